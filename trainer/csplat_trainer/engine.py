@@ -24,11 +24,11 @@ __all__ = ["CpuEngine", "Engine"]
 
 F32 = NDArray[np.float32]
 
-_LARGEST_LOG = 40.0  # of a log scale whose slope Adam can square in float32
+_LARGEST_LOG = 40.0  # largest log scale whose gradient Adam can square in float32
 
 
 class Engine(Protocol):
-    """What trains: the numba kernels of the CPU, or gsplat's on a GPU."""
+    """Training engine: the numba kernels of the CPU, or gsplat's on a GPU."""
 
     screen: ScreenGradients | None
 
@@ -63,13 +63,13 @@ class CpuEngine:
     """Training steps in numba; all buffers are kept from one step to the next.
 
     Args:
-        parameters: where to start; changed in place by `step`.
+        parameters: initial state; changed in place by `step`.
         options: weights of the loss, antialiasing, noise.
         perceptual: a further term of the loss.
 
     Attributes:
         parameters: the state of the optimisation.
-        screen: gradients on screen since it was last replaced, where the strategy wants them.
+        screen: gradients on screen since it was last replaced, if the strategy needs them.
     """
 
     def __init__(self, parameters: Parameters, options: TrainOptions, perceptual: PerceptualLoss | None = None) -> None:
@@ -95,11 +95,11 @@ class CpuEngine:
         """Make one step of training on one picture.
 
         Args:
-            picture: what the splats are to look like.
+            picture: the image to fit.
             background: [3], behind both.
             degree: of the SH bands that are evaluated.
             rates: learning rate of each group of parameters.
-            rng: makes the noise.
+            rng: source of the noise.
             exposure: how the photograph was exposed, if that is learnt.
 
         Returns:
@@ -202,8 +202,8 @@ def _chain(
         by_alpha: [N], gradient by opacity.
         scales: [N, 3], logarithms.
         by_scale: [N, 3], gradient by log-scale; the regulariser's is added.
-        opacity_weight: of the sum of opacities.
-        scale_weight: of the sum of standard deviations.
+        opacity_weight: weight of the sum of opacities.
+        scale_weight: weight of the sum of standard deviations.
         by_logit: [N], written.
     """
     first, end = lane_run(lane, lanes, len(alphas))

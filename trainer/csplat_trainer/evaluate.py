@@ -1,4 +1,4 @@
-"""How good a scene is on photographs."""
+"""Scores of a scene on photographs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def photograph_judge(
     Args:
         pictures: at least one.
         background: red, green, blue, behind renders and behind photographs that have an alpha channel.
-        mode, threads, origin: as of `Judge`.
+        mode, threads, origin: as in `Judge`.
     """
     colour = np.asarray(background, np.float32)
     cameras = [picture.camera for picture in pictures]
@@ -51,13 +51,13 @@ def evaluate(
     """Compare renders with photographs.
 
     Args:
-        render: makes the picture of a camera, [H, W, 3].
+        render: renders a camera's view, [H, W, 3].
         pictures: at least one.
         background: [3], behind photographs that have an alpha channel; `render` uses the same.
         lpips: the perceptual distance, or `None`.
 
     Returns:
-        What `csplat_render.metrics.Scores` says of all pictures together.
+        The fields of `csplat_render.metrics.Scores` for all images together.
     """
     judge = photograph_judge(pictures, background)
     each = [judge.score(number, render(camera), lpips=lpips) for number, camera in enumerate(judge.cameras)]
@@ -71,5 +71,5 @@ def _look(picture: Picture, background: F32) -> Look:
 
 
 def _count(picture: Picture) -> int:
-    """How many pixels count."""
+    """Return the number of pixels that count."""
     return picture.camera.W * picture.camera.H if picture.mask is None else int(picture.mask.sum())

@@ -1,8 +1,8 @@
 """Photographs of one scene that were exposed differently: a gain and a shift per photograph and channel.
 
-What the splats show is corrected before it is compared with a photograph, as in the code of "A Hierarchical 3D Gaussian
-Representation" (Kerbl et al. 2024, https://arxiv.org/abs/2406.12080). Corrections are learnt beside the splats, and no
-file holds them: together they leave the scene as bright as the photographs are in the mean.
+Renders are corrected before they are compared with a photograph, as in the code of "A Hierarchical 3D Gaussian
+Representation" (Kerbl et al. 2024, https://arxiv.org/abs/2406.12080). Corrections are learnt together with the splats,
+and no file holds them: together they leave the scene as bright as the photographs are in the mean.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ __all__ = ["Exposure", "Exposures"]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-_STATE = (4, 2, 3)  # of a photograph: values, both of Adam's means, steps
+_STATE = (4, 2, 3)  # state of a photograph: values, both of Adam's means, steps
 _BETA1, _BETA2, _EPSILON = 0.9, 0.99, 1e-15
-_MOST = 1.0  # of the logarithm of a gain, and of a shift: pictures that differ by more are none of one scene
+_MOST = 1.0  # limit on the logarithm of a gain, and on a shift: images that differ by more are not of one scene
 
 
 class Exposures:
-    """Corrections of the photographs that teach, and Adam's memory of them.
+    """Per-image gain and bias of the training photographs, and Adam's memory of them.
 
     Args:
-        count: of photographs.
+        count: number of photographs.
         stored: what `as_json` returned, to go on from.
 
     Attributes:
         values: [P, 2, 3], logarithms of the gains, and shifts, by photograph; their mean is 0.
 
     Raises:
-        InputError: what is stored is of another number of photographs.
+        InputError: the stored state is for another number of photographs.
     """
 
     def __init__(self, count: int, stored: Sequence[Sequence[float]] = ()) -> None:
@@ -70,8 +70,8 @@ class Exposure:
     """The correction of one photograph.
 
     Attributes:
-        among: those of all.
-        number: of the photograph.
+        among: the corrections of all photographs.
+        number: index of the photograph.
         rate: learning rate.
     """
 
@@ -80,7 +80,7 @@ class Exposure:
     rate: float
 
     def applied(self, seen: F32) -> F32:
-        """What is seen, [H, W, 3], as the photograph shows it."""
+        """Apply the photograph's correction to a render, [H, W, 3]."""
         gain, shift = self.among.values[self.number]
         shown: F32 = seen * np.exp(gain).astype(np.float32) + shift.astype(np.float32)
         return shown

@@ -25,19 +25,19 @@ F64 = NDArray[np.float64]
 #: Weights of L1 and of 1 − SSIM, by the name of the option.
 LOSS_WEIGHTS = {"inria": (0.8, 0.2), "study": (1.0, 0.2), "l1": (1.0, 0.0)}
 
-_PAD = CHANNELS * RADIUS  # values on either side of a row; three channels lie beside each other
-_TAPS = WINDOW[RADIUS:].astype(np.float32)  # of the window, from its middle outwards
+_PAD = CHANNELS * RADIUS  # values on either side of a row; three channels lie next to each other
+_TAPS = WINDOW[RADIUS:].astype(np.float32)  # weights of the window, from its middle outwards
 
 
 @dataclass(frozen=True)
 class LossValue:
-    """What one call of `PhotometricLoss` found.
+    """Result of one call of `PhotometricLoss`.
 
     Attributes:
         loss: the weighted sum.
         l1: mean absolute difference.
         ssim: mean SSIM.
-        mse: mean squared difference, of the pixels that count.
+        mse: mean squared difference of the pixels that count.
     """
 
     loss: float
@@ -50,8 +50,8 @@ class PhotometricLoss:
     """L1 + SSIM against photographs of one size; its buffers are kept between calls.
 
     Args:
-        height: of the pictures, in pixels.
-        width: of the pictures, in pixels.
+        height: height of the images, in pixels.
+        width: width of the images, in pixels.
         l1_weight: factor of the mean absolute difference.
         ssim_weight: factor of 1 − SSIM.
     """

@@ -28,7 +28,7 @@ DEVICES: tuple[Device, ...] = get_args(Device)
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """How to train. The defaults suit thousands to a hundred thousand splats on a CPU.
+    """Options of training. The defaults suit thousands to a hundred thousand splats on a CPU.
 
     They are the usual ones but for the learning rates of means and of the higher SH bands (twice
     those of the first publication), the noise (the same in scene units) and the weight of the mean
@@ -36,21 +36,21 @@ class TrainOptions:
 
     Attributes:
         max_splats: no more splats than this, ever.
-        sh_degree: of the finished scene, 0 to 3.
-        iterations: training steps, one picture each.
-        seed: of every random choice.
+        sh_degree: SH degree of the finished scene, 0 to 3.
+        iterations: training steps, one image each.
+        seed: seed of every random choice.
         device: `cpu` (numba) or `cuda` (the gsplat package).
-        strategy: how splats come and go: `mcmc`, `fixed`, `gradient` or `none`.
-        init: where splats start: at the data set's points, inside the visual hull of the alpha
+        strategy: how splats are added and removed: `mcmc`, `fixed`, `gradient` or `none`.
+        init: initial places of splats: at the data set's points, inside the visual hull of the alpha
             masks, anywhere in the scene's box, or (`auto`) the first of these that there is.
-        initial_splats: how many there are at first; 0: the strategy decides.
-        final_share: of the splats, how many are left at the end: once they no longer move, those that pictures need
-            least go, a few at a time. 1: all stay.
-        background: behind the splats, and behind pictures that have an alpha channel. `auto`: white
-            if any has one, else black; `random`: another one at each step, judged in front of white.
+        initial_splats: initial number of splats; 0: the strategy decides.
+        final_share: fraction of the splats that is kept at the end: once they no longer move, those that images need
+            least are pruned, a few at a time. 1: all are kept.
+        background: colour behind the splats, and behind images that have an alpha channel. `auto`: white
+            if any has one, else black; `random`: another one at each step, scored in front of white.
         antialiased: train with the mip-splatting low-pass filter.
         loss: `inria` 0.8 L1 + 0.2 (1 − SSIM), `study` L1 + 0.2 (1 − SSIM), `l1` L1 alone.
-        lpips_weight: of a perceptual term, LPIPS-Alex; 0: none. Needs torch and the weights.
+        lpips_weight: weight of a perceptual term, LPIPS-Alex; 0: none. Needs torch and the weights.
         lr_means: at first, as a share of the scene's extent; falls exponentially ...
         lr_means_final: ... to this.
         lr_quats: learning rate of the rotations.
@@ -58,24 +58,24 @@ class TrainOptions:
         lr_opacities: learning rate of the logits of opacity.
         lr_sh0: learning rate of the base colour.
         lr_shN: learning rate of the higher SH coefficients.
-        lr_exposure: of a gain and a shift per photograph and channel, for photographs that were exposed differently; no
-            scene holds them. Falls exponentially to a twentieth; 0: none are learnt.
-        lr_decay: the other rates fall to this share of themselves, along half a cosine from `refine_stop` (not where
+        lr_exposure: learning rate of a gain and a shift per photograph and channel, for photographs that were exposed
+            differently; no scene holds them. Falls exponentially to a twentieth; 0: none are learnt.
+        lr_decay: the other rates fall to this fraction, along half a cosine from `refine_stop` (unless
             that is 1) to the end.
-        half_size: share of the iterations, the first, that learn from photographs of half the width and height: for
-            splats that are few and in rough places yet.
+        half_size: fraction of the iterations, at the start, that train on photographs of half the width and height:
+            while splats are few and their places rough.
         sh_interval: steps before each next SH degree; 0: a fifteenth of the iterations, at most 1000.
-        opacity_weight: of the mean opacity in the loss (mcmc and fixed).
-        scale_weight: of the mean standard deviation in the loss (mcmc and fixed).
-        noise: of the positions, times their learning rate (mcmc and fixed).
+        opacity_weight: weight of the mean opacity in the loss (mcmc and fixed).
+        scale_weight: weight of the mean standard deviation in the loss (mcmc and fixed).
+        noise: noise of the positions, as a multiple of their learning rate (mcmc and fixed).
         dead_opacity: splats below this are moved (mcmc, fixed) or removed (gradient).
         refine_start: step of the first change of the splats' number or places.
-        refine_stop: share of the iterations after which there is none.
+        refine_stop: fraction of the iterations after which there is none.
         refine_every: steps from one to the next.
         growth: mcmc grows by this factor each time; 0: by a twentieth, or by as much as reaches the
             cap halfway to `refine_stop`.
         grad_threshold: gradient densifies splats whose mean gradient on screen, in pixels of half
-            a picture, is above this.
+            an image, is above this.
         eval_every: steps between evaluations on the test views; 0: at the end alone.
         eval_views: test views of an evaluation; 0: all of them.
         log_every: steps between entries of the log.
@@ -145,7 +145,7 @@ class TrainOptions:
         return int(self.refine_stop * self.iterations)
 
     def halves(self, iteration: int) -> bool:
-        """Whether a step learns from a photograph of half the size."""
+        """Return True if a step trains on a photograph of half the size."""
         return iteration <= self.half_size * self.iterations
 
     def active_degree(self, iteration: int) -> int:
@@ -153,14 +153,14 @@ class TrainOptions:
         return min(self.sh_degree, iteration // self.sh_every)
 
     def refines_after(self, iteration: int) -> bool:
-        """Whether the strategy acts after a step."""
+        """Return True if the strategy acts after a step."""
         due = iteration % self.refine_every == 0
         return self.strategy != "none" and due and self.refine_start <= iteration <= self.refine_end
 
     def thinnings_left(self, iteration: int) -> int:
-        """How many times splats still go, the one after this step included; 0 where none go after it.
+        """Return the number of prunings left, including the one after this step; 0 if no pruning follows this step.
 
-        The last go where two fifths of the steps are left that follow the last move of splats.
+        The last one happens when two fifths of the steps after the last move of splats are left.
         """
         begin = min(self.refine_end, self.iterations - 1)
         steps = max(1, int(_THINNED * (self.iterations - begin)))
@@ -169,7 +169,7 @@ class TrainOptions:
         return max(0, times + 1 - done) if self.final_share < 1.0 and rest == 0 and done > 0 else 0
 
     def growth_from(self, count: int) -> float:
-        """Factor by which a run that begins with so many splats grows each time."""
+        """Return the factor by which a run that begins with `count` splats grows each time."""
         if self.growth:
             return self.growth
         times = (self.refine_end // 2 - self.refine_start) // self.refine_every + 1
@@ -199,9 +199,9 @@ class TrainOptions:
         }
 
 
-_GROWTH = 1.05  # of the paper
-_THINNINGS = 10  # times at most that splats go,
-_THINNED = 0.6  # in this share of the steps that follow the last move of splats
+_GROWTH = 1.05  # factor of the paper
+_THINNINGS = 10  # prunings, at most
+_THINNED = 0.6  # fraction of the steps after the last move of splats in which they happen
 _LAST_EXPOSURE = 0.05  # share of the learning rate of exposures that is left at the end
 
 _CHOICES = {

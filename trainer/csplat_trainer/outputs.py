@@ -1,4 +1,4 @@
-"""What a run reads and writes beside its data set, and what it ends with."""
+"""Files that a run reads and writes besides its data set, and its result."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class Outputs:
     """Files that a run writes on its way.
 
     Attributes:
-        checkpoint: where checkpoints go (each replaces the last), or `None`.
+        checkpoint: file for checkpoints (each replaces the last), or `None`.
         checkpoint_every: steps from one to the next; 0: at the end alone.
-        previews: folder for early pictures (photograph and render beside each other), or `None`.
+        previews: folder for early renders (photograph and render next to each other), or `None`.
         preview_every: steps from one to the next; 0: at powers of two from 100 on, and the end.
         resume: checkpoint to go on from, or `None`.
         lpips_weights: file of the weights of LPIPS-Alex; `None`: they are looked for in the usual places.
@@ -32,7 +32,7 @@ class Outputs:
     lpips_weights: str | Path | None = None
 
     def preview_due(self, iteration: int, iterations: int) -> bool:
-        """Whether a picture is wanted after a step."""
+        """Return True if a preview is due after a step."""
         if self.previews is None:
             return False
         if iteration == iterations:
@@ -44,12 +44,12 @@ class Outputs:
 
 @dataclass(frozen=True)
 class TrainResult:
-    """What a run ends with.
+    """Result of a run.
 
     Attributes:
         model: the scene.
         log: JSON-compatible: options, entries on the way, the loss of each step, figures, times.
-        metrics: on the test pictures, see `evaluate`; `None` where there are none.
+        metrics: scores on the test images, see `evaluate`; `None` if there are none.
     """
 
     model: SplatModel

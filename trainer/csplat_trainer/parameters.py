@@ -1,4 +1,4 @@
-"""What training changes: the parameters of the splats and Adam's memory of them.
+"""Parameters of the splats that training changes, and Adam's memory of them.
 
 Opacities are logits here, and quaternions unit: each step ends by bringing them back to length 1.
 """
@@ -81,7 +81,7 @@ class Parameters:
 
 
 def from_model(model: SplatModel, sh_degree: int) -> Splats:
-    """Parameters of the splats of a model, with SH of another degree (cut, or zeros) where wanted."""
+    """Return the parameters of a model's splats, with SH of another degree (cut, or zeros) if requested."""
     alpha = np.clip(model.opacities.astype(np.float64), 1e-6, 1.0 - 1e-6)
     coefficients = (sh_degree + 1) ** 2 - 1
     shN = np.zeros((len(model), coefficients, 3), np.float32)
@@ -121,7 +121,7 @@ def adam_step(parameters: Parameters, gradients: Splats, rates: dict[str, float]
 
     Args:
         parameters: changed in place.
-        gradients: of the loss, shapes as `Parameters.values`.
+        gradients: gradients of the loss, shapes as `Parameters.values`.
         rates: learning rate of each group.
     """
     parameters.step += 1

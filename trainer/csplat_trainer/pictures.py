@@ -1,4 +1,4 @@
-"""`Picture`: a photograph and its camera, as training wants them: bytes, made float when their turn comes."""
+"""`Picture`: a photograph and its camera in the form that training needs: bytes, converted to float on demand."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class UnreadPixels:
     """Pixels that are read when they are first asked for, and then kept.
 
     Attributes:
-        has_alpha: whether there is an alpha channel.
-        read: makes the array that `Picture` wants.
+        has_alpha: True if there is an alpha channel.
+        read: makes the array that `Picture` needs.
     """
 
     has_alpha: bool
@@ -44,7 +44,7 @@ class UnreadMask:
     """A mask that is read when it is first asked for, and then kept.
 
     Attributes:
-        read: makes the array that `Picture` wants.
+        read: makes the array that `Picture` needs.
     """
 
     read: Callable[[], Mask]
@@ -60,7 +60,7 @@ class Picture:
     """One view of a data set.
 
     Attributes:
-        camera: where it was taken; its W and H are the picture's.
+        camera: its camera; W and H are those of the image.
         source: [H, W, 3] or [H, W, 4] uint8, C-contiguous, RGB or RGBA with straight (not
             premultiplied) alpha; or such pixels that are not read yet.
         masked: [H, W], which pixels count: nobody learns from the others, or is judged by them; or a mask that is not
@@ -80,7 +80,7 @@ class Picture:
 
     @property
     def pixels(self) -> U8:
-        """The pixels. Those that are not read yet are read.
+        """Pixels of the image. They are read on first access.
 
         Raises:
             InputError: the file is damaged.
@@ -92,7 +92,7 @@ class Picture:
 
     @property
     def mask(self) -> Mask | None:
-        """Which pixels count; `None`: all of them. A mask that is not read yet is read.
+        """Pixels that count; `None`: all of them. A mask is read on first access.
 
         Raises:
             InputError: the file is damaged, or no pixel counts.
@@ -106,7 +106,7 @@ class Picture:
 
     @property
     def has_alpha(self) -> bool:
-        """Whether there is an alpha channel; nothing is read for it."""
+        """True if there is an alpha channel; nothing is read for it."""
         return self.source.has_alpha if isinstance(self.source, UnreadPixels) else self.source.shape[2] == 4
 
     def at(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> F64:
@@ -126,7 +126,7 @@ def compose(picture: Picture, background: F32, out: F32) -> F32:
     """The picture as floats, in front of a background.
 
     Args:
-        picture: what to show.
+        picture: the image to compose.
         background: [3], the colour behind it.
         out: [H, W, 3] float32, overwritten.
 

@@ -1,4 +1,4 @@
-"""What a training run tells: progress, log, loss plot, early pictures."""
+"""Reports of a training run: progress, log, loss plot, early renders."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ _WINDOW_SHARE = 50  # the moving average spans this part of the run
 
 @dataclass(frozen=True)
 class TrainingStep:
-    """Where a run stands.
+    """Progress of a run.
 
     Attributes:
         iteration: steps made.
         iterations: steps in all.
         loss: mean over the steps since the last report.
-        psnr: of the training pictures since the last report, pooled, dB.
+        psnr: PSNR of the training images since the last report, pooled, dB.
         splat_count: splats at present.
-        sh_degree: that is trained at present.
-        seconds: since the start.
-        seconds_left: at the present pace.
+        sh_degree: SH degree that is trained at present.
+        seconds: time since the start.
+        seconds_left: remaining time at the present pace.
     """
 
     iteration: int
@@ -47,7 +47,7 @@ class TrainingStep:
 
 
 def peak_memory() -> int | None:
-    """Most memory that this process has held, bytes; `None` where the system does not say."""
+    """Return the most memory that this process has held, bytes; `None` if the system does not report it."""
     if sys.platform == "win32":
         return None
     try:
@@ -76,9 +76,9 @@ def plot_loss(path: str | Path, losses: Sequence[float], title: str = "") -> Non
     """Draw the loss over the steps, with its moving average, as a PNG.
 
     Args:
-        path: of the picture.
-        losses: of each step.
-        title: above the plot.
+        path: path of the plot.
+        losses: loss of each step.
+        title: title above the plot.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -100,7 +100,7 @@ def plot_loss(path: str | Path, losses: Sequence[float], title: str = "") -> Non
 
 
 def side_by_side(*pictures: F32) -> F32:
-    """Pictures of one height beside each other."""
+    """Return images of one height next to each other."""
     return np.concatenate(pictures, axis=1)
 
 

@@ -1,13 +1,13 @@
-"""How much pictures depend on each splat, attribute by attribute, measured from training cameras or virtual ones.
+"""Sensitivity of renders to each splat, attribute by attribute, measured from training cameras or virtual ones.
 
 The sensitivity of a parameter p is S(p) = Σ_i |∂E_i/∂p| / Σ_i P_i over the views i, E_i the sum of the red, green and
 blue of view i, P_i its pixels; that of a group of parameters is its maximum (Niedermayr, Stumpfegger, Westermann,
 "Compressed 3D Gaussian Splatting for Accelerated Novel View Synthesis", CVPR 2024). For colours that is what counts.
 For opacity and shape the pixels of one view cancel in E_i: a splat that grows brightens here what it darkens there. So
-magnitudes are taken here before pixels and channels are added up; the published figure stands beside it.
+magnitudes are taken here before pixels and channels are added up; the published figure is reported as well.
 
 Sums of squares in place of magnitudes are the diagonal of the Gauss-Newton matrix: what a small error of the parameter
-adds to the squared error of the pictures. Those are the weights of k-means, whose errors are squared too.
+adds to the squared error of the renders. They are the weights of k-means, whose errors are squared too.
 """
 
 from __future__ import annotations
@@ -34,34 +34,34 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-_DIAGONAL = [0, 6, 11, 15, 18, 20]  # of a triangle of 6 by 6
-_LARGEST = 1e37  # of a sum; float32 holds six of them
+_DIAGONAL = [0, 6, 11, 15, 18, 20]  # indices of the diagonal in a triangle of 6 by 6
+_LARGEST = 1e37  # largest value of a sum; float32 holds six of them
 
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """What pictures of a scene depend on, by splat and group of attributes.
+    """Sensitivities and squared derivatives of a scene's renders, by splat and group of attributes.
 
     Attributes:
         colour: [N] float64, S of the SH coefficients, sh0 among them: the largest of up to 48.
         opacity: [N] float64, S of alpha, magnitudes added pixel by pixel and channel by channel.
         shape: [N] float64, S of the covariance divided by its trace, the largest of 6 entries, added likewise.
         opacity_net: [N] float64, S of alpha as published: pixels of a view cancel.
-        shape_net: [N] float64, the same of the covariance. All five are `None` if they were not asked for.
+        shape_net: [N] float64, the same of the covariance. All five are `None` if they were not requested.
         colour_squares: [N] float64, squared derivatives of a pixel's channel towards the splat's colour in that
             channel, summed over pixels and views, per pixel.
         opacity_squares: [N] float64, the same of all three channels towards alpha.
         shape_squares: [N] float64, towards all nine entries of the covariance divided by its trace.
-        means_squares: [N] float64, towards the three coordinates of the centre, per square scene unit; what follows
-            through the direction of view alone is left out.
+        means_squares: [N] float64, towards the three coordinates of the centre, per square scene unit; effects through
+            the viewing direction alone are left out.
         shape_metric: [N, 21] float64, the Gauss-Newton matrix whose trace is `shape_squares`: the upper triangle, row
             by row, over xx, yy, zz, √2 xy, √2 xz, √2 yz of the covariance divided by its trace.
         metric: [N, B (B + 1) / 2] float32, `colour_squares` with the basis functions of each view, B = (degree + 1)²:
             the Gauss-Newton matrix of the SH coefficients of one channel, its upper triangle; None if it was not
-            asked for.
-        views: [N] int64, how many views saw the splat.
-        view_count: how many there were.
-        pixel_count: of all views together.
+            requested.
+        views: [N] int64, number of views that saw the splat.
+        view_count: number of views.
+        pixel_count: pixels of all views together.
     """
 
     colour: F64 | None
@@ -108,11 +108,11 @@ def measure_sensitivity(
         model: the scene.
         cameras: the views, at least one; relative to the scene's origin.
         background: red, green, blue behind everything.
-        metric: the matrices of SH coefficients too: 2 B (B + 1) bytes per splat.
-        magnitudes: sensitivities themselves; without them 112 + 12 B bytes per splat less.
-        dtype: of pixels, float32 or float64 (which is for tests).
-        threads: how many; None for all. The result does not depend on it.
-        progress: is told how much is done.
+        metric: compute the matrices of SH coefficients too: 2 B (B + 1) bytes per splat.
+        magnitudes: compute the sensitivities themselves; without them 112 + 12 B bytes per splat less.
+        dtype: dtype of pixels, float32 or float64 (which is for tests).
+        threads: number of threads; None for all. The result does not depend on it.
+        progress: called with the stage and the fraction done.
 
     Raises:
         InputError: there is no camera.
@@ -129,7 +129,7 @@ def measure_sensitivity(
 
 
 class _Derivatives(Rasteriser):
-    """Renders views and adds up what each of them says. Owns the sums."""
+    """Renders views and adds up the derivatives of each. Owns the sums."""
 
     def __init__(self, model: SplatModel, *, metric: bool, magnitudes: bool, dtype: Any, threads: int | None) -> None:
         super().__init__("standard", dtype, gradients=True, threads=threads)
@@ -197,7 +197,7 @@ class _Derivatives(Rasteriser):
 
 
 def _over(sums: F64, pixels: int) -> F64:
-    """The array itself, divided and made to fit float32; sums that have left float64 say nothing, and become 0."""
+    """Divide the array in place and make it fit float32; sums that have overflowed float64 become 0. Return it."""
     sums /= pixels
     np.nan_to_num(sums, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
     return np.clip(sums, -_LARGEST, _LARGEST, out=sums)

@@ -1,4 +1,4 @@
-"""Sensitivities in a file: one array per group, and which scene they belong to. Wants NumPy alone, no renderer."""
+"""Sensitivities in a file: one array per group, and the scene they belong to. Requires only NumPy, no renderer."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ _FORMAT = "csplat sensitivity 1"
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 _CHANNELS = 3.0
 _SHAPE = 6.0  # entries of a covariance
-_FLOOR = 0.01  # of the median: the weight of what no view saw; other views may see it
+_FLOOR = 0.01  # fraction of the median: the weight of splats that no view saw; other views may see them
 
 
 @dataclass(frozen=True, eq=False)
 class StoredSensitivity:
-    """What a file holds.
+    """Contents of a sensitivity file.
 
     Attributes:
-        groups: [N] float32 by name, see `GROUPS`; of a file all of them.
-        views: [N] int32, how many views saw each splat.
-        source: where the views came from, one of `SOURCES`.
-        view_count: how many there were.
-        missed_share: share of the splats that views that were kept aside saw, and no other; NaN where none were.
+        groups: [N] float32 by name, see `GROUPS`; a file holds all of them.
+        views: [N] int32, number of views that saw each splat.
+        source: kind of views, one of `SOURCES`.
+        view_count: number of views.
+        missed_share: fraction of the splats that only held-out views saw; NaN if no views were held out.
         shape_matrices: [N, 21] float32, upper triangles of the Gauss-Newton matrices of the covariance over its trace,
             see `Sensitivity.shape_metric`, the mean of the diagonal being 1.
         matrices: [N, K (K + 1) / 2] float16, upper triangles of the Gauss-Newton matrices of the SH bands 1 to d, the
@@ -65,11 +65,11 @@ class StoredSensitivity:
     def of(
         cls, model: SplatModel, found: Sensitivity, source: str = "virtual", missed_share: float = float("nan")
     ) -> StoredSensitivity:
-        """What a file of a scene's sensitivities holds.
+        """Gather the contents of a file of a scene's sensitivities.
 
         Args:
             model: the scene that was measured.
-            found: what was measured.
+            found: the measured sensitivities.
             source: as the attribute, like the next.
             missed_share: as the attribute.
         """
@@ -89,14 +89,14 @@ class StoredSensitivity:
         return np.asarray(self.views > 0, np.bool_)
 
     def importance(self) -> Importance:
-        """Return the weights of squared errors that the encoder wants."""
+        """Return the weights of squared errors that the encoder needs."""
         matrices = self.matrices, self.shape_matrices
         return Importance(
             self._floored("colour_squares"), self._floored("shape_squares"), *matrices, self._curvatures()
         )
 
     def _curvatures(self) -> Curvatures:
-        """The same, attribute by attribute and not only in ratios, where nothing stands in for what no view saw."""
+        """Return the same by attribute, not only in ratios, with nothing in place of the values that no view saw."""
         opacity, shape, means = (self.groups[f"{name}_squares"] / _CHANNELS for name in ("opacity", "shape", "means"))
         return Curvatures(
             opacity, self.shape_matrices * (shape / _SHAPE)[:, None], means, self.groups["colour_squares"]
@@ -125,9 +125,9 @@ def write_sensitivity(
     """Write a file.
 
     Args:
-        stream: where it goes.
+        stream: the stream to write to.
         model: the scene that was measured.
-        found: what was measured.
+        found: the measured sensitivities.
         source: see `StoredSensitivity`.
         missed_share: see `StoredSensitivity`.
     """
@@ -210,5 +210,5 @@ def _over_mean(triangles: NDArray[Any], mean: NDArray[np.float64]) -> NDArray[np
 
 
 def _order(triangles: NDArray[Any]) -> int:
-    """Rows of a matrix whose upper triangle has so many entries."""
+    """Return the rows of a matrix from the length of its upper triangle."""
     return (math.isqrt(8 * int(triangles.shape[1]) + 1) - 1) // 2

@@ -1,4 +1,4 @@
-"""What turns a place on a picture into the derivative of a splat's exponent towards its covariance."""
+"""Linear forms from a place on a render to the derivative of a splat's exponent with respect to its covariance."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from csplat_render.projecting import BLOCK, determinants, deviation, perspective
 
 __all__ = ["FORM", "covariance_forms"]
 
-#: Numbers per splat that say how its exponent depends on its covariance.
+#: Numbers per splat that determine how its exponent depends on its covariance.
 FORM = 12
 
 
 @parallel_kernel()
 def covariance_forms(lane: int, lanes: int, means: Any, quats: Any, scales: Any, view: Any, antialiased: bool,
                      shape: Any, near: Any, forms: Any) -> None:  # fmt: skip
-    """What turns a place on the picture into the exponent's derivative towards a splat's covariance.
+    """Compute the forms that turn a place on a render into the exponent's derivative towards a splat's covariance.
 
-    With Σ2 the covariance on the picture, M the linearised perspective and γ² the trace of the covariance Σ, the
+    With Σ2 the covariance on the render, M the linearised perspective and γ² the trace of the covariance Σ, the
     exponent's derivative towards Σ / γ² is t = h hᵀ + C, h = γ/√2 · Mᵀ Σ2⁻¹ d, d the distance from the centre in
     pixels. C is 0 but in the antialiased mode, whose opacity depends on the covariance too. Parallel over blocks.
 
@@ -33,9 +33,9 @@ def covariance_forms(lane: int, lanes: int, means: Any, quats: Any, scales: Any,
         view: see `project`.
         antialiased: see `project`.
         shape: see `project`.
-        near: [N] float32, above 0 for what is drawn.
-        forms: [N, FORM] float64, written for what is drawn: the matrix of h, [3, 2] row by row; C, as xx yy zz xy xz
-            yz.
+        near: [N] float32, above 0 for splats that are drawn.
+        forms: [N, FORM] float64, written for splats that are drawn: the matrix of h, [3, 2] row by row; C, as xx yy zz
+            xy xz yz.
     """
     n = means.shape[0]
     for block in range(lane, (n + BLOCK - 1) // BLOCK, lanes):

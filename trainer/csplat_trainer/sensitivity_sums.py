@@ -1,8 +1,8 @@
-"""How every pixel of a picture answers to every splat: sums of its derivatives, without any matrix being built.
+"""Sums of the derivatives of every pixel of a render towards every splat, without building any matrix.
 
-`Rasteriser.backward` adds the derivatives of a picture's pixels before anyone sees them: an axis that grows brightens
-one side of a splat and darkens what it hides, and the sum may be near 0 for a splat on which much depends. Here
-magnitudes and squares are added pixel by pixel and channel by channel, and the plain sum beside them.
+`Rasteriser.backward` adds the derivatives of a render's pixels before they can be examined: an axis that grows
+brightens one side of a splat and darkens what it hides, and the sum may be near 0 for a splat on which much depends.
+Here magnitudes and squares are added pixel by pixel and channel by channel, in addition to the plain sum.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SUMS = 39
 
 _AREA = TILE * TILE
 
-# Where the planes of a tile begin: transmittance, what lies behind by channel, the current splat's share of the pixel,
+# Offsets of the planes of a tile: transmittance, what lies behind by channel, the current splat's share of the pixel,
 # Σ s, Σ |s|, Σ s², positions about the centre of the tile.
 _RED, _GREEN, _BLUE, _WEIGHT, _SLOPE, _SIZE, _SQUARE, _X, _Y = (_AREA * k for k in range(1, 10))
 _PLANES = 10
@@ -208,26 +208,26 @@ def _moments(body: Any, count: int, form: Any, sums: Any) -> None:
 def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, view: Any, degree: int, shape: Any,
              near: Any, offsets: Any, records: Any, colour: Any, net: Any, sizes: Any, squares: Any, metric: Any,
              bends: Any, views: Any) -> None:  # fmt: skip
-    """Add what one view says of every splat; parallel over blocks of splats, records in one order.
+    """Add one view's sums for every splat; parallel over blocks of splats, records in one order.
 
     Args:
         means: see `project`, as the next two.
         opacities: see `project`.
         scales: see `project`.
         view: see `project`.
-        degree: of the spherical harmonics.
+        degree: degree of the spherical harmonics.
         shape: see `project`.
-        near: [N] float32, above 0 for what is drawn.
+        near: [N] float32, above 0 for splats that are drawn.
         offsets: [N + 1] int64, where the records of each splat begin.
         records: [intersections, SUMS].
-        colour: [N, B, 3] float32, added to: |derivative of the picture's sum towards a coefficient|; [0, …] if neither
-            this nor the next two are wanted.
+        colour: [N, B, 3] float32, added to: |derivative of the render's sum towards a coefficient|; [0, …] if neither
+            this nor the next two are needed.
         net: [N, 7] float64, added to: the same towards alpha and the six entries of the covariance over its trace.
         sizes: [N, 7] float64, added to: the same with magnitudes taken pixel by pixel and channel by channel.
         squares: [N, 3] float64, added to: squared derivatives of the pixels' channels towards a colour (one channel of
             it), alpha, and the centre.
         metric: [N, B (B + 1) / 2] float32, added to: squared derivatives towards SH coefficients, of one channel, the
-            upper triangle of a matrix; [0, …] if it is not wanted.
+            upper triangle of a matrix; [0, …] if it is not needed.
         bends: [N, 21] float64, added to: squared derivatives of all channels towards the covariance over its trace, as
             the upper triangle of a matrix over xx, yy, zz, √2 xy, √2 xz, √2 yz.
         views: [N] int64, added to: 1 where the splat was seen.
@@ -264,7 +264,7 @@ def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, vie
                 net[i, 0] += abs(sums[2]) / alpha
                 sizes[i, 0] += sums[3] / alpha
             for e in range(6 if with_magnitudes else 0):
-                twice = 1.0 if e < 3 else 2.0  # an entry beside the diagonal stands twice in the covariance
+                twice = 1.0 if e < 3 else 2.0  # an entry off the diagonal occurs twice in the covariance
                 net[i, 1 + e] += twice * abs(sums[5 + e])
                 sizes[i, 1 + e] += twice * sums[11 + e]
             s0, s1, s2 = deviation(scales[i, 0]), deviation(scales[i, 1]), deviation(scales[i, 2])

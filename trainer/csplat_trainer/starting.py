@@ -1,4 +1,4 @@
-"""Where splats start: at known points, inside the visual hull of the masks, or anywhere in a box."""
+"""Initial splats: at known points, inside the visual hull of the masks, or anywhere in a box."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ _OPACITY = 0.5
 _BATCH = 20_000  # points drawn at a time
 _BATCHES = 400  # before what was found must do
 _MASK = 0.02  # alpha at and above which a pixel belongs to the object
-_MISSES = 0.02  # share of the pictures that may miss a point of the hull: rounding to pixels
+_MISSES = 0.02  # fraction of the images that may miss a point of the hull: rounding to pixels
 _NEIGHBOURS = 3
-_BOX_SHARE = 0.9  # of what the middle camera sees at the distance of the focus
-_PHOTO_BOX = 1.5  # photographs show what lies around their subject too
+_BOX_SHARE = 0.9  # fraction of the middle camera's field of view at the distance of the focus
+_PHOTO_BOX = 1.5  # factor for photographs, which show the surroundings of their subject too
 
 
 @dataclass(frozen=True)
 class StartingScene:
-    """What the cameras say about a scene.
+    """Extent and focus of a scene according to its cameras.
 
     Attributes:
         extent: 1.1 times the greatest distance of a camera from their centre (INRIA's unit of the
@@ -90,11 +90,11 @@ def starting_splats(
     """Place the splats that training begins with.
 
     Args:
-        pictures: of the training views.
-        scene: where it lies.
-        count: how many splats.
-        sh_degree: of the parameters; bands above 0 begin at zero.
-        rng: chooses.
+        pictures: images of the training views.
+        scene: extent and focus of the scene.
+        count: number of splats.
+        sh_degree: SH degree of the parameters; bands above 0 begin at zero.
+        rng: source of random choices.
         init: `points`, `hull`, `box`, or `auto` for the first of them that there is.
         points: [P, 3], points of the scene, where the data set has any.
         colours: [P, 3] in 0..1, their colours; `None`: those of the pictures there.
@@ -128,7 +128,7 @@ def starting_splats(
 
 
 def _at_points(points: F32, colours: F32, count: int, scene: StartingScene, rng: Generator) -> tuple[F64, F64]:
-    """Some of the points, or all of them and more beside them where more are wanted."""
+    """Choose some of the points, or all of them and repeat some if more are needed."""
     order = rng.permutation(len(points))
     chosen = np.concatenate([order, rng.integers(0, len(points), max(0, count - len(points)))])[:count]
     means = points[chosen].astype(np.float64)
@@ -143,7 +143,7 @@ def _at_points(points: F32, colours: F32, count: int, scene: StartingScene, rng:
 def _in_box(
     pictures: Sequence[Picture], scene: StartingScene, count: int, rng: Generator, *, masked: bool
 ) -> tuple[F64, F64]:
-    """Points that cameras see, inside the hull of the masks where wanted, with the mean of their pixels."""
+    """Find points that cameras see, inside the hull of the masks if requested, with the mean of their pixels."""
     found: list[F64] = []
     colours: list[F64] = []
     total = 0
@@ -167,7 +167,7 @@ def _in_box(
 
 
 def _look(pictures: Sequence[Picture], points: F64) -> tuple[NDArray[np.int64], NDArray[np.int64], F64]:
-    """How many pictures see each point, in how many it falls on the object, the mean colour there."""
+    """Return how many images see each point, in how many it falls on the object, and its mean colour there."""
     seen, hits = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     colour = np.zeros((len(points), 3))
     for picture in pictures:
@@ -211,7 +211,7 @@ def _splats(means: F64, colour: F64, sh_degree: int, scene: StartingScene, rng: 
 def _neighbour_distances(points: F64, scene: StartingScene) -> F64:
     """Root mean square distance to the nearest three others, never 0.
 
-    Where most points have others in the very same place, that says nothing: then as if they filled the scene's box.
+    If most points have others in the very same place, that carries no information: then as if they filled the box.
     """
     evenly = 2.0 * scene.half / max(1, len(points)) ** (1.0 / 3.0)
     if len(points) < 2:

@@ -3,7 +3,7 @@
 """Checkpoints of gsplat's simple_trainer, of nerfstudio's splatfacto and of INRIA's trainer, read as scenes.
 
 All are pickles of torch; nothing in them is run: `weights_only` admits tensors, containers and plain numbers alone.
-What they do not say, such as whether a scene was trained antialiased, stands in the files of their trainers.
+What they leave out, such as whether a scene was trained antialiased, is in the files of their trainers.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ __all__ = ["FORMAT"]
 
 _NAMED = 5  # names in a message
 _SH_C0 = 0.28209479177387814
-#: What INRIA's `GaussianModel.capture` returns, behind the SH degree in use (scene/gaussian_model.py).
+#: Values that INRIA's `GaussianModel.capture` returns after the SH degree in use (scene/gaussian_model.py).
 _INRIA = ("means", "sh0", "shN", "scales", "quats", "opacities")
-_HOLDERS = ("pipeline", "state_dict", "model")  # what has the tensors of splatfacto, where it is not the file itself
+_HOLDERS = ("pipeline", "state_dict", "model")  # keys that may hold splatfacto's tensors; else the top level does
 #: gsplat writes a file for each GPU, which has a part of the splats (simple_trainer.py).
 _RANK = re.compile(r"(?P<run>.*_rank)(?P<rank>\d{1,4})(?P<ending>\.pt)")
 _NAMES = {
@@ -99,7 +99,7 @@ def _read(path: Path, sh_degree: int | None) -> SplatModel:
     except Exception as error:  # noqa: BLE001 -- an unpickler raises whatever a damaged file makes of it
         if isinstance(error, pickle.UnpicklingError) and "eights only" in str(error):
             reason = "holds objects of a program, which could do anything: save tensors alone, as state_dict gives them"
-        else:  # what torch says of it goes on for twenty lines
+        else:  # torch's message goes on for twenty lines
             reason = "is no whole checkpoint of torch: copy it again, or save its splats as PLY where it was trained"
         raise InputError(f"{path.name} {reason}") from None
     try:
@@ -152,9 +152,9 @@ def _of_inria(said: object) -> dict[str, Any] | None:
 
 
 def _models_in(named: Mapping[str, Any]) -> list[str]:
-    """What stands before the names of the tensors of each model of splats.
+    """Return the prefix of the tensors' names of each model of splats.
 
-    That is `_model.gauss_params.` in splatfacto, `_model.` before nerfstudio 1.1, and nothing in a state_dict alone.
+    It is `_model.gauss_params.` in splatfacto, `_model.` before nerfstudio 1.1, and empty in a state_dict alone.
     """
     prefixes = [name.removesuffix("means") for name in named if name == "means" or name.endswith(".means")]
     return [one for one in prefixes if f"{one}scales" in named or f"{one}quats" in named]

@@ -21,23 +21,23 @@ from csplat_trainer.data.pixels import shown_size
 
 __all__ = ["check_shots", "notes_on_images", "notes_on_lenses", "notes_on_poses"]
 
-_ROUNDING = 1.0  # pixels, of each side of an image that was made smaller
+_ROUNDING = 1.0  # pixels by which each side of a scaled-down image may be rounded
 _NEARLY = 0.02  # relative, of scales across and down: beyond it an image is turned, or a mask is another image's
-_MIDDLE = (0.25, 0.75)  # of the image: principal points elsewhere are reported
-_SMALL_RANGE = 1.0 / 8.0  # of what 16 bits hold: images of 12 bits are as dark as that
-_SAME = 1e-9  # relative, of places; coordinates of maps are a million times the distance of cameras
+_MIDDLE = (0.25, 0.75)  # fractions of the image: principal points outside this range are reported
+_SMALL_RANGE = 1.0 / 8.0  # fraction of the 16-bit range: images of 12 bits are as dark as that
+_SAME = 1e-9  # relative difference of positions; coordinates of maps are a million times the distance of cameras
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes of a camera to OpenCV's
 _FEW = 4  # cameras; fewer need not look anywhere in common
 _AIMED, _AIMLESS = 0.95, 0.5  # median cosines; see `_gaze`
-_SHOTS, _POINTS = 64, 4096  # of a set, at most, that are looked at to see whether they belong together
+_SHOTS, _POINTS = 64, 4096  # shots and points of a set, at most, that are checked for belonging together
 
 
 def check_shots(shots: Sequence[Shot], heads: Mapping[Path, ImageHead]) -> None:
     """Check lenses against reason, images against their cameras' sizes, and masks against their images'.
 
     Args:
-        shots: all of a set.
-        heads: of their files.
+        shots: all shots of a set.
+        heads: headers of their image files.
 
     Raises:
         InputError: something contradicts itself.
@@ -126,11 +126,11 @@ def notes_on_lenses(shots: Sequence[Shot]) -> list[str]:
 
 
 def notes_on_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | None) -> list[str]:
-    """Report cameras that all stand at one place, see none of the points, or look as inverted poses do.
+    """Report cameras that are all at one place, see none of the points, or look as inverted poses do.
 
     Args:
-        shots: all that teach or judge.
-        points: [P, 3], of the set, or `None`.
+        shots: all training and test images.
+        points: [P, 3], points of the set, or `None`.
     """
     notes = []
     places = np.stack([-shot.viewmat[:3, :3].T @ shot.viewmat[:3, 3] for shot in shots])
@@ -157,7 +157,7 @@ def notes_on_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | No
             "all cameras look away from what they stand around, as in a panorama: if that is wrong, the poses have "
             "other axes than files of this kind"
         )
-    # What a file holds may be the inverse as COLMAP has it, or of either custom of axes as transforms.json is read.
+    # The file may hold the inverse of COLMAP's poses, or of either axis convention that transforms.json is read with.
     elif abs(gaze) < _AIMLESS and max(map(_gaze, (inverse, inverse @ _FLIP, _FLIP @ inverse @ _FLIP))) > _AIMED:
         notes.append(
             "the cameras look past each other, and with inverted poses all at one point: does the file hold the "
@@ -169,7 +169,7 @@ def notes_on_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | No
 def _gaze(viewmats: NDArray[np.float64]) -> float:
     """Return the median cosine between where cameras look and where the point lies that is nearest to all their lines.
 
-    1 of cameras that look at one thing from all around, -1 of those that look away from their middle.
+    1 for cameras that look at one thing from all around, -1 for cameras that look away from their middle.
     """
     axes = viewmats[:, 2, :3]
     positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
@@ -180,7 +180,7 @@ def _gaze(viewmats: NDArray[np.float64]) -> float:
 
 
 def _sees_any(shot: Shot, points: NDArray[np.floating[Any]]) -> bool:
-    """Whether a point lies in front of a camera, and within twice the width and height of its image."""
+    """Return True if a point lies in front of a camera, and within twice the width and height of its image."""
     x, y, z = (points @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]).T
     lens = shot.lens
     across, down = np.abs(x) * lens.fx <= lens.width * z, np.abs(y) * lens.fy <= lens.height * z
@@ -193,7 +193,7 @@ def _misshapen(path: Path, size: tuple[int, int], wanted: tuple[float, float], s
 
 
 def _misfit(size: tuple[int, int], wanted: tuple[float, float]) -> float:
-    """How much more an image is scaled along one side than along the other, relative; 0 where rounding explains it."""
+    """Return how much more an image is scaled along one side than the other, relative; 0 if rounding explains it."""
     (low_x, high_x), (low_y, high_y) = (
         ((side - _ROUNDING) / (other + _ROUNDING), (side + _ROUNDING) / max(other - _ROUNDING, 0.5))
         for side, other in zip(size, wanted, strict=True)
@@ -210,6 +210,6 @@ def _is_in_the_middle(lens: Lens) -> bool:
 
 
 def _turn_is_undecided(head: ImageHead) -> bool:
-    """Whether EXIF turns an image and its camera's size does not tell whether the camera's program did."""
+    """Return True if EXIF turns an image and its camera's size leaves open whether the camera's program did so."""
     width, height = head.size
     return head.orientation in (2, 3, 4) or (head.orientation in (5, 6, 7, 8) and width == height)

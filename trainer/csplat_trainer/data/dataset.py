@@ -24,28 +24,28 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-_NEAR = 0.03  # of the cameras' distance from what they look at
+_NEAR = 0.03  # fraction of the cameras' distance from what they look at
 
 
 @dataclass(frozen=True, eq=False)
 class DataSet:
-    """Posed pictures to train on and to judge by.
+    """Posed images to train on and to score with.
 
     Attributes:
         name: kind and place, for messages: `COLMAP set /data/garden`.
         train: pictures to learn from, at least one.
         test: pictures that were held out; none if the set is too small or names none.
-        points: [P, 3] float32, points of the scene, relative to `origin`; `None` where the set has none.
-        points_rgb: [P, 3] float32 in 0..1, their colours; `None` where they have none of their own.
+        points: [P, 3] float32, points of the scene, relative to `origin`; `None` if the set has none.
+        points_rgb: [P, 3] float32 in 0..1, their colours; `None` if they have none of their own.
         report: what was found, left out and changed, a line each.
-        coordinate_system: as in `SplatModel`, where the kind of set has a custom.
-        up: which direction is up; `None` where neither the kind of set nor its cameras say it.
-        test_every: every so-manieth picture was held out; `None` where the set names its test pictures.
-        size: what the pictures are scaled to, width and height; `None`: they are not.
-        images: the folder of pictures that was asked for; `None`: the reader chose.
-        val: pictures that the set names to decide by: they neither teach nor judge.
-        origin: [3] float64, what points and cameras are relative to, in the coordinates of the set's files; other than
-            0 where these lie so far from 0 that float32 would lose what shows.
+        coordinate_system: as in `SplatModel`, if there is a convention for this kind of set.
+        up: direction that is up; `None` if neither the kind of set nor its cameras determine it.
+        test_every: every Nth image was held out; `None` if the set names its test images.
+        size: width and height that the images are scaled to; `None`: they are not.
+        images: the folder of images that was requested; `None`: the reader chose.
+        val: validation images that the set names; they are neither training nor test images.
+        origin: [3] float64, the point that points and cameras are relative to, in the coordinates of the set's files;
+            other than 0 if these lie so far from 0 that float32 would lose visible detail.
     """
 
     name: str
@@ -64,32 +64,32 @@ class DataSet:
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """What belongs behind the splats: white if pictures have alpha, as in published tables; else black."""
+        """Colour behind the splats: white if images have alpha, as in published tables; else black."""
         return _WHITE if any(picture.has_alpha for picture in (*self.train, *self.test)) else _BLACK
 
     def trained_on(self, background: tuple[float, float, float]) -> TrainedOn:
-        """What is to be said of a scene that was trained on this set.
+        """Return the record for a scene that was trained on this set.
 
         Args:
-            background: red, green, blue behind the splats when the scene was judged.
+            background: red, green, blue behind the splats when the scene was scored.
         """
         return TrainedOn(background, self.test_every, self.size, self.train[0].camera.near, self.images)
 
     @cached_property
     def outliers(self) -> list[Picture]:
-        """The images whose cameras stand far away from all others (`camera_outliers`)."""
+        """Images whose cameras are far away from all others (`camera_outliers`)."""
         images = [*self.train, *self.test, *self.val]
         outliers = camera_outliers(np.stack([image.camera.viewmat for image in images]), self.points)
         return [image for image, outlier in zip(images, outliers, strict=True) if outlier]
 
     @property
     def counted(self) -> list[Picture]:
-        """The training images that say where the scene lies: all but outliers, or all where only such are left."""
+        """Training images that determine where the scene lies: all but outliers, or all if only outliers are left."""
         outliers = {id(image) for image in self.outliers}
         return [image for image in self.train if id(image) not in outliers] or self.train
 
     def read(self) -> None:
-        """Read all pictures that teach or judge now: a damaged one is found before anything is done with the others.
+        """Read all training and test images now: a damaged one is found before anything is done with the others.
 
         Raises:
             InputError: a file is no image, or is cut short.
@@ -119,7 +119,7 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What a reader found: everything but the pixels.
+    """Result of a reader: everything but the pixels.
 
     Attributes:
         kind: `Blender set`, …
@@ -130,7 +130,7 @@ class Found:
         report: lines for the user.
         test_every: as in `DataSet`.
         coordinate_system: as in `DataSet`.
-        val: shots to decide by.
+        val: validation shots.
     """
 
     kind: str

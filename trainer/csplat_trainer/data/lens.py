@@ -38,7 +38,7 @@ class Lens:
     """A camera's lens, for images of one size.
 
     Attributes:
-        width: of the images that the numbers are meant for, pixels.
+        width: width of the images that the numbers apply to, pixels.
         height: the same.
         fx: focal length across, pixels.
         fy: focal length down, pixels.
@@ -48,9 +48,9 @@ class Lens:
         tangential: p1, p2.
         divisor: k4, k5, k6 of OpenCV's rational model: as `radial`, of the polynomial that divides.
         prism: sx1, sy1 of thin prisms.
-        projection: what comes before the distortion.
-        omega: of the FOV model (Devernay and Faugeras 2001), radians.
-        source: file and place that state the lens, for messages.
+        projection: projection that precedes the distortion.
+        omega: parameter of the FOV model (Devernay and Faugeras 2001), radians.
+        source: file and place that specify the lens, for messages.
     """
 
     width: float
@@ -74,7 +74,7 @@ class Lens:
 
     @property
     def distorts(self) -> bool:
-        """Whether it is more than a pinhole."""
+        """True if the lens is more than a pinhole."""
         factors = (*self.radial, *self.tangential, *self.divisor, *self.prism)
         return self.projection != "perspective" or any(value != 0.0 for value in factors)
 
@@ -108,9 +108,9 @@ def distorted(u: F64, v: F64, lens: Lens, straight: Lens) -> tuple[F64, F64]:
     """Find where pixels of the straight image lie in the distorted one.
 
     Args:
-        u: pixels across, of any shape.
-        v: pixels down, of the same shape.
-        lens: of the photograph.
+        u: horizontal pixel coordinates, of any shape.
+        v: vertical pixel coordinates, of the same shape.
+        lens: lens of the photograph.
         straight: the pinhole of the straight image.
     """
     x, y = (u - straight.cx) / straight.fx, (v - straight.cy) / straight.fy
@@ -164,7 +164,7 @@ def _border_is_inside(lens: Lens, straight: Lens) -> bool:
 
 
 def _is_one_to_one(lens: Lens, straight: Lens) -> bool:
-    """Whether farther from the principal point is farther in the photograph too: a polynomial may turn back."""
+    """Return True if distances from the principal point keep their order in the photograph; polynomials may turn back."""
     u, v = _border(lens, _RAYS)
     along = np.linspace(0.0, 1.0, _RAY_POINTS)[:, None]
     x, y = distorted(lens.cx + along * (u - lens.cx), lens.cy + along * (v - lens.cy), lens, straight)

@@ -1,4 +1,4 @@
-"""Which way is up, from how the cameras of a set were held."""
+"""Up direction of a set, estimated from how its cameras were held."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ __all__ = ["Level", "find_level"]
 F64 = NDArray[np.float64]
 
 _TURNED = 0.03  # least mean square, across the weakest direction but one, of the axes that point to the right
-_TILT_MAX = 20.0  # degrees; cameras that were held less level say nothing
-_UNDECIDED = 0.1  # of the mean of the cameras' up: below, they look down, and what they look away from is up
+_TILT_MAX = 20.0  # degrees; cameras that were held less level determine nothing
+_UNDECIDED = 0.1  # cosine with the cameras' mean up below which they look down: up is then where they look away from
 
 
 @dataclass(frozen=True)
 class Level:
-    """What cameras say of up.
+    """Up direction according to the cameras of a set.
 
     Attributes:
         up: unit length, in the scene's coordinates.
-        tilt_degrees: half of the pictures are off by no more: their horizons against level ones, or where
-            `by_horizons` does not hold the cameras' own up against this one. Some pictures taken with the camera on its
-            side change little.
-        by_horizons: people hold cameras level and look up and down: up is the direction that axes to the right show
-            least of. It takes cameras that are turned to several sides; of others up is the mean of theirs.
+        tilt_degrees: median error of the images: of their horizons against level ones, or, if `by_horizons` is False,
+            of the cameras' own up against this one. Some images taken with the camera on its side change little.
+        by_horizons: True if up is the direction in which the cameras' right axes point least: people hold cameras level
+            and look up and down. It requires cameras that are turned to several sides; otherwise up is the mean of
+            the cameras' own.
     """
 
     up: Direction
@@ -50,7 +50,7 @@ def find_level(viewmats: Sequence[F64]) -> Level | None:
         viewmats: [4, 4] each, world to camera, OpenCV axes: rows are right, down, forward. At least one.
 
     Returns:
-        What they say; `None` where they were held at all angles.
+        The estimate; `None` if the cameras were held at all angles.
     """
     rotations = np.stack([viewmat[:3, :3] for viewmat in viewmats])
     right, own_up, forward = rotations[:, 0], -rotations[:, 1], rotations[:, 2]

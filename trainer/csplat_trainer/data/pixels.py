@@ -1,4 +1,4 @@
-"""From a shot to a picture: its pixels are read when they are wanted; undo the lens, change the size."""
+"""Turn a shot into an image: read its pixels on demand, undo the lens, change the size."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def picture_of(shot: Shot, head: ImageHead, size: tuple[int, int] | None, near: 
     """The picture of a shot, undistorted, RGBA where the file has transparency; pixels and mask are not read yet.
 
     Args:
-        shot: which.
-        head: of its file.
-        size: width and height of the picture; `None`: the file's.
+        shot: the shot to convert.
+        head: header of its file.
+        size: width and height of the image; `None`: the file's.
         near: the camera's near plane, scene units.
 
     Raises:
@@ -56,7 +56,7 @@ def shown_size(path: Path, size: tuple[int, int], lens: Lens) -> tuple[int, int]
     Args:
         path: the file.
         size: width and height as stored.
-        lens: of the image.
+        lens: lens of the image.
     """
     if not _fits_sideways(size, lens):
         return size
@@ -65,22 +65,22 @@ def shown_size(path: Path, size: tuple[int, int], lens: Lens) -> tuple[int, int]
 
 
 def _fits_sideways(size: tuple[int, int], lens: Lens) -> bool:
-    """Whether an image's sides agree better with its lens when they are swapped."""
+    """Return True if an image's sides agree better with its lens when they are swapped."""
     width, height = size
     return abs(lens.width * width - lens.height * height) < abs(lens.width * height - lens.height * width)
 
 
 def _turned(image: Image.Image, lens: Lens) -> bool:
-    """Whether EXIF lays an image on its side, and its lens is that of the image as it is shown.
+    """Return True if EXIF lays an image on its side, and its lens is that of the image as it is shown.
 
-    Programs that find poses read pixels as they are stored, or as they are shown: the size that they state tells which.
+    Programs that find poses read pixels as they are stored, or as they are shown: the size that they give tells which.
     """
     sideways = _fits_sideways(image.size, lens)
     return sideways and image.getexif().get(ExifTags.Base.Orientation) in _ON_ITS_SIDE
 
 
 def _upright(pixels: U8, image: Image.Image) -> U8:
-    """Turn decoded pixels as the file's EXIF says."""
+    """Turn decoded pixels as the file's EXIF specifies."""
     quarters, flips = _ON_ITS_SIDE[image.getexif()[ExifTags.Base.Orientation]]
     turned = np.rot90(pixels, quarters)
     return turned[::-1] if flips else turned
@@ -89,7 +89,7 @@ def _upright(pixels: U8, image: Image.Image) -> U8:
 def _read(
     path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None, *, turned: bool, with_alpha: bool
 ) -> U8:
-    """Pixels of a file, straight, in the size that is wanted; turned as EXIF says, or as they are stored."""
+    """Return the pixels of a file, straight, in the requested size; turned as EXIF specifies, or as they are stored."""
     with opened_image(path) as stored:
         pixels = rgb_pixels(stored, path)
         if not with_alpha:
@@ -106,7 +106,7 @@ def _read(
 
 
 def _read_mask(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None) -> Mask:
-    """Which pixels of a picture count: where its mask, which may be larger or smaller, is brighter than half."""
+    """Return which pixels of an image count: its mask, which may be larger or smaller, is brighter than half there."""
     sides = int(lens.width), int(lens.height)
     with opened_image(path) as stored:
         values = mask_values(stored, path).values

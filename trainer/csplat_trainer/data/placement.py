@@ -1,4 +1,4 @@
-"""Where a data set lies: the origin of its coordinates, and the cameras that stand far away from all others."""
+"""Position of a data set: the origin of its coordinates, and the cameras that are far away from all others."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["centre", "describe_outliers"]
 F64 = NDArray[np.float64]
 Origin = tuple[float, float, float]
 
-_NEAR_SIZES = 16.0  # of the scene; farther from 0, float32 no longer holds the last steps of a training (3e-6 extents)
+_NEAR_SIZES = 16.0  # scene sizes; farther from 0, float32 no longer holds the last steps of a training (3e-6 extents)
 
 
 def centre(found: Found) -> tuple[Found, Origin]:
@@ -29,13 +29,13 @@ def centre(found: Found) -> tuple[Found, Origin]:
     halves.
 
     Args:
-        found: what a reader found.
+        found: result of a reader.
 
     Returns:
         The set relative to the origin, and the origin.
 
     Raises:
-        InputError: a camera stands where float32 does not reach.
+        InputError: a camera's position exceeds float32.
     """
     shots = [*found.train, *found.test, *found.val]
     viewmats = np.stack([shot.viewmat for shot in shots])
@@ -65,9 +65,9 @@ def centre(found: Found) -> tuple[Found, Origin]:
 
 
 def describe_outliers(data: DataSet) -> str:
-    """Name the cameras that stand far away from all others, in a sentence; an empty one where there are none.
+    """Name the cameras that are far away from all others, in a sentence; return "" if there are none.
 
-    They stay training, validation or test images: a training image that shows nothing teaches nothing.
+    They stay training, validation or test images: a training image that shows nothing has no effect.
     """
     if not data.outliers:
         return ""

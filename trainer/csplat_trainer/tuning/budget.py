@@ -8,12 +8,12 @@ from typing import Any
 
 __all__ = ["Budget"]
 
-_REACHED = 0.6  # share of the steps after which the size is to stand: later ones hardly move a value
-_BELOW = 0.002  # of the size that is left free: counts come every few steps, and files grow between them
-_GAIN, _FASTEST = 40.0, 0.5  # of the logarithm of the cost: per share of bits too many, and at most, at each count
+_REACHED = 0.6  # fraction of the steps after which the size should be reached: later ones hardly move a value
+_BELOW = 0.002  # fraction of the size that is left free: counts come every few steps, and files grow between them
+_GAIN, _FASTEST = 40.0, 0.5  # gain of log(cost) per relative excess of bits, and its largest change at each count
 _COSTS = (1e-7, 1e-2)
-# Of the first cost, what it falls to: files grow while values move far, and a cost that had fallen to nothing, because
-# bytes were free before, rises too late.
+# Smallest cost, as a fraction of the first: files grow while values move far, and a cost that had fallen to nothing,
+# because bytes were free before, rises too late.
 _LEAST = 0.25
 
 
@@ -22,10 +22,10 @@ class Budget:
     """Bytes that a file may have, and what they cost at present so that it does.
 
     Attributes:
-        size_bytes: at most.
-        byte_cost: what a bit per splat costs in the loss at present.
-        first_bits: of the integers where the run began; 0: not known yet.
-        goal_bits: of the integers of a file of that size, by the last file that was made.
+        size_bytes: largest size of the file.
+        byte_cost: rate weight at present: loss per bit and splat.
+        first_bits: bits of the integers at the start of the run; 0: not known yet.
+        goal_bits: bits of the integers of a file of that size, by the last file that was made.
     """
 
     size_bytes: int
@@ -34,11 +34,11 @@ class Budget:
     goal_bits: float = 0.0
 
     def __post_init__(self) -> None:
-        self.byte_cost = min(max(self.byte_cost, _COSTS[0]), _COSTS[1])  # of nothing, no factor makes a price
+        self.byte_cost = min(max(self.byte_cost, _COSTS[0]), _COSTS[1])  # a cost of 0 would stay 0 under any factor
 
     @property
     def exhausted(self) -> bool:
-        """Whether bytes cannot be made dearer."""
+        """True if the rate weight cannot be raised further."""
         return self.byte_cost >= _COSTS[1]
 
     @classmethod
@@ -51,11 +51,11 @@ class Budget:
         return cls(**stored) if numbers else None
 
     def overdrawn(self, size_bytes: int, bits: float) -> float:
-        """What a file that is too large adds to its loss; its size says how many bits its integers may have.
+        """Return the penalty of a file that is too large; its size determines how many bits its integers may have.
 
         Args:
-            size_bytes: of the file.
-            bits: of its integers, by their order-0 entropy.
+            size_bytes: size of the file.
+            bits: bits of its integers, by their order-0 entropy.
         """
         allowed = (1.0 - _BELOW) * self.size_bytes
         self.first_bits = self.first_bits or bits
@@ -66,9 +66,9 @@ class Budget:
         """Make bytes dearer or cheaper, by how many bits there are and how many should be left.
 
         Args:
-            bits: of the integers at present.
-            done: share of the steps.
-            first_cost: what a bit per splat cost where the run began.
+            bits: bits of the integers at present.
+            done: fraction of the steps done.
+            first_cost: rate weight at the start of the run.
         """
         wanted = self.goal_bits + (self.first_bits - self.goal_bits) * max(0.0, 1.0 - done / _REACHED)
         by = min(max(_GAIN * (bits / max(wanted, 1.0) - 1.0), -_FASTEST), _FASTEST)

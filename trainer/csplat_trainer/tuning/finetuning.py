@@ -35,11 +35,11 @@ class Finetuned:
     """A tuned file.
 
     Attributes:
-        result: of the encoder.
-        decoded: what a decoder sees of it, which is what was tuned, bit for bit.
+        result: result of the encoder.
+        decoded: values that a decoder returns from it, which are the tuned ones, bit for bit.
         plain: the file of the same decisions without tuning.
         log: JSON-compatible: options, losses, looks at the views, times.
-        seconds: of `encoding` and `tuning`.
+        seconds: duration of `encoding` and `tuning`.
     """
 
     result: EncodeResult
@@ -89,18 +89,18 @@ def finetune(
 
     Args:
         model: the splats that the file will hold.
-        views: what it is to look like: photographs, or renders of the scene itself (`renders_of`). Of a data set those
-            that it trains on, in front of what the scene says was behind it.
-        encoding: of the encoder; its threads hold for all.
-        options: of the tuning.
-        size_bytes: of the file, at most, as far as the cost of bytes can bring it there; as of `tune`.
-        importance: how much splats matter, as for the encoder; `None`: measured in the views that teach.
-        source: the scene that the splats were chosen of, where they are not all, and `origin` which of it they are.
-        origin: as of the encoder.
-        said: what the file is to say of its tuning, beside the steps and the number of views.
+        views: the reference images: photographs, or renders of the scene itself (`renders_of`). From a data set, the
+            training images are used, in front of the background that the scene records.
+        encoding: options of the encoder; its threads apply to everything.
+        options: options of the tuning.
+        size_bytes: largest size of the file, as far as the rate weight can bring it there; as in `tune`.
+        importance: importance of the splats, as for the encoder; `None`: measured in the training views.
+        source: the scene that the splats were chosen from, if they are not all, and `origin` their indices in it.
+        origin: as for the encoder.
+        said: metadata about the tuning, in addition to the steps and the number of views.
         outputs: checkpoints.
-        progress: is told the stage and the share of it that is done, 0 to 1.
-        on_step: is told where the tuning stands, every `log_every` steps.
+        progress: called with the stage and the fraction of it that is done, 0 to 1.
+        on_step: called with the progress of the tuning, every `log_every` steps.
 
     Examples:
         >>> import csplat, csplat_trainer
@@ -127,7 +127,7 @@ def finetune(
         plain = coded.write()
 
     def told(steps: int) -> dict[str, Any]:
-        """What the file says of its tuning; `simplified_from` says the first, where splats were taken away."""
+        """Return the metadata about the tuning; after pruning, its `simplified_from` is the splat count before."""
         return {"finetuned": {"simplified": {}, "views": len(views.train), "steps": steps, **(said or {})}}
 
     if size_bytes is not None:
@@ -155,7 +155,7 @@ def finetune(
 
 
 def _views_of(data: DataSet, model: SplatModel) -> Views:
-    """The photographs of a data set that teach, in front of what the scene says was behind it."""
+    """Return the training photographs of a data set, in front of the background that the scene records."""
     trained = TrainedOn.of(model.metadata)
     behind = data.background if trained is None else trained.background
     shift = np.subtract(model.origin, data.origin)
@@ -166,7 +166,7 @@ def _views_of(data: DataSet, model: SplatModel) -> Views:
 def _measured(
     model: SplatModel, views: Views, encoding: EncodeOptions, progress: Callable[[str, float], None] | None
 ) -> Importance:
-    """How much the views that teach depend on each splat."""
+    """Measure how much the training views depend on each splat."""
     cameras = [one.camera for one in views.train]
     found = measure_sensitivity(
         model, cameras, background=views.background, metric=True, magnitudes=False, threads=encoding.threads,

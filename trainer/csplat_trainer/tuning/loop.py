@@ -32,20 +32,20 @@ __all__ = ["FinetuneResult", "TuningStep", "tune"]
 F32 = NDArray[np.float32]
 
 _COUNT_EVERY = 50  # steps between counts of the integers
-_LEAST_GAIN = 2e-4  # of the score that counts as a gain
+_LEAST_GAIN = 2e-4  # smallest difference of the score that counts as a gain
 
 
 @dataclass(frozen=True)
 class TuningStep:
-    """Where a run stands.
+    """Progress of a run.
 
     Attributes:
         iteration, iterations: steps made, and in all.
         loss: mean over the steps since the last report.
-        validation_psnr: of the last look at the validation views, pooled, dB.
+        validation_psnr: PSNR of the last evaluation on the validation views, pooled, dB.
         best_psnr: the best so far.
-        size_bytes: of the file at that last look.
-        seconds, seconds_left: since the start, and at the present pace.
+        size_bytes: size of the file at that evaluation.
+        seconds, seconds_left: time since the start, and remaining time at the present pace.
     """
 
     iteration: int
@@ -60,10 +60,10 @@ class TuningStep:
 
 @dataclass(frozen=True, eq=False)
 class FinetuneResult:
-    """What a run ends with.
+    """Result of a run.
 
     Attributes:
-        held: the values that looked best on the validation views, those of the start if none did.
+        held: the values that scored best on the validation views, those of the start if none did.
         log: JSON-compatible: options, losses, looks, times.
     """
 
@@ -88,13 +88,13 @@ def tune(
     The same scene, views and options give the same values on the same machine, at any number of threads.
 
     Args:
-        frozen: what the encoder decided.
-        views: what the file is to look like.
-        options: how.
-        size_bytes: of the file, at most: bytes then cost as much as keeps to it, in place of `byte_cost`, with which
-            the run begins.
-        progress: is told every `log_every` steps.
-        checkpoint: where checkpoints go, each in the place of the last; `None`: nowhere.
+        frozen: the encoder's decisions.
+        views: the reference images of the file.
+        options: options of the tuning.
+        size_bytes: largest size of the file: the rate weight is then adjusted to keep to it, beginning with
+            `byte_cost`.
+        progress: called every `log_every` steps.
+        checkpoint: file for checkpoints, each of which replaces the last; `None`: none are written.
         checkpoint_every: steps from one to the next; 0: at the end alone.
         resume: a checkpoint of the same frozen scene to go on from.
         threads: how many; `None` for all.
@@ -121,7 +121,7 @@ class _Best:
 
 @dataclass
 class _Buffers:
-    """Loss and wanted picture of a size; kept from step to step."""
+    """Loss and reference image of a size; kept from step to step."""
 
     loss: PhotometricLoss
     wanted: F32
@@ -169,7 +169,7 @@ class _Run:
         self._queue = [index for index in checkpoint.queue if index < len(self._views.train)]
         self._log = checkpoint.log
         for look in self._log["looks"]:
-            look.setdefault("size_bytes", 0)  # an older checkpoint does not say it where no size was wanted
+            look.setdefault("size_bytes", 0)  # older checkpoints lack it if no size was requested
         self._exposures = Exposures(len(self._views.train), self._log.get("exposures", ()))
         self._best = _Best(checkpoint.best_held, *checkpoint.best)
         self._budget = budget
@@ -206,7 +206,7 @@ class _Run:
 
     @property
     def _settled(self) -> bool:
-        """Whether looks have brought nothing for long enough."""
+        """True if evaluations have brought no gain for long enough."""
         assert self._best is not None
         return 0 < self._options.patience <= self._best.since
 
@@ -240,7 +240,7 @@ class _Run:
 
     @property
     def _byte_cost(self) -> float:
-        """What a bit per splat costs at present, in loss."""
+        """The present rate weight: loss per bit and splat."""
         return self._options.byte_cost if self._budget is None else self._budget.byte_cost
 
     def _rates(self) -> dict[str, float]:
@@ -270,7 +270,7 @@ class _Run:
         loss, error, count = 0.0, 0.0, 0
         for view in self._views.validation:
             buffers, rendered = self._buffers(view), self._render(seen, view)
-            if self._options.lr_exposure and id(view) in self._numbers:  # one that teaches, too
+            if self._options.lr_exposure and id(view) in self._numbers:  # a training view, too
                 rendered = Exposure(self._exposures, self._numbers[id(view)], 0.0).applied(rendered)
             wanted = view.picture(self._views.background, buffers.wanted)
             loss += buffers.loss(rendered, wanted, view.mask)[0].loss / len(self._views.validation)

@@ -13,28 +13,28 @@ __all__ = ["FinetuneOptions"]
 
 @dataclass(frozen=True)
 class FinetuneOptions:
-    """How to fine-tune. Learning rates rise for `warm_up` steps, and fall to `decay` along half a cosine.
+    """Options of fine-tuning. Learning rates rise for `warm_up` steps, and fall to `decay` along half a cosine.
 
     Attributes:
-        iterations: steps at most, one picture each.
-        seed: of the order of the pictures.
+        iterations: steps at most, one image each.
+        seed: seed of the order of the images.
         loss: `inria`, `study` or `l1`, as in `TrainOptions`.
         lr_means: learning rate of the means, as a share of the median of the splats' middle standard deviation.
-        lr_quats: of the rotations.
-        lr_scales: of the log scales.
-        lr_opacities: of the logits of opacity.
-        lr_sh0: of the base colour.
-        lr_shN: of the higher SH coefficients.
-        lr_entries: of the codebook's entries.
-        lr_exposure: as in `TrainOptions`: 0, no photograph is taken for brighter or darker than others.
-        byte_cost: how much a bit per splat weighs in the loss; 0: files may grow as they please.
+        lr_quats: learning rate of the rotations.
+        lr_scales: learning rate of the log scales.
+        lr_opacities: learning rate of the logits of opacity.
+        lr_sh0: learning rate of the base colour.
+        lr_shN: learning rate of the higher SH coefficients.
+        lr_entries: learning rate of the codebook's entries.
+        lr_exposure: as in `TrainOptions`; 0: no photograph is treated as brighter or darker than others.
+        byte_cost: rate weight in the loss, per bit and splat; 0: files may grow as they please.
         warm_up: steps in which Adam learns the sizes of the gradients, and values hardly move.
-        decay: share of the learning rates that is left at the end. Next to nothing: values that still move go back and
-            forth between two integers.
-        validate_every: steps between looks at the validation views.
-        patience: looks without a gain after which a run ends early, once the learning rates have fallen to a quarter:
-            before, values shake too much to look their best. Of a file that is to have a size, those at which it is
-            still too large do not count. 0: never.
+        decay: fraction of the learning rates that is left at the end. Next to nothing: values that still move go back
+            and forth between two integers.
+        validate_every: steps between evaluations on the validation views.
+        patience: evaluations without a gain after which a run ends early, once the learning rates have fallen to a
+            quarter: before, values shake too much to score their best. With a size target, evaluations at which the
+            file is still too large do not count. 0: never.
         log_every: steps between entries of the log.
 
     Raises:
@@ -74,7 +74,7 @@ class FinetuneOptions:
         return rising * (self.decay + (1.0 - self.decay) * 0.5 * (1.0 + math.cos(math.pi * done)))
 
     def has_calmed(self, iteration: int) -> bool:
-        """Whether looks without a gain count."""
+        """Return True if evaluations without a gain count."""
         return iteration > 0.5 * self.iterations and self.share(iteration) <= _CALM
 
     def scaled(self, factor: float) -> FinetuneOptions:
@@ -83,7 +83,7 @@ class FinetuneOptions:
         return replace(self, **rates)
 
 
-_CALM = 0.25  # of the learning rates
+_CALM = 0.25  # fraction of the learning rates
 
 _RANGES: dict[str, tuple[float, float]] = {
     "iterations": (1, 10**7),

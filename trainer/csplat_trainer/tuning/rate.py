@@ -32,7 +32,7 @@ _ROOT2 = np.sqrt(2.0)
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """What the streams of a file hold, as a decoder will see it: arrays as in `Held`, all on their lattices."""
+    """Contents of a file's streams, as a decoder will return them: arrays as in `Held`, all on their lattices."""
 
     quats: F32
     scales: F32
@@ -49,7 +49,8 @@ class Costs:
     Attributes:
         frozen: lattices.
         weight: loss per bit and splat.
-        tables: by attribute, and grade where there are several: slopes in bits per step, [columns, 2 · 128 + 1].
+        tables: by attribute, and quantisation class if there are several: slopes in bits per step,
+            [columns, 2 · 128 + 1].
         bits: of all integers together, by their order-0 entropy; without centres and indices, which hardly change.
     """
 
@@ -63,8 +64,8 @@ class Costs:
         """Count the integers of a scene.
 
         Args:
-            frozen: what was decided.
-            stored: what the streams hold.
+            frozen: the encoder's decisions.
+            stored: contents of the streams.
             weight: loss per bit and splat.
         """
         costs = cls(frozen, weight, {})
@@ -93,7 +94,7 @@ class Costs:
 
     @property
     def loss(self) -> float:
-        """What the bytes are worth, in loss."""
+        """Rate term of the loss: weight times bits per splat."""
         return self.weight * self.bits / len(self.frozen.source_index)
 
     def add_to(self, steps: Splats, stored: Stored) -> None:
@@ -101,7 +102,7 @@ class Costs:
 
         Args:
             steps: gradients of the loss by group; changed in place.
-            stored: what the streams hold.
+            stored: contents of the streams.
         """
         plan, tables = self.frozen.plan, self.tables
         per_bit = np.float32(self.weight / len(stored.opacities))

@@ -1,8 +1,8 @@
-"""What fine-tuning changes: values in float, seen through the quantisers of the file that will be written.
+"""State of fine-tuning: values in float, and their quantised form in the file that will be written.
 
-Straight through: pictures are rendered from what a decoder will see, and their gradients are applied to the values
-that were quantised, as if nothing lay between (Bengio et al. 2013, https://arxiv.org/abs/1308.3432). A codebook's
-entry gets the sum of the gradients of all who use it.
+Straight through: images are rendered from the values that a decoder will return, and their gradients are applied to the
+values that were quantised, as if nothing lay between (Bengio et al. 2013, https://arxiv.org/abs/1308.3432). A
+codebook's entry gets the sum of the gradients of all splats that use it.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ __all__ = ["TunedScene", "sum_by_entry", "sum_by_entry_twin"]
 F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]
 
-_ALPHAS = (1e-6, 1.0 - 1e-6)  # what logits are made of
+_ALPHAS = (1e-6, 1.0 - 1e-6)  # range of the opacities that logits are computed from
 
 
 class TunedScene:
     """Values of a frozen scene, Adam's memory of them, and the way from pictures' gradients to both.
 
     Args:
-        frozen: what the encoder decided.
-        parameters: where to go on; `None`: at the values that the encoder found.
+        frozen: the encoder's decisions.
+        parameters: state to go on from; `None`: the values that the encoder found.
 
     Attributes:
         frozen: as given.
@@ -56,12 +56,12 @@ class TunedScene:
         return FreeValues(v["means"], v["quats"], v["scales"], alphas, v["sh0"], v["shN"], v["sizes"])
 
     def seen(self) -> tuple[DecodedValues, F32]:
-        """What a decoder will see, and the opacities before they were quantised."""
+        """Return the values that a decoder will return, and the opacities before they were quantised."""
         held = self.held
         return self.frozen.seen(held), held.opacities
 
     def stored(self, seen: DecodedValues) -> Stored:
-        """What the streams of the file hold, as a decoder will see it."""
+        """Return the contents of the file's streams, as a decoder will return them."""
         sh = self.frozen.seen_rows(self.parameters.values["shN"]) if self.frozen.book is not None else seen.shN
         if self.frozen.shapes is None:
             return Stored(seen.quats, seen.scales, self.parameters.values["sizes"], seen.opacities, seen.sh0, sh)
@@ -78,10 +78,10 @@ class TunedScene:
         """Move the values against the gradients by what was seen.
 
         Args:
-            gradients: of the loss.
+            gradients: gradients of the loss.
             seen, alphas: as `seen` returned them.
             rates: learning rate of each group.
-            costs: of bytes, a further part of the loss.
+            costs: costs of bytes, a further part of the loss.
         """
         quats, scales, sizes = self._by_shape(gradients)
         steps = {

@@ -1,4 +1,4 @@
-"""What fine-tuning looks at: photographs, or renders of the source; some of them to learn from, some to decide by."""
+"""Views of fine-tuning: photographs, or renders of the source, for training and for validation."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ __all__ = ["View", "Views", "renders_of", "split_views"]
 
 F32 = NDArray[np.float32]
 
-_JUDGES = 16  # views at most, of those that teach
-_BRIGHTEST = np.float32(6e4)  # what float16 holds
+_JUDGES = 16  # validation views at most, if they are training views too
+_BRIGHTEST = np.float32(6e4)  # largest value for float16
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +46,11 @@ class View:
 
     @property
     def mask(self) -> NDArray[np.bool_] | None:
-        """Which pixels count, [H, W]; `None`: all of them."""
+        """Pixels that count, [H, W]; `None`: all of them."""
         return self.wanted.mask if isinstance(self.wanted, Picture) else None
 
     def picture(self, background: F32, out: F32) -> F32:
-        """The wanted picture, [H, W, 3] float32; `out` may be overwritten and returned."""
+        """Return the reference image, [H, W, 3] float32; `out` may be overwritten and returned."""
         if isinstance(self.wanted, Picture):
             return compose(self.wanted, background, out)
         np.copyto(out, self.wanted)
@@ -59,7 +59,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Views to learn from, views to decide by, and the colour behind all of them.
+    """Training views, validation views, and the colour behind all of them.
 
     Attributes:
         train: at least one.
@@ -80,27 +80,29 @@ class Views:
 
     @property
     def digest(self) -> str:
-        """Of the cameras and the background: what tells these views from others."""
+        """Hash of the cameras, the split and the background, which identifies these views."""
         cameras = [(c.W, c.H, c.K.tolist(), c.viewmat.tolist()) for c in (one.camera for one in self.train)]
         said = repr((cameras, len(self.validation), self.kept_aside, self.background.tolist()))
         return hashlib.sha256(said.encode()).hexdigest()
 
     @property
     def kept_aside(self) -> bool:
-        """Whether the views to decide by are not learnt from."""
+        """True if no validation view is a training view."""
         return not any(one is other for one in self.validation for other in self.train)
 
 
 def split_views(views: Sequence[View], background: F32, aside: int = 0) -> Views:
-    """Say which views teach and which decide.
+    """Split views into training and validation views.
 
-    A scene fits the pictures that it was trained on better than any others. Those of them that are kept aside look
-    worse with every step, whatever is gained elsewhere; so by default all teach, and some of them decide.
+    A scene fits the images that it was trained on better than any others. Those of them that are held out look worse
+    with every step, whatever is gained elsewhere; so by default all are training views, and some of them are
+    validation views, too.
 
     Args:
-        views: in the order of their taking.
+        views: the views, in the order of their taking.
         background: [3], behind all of them.
-        aside: how many decide and do not teach: pictures that the scene was not trained on, or renders of it. 0: none.
+        aside: number of validation views that are held out: images that the scene was not trained on, or renders of
+            it. 0: none.
 
     Raises:
         InputError: there are not as many views.
