@@ -45,7 +45,7 @@ class FormatError(CsplatError):
 
     Args:
         code: error code of the registry, `E_...`.
-        offset: byte of the file where the offending field begins; `None` where no single byte is
+        offset: byte of the file where the offending field begins; `None` if no single byte is
             to blame.
         clause: id of the clause that is broken, `CRC-1`.
         detail: text after the colon, if `found` and `wanted` are not enough.
@@ -164,7 +164,7 @@ def counted(count: int, one: str, many: str | None = None) -> str:
     """A number and what it counts, for messages: `1 tile`, `59,325 tiles`.
 
     Args:
-        count: how many.
+        count: the number.
         one: the word for one of them.
         many: that for others; `None`: the same with an s.
     """

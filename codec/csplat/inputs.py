@@ -32,7 +32,7 @@ File = str | os.PathLike[str] | BinaryFile | Buffer
 
 
 def mapped(path: str | os.PathLike[str]) -> bytes | mmap:
-    """The bytes of a file, without reading it where that is possible; let go of when nobody looks at them any more.
+    """Return the bytes of a file, mapped if that is possible; the mapping is released with the last reference to it.
 
     Raises:
         OSError: it cannot be read.
@@ -48,7 +48,7 @@ def stand_in(head: bytes) -> str:
     """Name the content that came in place of a file, whatever file was expected; "" if there is no sign of that.
 
     Args:
-        head: the first bytes of the file, 64 or more where it has them.
+        head: the first bytes of the file, 64 or more if it has them.
 
     Examples:
         >>> stand_in(b"version https://git-lfs.github.com/spec/v1")
@@ -83,7 +83,7 @@ class LetGo:
         self._read_bytes, self._step_bytes = 0, step_bytes
 
     def after(self, size_bytes: int) -> None:
-        """Note that so much has been read, and let go of everything now and then."""
+        """Count bytes that were read, and release all pages now and then."""
         self._read_bytes += size_bytes
         if sys.platform != "win32" and self._file is not None and self._read_bytes >= self._step_bytes:
             self._read_bytes = 0

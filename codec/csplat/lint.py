@@ -80,7 +80,7 @@ _OPACITY = "opacity"
 _FILTER = "filter_3D"
 _REST = re.compile(r"f_rest_(0|[1-9][0-9]*)")
 
-#: What CloudCompare puts before the names of scalar fields (PlyFilter.cpp), and 3dgsconverter, which prepares files for
+#: Prefix of CloudCompare's scalar fields (PlyFilter.cpp), and the one that 3dgsconverter, which prepares files for
 #: it, before that.
 _PREFIXES = re.compile(r"(?:scal(?:ar)?_)+")
 #: Colours in place of f_dc, as ns-export of nerfstudio writes them; the other names are the equivalents that three.js'
@@ -167,7 +167,7 @@ def find_columns(
         elements: names of the other elements of the file, for messages.
 
     Returns:
-        The columns, `None` where the findings hold an error; and the findings.
+        The columns, `None` if the findings hold an error; and the findings.
     """
     names = _Names(dtype.names or ())
     findings: list[Finding] = []

@@ -1,4 +1,4 @@
-"""Several files as one: tiles are copied where that is possible, else the scenes are coded again together."""
+"""Merge several files: tiles are copied if that is possible, else the scenes are coded again together."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def merge(
 ) -> Merged:
     """Join files: the splats of the first, then those of the second, and so on.
 
-    Tiles are copied bit for bit, without decoding, where the files agree on steps and levels of all attributes, SH
+    Tiles are copied bit for bit, without decoding, if the files agree on steps and levels of all attributes, SH
     degree, origin and extra columns, as parts of one file do (`extract`, or files that were encoded with the same
     steps); their codebooks get new ids. This takes memory for the codebooks of one file and some megabytes. Other files
     are decoded and coded again together, as `csplat.large.encode_scene` does it, which costs quality once more;
@@ -95,7 +95,7 @@ def merge(
 
     Raises:
         InputError: fewer than two files; their axes, units or ways to be shown contradict each other.
-        FormatError, UnsupportedError, LimitError, StoreError, OSError: as of `csplat.open`, and of what is read.
+        FormatError, UnsupportedError, LimitError, StoreError, OSError: as in `csplat.open`, and errors of reading.
     """
     if isinstance(files, (str, bytes, os.PathLike)) or len(files) < 2:
         raise InputError("merge joins two files or more: wanted a list of them")
@@ -193,7 +193,7 @@ def _written(scene: SceneFields, tiles: Sequence[FileTile], output: str | os.Pat
 def _coded_again(
     scenes: Sequence[SplatFile], output: str | os.PathLike[str] | BinaryWriter, options: EncodeOptions, why: str
 ) -> Merged:
-    """Decode tile by tile and encode anew, in memory where that is enough for it."""
+    """Decode tile by tile and encode anew, in memory if that is enough for it."""
     facts = _facts(scenes)
     whole = Scene(sum(map(len, scenes)), facts, partial(_blocks, scenes, facts))
     dropped = {column.name for scene in scenes for column in scene.header.extras} - facts.extra.keys()

@@ -43,7 +43,7 @@ QUAT_LENGTH_TOLERANCE = 1e-3
 UNSPECIFIED = "unspecified"
 
 _AXIS_OF_LETTER = {"R": "x", "L": "x", "U": "y", "D": "y", "F": "z", "B": "z"}
-_BLOCK = 1 << 18  # values that are checked at a time where a sum was not finite
+_BLOCK = 1 << 18  # values that are checked at a time if a sum was not finite
 _NO_SH: F32 = np.zeros((0, 0, 3), np.float32)
 
 
@@ -72,7 +72,7 @@ class SplatModel:
         antialiased: trained with the mip-splatting low-pass filter; renders must apply it.
         flat: splats are discs (2DGS): the third, smallest scale means nothing.
         cameras: training cameras, each {K, viewmat, W, H, near, image}, viewmat world to camera
-            with OpenCV axes, pixel centres at +0.5; `None` where there are none.
+            with OpenCV axes, pixel centres at +0.5; `None` if there are none.
         metadata: free, JSON-compatible. Keys in use: `licence` (str), `comments` (list of str),
             `training` (see `csplat.training`), `up` (see `csplat.upright`), `view`
             (a camera as those of `cameras`, from which the scene is shown first).
@@ -251,7 +251,7 @@ def _check_array(name: str, array: F32, shape: tuple[int | str, ...]) -> None:
 
 
 def _non_finite_count(array: F32) -> int:
-    """Count NaN and infinities; one pass over memory where there are none."""
+    """Count NaN and infinities; one pass over memory if there are none."""
     with np.errstate(over="ignore", invalid="ignore"):
         if np.isfinite(array.sum(dtype=np.float32)):
             return 0  # a NaN or an infinity would have shown in the sum

@@ -50,7 +50,7 @@ class SplatFile:
         name: the path or URL, for messages.
         size: bytes of the file.
         requests: how often the store was asked so far.
-        bytes_read: how many bytes it gave so far.
+        bytes_read: bytes that it gave so far.
     """
 
     header: SceneHeader
@@ -137,8 +137,8 @@ class SplatFile:
 
         Raises:
             InputError: an argument is at fault, or no tile touches the box.
-            FormatError, LimitError: as of `csplat.decoder.iter_tiles`.
-            StoreError, OSError: as of `csplat.open`.
+            FormatError, LimitError: as in `csplat.decoder.iter_tiles`.
+            StoreError, OSError: as in `csplat.open`.
         """
         chosen = None if box is None else [tile.index for tile in touching(self.header, box)]
         with self._store.telling():
@@ -170,8 +170,8 @@ class SplatFile:
 
         Raises:
             InputError: an argument is at fault, or no tile touches the box.
-            FormatError, LimitError: as of `csplat.decode`.
-            StoreError, OSError: as of `csplat.open`.
+            FormatError, LimitError: as in `csplat.decode`.
+            StoreError, OSError: as in `csplat.open`.
         """
         if box is not None:
             if tiles is not None:

@@ -102,7 +102,7 @@ class TileCopies:
     """Tiles that are written again as they are. Their chunks are read when they are written.
 
     Args:
-        window, files: as of `InTurn`.
+        window, files: as in `InTurn`.
     """
 
     def __init__(self, window: Window, files: int = 1) -> None:

@@ -199,7 +199,7 @@ class _Opened:
 def _opened(
     path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool, sh_degree: int | None
 ) -> _Opened | None:
-    """Look at all but the rows, appending what is noticed to `findings`; `None` where that holds an error."""
+    """Look at all but the rows, appending what is noticed to `findings`; `None` if that holds an error."""
     check_sh_degree(sh_degree)
     content = parse(path, findings)
     if content is None:
@@ -222,7 +222,7 @@ def _opened(
 def _load(
     path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool, sh_degree: int | None
 ) -> SplatModel | None:
-    """Read a file, appending what is noticed to `findings`; `None` where that holds an error."""
+    """Read a file, appending what is noticed to `findings`; `None` if that holds an error."""
     opened = _opened(path, findings, keep_extra=keep_extra, strict=strict, sh_degree=sh_degree)
     if opened is None:
         return None

@@ -58,7 +58,7 @@ _BYTE_COLOUR = 4.0  # an f_dc beyond is brighter than white, 1.77, and may be a 
 class Arrays:
     """The arrays of a `SplatModel`, by the same names, filled row by row.
 
-    `means` is float64 where the file's positions are double.
+    `means` is float64 if the file's positions are double.
     """
 
     means: NDArray[Any]

@@ -151,7 +151,7 @@ def format_comments(model: SplatModel, *, absolute: bool) -> list[str]:
 
 
 def _parse_fact(facts: SceneFacts, key: str, values: Sequence[str]) -> bool:
-    """Take one fact over; `False` where the key is none of ours."""
+    """Take over one field; return `False` if the key is none of ours."""
     if key in ("origin", "absolute_origin"):
         x, y, z = _numbers(key, values, 3)
         facts.origin, facts.origin_is_added = (x, y, z), key == "absolute_origin"

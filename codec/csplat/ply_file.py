@@ -54,7 +54,7 @@ def parse(path: Path, findings: list[Finding]) -> Content | None:
         findings: anything noticed is appended.
 
     Returns:
-        Its content; `None` where the findings hold an error.
+        Its content; `None` if the findings hold an error.
 
     Raises:
         InputError: not a PLY of splats, or its header cannot be parsed.
@@ -203,7 +203,7 @@ def blocks_of(path: Path, rows: Rows, most: int | None = None) -> Iterator[Rows]
 
 
 def _open(path: Path, header: Header) -> IO[Any]:
-    """Open a PLY for plyfile, behind a byte order mark: as text where it is text, with the header that it takes."""
+    """Open a PLY for plyfile, behind a byte order mark: as text if it is text, with the header that it takes."""
     stream = _PlyReader(path, header)
     return io.TextIOWrapper(stream, encoding="ascii", errors="replace") if header.is_text else stream
 

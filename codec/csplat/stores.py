@@ -149,7 +149,7 @@ class Window:
 
     Args:
         store: the file.
-        head: its beginning, where that was read already.
+        head: its beginning, if that was read already.
     """
 
     def __init__(self, store: Store, head: bytes = b"") -> None:
@@ -168,7 +168,7 @@ class Window:
         """Read parts of the file, each an offset and a size; those that lie together in one request, others not again.
 
         Raises:
-            StoreError, OSError: as of `Store.read`.
+            StoreError, OSError: as in `Store.read`.
         """
         sizes = self.store.sizes
         wanted = _missing(((at, at + size) for at, size in parts), self._here)
@@ -197,7 +197,7 @@ class Window:
 
 
 def _joined(ranges: Iterable[tuple[int, int]], gap: int = 0) -> list[tuple[int, int]]:
-    """Ranges in order, as one where no more than a gap lies between them."""
+    """Ranges in order, as one if no more than a gap lies between them."""
     runs: list[tuple[int, int]] = []
     for start, stop in sorted(ranges):
         if runs and start - runs[-1][1] <= gap:

@@ -40,7 +40,7 @@ def up_of(metadata: Mapping[str, Any], coordinate_system: str = UNSPECIFIED) -> 
 
 
 def up_of_axes(coordinate_system: str) -> Direction | None:
-    """The axis, or its opposite, that three letters call up; `None` where there are none."""
+    """The axis, or its opposite, that three letters call up; `None` if there are none."""
     if coordinate_system == UNSPECIFIED:
         return None
     x, y, z = ({"U": 1.0, "D": -1.0}.get(letter, 0.0) for letter in coordinate_system)
@@ -69,13 +69,13 @@ def unit_up(values: object) -> Direction:
 
 
 def with_up(model: SplatModel, up: Direction | None = None, coordinate_system: str | None = None) -> SplatModel:
-    """The same scene, which says another direction or other axes; what that contradicts it no longer says.
+    """Return the scene with another up direction or other axes; an entry that contradicts them is removed.
 
     Args:
         model: the scene.
-        up: three finite numbers, not all 0; `None`: what it says. Axes of which another one is up go, where none are
+        up: three finite numbers, not all 0; `None`: unchanged. Axes with another up are removed if no axes are
             given.
-        coordinate_system: as in `SplatModel`; `None`: what it says. An `up` that was there goes, where none is given.
+        coordinate_system: as in `SplatModel`; `None`: unchanged. An existing `up` is removed if none is given.
 
     Examples:
         >>> import csplat

@@ -60,9 +60,9 @@ class RenderResult:
         depth: [H, W], sum of weight · depth, not divided by alpha.
         radii: [N] float32, 3 standard deviations of each splat along its longest axis, in pixels;
             0 for what is not drawn.
-        drawn: how many splats lie in view.
+        drawn: number of splats in view.
         intersections: pairs of splat and tile; what the time depends on.
-        ignored: how many splats hold NaN or infinity.
+        ignored: number of splats that hold NaN or infinity.
     """
 
     rgb: Array

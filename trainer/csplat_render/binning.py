@@ -226,7 +226,7 @@ def fill_tiles(
         counts: [CHUNKS, tiles] int32, from `tile_starts`; used up.
         starts: [tiles + 1] int64.
         ids: [intersections] int32, written: splats, tile by tile.
-        offsets: [N + 1] int64, where the gradient records of each splat begin; empty without gradients.
+        offsets: [N + 1] int64, index of each splat's first gradient record; empty without gradients.
         slots: [intersections] int32, written: the gradient record of each of `ids`.
         slot_tiles: [intersections] int32, written: the tile of each gradient record.
     """

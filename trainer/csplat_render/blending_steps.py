@@ -84,7 +84,7 @@ def begin_tile(T: Any, columns: int, one: Any) -> None:
 
     Args:
         T: [TILE, TILE or more], transmittances, written; a pixel that is finished has a negative one.
-        columns: how many are on the picture.
+        columns: number of columns on the image.
         one: 1, of the dtype of the pixels.
     """
     for y in range(TILE):
@@ -97,9 +97,9 @@ def go_on(state: Any, X0: int, Y0: int, columns: int, high: int, planes: Any) ->
     """Begin a tile where nearer splats left it.
 
     Args:
-        state: [H, W, 5]: transmittance, negative where a pixel is finished, red, green, blue, and the fifth plane.
+        state: [H, W, 5]: transmittance, negative if a pixel is finished, red, green, blue, and the fifth plane.
         X0, Y0: first column and row of the tile.
-        columns, high: how many of either are on the picture.
+        columns, high: number of columns and rows on the image.
         planes: [TILE, 5 * TILE or more], written on the picture.
     """
     for y in range(high):
@@ -145,7 +145,7 @@ def tile_polynomial(shape: Any, i: int, x: float, y: float) -> tuple[float, floa
 
 @inline
 def alive_rows(T: Any, low: int, high: int) -> tuple[int, int]:
-    """Narrow a range of rows to those where some pixel is not finished."""
+    """Narrow a range of rows to the rows in which some pixel is not finished."""
     while low < high:
         best = T[low, 0]
         for x in range(1, TILE):

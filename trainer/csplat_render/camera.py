@@ -86,7 +86,7 @@ class Camera:
         """Make a camera of one entry of a camera file; keys that are not known are ignored.
 
         Args:
-            entry: K, viewmat, W, H and, where they are not the defaults, near and image.
+            entry: K, viewmat, W, H and, if they are not the defaults, near and image.
 
         Raises:
             InputError: a key is missing or a value is not valid for `Camera`.

@@ -1,4 +1,4 @@
-"""A scene as a cloud of surface points: where it lies, how large it is, how much of a picture it fills.
+"""A scene as a cloud of surface points: its position, its size, and how much of an image it fills.
 
 Choosing cameras needs hundreds of rough pictures, not exact ones. Splats are replaced by points
 drawn from their Gaussians; each point represents a share of its splat's optical depth times the area
@@ -55,7 +55,7 @@ class Cloud:
 
 
 def visible_opacity(model: SplatModel) -> F64:
-    """Opacities in float64, 0 where a splat never shows; all 1 where none shows at all."""
+    """Return opacities in float64, 0 for splats that never show; all 1 if none shows at all."""
     alpha = model.opacities.astype(np.float64)
     alpha[alpha < MIN_OPACITY] = 0.0
     return alpha if alpha.any() else np.ones_like(alpha)
@@ -80,7 +80,7 @@ def sample_cloud(model: SplatModel, count: int, rng: np.random.Generator, every:
 
     Args:
         model: the scene, at least one splat.
-        count: how many points.
+        count: number of points.
         rng: source of random numbers.
         every: number of the scene's splats that each of the model's represents.
 

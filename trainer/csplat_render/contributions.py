@@ -120,7 +120,7 @@ class Contributions(Rasteriser):
             drawn: the view, its shape holding the splats' colours.
             shN: [N, K, 3] float32, spherical harmonics of all splats beyond the first.
             totals: [N, 5] float64, added to: squared change of the picture if the splat were not there, product of
-                that change with (picture − reference), weight, squared weight, and 1 where the splat was seen.
+                that change with (picture − reference), weight, squared weight, and 1 if the splat was seen.
             bands: [N, d] float64, added to: squared change of the picture if its band 1, … d were zero; [N, 0] for
                 views without a basis.
             background: [3], behind everything.
@@ -148,7 +148,7 @@ class Contributions(Rasteriser):
     ) -> Array:
         """Render with other colours, subtract a picture, and take the difference back to the colours.
 
-        A colour is offset + Σ_k Y_k(direction) · coefficient_k where it is active, else 0: linear, not clamped.
+        A colour is offset + Σ_k Y_k(direction) · coefficient_k if it is active, else 0: linear, not clamped.
 
         Args:
             drawn: the view; its colours are overwritten.

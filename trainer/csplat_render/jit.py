@@ -151,7 +151,7 @@ class _First(event.Listener):  # type: ignore[misc]  # numba's types are those o
 
 @contextmanager
 def on_compiling(call: Callable[[], object]) -> Iterator[None]:
-    """Call something once when a kernel is compiled meanwhile: not where all of them come from numba's cache."""
+    """Call something once if a kernel is compiled meanwhile: not if all of them come from numba's cache."""
     with event.install_listener("numba:compile", _First(call)):
         yield
 
@@ -204,7 +204,7 @@ def lane_run(lane: int, lanes: int, count: int) -> tuple[int, int]:
 
 
 def python(compiled: Callable[P, R]) -> Callable[P, R]:
-    """The Python function that was compiled; it takes arrays where a kernel takes numbers."""
+    """Return the Python function that was compiled; it accepts arrays in place of a kernel's numbers."""
     function: Callable[P, R] = getattr(compiled, "py_func", compiled)
     return function
 

@@ -148,7 +148,7 @@ class Judge:
         return metrics.psnr_of_mse(self.pooled(self.errors(model)))
 
     def some(self, places: Sequence[int]) -> Judge:
-        """A judge by some of the views."""
+        """Return a judge for some of the views."""
         pixels = None if self.pixels is None else [self.pixels[i] for i in places]
         cameras, looks = [self.cameras[i] for i in places], [self.looks[i] for i in places]
         return replace(self, cameras=cameras, looks=looks, pixels=pixels)

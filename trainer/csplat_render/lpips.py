@@ -33,7 +33,7 @@ F32 = NDArray[np.float32]
 #: Smallest width and height of a picture, pixels: AlexNet has nothing left of a smaller one.
 MIN_SIZE = 31
 
-#: Where the weights are looked for after the file that is named.
+#: Environment variable with the path of the weights, for when no file is named.
 ENVIRONMENT = "CSPLAT_LPIPS"
 
 #: Mean and standard deviation of the network's input, red, green, blue, of pictures in −1 to 1.
@@ -82,7 +82,7 @@ class Lpips:
                     raise InputError(f"{self.source}: {name} {i} holds values that are not finite")
 
     def __call__(self, reference: NDArray[Any], image: NDArray[Any]) -> float:
-        """Perceptual distance of two pictures, 0 where they are the same; lower is better.
+        """Perceptual distance of two pictures, 0 if they are the same; lower is better.
 
         Args:
             reference: [H, W, 3] floating, clipped to [0, 1]; H and W at least `MIN_SIZE`.

@@ -5,9 +5,9 @@ Conventions, without which a number means nothing:
 * Images are clipped to [0, 1] and compared in float64; the peak is 1.
 * `psnr` of several views is one PSNR of the squared error pooled over views, pixels and channels;
   `psnr_mean` is the mean of the views' PSNRs, which is what papers print. Both end at 99 dB.
-* Over *covered* pixels only counts where the reference's alpha is at least `COVERED_ALPHA`: a plain
-  background that both images share inflates the PSNR of an object, a white one no less than a
-  black one, by 3 dB if half of the image is empty.
+* A pixel is *covered* if the reference's alpha is at least `COVERED_ALPHA`. Some scores are over
+  covered pixels only: a plain background that both images share inflates the PSNR of an object, a
+  white one no less than a black one, by 3 dB if half of the image is empty.
 * SSIM is INRIA's: a Gaussian window of 11×11, σ 1.5, zeros beyond the border, C1 = 0.01²,
   C2 = 0.03², mean over all pixels and channels. (Wang's original leaves the border out; scikit-image
   does so too.)
@@ -217,14 +217,14 @@ def psnr(reference: NDArray[Any], image: NDArray[Any]) -> float:
 
 
 def ssim(reference: NDArray[Any], image: NDArray[Any]) -> float:
-    """SSIM of one pair of pictures, [H, W, 3] each; 1 where they are the same."""
+    """SSIM of one pair of images, [H, W, 3] each; 1 if they are the same."""
     from csplat_render.similarity import mean_ssim  # numba takes a second to import
 
     return mean_ssim(*_clipped(reference, image))
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    """The mean of what is known; `None` where nothing is."""
+    """The mean of what is known; `None` if nothing is."""
     known = [value for value in values if value is not None]
     return math.fsum(known) / len(known) if known else None
 

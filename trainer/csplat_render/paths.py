@@ -69,7 +69,7 @@ def orbit_cameras(
 
     Args:
         model: the scene.
-        count: how many.
+        count: number of cameras.
         width: pixels.
         height: pixels.
         elevation: degrees above the horizon, of an object.

@@ -138,7 +138,7 @@ def virtual_cameras(
 
     Args:
         model: the scene. Its training cameras, if it has any, are not looked at.
-        count: how many cameras, at least 1.
+        count: number of cameras, at least 1.
         width: pixels.
         height: pixels.
         seed: decides where around the scene the cameras begin, and what exactly they look at.
@@ -231,7 +231,7 @@ def _in_surroundings(views: _Views, cloud: Cloud, count: int, begin: float) -> l
     good = details >= _GOOD_DETAIL * details.max()
     enough = len(angles)
     while enough < len(cameras) and np.count_nonzero(good[:enough]) < count:
-        enough += len(angles)  # nearer views only where the farther ones are too few
+        enough += len(angles)  # nearer views only if the farther ones are too few
     pool = np.flatnonzero(good[:enough])
     if len(pool) < count:
         pool = np.argsort(-details, kind="stable")[: max(count, len(pool))]

@@ -97,7 +97,7 @@ class CpuEngine:
         Args:
             picture: the image to fit.
             background: [3], behind both.
-            degree: of the SH bands that are evaluated.
+            degree: degree of the SH bands that are evaluated.
             rates: learning rate of each group of parameters.
             rng: source of the noise.
             exposure: how the photograph was exposed, if that is learnt.

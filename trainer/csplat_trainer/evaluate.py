@@ -28,7 +28,7 @@ def photograph_judge(
     threads: int | None = None,
     origin: Sequence[float] | None = None,
 ) -> Judge:
-    """Judge by photographs; each is composed when its turn comes.
+    """Return a judge by photographs; each is composed when its turn comes.
 
     Args:
         pictures: at least one.

@@ -36,7 +36,7 @@ class Parameters:
             has a group more, and as many rows as its file holds.
         first: Adam's running mean of the gradients, the same shapes.
         second: Adam's running mean of their squares.
-        step: how many steps Adam has made.
+        step: number of steps that Adam has made.
         beta2: share of the mean of squares that a step leaves.
     """
 

@@ -110,7 +110,7 @@ class Picture:
         return self.source.has_alpha if isinstance(self.source, UnreadPixels) else self.source.shape[2] == 4
 
     def at(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> F64:
-        """Some pixels, RGBA in 0..1, [M, 4]; alpha 1 where there is none."""
+        """Some pixels, RGBA in 0..1, [M, 4]; alpha 1 if there is none."""
         values = self.pixels[rows, columns].astype(np.float64) / 255.0
         return values if self.has_alpha else np.concatenate([values, np.ones((len(values), 1))], axis=1)
 

@@ -27,7 +27,7 @@ GROUPS = (
     "colour_squares", "opacity_squares", "shape_squares", "means_squares",
 )  # fmt: skip
 
-#: Where the views came from.
+#: Kinds of views that sensitivities are measured in.
 SOURCES = ("training", "cameras", "virtual")
 
 _FORMAT = "csplat sensitivity 1"

@@ -218,7 +218,7 @@ def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, vie
         degree: degree of the spherical harmonics.
         shape: see `project`.
         near: [N] float32, above 0 for splats that are drawn.
-        offsets: [N + 1] int64, where the records of each splat begin.
+        offsets: [N + 1] int64, index of each splat's first record.
         records: [intersections, SUMS].
         colour: [N, B, 3] float32, added to: |derivative of the render's sum towards a coefficient|; [0, …] if neither
             this nor the next two are needed.
@@ -230,7 +230,7 @@ def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, vie
             upper triangle of a matrix; [0, …] if it is not needed.
         bends: [N, 21] float64, added to: squared derivatives of all channels towards the covariance over its trace, as
             the upper triangle of a matrix over xx, yy, zz, √2 xy, √2 xz, √2 yz.
-        views: [N] int64, added to: 1 where the splat was seen.
+        views: [N] int64, added to: 1 if the splat was seen.
     """
     n = means.shape[0]
     count = (degree + 1) * (degree + 1)

@@ -50,7 +50,7 @@ class StartingScene:
 
 
 def scene_of(pictures: Sequence[Picture]) -> StartingScene:
-    """Find out where the scene lies.
+    """Find the extent and the focus of the scene.
 
     Args:
         pictures: at least one, without outliers: `DataSet.counted`.
@@ -96,7 +96,7 @@ def starting_splats(
         sh_degree: SH degree of the parameters; bands above 0 begin at zero.
         rng: source of random choices.
         init: `points`, `hull`, `box`, or `auto` for the first of them that there is.
-        points: [P, 3], points of the scene, where the data set has any.
+        points: [P, 3], points of the scene, if the data set has any.
         colours: [P, 3] in 0..1, their colours; `None`: those of the pictures there.
 
     Raises:

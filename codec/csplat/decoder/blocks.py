@@ -89,7 +89,7 @@ class Indices:
     Attributes:
         book: the codebook.
         attribute: attribute id of the first block.
-        places: [n], which entry; the size of the codebook where none serves.
+        places: [n], the entry of each splat; the size of the codebook if it is escaped.
         escaped: places of the splats that no entry serves, ascending.
     """
 

@@ -16,7 +16,7 @@ class ExtraColumn:
 
     Attributes:
         name: as in `SplatModel.extra`.
-        dtype: NumPy name of its type, `<u2`; `None` where this version does not know it: then it is not returned.
+        dtype: NumPy name of its type, `<u2`; `None` if this version does not know it: then it is not returned.
     """
 
     name: str
@@ -110,5 +110,5 @@ class SceneHeader:
         return self.attributes[attribute - 1]
 
     def chunk(self, kind: bytes) -> _spec.DirectoryRecord | None:
-        """Return the directory record of META, CAMS, OPTS or SERR, `None` where there is none."""
+        """Return the directory record of META, CAMS, OPTS or SERR, `None` if there is none."""
         return next((record for record in self.directory if record.type == kind), None)

@@ -36,10 +36,10 @@ def read_header(data: File) -> SceneHeader:
     The header's and the index's CRC are checked, chunks are not looked at.
 
     Args:
-        data: a file, as of `decode`, or its beginning.
+        data: a file, as in `decode`, or its beginning.
 
     Raises:
-        FormatError: a clause on header or index is broken; E_TRUNCATED where the data ends
+        FormatError: a clause on header or index is broken; E_TRUNCATED if the data ends
             before the index does.
         UnsupportedError: another version or profile, or a critical chunk of unknown type.
         InputError: `data` is not a contiguous buffer.

@@ -53,7 +53,7 @@ class Job:
 
 
 def prepare(data: File, limits: Limits | None, tiles: Sequence[int] | None, sh_degree: int | None) -> Job:
-    """Check header and index; arguments and errors as of `decode`."""
+    """Check header and index; arguments and errors as in `decode`."""
     view = view_of(data)
     check_length(view, read_file_header(view).file_size)
     header = read_header(view)

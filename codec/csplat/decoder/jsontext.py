@@ -23,7 +23,7 @@ class _RefusedError(ValueError):
 
 
 def read_json(view: memoryview, header: SceneHeader, kind: bytes, json_bytes: int) -> Any:
-    """Return the value of the META, CAMS or OPTS chunk, `None` where the file has none.
+    """Return the value of the META, CAMS or OPTS chunk, `None` if the file has none.
 
     Args:
         view: the whole file.

@@ -47,8 +47,8 @@ class StatedErrors:
         source_count: splats of the source.
         pruned_count: splats of the source that the file does not hold.
         source_sh_degree: SH degree of the source.
-        refitted: attributes were fitted anew; renders judge those without a record.
-        records: by measure.
+        refitted: attributes were refitted; those without a record can only be judged by renders.
+        records: declared errors by measure.
     """
 
     source_count: int
@@ -59,7 +59,7 @@ class StatedErrors:
 
 
 def read_serr(view: memoryview, header: SceneHeader) -> StatedErrors | None:
-    """Return what the SERR chunk states, `None` where the file has none."""
+    """Return what the SERR chunk states, `None` if the file has none."""
     record = header.chunk(_spec.CHUNK_STATED_ERRORS)
     if record is None:
         return None

@@ -38,7 +38,7 @@ def cut_scene(
         model: the scene.
         plan: lattices and tile size.
         grades: quantisation classes, whose splats share steps; `None`: all splats share them.
-        buckets: `bucket_rows` of the model, where they are known.
+        buckets: `bucket_rows` of the model, if they are known.
 
     Returns:
         As `cut`, bucket by bucket, or grade by grade; and after those of each the tiles of splats some of whose values
@@ -70,7 +70,7 @@ def _cut_groups(means: F32, rows: Rows, groups: Flags | None, coarse: Sequence[C
 
 
 def _huge(model: SplatModel, plan: Plan) -> Flags | None:
-    """[N], a bit for each attribute with a value that the file's lattice does not hold; None where there is none."""
+    """[N], a bit for each attribute with a value that the file's lattice does not hold; None if there is none."""
     kept = (plan.sh_degree + 1) ** 2 - 1
     # Colours go through sums and differences of two channels.
     looked_at = (

@@ -94,7 +94,7 @@ def choose_sh(
 
     Args:
         draft: the scene; its plan's `sh_coding` is "auto", "codebook", "scalar" or "none".
-        weights: [N] float32, importance of the splats, a guess where the draft has none; None where nothing needs it.
+        weights: [N] float32, importance of the splats, a guess if the draft has none; None if nothing needs it.
         metric: how errors of the coefficients of all bands weigh together; None: each for itself, by `weights`.
         sample: rows of one tile, on which scalar coding is tried.
         report: progress.
@@ -240,7 +240,7 @@ def _fits(largest: float, plan: Plan) -> bool:
 
 
 def _errors(shN: F32, index: I32, entries: I32, plan: Plan, judge: _Judge) -> NDArray[np.float64]:
-    """[N] weighted squared error of each splat; infinite where a coefficient was clipped."""
+    """[N] weighted squared error of each splat; infinite if a coefficient was clipped."""
     kept = (plan.sh_degree + 1) ** 2 - 1
     table = entries.astype(np.float32) * np.float32(plan.sh_step)
     errors = np.empty(len(shN))

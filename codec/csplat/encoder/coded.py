@@ -117,10 +117,10 @@ class Coded:
         return replace(self, errors=measured_sums(source, decoded, self.source_index))
 
     def write(self, said: Mapping[str, Any] | None = None) -> EncodeResult:
-        """Write the file. This takes no time beside coding: do it twice, where a file says how good itself is.
+        """Write the file. This takes no time compared with coding: do it twice if a file is to record its own PSNR.
 
         Args:
-            said: what its options say beside those of the encoder, JSON-compatible, by a name for each.
+            said: metadata to add to the options of the encoder, JSON-compatible, by a name for each.
 
         Raises:
             InputError: an error that no file can state.
@@ -154,9 +154,9 @@ def _coded_tiles(draft: Draft, books: Books, progress: Progress | None) -> list[
 
 
 def notes_on(tiles: Sequence[EncodedTile], *, strict: bool) -> tuple[str, ...]:
-    """Say where a value so large that its tile's lattice had to be coarser took precision from its neighbours.
+    """Report values so large that their tile's lattice had to be coarser, which took precision from their neighbours.
 
-    And where a bound of the means, finer than 16 bits of a tile of many, took tiles of few.
+    Report also a bound of the means that is finer than 16 bits of a tile of many splats, so that tiles hold few.
     """
     notes = []
     splats = sum(part.tile.splat_count for part in tiles)

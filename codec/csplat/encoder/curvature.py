@@ -72,7 +72,7 @@ def step_errors(model: SplatModel, curvatures: Curvatures, plan: Plan) -> F64:
 
     Returns:
         [N, 5] float64, >= 0, by splat and attribute, in the order of `GRADED`; four times as much for twice the step.
-        Not finite where a scene is so large that squares leave float64.
+        Not finite if a scene is so large that squares leave float64.
     """
     errors = np.empty((len(model), len(GRADED)))
     squared_levels = float(plan.opacity_levels) ** 2

@@ -81,9 +81,9 @@ class Draft:
         model: the scene, with the colours that are to be coded.
         options: the caller's options.
         origin: the source that the scene was derived from.
-        importance: how much renders depend on its splats, as far as the caller knows.
+        importance: importance of its splats for renders, as far as the caller knows.
         plan: lattices and codings; that of SH may still be open.
-        tiles: which rows of the model, on which lattice.
+        tiles: rows of the model and lattice, by tile.
         extras: records of the extra columns that are carried.
         shapes: the codebook of shapes, if there is one.
         grades: quantisation classes of the splats, if there are several.
@@ -265,7 +265,7 @@ class Draft:
 
 
 def tried_rows(model: SplatModel, tiles: Sequence[Tile], grades: Grades | None) -> NDArray[np.intp]:
-    """Rows like those of one tile, on which codings are tried: of all grades, where there are several."""
+    """Return rows like those of one tile, to try codings on: from all quantisation classes, if there are several."""
     if not tiles:
         return np.zeros(0, np.intp)
     if grades is None:

@@ -58,7 +58,7 @@ class Grades:
 
     Attributes:
         index: [N] uint8; the finest class, whose tiles come first in a file, is 0.
-        coarse: how much coarser the steps are, by class.
+        coarse: factors by which the steps are coarser, by class.
     """
 
     index: U8

@@ -85,8 +85,8 @@ def reassign(points: Floats, metric: Metric, entries: Floats, index: I64, thread
         metric: metric of the points.
         entries: [K, D, C].
         index: [N], the entry of each point.
-        threads: how many to use; the result does not depend on it.
-        tried: how many entries: its own and that one's nearest neighbours.
+        threads: number to use; the result does not depend on it.
+        tried: number of entries to try: its own and that one's nearest neighbours.
 
     Returns:
         [N].
@@ -103,7 +103,7 @@ def refine(points: Floats, metric: Metric, entries: I32, index: I64, threads: in
         metric: metric of the points.
         entries: [K, D, C] lattice integers.
         index: [N], the entry of each point.
-        threads: how many to use; the result does not depend on it.
+        threads: number to use; the result does not depend on it.
 
     Returns:
         entries [K', D, C], distinct, each used; index [N].
@@ -163,7 +163,7 @@ def _neighbours(entries: Floats, tried: int) -> I64:
 
 
 def _solve(points: Floats, metric: Metric, entries: I32, index: I64) -> I32:
-    """[K, D, C]: where the sums of the points' errors are least, rounded."""
+    """Return the entries, [K, D, C], that minimise the sums of the points' errors, rounded."""
     count, size, channels = entries.shape
     above, beside = np.triu_indices(size)
     weights = metric.weights.astype(np.float64)

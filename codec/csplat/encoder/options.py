@@ -29,7 +29,7 @@ class EncodeOptions:
             overrides the preset's. All steps follow from it.
         position_bits: bits per axis of a tile's box, 2 to 16; overrides the step that follows from the quality.
         position_step: lattice step of the means in scene units, > 0; overrides `position_bits`.
-        position_error: largest distance of a centre from where it was, scene units, > 0; overrides both. The step
+        position_error: largest displacement of a centre, scene units, > 0; overrides both. The step
             follows from it, and tiles are cut until none needs a coarser one.
         means_coding: "auto", "morton" or "axis".
         scale_step: step of the log scales, > 0.
@@ -43,22 +43,22 @@ class EncodeOptions:
         codebook_size: entries of the SH codebook.
         escape_fraction: share of the splats, those with the largest weighted error, whose SH is coded directly, 0 to 1.
         shape_codebook_size: entries at most of a codebook of shapes (rotation, and scales up to a common factor); 0,
-            as by default: none. It is made only where the file becomes smaller.
-        shape_escape_fraction: share of the splats, those with the largest weighted error, that keep shapes of their
-            own; by default those whose error would grow by more than the bits are worth, where an importance holds
-            matrices of shapes, and a twentieth where not.
+            the default: none. It is made only if the file becomes smaller.
+        shape_escape_fraction: fraction of the splats, those with the largest weighted error, that keep shapes of their
+            own; by default those whose error would grow by more than the bits are worth, if an importance holds
+            matrices of shapes, and otherwise a twentieth.
         adaptive: how much coarser the SH of unimportant splats is, 0 (not at all) to 1 (their error grows as their
-            importance falls). By default only where an importance is given.
-        grades: into how many grades splats are sorted, at most, 1 to 5: those whose errors show alike share tiles with
-            steps of their own. Only where an importance holds curvatures; by default one per 2,500 splats, one in
-            all with the preset "fast".
+            importance falls). By default only if an importance is given.
+        grades: quantisation classes that splats are sorted into, at most, 1 to 5: splats whose errors are equally
+            visible share tiles with steps of their own. Only if an importance holds curvatures; by default one per
+            2,500 splats, one in all with the preset "fast".
         tile_splats: splats per tile at most, 1 to 65536. Decoders spread tiles over cores: 16384 makes scenes of few
             tiles 1.2 to 3.6 times as fast to decode on four, at most, for up to 1.2 % more bytes; 4096 costs 3 to 6 %.
         deflate_level: how hard to compress, 1 to 12: the level of libdeflate; zlib stops at 9.
         deflate: "auto", "libdeflate" or "zlib".
         keep_extra: carry the model's extra columns.
         seed: seed of the k-means.
-        threads: how many to use; `None` takes all cores. The bytes do not depend on it.
+        threads: number to use; `None` takes all cores. The bytes do not depend on it.
 
     Examples:
         >>> import csplat
@@ -196,7 +196,7 @@ _NEVER_NONE = ("tile_splats", "seed")
 
 
 def _number(value: Any, kind: type[int | float]) -> int | float | None:
-    """Return a Python number of that kind, or None where the value is none."""
+    """Return a Python number of that kind, or None if the value is none."""
     if kind is int:
         return int(value) if isinstance(value, Integral) else None
     return float(value) if isinstance(value, Real) else None

@@ -91,7 +91,7 @@ def choose_shapes(
         report: progress.
 
     Returns:
-        The codebook, or None where the file is not smaller with one.
+        The codebook, or None if the file is not smaller with one.
     """
     size = min(options.shape_codebook_size or 0, len(model) // _USERS)
     if size < 1:
@@ -195,7 +195,7 @@ def _served_errors(scene: _Scene, entries: I32, index: I64, plan: Plan) -> tuple
 
 
 def _best_size(wanted: F64, found: F64, metric: Metric) -> F64:
-    """[N] by which summand of the log scales `found` [6, N] comes nearest to `wanted`; 0 keeps the trace."""
+    """Return [N], the summand of the log scales that brings `found` [6, N] closest to `wanted`; 0 keeps the trace."""
     a, b = _vectors(found)[:, :, None], _vectors(wanted)[:, :, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = metric.products(a, b) / metric.products(a, a)

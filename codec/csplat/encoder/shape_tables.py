@@ -91,7 +91,7 @@ def shape_book(tables: ShapeTables, coding: Coding) -> tuple[CodebookTable, File
 def shape_blocks(
     scales: Integers, exponent: int, quats: Integers, part: ShapePart | None, coding: Coding
 ) -> list[bytes]:
-    """Code scales [3, n] and quats [3, n] of a tile: for themselves, or by codebook where there is a part."""
+    """Code scales [3, n] and quats [3, n] of a tile: directly, or by codebook if there is a part."""
     if part is None:
         return [
             blocks.offset_block(_spec.ATTRIBUTE_SCALES, scales, exponent, coding),

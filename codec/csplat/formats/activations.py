@@ -76,7 +76,7 @@ def read_scales_as(found: Spread, name: str, *, strict: bool, writer: str = "") 
         writer: the program that wrote the file, if the file names it.
 
     Returns:
-        Whether they are, and what is to be said: an error where they are neither.
+        True if they are logarithms, and the findings about it: an error if they are neither.
     """
     if found.first is None:
         return False, []

@@ -14,7 +14,7 @@ from csplat.scene import Scene
 
 __all__ = ["ARRAYS", "Format", "Reader", "Writer"]
 
-#: What each splat has.
+#: Splat attributes of every format.
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
@@ -103,7 +103,7 @@ class Format:
         return KINDS[self.name].suffixes
 
     def expected_bytes(self, facts: SplatModel, count: int) -> int | None:
-        """About how large a file gets; `None` where that depends on the scene."""
+        """About how large a file gets; `None` if that depends on the scene."""
         return round(count * self.splat_bytes[min(facts.sh_degree, self.degree)]) if self.splat_bytes else None
 
     def losses(self, facts: SplatModel) -> tuple[str, ...]:

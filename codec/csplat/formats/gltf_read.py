@@ -43,7 +43,7 @@ AXES = "LUF"
 EXTENSION = "KHR_gaussian_splatting"
 COLOURS = "srgb_rec709_display"
 _LINEAR = "lin_rec709_display"
-#: What splats are packed into, in the extension or, before there was one, in its place: by all names that it had.
+#: Names of the extension that packs splats as SPZ, and of those that came before it.
 _SPZ = (
     "KHR_gaussian_splatting_compression_spz_2",
     "KHR_gaussian_splatting_compression_spz",
@@ -347,7 +347,7 @@ def _with_bands(block: SplatModel, degree: int) -> SplatModel:
 
 
 def _placed(block: SplatModel, part: _Part, facts: SplatModel) -> SplatModel:
-    """Move some splats to where the scene has them."""
+    """Move some splats to their place in the scene."""
     if not np.array_equal(part.linear, np.eye(3)):
         block = stretched(block, part.linear)
     offset = part.translation - np.array(facts.origin)

@@ -64,7 +64,7 @@ class _SectionHead(NamedTuple):
         bucket: splats of a full bucket.
         block: length of the block around a bucket's centre, scene units.
         span: units of a position from there to a face; 0: the usual.
-        full, partial: how many buckets are full, and are not.
+        full, partial: number of buckets that are full, and of those that are not.
     """
 
     splats: int

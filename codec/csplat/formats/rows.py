@@ -17,7 +17,7 @@ __all__ = ["SH_C0", "colours_of_bytes", "finite_scene"]
 
 Rows = NDArray[Any]
 
-_SMALLEST = np.float32(1e-20)  # what a standard deviation of 0 becomes
+_SMALLEST = np.float32(1e-20)  # value that a standard deviation of 0 is replaced by
 
 
 def finite_scene(
@@ -36,7 +36,7 @@ def finite_scene(
         zero_quat: value of each component of a rotation of length 0 in the file.
 
     Returns:
-        The scene; where there are rows, and none is finite, its findings hold an error.
+        The scene; if there are rows, but none is finite, its findings hold an error.
     """
     total, kept, spread, counts = 0, 0, Spread(), Counts()
     for rows, *_ in blocks():

@@ -67,7 +67,7 @@ class BucketWriter:
     """Appends splats to the files of their buckets.
 
     Attributes:
-        folder: where the files are; it exists, and holds none of them.
+        folder: folder of the files; it exists, and holds none of them.
         layout: layout of the splats.
         curve: the curve that determines a splat's bucket.
         room_bytes: bytes of splats that wait for being written, at most.

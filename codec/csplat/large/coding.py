@@ -86,12 +86,12 @@ def code_bucket(folder: Path, bucket: Bucket, coding: Coding) -> None:
                 stream.write(payload)
                 size += len(payload)
     text = json.dumps(said).encode()
-    with atomic_writer(_said_path(folder, bucket)) as stream:  # last: where it is, all is
+    with atomic_writer(_said_path(folder, bucket)) as stream:  # last: if it is there, everything is
         stream.write(zlib.crc32(text).to_bytes(4, "little") + text)
 
 
 def coded_bucket(folder: Path, bucket: Bucket) -> list[EncodedTile] | None:
-    """The tiles of a bucket; `None` where it is not coded yet.
+    """The tiles of a bucket; `None` if it is not coded yet.
 
     Raises:
         InputError: a file is damaged.

@@ -1,4 +1,4 @@
-"""A scene of any size to a file: in memory where it fits, else bucket by bucket by way of the disk."""
+"""Encode a scene of any size to a file: in memory if it fits, else bucket by bucket by way of the disk."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ def encode_scene(
 
 @dataclass(eq=False)
 class _Encoding:
-    """The stages of one encoding by way of the disk, each of which is skipped where the folder has it."""
+    """The stages of one encoding by way of the disk, each of which is skipped if the folder has it."""
 
     scene: Scene
     target: Path

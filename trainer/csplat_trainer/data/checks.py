@@ -167,7 +167,7 @@ def notes_on_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | No
 
 
 def _gaze(viewmats: NDArray[np.float64]) -> float:
-    """Return the median cosine between where cameras look and where the point lies that is nearest to all their lines.
+    """Return the median cosine between viewing directions and directions to the point nearest to all lines of sight.
 
     1 for cameras that look at one thing from all around, -1 for cameras that look away from their middle.
     """

@@ -107,7 +107,7 @@ class Shot:
         path: the file.
         lens: how it was taken.
         viewmat: [4, 4] float64, world to camera, OpenCV axes.
-        mask: a file that is black where the picture does not count.
+        mask: path of an image that is black for pixels that do not count.
     """
 
     name: str
@@ -152,7 +152,7 @@ def near_plane(shots: Sequence[Shot], points: F64 | None = None) -> float:
 
     Args:
         shots: at least one; outliers do not count.
-        points: [P, 3], points of the scene, where they are known.
+        points: [P, 3], points of the scene, if they are known.
     """
     viewmats = np.stack([shot.viewmat for shot in shots])
     viewmats = viewmats[~camera_outliers(viewmats, points)]

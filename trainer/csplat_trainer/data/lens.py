@@ -1,4 +1,4 @@
-"""Lenses: where a pixel of a straightened image lies in the photograph, and the pinhole to straighten to.
+"""Lenses: the place in the photograph of a straightened image's pixel, and the pinhole to straighten to.
 
 A lens maps directions (x, y), with z = 1 ahead, to the plane of the image in two steps: a projection (perspective,
 equidistant as fisheyes have it, or the FOV model), then a distortion, of OpenCV's form in all of them:
@@ -27,7 +27,7 @@ _MAX_ZOOM = 1.5
 _BORDER_POINTS = 65
 _RAY_POINTS = 33  # from the principal point to the border
 _RAYS = 9  # to each side
-#: What straightens images of every lens that COLMAP knows.
+#: Command that straightens images of every lens that COLMAP supports.
 UNDISTORTER = "`colmap image_undistorter --image_path IMAGES --input_path SPARSE --output_path OUT`"
 
 _SMALL = 1e-8  # radius below which a projection is its limit
@@ -164,7 +164,7 @@ def _border_is_inside(lens: Lens, straight: Lens) -> bool:
 
 
 def _is_one_to_one(lens: Lens, straight: Lens) -> bool:
-    """Return True if distances from the principal point keep their order in the photograph; polynomials may turn back."""
+    """Return True if distances from the principal point keep their order in the photograph: polynomials may not."""
     u, v = _border(lens, _RAYS)
     along = np.linspace(0.0, 1.0, _RAY_POINTS)[:, None]
     x, y = distorted(lens.cx + along * (u - lens.cx), lens.cy + along * (v - lens.cy), lens, straight)

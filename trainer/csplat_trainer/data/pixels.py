@@ -26,7 +26,7 @@ _ON_ITS_SIDE = {5: (1, True), 6: (-1, False), 7: (-1, True), 8: (1, False)}
 
 
 def picture_of(shot: Shot, head: ImageHead, size: tuple[int, int] | None, near: float) -> Picture:
-    """The picture of a shot, undistorted, RGBA where the file has transparency; pixels and mask are not read yet.
+    """The image of a shot, undistorted, RGBA if the file has transparency; pixels and mask are not read yet.
 
     Args:
         shot: the shot to convert.

@@ -24,7 +24,7 @@ _NEAR_SIZES = 16.0  # scene sizes; farther from 0, float32 no longer holds the l
 def centre(found: Found) -> tuple[Found, Origin]:
     """Choose an origin for a set, and measure its cameras and points from there.
 
-    The origin is 0 where the set lies around 0 or near it. Else it is the middle of the cameras, rounded to a power of
+    The origin is 0 if the set lies around 0 or near it. Else it is the middle of the cameras, rounded to a power of
     ten below the size of the scene: coordinates of maps (UTM, ECEF) are millions of metres, of which float32 holds
     halves.
 

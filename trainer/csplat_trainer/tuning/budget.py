@@ -43,7 +43,7 @@ class Budget:
 
     @classmethod
     def of(cls, stored: Any) -> Budget | None:
-        """The budget of a checkpoint; `None` where it holds none, or not all of its numbers."""
+        """The budget of a checkpoint; `None` if it holds none, or not all of its numbers."""
         names = {one.name for one in fields(cls)}
         if not isinstance(stored, dict) or stored.keys() != names:
             return None

@@ -97,7 +97,7 @@ def tune(
         checkpoint: file for checkpoints, each of which replaces the last; `None`: none are written.
         checkpoint_every: steps from one to the next; 0: at the end alone.
         resume: a checkpoint of the same frozen scene to go on from.
-        threads: how many; `None` for all.
+        threads: number of threads; `None` for all.
 
     Raises:
         InputError: a checkpoint is none, or of another scene, views or options; or a loss or a value is not finite.
@@ -263,7 +263,7 @@ class _Run:
         ).rgb
 
     def _look(self) -> None:
-        """Judge by the validation views, and keep what is best: by their loss, and what the bytes are worth."""
+        """Score on the validation views, and keep the best values: by their loss, and the rate term of the bytes."""
         if not all(np.isfinite(values).all() for values in self._scene.parameters.values.values()):
             raise InputError(f"a value is not finite at step {self._iteration}: try smaller learning rates")
         seen, _ = self._scene.seen()

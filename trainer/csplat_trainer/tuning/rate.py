@@ -51,7 +51,7 @@ class Costs:
         weight: loss per bit and splat.
         tables: by attribute, and quantisation class if there are several: slopes in bits per step,
             [columns, 2 · 128 + 1].
-        bits: of all integers together, by their order-0 entropy; without centres and indices, which hardly change.
+        bits: bits of all integers together, by their order-0 entropy; without centres and indices, which hardly change.
     """
 
     frozen: Frozen
@@ -127,7 +127,7 @@ class Costs:
 
 @dataclass(frozen=True)
 class _Grade:
-    """Rows that have the same steps, one after the other; all of them where there are no grades."""
+    """Rows that have the same steps, one after the other; all of them if there are no quantisation classes."""
 
     rows: slice
     scale_step: float

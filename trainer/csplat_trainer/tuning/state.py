@@ -154,7 +154,7 @@ def sum_by_entry(lane: int, lanes: int, values: F32, order: I64, starts: I64, ou
     Args:
         values: [N, C].
         order: [N], rows of `values` by entry.
-        starts: [size + 1], where the users of an entry begin in `order`.
+        starts: [size + 1], index in `order` of an entry's first user.
         out: [size, C], overwritten.
     """
     for entry in range(lane, out.shape[0], lanes):

@@ -26,11 +26,11 @@ _BRIGHTEST = np.float32(6e4)  # largest value for float16
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera and what it is to see.
+    """A camera and its reference image.
 
     Attributes:
         camera: relative to the scene's origin.
-        wanted: a photograph, or [H, W, 3] float16 or float32.
+        wanted: a photograph, or [H, W, 3] float16 or float32: the reference image.
 
     Raises:
         InputError: a picture of another size.
@@ -116,7 +116,7 @@ def split_views(views: Sequence[View], background: F32, aside: int = 0) -> Views
 
 
 def renders_of(source: SplatModel, cameras: Sequence[Camera], background: F32, threads: int | None) -> list[View]:
-    """Views of a scene itself: what its file is to look like where there are no photographs.
+    """Return views of a scene itself: the reference for its file if there are no photographs.
 
     They are kept in float16, 66 dB and more from what they were up to white; there are hundreds of them.
     """
