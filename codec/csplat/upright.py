@@ -83,7 +83,7 @@ def with_up(model: SplatModel, up: Direction | None = None, coordinate_system: s
         [0.0, 0.0, 1.0]
 
     Raises:
-        InputError: one of them says nothing.
+        InputError: one of them is not valid.
     """
     if up is None and coordinate_system is None:
         return model

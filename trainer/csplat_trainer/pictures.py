@@ -140,7 +140,7 @@ def compose(picture: Picture, background: F32, out: F32) -> F32:
 def halved(picture: Picture) -> Picture:
     """The picture at half its width and height: each pixel is the mean of four, weighted with their alpha.
 
-    A last odd row or column is left out. A pixel counts where all four do; where none would, or the picture is one
+    A last odd row or column is left out. A pixel counts if all four do; if none would, or the picture is one
     pixel wide or high, it stays as it is.
     """
     camera = picture.camera

@@ -151,7 +151,7 @@ def _octaves(errors: F64, places: U8, integers: F64) -> F64:
 
 
 def _assigned(errors: F64, integers: F64, octaves: F64) -> U8:
-    """Assign each splat to the class, [N], with the smallest sum of its bits and its error, weighted equally."""
+    """Return the class of each splat, [N]: the one with the fewest bits, its error counted in bits too."""
     grown, saved = 4.0**octaves / (2.0 * math.log(2.0)), (integers * octaves).sum(axis=1)
     index = np.zeros(len(errors), np.uint8)
     for at in range(0, len(errors), _BLOCK):

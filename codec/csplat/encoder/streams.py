@@ -159,7 +159,7 @@ def _finish(values: Integers, width: int, transforms: tuple[int, ...], coding: C
 
 
 def _is_smaller(runs: NDArray[np.uint8], planes: NDArray[np.uint8], coding: Coding) -> bool:
-    """Return True if runs compress to fewer bytes than the planes they replace, by a quick trial to save time."""
+    """Return True if runs compress to at most `_GAIN` of the planes they replace, by a quick trial to save time."""
     trial = replace(coding, level=min(coding.level, _TRIAL_LEVEL))
     return len(_code(runs, trial)[1]) <= _GAIN * len(_code(planes, trial)[1])
 

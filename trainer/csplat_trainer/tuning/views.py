@@ -80,7 +80,7 @@ class Views:
 
     @property
     def digest(self) -> str:
-        """Hash of the cameras, the split and the background, which identifies these views."""
+        """Hash of the training cameras, the split and the background, which identifies these views."""
         cameras = [(c.W, c.H, c.K.tolist(), c.viewmat.tolist()) for c in (one.camera for one in self.train)]
         said = repr((cameras, len(self.validation), self.kept_aside, self.background.tolist()))
         return hashlib.sha256(said.encode()).hexdigest()
