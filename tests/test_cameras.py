@@ -165,6 +165,14 @@ def test_cameras_that_belong_to_a_set_are_no_outliers():
         assert not camera_outliers(viewmats(positions), points).any(), name
 
 
+def test_a_second_tripod_is_no_outlier_where_nothing_tells_the_size_of_the_scene():
+    K, rng = intrinsics(64, 48, 50.0), np.random.default_rng(1)
+    places = 1e-3 * rng.normal(size=(16, 3)) + np.where(np.arange(16) < 13, 0.0, 4.0)[:, None]
+    turned = [(np.cos(a), np.sin(a), 0.1) for a in np.linspace(0.0, 6.0, 16)]
+    cameras = [look_at(place, place + way, (0, 0, 1), K, 64, 48) for place, way in zip(places, turned, strict=True)]
+    assert not camera_outliers(np.stack([camera.viewmat for camera in cameras])).any()
+
+
 def test_cameras_around_an_origin_far_from_0_are_told_from_those_around_0(tmp_path):
     K, place, path = intrinsics(64, 48, 50.0), np.array((500123.0, 4649876.0, 214.0)), tmp_path / "cameras.json"
     own = [look_at((x, 3, 0), (0, 0, 5), (0, -1, 0), K, 64, 48) for x in (-2, 0, 2)]

@@ -349,6 +349,73 @@ def test_cameras_that_contradict_their_text_are_reported(colmap_set):
         assert says == ("cameras.txt holds other cameras than cameras.bin, which is read" in report), report
 
 
+def test_images_that_contradict_their_text_are_reported(colmap_set):
+    write_colmap(colmap_set / "away", cameras(9), text=True)
+    (colmap_set / "away" / "images.txt").rename(colmap_set / "sparse" / "0" / "images.txt")
+    write_colmap(colmap_set / "sparse" / "0", cameras(3))
+    assert "images.txt holds 9 images, images.bin 3: images.bin is read" in load(colmap_set).report
+
+
+def test_the_largest_of_models_in_several_folders_is_read(colmap_set):
+    write_colmap(colmap_set / "colmap" / "sparse" / "0", cameras(4))
+    write_colmap(colmap_set / "sparse", cameras(2))
+    write_colmap(colmap_set / "sparse" / "1", cameras(9))
+    (colmap_set / "sparse" / "1" / "images.bin").write_bytes(b"")
+    data = load(colmap_set)
+    assert (7, 2) == (len(data.train), len(data.test))
+    others = "sparse/1 has no whole list of images, sparse has 2, colmap/sparse/0 has 4"
+    assert f"there are 4 models: sparse/0 is read, with 9 images; {others}" in data.report
+
+
+def test_names_of_lists_may_hold_what_separates_others(colmap_set):
+    names = {3: "a,3.png", 4: "#4.png", 5: "'5'.png"}
+    rename_in_images_txt(colmap_set, lambda i: names.get(i, f"im {i:03}.png"))
+    for i, name in names.items():
+        (colmap_set / "images" / f"im {i:03}.png").rename(colmap_set / "images" / name)
+    (colmap_set / "Test.txt").write_text("a,3.png\n#4.png\n'5'.png\n./im 006.png\nim 006.png\n")
+    data = load(colmap_set)
+    assert [*names.values(), "im 006.png"] == [picture.camera.image for picture in data.test]
+
+
+def test_an_image_may_have_a_name_of_numbers_or_keypoints_that_are_none(tmp_path):
+    write_colmap_set(tmp_path, text=True)
+    rename_in_images_txt(tmp_path, lambda i: "7 8 0" if i == 3 else f"im {i:03}.png")
+    (tmp_path / "images" / "im 003.png").rename(tmp_path / "images" / "7 8 0")
+    file = tmp_path / "sparse" / "0" / "images.txt"
+    file.write_text(file.read_text().replace("1.5 2.5 -1", "nan nan -1"))
+    assert 9 == len(load(tmp_path, test_every=0).train)
+
+
+def test_test_images_that_are_for_training_too_are_reported(ngp):
+    frames = json.loads((ngp / "transforms.json").read_text())["frames"]
+    change_transforms(ngp, test_frames=frames[:2])
+    assert any("2 test images used for training, too" in line for line in load(ngp).report)
+
+
+def test_numbers_beyond_float64_are_refused_in_a_line(ngp):
+    frames = json.loads((ngp / "transforms.json").read_text())["frames"]
+    frames[3]["transform_matrix"][0][3] = 10**400
+    change_transforms(ngp, frames=frames)
+    with pytest.raises(InputError, match="frame 3: transform_matrix is not a matrix of numbers"):
+        load(ngp)
+    change_transforms(ngp, frames=frames[:3], fl_x=10**400)
+    with pytest.raises(InputError, match=r"fl_x is 1000.*, expected a number"):
+        load(ngp)
+
+
+def test_a_last_row_may_be_rounded(ngp):
+    frames = json.loads((ngp / "transforms.json").read_text())["frames"]
+    frames[3]["transform_matrix"][3] = [0.0, -1e-17, 0.0, 1.0000001]
+    change_transforms(ngp, frames=frames)
+    assert 9 == len(load(ngp, test_every=0).train)
+
+
+def test_distortion_params_of_nerfstudio_are_read(ngp):
+    frames = json.loads((ngp / "transforms.json").read_text())["frames"]
+    change_transforms(ngp, frames=[{**frame, "distortion_params": [0.1, 0, 0, 0, 0, 0]} for frame in frames])
+    assert any("lens distortion is undone" in line for line in load(ngp).report)
+
+
 def test_an_empty_file_of_a_model_gives_way_to_its_text(colmap_set):
     write_colmap(colmap_set / "sparse" / "0", cameras(9), text=True)
     (colmap_set / "sparse" / "0" / "cameras.bin").write_bytes(b"")
@@ -667,8 +734,9 @@ def test_alpha_that_is_1_all_over_is_none(ngp):
     assert "alpha is 1 all over 3 images: they count as images without alpha" in data.report
     Image.new("RGBA", (W, H)).save(ngp / "images" / "0005.png")
     data = load(ngp)
-    assert (1.0, 1.0, 1.0) == data.background
     assert 4 == sum(picture.has_alpha for picture in (*data.train, *data.test))
+    assert (0.0, 0.0, 0.0) == data.background
+    assert "4 of 9 images have transparency: the background of all is black" in data.report
 
 
 def test_a_palette_with_transparency_is_seen_before_it_is_decoded(blender):

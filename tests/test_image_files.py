@@ -43,8 +43,9 @@ NAMES = {
     "a space at the end": ("a/1.png ", ["a/1.png"], "a/1.png", "with / for \\, without spaces around it"),
     "a backslash in a name": ("a\\1.png", ["a\\1.png", "a/1.png"], "a\\1.png", None),
     "another case": ("img_1.png", ["IMG_1.PNG"], "IMG_1.PNG", "in another case"),
+    "another case rather than another ending": ("1.JPG", ["1.jpg", "1.png"], "1.jpg", "in another case"),
     "another case, two files": ("img_1.png", ["IMG_1.png", "Img_1.png"], "fits 2 names", None),
-    "another case and ending": ("img_1.jpg", ["IMG_1.PNG"], "IMG_1.PNG", "in another case"),
+    "another case and ending": ("img_1.jpg", ["IMG_1.PNG"], "IMG_1.PNG", "with another ending"),
     "another Unicode form": (
         unicodedata.normalize("NFD", "Köln.png"),
         [unicodedata.normalize("NFC", "Köln.png")],

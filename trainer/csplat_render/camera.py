@@ -101,6 +101,9 @@ class Camera:
         return cls(entry["K"], entry["viewmat"], entry["W"], entry["H"], near, image)
 
 
+_ROW_TOLERANCE = 1e-5  # of values of the last row; files hold few digits, or are products of matrices
+
+
 def check_last_row(pose: F64, name: str) -> None:
     """Check that a pose moves points and does nothing else; one that is written by columns is recognised.
 
@@ -112,9 +115,9 @@ def check_last_row(pose: F64, name: str) -> None:
         InputError: its last row is not 0 0 0 1.
     """
     wanted = (0.0, 0.0, 0.0, 1.0)
-    if (pose[3] == wanted).all():
+    if np.abs(pose[3] - wanted).max() <= _ROW_TOLERANCE:
         return
-    found = " ".join(f"{value:g}" for value in pose[3])
+    found = " ".join(f"{value:.9g}" for value in pose[3])
     by_columns = (pose[:, 3] == wanted).all()
     hint = ": its last column is that, so it is transposed" if by_columns else ""
     raise InputError(f"{name} has the last row {found}, expected 0 0 0 1{hint}")

@@ -35,12 +35,14 @@ F64 = NDArray[np.float64]
 #: Models of transforms.json that are a pinhole with OpenCV's distortion, or without; "" where none is named.
 PERSPECTIVES = ("", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
-_FOCAL_RANGE = (0.05, 100.0)  # of focal lengths, relative to the image's side: 169 to 0.6 degrees of view
-_MOST_UNEQUAL = 2.0  # of focal lengths across and down
+_FOCAL_RANGE = (0.05, 500.0)  # focal lengths relative to the image's side: 169 to 0.1 degrees of view (satellites)
+_MOST_UNEQUAL = 3.0  # of focal lengths across and down
+_OFF_CENTRE = 10.0  # sides of the image, up to which the principal point may be away
 _SWAPPED = 0.02  # relative, of a principal point to half of the other side
 _NEAR = 0.01  # scene units, of nerfstudio's renderer
 _SCALE_TOLERANCE = 1e-3
 _ANGLES_AGREE = 0.01  # relative, of a focal length with one stated beside it; files hold few digits
+_LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")  # distortion_params
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
@@ -83,6 +85,9 @@ def frame_values(document: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[
     """Join what a transforms.json states for all frames with what one of them states: its own counts."""
     own = {**frame, **_intrinsics_of_matrix(frame)}
     values = {**document, **own}
+    listed = values.get("distortion_params")  # of nerfstudio
+    if isinstance(listed, list) and len(listed) == len(_LISTED):
+        values |= dict(zip(_LISTED, listed, strict=True))
     for axis in "xy":
         if f"fl_{axis}" in own and f"camera_angle_{axis}" not in own:
             values.pop(f"camera_angle_{axis}", None)
@@ -98,7 +103,7 @@ def _intrinsics_of_matrix(frame: Mapping[str, Any]) -> dict[str, Any]:
         return {}
     try:
         matrix = np.array(frame["intrinsic_matrix"], np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return {}
     if matrix.ndim != 2 or min(matrix.shape) < 3:
         return {}
@@ -134,7 +139,8 @@ def check_intrinsics(
             f"{where}the focal lengths are {fx:g} across and {fy:g} down, expected about the same: one of them is wrong"
         )
     point = f"{where}the principal point is {cx:g} {cy:g} in {width:g}×{height:g} pixels"
-    if not (-width <= cx <= 2.0 * width and -height <= cy <= 2.0 * height):
+    far = _OFF_CENTRE  # images that are tiles of a larger one have it outside of themselves
+    if not (-far * width <= cx <= far * width and -far * height <= cy <= far * height):
         raise InputError(f"{point}, expected about the middle")
     away = max(abs(2.0 * cx / width - 1.0), abs(2.0 * cy / height - 1.0))
     away_if_swapped = max(abs(2.0 * cx / height - 1.0), abs(2.0 * cy / width - 1.0))
@@ -152,9 +158,13 @@ def finite_number(values: Mapping[str, Any], key: str, where: str, default: floa
     value = values.get(key)
     if value is None and default is not None:
         return default
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where}: {key} is {value!r}, expected a number")
-    return float(value)
+    try:
+        number = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else float(value)
+    except OverflowError:  # an integer beyond float64
+        number = math.inf
+    if not math.isfinite(number):
+        raise InputError(f"{where}: {key} is {repr(value)[:40]}, expected a number")
+    return number
 
 
 def focal_lengths(
@@ -198,7 +208,7 @@ def viewmat_of_opengl(matrix: Any, name: str, where: str) -> F64:
     """
     try:
         pose = np.array(matrix, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{where}: {name} is not a matrix of numbers") from None
     if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
         raise InputError(f"{where}: {name} has shape {list(pose.shape)}, expected [4, 4], finite")
@@ -276,7 +286,7 @@ def _inria(entry: Mapping[str, Any], at: str) -> Camera:
     focals = finite_number(entry, "fx", at), finite_number(entry, "fy", at)
     try:
         rotation, position = (np.array(entry.get(key), np.float64) for key in ("rotation", "position"))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         rotation = position = np.zeros(0)
     if rotation.shape != (3, 3) or position.shape != (3,):
         raise InputError(f"{at}: rotation and position have other shapes, expected [3, 3] and [3]")

@@ -38,9 +38,10 @@ F64 = NDArray[np.float64]
 
 _PARALLEL = 1e-6  # the sine of an angle below which two directions count as parallel
 _FAR = 20.0  # usual distances from the middle beyond which a camera may be an outlier,
-_GAP = 5.0  # if it is this many times as far away as the farthest of the others,
+_AIMED = 0.7  # median cosine of `gaze` from which cameras look at one thing
+_GAP = 4.0  # if it is this many times as far away as the farthest of the others,
 _ORIGIN_FAR = 100.0  # times the distance of cameras from an origin, at least, that the origin is from 0
-_MOST_OUTLIERS = 0.25  # share of the cameras: more of them are a part of the set
+_MOST_OUTLIERS = 1.0 / 3.0  # share of the cameras: more of them are a part of the set
 
 
 def load_cameras(
@@ -122,7 +123,7 @@ def camera_outliers(viewmats: F64, points: NDArray[np.floating] | None = None) -
         points: [P, 3], points of the scene, where they are known.
 
     Returns:
-        [N], true for outliers: none of fewer than four cameras, a quarter of all at most.
+        [N], true for outliers: none of fewer than four cameras, a third of all at most.
     """
     positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     middle = np.median(positions, axis=0)
@@ -137,11 +138,29 @@ def camera_outliers(viewmats: F64, points: NDArray[np.floating] | None = None) -
         if points is not None and len(points):
             subject = np.median(points, axis=0)
         else:
-            subject = nearest_point(positions[others] - middle, viewmats[others, 2, :3]) + middle
+            near, axes = positions[others] - middle, viewmats[others, 2, :3]
+            if gaze(near, axes) < _AIMED:  # a tripod, a street: nothing tells how large the scene is
+                continue
+            subject = nearest_point(near, axes) + middle
         if away[first] > _FAR * float(np.sqrt(np.sum((subject - middle) ** 2))):
             outliers: B = distances >= away[first]
             return outliers
     return np.zeros(len(distances), np.bool_)
+
+
+def gaze(positions: F64, axes: F64) -> float:
+    """Return the median cosine between where cameras look and where the point lies that is nearest to all their lines.
+
+    Args:
+        positions: [N, 3], where cameras stand, relative to a point among them.
+        axes: [N, 3], unit length, where they look.
+
+    Returns:
+        1 for cameras that look at one thing from several sides, -1 for those that look away from their middle.
+    """
+    towards = nearest_point(positions, axes) - positions
+    lengths = np.maximum(np.linalg.norm(towards, axis=1), np.finfo(np.float64).tiny)
+    return float(np.median(np.einsum("ni,ni->n", axes, towards) / lengths))
 
 
 def nearest_point(positions: F64, axes: F64) -> F64:

@@ -169,7 +169,7 @@ def _table_lines(text: str) -> Iterator[tuple[int, dict[str, Any]]]:
     """Give the rows of a table with their cells by column; a heading may name the columns in another order."""
     rows = csv.reader(text.splitlines(), skipinitialspace=True, delimiter=_separator(text))
     columns: Sequence[str] = _COLUMNS
-    for row in rows:
+    for row in _rows(rows):
         cells = [cell.strip() for cell in row]
         if not any(cells) or cells[0].startswith(("#", "sep=")):
             continue
@@ -178,6 +178,13 @@ def _table_lines(text: str) -> Iterator[tuple[int, dict[str, Any]]]:
             columns = heading
         else:
             yield rows.line_num, dict(zip(columns, cells, strict=False))
+
+
+def _rows(rows: Iterator[list[str]]) -> Iterator[list[str]]:
+    try:
+        yield from rows
+    except csv.Error as error:
+        raise InputError(f"the manifest is no table: {error}") from None
 
 
 def _separator(text: str) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat_render.camera_forms import check_intrinsics
-from csplat_render.cameras import camera_outliers, nearest_point
+from csplat_render.cameras import camera_outliers, gaze, nearest_point
 from csplat_trainer.data.dataset import Shot
 from csplat_trainer.data.image_pixels import ImageHead, image_size, mask_values, opened_image, value_range
 from csplat_trainer.data.lens import Lens, undistorted_lens
@@ -26,9 +26,10 @@ _NEARLY = 0.02  # relative, of scales across and down: beyond it an image is tur
 _MIDDLE = (0.25, 0.75)  # fractions of the image: principal points outside this range are reported
 _SMALL_RANGE = 1.0 / 8.0  # fraction of the 16-bit range: images of 12 bits are as dark as that
 _SAME = 1e-9  # relative difference of positions; coordinates of maps are a million times the distance of cameras
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes of a camera to OpenCV's
 _FEW = 4  # cameras; fewer need not look anywhere in common
-_AIMED, _AIMLESS = 0.95, 0.5  # median cosines; see `_gaze`
+_AIMED = 0.98  # median cosine, see `gaze`
+_PARALLEL = 0.05  # least mean square of what is across to lines of sight that are not parallel
+_MEETING = 0.1  # of their distance: lines of sight that pass a point so near meet there
 _SHOTS, _POINTS = 64, 4096  # shots and points of a set, at most, that are checked for belonging together
 
 
@@ -147,36 +148,28 @@ def notes_on_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | No
                 cause = "with inverted poses they would: the file holds the inverse of what it should"
             what = f"{len(blind)} of {len(some_shots)} cameras ({blind[0].name}, …) see none of the points"
             return [*notes, f"{what}: {cause}"]
-    if len(shots) < _FEW:
         return notes
     viewmats = np.stack([shot.viewmat for shot in shots])
-    viewmats = viewmats[~camera_outliers(viewmats, points)]
-    gaze, inverse = _gaze(viewmats), np.asarray(np.linalg.inv(viewmats), np.float64)
-    if gaze < -_AIMED:
+    if len(shots) >= _FEW and _is_panorama(viewmats[~camera_outliers(viewmats)]):
         notes.append(
-            "all cameras look away from what they stand around, as in a panorama: if that is wrong, the poses have "
-            "other axes than files of this kind"
-        )
-    # The file may hold the inverse of COLMAP's poses, or of either axis convention that transforms.json is read with.
-    elif abs(gaze) < _AIMLESS and max(map(_gaze, (inverse, inverse @ _FLIP, _FLIP @ inverse @ _FLIP))) > _AIMED:
-        notes.append(
-            "the cameras look past each other, and with inverted poses all at one point: does the file hold the "
-            "inverse of what it should?"
+            "all cameras look away from what they stand around, as in a panorama: if that is wrong, the poses are "
+            "inverted, or have other axes than files of this kind"
         )
     return notes
 
 
-def _gaze(viewmats: NDArray[np.float64]) -> float:
-    """Return the median cosine between viewing directions and directions to the point nearest to all lines of sight.
-
-    1 for cameras that look at one thing from all around, -1 for cameras that look away from their middle.
-    """
+def _is_panorama(viewmats: NDArray[np.float64]) -> bool:
+    """Report whether the lines of sight meet in a point, which lies behind the cameras."""
     axes = viewmats[:, 2, :3]
     positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     positions = positions - positions.mean(axis=0)
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    if np.linalg.eigvalsh(across.mean(axis=0))[0] < _PARALLEL:
+        return False
     towards = nearest_point(positions, axes) - positions
-    lengths = np.maximum(np.linalg.norm(towards, axis=1), np.finfo(np.float64).tiny)
-    return float(np.median(np.einsum("ni,ni->n", axes, towards) / lengths))
+    missed = np.linalg.norm(np.einsum("nij,nj->ni", across, towards), axis=1)
+    distance = float(np.median(np.linalg.norm(towards, axis=1)))
+    return gaze(positions, axes) < -_AIMED and float(np.median(missed)) < _MEETING * distance
 
 
 def _sees_any(shot: Shot, points: NDArray[np.floating[Any]]) -> bool:

@@ -9,7 +9,7 @@ A `test.txt` next to the model, one name a line, lists the test images, `val.txt
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,32 +27,26 @@ __all__ = ["find_model", "read_colmap"]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-_MODEL_FOLDERS = ("sparse", "colmap/sparse", "distorted/sparse")  # with models in numbered folders, or one in itself
+#: With models in numbered folders, or one in itself; the last only if there is no other.
+_MODEL_FOLDERS = (("sparse", "colmap/sparse"), ("distorted/sparse",))
 _IMAGE_FOLDERS = ("images", "input", ".")
 _UNDISTORTED_FIRST = "distorted"  # convert.py of 3DGS: images/ belongs to sparse/0, input/ to this folder's model
 
 
 def find_model(folder: Path) -> tuple[Path, list[str]] | None:
-    """Find the sparse model of a set: the one of most images, where there are several.
+    """Find the sparse model of a set: the one of most images, if there are several.
 
     Args:
         folder: the set's.
 
     Returns:
-        The model's folder, and a line that names the others if there are any; `None` where there is no model.
-
-    Raises:
-        InputError: one of several models is damaged.
+        The model's folder, and a line that names the others if there are any; `None` if there is no model.
     """
-    for name in _MODEL_FOLDERS:
-        inside = folder / name
-        if not inside.is_dir():
-            continue
-        models = [path for path in sorted(inside.iterdir(), key=_number) if _is_model(path)]
+    for names in _MODEL_FOLDERS:
+        inside = [folder / name for name in names if (folder / name).is_dir()]
+        models = [path for one in inside for path in (*sorted(one.iterdir(), key=_number), one) if _is_model(path)]
         if models:
             return _largest(models, folder)
-        if _is_model(inside):
-            return inside, []
     return (folder, []) if _is_model(folder) else None
 
 
@@ -75,6 +69,10 @@ def read_colmap(folder: Path, model: Path, size: tuple[int, int] | None, images:
     registered, report = read_images(images_path)
     used = {image.camera for image in registered}
     cameras = read_cameras(cameras_path, used)
+    same = images_path.with_suffix(".txt")
+    if same != images_path and same.is_file() and (there := count_images(same)) != len(registered):
+        what = f"{same.name} holds {counted(there, 'image')}, {images_path.name} {len(registered)}"
+        report.append(f"{what}: {images_path.name} is read")
     other = cameras_path.with_suffix(".txt")
     if other != cameras_path and other.is_file() and not _agree(cameras, read_cameras(other, used)):
         report.append(f"{other.name} holds other cameras than {cameras_path.name}, which is read")
@@ -96,7 +94,7 @@ def read_colmap(folder: Path, model: Path, size: tuple[int, int] | None, images:
         if image.name in found.files
     ]
     points, colours = _points(model, report)
-    lists, files = lists_next_to((model, folder))
+    lists, files = lists_next_to((model, model.parent, folder))
     if lists:
         train, val, test = split_listed(shots, lists, files, report)
         return Found("COLMAP set", train, test, points, colours, report, val=val)
@@ -112,7 +110,7 @@ def _each_once(registered: list[ColmapImage], path: Path, report: list[str]) -> 
     """
     first: dict[str, ColmapImage] = {}
     for image in registered:
-        other = first.setdefault(image.name, image)
+        other = first.setdefault(PurePosixPath(image.name).as_posix(), image)
         if other.camera != image.camera or (other.viewmat != image.viewmat).any():
             raise InputError(
                 f"{path}: {image.name} is there twice, with different poses or cameras; expected each once"
@@ -140,13 +138,23 @@ def _number(path: Path) -> tuple[bool, int, str]:
 def _largest(models: list[Path], folder: Path) -> tuple[Path, list[str]]:
     if len(models) == 1:
         return models[0], []
-    counts = [count_images(path) for model in models if (path := _file(model, "images")) is not None]
+    counts = [_count(model) for model in models]
     best = max(range(len(models)), key=counts.__getitem__)  # of equal ones the first
-    others = ", ".join(f"{_relative(models[i], folder)} has {counts[i]}" for i in range(len(models)) if i != best)
+    said = [f"{counts[i]}" if counts[i] >= 0 else "no whole list of images" for i in range(len(models))]
+    others = ", ".join(f"{_relative(models[i], folder)} has {said[i]}" for i in range(len(models)) if i != best)
     chosen = _relative(models[best], folder)
     return models[best], [
-        f"there are {len(models)} models: {chosen} is read, with {counted(counts[best], 'image')}; {others}"
+        f"there are {len(models)} models: {chosen} is read, with {counted(max(counts), 'image')}; {others}"
     ]
+
+
+def _count(model: Path) -> int:
+    """Count the images of a model; -1 if that is damaged."""
+    path = _file(model, "images")
+    try:
+        return -1 if path is None else count_images(path)
+    except InputError:
+        return -1
 
 
 def _folders(folder: Path, model: Path, images: str | None) -> tuple[str, ...]:

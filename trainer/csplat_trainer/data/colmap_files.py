@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import struct
 from collections.abc import Collection, Iterator, Sequence
@@ -255,13 +254,21 @@ def _image_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
     Returns:
         The lines of poses, each with where it stands; and a line for the report if any has no second one.
     """
+    written = [
+        (line, f"{path}, line {number}")
+        for number, line in enumerate(read_text(path).split("\n"), 1)
+        if not line.lstrip().startswith("#")
+    ]
+    while written and not written[0][0].strip():
+        written.pop(0)
+    if all(_is_pose(line) for line, _ in written[::2] if line.strip()) and all(
+        _is_keypoints(line.split()) for line, _ in written[1::2]
+    ):
+        return [pair for pair in written[::2] if pair[0].strip()], []
     poses: list[tuple[str, str]] = []
     single = 0
     expected = False  # whether a line of keypoints may follow
-    for number, line in enumerate(read_text(path).split("\n"), 1):
-        where = f"{path}, line {number}"
-        if line.lstrip().startswith("#"):
-            continue
+    for line, where in written:
         if not _is_keypoints(line.split()):
             single += expected
             poses.append((line, where))
@@ -282,9 +289,14 @@ def _is_keypoints(words: list[str]) -> bool:
     if len(words) % 3:
         return False
     try:
-        return all(math.isfinite(float(word)) for word in words)
+        return all(float(_NO_NUMBER.sub("nan", word)) is not None for word in words)
     except ValueError:
         return False
+
+
+def _is_pose(line: str) -> bool:
+    words = line.split(None, 9)
+    return len(words) == 10 and words[0].isdecimal() and words[8].isdecimal()
 
 
 def _numbers(words: list[str], where: str) -> list[float]:

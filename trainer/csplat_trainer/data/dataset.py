@@ -65,7 +65,8 @@ class DataSet:
     @property
     def background(self) -> tuple[float, float, float]:
         """Colour behind the splats: white if images have alpha, as in published tables; else black."""
-        return _WHITE if any(picture.has_alpha for picture in (*self.train, *self.test)) else _BLACK
+        images = (*self.train, *self.test)
+        return _WHITE if 2 * sum(image.has_alpha for image in images) >= len(images) else _BLACK
 
     def trained_on(self, background: tuple[float, float, float]) -> TrainedOn:
         """Return the record for a scene that was trained on this set.

@@ -7,8 +7,8 @@ one rule after the other, and every rule that was needed is reported:
 1. as written;
 2. `\` as `/`, without a drive letter and spaces around it;
 3. as a URL: without `file:`, `%20` as a space;
-4. with another ending of images, or with one if there is none (Blender's names);
-5. in another case or Unicode form, perhaps with another ending;
+4. in another case or Unicode form;
+5. with another ending of images, or with one if there is none (Blender's names), in any case;
 6. without its leading folders, if rules 1 to 5 find nothing at all;
 7. in a folder below, if rule 6 finds nothing either.
 
@@ -41,7 +41,7 @@ __all__ = [
     "shown",
 ]
 
-_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+_ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".avif", ".tif", ".tiff", ".bmp", ".jp2")
 _SHOWN = 5  # names in a message, at most
 
 _FOLDER_WORDS = ("without leading folders", "in folders below")  # rules 6 and 7
@@ -143,10 +143,10 @@ def find_masks(root: Path, names: Sequence[str]) -> FoundImages | None:
 
 def masks_among(images: Sequence[Path]) -> list[str]:
     """Report masks that lie next to the images: a line, or none if there are none."""
-    stems = {path.stem: path for path in images}
+    stems = {path.stem for path in images}
     for name in _below(images[0].parent) if images else ():
-        stem = PurePosixPath(_without_affix(name)).stem
-        if stem != PurePosixPath(name).stem and stem in stems:
+        stem, path = PurePosixPath(_without_affix(name)).stem, PurePosixPath(name)
+        if stem in stems and (stem != path.stem or path.parent.name.casefold() in ("mask", "masks")):
             return [f"there are masks next to the images, such as {name}: they are read from a folder masks alone"]
     return []
 
@@ -226,8 +226,8 @@ def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[t
     yield "", [(_as_written, _as_written)]
     yield "with / for \\, without spaces around it", [(plain, plain)]
     yield "as a URL", [(decoded, plain)]
-    yield "with another ending", [(unended, unended)]
-    yield "in another case", in_any_case(plain, plain)
+    yield "in another case", [(folded, folded)]
+    yield "with another ending", [(unended, unended), (lambda name: folded(unended(name)),) * 2]
     if not folders:
         return
     depths = {len(parts(name)) for name in names}

@@ -53,6 +53,7 @@ _FLOAT = "F"
 _DEEP = ";16"  # in pillow's names of raw data of which it keeps the upper 8 bits
 _FLOAT_TOLERANCE = 1e-3  # of a range of 0 to 1, for files that were resampled
 _WHITE_IS_ZERO, _IN_PLANES = 0, 2  # TIFF 6.0: PhotometricInterpretation, PlanarConfiguration
+_OPAQUE = 250  # alpha that is 1 but for rounding
 _HEAD_SIZE = 64
 
 # By the first bytes and where they lie: what people have images in and pillow does not open.
@@ -157,7 +158,7 @@ def opaque_images(heads: Iterable[ImageHead]) -> list[ImageHead]:
     with_alpha = [head for head in heads if head.has_alpha]
     for head in with_alpha:
         with opened_image(head.path) as image:
-            if (rgb_pixels(image, head.path)[..., 3:] < 255).any():
+            if (rgb_pixels(image, head.path)[..., 3:] < _OPAQUE).any():
                 return []
     return with_alpha
 

@@ -92,6 +92,14 @@ def load(
     if opaque:
         report.append(f"alpha is 1 all over {counted(len(opaque), 'image')}: they count as images without alpha")
     report += [*notes_on_lenses(shots), *notes_on_images(shots, heads), *doubts]
+    with_alpha = sum(heads[shot.path].has_alpha for shot in shots)
+    if 0 < with_alpha < len(shots):
+        background = "white" if 2 * with_alpha >= len(shots) else "black"
+        report.append(f"{with_alpha} of {len(shots)} images have transparency: the background of all is {background}")
+    taught = {shot.path for shot in found.train}
+    both = sum(shot.path in taught for shot in found.test)
+    if both:
+        report.append(f"{counted(both, 'test image')} used for training, too: they do not show what new views are like")
     if found.points is None and not any(picture.has_alpha for picture in train):
         report.append("there are no points: splats start anywhere in view")
     colours = found.points_rgb
@@ -161,6 +169,8 @@ def _find(path: Path, size: tuple[int, int] | None, images: str | None, test_eve
         )
     if model is not None:
         found = replace(found, report=[*found.report, "there is a COLMAP model too, which is not read"])
+    if found.kind == "Blender set" and (path / "transforms.json").is_file():
+        found = replace(found, report=[*found.report, "there is a transforms.json too, which is not read"])
     return found
 
 

@@ -18,7 +18,7 @@ __all__ = ["centre", "describe_outliers"]
 F64 = NDArray[np.float64]
 Origin = tuple[float, float, float]
 
-_NEAR_SIZES = 16.0  # scene sizes; farther from 0, float32 no longer holds the last steps of a training (3e-6 extents)
+_NEAR_SIZES = 256.0  # sizes of the scene; farther from 0, a step of float32 is more than 1.5e-5 of that size
 
 
 def centre(found: Found) -> tuple[Found, Origin]:
@@ -59,7 +59,7 @@ def centre(found: Found) -> tuple[Found, Origin]:
     origin = np.array([x, y, z])
     train, test, val = ([_moved(shot, origin) for shot in part] for part in (found.train, found.test, found.val))
     points = None if found.points is None else found.points - origin
-    words = " ".join(f"{value:.17g}" for value in (x, y, z))
+    words = " ".join(str(value).removesuffix(".0") for value in (x, y, z))
     report = f"coordinates lie far from 0: the scene is measured from its origin, {words}"
     return replace(found, train=train, test=test, val=val, points=points, report=[*found.report, report]), (x, y, z)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Container, Mapping, Sequence
+from pathlib import Path, PurePosixPath
 
 from csplat.errors import InputError, counted
 from csplat.files import read_text
 from csplat_trainer.data.dataset import Shot
-from csplat_trainer.data.image_files import match_names, shown
+from csplat_trainer.data.image_files import match_names, plain, shown
 
 __all__ = ["ROLES", "lists_next_to", "split_every", "split_listed"]
 
@@ -28,7 +28,7 @@ def lists_next_to(folders: Sequence[Path]) -> tuple[dict[str, list[str]], str]:
         folders: to look in; the first that has any counts.
 
     Returns:
-        Names by `train`, `val` and `test`, without quotes, and the files' names.
+        Lines by `train`, `val` and `test`, and the files' names.
 
     Raises:
         InputError: a file is not UTF-8 text.
@@ -39,7 +39,7 @@ def lists_next_to(folders: Sequence[Path]) -> tuple[dict[str, list[str]], str]:
             return _json_lists(document), document.name
         files = {role: path for role in ROLES for path in _files(folder, role)[:1]}
         if files:
-            lists = {role: _names(read_text(path)) for role, path in files.items()}
+            lists = {role: read_text(path).splitlines() for role, path in files.items()}
             return lists, ", ".join(path.name for path in files.values())
     return {}, ""
 
@@ -57,13 +57,18 @@ def _json_lists(path: Path) -> dict[str, list[str]]:
 
 
 def _files(folder: Path, role: str) -> list[Path]:
-    return [path for form in ("{}.txt", "{}_list.txt") if (path := folder / form.format(role)).is_file()]
+    names = {path.name.casefold(): path for path in folder.glob("*.[tT][xX][tT]")}
+    return [names[name] for name in (f"{role}.txt", f"{role}_list.txt") if name in names]
 
 
-def _names(text: str) -> list[str]:
-    """Return the names of a list: one a line, or with commas between them; in quotes, perhaps."""
-    lines = [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    return [name for line in lines for cell in line.split(",") if (name := cell.strip().strip("\"'").strip())]
+def _cells(line: str, known: Container[str]) -> list[str]:
+    """Return the names of a line of a list: the line itself, or what is between commas and in quotes; no comments."""
+    line = line.strip()
+    if line in known or plain(line) in known:
+        return [line]
+    if line.startswith("#"):
+        return []
+    return [name for cell in line.split(",") if (name := cell.strip().strip("\"'").strip())]
 
 
 def split_every(shots: Sequence[Shot], every: int, report: list[str]) -> tuple[list[Shot], list[Shot]]:
@@ -100,7 +105,7 @@ def split_listed(
 
     Args:
         shots: all images.
-        lists: names by `train`, `val` and `test`, of which one is there at least.
+        lists: names, or lines of a file, by `train`, `val` and `test`, of which one is there at least.
         where: the file that has the lists, for messages.
         report: lines are appended on what each list names.
 
@@ -116,7 +121,8 @@ def split_listed(
     for role, word in reversed(ROLES.items()):
         if role not in lists:
             continue
-        names = list(dict.fromkeys(lists[role]))
+        cells = [name for line in lists[role] for name in _cells(line, by_name)]
+        names = list({PurePosixPath(name).as_posix(): name for name in cells}.values())
         found, notes = match_names(names, by_name, where)
         report += notes
         missing = [name for name in names if name not in found]

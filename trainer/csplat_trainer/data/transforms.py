@@ -36,7 +36,7 @@ __all__ = ["read_blender", "read_transforms"]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-_POINT_CLOUDS = ("points3d.ply", "points3D.ply")
+_POINT_CLOUDS = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
 _BLENDER_AXES = "RFU"  # seen from the front: x to the right, y away, z up
 _RATIONAL = "FULL_OPENCV"
 _FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -80,7 +80,7 @@ def read_transforms(path: Path, test_every: int, images: str | None = None) -> F
     """
     document, report = _load(path), list[str]()
     shots = _shots(path, images, report)
-    points, colours = _points(document, path, report)
+    points, colours = _points(document, shots, path, report)
     if "test_frames" in document:  # ScanNet++
         test = _shots(path, images, report, key="test_frames", needed=False)
         return Found("transforms.json set", shots, test, points, colours, report)
@@ -194,7 +194,7 @@ def _is_lost(frame: Mapping[str, Any]) -> bool:
     matrix = frame["transform_matrix"]
     try:
         return matrix is None or not np.isfinite(np.array(matrix, np.float64)).all()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return False  # what it is instead is said later
 
 
@@ -231,11 +231,13 @@ def _masks(frames: Sequence[_Frame], path: Path, report: list[str]) -> dict[str,
     return {name: found.files[mask] for name, mask in named.items()}
 
 
-def _points(document: Mapping[str, Any], path: Path, report: list[str]) -> tuple[F64 | None, F32 | None]:
+def _points(
+    document: Mapping[str, Any], shots: Sequence[Shot], path: Path, report: list[str]
+) -> tuple[F64 | None, F32 | None]:
     """Read the point cloud that nerfstudio's `ply_file_path` names, which has the coordinates of the cameras."""
     name = document.get("ply_file_path")
     if name is None:
-        return None, None
+        return _points_next_to(shots, path.parent, report)
     if not isinstance(name, str):
         raise InputError(f"{path}: ply_file_path is {name!r}, expected a name")
     candidates = (path.parent / name, path.parent / plain(name), path.parent / PurePosixPath(plain(name)).name)
