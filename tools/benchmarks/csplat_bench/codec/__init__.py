@@ -1,1 +1,1 @@
-"""What the codec makes of scenes: throughput, memory, size, quality; how fast decoders are, and whether ours agree."""
+"""Benchmarks of the codec: throughput, memory, size, quality; how fast decoders are, and whether ours agree."""

@@ -1,4 +1,4 @@
-"""Measure `csplat batch` on many small scenes, some of them broken, beside a loop of the shell; end it in the middle.
+"""Measure `csplat batch` on many small scenes, some of them broken, compared with a shell loop; interrupt it midway.
 
     python -m csplat_bench.codec.batch
     python -m csplat_bench.codec.batch --count 40 --broken 4 --splats 500
@@ -131,7 +131,7 @@ def _write_nan(path: Path, model: SplatModel) -> None:
 
 
 def _loop(scenes: Path, out: Path, at_once: int) -> tuple[Any, ...]:
-    """What a shell does; of several at once `xargs -P`."""
+    """Encode the scenes with `csplat encode` in a shell, `at_once` at a time with `xargs -P`; return a table row."""
     out.mkdir()
     program = " ".join(_PROGRAM)
     one = f'n="$(basename "$1")"; {program} encode "$1" "{out}/${{n%%.*}}.csplat" --quiet 2>/dev/null || echo failed'
@@ -165,7 +165,7 @@ def _batch(scenes: Path, out: Path, words: Sequence[str], end: End | None) -> tu
 
 
 def _heed_interrupts() -> None:
-    """What a shell starts in the background ignores them, and so does what that starts."""
+    """Restore the default handling of SIGINT: background jobs of a shell, and their children, ignore it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 

@@ -37,19 +37,19 @@ from csplat_tools.views import comparison_cameras
 
 FIGURES = ROOT / "conformance" / "csplat_conformance" / "encoders" / "figures.json"
 PRESETS = ("fast", "balanced", "small")
-_SHOWN = "balanced"  # the preset that the suite shows beside others
-_DIGITS = 2  # of dB
+_SHOWN = "balanced"  # preset of our encoder that the table compares with others
+_DIGITS = 2  # decimals of values in dB
 
 Figures = dict[str, float | int | None]
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What was made of an input.
+    """The files made of an input.
 
     Attributes:
-        ours: by preset; none where ours refuses it.
-        spz: `None` where there is no file.
+        ours: figures by preset; empty if csplat refuses the input.
+        spz: figures of the SPZ; `None` if there is no file.
     """
 
     ours: dict[str, Figures]

@@ -17,12 +17,12 @@ __all__ = ["Run", "encoded"]
 
 @dataclass(frozen=True)
 class Run:
-    """What encoding takes.
+    """Time and memory of encoding.
 
     Attributes:
         seconds: median of the runs.
-        growth_bytes: what the first run made the process grow by.
-        array_bytes: of the scene's arrays.
+        growth_bytes: growth of the process during the first run.
+        array_bytes: size of the scene's arrays.
     """
 
     seconds: float

@@ -1,1 +1,1 @@
-"""What several benchmarks share: scenes, clocks, peers, command lines, rows that are kept, tables."""
+"""Code shared by several benchmarks: scenes, clocks, peers, command lines, stored results, tables."""

@@ -25,7 +25,7 @@ _TOLD = 5  # lines of progress of a training
 
 
 class Training(TypedDict, total=False):
-    """How splats were trained; empty where that is not known."""
+    """A record of how splats were trained; empty if unknown."""
 
     options: dict[str, Any]
     seconds: float
@@ -38,7 +38,7 @@ class Capture:
     """A scene with its photographs.
 
     Attributes:
-        name: what tables and files call it.
+        name: name in tables and file names.
         data: the data set.
         size: width and height of the photographs; `None`: as they are.
         ply: the splats; `None`: they are trained by `training`.
@@ -131,7 +131,7 @@ def trained(capture: Capture, out: Path) -> tuple[Path, Training]:
 
 
 def train_to(ply: Path, data: DataSet, options: TrainOptions) -> Training:
-    """Train a scene and write its PLY, and beside that how it was trained."""
+    """Train a scene and write its PLY and, next to it, how it was trained."""
     every = max(1, options.iterations // _TOLD // options.log_every) * options.log_every
 
     def show(now: TrainingStep) -> None:
@@ -150,7 +150,7 @@ def train_to(ply: Path, data: DataSet, options: TrainOptions) -> Training:
 
 
 def read_training(ply: Path) -> Training:
-    """How a PLY was trained."""
+    """Return how a PLY was trained, from the JSON file next to it; empty if there is none."""
     path = ply.with_suffix(".training.json")
     if not path.exists():
         return {}

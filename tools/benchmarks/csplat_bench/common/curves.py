@@ -10,7 +10,7 @@ from itertools import pairwise
 __all__ = ["Point", "Rate", "Series", "bracket", "bytes_between", "front", "psnr_at", "rate_at"]
 
 _WINDOW = 2.0  # dB on either side of a goal in which a point has to lie for a straight line to be trusted
-_BESIDE = 0.4  # dB beside a goal at which a point is aimed
+_BESIDE = 0.4  # dB: points are aimed this far from a goal
 _SLOPES = (0.1, 2.0)  # dB of PSNR per dB of quality that are believed
 _LEAST_RATE = 0.03  # share of the bytes that a decibel costs, at least
 _CLOSE = 0.02  # dB of quality that change nothing any more
@@ -34,17 +34,17 @@ class Point:
     seconds: float = 0.0
 
 
-Series = Mapping[str, Sequence[Point]]  # by what was chosen beside the quality
+Series = Mapping[str, Sequence[Point]]  # by the settings other than the quality
 
 
 @dataclass(frozen=True)
 class Rate:
-    """What files of a PSNR take.
+    """Size of files at a given PSNR.
 
     Attributes:
-        size_bytes: interpolated; or of a file that is better than what was asked.
+        size_bytes: interpolated size, or the size of a file with a higher PSNR than the given one.
         how: name of the series.
-        measured: PSNR of that file, dB, where nothing was interpolated.
+        measured: PSNR of that file, dB, if nothing was interpolated.
     """
 
     size_bytes: float
@@ -171,7 +171,11 @@ def _expected(points: Sequence[Point], goal: float) -> float:
 
 
 def _quality_for(points: Sequence[Point], psnr: float, start: float) -> float:
-    """Where the straight line through the two points nearest to a PSNR reaches it; a slope of 1 through one."""
+    """Return the quality at which the line through the two points nearest to a PSNR reaches it.
+
+    With one point, or two of equal quality, the slope is 0.8 dB per dB; slopes are clamped to `_SLOPES`.
+    Without points the result is `start`.
+    """
     if not points:
         return start
     near = sorted(points, key=lambda one: abs(one.psnr - psnr))

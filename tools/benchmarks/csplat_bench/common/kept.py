@@ -1,4 +1,4 @@
-"""What was measured of a scene, on disk after each measurement: a run that is interrupted goes on where it ended."""
+"""Store the measurements of a scene on disk, one by one: an interrupted run continues where it stopped."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class Kept:
     """Results of a scene by kind and name. Owns the file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         settings: whatever results depend on, JSON-compatible.
         again: forget what is there.
 
     Raises:
-        InputError: what is on disk was measured with other settings.
+        InputError: the results on disk were measured with other settings.
     """
 
     def __init__(self, path: Path, settings: Mapping[str, object] | None = None, *, again: bool = False) -> None:
@@ -44,7 +44,7 @@ class Kept:
                 )
 
     def knows(self, kind: str, key: str) -> bool:
-        """Whether that was measured."""
+        """Return True if this has been measured."""
         return key in self.values.get(kind, {})
 
     def measure(self, kind: str, key: str, call: Callable[[], T]) -> T:
@@ -63,7 +63,7 @@ class Kept:
 
 
 def read_kept(folder: Path) -> dict[str, Any]:
-    """All that is known in a folder, by scene; what trainings keep beside it left out."""
+    """Return all results in a folder, by scene, without the `.training.json` files."""
     files = [path for path in sorted(folder.glob("*.json")) if not path.name.endswith(".training.json")]
     return {path.stem: json.loads(path.read_text("utf-8")) for path in files}
 

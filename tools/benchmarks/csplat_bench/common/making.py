@@ -36,7 +36,7 @@ def blow_up(model: SplatModel, count: int, seed: int = 0) -> SplatModel:
 
 
 def copies(model: SplatModel, count: int, seed: int = 0) -> Iterator[SplatModel]:
-    """What `blow_up` puts together, copy by copy; the rest as there."""
+    """Yield the copies that `blow_up` puts together, one by one; see there for the arguments."""
     rng = np.random.default_rng(seed)
     low, high = np.quantile(model.means, (0.01, 0.99), axis=0)
     many = math.ceil(count / len(model))

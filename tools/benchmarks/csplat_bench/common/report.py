@@ -1,4 +1,4 @@
-"""What benchmarks print and write: tables for a terminal or a document, the machine, JSON."""
+"""Output of benchmarks: tables for a terminal or a document, the machine's description, JSON."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from csplat_tools.tradeoffs.machine import describe_machine
 
 __all__ = ["Machine", "Table", "describe", "laid_out", "machines", "optional", "table", "tell_machine", "write_json"]
 
-#: What figures were taken on, in lines by name.
+#: The machine that figures were taken on: descriptions by name.
 Machine = dict[str, str]
 
 

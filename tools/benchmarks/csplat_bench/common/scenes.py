@@ -98,11 +98,11 @@ class Scene:
 
 
 def find_scenes(names: Sequence[str], cache: Path = MADE, extra: Sequence[Path] = ()) -> list[Scene]:
-    """Find or make scenes; those that are absent are told of on standard error.
+    """Find or make scenes; absent ones are reported on standard error.
 
     Args:
         names: in this order.
-        cache: folder for those that have to be made.
+        cache: folder for scenes that have to be made.
         extra: PLYs of others, which come after them.
     """
     cache.mkdir(parents=True, exist_ok=True)
@@ -115,7 +115,7 @@ def find_scenes(names: Sequence[str], cache: Path = MADE, extra: Sequence[Path] 
 
 
 def _path(name: str, cache: Path) -> Path | None:
-    """Where a scene lies, once it was made; `None` where it or what it is made of is absent."""
+    """Return the path of a scene, made if necessary; `None` if neither it nor its source exists."""
     made = cache / f"{name}.ply"
     if name in _SOG:
         source = DATA / "sog" / _SOG[name]

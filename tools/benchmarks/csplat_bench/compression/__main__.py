@@ -164,7 +164,7 @@ def _measure(
 
 
 def _measure_memory(scene: Capture, counts: Sequence[int], preset: str, out: Path) -> None:
-    """Of the command as it is: what the encoder is told hardly matters."""
+    """Measure the peak memory of `csplat finetune` by number of splats, with default encoder options."""
     ply, _ = trained(scene, out)
     kept = Kept(out / f"{_MEMORY}.json", {"scene": scene.name, "preset": preset})
     kept.values["machine"] = tell_machine()

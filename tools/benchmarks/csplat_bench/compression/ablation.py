@@ -23,7 +23,7 @@ def ablation(bench: Bench, tuned: Tuned) -> list[Step]:
 
     Args:
         bench: the scene.
-        tuned: what came of all of them.
+        tuned: the result with all of them.
 
     Returns:
         A row for each; its size is as `sizes` counts it.
@@ -84,7 +84,7 @@ def _served_shapes(
 
 
 def _as_model(frozen: Frozen, held: FreeValues) -> SplatModel:
-    """What a decoder will see, from memory."""
+    """Return the model that a decoder will reconstruct, without writing a file."""
     seen, model = frozen.seen(held), frozen.draft.model
     shN = np.zeros_like(model.shN)
     shN[:, : seen.shN.shape[1]] = seen.shN
@@ -102,7 +102,7 @@ def _unordered(frozen: Frozen, held: FreeValues) -> EncodeResult:
 
 
 def _same_set(one: SplatModel, other: SplatModel) -> bool:
-    """Whether two models hold the same splats, in whatever order."""
+    """Return True if two models hold the same splats, in any order."""
     rows = [
         np.unique(np.concatenate([getattr(model, name).reshape(len(model), -1) for name in ARRAYS], axis=1), axis=0)
         for model in (one, other)

@@ -1,4 +1,4 @@
-"""What a compression is to be held against: the same steps without quantisers, eight bits for every value."""
+"""Controls for the compression: the same steps without quantisers, and eight bits for every value."""
 
 from __future__ import annotations
 

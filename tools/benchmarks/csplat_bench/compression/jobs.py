@@ -26,13 +26,13 @@ Job = tuple[str, str, Callable[[], object]]
 
 @dataclass(frozen=True)
 class Lists:
-    """What is varied.
+    """Values of the parameters that are varied.
 
     Attributes:
-        sizes: entries of both codebooks.
-        escapes: shares of the splats that keep values of their own.
-        bits: of positions, per axis.
-        keep: shares of the splats that are left when a scene is simplified first.
+        sizes: numbers of entries of both codebooks.
+        escapes: shares of the splats that keep values of their own (0 to 1).
+        bits: bits of positions, per axis.
+        keep: shares of the splats that are kept if the scene is simplified first.
     """
 
     sizes: Sequence[int]
@@ -42,7 +42,7 @@ class Lists:
 
 
 def variants(encoding: EncodeOptions, lists: Lists) -> dict[tuple[str, str], EncodeOptions]:
-    """What the encoder is told otherwise, by kind and name of the row.
+    """Return encoder options that differ from the given ones, by kind and name of the row.
 
     Raises:
         InputError: an option is out of its range.
@@ -85,7 +85,7 @@ def _main(bench: Bench, kept: Kept) -> Row:
 
 
 def facts_of(bench: Bench, training: Training) -> Facts:
-    """What tables say of the scene itself, and of its training."""
+    """Return the facts that tables show of the scene and its training."""
     return {
         "splats": len(bench.source),
         "sh_degree": bench.source.sh_degree,

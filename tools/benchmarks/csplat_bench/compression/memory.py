@@ -16,12 +16,12 @@ __all__ = ["finetuned", "measure_memory"]
 
 
 def measure_memory(ply: Path, count: int, words: Sequence[str]) -> Memory:
-    """Tune a scene with so many splats in a process of its own.
+    """Tune a scene with `count` splats in a process of its own.
 
     Args:
         ply: a scene.
         count: splats.
-        words: of the command, but for its input and its output.
+        words: arguments of the command, without input and output.
     """
     with TemporaryDirectory() as folder:
         source, report = Path(folder) / "scene.ply", Path(folder) / "report.json"

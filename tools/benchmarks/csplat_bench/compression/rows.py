@@ -1,4 +1,4 @@
-"""What is kept of a scene that was compressed, as JSON has it."""
+"""Types of the stored results of compressing a scene, as in the JSON file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Scores(TypedDict):
 
 
 class Facts(TypedDict):
-    """What tables say of the scene itself."""
+    """Facts that tables show of the scene itself."""
 
     splats: int
     sh_degree: int
@@ -34,12 +34,12 @@ class Row(TypedDict):
     """A file, before and after tuning.
 
     Attributes:
-        splats: that are left.
-        sh_entries, shapes: of codebooks; 0 where there are none.
+        splats: number of splats kept.
+        sh_entries, shapes: entries of the codebooks; 0 if there are none.
         sh_escapes, shape_escapes: share of the splats that have values of their own.
-        attribute_bytes: of the tuned file.
+        attribute_bytes: size of each attribute in the tuned file.
         seconds: by stage.
-        encoding: what the encoder was told.
+        encoding: options of the encoder.
     """
 
     splats: int

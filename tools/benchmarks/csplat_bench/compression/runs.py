@@ -41,11 +41,11 @@ class Tuned:
 
     Attributes:
         chosen: its splats.
-        frozen: what the encoder decided.
+        frozen: the encoder's decisions.
         held: the values that were tuned.
         plain: the file before tuning. result: the file.
-        log: of the tuning.
-        seconds: by stage, without those of judging.
+        log: log of the tuning.
+        seconds: time by stage, without judging.
     """
 
     chosen: Chosen
@@ -61,11 +61,11 @@ class Bench:
     """Compresses one scene over and over. Owns what all ways have in common, found once.
 
     Args:
-        scene: what is compressed.
-        ply: its splats.
-        encoding: what the encoder is told where a way does not say otherwise.
-        tuning: how is tuned.
-        lpips: weights, or `None`: not measured.
+        scene: the scene that is compressed.
+        ply: path of its splats.
+        encoding: options of the encoder, unless a variant overrides them.
+        tuning: options of the tuning.
+        lpips: weights of LPIPS; `None`: not measured.
     """
 
     def __init__(
@@ -86,12 +86,12 @@ class Bench:
 
     @property
     def threads(self) -> int | None:
-        """How many; `None` for all."""
+        """Number of threads; `None` for all."""
         return self.encoding.threads
 
     @cached_property
     def views(self) -> Views:
-        """What teaches, and what judges on the way."""
+        """Training and validation views of the tuning."""
         return training_views(self.source, self.looks, self.threads)
 
     def chosen(self, keep: float | None = None, *, told: bool = True) -> Pick:
@@ -149,7 +149,7 @@ class Bench:
         return Tuned(chosen, frozen, run.held, plain, result, run.log, {**clock.seconds, "of it shapes": stages.shapes})
 
     def row(self, tuned: Tuned) -> Row:
-        """What came of it: sizes and scores before and after tuning."""
+        """Return the row of a tuned file: sizes and scores before and after tuning."""
         before, after = decode(tuned.plain.data), decode(tuned.result.data)
         assert _same(tuned, after), "the decoded file is not what was tuned"
         scores = self.judge({"before": before, "after": after})
@@ -182,7 +182,7 @@ class Bench:
 
 
 class _Stages:
-    """When the encoder has done with shapes: what it tells while it decides."""
+    """A progress callback that records how many seconds passed until the encoder finished shapes."""
 
     def __init__(self) -> None:
         self._begin, self.shapes = time.perf_counter(), 0.0
@@ -193,7 +193,7 @@ class _Stages:
 
 
 def _same(tuned: Tuned, decoded: SplatModel) -> bool:
-    """Whether a decoded file holds what was tuned, bit for bit."""
+    """Return True if a decoded file equals the tuned values bit for bit."""
     seen = tuned.frozen.seen(tuned.held)
     places = np.argsort(tuned.frozen.source_index)[
         np.searchsorted(np.sort(tuned.frozen.source_index), tuned.result.source_index)

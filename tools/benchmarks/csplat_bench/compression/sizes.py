@@ -1,7 +1,7 @@
-"""What the steps of a compression would take on disk if the pipeline ended there, in bytes.
+"""Sizes on disk, in bytes, that a compression would reach if the pipeline ended after each of its steps.
 
 Before anything is quantised values are floats. A codebook takes its entries, an index per splat, and the values of
-those that escape from it. Integers take whole bytes, each column as many as its range wants; only a file has an order
+those that escape from it. Integers take whole bytes, each column as many as its range needs; only a file has an order
 and an entropy coder.
 """
 
@@ -52,7 +52,7 @@ def float_bytes(splats: int, coefficients: int, colours: Book | None, shapes: Bo
     """Floats, and codebooks of floats.
 
     Args:
-        splats: how many.
+        splats: number of splats.
         coefficients: floats of the SH bands above 0, per splat.
         colours: their codebook, if there is one.
         shapes: that of rotations and scales, whose common factor stays each splat's own.
@@ -75,7 +75,7 @@ def _index_bytes(entries: int) -> int:
 
 
 def integer_bytes(columns: Iterable[NDArray[Any]]) -> int:
-    """Integers [n, C] in whole bytes: a column takes what its range wants, nothing if it is constant."""
+    """Integers [n, C] in whole bytes: a column takes what its range needs, nothing if it is constant."""
     total = 0
     for array in columns:
         if array.size:
@@ -92,7 +92,7 @@ def integer_columns(frozen: Frozen, held: FreeValues) -> Sequence[NDArray[np.int
     """Every integer that the file of some values holds, as arrays [n, C], in no order of meaning.
 
     Args:
-        frozen: what was decided.
+        frozen: the encoder's decisions.
         held: values, constrained.
     """
     plan, seen = frozen.plan, frozen.seen(held)

@@ -30,7 +30,7 @@ def tables(results: Results, memory: Mapping[str, Memory] | None = None, *, mark
     Args:
         results: by scene, what is kept of it.
         memory: by number of splats.
-        markdown: as documents have tables.
+        markdown: format tables in Markdown.
     """
     known = {name: one for name, one in results.items() if "facts" in one}
     parts: list[Table | str] = [_summary(known)]
@@ -117,7 +117,7 @@ def _file_cells(name: str, row: Row, facts: Facts) -> tuple[str, ...]:
 
 
 def _control(one: Known) -> Table:
-    """What as many steps do without quantisers, beside those that tune the file."""
+    """Compare the same number of training steps without quantisers with the steps that tune the file."""
     facts, main = one["facts"]["scene"], one.get("main", {}).get("main")
     lines = []
     for found in one.get("control", {}).values():
@@ -197,5 +197,5 @@ def _of_training(row: Row, facts: Facts) -> str:
 
 
 def _seconds(row: Row) -> float:
-    """Of all that the compression takes; reading and judging left out."""
+    """Return the total time of the compression, without reading and judging."""
     return float(sum(row["seconds"].get(stage, 0.0) for stage in _WORK))

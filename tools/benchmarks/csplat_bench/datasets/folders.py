@@ -17,7 +17,7 @@ from csplat_trainer.data.transforms import read_blender, read_transforms
 
 __all__ = ["TEST_EVERY", "PictureChoice", "SceneFolder", "choose_pictures", "choose_scenes", "find_scene_folders"]
 
-#: Where a set names no test pictures, every so-manieth is one.
+#: If a set does not name its test images, every Nth image is one.
 TEST_EVERY = 8
 
 _DEPTH = 5  # folders below the one that is named
@@ -51,12 +51,12 @@ class SceneFolder:
 
 @dataclass(frozen=True)
 class PictureChoice:
-    """Which pictures of a scene are used.
+    """The images that are used of a scene.
 
     Attributes:
         images: COLMAP: name of the folder; `None`: the smallest that is large enough for `size`.
-        size: width and height that they are brought to; `None`: as they are.
-        protocol_size: what the papers use, as far as it is known; the pictures' own size otherwise.
+        size: width and height that they are resized to; `None`: not resized.
+        protocol_size: size that the papers use, if known; otherwise the images' own size.
         remarks: lines for the user.
     """
 
@@ -69,7 +69,7 @@ class PictureChoice:
 def find_scene_folders(root: Path) -> list[SceneFolder]:
     """Find all scenes that the trainer's readers recognise, in a folder itself or some folders below.
 
-    What looks like a scene and is none is told of.
+    Folders that look like a scene but are none are reported to the user.
 
     Returns:
         Scenes of the benchmark sets first, in the order of their tables.
@@ -152,12 +152,12 @@ def _walk(folder: Path, depth: int) -> Iterator[SceneFolder]:
 
 
 def _is_part(name: str) -> bool:
-    """Whether a folder is hidden, or part of a COLMAP model rather than a scene."""
+    """Return True if a folder is hidden, or part of a COLMAP model rather than a scene."""
     return name.startswith(".") or name in ("sparse", "colmap", "distorted")
 
 
 def _kind(folder: Path) -> str | None:
-    """How a folder is laid out, in the order in which `csplat_trainer.data.load` looks; `None`: no scene."""
+    """Return a folder's layout, tested in the order used by `csplat_trainer.data.load`; `None` if it is not a scene."""
     if (folder / "transforms_train.json").is_file():
         return BLENDER
     if (folder / "transforms.json").is_file():

@@ -41,14 +41,14 @@ _INRIA_SPLAT_BYTES = 248  # in the published code's PLY: 62 floats
 
 @dataclass(frozen=True)
 class Published:
-    """What a paper prints; `None`: it does not.
+    """Figures printed in a paper; `None` if it does not print one.
 
     Attributes:
-        psnr: mean over the test pictures, dB.
-        ssim: the same.
-        lpips_vgg: the same, VGG backbone.
-        size_mb: of the file, as printed.
-        train: time of training, as printed.
+        psnr: mean over the test images, dB.
+        ssim: mean over the test images.
+        lpips_vgg: mean over the test images, VGG backbone.
+        size_mb: size of the file in MB, as printed.
+        train: training time, as printed.
     """
 
     psnr: float | None = None
@@ -63,7 +63,7 @@ class Protocol:
     """A benchmark set.
 
     Attributes:
-        name: as papers call it.
+        name: name in the papers.
         slug: for file names.
         kind: layout on disk, `COLMAP` or `BLENDER`.
         factors: scene → by how much its pictures are scaled down: 4 stands for the folder `images_4`.

@@ -1,4 +1,4 @@
-"""What is kept of a benchmark scene, as JSON has it."""
+"""Types of the stored results of a benchmark scene, as in the JSON file."""
 
 from __future__ import annotations
 

@@ -26,21 +26,21 @@ from csplat_trainer.options import TrainOptions
 
 __all__ = ["PLY", "Settings", "run_scene"]
 
-#: What the trained scene is called among its compressed ones.
+#: Name of the trained scene among its compressed files.
 PLY = "PLY"
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the command line asks for.
+    """Settings from the command line.
 
     Attributes:
-        training: how scenes are trained.
-        size: exact size of all pictures, or `None`.
-        downscale: sides of the papers' pictures are divided by this.
-        presets: of the encoder.
-        force: train again what is trained.
-        rescore: encode and score again what is scored.
+        training: options for training scenes.
+        size: exact width and height of all images, or `None`.
+        downscale: divisor of the width and height that the papers use.
+        presets: presets of the encoder.
+        force: train scenes again that are already trained.
+        rescore: encode and score files again that are already scored.
     """
 
     training: TrainOptions

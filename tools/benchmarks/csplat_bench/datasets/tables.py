@@ -53,7 +53,7 @@ def means_table(records: Sequence[Record], *, markdown: bool) -> str:
 
 
 def notes(records: Sequence[Record]) -> list[str]:
-    """What a reader must know before comparing these figures with published ones; nothing where none are printed."""
+    """Return what a reader must know before comparing these figures with published ones; empty if none are printed."""
     known = [one for one in records if one["set"] != OTHER.slug]
     if not known:
         return []

@@ -1,1 +1,1 @@
-"""Bytes at equal quality: beside other formats, with and without grades, and for those who download."""
+"""Bytes at equal quality: compared with other formats, with and without quantisation classes, and for downloads."""

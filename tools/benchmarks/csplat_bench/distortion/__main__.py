@@ -1,4 +1,4 @@
-"""Measure rate against distortion beside SPZ and SOG: bytes at equal PSNR, without and with simplification.
+"""Measure rate against distortion, compared with SPZ and SOG: bytes at equal PSNR, with and without simplification.
 
     python -m csplat_bench.distortion plain                       # peers, and files of whole scenes; half an hour
     python -m csplat_bench.distortion simplified                  # files of simplified scenes; an hour
@@ -72,7 +72,7 @@ _GRID_FAR = (-16.0, -12.5)  # likewise, without SH, where SPZ is far above what 
 
 
 class Part(StrEnum):
-    """What is measured."""
+    """The stages that the command line can name."""
 
     plain = "plain"
     simplified = "simplified"
@@ -122,7 +122,7 @@ def main(
 
 @dataclass(frozen=True, eq=False)
 class _Bench:
-    """A scene, what is known of it, and who judges."""
+    """A scene, its stored results, and the judge of its files."""
 
     scene: Scene
     source: SplatModel
@@ -131,7 +131,7 @@ class _Bench:
 
     @cached_property
     def importance(self) -> Importance | None:
-        """What training cameras say, or virtual views of an object; None inside of surroundings without cameras."""
+        """Importance by the cameras stored next to the scene, else by virtual views if it is an object, else None."""
         beside = self.scene.path.with_suffix(".cameras.json")
         given = str(beside) if beside.exists() else None
         if given is None and scene_frame(self.source).kind != "object":
@@ -141,7 +141,7 @@ class _Bench:
 
     @property
     def known(self) -> Measured:
-        """What has been measured."""
+        """The results measured so far."""
         return Measured(self.kept.values)  # type: ignore[arg-type]  # as this module keeps it
 
     @property

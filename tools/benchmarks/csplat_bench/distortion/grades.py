@@ -1,11 +1,11 @@
-"""Measure what grades are worth: bytes at equal PSNR with and without, by who says how precise splats have to be.
+"""Measure what quantisation classes save: bytes at equal PSNR with and without, by source of the importance.
 
     python -m csplat_bench.distortion.grades                       # six scenes; ten minutes on two cores
     python -m csplat_bench.distortion.grades --scenes fox60k_noreg --markdown
 
-Who measures: virtual views, as for a target; or every other camera that a scene was trained with. Who judges: the
-cameras of the data folder; or the other half of the training cameras. Nobody judges what the same cameras measured. SH
-is left out of scenes that have it: its coding is another matter.
+Importance is measured by virtual views, as for a target, or by every other camera that a scene was trained with. PSNR
+is judged by the cameras of the data folder, or by the other half of the training cameras: never by the cameras that
+measured the importance. SH is left out of scenes that have it: its coding is another matter.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def _file(source: SplatModel, quality: float, importance: Importance | None = No
 def _shares(
     source: SplatModel, views: Sequence[Camera], even: Sequence[bytes], graded: dict[str, tuple[str, list[bytes]]]
 ) -> dict[str, tuple[str, list[str]]]:
-    """What part of the bytes of even files the graded ones take, at their own PSNR, as these views judge."""
+    """Return the size of graded files relative to even ones at the same PSNR, judged by these views."""
     judge = Judge.of_source(source, views, BLACK)
 
     def point(data: bytes) -> Point:

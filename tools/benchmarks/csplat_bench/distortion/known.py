@@ -1,4 +1,4 @@
-"""What is known of a scene, and what others were found to take elsewhere."""
+"""Stored results of a scene, and figures of other formats on other scenes."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from csplat_bench.common.report import Machine
 
 __all__ = ["FIGURES", "GRADED", "Figure", "KeptPoint", "Measured", "Simplified", "Values", "point_of"]
 
-#: What names of series begin with whose splats are graded by what views say.
+#: Prefix of the names of series whose splats are in quantisation classes by measured importance.
 GRADED = "graded"
 
 
 @dataclass(frozen=True)
 class Figure:
-    """What a format was found to take on other scenes: bytes per splat, and PSNR where it was taken."""
+    """A format's figures on other scenes: bytes per splat, and PSNR if it was measured."""
 
     name: str
     bytes_per_splat: tuple[float, float]
@@ -24,7 +24,7 @@ class Figure:
 
     @property
     def short(self) -> str:
-        """The name, as a plot has room for it."""
+        """The name, abbreviated to fit into a plot."""
         return self.name.replace("splat-transform", "s.-t.")
 
 
@@ -70,11 +70,13 @@ class Simplified(TypedDict, total=False):
 
 
 class Values(TypedDict, total=False):
-    """What is kept of a scene.
+    """Stored results of a scene.
 
     Attributes:
-        cameras: those that judge.
-        peers: by format. plain: by preset and coding of SH. simplified: by dB beside SPZ, or by dB.
+        cameras: cameras that judge: "given" or "virtual".
+        peers: files of other formats, by format.
+        plain: files of the whole scene, by preset and coding of SH.
+        simplified: files of simplified scenes, by dB relative to SPZ, or by dB.
     """
 
     machine: Machine
@@ -88,7 +90,7 @@ class Values(TypedDict, total=False):
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """What is known of a scene, as it is kept."""
+    """The results measured for a scene."""
 
     values: Values
 
@@ -99,7 +101,7 @@ class Measured:
 
     @property
     def has_sh(self) -> bool:
-        """Whether there is more than degree 0."""
+        """True if the scene has SH above degree 0."""
         return self.values["sh_degree"] > 0
 
     def plain(self) -> Series:
@@ -107,7 +109,7 @@ class Measured:
         return {how: [point_of(one) for one in points] for how, points in self.values.get("plain", {}).items()}
 
     def unmeasured(self) -> Series:
-        """Those of them that the encoder made without having seen a picture."""
+        """Files of the whole scene that were encoded without measuring importance in renders."""
         return {how: points for how, points in self.plain().items() if not how.startswith(GRADED)}
 
     def simplified(self) -> Series:
@@ -119,9 +121,9 @@ class Measured:
         }
 
     def simplified_rate(self, psnr: float) -> Rate | None:
-        """What files of a PSNR take where splats may go; to leave a scene whole is one way of simplifying.
+        """Return the rate at a PSNR if splats may be pruned; keeping the whole scene is one way of simplifying.
 
-        `None` where none was simplified to that PSNR.
+        `None` if no file was simplified to that PSNR.
         """
         simplified = self.simplified()
         if rate_at(simplified, psnr) is None:

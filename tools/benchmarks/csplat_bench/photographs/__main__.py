@@ -145,7 +145,7 @@ def _said(words: Sequence[str], folder: Path) -> str:
 
 
 def _scores(model: SplatModel, data: DataSet, lpips: Lpips | None) -> dict[str, float | None]:
-    """Of the held-out photographs."""
+    """Return the scores of a model on the held-out photographs."""
     found = photograph_judge(data.test, data.background, origin=(0.0, 0.0, 0.0)).scores(model, lpips=lpips)
     return {score: getattr(found, score) for score in ("psnr_mean", "psnr", "ssim", "lpips")}
 

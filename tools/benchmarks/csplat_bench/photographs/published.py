@@ -1,4 +1,4 @@
-"""What others published of a scene: figures of the files that they made of the same photographs."""
+"""Published figures of other methods: files made from the same photographs of a scene."""
 
 from __future__ import annotations
 

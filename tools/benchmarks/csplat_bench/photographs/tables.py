@@ -1,4 +1,4 @@
-"""What came of photographs: a table and a plot, beside published figures."""
+"""Tables and plots of files made from photographs, next to published figures."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def _row(name: str, one: Mapping[str, Any]) -> list[str]:
 
 
 def _series(one: Mapping[str, Any]) -> tuple[str, str | None]:
-    """What a file is drawn with: those that were made by the same command, without the same thing."""
+    """Return the plot series of a file: the command that made it, and what it is made without."""
     return one["by"], one.get("without")
 
 

@@ -1,1 +1,1 @@
-"""What pictures, their gradients and the removal of splats cost."""
+"""Benchmarks of rendering, gradients, and the removal of splats."""

@@ -1,7 +1,7 @@
-"""Measure the removal of splats: what is left of a scene, by method; and what the pass costs that says in which order.
+"""Measure the removal of splats: quality by method and share removed, and the cost of the pass that orders the splats.
 
     python -m csplat_bench.rendering.removal removal --scenes plane3,donut      # PSNR by share removed and method
-    python -m csplat_bench.rendering.removal pass                               # the pass beside a render
+    python -m csplat_bench.rendering.removal pass                               # the pass compared with a render
     python -m csplat_bench.rendering.removal tables                             # print what was measured
 
 What was measured is kept scene by scene in out/removal/NAME.json: a run that is interrupted goes on where it ended.
@@ -47,7 +47,7 @@ _PASS_VIEWS = 24
 
 
 class Part(StrEnum):
-    """What is measured."""
+    """The parts that the command line can name."""
 
     removal = "removal"
     passes = "pass"
@@ -55,13 +55,13 @@ class Part(StrEnum):
 
 
 class Left(TypedDict, total=False):
-    """What is left of a scene; fitted only where splats go by `rounds`.
+    """Quality after removing splats; the fit is measured only for the method `rounds`.
 
     Attributes:
-        psnr: dB.
-        seconds: of the order.
-        views: that taught.
-        fit_*: what is left was fitted; used, check: by the views that taught, and others.
+        psnr: dB, before a fit.
+        seconds: time to find the order of removal.
+        views: number of training views.
+        fit_*: the same after fitting the kept splats; `fit_used`, `fit_check`: PSNR on the training and on other views.
     """
 
     psnr: float

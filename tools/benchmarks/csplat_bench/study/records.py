@@ -1,4 +1,4 @@
-"""What is kept of a scene that strategies were tried on, as JSON has it."""
+"""Types of the stored results of the study's strategies on a scene, as in the JSON file."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class Measured(Scored):
     """A line of a table.
 
     Attributes:
-        splats: that are left.
-        study_bytes: by the published rule.
-        csplat_bytes, file_psnr_mean, file_psnr_std: of the file, decoded.
-        books: by attribute, entries of each codebook and the share of the variance that is lost.
-        strategy_seconds, encode_seconds, seconds: of the strategy, of encoding, in all.
+        splats: number of splats kept.
+        study_bytes: size by the published rule.
+        csplat_bytes, file_psnr_mean, file_psnr_std: size of the .csplat file, and scores of what it decodes to.
+        books: by attribute, the entries of each codebook and the share of the variance that it loses.
+        strategy_seconds, encode_seconds, seconds: time of the strategy, of encoding, and in total.
     """
 
     how: How
@@ -57,14 +57,14 @@ class Measured(Scored):
 
 
 class Survivors(Scored):
-    """What is left at a threshold of opacity."""
+    """Splats that survive a threshold of opacity, and their scores."""
 
     tau: float
     splats: int
 
 
 class Facts(TypedDict):
-    """What tables say of a scene; `how` and what is said of its training are `None` where it was at hand."""
+    """Facts that tables show of a scene; `how`, `training_seconds` and `training` are `None` for a given scene."""
 
     splats: int
     sh_degree: int

@@ -1,4 +1,4 @@
-"""What the study does to each scene, and what is measured of it."""
+"""The rows of the study: what is done to each scene, and measurements of the results."""
 
 from __future__ import annotations
 

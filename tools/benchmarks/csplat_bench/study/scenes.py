@@ -23,7 +23,7 @@ __all__ = ["BASELINES", "OTHERS", "OWN", "RENDERED", "Subject", "baselines", "la
 
 _LPIPS_WEIGHT = 0.1
 
-#: What the published study trains, and variants of it, by name: how each differs.
+#: The published study's training and variants of it, by name: how each differs.
 BASELINES = {
     "study1k": "fixed 1,000 splats that start at random in the scene's box",
     "study1k-hull": "fixed 1,000 splats that start inside the visual hull of the masks",
@@ -69,11 +69,11 @@ class Subject:
 
 
 def baselines(iterations: int, count: int) -> dict[str, Capture]:
-    """How the baseline and its variants are trained.
+    """Return how the baseline and its variants are trained, by name.
 
     Args:
         iterations: 7,000 as published.
-        count: of splats, 1,000 as published.
+        count: number of splats, 1,000 as published.
     """
     plain = TrainOptions(max_splats=count, sh_degree=1, iterations=iterations, strategy="none", init="box")
     how = {

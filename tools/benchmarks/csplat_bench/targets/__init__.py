@@ -1,1 +1,1 @@
-"""What targets give, beside presets, fixed shares of the splats, and another build."""
+"""Benchmarks of targets, compared with presets, fixed shares of the splats, and another build."""

@@ -1,4 +1,4 @@
-"""Measure what targets give: bytes, PSNR and seconds, beside presets, fixed shares of the splats, and another build.
+"""Measure targets: bytes, PSNR and seconds, compared with presets, fixed shares of the splats, and another build.
 
     python -m csplat_bench.targets                                  # what is missing; hours on two cores
     python -m csplat_bench.targets --scenes plane3,donut --psnr 38 --sizes 4,8
@@ -41,7 +41,7 @@ from csplat_tools.views import BLACK
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg,angel,fox120k,st-peter,statue"  # the quick ones first
 _KEEPS = (0.7, 0.5)
-_SEEDS = (1, 2)  # of the judging cameras; targets judge by seed 0
+_SEEDS = (1, 2)  # seeds of the judging cameras; targets themselves use seed 0
 _KEPT = ROOT / "tools" / "benchmarks" / "targets"
 _CSPLAT = str(Path(sys.executable).with_name("csplat"))
 
@@ -91,7 +91,7 @@ def main(
 
 
 def _rows(scene: Scene, psnrs: Sequence[str], sizes: Sequence[str]) -> Iterator[Row]:
-    """What is made of every splat of a scene, what is quick first."""
+    """Yield the files that keep every splat of a scene, the fastest first."""
     for preset in PRESETS:
         yield Row(preset, ["--preset", preset], True)
     for psnr in psnrs:
@@ -129,7 +129,7 @@ def _measure(scene: Scene, rows: Sequence[Row], kept: Kept, name: str, program: 
     for row in missing:
         build["rows"][row.name] = found = _made(program, scene, row, judge)
         if machine != build["machine"]:
-            found["machine"] = machine  # its seconds are not to be compared with those of other rows
+            found["machine"] = machine  # its seconds cannot be compared with other rows
         kept.write()
         tell(f"{scene.name} {name} {row.name}: {json.dumps(found)}")
 

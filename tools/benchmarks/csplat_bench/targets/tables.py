@@ -38,7 +38,7 @@ class File(TypedDict, total=False):
 
 
 class Build(TypedDict):
-    """What a build of the program made, by name."""
+    """The results of one build of the program, by name of the row."""
 
     machine: str
     rows: dict[str, File]
@@ -59,11 +59,11 @@ Results = Mapping[str, Known]
 
 @dataclass(frozen=True)
 class Ratio:
-    """What files take beside those of another build, at the same PSNR.
+    """Size relative to files of another build at the same PSNR.
 
     Attributes:
-        value: their bytes over the other's.
-        guessed: one side had no file, so that 4.5 % of the bytes per dB were taken.
+        value: bytes divided by the other build's.
+        guessed: True if one side had no file, so that 4.5 % of the bytes per dB were assumed.
     """
 
     value: float
@@ -82,7 +82,7 @@ def tables(known: Results, *, markdown: bool) -> str:
 
 
 def kind_of(name: str) -> str:
-    """What rows have in common that differ in nothing but a number: `dB, every splat` of `38 dB, every splat`."""
+    """Return a row's name without its number: `dB, every splat` for `38 dB, every splat`."""
     return " ".join(word for word in name.split() if not word.replace(".", "", 1).isdigit())
 
 
@@ -110,12 +110,12 @@ def at_equal_psnr(before: Rows, now: Rows, name: str) -> Ratio | None:
 
 
 def dominated(rows: Rows) -> dict[str, str]:
-    """Which files another one beats by more than 1 % of the bytes and 0.1 dB, and the smallest that does.
+    """Return files that another one beats by more than 1 % of the bytes and 0.1 dB, each with the smallest that does.
 
-    A file that holds every splat is beaten by others that do.
+    A file that holds every splat is beaten only by others that do.
 
     Args:
-        rows: of a scene and a build, by name.
+        rows: rows of a scene and a build, by name.
     """
     found = {}
     for name, row in _files(rows):
@@ -132,7 +132,7 @@ def dominated(rows: Rows) -> dict[str, str]:
 
 
 def _bytes_tables(known: Results) -> list[Table | str]:
-    """Of each kind of target a table of bytes, PSNRs and ratios, scenes by numbers."""
+    """Return a table of bytes, PSNRs and ratios for each kind of target, scenes by numbers."""
 
     def cell(before: Rows, now: Rows, name: str) -> str:
         sizes = " → ".join(_said(rows, name, lambda row: f"{row['bytes'] / 1e3:.1f}") for rows in (before, now))
@@ -176,7 +176,7 @@ def _number(name: str) -> float:
 
 
 def _said(rows: Rows, name: str, say: Callable[[File], str], *, none: str = "-") -> str:
-    """What is to be said of a file; `none` where there is none."""
+    """Return a cell about a file; `none` if there is no file."""
     row = dict(_files(rows)).get(name)
     return none if row is None else say(row)
 
@@ -221,7 +221,7 @@ def _dominated_table(known: Results) -> Table | str:
 
 
 def _failed_table(known: Results) -> Table:
-    """What could not be made, and why."""
+    """Return the table of files that could not be made, and why."""
     lines = [
         (scene, build, name, row["error"])
         for scene, one in known.items()

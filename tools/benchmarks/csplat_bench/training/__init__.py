@@ -1,1 +1,1 @@
-"""What training takes: a step of it, stage by stage; Lego by number of splats."""
+"""Benchmarks of training: a step, stage by stage; Lego by number of splats."""

@@ -23,7 +23,7 @@ from csplat_trainer.starting import scene_of, starting_splats
 
 __all__ = ["STAGES", "Steps", "measured"]
 
-#: Beside `step`, which is all of them, and `CPU`, the seconds of all threads.
+#: In addition to `step`, which is all of them, and `CPU`, the seconds of all threads.
 STAGES = ("forward", "loss", "backward", "Adam", "other")
 
 _DEGREE = 3
@@ -32,14 +32,14 @@ _WARM_SPLATS = 10  # enough to compile what a step runs
 
 @dataclass(frozen=True)
 class Steps:
-    """What a step takes.
+    """Time and memory of training steps.
 
     Attributes:
-        splats: how many.
-        size: of the pictures.
-        seconds: medians, by stage.
-        psnr: on the pictures that taught, dB.
-        memory_bytes: what the process grew by, from the moment that the pictures were read.
+        splats: number of splats.
+        size: width and height of the images.
+        seconds: median time by stage.
+        psnr: on the training images, dB.
+        memory_bytes: growth of the process after the images were read.
     """
 
     splats: int

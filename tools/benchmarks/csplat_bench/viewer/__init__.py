@@ -1,1 +1,1 @@
-"""What the viewer takes, in a browser, and the JavaScript decoder, in Node.js."""
+"""Benchmarks of the viewer, in a browser, and of the JavaScript decoder, in Node.js."""

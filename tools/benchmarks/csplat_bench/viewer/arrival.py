@@ -51,7 +51,7 @@ from csplat_render.metrics import psnr
 _GOOD = 25.0  # dB
 _SMALL = (120, 160)  # rows and columns of what is looked at, as pages/arrival.mjs has them
 _BLACK = 8  # no component of a black picture is larger
-_STILL_SECONDS, _FRAMES = 1.5, 5  # for so long, and so many frames, the finished picture stays the same
+_STILL_SECONDS, _FRAMES = 1.5, 5  # seconds and frames for which the finished picture stays the same
 _PATIENCE = 180.0  # seconds
 _POLL_MS = 100
 
@@ -82,7 +82,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class Seen:
-    """What was seen of a scene in one run; the moments of the pictures that the head of this module names."""
+    """The moments at which a scene could be seen in one run, as this module's docstring defines them."""
 
     first: Moment
     good: Moment
@@ -108,7 +108,7 @@ class Watched:
 
     @property
     def shown(self) -> tuple[int, int, int]:
-        """Which pictures are the first, the first that is near the finished one, the finished one."""
+        """Indices of three frames: the first that is not black, the first near the finished one, the finished one."""
         finished = self.pictures[-1].astype(np.float32) / 255.0
         first = int(np.argmax((self.pictures > _BLACK).any((1, 2, 3))))
         good = first
@@ -118,12 +118,12 @@ class Watched:
 
     @property
     def seen(self) -> Seen:
-        """When they came."""
+        """The moments at which these frames appeared."""
         first, good, whole = (self.at(picture) for picture in self.shown)
         return Seen(first, good, whole, sum(size for _, size in self.sent))
 
     def at(self, picture: int) -> Moment:
-        """When a picture was there."""
+        """Return when a frame was there: milliseconds since the first request, and the bytes sent by then."""
         when = self.times[picture]
         return Moment(1e3 * (when - self.begun), sum(size for moment, size in self.sent if moment <= when))
 

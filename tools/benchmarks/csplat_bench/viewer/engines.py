@@ -104,7 +104,7 @@ def _opened(
 
 @contextmanager
 def _places(source: Path) -> Iterator[dict[str, str]]:
-    """Where the scene can be opened: names and addresses."""
+    """Yield the addresses at which the scene can be opened, by name."""
     with tempfile.TemporaryDirectory() as folder, open_scene(str(source), preset="fast") as scene:
         page = Path(folder, "page.html")
         page.write_bytes(export_page(scene.read(), scene.name).page)

@@ -16,7 +16,7 @@ from csplat_bench.common.scenes import Scene
 
 __all__ = ["FORMS", "Form", "size_of"]
 
-_LEVELS = ("25%", "6%")  # of the splats, below the finest one
+_LEVELS = ("25%", "6%")  # shares of the splats in the levels below the finest
 
 #: Writes a scene into an empty folder, gives the file that viewers open; the words are those that run splat-transform.
 Writer = Callable[[Scene, Path, Sequence[str]], Path]

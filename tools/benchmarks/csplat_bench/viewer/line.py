@@ -1,4 +1,4 @@
-"""A slow line from a server to a browser: so many bits a second over all connections, a while before each answer."""
+"""A slow line from a server to a browser: limited bits per second for all connections together, and a latency."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from csplat_tools.present.server import byte_range
 
 __all__ = ["SLOW", "Line"]
 
-#: What lies in this folder of a served one comes over the line, everything else as fast as it goes.
+#: Files in this folder of a served one come over the slow line, all others at full speed.
 SLOW = "/scenes/"
 
-_BLOCK_BYTES = 4096  # 3 ms at 10 Mbit/s: connections take turns after so many
+_BLOCK_BYTES = 4096  # bytes after which connections take turns: 3 ms at 10 Mbit/s
 
 
 class Line:
@@ -47,7 +47,7 @@ class Line:
 
     @property
     def quiet_seconds(self) -> float:
-        """How long nobody has asked for anything; 0 while something is on its way."""
+        """Seconds since the last request ended; 0 while one is in progress."""
         with self._lock:
             return 0.0 if self._open else time.time() - self._ended
 
@@ -77,7 +77,7 @@ class Line:
                 self._ended = time.time()
 
     def passed(self, size: int) -> None:
-        """Wait until so many bytes have passed, behind those of others."""
+        """Wait until `size` bytes have passed, behind those of other requests."""
         with self._lock:
             self._free = max(self._free, time.monotonic()) + size / self._bytes_per_second
             wait = self._free - time.monotonic()

@@ -40,13 +40,13 @@ _HEADER = (
 
 @dataclass(frozen=True)
 class Loaded:
-    """What a loader did with a scene.
+    """Measurements of a loader on a scene.
 
     Attributes:
-        splats: that the engine holds.
-        same: picture against the PLY's in the same engine, dB.
-        heap, gpu: bytes per splat.
-        abort: what an ended load rejects with, and after how many ms.
+        splats: number of splats that the engine holds.
+        same: PSNR against the picture of the PLY in the same engine, dB.
+        heap, gpu: bytes per splat on the JavaScript heap and on the GPU.
+        abort: what an aborted load rejects with, and after how many ms.
         damaged: codes of the errors for a flipped bit and a file cut short.
         heap_left, gpu_left: bytes more after twenty loads than after two.
     """
@@ -64,7 +64,7 @@ class Loaded:
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """As the table has them."""
+        """The cells of its table row."""
         left = f"{self.heap_left / 1e6:+.1f}, {self.gpu_left / 1e6:+.1f}"
         numbers = (f"{one:.0f}" for one in (self.heap, self.gpu))
         same = f"{self.same:.1f}"

@@ -60,15 +60,16 @@ _FORMATS = "ply,csplat,gltf,sog,compressed-ply,spz,spz4,splat"
 
 @dataclass(frozen=True)
 class Shown:
-    """What became of a file in an engine.
+    """The picture of a file in an engine, compared with ours.
 
     Attributes:
         engine: its name and version.
-        stands: how its world holds the scene: "upright", "on its head", "on its side"; or why there is no picture.
-        psnr: against ours, dB; against ours by the engine's rules.
-        wrong: the same of the likest of that one mirrored and on its head.
+        stands: how the scene stands in the engine's world: "upright", "on its head", "on its side"; or why there is no
+            picture.
+        psnr: PSNR against our picture, and against ours by the engine's rules, dB.
+        wrong: the best PSNR against the latter mirrored or on its head, dB.
         sh: how far the picture lies on the way from ours without SH to ours, by these rules; 1 where there is none.
-        ply: against that of the PLY in the same engine, dB.
+        ply: PSNR against the picture of the PLY in the same engine, dB.
     """
 
     scene: str
@@ -82,12 +83,12 @@ class Shown:
 
     @property
     def right(self) -> bool:
-        """Whether it is our picture and no other."""
+        """True if the picture is ours: neither mirrored nor on its head, and with its SH."""
         return self.psnr is not None and self.psnr[1] > self.wrong and abs(self.sh - 1.0) < _SH_OFF
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """As the table has them."""
+        """The cells of its table row."""
         found = [] if self.psnr is None else [f"{self.psnr[0]:.1f}", f"{self.psnr[1]:.1f}", f"{self.sh:.2f}"]
         found.append("-" if self.ply is None else f"{self.ply:.1f}")
         seen = found if self.psnr else ("-",) * 4
@@ -175,7 +176,7 @@ def still(page: Any, pause: float = _PAUSE) -> Picture:
 
 
 def stands(placed: SplatModel, world: Sequence[float]) -> str:
-    """How what is up by the axes of a file lies in a world whose y is up."""
+    """Tell how the up direction of a file's axes lies in a world whose y points up."""
     axes = placed.coordinate_system
     up = up_of_axes(USUAL if axes == UNSPECIFIED else axes)
     if up is None:

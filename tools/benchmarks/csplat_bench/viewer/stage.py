@@ -63,9 +63,9 @@ def opened_page(
     Args:
         chromium: the program.
         peers: folder of npm packages.
-        more: packages beside those of the engines, and how their versions begin.
+        more: packages in addition to the engines', and how their versions begin.
         serving: serves a folder, gives its address.
-        webgpu: whether the browser has it.
+        webgpu: whether the browser supports WebGPU.
 
     Yields:
         playwright's page, the folder, its address.
@@ -119,7 +119,7 @@ def looked_at(scene: Scene) -> tuple[SplatModel, Camera]:
 
 
 def placed_in(form: Format, model: SplatModel) -> tuple[SplatModel, Camera]:
-    """What a format makes of a scene's facts, and its camera, along the format's axes."""
+    """Return a scene along a format's axes, and its camera."""
     placed = in_axes(scene_of(model), form.axes).facts if form.axes else model
     return placed, Camera.from_json((placed.cameras or [])[0])
 

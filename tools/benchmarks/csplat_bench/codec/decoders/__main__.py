@@ -56,7 +56,7 @@ from csplat_bench.common.scenes import MADE, NPM, ROOT, Scene, find_scenes
 _SCENES = "lego60k,fox120k,fontaine,fox-1M,donut,donut-1M"
 Start = Callable[[Decoder, Path], Process | Tab]
 
-_WARM_SPLATS = 1_000_000  # after so many, decoded some times, compilers of JavaScript have done their work
+_WARM_SPLATS = 1_000_000  # splats of the warm-up: after several decodings JavaScript is compiled
 _PLACES = "native,python,node,chromium"
 
 
@@ -65,11 +65,11 @@ class Row:
     """A decoder on a file of a scene.
 
     Attributes:
-        scene, splats, sh_degree: of the scene.
-        place, decoder, delivers: as of `Decoder`.
+        scene, splats, sh_degree: name, number of splats and SH degree of the scene.
+        place, decoder, delivers: `place`, `name` and `delivers` of `Decoder`.
         file, file_bytes: its suffix and size.
         first_seconds, seconds: of the first decoding of a process or page; of each run, after many more.
-        array_bytes: of what comes out.
+        array_bytes: size of the decoded arrays.
         growth_bytes: of the process, decoding for the first time.
         ratio: how many times as fast it is as the reference.
     """
@@ -139,7 +139,7 @@ def _files(
 
 @contextmanager
 def _starting(wanted: Sequence[Decoder], chromium: str, peers: Path, folder: Path) -> Iterator[Start]:
-    """What starts decoders on files of a folder; with a browser and a server where one of them wants it."""
+    """Yield a function that starts a decoder on a file of a folder; run a browser and a server if one needs them."""
     if all(one.place != "chromium" for one in wanted):
         yield lambda one, path: Process(one, peers, path)
         return

@@ -35,12 +35,12 @@ _ADAPTER = ROOT / "codec" / "js" / "test" / "adapter.mjs"
 
 
 class Said(TypedDict, total=False):
-    """What a decoder makes of a file, in the words of `codec/js/test/adapter.mjs`.
+    """A decoder's result for a file, as reported by `codec/js/test/adapter.mjs`.
 
     Attributes:
-        arrays: size in bytes and SHA-256 by name.
-        code: of the error with which it refuses the file.
-        defect: how it failed otherwise.
+        arrays: size in bytes and SHA-256 of each array, by name.
+        code: code of the error with which it refuses the file.
+        defect: any other failure.
     """
 
     arrays: dict[str, tuple[int, str]]
@@ -54,7 +54,7 @@ class Compared:
 
     Attributes:
         verdict: in words; begins with DIFFERENT where they do.
-        size_bytes: of all arrays.
+        size_bytes: total size of all arrays.
         sums: SHA-256 by array, of the Python decoder.
     """
 
@@ -64,7 +64,7 @@ class Compared:
 
     @property
     def differs(self) -> bool:
-        """Whether the decoders do not agree."""
+        """True if the decoders disagree."""
         return self.verdict.startswith("DIFFERENT")
 
 

@@ -48,15 +48,15 @@ _LOAD = """async ([timing, module, name, url]) => {
 
 @dataclass(frozen=True)
 class Decoder:
-    """Who decodes.
+    """A decoder that is measured.
 
     Attributes:
         place: native, python, node or chromium.
-        name: as the table has it.
-        files: which it is given, by suffix.
-        delivers: its arrays, in words.
-        driver: what starts it: a program that is built, or a module in JavaScript or Python.
-        word: for the driver: an export of the module, threads, what to deliver.
+        name: name in the table.
+        files: suffixes of the files that it is given.
+        delivers: description of the arrays that it returns.
+        driver: the program (built on demand) or the JavaScript or Python module that runs it.
+        word: argument of the driver: an export of the module, a number of threads, or what to deliver.
     """
 
     place: str
@@ -68,7 +68,7 @@ class Decoder:
 
     @property
     def is_reference(self) -> bool:
-        """Whether it is SPZ's own library, to floats."""
+        """True for SPZ's own library, decoding to floats."""
         return (self.driver, self.word) in {("spz", "floats"), ("others.mjs", "adobe")}
 
 
@@ -209,7 +209,7 @@ class Process:
         return float(seconds), int(size)
 
     def growth_bytes(self) -> int | None:
-        """What it grew by at most, since it was ready; `None` where the kernel does not say."""
+        """Return the largest growth since the process was ready, in bytes; `None` if the kernel does not report it."""
         peak = peak_bytes(self._process.pid)
         return peak - self._before if peak else None
 
