@@ -1,4 +1,4 @@
-"""What a decoder made of a vector, and whether that is what the manifest says.
+"""Compare a decoder's answer for a vector with the manifest.
 
 | level | looks at |
 |---|---|
@@ -35,18 +35,18 @@ FloatsOf = Callable[[str], Mapping[str, NDArray[Any]]]
 
 @dataclass(frozen=True)
 class Answer:
-    """What became of one vector.
+    """A decoder's answer for one vector.
 
     Attributes:
-        status: PASSED where the file was decoded, REFUSED where it was refused, otherwise what went wrong.
+        status: PASSED if the file was decoded, REFUSED if it was refused, otherwise what went wrong.
         message: one line about what went wrong.
-        header: facts of header and index.
+        header: fields of header and index.
         arrays: by `part.name`, as `floats.means`: bytes and SHA-256 of the raw little-endian values.
-        floats: by name, as `means`: the raw values, where they were kept for the class renderer.
+        floats: by name, as `means`: the raw values, if they were kept for the class renderer.
         code: error code of a refusal.
         clause: clause that it names, if any.
-        offset: byte of the file that it names, if any.
-        seconds: how long it took.
+        offset: byte offset in the file that it names, if any.
+        seconds: time it took.
     """
 
     status: Status
@@ -72,9 +72,9 @@ def judge(
 
     Args:
         vector: entry of the manifest.
-        answer: what the decoder did.
-        levels: numbers of the levels that are asked for.
-        exact: of refusals demand code, clause and offset too, and optional refusals: for csplat's own decoders.
+        answer: the decoder's answer.
+        levels: numbers of the levels to check.
+        exact: require refusals to match in code, clause and offset, even optional ones: for csplat's own decoders.
         near: gives the exact floats of a vector, which a decoder of the class renderer need only be near to.
     """
     if vector.error:
@@ -188,7 +188,7 @@ def _compare(vector: Vector, answer: Answer, parts: tuple[str, ...], near: Float
 
 
 def _gravity(status: Status) -> int:
-    """Of several things that are wrong with the arrays of one vector the first of these gives the name."""
+    """Rank a failure of the arrays of one vector: of several, the one with the largest rank is reported."""
     return -[Status.WRONG_ANSWER, Status.PARTIAL_OUTPUT, Status.FAILED].index(status)
 
 

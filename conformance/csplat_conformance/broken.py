@@ -1,4 +1,4 @@
-"""How a recipe breaks a valid file: overwrite its fields, or declare its scene wrong."""
+"""Recipes that break a valid file: they overwrite its fields, or declare its scene wrongly."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def patched(
     """Return a recipe that overwrites fields of a valid file.
 
     Args:
-        name: of the vector.
+        name: name of the vector.
         why: one line.
         clauses: the one that is broken, and others that the vector covers.
         code: error code.
         base: the valid file.
         changes: field to value.
         also: further codes that do as well.
-        at: field that is to blame; the first that changes where left out.
+        at: field that is to blame; by default the first that changes.
         within: byte within that field.
     """
     place = base.fields[at or next(iter(changes))].offset + within
@@ -89,11 +89,11 @@ def cut(
     """Return a recipe that shortens the payload of a file's last chunk; all sizes of the container are right.
 
     Args:
-        name, why, clauses, code: as of `patched`.
+        name, why, clauses, code: as for `patched`.
         base: the valid file.
         size: bytes that are missing at the end.
         at: field that is to blame.
-        changes: field to value, beside the sizes.
+        changes: field to value, in addition to the sizes.
         within: byte within that field.
     """
     chunk, (offset, length) = max(base.spans.items(), key=lambda item: item[1])

@@ -1,4 +1,4 @@
-"""Which clause of the spec is shown by which vector, and why some are shown by none."""
+"""Map the clauses of the spec to the vectors that cover them, with the reason for clauses that none covers."""
 
 from __future__ import annotations
 

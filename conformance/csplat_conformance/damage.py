@@ -29,14 +29,14 @@ _CLAUSES_SHOWN = 6
 
 @dataclass
 class Found:
-    """What became of a number of damaged files.
+    """Statistics of a number of damaged files.
 
     Attributes:
-        what: how they were damaged.
-        count: how many there were.
-        found: how many of them break a clause.
-        clauses: how often each clause was broken.
-        missed: the damages that were not found.
+        what: kind of damage.
+        count: number of files.
+        found: number of files in which the validator finds a violation.
+        clauses: number of violations of each clause.
+        missed: the damages that the validator did not find.
     """
 
     what: str
@@ -69,9 +69,9 @@ def flips(
 
     Args:
         data: a valid file.
-        count: how many; at most as many as there are bits.
-        seed: of the choice.
-        progress: is told the stage and how many are done.
+        count: number of flips, at most the number of bits.
+        seed: seed of the choice.
+        progress: called with the stage and the number that are done.
 
     Returns:
         What was found in the file as it is, and with all checksums repaired.

@@ -1,4 +1,4 @@
-"""What a wrong decoder does wrong, how the Python one is made wrong, and what the suite says of it."""
+"""Mistakes of wrong decoders, ways to plant them in the Python decoder, and the suite's findings."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Mistake:
     """One thing that a decoder does wrong.
 
     Attributes:
-        name: short.
+        name: short name.
         what: what a hurried implementer might do.
-        clause: of the spec, that it breaks.
+        clause: the clause of the spec that it breaks.
         apply: makes the decoder wrong until the stack is closed.
         by: class of decoders (spec 9.2) that it is judged as.
     """
@@ -42,10 +42,10 @@ class Mistake:
 
 @dataclass(frozen=True)
 class Caught:
-    """What the suite says of a wrong decoder.
+    """The suite's findings about a wrong decoder.
 
     Attributes:
-        language: of the decoder.
+        language: language of the decoder.
         mistake: what is wrong with it.
         failed: the checks that failed.
     """

@@ -1,4 +1,4 @@
-"""How far a float of the class renderer may lie from the exact one (spec 9.2, CNF-7)."""
+"""The distance that floats of the class renderer may have from the exact ones (spec 9.2, CNF-7)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def too_far(name: str, found: bytes, wanted: NDArray[Any]) -> str:
     """Return which values lie too far off in words, or nothing.
 
     Args:
-        name: of the array, `means`.
+        name: name of the array, as `means`.
         found: raw values, as many bytes as `wanted` has.
         wanted: float32, exact.
     """

@@ -34,15 +34,15 @@ _WINDOWS_EXCEPTION = 0xC0000000  # least exit status of a Windows program that c
 
 @dataclass(frozen=True)
 class Ended:
-    """How a program ended.
+    """The end of a process.
 
     Attributes:
         status: `CRASHED` by a signal, `HUNG`, `WRONG_STATUS` for anything but 0 and 1; `None` for 0 and 1.
         returncode: exit status, minus the signal's number after a crash.
         stdout: the end of standard output, a mebibyte at most.
         stderr: the end of standard error, likewise.
-        seconds: how long it ran.
-        message: what `status` means here, in words; empty for `None`.
+        seconds: time it ran.
+        message: the meaning of `status` here, in words; empty for `None`.
     """
 
     status: Status | None
@@ -58,8 +58,8 @@ def split_command(command: str, names: tuple[str, ...], optional: tuple[str, ...
 
     Args:
         command: the line.
-        names: that have to stand in it in braces.
-        optional: that may.
+        names: names that must occur in it, in braces.
+        optional: names that may occur.
 
     Raises:
         InputError: quotes without an end, no program, a name in braces that is missing or unknown.
@@ -81,7 +81,7 @@ def run_program(command: str, places: Mapping[str, str], timeout_seconds: float,
 
     Args:
         command: with the keys of `places` in braces.
-        places: what to put in.
+        places: values to insert, by name.
         timeout_seconds: wall-clock limit.
         cwd: working directory. A program with a slash is then still one of this process's own directory, and so are
             words, or what follows the `=` of an option, that look like a path (a slash, or a suffix) and name

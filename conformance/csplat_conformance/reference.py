@@ -1,4 +1,4 @@
-"""What a decoder must return for a scene, straight from the formulae of the spec (sections 6.4.5, 7 and 9.2).
+"""Compute what a decoder must return for a scene, straight from the formulae of the spec (sections 6.4.5, 7 and 9.2).
 
 Python integers and one IEEE operation at a time; slow on purpose, and independent of `csplat.decoder`.
 """

@@ -1,4 +1,4 @@
-"""What became of a run of the suite, for people (a table), for programs (JSON) and for CI (JUnit XML).
+"""Reports of a run of the suite, for people (a table), for programs (JSON) and for CI (JUnit XML).
 
     >>> report = Report("decoder", "my-decoder {input} {outdir}", [
     ...     Outcome("valid/rich", "L2", Status.PASSED, seconds=0.25),
@@ -31,12 +31,12 @@ from typing import Any
 
 __all__ = ["Outcome", "Report", "Status", "to_json", "to_junit", "to_table"]
 
-#: What XML 1.0 cannot hold, not even as a reference.
+#: Characters that XML 1.0 cannot hold, not even as references.
 _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 class Status(StrEnum):
-    """What became of a check. Those from `FAILED` to `REFUSED` are failures."""
+    """The result of a check. The statuses from `FAILED` to `REFUSED` are failures."""
 
     PASSED = "passed"
     WARNED = "warned"  #: passed: legal, and far worse than need be
@@ -54,9 +54,9 @@ class Status(StrEnum):
 
 
 _GOOD = frozenset((Status.PASSED, Status.WARNED, Status.DECLINED, Status.NOT_PROVED, Status.SKIPPED))
-#: What is no failure, and no pass either: JUnit calls these skipped.
+#: Neither failures nor passes: JUnit calls these skipped.
 _OPEN = frozenset((Status.DECLINED, Status.NOT_PROVED, Status.SKIPPED))
-#: What did not come to an answer: JUnit calls these errors.
+#: Checks that came to no answer: JUnit calls these errors.
 _ERRORS = frozenset((Status.CRASHED, Status.HUNG, Status.WRONG_STATUS, Status.NO_OUTPUT, Status.WRONG_ANSWER))
 
 
@@ -65,13 +65,13 @@ class Outcome:
     """One check.
 
     Attributes:
-        name: what was looked at, with its group, `invalid/index_crc`.
-        level: what was asked of it, `L1`.
-        status: what became of it.
-        clauses: ids of the spec: those that are broken, or, where nobody can tell, those that the check covers.
+        name: the vector or input, with its group, `invalid/index_crc`.
+        level: the level that was checked, `L1`.
+        status: the result.
+        clauses: ids of the broken clauses of the spec or, if they are unknown, of the clauses that the check covers.
         code: error code that was reported or found, `E_CRC`.
         message: one line; of a check that passed a remark, if there is one.
-        seconds: how long it took.
+        seconds: time it took.
         details: JSON-compatible facts for programs, such as measured numbers.
     """
 
@@ -86,7 +86,7 @@ class Outcome:
 
     @property
     def good(self) -> bool:
-        """Whether the check did not fail."""
+        """True if the check did not fail."""
         return self.status in _GOOD
 
 
@@ -96,10 +96,10 @@ class Report:
 
     Attributes:
         suite: `decoder` or `encoder`.
-        subject: what was tested: a command line, or words.
+        subject: what was tested: a command line, or a description.
         outcomes: in the order of the run.
         notes: a line each about the run as a whole.
-        extra: statuses that this suite has beside passed, failed and skipped, and that are counted.
+        extra: statuses that this suite counts in addition to passed, failed and skipped.
     """
 
     suite: str
@@ -115,7 +115,7 @@ class Report:
 
     @property
     def passed(self) -> bool:
-        """Whether something was checked and nothing failed."""
+        """True if something was checked and nothing failed."""
         return bool(self.outcomes) and not self.failures
 
     def levels(self) -> dict[str, dict[str, int]]:

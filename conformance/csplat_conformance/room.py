@@ -1,4 +1,4 @@
-"""How far a statement of an error may lie from what it speaks of (spec SER-5, SER-7)."""
+"""The tolerance between a stated error and the measured one (spec SER-5, SER-7)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def room(measure: str, error: float, reach: float) -> float:
     """Return how far two right computations of an error may lie apart (SER-7).
 
     Args:
-        measure: of the registry of stated errors.
+        measure: name in the registry of stated errors.
         error: the error, in the measure's unit.
         reach: largest magnitude of a coordinate of the source or of the file's origin, scene units.
     """
@@ -24,13 +24,13 @@ def room(measure: str, error: float, reach: float) -> float:
 
 
 def may_be_stated(measure: str, stated: float, found: float, reach: float) -> bool:
-    """Whether a file may state this of an error: no less than was found, and hardly more (SER-5).
+    """Return True if a file may state this error: no less than was measured, and hardly more (SER-5).
 
     Args:
-        measure: of the registry of stated errors.
-        stated: maximum or rms, as the file has it.
-        found: the same, as a checker found it.
-        reach: as of `room`.
+        measure: name in the registry of stated errors.
+        stated: maximum or rms in the file.
+        found: the same, as measured by a checker.
+        reach: as for `room`.
     """
     open_ = room(measure, found, reach)
     return found - open_ <= stated <= found * (1.0 + _EXCESS) + _EXCESS_FLOOR + open_
@@ -40,7 +40,7 @@ def least_true(measure: str, stated: float) -> float:
     """Return what an error is at least, of which this may be stated; of centres that are not far from 0.
 
     Args:
-        measure: of the registry of stated errors.
+        measure: name in the registry of stated errors.
         stated: maximum or rms, as the file has it.
     """
     return max(0.0, (stated - _EXCESS_FLOOR - room(measure, 0.0, 0.0)) / (1.0 + _EXCESS + _ROUNDING))

@@ -5,7 +5,7 @@
     True
 
 `run_builtin` calls `csplat.decoder` in this process; `run_command` starts another decoder for each vector, by the
-protocol of `protocol`. What the levels ask for is told in `answers` and `views`.
+protocol of `protocol`. The levels are described in `answers` and `views`.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Choice:
-    """What is run, and how strictly.
+    """Settings of a run: the vectors, and how strictly they are judged.
 
     Attributes:
         pattern: shell patterns of the vectors' names, `valid/sh*,valid/rich`; None for all.
         clause: shell patterns of clauses, `HDR-*,LIM-1`: vectors that cover one of them; None for all.
-        levels: of 1 to 4.
-        exact: of refusals demand code, clause and offset, and optional refusals too: for csplat's own decoders.
-        timeout: seconds for one process.
-        jobs: processes at a time; None for as many as there are processors.
-        by: the class of decoders (spec 9.2) whose rules hold.
+        levels: levels to check, of 1 to 4.
+        exact: require refusals to match in code, clause and offset, even optional ones: for csplat's own decoders.
+        timeout: time limit for one process, seconds.
+        jobs: number of processes at a time; None for the number of processors.
+        by: the class of decoders (spec 9.2) whose rules apply.
     """
 
     pattern: str | None = None
@@ -69,7 +69,7 @@ class Choice:
 
     @property
     def near(self) -> FloatsOf | None:
-        """What floats need only be near to, if not bit for bit."""
+        """The source of exact floats that a decoder's must be near; None if they must be equal bit for bit."""
         return exact_floats if self.by == RENDERER else None
 
 
@@ -92,8 +92,8 @@ def run_builtin(choice: Choice | None = None, progress: Progress | None = None) 
     """Run this package's own decoder over the vectors: code, clause and offset of refusals are demanded of it.
 
     Args:
-        choice: what is run; `exact`, `timeout` and `jobs` do not apply.
-        progress: is told how many vectors are done.
+        choice: settings of the run; `exact`, `timeout` and `jobs` do not apply.
+        progress: called with the number of vectors that are done.
 
     Raises:
         InputError: a pattern of `choice` matches nothing.
@@ -129,7 +129,7 @@ def run_command(
         command: command line of the decoder with `{input}` and `{outdir}`; None to test a renderer alone.
         choice: what is run.
         render: command line of the renderer with `{input}`, `{camera}` and `{out}` or `{outdir}`, for L4.
-        progress: is told how many vectors are done.
+        progress: called with the number of vectors that are done.
 
     Raises:
         InputError: a command line that cannot be run; a pattern of `choice` matches nothing.

@@ -37,11 +37,11 @@ _LAYER_0 = tuple(a for a, layer in _spec.ATTRIBUTE_LAYER.items() if layer == _sp
 
 @dataclass(frozen=True)
 class Stream:
-    """How a stream is coded.
+    """The coding of a stream.
 
     Attributes:
         width: bytes of an element.
-        transforms: registry values, as they stand in the file.
+        transforms: registry values, as in the file.
         coder: `stored`, `deflate_stored`, `deflate_fixed` or `deflate_dynamic`.
         packed: bytes between transforms and coder, in place of the true ones.
         coded: bytes after the coder, in place of the true ones.

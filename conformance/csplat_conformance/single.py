@@ -1,4 +1,4 @@
-"""What a GPU makes of a scene's integers: section 7 in single precision, and how far it lies from the exact values.
+"""Compute what a GPU makes of a scene's integers: section 7 in single precision, and its distance from exact values.
 
 Usage:
     python -m csplat_conformance.single                # all valid vectors, and seeded integers
@@ -34,7 +34,7 @@ F32 = NDArray[np.float32]
 _NEAREST = 0.5
 _NEIGHBOUR = 0.999
 _SMALLEST = 2.0**-126
-_BITS = 24  # of a significand
+_BITS = 24  # bits of a binary32 significand
 _LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -98,12 +98,12 @@ GPUS: Final = {
 
 
 def lattice_values(n: Ints, step: float, exponent: int, gpu: Gpu) -> F32:
-    """Return n, rounded to binary32 once, times s, rounded once; powers of two beside them (7.2, 7.4).
+    """Return n, rounded to binary32 once, times s, rounded once; powers of two next to them (7.2, 7.4).
 
     Args:
         n: int64, within 2^53: made of integers, whatever their size.
-        step: of the attribute's record.
-        exponent: of the tile or block.
+        step: step in the attribute's record.
+        exponent: exponent of the tile or block.
         gpu: arithmetic.
     """
     mantissa, power = math.frexp(math.ldexp(step, exponent))

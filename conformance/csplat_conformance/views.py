@@ -35,7 +35,7 @@ _LEVEL = "L4"
 
 
 def can_render() -> bool:
-    """Whether csplat's renderer can be imported (the extra `render`)."""
+    """Return True if csplat's renderer can be imported (the extra `render`)."""
     return importlib.util.find_spec("numba") is not None
 
 
@@ -47,7 +47,7 @@ def quantised(rgb: NDArray[Any]) -> U8:
 
 def reference_picture(floats: Mapping[str, NDArray[Any]], camera: Mapping[str, Any], antialiased: bool) -> U8:
     """Render the expected arrays of a scene from the equations, in binary64. Needs the extra `render`."""
-    from csplat_render.camera import Camera  # of the extra, which the suite does without
+    from csplat_render.camera import Camera  # in the extra `render`, which the suite can do without
     from csplat_render.twin import render_exact
 
     splats: Any = SimpleNamespace(**floats)

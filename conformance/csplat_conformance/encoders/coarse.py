@@ -1,4 +1,4 @@
-"""What is legal, honest, and so coarse that hardly anyone means it: the suite warns of it, and passes it.
+"""Warn of files that are legal and honest, but coarser than anyone is likely to intend; they still pass.
 
 Centres of the inputs keep a distance (`Input.apart`):
 

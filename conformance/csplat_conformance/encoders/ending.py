@@ -1,4 +1,4 @@
-"""How a run ended, what it left behind, and whether a second one gives the same bytes."""
+"""Judge how a run ended, what it left behind, and whether a second run gives the same bytes."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _with_line(message: str, ended: Ended) -> str:
 
 
 def wrong_habits(first: Trial, again: Trial | None) -> list[Wrong]:
-    """Say what a program that wrote its file did beside it, and how a second run differs from the first (CNF-10).
+    """Say what a program that wrote its file did in addition, and how a second run differs from the first (CNF-10).
 
     Args:
         first: the run that is judged.

@@ -1,4 +1,4 @@
-"""Judge one input level by level; where one fails, those that need it are skipped."""
+"""Judge one input level by level; if one fails, the levels that depend on it are skipped."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ LEVELS = ("L1", "L2", "L3", "L4")
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked of an encoder.
+    """The checks that are requested of an encoder.
 
     Attributes:
-        levels: those wanted; each needs the ones before it, which are judged and not reported.
-        psnr_min: dB, of L4.
-        pictures: judges L4; `None` where nothing renders.
-        no_pictures: why nothing does.
+        levels: levels to report; each depends on the ones before it, which are judged but not reported.
+        psnr_min: lowest PSNR that passes L4, dB.
+        pictures: judge of L4; `None` if nothing can render.
+        no_pictures: why nothing can render.
     """
 
     levels: tuple[str, ...]
@@ -47,7 +47,7 @@ def judge_input(one: Input, first: Trial, again: Trial | None, asked: Asked) -> 
         one: the input.
         first: the run that is judged.
         again: a second one; `None` where the first wrote no file.
-        asked: what is asked.
+        asked: the checks to make.
     """
 
     def outcome(level: str, verdict: Verdict, seconds: float = 0.0) -> Outcome:
@@ -87,11 +87,11 @@ def _judge_pictures(one: Input, scene: Scene, pairs: Pairs, size_bytes: int, alo
 
     Args:
         one: the input.
-        scene: what the file holds.
-        pairs: which splat of the source each of the file's is.
-        size_bytes: of the file.
+        scene: the decoded scene.
+        pairs: the source splat of each decoded splat.
+        size_bytes: size of the file.
         alone: why nothing but pictures can judge it; nothing where errors are proved.
-        asked: what is asked.
+        asked: the checks to make.
     """
     if not one.renders or one.source is None:
         return Verdict(Status.SKIPPED, "pictures of this scene say nothing")

@@ -1,4 +1,4 @@
-"""Which source splat a decoded one stands for: the only one that is near, since the inputs keep them apart."""
+"""Find the source splat of each decoded one: the only one nearby, since the inputs keep splats apart."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 _NONE = -1
-_CELL_MAX = 2.0**40  # centres farther away than so many distances share a cell; distance decides anyway
+_CELL_MAX = 2.0**40  # centres more cells away from the origin than this share a cell; distance decides anyway
 _MIX = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F), np.uint64(0x165667B19E3779F9))
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Who belongs to whom.
+    """Pairs of decoded splats and source splats.
 
     Attributes:
-        source_index: [N], of each decoded splat; −1 where no source splat is near.
+        source_index: [N], the source splat of each decoded splat; −1 if none is near.
         strays: decoded splats without a source.
-        surplus: decoded splats whose source splat another one has taken.
-        missing: source splats that nobody stands for.
-        examples: the first of `strays` and of `surplus`; −1 where there is none.
+        surplus: decoded splats whose source splat is already paired with another.
+        missing: source splats without a decoded splat.
+        examples: index of the first of `strays` and of `surplus`; −1 if there is none.
     """
 
     source_index: I64

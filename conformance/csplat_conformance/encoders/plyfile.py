@@ -90,22 +90,22 @@ def meaning(splats: Splats) -> Source:
 
 @dataclass(frozen=True)
 class Layout:
-    """How rows are laid out in a PLY.
+    """The layout of rows in a PLY.
 
     Attributes:
-        format: of the header: `ascii`, `binary_little_endian` or `binary_big_endian`.
-        normals: whether there are columns nx, ny, nz, zero unless the rows say otherwise, as most trainers write.
-        dtype: `f4` or `f8`, of all columns but the extra ones.
-        means_dtype: of x, y, z, where it is another one.
-        comments: lines of the header, of any characters; bytes that are no UTF-8 by surrogates.
-        obj_info: lines of that word.
-        reverse: columns in the opposite order: only their names count.
-        renamed: columns that get another name, or none and are left out.
-        count: of rows, as the header has it, where it is another one.
-        line_end: of the header's lines.
+        format: format in the header: `ascii`, `binary_little_endian` or `binary_big_endian`.
+        normals: whether there are columns nx, ny, nz, as most trainers write; zero unless the rows have values.
+        dtype: `f4` or `f8`, the type of all columns but the extra ones.
+        means_dtype: type of x, y, z, if it differs.
+        comments: comment lines of the header, with any characters; bytes that are not UTF-8 as surrogates.
+        obj_info: `obj_info` lines of the header.
+        reverse: write columns in the opposite order: only their names count.
+        renamed: new names of columns; an empty one leaves the column out.
+        count: number of rows in the header, if it differs from the true one.
+        line_end: end of the header's lines.
         lists: [N] lists of small numbers, a property of that kind before all others; not in `ascii`.
-        before: lines of the header and bytes of elements that come before the splats.
-        after: the same of elements that follow them; or no lines, and bytes that nothing speaks of.
+        before: header lines and bytes of elements before the splats.
+        after: the same for elements after them; or no lines, and bytes that the header does not mention.
     """
 
     format: str = "binary_little_endian"

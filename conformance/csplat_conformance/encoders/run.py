@@ -31,16 +31,16 @@ _AGAIN = ".again"
 
 @dataclass(frozen=True)
 class EncoderChoice:
-    """What to run.
+    """Settings of a run of the encoder suite.
 
     Attributes:
         pattern: shell patterns of the inputs' names, `ordinary/*,nasty/empty`; `None` for all.
-        levels: those wanted; each needs the ones before it, which are run and not reported. Where L3 proves nothing
-            L4 is judged, too.
-        timeout_seconds: for one input.
-        psnr_min: dB, of L4; inputs that want more or less than the usual do so by as much here.
-        jobs: processes at a time; one per core if left out.
-        keep: folder for the inputs and what was made of them, a folder for each; `None` keeps nothing.
+        levels: levels to report; each depends on the ones before it, which are run but not reported. If L3 proves
+            nothing, L4 is judged, too.
+        timeout_seconds: time limit for one input.
+        psnr_min: lowest PSNR that passes L4, dB; inputs with another limit keep their difference from the default.
+        jobs: number of processes at a time; default: one per core.
+        keep: folder for the inputs and their results, a folder for each; `None` keeps nothing.
     """
 
     pattern: str | None = None
@@ -68,10 +68,10 @@ def run_encoder(
     Args:
         command: its command line, with `{ply}` and `{out}`, and perhaps `{index}`, where it writes which splat of the
             source each splat of the file is.
-        choice: what to run.
+        choice: settings of the run.
         pictures: judges L4; without it the level is skipped, or fails where nothing else can judge.
         no_pictures: why it is.
-        progress: is told how many steps of how many are done.
+        progress: called with the number of steps done and the total.
         run: runs the command line with `ply`, `out` and `index` put in, within some seconds, in this process; on
             threads, as many as `choice.jobs` says. Without it processes are started, each in an empty working
             directory, and `AGAIN_SECONDS` go by before a repetition.
@@ -126,7 +126,7 @@ def chosen_inputs(pattern: str | None) -> list[Input]:
     """Return the inputs of some names, in the order of a run.
 
     Args:
-        pattern: as in `EncoderChoice`.
+        pattern: see `EncoderChoice`.
 
     Raises:
         InputError: a pattern matches none.
@@ -152,14 +152,14 @@ def _place(folder: Path, one: Input) -> Path:
 
 @dataclass
 class _Steps:
-    """How far a run has come."""
+    """The progress of a run."""
 
     count: int
     progress: Callable[[int, int], None] | None
     done: int = 0
 
     def go(self) -> None:
-        """Go one step."""
+        """Count one step as done."""
         self.done += 1
         if self.progress is not None:
             self.progress(self.done, self.count)

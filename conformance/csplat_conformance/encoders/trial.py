@@ -18,7 +18,7 @@ __all__ = ["AGAIN_SECONDS", "OPTIONAL_PLACES", "PLACES", "Runner", "Trial", "try
 #: Runs a command line with some places put in, within some seconds, without a process of its own.
 Runner = Callable[[str, Mapping[str, str], float], Ended]
 
-#: What a command line names, and what it may name.
+#: Places that a command line must have, and may have.
 PLACES, OPTIONAL_PLACES = ("ply", "out"), ("index",)
 #: From the start of a run to that of its repetition: a time stamp in seconds is another one by then.
 AGAIN_SECONDS = 1.1
@@ -31,11 +31,11 @@ class Trial:
     """One run.
 
     Attributes:
-        ended: how it ended.
-        out: where the file was to be written.
-        index: where the source index was; `None` where the command line has no place for it.
-        traces: what the run did beside writing its output, a line each.
-        started: when, in seconds of `time.monotonic`.
+        ended: how the process ended.
+        out: path where the file was to be written.
+        index: path of the source index; `None` if the command line has no place for it.
+        traces: what the run did in addition to writing its output, a line each.
+        started: time of the start, in seconds of `time.monotonic`.
     """
 
     ended: Ended
@@ -46,7 +46,7 @@ class Trial:
 
     @property
     def wrote(self) -> bool:
-        """Whether there is a file, and the exit status says that it is one."""
+        """True if there is a file, and the exit status reports success."""
         return self.ended.status is None and self.ended.returncode == 0 and self.out.is_file()
 
 
@@ -65,7 +65,7 @@ def try_once(command: str, one: Input, folder: Path, seconds: float, run: Runner
     """
     ply = one.make()
     if folder.is_dir():
-        shutil.rmtree(folder)  # of an earlier run that was kept
+        shutil.rmtree(folder)  # kept from an earlier run
     folder.mkdir(parents=True)
     places = {
         name: folder / _NAMES[name] for name in (*PLACES, *OPTIONAL_PLACES) if name in PLACES or _has(command, name)

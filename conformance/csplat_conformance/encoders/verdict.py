@@ -1,4 +1,4 @@
-"""What one level says of one file."""
+"""The verdict of one level on one file."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _SHOWN = 2
 
 @dataclass(frozen=True)
 class Verdict:
-    """What one level says.
+    """The verdict of one level.
 
     Attributes:
-        status: passed or not.
-        message: why, or a remark.
-        clauses: that are broken.
-        code: of the first violation.
+        status: whether it passed.
+        message: the reason, or a remark.
+        clauses: the broken clauses.
+        code: error code of the first violation.
         details: numbers, for programs.
     """
 

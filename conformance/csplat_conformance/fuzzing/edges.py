@@ -1,4 +1,4 @@
-"""Which edges between lines of some Python files were taken: what guides the fuzzer, and what it reports."""
+"""Record which edges between lines of Python files were taken, to guide the fuzzer and for its report."""
 
 from __future__ import annotations
 

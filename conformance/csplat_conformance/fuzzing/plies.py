@@ -26,7 +26,7 @@ _PACKAGE = Path(csplat.__file__).parent
 
 
 class FileTarget:
-    """What targets share that read files of a folder of their own; nothing of them runs elsewhere."""
+    """A base of targets that read files from a folder of their own, within this process."""
 
     def __init__(self) -> None:
         memory = Path("/dev/shm")  # noqa: S108 - a folder of our own is made in it; a disk costs most of the time
@@ -129,7 +129,7 @@ def _linted(path: Path) -> list[str] | None:
 
 
 def unsound(model: SplatModel) -> str:
-    """What is wrong with a model that was read; nothing as a rule."""
+    """Return what is wrong with a model that was read; an empty string if nothing is."""
     arrays = {name: getattr(model, name) for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
     for name, array in arrays.items():
         if array.dtype != np.float32 or len(array) != len(model.means):

@@ -1,4 +1,4 @@
-"""What is fuzzed: the Python decoder, and those in JavaScript and C against it."""
+"""Targets of the fuzzer: the Python decoder, and the decoders in JavaScript and C compared with it."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Target(Protocol):
 
     Attributes:
         name: on the command line.
-        suffix: of its files.
+        suffix: suffix of its files.
         watched: Python files, or folders of them, whose coverage guides it.
     """
 
@@ -163,11 +163,11 @@ class OthersTarget(DecoderTarget):
 
     Args:
         scratch: folder for the coverage that Node writes.
-        languages: those of the decoders.
+        languages: languages of the decoders.
         memory_bytes: see below.
 
     Attributes:
-        decoders: those that can run here, by language.
+        decoders: decoders that can run here, by language.
         memory_bytes: resident memory that none of them exceeds.
     """
 

@@ -68,8 +68,8 @@ class JavaScriptDecoder:
             self._mutants = [Mutant(*one) for one in json.loads(done.stdout)]
         return self._mutants
 
-    def valid(self, mutant: Mutant) -> bool:  # noqa: ARG002 - as of Python
-        """Whether it is a program: the parser's expressions change as a whole, and so they all are."""
+    def valid(self, mutant: Mutant) -> bool:  # noqa: ARG002 - as for Python
+        """Return True: the operators change whole expressions of a parser, so every mutant is a program."""
         return True
 
     def attempt(self, mutant: Mutant) -> Result:

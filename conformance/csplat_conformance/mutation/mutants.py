@@ -19,10 +19,10 @@ class Mutant:
 
     Attributes:
         file: name of the module's file.
-        line: of the change, from 1.
+        line: line of the change, from 1.
         start: character at which the old text begins.
         old: a piece of the file's text: the smallest expression or statement that changes.
-        new: what stands in its place.
+        new: its replacement.
     """
 
     file: str
@@ -44,7 +44,7 @@ class Mutant:
 
 
 class Fate(StrEnum):
-    """What became of a mutant."""
+    """The outcome for a mutant."""
 
     CAUGHT = "caught"  #: a vector fails
     MISSED = "missed"  #: all vectors pass, and a fuzzed file shows a difference
@@ -53,11 +53,11 @@ class Fate(StrEnum):
 
 @dataclass(frozen=True)
 class Result:
-    """What became of a mutant.
+    """A mutant and its fate.
 
     Attributes:
-        mutant: which.
-        fate: what became of it; other runners have fates of their own.
+        mutant: the mutant.
+        fate: the outcome; other runners have fates of their own.
         by: the vector, or the fuzzed file and how the answers differ.
     """
 
@@ -80,7 +80,7 @@ class Decoder(Protocol):
         ...
 
     def valid(self, mutant: Mutant) -> bool:
-        """Whether it is a program."""
+        """Return True if the mutant is a valid program."""
         ...
 
     def attempt(self, mutant: Mutant) -> Result:

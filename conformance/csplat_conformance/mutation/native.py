@@ -41,7 +41,7 @@ class NativeDecoder:
             self._wanted = [verdict(right.ask(data)) for data in files]
 
     def valid(self, mutant: Mutant) -> bool:
-        """Whether it is a program."""
+        """Return True if the mutant compiles."""
         with tempfile.TemporaryDirectory(prefix="csplat-mutant-") as name:
             try:
                 compile_c(Path(name) / "nothing", "-fsyntax-only", self._written(mutant, Path(name)))

@@ -31,7 +31,7 @@ __all__ = ["NO_FORK", "PythonDecoder"]
 NO_FORK = "this system cannot copy processes, in which mutants run: use Linux or macOS"
 
 _PROCESSOR_SECONDS = 30  # the right decoder takes five
-_SECONDS = 300.0  # of a clock, for what waits; other processes may be busy
+_SECONDS = 300.0  # seconds of wall time, for a mutant that waits; other processes may be busy
 _ADDRESS_SPACE = 3_000_000_000  # bytes beyond what the process has: an allocation without bound fails at once
 
 
@@ -63,7 +63,7 @@ class PythonDecoder:
         return self._mutants
 
     def valid(self, mutant: Mutant) -> bool:
-        """Whether it is a program."""
+        """Return True if the mutant compiles."""
         try:
             self._compiled(mutant.file, mutant.apply(self.texts[mutant.file]))
         except SyntaxError:

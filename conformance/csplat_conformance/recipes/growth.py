@@ -1,4 +1,4 @@
-"""What later versions may add and this one skips: tails of records, ancillary layers, types and flags."""
+"""Extensions that later versions may add and this one skips: tails of records, ancillary layers, types and flags."""
 
 from __future__ import annotations
 

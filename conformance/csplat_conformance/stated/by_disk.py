@@ -1,4 +1,4 @@
-"""Prove stated errors where file and source do not fit the memory: by way of a file on the disk.
+"""Prove stated errors when file and source do not fit into memory: by way of a file on the disk.
 
 Without a source index space is cut into cells of about as many splats, and the source's splats are sorted by them. The
 tiles near a cell are decoded and matched with it: first as near as the file's own lattice puts partners, and then, for
@@ -38,22 +38,22 @@ __all__ = ["PartSizes", "fits_memory", "prove_by_disk"]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-_FOLDS = 2.2  # of the arrays of both scenes: what comparing them in memory takes
-_SPLAT_BYTES = 80  # of the source, beside its arrays: keys, order, centres in doubles
-_PART_FOLDS = 5  # of a part's arrays: records, source, tiles and their selection
-_BASE_BYTES = 200_000_000  # program, tiles that are being decoded, splats that wait for being written
-_WORKER_BYTES = 50_000_000  # of a process beside its part
+_FOLDS = 2.2  # memory to compare two scenes, as a multiple of their arrays
+_SPLAT_BYTES = 80  # bytes per source splat in addition to its arrays: keys, order, centres in doubles
+_PART_FOLDS = 5  # memory for a part, as a multiple of its arrays: records, source, tiles and their selection
+_BASE_BYTES = 200_000_000  # bytes of the program, tiles that are being decoded, splats that wait to be written
+_WORKER_BYTES = 50_000_000  # bytes of a process in addition to its part
 _INDEX_BLOCK = 1 << 20  # numbers of a source index
 
 
 @dataclass(frozen=True)
 class PartSizes:
-    """How many splats are compared at a time.
+    """Numbers of splats that are compared at a time.
 
     Attributes:
-        least: however little memory there is.
-        most: however much there is: more are hardly faster, for caches are small.
-        worth_a_process: with fewer, one more process does not pay: at the rims of parts work is done twice.
+        least: minimum, however little memory there is.
+        most: maximum, however much there is: more are hardly faster, because caches are small.
+        worth_a_process: with fewer, another process does not pay: at the edges of parts work is done twice.
     """
 
     least: int = 1 << 14
@@ -62,13 +62,13 @@ class PartSizes:
 
 
 def fits_memory(opened: Opened, source_count: int, source_bytes: int, memory_bytes: int | None) -> bool:
-    """Whether a file and its source can be compared in memory.
+    """Return True if a file and its source can be compared in memory.
 
     Args:
         opened: the file.
         source_count: splats of the source.
         source_bytes: size of its file.
-        memory_bytes: bound; `None`: half of what is free.
+        memory_bytes: memory limit; `None`: half of the free memory.
     """
     splat_bytes = _splat_bytes(opened)
     source = max(source_count * (_FOLDS * splat_bytes + _SPLAT_BYTES), source_bytes)
@@ -98,13 +98,13 @@ def prove_by_disk(
     Args:
         scene: the source.
         opened: the file.
-        source_index: as of `prove`; it may be mapped.
+        source_index: as for `prove`; it may be mapped.
         memory_bytes: bound, about; `None`: half of what is free. A few bytes of each splat come to it.
-        sizes: of the parts; the proof does not depend on them.
-        progress: is told how far comparing has come.
+        sizes: sizes of the parts; the proof does not depend on them.
+        progress: called with the progress of the comparison.
 
     Raises:
-        InputError: as of `prove`; the source is not whole; or the disk has no room.
+        InputError: as for `prove`; the source is incomplete; or the disk is full.
         OSError: the disk cannot be written or read.
     """
     with closing(_ByDisk(scene, opened, memory_bytes, sizes or PartSizes(), progress)) as way:
@@ -130,7 +130,7 @@ class _ByDisk:
 
     @property
     def names(self) -> list[str]:
-        """Of the measures."""
+        """Names of the measures."""
         return measure_names(self.scene.facts, self.opened.facts)
 
     @property
@@ -145,7 +145,7 @@ class _ByDisk:
 
     @property
     def _memory(self) -> int:
-        """Of the bound, what parts may take."""
+        """Memory for parts, in bytes: the limit without the base of the program."""
         return (default_bytes() if self.memory_bytes is None else self.memory_bytes) - _BASE_BYTES
 
     @property
@@ -293,7 +293,7 @@ class _ByDisk:
 
 
 def _inverse(source_index: NDArray[Any], source_count: int) -> NDArray[Any]:
-    """Which splat of the file each source splat became: the dtype's largest number where none did."""
+    """Return the splat of the file that each source splat became; the dtype's largest number if there is none."""
     dtype = np.uint32 if len(source_index) < 2**32 - 1 else np.uint64
     became = np.full(source_count, np.iinfo(dtype).max, dtype)
     base = source_index.base

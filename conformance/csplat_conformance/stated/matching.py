@@ -2,7 +2,7 @@
 
 Source splats are sorted by the cell of a grid over centre, opacity and green; cells are twice as wide as the bounds, so
 a splat's partner lies in its own cell or, along each axis, in the nearer neighbour. Most are found in the first of the
-32 cells. Memory is a few numbers per splat, beside blocks of fixed size.
+32 cells. Memory is a few numbers per splat, plus blocks of fixed size.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from csplat_conformance.stated.source import Source
 
 __all__ = ["STAGE", "UNDECIDED", "UNMATCHED", "Progress", "lattice_radii", "match", "tile_radii"]
 
-#: Is told a stage's name and how far it has come, 0 to 1.
+#: Called with a stage's name and its progress, 0 to 1.
 Progress = Callable[[str, float], None]
 
 F64 = NDArray[np.float64]
@@ -35,14 +35,14 @@ U64 = NDArray[np.uint64]
 UNMATCHED = -1  #: no source splat lies within the bounds
 UNDECIDED = -2  #: more candidates than were looked at
 
-#: What `Progress` is told of.
+#: The stage that `Progress` is called with.
 STAGE = "matching splats"
 
 _AXES = 5  # x, y, z, alpha, green
 _BLOCK = 1 << 16  # splats at a time
 _FIRST = frozenset(("means", "opacities", "sh0"))  # are compared first
 _PAIR_BLOCK = 4096  # pairs that are compared at a time
-_CANDIDATES_MAX = 1000  # of one cell: scenes of equals would take for ever
+_CANDIDATES_MAX = 1000  # splats of one cell: scenes of equal splats would take for ever
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -68,9 +68,9 @@ def match(
         radii: [N], how near the partner's centre is expected.
         far: where there is none, the search goes on up to the bound.
         reach: of all of the scene, as `Source.reach` has it, where the splats are a part of it.
-        candidates_max: how many splats of one cell are looked at for one partner.
-        threads: how many to use, one per core by default. The result does not depend on it.
-        progress: is told how much is done.
+        candidates_max: number of splats of one cell that are compared to find one partner.
+        threads: number of threads, one per core by default. The result does not depend on it.
+        progress: called with the progress.
 
     Returns:
         [N] index of a source splat within the bounds, or `UNMATCHED`, or `UNDECIDED`.
@@ -183,7 +183,7 @@ def _search(
 def _within(
     source: Source, decoded: SplatModel, source_rows: I64, decoded_rows: I64, bounds: Mapping[str, float]
 ) -> NDArray[np.bool_]:
-    """Which pairs lie within the bounds; SH and covariance are looked at only where the rest does."""
+    """Return which pairs are within the bounds; SH and covariance are compared only if all others are."""
     good = np.ones(len(source_rows), bool)
     for names in (_FIRST, bounds.keys() - _FIRST):
         pairs = np.flatnonzero(good)

@@ -1,4 +1,4 @@
-"""How far decoded splats lie from those of their source (spec 5.5).
+"""Measure the differences between decoded splats and those of their source (spec 5.5).
 
 Written apart from what our encoder measures with, so that each finds the other's mistakes. Everything is
 float64, in blocks that stay in the cache; sums do not depend on the number of threads.
@@ -58,10 +58,10 @@ def measure_pairs(
     """Measure the errors of decoded splats against the splats that they stand for.
 
     Args:
-        source: what was encoded.
-        decoded: what its file decodes to, N splats.
+        source: the encoded scene.
+        decoded: the decoded file, N splats.
         source_index: [N] integers; decoded splat i stands for source splat `source_index[i]`.
-        threads: how many to use, one per core by default. The result does not depend on it.
+        threads: number of threads, one per core by default. The result does not depend on it.
 
     Returns:
         The errors by measure. The maximum is over components, a vector's square the sum over
@@ -119,10 +119,10 @@ def differences(
     """Differences of pairs of splats, by measure.
 
     Args:
-        source: what was encoded.
-        decoded: what came of it; its origin may be another one.
+        source: the encoded scene.
+        decoded: the decoded file; its origin may differ.
         source_rows, decoded_rows: n splats each; pair k is splat k of both.
-        names: of the measures that are wanted; `None`: all of `measure_names`.
+        names: names of the measures to compute; `None`: all of `measure_names`.
 
     Returns:
         [n, C] by measure: the distance of the centres, the relative Frobenius distance of the
@@ -154,7 +154,7 @@ def check_source_index(
     """See to it that a source index may be one (SRC-4).
 
     Args:
-        index: of any type and shape.
+        index: an array of any type and shape.
         source_count: splats of the source.
         decoded_count: splats of the file.
         once: no number occurs twice.

@@ -49,12 +49,12 @@ def prove(
     """Compare a file's stated errors with its source.
 
     Args:
-        source: what was encoded.
-        decoded: what the file decodes to.
+        source: the encoded scene.
+        decoded: the decoded file.
         header: the file's header and index.
-        stated: what it states, `None` where it states nothing.
+        stated: the errors that it states; `None` if it states none.
         source_index: [N] integers; which source splat each splat of the file is. `None`: not known.
-        progress: is told how far matching has come.
+        progress: called with the progress of matching.
 
     Raises:
         InputError: `source_index` is not one index of a source splat for each splat of the file.
@@ -63,12 +63,12 @@ def prove(
 
 
 class Pairs(NamedTuple):
-    """What was found where it is known which splat stands for which.
+    """Measurements of known pairs of splats.
 
     Attributes:
         measured: errors by measure.
-        extras: lines about extra columns.
-        reach: as of `room`.
+        extras: lines about differences in extra columns.
+        reach: as for `room`.
     """
 
     measured: dict[str, Measured]
@@ -77,11 +77,11 @@ class Pairs(NamedTuple):
 
 
 class Way(Protocol):
-    """How splats are compared with those of their source."""
+    """A way of comparing splats with those of their source."""
 
     @property
     def names(self) -> list[str]:
-        """Of the measures, in the order of the registry."""
+        """Names of the measures, in the order of the registry."""
         ...
 
     @property
@@ -136,7 +136,7 @@ def prove_by(
 
 
 def _different_scenes(way: Way, stated: StatedErrors) -> Iterator[str]:
-    """What must be equal before splats are compared at all."""
+    """Yield differences that rule out a comparison: number of splats, SH degree."""
     if way.source_count != stated.source_count:
         yield f"the file stands for a source of {stated.source_count} splats, this one has {way.source_count}"
     if way.source_degree != stated.source_sh_degree:
@@ -172,7 +172,7 @@ def contradictions(
     """Say where a statement is below what is true, or above it by more than SER-5 allows; a line each.
 
     Args:
-        name: of the measure.
+        name: name of the measure.
         found: (max, rms), as they are.
         stated: the same, as the file has them.
         reach: as of `room`.
@@ -190,7 +190,7 @@ def contradictions(
 
 
 def tile_of(header: SceneHeader, splat: int) -> int:
-    """Which tile holds a splat."""
+    """Return the index of the tile that holds a splat."""
     starts = [tile.start for tile in header.tiles]
     return int(np.searchsorted(starts, splat, "right")) - 1
 

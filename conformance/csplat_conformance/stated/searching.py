@@ -1,4 +1,4 @@
-"""Which splats of a file have a partner in a part of their source; parts are searched by several processes."""
+"""Find the splats of a file that have a partner in a part of their source; several processes search the parts."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Search:
     Attributes:
         opened: the file.
         spool: its source by cells.
-        bounds: as of `match`.
-        reach: as of `room`.
+        bounds: as for `match`.
+        reach: as for `room`.
         most: splats that are compared at a time.
         workers: processes.
     """

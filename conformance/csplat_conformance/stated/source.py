@@ -1,4 +1,4 @@
-"""What a file is compared with: the splats of its source (spec 5.6)."""
+"""The splats of the source, with which a file is compared (spec 5.6)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Source:
         opacities: [M] float32, alpha: the logistic function of the logit, rounded.
         sh0: [M, 3] float32.
         shN: [M, K, 3] float32, K = (d + 1)² − 1.
-        origin: what to add to `means`, float64.
+        origin: offset to add to `means`, float64.
         extra: further columns by name, [M].
     """
 
@@ -87,7 +87,7 @@ class Source:
         return replace(first, **arrays, extra=extra)
 
     def model(self, origin: tuple[float, float, float]) -> SplatModel:
-        """Return it for renders beside a file of this origin: centres in float32 relative to it, degree 3 at most."""
+        """Return it for renders next to a file of this origin: centres in float32 relative to it, degree 3 at most."""
         near = self.about(origin)
         with np.errstate(over="ignore"):  # the model refuses what leaves float32
             means = near.means.astype(np.float32)

@@ -20,7 +20,7 @@ __all__ = ["Rows", "Spool", "opened_spool"]
 I64 = NDArray[np.int64]
 Records = NDArray[Any]  # structured, a splat each
 
-_WAITING_BYTES = 1 << 25  # of splats that wait for being written: so parts of a file are not too small to be read
+_WAITING_BYTES = 1 << 25  # bytes of splats that wait to be written, so that parts of a file are large enough to read
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
@@ -29,9 +29,9 @@ class Rows:
     """Splats as records, and back.
 
     Attributes:
-        dtype: of a record: the arrays of a `Source`, its extra columns, and an integer `number`.
-        origin: of the source.
-        names: of the extra columns.
+        dtype: type of a record: the arrays of a `Source`, its extra columns, and an integer `number`.
+        origin: origin of the source.
+        names: names of the extra columns.
     """
 
     dtype: np.dtype[Any]
@@ -69,7 +69,7 @@ class Spool:
 
     Attributes:
         stream: a file of no name.
-        rows: how splats lie in it.
+        rows: layout of the splats in it.
     """
 
     stream: IO[bytes]
@@ -83,7 +83,7 @@ class Spool:
         """Take some splats, those of a key in the order in which they come.
 
         Args:
-            source: of the layout.
+            source: splats of that layout.
             rows: [n] which of its splats.
             keys: [n] what each is to be found under.
             numbers: [n] what is said of each.
@@ -119,7 +119,7 @@ class Spool:
         self._waiting, self._waiting_bytes = {}, 0
 
     def counts(self) -> dict[int, int]:
-        """How many splats each key has, by key."""
+        """Return the number of splats of each key."""
         return {key: sum(count for _, count in parts) for key, parts in sorted(self._parts.items())}
 
     def sources(self, key: int, most: int) -> Iterator[tuple[Source, I64]]:
@@ -156,7 +156,7 @@ def opened_spool(rows: Rows, count: int) -> Spool:
     """Open a spool in the folder for temporary files (TMPDIR).
 
     Args:
-        rows: how splats will lie in it.
+        rows: layout of the splats in it.
         count: splats that will lie in it, at most.
 
     Raises:

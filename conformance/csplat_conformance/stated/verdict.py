@@ -1,4 +1,4 @@
-"""What became of the attempt to prove the errors that a file states."""
+"""The result of an attempt to prove the errors that a file states."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ class Worst:
     """The splat that is farthest off.
 
     Attributes:
-        splat: of the file.
-        tile: that holds it.
-        source_splat: what it stands for or, where nobody said which it is, is nearest to.
-        found: how far it is off, in the measure's unit.
+        splat: splat of the file.
+        tile: tile that holds it.
+        source_splat: its source splat or, if that is not known, the nearest one.
+        found: its error, in the measure's unit.
     """
 
     splat: int
@@ -33,9 +33,9 @@ class MeasureProof:
     """One measure: what is stated, what was found, and whether it holds.
 
     Attributes:
-        name: of the registry of stated errors.
-        stated_max, stated_rms: of the file; `None` where it does not state the measure.
-        measured_max, measured_rms: of the pairs; `None` without a source index.
+        name: name in the registry of stated errors.
+        stated_max, stated_rms: errors in the file; `None` if it does not state the measure.
+        measured_max, measured_rms: errors of the pairs; `None` without a source index.
         holds: nothing contradicts the statement; `None` where there is none.
         worst: the splat with the largest error. Without a source index it is there only where a splat has no partner
             because of this measure.
@@ -52,14 +52,14 @@ class MeasureProof:
 
 @dataclass(frozen=True)
 class Proof:
-    """What became of the attempt.
+    """The result of an attempt to prove stated errors.
 
     Attributes:
         measures: in the order of the registry.
-        failures: one line each; none when the file's statement holds.
-        clauses: of the spec, that they break.
-        unproved: measures of which nothing is stated: what was fitted anew, or everything.
-        rms_proved: whether rms and counts were proved too.
+        failures: one line each; none if the file's statement holds.
+        clauses: the clauses of the spec that the failures break.
+        unproved: measures for which the file states no error: refitted ones, or all.
+        rms_proved: whether rms and counts were proved, too.
     """
 
     measures: tuple[MeasureProof, ...] = ()
@@ -70,12 +70,12 @@ class Proof:
 
     @property
     def holds(self) -> bool:
-        """Whether everything that could be looked at holds."""
+        """True if everything that could be checked holds."""
         return not self.failures
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was not proved, a line each."""
+        """Lines about what was not proved."""
         notes = []
         if self.measures and not self.rms_proved:
             notes.append(_NOT_WITHOUT_INDEX)

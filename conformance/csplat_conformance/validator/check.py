@@ -24,7 +24,7 @@ __all__ = ["validate"]
 
 _CRC_SIZE = 4
 _TEXTS = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS)
-#: Which clause wants the payload to end with its last structure.
+#: The clause that requires the payload to end with its last structure.
 _ENDS = {
     _spec.CHUNK_CODEBOOK: "CDB-2",
     _spec.CHUNK_METADATA: "JSN-2",
@@ -51,7 +51,7 @@ def validate(
         json_bytes_max: budget for one JSON text (STR-8).
         splats_max: budget of splats (LIM-1), above which the tiles are not read; `None` for none: one tile lies in
             memory at a time.
-        progress: is told how much of the file has been looked at.
+        progress: called with the share of the file that has been checked.
 
     Returns:
         What was found; never raises for what a file holds.
@@ -72,7 +72,7 @@ def validate(
 
 
 class _Counts:
-    """What is known of the scene."""
+    """Numbers of splats and tiles, as far as they are known."""
 
     splats = 0
     tiles = 0

@@ -59,7 +59,7 @@ def _inflated(coded: memoryview, size: int) -> tuple[bytes, bool]:
 
 
 def _has_spare_bits(before: zlib._Decompress, last: int, rest: bytes) -> bool:
-    """Whether bits of the last byte are set behind the end of the final block.
+    """Return True if bits of the last byte are set after the end of the final block.
 
     A byte whose bits from k on are cleared still gives the same end as soon as k is where the block ends; a smaller k
     does so only if the bits in between were 0 anyway.

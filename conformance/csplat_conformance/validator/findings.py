@@ -1,4 +1,4 @@
-"""What is wrong with a file: one `Violation` for each clause that is broken at a place."""
+"""Findings of the validator: one `Violation` for each clause that is broken at a place."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Violation:
         code: error code with which a decoder refuses the file; empty for SER-5, which no decoder can judge.
         offset: byte of the file where the offending field, or else its structure, begins.
         field: its name: structure and field, `tile[0].layer[1].offset`, `TILE.0.1/sh1.stream.count`.
-        message: what was found and what is wanted, one line.
+        message: what was found and what was expected, one line.
     """
 
     clause: str
@@ -56,15 +56,15 @@ class Unread:
 
 @dataclass(frozen=True)
 class Validation:
-    """What is known of a file.
+    """The result of validating a file.
 
     Attributes:
-        violations: ordered by offset. None: the file conforms (CNF-1).
-        remarks: what no clause forbids and the spec nevertheless asks otherwise: unused values that are not written as
+        violations: ordered by offset. If there are none, the file conforms (CNF-1).
+        remarks: what no clause forbids although the spec asks otherwise: unused values that are not written as
             stated, recommendations not followed. A line each.
-        unread: parts that were not looked at; without violations there are none.
-        splat_count: N as the index states it, 0 where it could not be read.
-        tile_count: tile records that were read.
+        unread: parts that were not checked; without violations there are none.
+        splat_count: N in the index, 0 if it could not be read.
+        tile_count: number of tile records that were read.
         checks: names of the checks that were made.
     """
 
@@ -77,12 +77,12 @@ class Validation:
 
     @property
     def conforms(self) -> bool:
-        """Whether no clause is broken."""
+        """True if no clause is broken."""
         return not self.violations
 
 
 class TooManyError(Exception):
-    """So much is wrong that the rest is not worth a look."""
+    """Raised when there are too many violations for the rest to be worth checking."""
 
 
 @dataclass(frozen=True)
@@ -125,9 +125,9 @@ class Findings:
         Args:
             clause: id of the spec.
             offset: byte of the file.
-            name: of the field.
-            message: what was found and what is wanted.
-            code: where it is not the clause's usual one.
+            name: name of the field.
+            message: what was found and what was expected.
+            code: error code, if it is not the clause's usual one.
 
         Raises:
             TooManyError: the list is full.

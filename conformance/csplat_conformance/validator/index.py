@@ -35,19 +35,19 @@ CodebookAt = Placed[_spec.CodebookRecord]
 
 @dataclass
 class Index:
-    """What the index says, as far as it could be read.
+    """The contents of the index, as far as it could be read.
 
     Attributes:
         head: the index head.
-        degree: `sh_degree`, `None` where it is none that this version has.
+        degree: `sh_degree`; `None` if this version does not have that degree.
         attributes: by registry value.
         steps: steps that obey ATT-6, by registry value.
         levels: levels that obey ATT-3 or ATT-4, by registry value.
-        codebooks: by id; those whose kind and sizes are sound.
-        codebook_ids: of all records.
-        extras: bytes of each extra column's values, `None` where the type is unknown.
+        codebooks: by id; only codebooks whose kind and sizes are valid.
+        codebook_ids: ids of all codebook records.
+        extras: bytes of each extra column's values, `None` if the type is unknown.
         complete: whether all records before the directory fit into the index.
-        end: where the last of them ends.
+        end: offset of the end of the last of them.
     """
 
     head: Head
@@ -62,7 +62,7 @@ class Index:
     end: int = 0
 
     def size_of(self, kind: str) -> int:
-        """Bytes of the head or of a kind of records, tail included; those of the fields where the head says fewer."""
+        """Return the bytes of the head or of a kind of record, tail included; at least the bytes of its fields."""
         return max(_LEAST[kind], int(getattr(self.head.record, f"{kind}_size")))
 
 
@@ -100,7 +100,7 @@ def read_records(view: memoryview, end: int, findings: Findings) -> Index:
 
 
 def _fitting(index: Index, at: int, end: int, count: int, size: int) -> int:
-    """How many records of a kind lie within the index; after the first kind that does not fit none do."""
+    """Return how many records of a kind fit into the index; after the first kind that does not fit, none do."""
     fitting = min(count, max(0, (end - at) // size)) if index.complete else 0
     index.complete &= fitting == count
     return fitting
@@ -195,7 +195,7 @@ def _check_lattice(findings: Findings, placed: AttributeAt, index: Index) -> Non
 
 
 def _is_single(step: Fraction) -> bool:
-    """Whether a normal binary32 value: at most 24 bits from the first that is 1 to the last."""
+    """Return True for a normal binary32 value: at most 24 bits from the first 1 to the last."""
     if not _SINGLE_MIN <= step <= _SINGLE_MAX:
         return False
     odd = step.numerator  # a binary fraction: either over a power of two, or whole

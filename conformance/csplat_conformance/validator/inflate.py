@@ -184,5 +184,5 @@ def _is_complete(lengths: Sequence[int]) -> bool:
 
 
 def _is_lone(lengths: Sequence[int]) -> bool:
-    """Whether there is one codeword, of one bit."""
+    """Return True if there is one codeword, of one bit."""
     return [length for length in lengths if length] == [1]

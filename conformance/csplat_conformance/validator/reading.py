@@ -14,7 +14,7 @@ _Unpack = Callable[[memoryview, int], T]
 
 
 class UnreadableError(Exception):
-    """What follows has no known place: a length or a kind before it is wrong. The violation has been noted."""
+    """Raised when the place of what follows is unknown: a length or a kind is wrong. The violation has been noted."""
 
 
 def place(view: memoryview, unpack: _Unpack[T], places: dict[str, int], at: int, name: str) -> Placed[T]:

@@ -33,7 +33,7 @@ class First:
     Attributes:
         indices: [n], `None` where they could not be read or name no entry.
         escaped: [n] bool, `None` likewise.
-        escape_count: as the block says.
+        escape_count: number of escapes in the block.
     """
 
     indices: Elements | None
@@ -151,7 +151,7 @@ class TileReader:
             check_integers(self.findings, self.index, attribute, rows, exponent, where)
 
     def check_step(self, params: Placed[Any], exponent: int, attribute: int) -> bool:
-        """Whether LAT-1 holds."""
+        """Check LAT-1; return True if it holds."""
         step = self.index.steps.get(attribute)
         if step is None or scaled(step, exponent, single=True) is not None:
             return True

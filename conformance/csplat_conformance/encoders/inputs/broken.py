@@ -1,4 +1,4 @@
-"""What an encoder must refuse."""
+"""Inputs that an encoder must refuse."""
 
 from __future__ import annotations
 

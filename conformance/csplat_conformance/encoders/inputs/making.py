@@ -1,4 +1,4 @@
-"""What inputs are, and the cloud of splats that most of them begin with."""
+"""The type of an input, and the cloud of splats on which most inputs are based."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from csplat_conformance.stated import Source
 
 __all__ = ["APART", "PITCH", "PSNR_MIN", "Input", "cloud", "made"]
 
-PSNR_MIN = 30.0  #: dB that pictures keep, unless an input says otherwise
+PSNR_MIN = 30.0  #: dB that renders must reach, unless an input sets another value
 PITCH = 0.1  #: scene units between neighbours
-_JITTER = 0.2  # of the pitch, to either side
-APART = PITCH * (1.0 - 2.0 * _JITTER)  #: what neighbours of a cloud keep between them
+_JITTER = 0.2  # fraction of the pitch, to either side
+APART = PITCH * (1.0 - 2.0 * _JITTER)  #: smallest distance between neighbours of a cloud, scene units
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,12 @@ class Input:
         name: group and name, `ordinary/degree_3`.
         why: one line: what it shows, why it hurts.
         make: gives the bytes of the PLY.
-        source: gives what it stands for; `None` where there is nothing to encode.
+        source: gives the scene that it holds; `None` if there is nothing to encode.
         apart: no two different splats are nearer to each other than this.
         may_refuse: status 1 and a line are as good as a file.
-        renders: whether pictures of it say something.
-        psnr_min: dB that pictures of it keep, unless another quality than the usual one is asked for. Those of csplat's
-            coarsest preset keep 1 dB more at least; what harms pictures takes them below.
+        renders: whether renders of it are meaningful.
+        psnr_min: dB that renders of it must reach at the default quality. Renders of csplat's
+            coarsest preset exceed it by at least 1 dB; defects that harm renders fall below it.
     """
 
     name: str
@@ -46,11 +46,11 @@ class Input:
 
     @property
     def must_refuse(self) -> bool:
-        """Whether there is nothing to encode."""
+        """True if there is nothing to encode."""
         return self.source is None
 
     def psnr_wanted(self, psnr_min: float) -> float:
-        """What pictures of it must keep, dB, where `psnr_min` is asked instead of `PSNR_MIN`: all inputs move alike."""
+        """Return the lowest PSNR of renders of it, dB, if `psnr_min` replaces `PSNR_MIN`; all inputs shift alike."""
         return self.psnr_min + psnr_min - PSNR_MIN
 
 

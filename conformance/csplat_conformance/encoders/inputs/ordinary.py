@@ -1,4 +1,4 @@
-"""What an encoder must take."""
+"""Inputs that an encoder must accept."""
 
 from __future__ import annotations
 
