@@ -23,7 +23,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 GUIDE = "tools/docs/guide"
 CONFIGURATION = ROOT / "tools" / "docs" / "mkdocs.yml"
-COLLECTED, SITE = ROOT / "out" / "docs", ROOT / "out" / "site"  # as the configuration says
+COLLECTED, SITE = ROOT / "out" / "docs", ROOT / "out" / "site"  # as in mkdocs.yml
 
 #: Pages that are files of the repository.
 SOURCES = {
@@ -71,7 +71,7 @@ def links(text: str) -> Iterator[re.Match[str]]:
 
 
 def target_of(source: str, link: str) -> tuple[str, str]:
-    """What a link of a file of the repository leads to: a path in it, and a place there.
+    """Resolve a link in a file of the repository to a path in the repository and an anchor.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -91,7 +91,7 @@ def rewritten(text: str, source: str, on_picture: Callable[[str], object] | None
     Args:
         text: Markdown.
         source: its path in the repository.
-        on_picture: is told the path of each picture in the repository.
+        on_picture: called with the path of each picture in the repository.
     """
     page_of = {path: page for page, path in pages().items()}
 
@@ -202,7 +202,7 @@ def main() -> int:
 
 
 def _is_cut(page: str) -> bool:
-    """Whether the generator lost some of a page: Python-Markdown does not see all that GitHub sees."""
+    """Return True if the site generator lost part of a page: Python-Markdown does not parse all that GitHub does."""
     text = (COLLECTED / page).read_text("utf-8")
     html = (SITE / page).with_suffix(".html").read_text("utf-8").partition("md-content__inner")[2]
     blocks = len(re.findall(r"(?ms)^(`{3,}).*?^\1$", text))

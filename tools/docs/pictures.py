@@ -45,7 +45,7 @@ FOLDER = Path(__file__).resolve().parent
 SAMPLE = FOLDER.parent / "csplat_tools" / "data" / "sample.ply"
 PICTURES = FOLDER / "pictures"
 MEASURED = FOLDER / "measured.json"
-SHOWN: PresetName = "balanced"  # the file beside the source
+SHOWN: PresetName = "balanced"  # preset of the file shown next to the source
 
 _PRESETS: tuple[PresetName, ...] = ("fast", "balanced", "small")
 _WHOLE = (30, 34, 38, 42, 46, 50)  # dB wanted, every splat kept
@@ -161,7 +161,7 @@ def draw_curves(measured: Mapping[str, Any]) -> None:
 
 
 def draw_tutorial(folder: Path) -> None:
-    """Show what the commands of the tutorial left: photographs, one beside its render, the page in Chromium.
+    """Show what the commands of the tutorial left: photographs, one next to its render, the page in Chromium.
 
     Args:
         folder: with `photographs`, `garden.csplat` and `garden.html`.
@@ -185,7 +185,7 @@ def draw_tutorial(folder: Path) -> None:
 
 
 def _row(names: Sequence[Path]) -> Image.Image:
-    """Pictures of one size beside each other."""
+    """Pictures of one size next to each other."""
     pictures = [Image.open(name).convert("RGBA") for name in names]
     width, height = pictures[0].size
     row = Image.new("RGBA", (width * len(pictures), height))

@@ -29,14 +29,14 @@ DISH_CENTRE, DISH_RADIUS = 0.30, 1.04
 
 
 class Garden(NamedTuple):
-    """Where everything stands.
+    """The layout of the garden.
 
     Attributes:
         toadstools: [n, 8] foot x y z, middle of the cap x y z, radius of the cap, kind.
         cushions: [n, 4] balls of moss: x y z, radius.
         pebbles: [n, 8] centre x y z, radii x y z, turn about y (radians), kind.
         strands: [n, 9] tapered sticks: x y z, x y z, radius at either end, part.
-        tufts: [n, 6] ball x y z, radius around the strands from the one to before the other.
+        tufts: [n, 6] ball x y z, radius around the strands from the first index to before the second.
         daisies: [n, 13] centre, three axes (the second one looks out of the flower), radius.
         shell: [n, 4] balls along a spiral: x y z, radius.
         shell_ball: [4] around the shell.
@@ -56,7 +56,7 @@ def make_garden(seed: int = 7) -> Garden:
     """Plant the garden.
 
     Args:
-        seed: of the blades of grass, which differ a little from each other.
+        seed: seed of the blades of grass, which differ a little from each other.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
     toadstools = [

@@ -67,14 +67,14 @@ _FAINT = 0.01  # splats that are more transparent than this do not show
 
 @dataclass(frozen=True)
 class Recipe:
-    """How much of everything.
+    """The sizes of a sample: views, pixels, points, and training.
 
     Attributes:
-        train_views: pictures to train on.
-        test_views: pictures to judge by.
-        size: width and height of the pictures, pixels.
-        points: on surfaces, to start from.
-        training: how splats are trained.
+        train_views: number of training images.
+        test_views: number of test images.
+        size: width and height of the images, pixels.
+        points: number of points on surfaces that training starts from.
+        training: options of the training.
     """
 
     train_views: int = 90
@@ -89,8 +89,8 @@ def make_sample(output: Path, folder: Path, recipe: Recipe | None = None) -> Tra
 
     Args:
         output: the PLY.
-        folder: where the pictures go.
-        recipe: how much of everything.
+        folder: folder for the images.
+        recipe: sizes of the sample.
 
     Returns:
         The scene as it is written, with the log of its training.
@@ -117,7 +117,7 @@ def photograph_all(folder: Path, recipe: Recipe) -> tuple[F32, F32]:
 
     Args:
         folder: it must exist.
-        recipe: how many pictures of which size.
+        recipe: number and size of the images.
 
     Returns:
         Points on the surfaces that the training pictures show, [P, 3], with colours, [P, 3] in 0..1:

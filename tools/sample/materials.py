@@ -1,4 +1,4 @@
-"""What the garden is made of: glaze, moss, gills, gloss."""
+"""Materials of the garden: glaze, moss, gills, gloss."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Material = tuple[Colour, float, float]
 
 @compiled
 def material(g: Garden, x: float, y: float, z: float, part: int, item: int) -> Material:
-    """What a surface is made of at a point."""
+    """Return the material of a surface at a point."""
     if part == DISH:
         return _glaze(x, y, z)
     if part == MOSS:

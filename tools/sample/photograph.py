@@ -26,7 +26,7 @@ U8 = NDArray[np.uint8]
 _LAMP = (0.46, 0.76, 0.46)
 _LAMP_COLOUR = (2.7, 2.45, 2.1)
 _EXPOSURE = 1.0
-_ALIKE = 0.04  # of two rays' colours, 0 to 1, and depths, scene units: a third and fourth would add nothing
+_ALIKE = 0.04  # differences of two rays, in colour (0 to 1) and depth (scene units), below which two rays suffice
 _STEPS = 160
 _HIT = 4e-4  # scene units
 
@@ -74,7 +74,7 @@ def _expose(g: Garden, viewmat: F64, K: F64, pixels: U8, points: F64) -> None:
 
 @compiled
 def _trace(g: Garden, V: F64, u: float, v: float) -> tuple[float, float, float, float]:
-    """What a ray sees: depth along the camera's axis (0: nothing), and a colour for displays, 0 to 1."""
+    """Return what a ray hits: depth along the camera's axis (0: nothing), and a display colour, 0 to 1."""
     # Camera to world, then y and z turned: the garden's y points up.
     length = math.sqrt(u * u + v * v + 1.0)
     dx = (V[0, 0] * u + V[1, 0] * v + V[2, 0]) / length
@@ -136,7 +136,7 @@ def _shade(g: Garden, x: float, y: float, z: float, dx: float, dy: float, dz: fl
 
 @compiled
 def _sky(x: float, y: float, z: float) -> Colour:
-    """What is around: a pale sky, a warm ground, two soft windows."""
+    """Return the colour of the surroundings: a pale sky, a warm ground, two soft windows."""
     up = ramp(-0.35, 0.6, y)
     window = 5.0 * ramp(0.55, 0.95, -0.62 * x + 0.55 * y + 0.56 * z)
     window += 3.0 * ramp(0.6, 0.95, 0.55 * x + 0.42 * y - 0.72 * z)
@@ -145,7 +145,7 @@ def _sky(x: float, y: float, z: float) -> Colour:
 
 @compiled
 def _clear(g: Garden, x: float, y: float, z: float, dx: float, dy: float, dz: float, hard: float) -> float:
-    """How much of a soft light in one direction is not hidden, 0 to 1."""
+    """Return the unoccluded share of a soft light in one direction, 0 to 1."""
     open_share, t = 1.0, 0.01
     for _ in range(26):
         d = field(g, x + t * dx, y + t * dy, z + t * dz)[0]
@@ -160,7 +160,7 @@ def _clear(g: Garden, x: float, y: float, z: float, dx: float, dy: float, dz: fl
 
 @compiled
 def _openness(g: Garden, x: float, y: float, z: float, nx: float, ny: float, nz: float) -> float:
-    """How little stands close by above a surface, 0 to 1."""
+    """Return the ambient openness close above a surface: 0 (covered) to 1 (open)."""
     hidden, weight, h = 0.0, 1.0, 0.02
     for _ in range(4):
         hidden += weight * max(h - field(g, x + h * nx, y + h * ny, z + h * nz)[0], 0.0) / h
