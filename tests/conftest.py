@@ -1,4 +1,4 @@
-"""What several test files need."""
+"""Fixtures and hooks shared by several test files."""
 
 import os
 import pickle

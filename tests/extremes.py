@@ -37,9 +37,9 @@ class Condition:
 
     Attributes:
         make: its columns, `means`, `quats`, `scales`, `logits`, `sh0`, `shN`, by row, as a PLY holds them.
-        comments: of the PLY's header.
+        comments: comments in the PLY's header.
         dropped: rows that a reader drops.
-        repairs: what `strict` refuses.
+        repairs: defects that `strict` refuses.
     """
 
     make: Callable[[], Columns]
@@ -182,7 +182,7 @@ CONDITIONS = {
     "exploded": Condition(exploded),
 }
 NAMES = tuple(CONDITIONS)
-#: Those that pictures at 640×480 can be taken of: a million splats that fill it are more than the renderer takes.
+#: Conditions that can be rendered at 640×480: a million splats that fill it are more than the renderer takes.
 DRAWN = tuple(name for name in NAMES if name != "a million identical")
 
 
@@ -233,7 +233,7 @@ def encoded(name: str, preset: str, quality: float | None = None) -> EncodeResul
 
 @cache
 def judge(name: str, size: tuple[int, int] = (640, 480)):
-    """Who compares pictures with those of a condition, from the cameras of `psnr`."""
+    """Return a judge that compares renders with those of a condition, from the cameras of `psnr`."""
     from csplat_render.judge import Judge
     from csplat_render.virtual import virtual_cameras
 
@@ -249,7 +249,7 @@ def guide_rows() -> list[list[str]]:
 
 
 def guide_figures() -> dict[str, list[tuple[float, float]]]:
-    """What the guide says of each condition that pictures are taken of: bytes per splat and dB, by preset."""
+    """Return the guide's bytes per splat and dB, by preset, for each condition that is rendered."""
     found = {}
     for name, *cells in guide_rows():
         pairs = [re.fullmatch(r"([0-9.]+), ([0-9.]+)", cell) for cell in cells]

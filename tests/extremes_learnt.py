@@ -41,7 +41,7 @@ def learnt_from(name: str) -> SplatModel:
 
 @cache
 def small_judge(name: str) -> Judge:
-    """Who compares pictures of 160×120 with those of the scene."""
+    """Return a judge that compares renders of 160×120 with those of the scene."""
     if name in DRAWN:
         return judge(name, SMALL)
     model = learnt_from(name)
@@ -78,7 +78,7 @@ def trained(name: str) -> TrainResult:
 
 @cache
 def tuned(name: str, count: int = 52) -> tuple[Frozen, FinetuneResult, Judge]:
-    """The scene, tuned as a file to so many pictures but four, and who judges it by those four."""
+    """Tune the scene as a file to `count` images but four; return it and a judge of those four."""
     source = learnt_from(name)
     views = split_views(renders_of(source, virtual_cameras(source, count, 48, 36), BLACK, None), BLACK, aside=4)
     frozen = Draft.of(source, COARSE).frozen()
@@ -89,7 +89,7 @@ def tuned(name: str, count: int = 52) -> tuple[Frozen, FinetuneResult, Judge]:
 
 
 def before_and_after(name: str) -> tuple[SplatModel, SplatModel]:
-    """What the file decodes to without and with tuning."""
+    """Return what the file decodes to without and with tuning."""
     frozen, result, _ = tuned(name)
     before, after = (decode(frozen.coded(held).write().data) for held in (frozen.start(), result.held))
     return before, after

@@ -1,4 +1,4 @@
-"""What the rasteriser is checked against: random and adversarial splats, the exact twin, finite differences."""
+"""References for the rasteriser: random and adversarial splats, the exact twin, finite differences."""
 
 from __future__ import annotations
 
@@ -46,18 +46,18 @@ VIEW = Camera(
     19,
 )
 
-_STEP = 1e-5  # of finite differences: their error is about its square
+_STEP = 1e-5  # step of finite differences: their error is about its square
 _FLIPPED = 1e-4  # colours differ by more where a comparison fell the other way
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How two pictures of the same splats differ.
+    """The difference of two renders of the same splats.
 
     Attributes:
-        most: largest difference of a colour.
-        share: of the pixels where a colour differs by more than 1/255.
-        mean: absolute difference of colours.
+        most: largest absolute difference of a colour component.
+        share: share of the pixels in which a colour differs by more than 1/255.
+        mean: mean absolute difference of colours.
     """
 
     most: float
@@ -70,8 +70,8 @@ class Case:
     """Splats that break rasterisers.
 
     Attributes:
-        arrays: of the splats, float32.
-        view: where they are seen from.
+        arrays: arrays of the splats, float32.
+        view: the camera.
         antialiased: render so.
         beyond: the gradients leave what float32 can hold: they are to be finite, no more.
     """

@@ -99,13 +99,13 @@ class _Parts(io.RawIOBase):
 
 
 class Web:
-    """What a server serves, and how.
+    """A server's files and behaviour.
 
     Attributes:
         files: by path, as `/scene.csplat`.
-        ranges: whether it knows parts of files.
-        cut_after: requests from which on a body ends in its middle; `None`: never.
-        asked: method, path and Range of each request.
+        ranges: whether it supports HTTP Range.
+        cut_after: number of requests after which bodies are cut short; `None`: never.
+        asked: method, path and Range of each request so far.
         before: called before each answer.
     """
 

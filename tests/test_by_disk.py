@@ -32,7 +32,7 @@ PARTS = PartSizes(least=200, most=200)  # small scenes have several
 
 
 def both(source, data, stated=None, index=None):
-    """What is found in memory, and by way of the disk; as JSON, for people, and numbers to nine digits."""
+    """Return the proofs made in memory and by way of the disk as JSON, with numbers rounded to nine digits."""
     opened = open_tiles(data)
     opened = replace(opened, stated_errors=stated or opened.stated_errors)
     at_once = prove(Source.of(source), decode(data), opened.header, opened.stated_errors, index)

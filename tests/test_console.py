@@ -1,4 +1,4 @@
-"""What people see who wait: after how long, how often, in which words. The clock is the test's own."""
+"""Progress shown to a waiting user: when, how often, in which words. The clock is the test's own."""
 
 import io
 import sys
@@ -36,7 +36,7 @@ def clock():
 
 
 def lines(display, clock, capsys, seconds):
-    """What is said while so many seconds go by, with ten looks at the clock in each."""
+    """Return the lines printed within some seconds, with ten looks at the clock in each."""
     for _ in range(round(seconds * 10)):
         clock.now += 0.1
         display.tick()

@@ -78,7 +78,7 @@ def write_blender(folder, train=4, test=2):
 
 
 def touch_colmap(folder, *pictures):
-    """What discovery looks at, and no more."""
+    """Create only the files and folders that discovery looks at."""
     for name in ("cameras.bin", "images.bin"):
         (folder / "sparse" / "0").mkdir(parents=True, exist_ok=True)
         (folder / "sparse" / "0" / name).touch()

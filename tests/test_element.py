@@ -21,7 +21,7 @@ GUIDE = (Path(__file__).resolve().parent.parent / "codec" / "EMBEDDING.md").read
 STYLE = "csplat-view { width: 160px; height: 120px }"
 ONE_FILE = '<script src="../scripts/csplat-view.js"></script>'
 MODULE = '<script type="module" src="/tools/viewer/element.mjs"></script>'
-# What elements tell, but progress: [[id, type, detail], ...].
+# Events of elements, without progress: [[id, type, detail], ...].
 RECORD = """
 globalThis.told = [];
 for (const type of ['load', 'error']) {
@@ -53,7 +53,7 @@ def blog(tab, site, make_model):
 
 
 def told(tab, identity=""):
-    """What an element told, its type and its detail."""
+    """Wait for an event of an element; return its type and its detail."""
     tab.until(f"told.some(([id]) => id === '{identity}')")
     return tab.page.evaluate(f"told.splice(told.findIndex(([id]) => id === '{identity}'), 1)[0].slice(1)")
 

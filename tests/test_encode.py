@@ -1,4 +1,4 @@
-"""What goes in comes back within the errors that the file states; or it is refused."""
+"""Scenes survive encoding and decoding within the errors that the file states, or they are refused."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""What the encoder suite makes of a file: facts, stated errors, what is only coarse, pictures; how reports say it."""
+"""The encoder suite's verdicts on a file: facts, stated errors, coarseness, renders; and their form in reports."""
 
 import dataclasses
 import json

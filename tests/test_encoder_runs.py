@@ -1,4 +1,4 @@
-"""How the encoder suite runs a program: places, traces, repetitions, refusals, the source index; inputs as files."""
+"""The encoder suite's runs of a program: places, traces, repetitions, refusals, the source index; inputs as files."""
 
 import json
 import shlex
@@ -347,7 +347,7 @@ def test_who_refuses_all_that_is_unusual_is_told_so():
     )
     assert {"refused: error: unusual"} == {
         one.message for one in report.outcomes
-    }  # of standard output, for want of other
+    }  # from standard output, for want of other
 
 
 def test_one_refusal_is_counted():

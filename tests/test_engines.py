@@ -28,7 +28,7 @@ pytestmark = [*IN_CHROMIUM, pytest.mark.area(name="engines")]
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "tools" / "examples"
 FAST = EncodeOptions(preset="fast")
-#: What a loader of the engine's own makes of the PLY: Spark's cuts SH that exceeds a power of two.
+#: The PLY as read by the engine's own loader: Spark's cuts SH that exceeds a power of two.
 LIKE_THE_PLY = {"three": 60.0, "playcanvas": 45.0, "babylon": 60.0, "spark": 38.0}
 
 
@@ -76,7 +76,7 @@ def trial(request, browser, files):
 
 @pytest.fixture(scope="module")
 def picture(trial):
-    """What the engine shows of the scene, and what it says."""
+    """Return the engine's picture of the scene and its messages."""
     said = trial.show("scene.csplat")
     assert "failed" not in said, said
     shown = settled(trial)
@@ -85,7 +85,7 @@ def picture(trial):
 
 
 def settled(trial):
-    """What the engine shows in the end; it draws all the time, which is what these tests take."""
+    """Return the engine's final picture; it redraws continuously, which makes up most of these tests' time."""
     return still(trial.page, 0.2)
 
 

@@ -63,7 +63,7 @@ def assert_finite(model):
 
 
 def told(name, column):
-    """What the guide's second table says of a condition."""
+    """Return a cell about a condition in the guide's second table."""
     return next(row[column] for row in guide_rows() if row[0] == name and len(row) == 4 and "→" in row[2])
 
 
@@ -132,7 +132,7 @@ def test_measured_importances_serve_what_stands_before_a_giant_background():
 
 @LONG
 def test_a_pile_of_identical_splats_wants_a_finer_quality():
-    """What alpha errs by adds up: the figures of the guide."""
+    """Compare with the guide's figures: errors of alpha add up in a pile of identical splats."""
     source, judged = learnt_from("a million identical"), small_judge("a million identical")
     told = ("small", None, 22.3), ("balanced", None, 30.0), ("fast", None, 35.1), ("balanced", 70.0, 37.9)
     for preset, quality, psnr in told:
@@ -213,7 +213,7 @@ def test_a_tuned_file_is_no_worse_than_before(name):
     decoded = before_and_after(name)
     assert_finite(decoded[1])
     before, after = (aside.psnr(model) for model in decoded)
-    assert after >= before - 0.5  # what is best is decided by SSIM and L1
+    assert after >= before - 0.5  # SSIM and L1 decide which step is best
     assert after == pytest.approx(min(result.log["best_psnr"], 99.0), abs=0.01)
     if name in ("a million identical", "half the rows NaN", "10 km away"):
         assert after >= before + 1.0

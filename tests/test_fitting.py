@@ -1,4 +1,4 @@
-"""How many splats, and how fine, a file of a size is tuned from: by drafts of known sizes."""
+"""Choose how many splats, and which precision, the tuning of a file of a given size starts from, by known drafts."""
 
 from types import SimpleNamespace
 
@@ -17,7 +17,7 @@ ENTRIES = 1024
 
 
 def bytes_of(count, options, per_db):
-    """1,000 bytes and ten of a splat at the usual precision, and those of entries beyond the usual."""
+    """Return a size: 1,000 bytes, 10 per splat at the usual precision, and the bytes of entries beyond the usual."""
     finer = 0.0 if options.attribute_psnr is None else options.attribute_psnr - USUAL
     return round(1000 + 10 * count * np.exp(per_db * finer)) + 2 * max(0, (options.codebook_size or ENTRIES) - ENTRIES)
 

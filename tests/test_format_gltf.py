@@ -72,7 +72,7 @@ def test_values_are_those_of_the_file():
     assert TWO["POSITION"].tolist() == model.means.tolist()
     assert [[1, 0, 0, 0], [0, 1, 0, 0]] == model.quats.tolist()
     assert np.log(np.float32([1, 2, 0.5])).tolist() == model.scales[0].tolist()
-    assert -88 < model.scales[1, 0] < -87  # of 0
+    assert -88 < model.scales[1, 0] < -87  # log scale of 0
     assert [0.25, 1] == model.opacities.tolist()
     assert TWO[f"{PREFIX}:SH_DEGREE_0_COEF_0"].tolist() == model.sh0.tolist()
     assert [[[1] * 3, [2] * 3, [3] * 3]] * 2 == model.shN.tolist()
@@ -273,7 +273,7 @@ def test_values_that_are_not_finite_are_refused(name):
 
 
 def linted(path, said, data):
-    """What lint finds in a file, and its splats along the axes of the file."""
+    """Lint a file; return the findings by id, and its splats along the axes of the file."""
     path.write_bytes(glb(said, data))
     return {one.id: one for one in lint(path)}, filed(path)
 

@@ -63,7 +63,7 @@ def test_shape_curvatures_are_those_of_the_covariance(make_model):
     matrices[:, rows, columns] = matrices[:, columns, rows] = curvatures.shapes
 
     def lost(quats, scales):
-        """What a small change of shape loses, by the covariance over the trace that it had."""
+        """Return the cost of a small change of shape, from the covariance relative to the trace before the change."""
         variances = np.exp(2.0 * model.scales.T.astype(np.float64))
         before = covariance_entries(model.quats.T, variances) / variances.sum(axis=0)
         after = covariance_entries(quats.T, np.exp(2.0 * scales.T.astype(np.float64))) / variances.sum(axis=0)
@@ -208,7 +208,7 @@ def test_what_is_frozen_of_several_grades_is_what_a_decoder_sees(model):
 
 
 def test_integers_of_each_grade_are_counted_as_they_are_coded(make_model):
-    """Those of the encoder, whole multiples divided by what they are multiples of."""
+    """Counts are those of the encoder: integers divided by the multiple of their class."""
     model = make_model(8_000, 0)  # counts of fewer differ by more than a thousandth
     frozen = Draft.of(model, EncodeOptions(sh_coding="none"), importance=important(model)).frozen()
     scene, plan, tiles = TunedScene(frozen), frozen.plan, frozen.draft.tiles

@@ -54,7 +54,7 @@ def source(row) -> Source:
 
 @pytest.fixture(scope="module")
 def file(spec, row):
-    """What a decoder makes of the integers of the example."""
+    """Decode the integers of the guide's example with the functions of the guide."""
     colours = [spec.rgb_from_ycocg(*map(int, one), 0) for one in row("sh0, integers Y, Co, Cg")]
     lattice = lambda rows, step: np.array(  # noqa: E731
         [[spec.lattice_value(int(n), step, 0) for n in one] for one in rows], np.float32

@@ -257,7 +257,7 @@ def views_once():
 
 
 class Called(Exception):  # noqa: N818  # no error: it ends a command where the interface begins
-    """What a command handed over."""
+    """Raised to end a command where the interface begins; carries the arguments that were passed."""
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ STEPS = {
 
 
 def merge(*files, **named):
-    """What became of the files, and the bytes."""
+    """Merge files into a stream; return the result and the bytes."""
     stream = io.BytesIO()
     done = csplat.merge(files, stream, **named)
     assert done.size == len(stream.getvalue())

@@ -1,4 +1,4 @@
-"""What a notebook shows of a scene: a frame with the viewer's page and the scene inside."""
+"""Scenes in a notebook: a frame with the viewer's page and the scene inside."""
 
 import base64
 import html

@@ -405,7 +405,7 @@ def unequal():
 
 @pytest.fixture(scope="module")
 def measured(unequal):
-    """What twelve views say of it."""
+    """Importance of the splats, measured in twelve views."""
     return measured_importance(unequal, cameras(12), BLACK, threads=None)
 
 

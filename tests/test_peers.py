@@ -161,23 +161,23 @@ READ = {
     "splat-transform": ["ply", "compressed-ply", "sog", "spz", "spz4", "splat"],
     "gsply": ["ply", "compressed-ply", "sog", "spz", "spz4"],
 }
-#: Who takes SPZ for a PLY's axes, which it has not: a half turn about x.
+#: Programs that read SPZ as if it had a PLY's axes: they are off by a half turn about x.
 UNTURNED = {"splat-transform", "gsply"}
-#: Who writes splats in another order.
+#: Programs that write splats in another order.
 REORDERED = {(writer, format) for writer in ("csplat", "splat-transform") for format in ("compressed-ply", "sog")}
-#: What has no place for antialiasing, or does not read it.
+#: Formats that cannot record antialiasing, and programs that do not read it.
 NOT_ANTIALIASED = {"gltf", "splat", "gsply"}
 
 
 def bounds(format, writer, reach):
-    """How far each property may be off: half a step of the format, or what its codebooks give."""
+    """Return the tolerance of each property: half a step of the format, or the error of its codebooks."""
     alpha = 0.5 / 255
     cut = 2 if writer == "splat-transform" else 1  # where csplat rounds
     names = ("means", "degrees", "scales", "opacities", "sh0", "shN")
     table = {
         "ply": (0, 1e-4, 0, 1e-6, 0, 0),
         "compressed-ply": (reach / 1023, 0.25, 9 / 1023, alpha, 1.7 / 255, 1 / 64),
-        # of SH the root of the mean square
+        # SH: root mean square error
         "sog": (cut * (1 + reach) * np.log1p(reach) / 65535, cut * 0.75, 0.15, cut * alpha, 0.03, 0.1),
         "spz": (max(2**-13, reach / 2**23), 0.3, 1 / 32, alpha, alpha / 0.15, 1 / 16 + 1 / 256),
         "splat": (0, 1.7, 1e-6, alpha, alpha / 0.282, 0),
@@ -196,7 +196,7 @@ def differences(source, found, format, allowed):
         source = SplatModel(**{**vars(source), **fields})
     off = {name: np.abs(getattr(source, name) - getattr(found, name)) for name in allowed if name != "degrees"}
     off["degrees"] = degrees(source.quats.astype(float), found.quats.astype(float))
-    if format == "sog":  # of what cannot be seen WebP may change the colours
+    if format == "sog":  # WebP may change the colours of invisible splats
         off["sh0"] = off["sh0"][source.opacities > 1 / 255]
         off["shN"] = np.sqrt(np.square(off["shN"]).sum() / max(1, off["shN"].size))
     most = {name: float(np.max(values, initial=0)) for name, values in off.items()}

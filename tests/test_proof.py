@@ -1,4 +1,4 @@
-"""What `verify` and `info` are made of: errors of pairs, partners without an index, the walk through the blocks."""
+"""The parts of `verify` and `info`: errors of pairs, partners without an index, the walk through the blocks."""
 
 from contextlib import suppress
 from dataclasses import replace

@@ -285,7 +285,7 @@ def test_what_a_store_refuses_is_said_without_secrets(store, status, error, says
 
 
 class Refused(Exception):  # noqa: N818  # as libraries of stores have them
-    """What a store answers in place of a file."""
+    """An error that a store raises instead of returning a file."""
 
 
 def test_a_url_that_fsspec_does_not_know_is_refused(store, monkeypatch):

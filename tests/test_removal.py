@@ -1,4 +1,4 @@
-"""What splats are to pictures: the removal pass against its twin, and colours fitted to pictures."""
+"""The contribution of splats to renders: the removal pass against its twin, and colours fitted to renders."""
 
 from dataclasses import dataclass, replace
 
@@ -209,7 +209,7 @@ def assert_finite(arrays, view, *, antialiased=False):
 
 @dataclass(frozen=True)
 class Loose(Splats):
-    """What `measure_removal` reads of a model, unchecked."""
+    """The fields of a model that `measure_removal` reads, without validation."""
 
     sh_degree: int
     antialiased: bool

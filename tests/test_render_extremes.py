@@ -1,4 +1,4 @@
-"""What breaks rasterisers: pictures and gradients stay finite, and nothing is written out of bounds."""
+"""Inputs that break rasterisers: renders and gradients stay finite, and nothing is written out of bounds."""
 
 import math
 

@@ -130,7 +130,7 @@ def test_what_is_invisible_goes_first_and_what_is_unseen_stays(source):
 
 
 def test_rounds_ask_one_side_after_the_other(source):
-    """What one side last said stays, until it is asked again."""
+    """Each round measures one side again; the other side keeps its last errors until its turn."""
     parts = [camera_sequence(source, 4, (48, 36), seed=seed) for seed in (1, 2)]
     sides = [Side(cameras, measure_removal(source, cameras, bands=False)) for cameras in parts]
     order = removal_order(source, sides, replace(SMALL, rounds=2), len(source) // 2)

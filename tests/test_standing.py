@@ -1,4 +1,4 @@
-"""Which way a scene seems to stand that does not say it: for the eye alone."""
+"""Up-axis estimates for scenes that record no up direction; they are used for viewing only."""
 
 import numpy as np
 import pytest

@@ -287,7 +287,7 @@ def test_a_coding_that_more_precision_hardly_betters_is_not_chosen():
 
 @pytest.mark.parametrize("keep_all", [True, False])
 def test_a_codebook_grows_until_the_goal_is_reached(keep_all):
-    """Of smaller ones no precision reaches it."""
+    """With smaller codebooks no precision reaches the goal."""
     scene, options = replace(PLAIN, book_psnr=32.0), EncodeOptions(sh_coding="codebook")
     found = search(scene, psnr=38.0, keep_all=keep_all, options=options)
     assert found.file.psnr() >= 38.0
@@ -295,7 +295,7 @@ def test_a_codebook_grows_until_the_goal_is_reached(keep_all):
 
 
 def test_a_codebook_grows_to_an_entry_for_four_splats():
-    """Of smaller ones no precision reaches it."""
+    """With smaller codebooks no precision reaches the goal."""
     scene, options = replace(PLAIN, splats=6000, book_psnr=29.0), EncodeOptions(sh_coding="codebook")
     found = search(scene, psnr=38.0, keep_all=True, options=options)
     assert 2048 == found.report.chosen["codebook_size"]  # 1500, as a power of two

@@ -45,7 +45,7 @@ def ply_of(model):
 
 
 def answer(make):
-    """What is made, or why not: some names of extra columns are none for a PLY."""
+    """Return the result, or the error's text if the input is refused: a PLY cannot hold some names of columns."""
     try:
         return make()
     except csplat.InputError as error:

@@ -72,7 +72,7 @@ def no_torch(monkeypatch):
 
 
 def made_splats(make_model, degree):
-    """What gsplat has of a scene."""
+    """Return a scene as gsplat's dictionary of tensors."""
     return {name: tensor(values) for name, values in to_gsplat(make_model(5, degree)).items()}
 
 
@@ -166,7 +166,7 @@ def renamed(splats, prefix):
 
 
 def of_inria(splats):
-    """What `GaussianModel.capture` of INRIA's trainer returns, and the iteration."""
+    """Return the result of `GaussianModel.capture` of INRIA's trainer, and the iteration."""
     arrays = (splats[name] for name in ("means", "sh0", "shN", "scales", "quats"))
     return ((3, *arrays, splats["opacities"][:, None], 0, 0, 0, {"state": {}}, 5.0), 30000)
 

@@ -78,7 +78,7 @@ def test_mixed_types_are_refused(make_model, camera):
 def rasterization(
     means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, sh_degree, backgrounds, **rest
 ):
-    """What stands in for gsplat: the rasteriser of the CPU, with gsplat's arguments."""
+    """Stand in for gsplat's function of this name: render with the CPU rasteriser, with gsplat's arguments."""
     camera = Camera(Ks[0].double().numpy(), viewmats[0].double().numpy(), width, height, near_plane)
     picture = autograd.render(
         means, quats, scales.log(), opacities, colors[:, 0], colors[:, 1:], camera,

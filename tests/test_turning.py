@@ -30,7 +30,7 @@ def covariances(model):
 
 
 def colours(model, directions):
-    """Of every splat in every direction, by the formulas of INRIA's renderer."""
+    """Return the SH colour of every splat in every direction, by the formulas of INRIA's renderer."""
     x, y, z = directions.T
     basis = [
         -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
@@ -54,7 +54,7 @@ def test_shapes_and_colours_turn_with_their_places(make_model, matrix):
     assert np.abs(model.means @ matrix.T - after.means).max() < 1e-6
     assert np.abs(matrix @ covariances(model) @ matrix.T - covariances(after)).max() < 1e-6
     assert np.abs(colours(model, directions) - colours(after, directions @ matrix.T)).max() < 2e-6
-    assert (model.scales[:, 2] == after.scales[:, 2]).all()  # of discs the third one means nothing
+    assert (model.scales[:, 2] == after.scales[:, 2]).all()  # the third scale of a disc means nothing
 
 
 @pytest.mark.parametrize("matrix", [ANY @ np.diag([0.5, 2.0, 1.0]), [[-3, 0, 0], [1, 1, 0], [0, 0, 2]], 2.0 * ANY])
@@ -79,7 +79,7 @@ def test_axes_there_and_back_are_the_same_bits(make_model, degree):
         assert all(getattr(model, name).tobytes() == getattr(back, name).tobytes() for name in exact)
         assert np.abs(model.shN - back.shN).max(initial=0.0) < 2e-6
         assert model.origin == back.origin
-    for matrix in (ANY, -ANY):  # of the two quaternions of a rotation the one that was there
+    for matrix in (ANY, -ANY):  # of a rotation's two quaternions, the original one
         assert np.abs(model.quats - turned(turned(model, matrix), matrix.T).quats).max() < 1e-6
 
 

@@ -1,4 +1,4 @@
-"""Which way is up: what a scene says, what it is told, and that it stays."""
+"""The up direction: read from a scene, set by the caller, and kept."""
 
 import math
 

@@ -32,7 +32,7 @@ INVALID = [vector for vector in VECTOR_LIST if vector.error]
 RICH = build(rich_scene())
 SMALL = build(scene())
 
-#: Vectors whose defect the validator finds at a better place than the manifest's: rms itself, not the max beside it.
+#: Vectors whose defect the validator finds at a better place than the manifest's: rms itself, not the max next to it.
 ELSEWHERE = {
     f"invalid/{name}": ("SERR/record[means].rms", "SERR/record[means].max")
     for name in (
@@ -54,7 +54,7 @@ NOT_ABOUT_FILES = {
 }  # fmt: skip
 
 
-#: Whose arrays, at SH degree 3, fill the decoders' default budget.
+#: Vectors whose arrays, at SH degree 3, fill the decoders' default budget.
 SPLATS_MAX = _spec.BUDGET_BYTES // (4 * (11 + 48))
 
 
@@ -64,13 +64,13 @@ def clauses_of(data, **options):
 
 @pytest.fixture(scope="module")
 def sound():
-    """What is found in each valid vector, by name."""
+    """Return the validator's result for each valid vector, by name."""
     return {vector.name: validate(vector.data) for vector in VALID}
 
 
 @pytest.fixture(scope="module")
 def broken():
-    """What is found in each invalid vector, by name, with the budget that their errors are stated for."""
+    """Return the violations in each invalid vector, by name, within the budget that their errors are defined for."""
     return {vector.name: validate(vector.data, splats_max=SPLATS_MAX).violations for vector in INVALID}
 
 
@@ -306,7 +306,7 @@ def test_texts_that_are_no_json_are_refused(text):
 @pytest.mark.slow
 @pytest.mark.parametrize(("built", "count"), [(SMALL, len(SMALL.data)), (RICH, 150)], ids=["small", "rich"])
 def test_prefixes_are_found(built, count):
-    # Of the small file every one; the decoder meets every one of the rich file in test_damage.py.
+    # Every one of the small file; the decoder meets every one of the rich file in test_damage.py.
     found = prefixes(built.data, count)
 
     assert (count, []) == (found.count, found.missed)

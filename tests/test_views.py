@@ -184,7 +184,7 @@ def made(monkeypatch):
 
 @pytest.mark.slow
 def test_no_command_decides_by_what_judges_and_all_say_the_same_of_the_same_scene(sets, made, tmp_path):
-    """What a sweep decides by, test_tradeoff.py asks."""
+    """The views by which a sweep decides are tested in test_tradeoff.py."""
     ply, own = sets["rgba"] / "scene.ply", ("--data", sets["rgba"], "--test-every", "5", "--size", "24x20")
     found = {}
 

@@ -66,7 +66,7 @@ _TELL = "print(json.dumps([plain, before, compiled()]), flush=True)"
 
 @pytest.fixture(scope="module")
 def versions():
-    """How many versions of each kernel there are at three times of each part: in processes that share imports alone."""
+    """Count the compiled versions of each kernel at three times of each part, in processes that share only imports."""
     parts = [f"{part}{_TELL}" for part in (_PLAIN + _SIMPLIFY, _COMPARE)]
     code = f"""{_USE}
 for part in {parts!r}:

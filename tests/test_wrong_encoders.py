@@ -59,7 +59,7 @@ REPRESENTATIVES = (
 
 @pytest.fixture(scope="module")
 def report_of():
-    """A function: what the suite says of a mistake."""
+    """Return a function that gives the suite's finding about a mistake."""
     return cache(finding.find)
 
 
@@ -104,7 +104,7 @@ NOTHING = Mistake("nothing", Harm.HARMLESS)
 
 
 def differs(folder, mistake, name):
-    """Whether file or index are others than ours."""
+    """Return True if file or index differ from ours."""
     out, index = folder / "out", folder / "index.npy"
     data, source_index = honest(written(folder, name).read_bytes(), tuple(mistake.options.items()))
     encode_wrongly(mistake, folder / "in.ply", out, index)
@@ -112,7 +112,7 @@ def differs(folder, mistake, name):
 
 
 def check_report(name, report):
-    """Assert that the suite says of a mistake what is to be said."""
+    """Assert that the suite reports a mistake as expected."""
     mistake = MISTAKES[name]
     level, clause = mistake.caught
     sign = finding.first_sign(report)
@@ -128,7 +128,7 @@ def check_report(name, report):
 
 
 def reported(report_of, names):
-    """Return the mistakes of which the suite says something else."""
+    """Return the mistakes that the suite reports differently."""
     renderable = [name for name in names if HAS_RENDERER or MISTAKES[name].caught[0] != "L4"]
     return failures({name: name for name in renderable}, lambda name: check_report(name, report_of(name)))
 

@@ -48,9 +48,9 @@ def table(names):
 
 
 def found(name):
-    """What the suite says of a mistake on its own inputs and the small ordinary ones: three cells, and whether it does.
+    """Run the suite on a mistake's own inputs and the small ordinary ones; return three cells and whether it is caught.
 
-    Those of how the program ends are looked at on their own inputs alone.
+    Mistakes in how the program ends run on their own inputs only.
     """
     mistake = MISTAKES[name]
     own = inputs_of(mistake)

@@ -1,4 +1,4 @@
-"""What a wrong encoder does: ours, with its one mistake."""
+"""Run a wrong encoder: ours, with one mistake."""
 
 import tempfile
 from functools import cache
@@ -17,11 +17,11 @@ def encode(mistake, ply, out, index=None):
     """Read, encode, write.
 
     Args:
-        mistake: what is wrong.
+        mistake: the mistake.
         ply, out: input and output.
-        index: where the map from splats of the file to those of the source is wanted, if it is.
+        index: path for the map from splats of the file to those of the source, if requested.
     """
-    with np.errstate(all="ignore"):  # who is wrong divides by zero, too
+    with np.errstate(all="ignore"):  # a wrong encoder may divide by zero
         data, source_index = _encoded(mistake, ply)
     if mistake.honest is not None:
         data = bounded(true_errors(mistake.honest(ply), csplat.decode(data), source_index))(data)
@@ -58,7 +58,7 @@ def honest(content, options=()):
 
     Args:
         content: the PLY.
-        options: of the encoder, (name, value) pairs.
+        options: options of the encoder, (name, value) pairs.
     """
     with tempfile.TemporaryDirectory(prefix="csplat-honest-") as folder:
         path = Path(folder) / "in.ply"

@@ -1,4 +1,4 @@
-"""What the conformance suite says of a mistake."""
+"""Run the conformance suite on a wrong encoder."""
 
 import contextlib
 import io
@@ -38,9 +38,9 @@ def find(name: str, *, names: list[str] | None = None, levels: tuple[str, ...] |
     """Run the conformance suite over a mistake; return its report.
 
     Args:
-        name: of the mistake.
-        names: of the inputs; its own if left out.
-        levels: those wanted; without pictures if left out, unless nothing else shows the mistake.
+        name: name of the mistake.
+        names: names of the inputs; default: the mistake's own.
+        levels: levels to check; default: all but renders, which are added if nothing else shows the mistake.
     """
     mistake = MISTAKES[name]
     names = inputs_of(mistake) if names is None else names
@@ -54,7 +54,7 @@ def find(name: str, *, names: list[str] | None = None, levels: tuple[str, ...] |
 
 
 def first_sign(report: Report):
-    """The first outcome that says that something is wrong, or `None`."""
+    """Return the first outcome that reports a defect, or `None`."""
     signs = report.failures or [one for one in report.outcomes if one.status in SIGNS]
     signs += [Outcome("", "L1", Status.WARNED, message=note) for note in report.notes if note.startswith("warning: ")]
     return signs[0] if signs else None

@@ -1,4 +1,4 @@
-"""What a mistake is, and the ways of making one."""
+"""The type of a mistake, and ways of making one."""
 
 import contextlib
 import dataclasses
@@ -16,7 +16,7 @@ import csplat
 
 PLAIN, DEGREE_2, DEGREE_3 = "ordinary/degree_1", "ordinary/degree_2", "ordinary/degree_3"
 STRONG = "ordinary/strong_colours"
-#: What is wrong throughout is seen where splats are many and slender.
+#: An input with many slender splats, which shows defects of every splat.
 DENSE = "ordinary/surfaces"
 
 Scene = csplat.SplatModel
@@ -24,12 +24,12 @@ Bytes = Callable[[bytes], bytes]
 
 
 class Harm(StrEnum):
-    """What a mistake does to whoever relies on the file."""
+    """The harm that a mistake does to users of the file."""
 
     VALIDITY = "validity"  #: a decoder refuses it, or there is no file
     PICTURE = "picture"  #: it looks wrong
     BOUND = "bound"  #: a stated error does not hold, or cannot be relied on
-    FACTS = "facts"  #: it says of the source, or of its splats, what is not so
+    FACTS = "facts"  #: it makes false statements about the source or its splats
     DETERMINISM = "determinism"  #: the same input gives other bytes
     FILES = "files"  #: files of the user are changed or left about, or cannot be encoded
     COARSE = "coarse"  #: legal and honest, and far worse than need be, or refused though it need not: worth a warning
@@ -41,16 +41,16 @@ class Mistake:
     """One mistake.
 
     Attributes:
-        why: what the author believed.
-        harm: what comes of it.
+        why: the author's wrong belief.
+        harm: the harm that it does.
         caught: level and clause that ought to find it; the clause is empty where it is no clause that is broken, and
             both are where there is nothing to find.
-        inputs: patterns of the reference inputs that show it; those that match none are no error.
+        inputs: patterns of the reference inputs that show it; a pattern without a match is not an error.
         ply: changes the bytes of the input before they are read.
         scene: changes what was read.
         keep: which splats of it are encoded, and in which order; the others count as pruned.
         stage: changes reader and encoder until it is left.
-        options: of the encoder.
+        options: options of the encoder.
         honest: the errors that the file states are measured at the end against this scene of the input.
         data: changes the file.
         index: changes the mapping from splats of the file to those of the source.
@@ -75,7 +75,7 @@ class Mistake:
 
     @property
     def is_late(self) -> bool:
-        """Whether it is made after our encoder has done all of its work."""
+        """True if the mistake is made after our encoder has finished."""
         early = (self.ply, self.scene, self.keep)
         return all(change is None for change in early) and self.stage is contextlib.nullcontext
 

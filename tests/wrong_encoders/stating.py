@@ -213,7 +213,7 @@ MISTAKES = {
         keep=lambda m: np.flatnonzero(m.opacities >= 0.5),
         stage=replaced(scene, "stated_errors", over_the_source),
     ),
-    # of the source
+    # statements about the source
     "pruned_invented": Mistake("counts are decoration", Harm.FACTS, ("L2", "SRC-1"), data=counts(3, 3)),
     "nan_rows_counted": Mistake(
         "rows with NaN are splats that were pruned",

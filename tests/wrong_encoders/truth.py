@@ -1,4 +1,4 @@
-"""What an honest encoder measures against: the scene as the input has it."""
+"""Scenes that an honest encoder measures errors against: as the input has them."""
 
 from dataclasses import dataclass
 
