@@ -68,7 +68,7 @@ class Contents:
     """A file as the encoder was asked for it.
 
     Attributes:
-        options: of the encoder, without any that is still to be chosen.
+        options: options of the encoder, without any that is still to be chosen.
         splats: how many it holds.
         refitted: those that are left were fitted to what the source looks like.
         graded: splats are sorted by importance.

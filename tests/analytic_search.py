@@ -59,9 +59,9 @@ def search(
         options: knobs of the encoder that the caller fixed.
         keep_all: no splat may be removed.
         judging: what the judging views see; usually what the deciding ones do.
-        photo_psnr: of the source against photographs, dB, which decide a loss.
+        photo_psnr: PSNR of the source against photographs, dB, which decide a loss.
         grades: splats may be sorted by importance.
-        effort: of the refit.
+        effort: effort of the refit.
         tried: receives the files that are made, even if the search is refused.
         target: as for `Target`.
     """

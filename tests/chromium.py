@@ -100,7 +100,7 @@ class Site:
     Attributes:
         requests: all that came, in order.
         ranges: False for a server that ignores Range and answers 200 with everything.
-        bytes_per_second: of each answer to a path that a test added; 0 for as fast as it goes.
+        bytes_per_second: bytes per second of each answer to a path that a test added; 0 for as fast as it goes.
         policy: the Content-Security-Policy of all answers, if any.
     """
 

@@ -37,7 +37,7 @@ class Learnt:
     Attributes:
         half: half its splats.
         trained: splats that learnt from photographs of it.
-        losses: of each step.
+        losses: losses of each step.
         tuned: what its tuned file decodes to, or why it cannot be tuned.
     """
 
@@ -53,13 +53,13 @@ class Chain:
 
     Attributes:
         source: the scene as it is read.
-        findings: of its reader.
+        findings: findings of its reader.
         linted: ids of the repairs that `lint_ply` names.
         refusal: why strict reading refuses it; "" if it does not.
         result: its file, preset `balanced`.
         decoded: the scene of the file.
-        proof: of the file's stated errors.
-        pictures: of source and decoded scene, in the modes `fast` and `exact`.
+        proof: proof of the file's stated errors.
+        pictures: renders of source and decoded scene, in the modes `fast` and `exact`.
         learnt: of `LEARNT` alone.
     """
 

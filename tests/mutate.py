@@ -248,7 +248,7 @@ class Suite:
             expression: which tests, as of pytest's `-m`.
             patterns: names of files in `tests`; none for all.
             budget: seconds that the tests of a mutant may take.
-            folder: of maps.
+            folder: folder of maps.
         """
         for tree in trees:
             tree.refresh()

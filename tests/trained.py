@@ -35,7 +35,7 @@ class TrainedScene:
     Attributes:
         data: folder of the photographs.
         ply: the scene.
-        report: of `csplat train`.
+        report: report of `csplat train`.
         checkpoint: after the last step.
         messages: what the command wrote to stderr.
     """
@@ -54,7 +54,7 @@ class TunedFile:
     Attributes:
         source: the scene.
         path: the file.
-        report: of `csplat finetune`.
+        report: report of `csplat finetune`.
         messages: what the command wrote to stderr.
     """
 

@@ -37,7 +37,7 @@ def answer(data: bytes, limits: Limits | None = None, threads: int | None = None
     Args:
         data: the file.
         limits: budgets; the registry's if left out.
-        threads: as of `csplat.decode`.
+        threads: as for `csplat.decode`.
     """
     began = time.monotonic()
     try:
@@ -108,7 +108,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """Answer by the protocol: files and status 0, or a line of JSON and status 1.
 
     Args:
-        words: of the command line; those of this process if left out.
+        words: arguments of the command line; default: those of this process.
     """
     parser = argparse.ArgumentParser(prog="csplat_conformance.adapter", description=__doc__)
     parser.add_argument("input", type=Path)

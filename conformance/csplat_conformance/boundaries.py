@@ -48,9 +48,9 @@ class Case:
     """A file with one field beyond a rule.
 
     Attributes:
-        rule: of the registry.
+        rule: rule of the registry.
         base: the valid file.
-        name: of the field in it.
+        name: name of the field in it.
         value: what an element of it holds instead.
         suffix: tells the cases of a rule apart.
     """

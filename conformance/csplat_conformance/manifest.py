@@ -30,7 +30,7 @@ class Vector:
     Attributes:
         name: group and name, `valid/rich`.
         file: path below the folder of the vectors.
-        sha256: of the file.
+        sha256: SHA-256 of the file.
         why: one line.
         clauses: ids that the vector covers.
         since: version of the format.

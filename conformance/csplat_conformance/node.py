@@ -49,7 +49,7 @@ class JsDecoder(Served):
     """A Node process that decodes what it is sent.
 
     Args:
-        folder: of the decoder's modules, a copy that may have been changed; None for the checkout's.
+        folder: folder of the decoder's modules, a copy that may have been changed; None for the checkout's.
         limits: budgets, by their names in JavaScript; the registry's if left out.
         timeout: seconds for one file.
         coverage: folder to which Node writes its coverage when it ends.

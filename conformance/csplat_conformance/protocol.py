@@ -48,7 +48,7 @@ def answered(ended: Ended, outdir: Path, *, keep_floats: bool = False) -> Answer
     Args:
         ended: how it ended.
         outdir: the folder it was given.
-        keep_floats: as of `ask`.
+        keep_floats: as for `ask`.
     """
     if ended.status is not None:
         return Answer(ended.status, ended.message + last_words(ended), seconds=ended.seconds)

@@ -67,9 +67,9 @@ class Block:
         rows: [n, C] integers: q of LEVELS, MORTON and AXIS, lattice integers of OFFSET and SIGNED, bits of RAW;
             of SPARSE those of the splats that the mask names.
         how: coding of the stream of these.
-        exponent: of OFFSET, SIGNED and SPARSE.
-        offsets: of OFFSET, one per column; for SHAPE's summand one.
-        mask: of SPARSE, a bit per splat.
+        exponent: exponent of OFFSET, SIGNED and SPARSE.
+        offsets: offsets of OFFSET, one per column; for SHAPE's summand one.
+        mask: mask of SPARSE, a bit per splat.
         mask_how: coding of its stream.
         bits: per axis, of MORTON.
         codebook: id, of CODEBOOK.
@@ -103,7 +103,7 @@ class Tile:
     Attributes:
         blocks: attribute (registry value) to block.
         corner: lattice integers.
-        exponent: of the means.
+        exponent: exponent of the means.
         extras: blocks RAW, one per extra column.
         tables: ids, or None for those that the blocks use.
         order: attributes of layer 0 as their blocks follow one another.
@@ -147,7 +147,7 @@ class Codebook:
     """A codebook: for each layer the entries as rows.
 
     Attributes:
-        id: of the record.
+        id: id of the record.
         kind: registry value.
         entries: layer to rows [size, C].
         bands: first and last SH band; zeros for other kinds.

@@ -27,7 +27,7 @@ class Served:
     Args:
         words: its command line.
         timeout: seconds for one file.
-        environment: of the process; None for ours.
+        environment: environment of the process; None for ours.
     """
 
     def __init__(self, words: Sequence[str], timeout: float, environment: Mapping[str, str] | None = None) -> None:

@@ -24,7 +24,7 @@ class Edit:
     Attributes:
         name: short.
         what: what a hurried implementer might do.
-        clause: of the spec, that it breaks.
+        clause: the clause of the spec that it breaks.
         file: module of the decoder.
         old: a piece of its text that occurs once.
         new: what stands there instead.

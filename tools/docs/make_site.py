@@ -173,7 +173,7 @@ def _environment() -> dict[str, str]:
 def for_python_markdown(text: str) -> str:
     """Mend what GitHub takes and Python-Markdown does not.
 
-    A comment would have what follows it taken for HTML, a block of code may name its language alone, a list wants an
+    A comment would have what follows it taken for HTML, a block of code may name its language alone, a list needs an
     empty line before it.
     """
     text = _WORDS.sub(r"\1", _COMMENT.sub("", text))

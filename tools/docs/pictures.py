@@ -1,8 +1,8 @@
 """Make the pictures of README and documentation from the sample scene: two renders, a plot, views of the tutorial.
 
 What the plot shows stands in `measured.json`: bytes, PSNR over the eight views of `csplat compare`, seconds, and the
-versions of all programs. `--measure` takes those figures anew, on an idle machine; it wants npm, for splat-transform,
-and some minutes. `--tutorial` takes a scene and a page that the commands of `guide/tutorial.md` left behind, and wants
+versions of all programs. `--measure` takes those figures anew, on an idle machine; it needs npm, for splat-transform,
+and some minutes. `--tutorial` takes a scene and a page that the commands of `guide/tutorial.md` left behind, and needs
 Chromium. `--engines` takes what `python -m csplat_bench.viewer.owners --scenes sample --formats csplat --out FOLDER`
 left behind.
 

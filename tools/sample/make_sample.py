@@ -5,7 +5,7 @@ Nobody else's work is in it: scene, pictures and splats are dedicated to the pub
 The same bytes each time on one machine, at any number of threads; another machine may round
 differently, and training makes that visible.
 
-Some minutes on two cores; wants the packages of the render extra.
+Some minutes on two cores; requires the packages of the render extra.
 
 Usage:
     python tools/sample/make_sample.py [OUT.ply] [--keep FOLDER]
@@ -149,9 +149,9 @@ def cameras(count: int, size: int, *, between: bool) -> list[Camera]:
     """Cameras spread evenly around the garden; every third one nearer, with something off the middle in view.
 
     Args:
-        count: how many.
+        count: number of cameras.
         size: width and height of their pictures, pixels.
-        between: stand elsewhere, between those of the training, and never near.
+        between: place them between the training cameras, none of them near.
     """
     rng = np.random.Generator(np.random.PCG64(_SEED))
     K = intrinsics(size, size, _FIELD_OF_VIEW)

@@ -35,7 +35,7 @@ def photograph(garden: Garden, camera: Camera) -> tuple[U8, F64]:
     """Take one picture, two rays to a pixel, four where these two do not agree.
 
     Args:
-        garden: what to look at; it stands upright in a world with y down.
+        garden: the garden; it stands upright in a world with y down.
         camera: from where.
 
     Returns:
@@ -170,5 +170,5 @@ def _openness(g: Garden, x: float, y: float, z: float, nx: float, ny: float, nz:
 
 @compiled
 def _display(light: float) -> float:
-    """Light as a display wants it, 0 to 1: a shoulder, then gamma."""
+    """Map light to a display value, 0 to 1: a shoulder, then gamma."""
     return (1.0 - math.exp(-_EXPOSURE * max(light, 0.0))) ** (1.0 / 2.2)

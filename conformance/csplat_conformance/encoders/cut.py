@@ -47,7 +47,7 @@ def find_cuts(
     Args:
         source: what was encoded.
         decoded: what the file decodes to.
-        header: of the file.
+        header: header of the file.
         index: [N] which splat of the source each of the file is.
         stated: the measures to look at.
 

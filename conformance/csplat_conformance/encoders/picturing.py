@@ -37,7 +37,7 @@ def judge_pictures(
         source: what it stands for.
         scene: what the file holds.
         pairs: which splat of the source each of the file's is.
-        size_bytes: of the file.
+        size_bytes: size of the file.
         pictures: compares.
         psnr_min: dB, that is asked; an input may want more or less by so much.
     """

@@ -33,8 +33,8 @@ class Seed:
     """A file.
 
     Attributes:
-        ending: of its name.
-        content: of the file.
+        ending: ending of its name.
+        content: content of the file.
     """
 
     ending: str

@@ -24,7 +24,7 @@ class Case:
     """One stream.
 
     Attributes:
-        name: of the vector, behind `deflate_`.
+        name: name of the vector, behind `deflate_`.
         why: one line.
         clause: that it breaks, or shows.
         coded: the stream.

@@ -88,7 +88,7 @@ def _scene(degree: int, n: int, scales: tuple[float, float]) -> Scene:
     """Return seeded splats in a box from −1 to 1.
 
     Args:
-        degree: of the harmonics.
+        degree: degree of the harmonics.
         n: splats.
         scales: smallest and largest log scale.
     """

@@ -175,7 +175,7 @@ def contradictions(
         name: name of the measure.
         found: (max, rms), as they are.
         stated: the same, as the file has them.
-        reach: as of `room`.
+        reach: as for `room`.
         worst: whose error the maximum is.
     """
     lines = []

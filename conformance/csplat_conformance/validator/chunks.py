@@ -29,7 +29,7 @@ class Chunk:
         flags: those of the record, or those registered for TILE.
         record: directory or layer record; both have `size` and `offset`.
         identity: codebook id, or place of the tile.
-        layer: of the record.
+        layer: layer of the record.
         whole: whether its bytes are there and are no other chunk's.
     """
 
@@ -160,7 +160,7 @@ def check_coverage(findings: Findings, chunks: Sequence[Chunk], start: int, file
     """COV-1; marks the chunks whose bytes can be read, and remarks on another order than 4.3.6 recommends.
 
     Args:
-        findings: what is told.
+        findings: where violations are added.
         chunks: all of the file.
         start: where the index ends.
         file_size: as the header says.
@@ -197,7 +197,7 @@ def check_frame(view: memoryview, chunk: Chunk, clause: str, findings: Findings)
         view: the file.
         chunk: the chunk.
         clause: the one that wants the payload to end with its last structure.
-        findings: what is told.
+        findings: where violations are added.
     """
     at, end = chunk.offset, chunk.offset + chunk.size
     stored, computed = chunk.record.record.crc, zlib.crc32(view[at:end])

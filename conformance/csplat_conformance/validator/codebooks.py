@@ -50,9 +50,9 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: Books) ->
     """Read the payload of a CODB chunk.
 
     Args:
-        payload: of the chunk.
+        payload: payload of the chunk.
         chunk: its record.
-        index: of the file.
+        index: index of the file.
         books: gets the entries, if a sound record asks for the chunk.
 
     Raises:

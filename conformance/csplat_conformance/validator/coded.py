@@ -34,7 +34,7 @@ def read_coded(reader: TileReader, payload: Payload, name: str, attribute: int, 
     Args:
         reader: the tile.
         payload: stands behind the block head.
-        name: of the block.
+        name: name of the block.
         attribute: registry value.
         at: where the block head begins.
 

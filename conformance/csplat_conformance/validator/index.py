@@ -81,7 +81,7 @@ def read_records(view: memoryview, end: int, findings: Findings) -> Index:
     Args:
         view: the file.
         end: where the index's CRC begins, as the header says; no more than the data's end.
-        findings: what is told.
+        findings: where violations are added.
     """
     start = _spec.HEADER_SIZE
     head = place(view, _spec.unpack_index_head, _spec.INDEX_HEAD_OFFSETS, start, "index")

@@ -29,9 +29,9 @@ class Payload:
         view: the whole file.
         at: where the payload begins.
         end: where it ends.
-        name: of the chunk, `TILE.0.0`.
+        name: name of the chunk, `TILE.0.0`.
         clause: the one that wants the payload to end with its last structure.
-        findings: what is told.
+        findings: where violations are added.
     """
 
     def __init__(self, view: memoryview, at: int, end: int, name: str, clause: str, findings: Findings) -> None:

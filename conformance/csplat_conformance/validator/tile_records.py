@@ -47,7 +47,7 @@ def read_tiles(view: memoryview, at: int, end: int, index: Index, findings: Find
         at: where they begin.
         end: where the index's CRC begins.
         index: what stands before them.
-        findings: what is told.
+        findings: where violations are added.
     """
     tiles: list[Tile] = []
     head = index.head.record

@@ -47,10 +47,10 @@ class TileReader:
 
     Attributes:
         view: the file.
-        index: of the file.
+        index: index of the file.
         tile: its record.
         books: entries by codebook id and layer.
-        findings: what is told.
+        findings: where violations are added.
         read_coded: reads what follows the head of a block coded CODEBOOK.
         first: by codebook id.
         lost: layers of which blocks are missing, because they could not be told apart.

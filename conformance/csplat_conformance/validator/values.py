@@ -24,11 +24,11 @@ def check_integers(findings: Findings, index: Index, attribute: int, rows: I64, 
     """Check the integers of a block, or of the part of it that one stream or one codebook gives.
 
     Args:
-        findings: what is told.
-        index: of the file.
+        findings: where violations are added.
+        index: index of the file.
         attribute: registry value; not means.
         rows: [C, n] integers, before the lifting of 7.1.
-        exponent: of the block.
+        exponent: exponent of the block.
         where: what is to blame.
 
     Returns:
@@ -114,8 +114,8 @@ def check_box(
     """TIL-10 and MEA-1.
 
     Args:
-        findings: what is told.
-        index: of the file.
+        findings: where violations are added.
+        index: index of the file.
         record: the tile record.
         rows: [3, n], the integers q.
         box: the record's `corner`.

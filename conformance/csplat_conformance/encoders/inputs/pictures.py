@@ -51,7 +51,7 @@ def _scene(gloss: float, noise: float, seed: int) -> Splats:
     Args:
         gloss: about how bright highlights are.
         noise: standard deviation by which each splat's coefficients differ from its neighbours'.
-        seed: of all that is at random.
+        seed: seed of all random choices.
     """
     rng = np.random.default_rng(seed)
     surfaces = [_torus(100, 14), _ball(1100), *_box(22)]

@@ -1,4 +1,4 @@
-"""Measure encoding: throughput, memory and size, beside what other programs make of the same files.
+"""Measure encoding: throughput, memory and size, compared with other programs on the same files.
 
     python -m csplat_bench.codec                     # everything that is there; an hour or more
     python -m csplat_bench.codec --quick             # the sample alone, one run

@@ -146,7 +146,7 @@ def _loop(scenes: Path, out: Path, at_once: int) -> tuple[Any, ...]:
 
 
 def _batch(scenes: Path, out: Path, words: Sequence[str], end: End | None) -> tuple[Any, ...]:
-    """Run it; end it where that is wanted. Seconds, and what its journal says."""
+    """Run `csplat batch`, interrupted by `end` if given; return seconds and the counts of its report."""
     before = _done(out)
     begun = time.perf_counter()
     command = [*_PROGRAM, "batch", str(scenes), str(out), *words, "--json", "--quiet"]
@@ -170,7 +170,7 @@ def _heed_interrupts() -> None:
 
 
 def _at(count: int, end: End) -> End:
-    """The same once so many scenes are done."""
+    """Return `end` delayed until `count` scenes are done."""
 
     def waiting(process: subprocess.Popen[str], out: Path) -> None:
         while len(_done(out)) < count and process.poll() is None:

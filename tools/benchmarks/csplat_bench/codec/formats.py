@@ -4,7 +4,7 @@
     python -m csplat_bench.codec.formats --scenes donut,plane3 --no-peers --markdown
 
 Seconds are processor time, of writing once and of reading the fastest of three; `psnr` is that of `csplat compare`
-against the PLY. SPZ and SOG by splat-transform stand beside ours, with the wall time of its command.
+against the PLY. SPZ and SOG by splat-transform are listed next to ours, with the wall time of its command.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ class Row:
 
     Attributes:
         scene: its name.
-        name: of the format; of another program's file behind the program.
-        size_bytes: of the file.
+        name: name of the format; of another program's file behind the program.
+        size_bytes: size of the file.
         psnr: dB against the PLY; or why there is none.
         write_seconds, read_seconds: `None` where they are not ours.
-        splats: of the scene.
+        splats: number of splats in the scene.
     """
 
     scene: str

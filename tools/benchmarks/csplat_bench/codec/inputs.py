@@ -4,8 +4,8 @@
     python -m csplat_bench.codec.inputs --scenes '*/surfaces,*/glossy' --markdown
     python -m csplat_bench.codec.inputs --write                 # figures.json of the suite, of all that can be encoded
 
-A column says what a file keeps, in dB of `psnr`. SPZ is written and read by splat-transform, from a plain PLY of the
-same splats: it is the format that is measured, not who reads what PLY.
+A column has the quality of a file, in dB of `psnr`. SPZ is written and read by splat-transform, from a plain PLY of the
+same splats: it is the format that is measured, not the PLY reader.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
 
 Scenes are copies of one, side by side, each a little different in every number. Memory is the sum over the command and
 its processes of what each holds alone and its share of what they have in common (PSS), looked at five times a second:
-the most that was seen. Files are written anew for each line of the table, and their CRC-32 says which are the same.
+the most that was seen. Files are written anew for each line of the table, and their CRC-32 shows which are equal.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def main(
 
 
 def _made(name: str, counts: str, degree: int, cache: Path) -> Iterator[Path]:
-    """PLYs of so many splats; each is removed when it is measured."""
+    """Yield PLYs of these numbers of splats; each is removed after its measurement."""
     (scene,) = find_scenes([name], cache)
     model = read_ply(scene.path)
     model = replace(model, shN=np.ascontiguousarray(model.shN[:, : (degree + 1) ** 2 - 1]))

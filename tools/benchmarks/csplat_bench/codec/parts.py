@@ -42,9 +42,9 @@ class Row:
     Attributes:
         place: disk, HTTP or S3.
         sh_degree: highest band that was read.
-        splats: of the part.
-        requests, bytes_read: of the store, from opening on.
-        seconds: of opening, reading and decoding; of opening alone.
+        splats: number of splats in the part.
+        requests, bytes_read: requests to the store, and bytes read from it, including opening.
+        seconds: time of opening, reading and decoding together; time of opening alone.
     """
 
     place: str
@@ -95,7 +95,7 @@ def middle_box(file: csplat.SplatFile, share: float) -> tuple[float, ...]:
     counts = np.array([tile.splat_count for tile in file.header.tiles])
     middles = file.boxes.mean(axis=1)
     centre = middles[np.argmin(np.linalg.norm(middles - np.median(middles, axis=0), axis=1))]
-    # How wide a cube has to be to touch each tile, and how many splats it then has.
+    # The half width of a cube that touches each tile, and the number of splats that it then holds.
     reach = np.maximum(0.0, np.maximum(file.boxes[:, 0] - centre, centre - file.boxes[:, 1])).max(axis=1)
     order = np.argsort(reach, kind="stable")
     enough = int(np.searchsorted(np.cumsum(counts[order]), share * counts.sum()))

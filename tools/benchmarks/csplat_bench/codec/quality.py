@@ -47,7 +47,7 @@ from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame, virtual_cameras
 
 _SCENES = "fox120k,fox60k_noreg,lego60k,plane3,statue,donut,jacket,horse,angel,st-peter"
-_LIMIT = 1.0  # dB between the cameras of the data folder and those that `psnr` chooses
+_LIMIT = 1.0  # dB: largest difference between the cameras of the data folder and those that `psnr` chooses
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,10 @@ class Quality:
     """A file of a scene.
 
     Attributes:
-        name: of the preset or format.
-        bytes_per_splat: of the source.
+        name: name of the preset or format.
+        bytes_per_splat: bytes per splat of the source.
         psnr: dB; or why there is none.
-        differences: of the PSNR by virtual cameras from this one, by seed, dB.
+        differences: PSNR by virtual cameras minus this one, by seed, dB.
     """
 
     name: str
@@ -125,7 +125,7 @@ def _files(scene: Scene, source: SplatModel, presets: Sequence[str], seeds: Sequ
 
 
 def _camera_table(measured: dict[Scene, tuple[str, list[Quality]]], seeds: Sequence[int], *, markdown: bool) -> str:
-    """By the cameras of the data folder, and by those that `psnr` chooses."""
+    """Return a table of PSNR by the cameras of the data folder, and by those that `psnr` chooses."""
     rows, off = [], 0.0
     for scene, (kind, found) in measured.items():
         for one in found:

@@ -42,7 +42,7 @@ class Capture:
         data: the data set.
         size: width and height of the photographs; `None`: as they are.
         ply: the splats; `None`: they are trained by `training`.
-        training: how, if the data set is at hand.
+        training: options of its training, if the data set is available.
     """
 
     name: str
@@ -143,7 +143,7 @@ def train_to(ply: Path, data: DataSet, options: TrainOptions) -> Training:
     training: Training = {
         "options": asdict(options), "seconds": log["seconds"], "splats": len(result.model), "views": len(data.train),
     }  # fmt: skip
-    # How first: a PLY without it counts as trained elsewhere.
+    # The record of the training first: a PLY without one counts as trained elsewhere.
     write_json(ply.with_suffix(".training.json"), training)
     write_ply(ply, result.model)
     return training

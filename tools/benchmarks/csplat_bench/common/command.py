@@ -38,7 +38,7 @@ THREADS = Annotated[int | None, typer.Option(help="default: one per core")]
 VIEWS = Annotated[int, typer.Option(help="virtual views at most")]
 LPIPS = Annotated[str | None, typer.Option(metavar="FILE", help="weights of LPIPS-Alex, or auto for the usual places")]
 
-#: What a benchmark raises where its words make no sense: status 2.
+#: Raised by a benchmark if its arguments make no sense: status 2.
 WrongWords = typer.BadParameter
 
 

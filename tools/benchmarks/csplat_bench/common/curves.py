@@ -1,4 +1,4 @@
-"""Rate–distortion curves: points, what a curve says between them, and which point to measure next."""
+"""Rate–distortion curves: points, interpolation between them, and which point to measure next."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Point:
 
     Attributes:
         psnr: against the source, dB.
-        size_bytes: of the file.
+        size_bytes: size of the file.
         quality: the encoder's option; 0 where it has none.
-        seconds: of encoding.
+        seconds: time of encoding.
     """
 
     psnr: float
@@ -130,11 +130,11 @@ def bracket(
     """Measure until a point lies just below a PSNR and one just above it.
 
     Args:
-        points: what is known.
+        points: the points measured so far.
         goal: PSNR, dB.
         measure: encodes at a quality.
         start: quality to begin with where nothing is known.
-        limits: of the quality.
+        limits: limits of the quality.
         ceiling: bytes of another series at the goal; one that is not going to be below is given up.
         most: measurements at most; then what is there has to do.
 

@@ -1,4 +1,4 @@
-"""Scenes made of others: copies side by side, splats split into smaller ones, so many splats in view."""
+"""Scenes made of others: copies side by side, splats split into smaller ones, a given number of splats in view."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def blow_up(model: SplatModel, count: int, seed: int = 0) -> SplatModel:
     Args:
         model: a scene.
         count: splats of the result.
-        seed: of the differences.
+        seed: seed of the differences.
     """
     parts = list(copies(model, count, seed))
     arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
@@ -64,15 +64,15 @@ def _vary(model: SplatModel, rng: np.random.Generator, shift: F32) -> SplatModel
 
 
 def crowd(model: SplatModel, cameras: Sequence[Camera], count: int, seed: int = 0) -> SplatModel:
-    """Make a scene of which so many splats lie in view, looking much as it did.
+    """Make a scene with `count` splats in view that looks much like the given one.
 
-    Splats are split as training does it; those that no camera sees are left out, and so are others by chance.
+    Splats are split as training does it; those that no camera sees are left out, and so are others at random.
 
     Args:
         model: a scene.
-        cameras: who sees it.
+        cameras: the cameras that see it.
         count: median over the cameras of the splats in view.
-        seed: of everything by chance.
+        seed: seed of all random choices.
     """
     rng = np.random.default_rng(seed)
     rasteriser = Rasteriser(gradients=False)
@@ -84,12 +84,12 @@ def crowd(model: SplatModel, cameras: Sequence[Camera], count: int, seed: int = 
 
 
 def with_splats(model: SplatModel, count: int, seed: int = 0) -> SplatModel:
-    """A scene that looks much like another, with so many splats: some of them, or all split into smaller ones.
+    """Return a scene of `count` splats that looks much like another: some of its splats, or all of them split.
 
     Args:
         model: the other.
         count: splats.
-        seed: of everything by chance.
+        seed: seed of all random choices.
     """
     rng = np.random.default_rng(seed)
     if count > len(model):

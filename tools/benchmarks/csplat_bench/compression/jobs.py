@@ -18,7 +18,7 @@ from csplat_trainer.tuning import FinetuneOptions, tune
 
 __all__ = ["KINDS", "Lists", "facts_of", "find_jobs", "variants", "warm"]
 
-#: Of rows.
+#: Kinds of rows.
 KINDS = ("main", "control", "others", "sizes", "escapes", "positions", "curve")
 
 Job = tuple[str, str, Callable[[], object]]

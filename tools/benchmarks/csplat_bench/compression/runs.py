@@ -99,7 +99,7 @@ class Bench:
 
         Args:
             keep: share of the source's splats; `None`: all that any view shows.
-            told: whether the encoder is told the sensitivities; otherwise the squared shares of pixels.
+            told: pass the sensitivities to the encoder; otherwise the squared shares of pixels.
         """
         if (keep, told) not in self._picks:
             self._picks[keep, told] = self._pick(keep, told=told)
@@ -133,7 +133,7 @@ class Bench:
         """Freeze, tune, write.
 
         Args:
-            encoding: what the encoder is told.
+            encoding: options of the encoder.
             pick: splats, and the seconds that they took; `None`: all that are seen.
         """
         chosen, seconds = pick or self.chosen()

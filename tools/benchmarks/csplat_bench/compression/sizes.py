@@ -55,7 +55,7 @@ def float_bytes(splats: int, coefficients: int, colours: Book | None, shapes: Bo
         splats: number of splats.
         coefficients: floats of the SH bands above 0, per splat.
         colours: their codebook, if there is one.
-        shapes: that of rotations and scales, whose common factor stays each splat's own.
+        shapes: codebook of rotations and scales, whose common factor stays each splat's own.
     """
     size = splats * _REST * _FLOAT
     size += _in_book(splats, coefficients, colours, 0) + _in_book(splats, _SHAPE, shapes, 1)
@@ -70,7 +70,7 @@ def _in_book(splats: int, floats: int, book: Book | None, own: int) -> int:
 
 
 def _index_bytes(entries: int) -> int:
-    """Bytes of an index whose largest value says "escaped"."""
+    """Return the bytes of an index whose largest value means "escaped"."""
     return _whole_bytes(0, entries)
 
 

@@ -108,7 +108,7 @@ def choose_scenes(found: list[SceneFolder], names: str | None) -> list[SceneFold
 
 
 def choose_pictures(folder: SceneFolder, size: tuple[int, int] | None, downscale: float) -> PictureChoice:
-    """Decide on folder and size of the pictures, as the papers do, and then as the user wants.
+    """Decide on folder and size of the images: as in the papers, unless the user asks otherwise.
 
     Args:
         folder: the scene.

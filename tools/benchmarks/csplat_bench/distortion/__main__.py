@@ -218,7 +218,7 @@ def _extend(bench: _Bench, preset: str, coding: str, goal: float, most: int = 8)
 
 
 def _simplified(bench: _Bench, offsets: Sequence[float], psnrs: Sequence[float], views: int) -> None:
-    """The smallest files that reach some PSNRs, and others beside that of SPZ, where splats may go."""
+    """Measure the smallest files, with pruning allowed, that reach given PSNRs and some near that of SPZ."""
     spz = bench.goals.get("SPZ")
     goals = {} if spz is None else {f"{offset:+g}": spz + offset for offset in offsets}
     for name, goal in {**goals, **{f"{psnr:g} dB": psnr for psnr in psnrs}}.items():

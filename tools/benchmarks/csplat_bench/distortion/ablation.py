@@ -44,7 +44,7 @@ class _Without:
     Attributes:
         simplifying, encoding: options that are not the usual ones.
         keep_all: no splat goes.
-        instead: what stands for something that the search calls or reads, with its module and name.
+        instead: replacement of something that the search calls or reads, with its module and name.
         sh: the part is one of scenes with SH alone.
     """
 

@@ -71,7 +71,7 @@ def _rows(scene: Scene) -> list[tuple[str, ...]]:
 
 
 def _file(source: SplatModel, quality: float, importance: Importance | None = None) -> bytes:
-    """A file; graded where an importance says how."""
+    """Encode a file; with quantisation classes if an importance is given."""
     return encode_with_report(source, EncodeOptions(attribute_psnr=quality), importance=importance).data
 
 

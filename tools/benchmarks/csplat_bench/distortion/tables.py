@@ -35,7 +35,7 @@ def tables(results: Results, *, markdown: bool = False) -> str:
 
 
 def _peer_table(results: Results, name: str) -> Table:
-    """Bytes at the PSNR of a peer; beside SPZ, whether the aims are met."""
+    """Return a table of bytes at the PSNR of a peer and, for SPZ, whether the aims are met."""
     judged = name == "SPZ"
     rows = []
     for scene, one in results.items():
@@ -73,7 +73,7 @@ def _met(rate: Rate | None, size_bytes: int, aim: float) -> str:
 
 
 def _share_table(results: Results) -> Table:
-    """PSNR with the shares of SPZ's bytes that are aimed at, beside that of SPZ with all of them."""
+    """Return a table of PSNR with the aimed-at shares of SPZ's bytes, next to that of SPZ with all of them."""
     rows = []
     for scene, one in results.items():
         peer = one.peers().get("SPZ")
@@ -88,14 +88,14 @@ def _share_table(results: Results) -> Table:
 
 
 def _reached(one: Measured, series: Series, bytes_per_splat: float) -> str:
-    """PSNR at so many bytes; that of the largest file where it has fewer."""
+    """Return the PSNR at a number of bytes; that of the largest file if it is smaller."""
     size = bytes_per_splat * one.splats
     above = "above " if any(series.values()) and size > front(series)[-1].size_bytes else ""
     return optional(psnr_at(series, size), lambda psnr: f"{above}{psnr:.1f}")
 
 
 def _simplified_table(results: Results) -> Table:
-    """Files of simplified scenes beside files of the whole ones of the same PSNR."""
+    """Return a table of files of simplified scenes, compared with files of whole scenes of the same PSNR."""
     rows = []
     for scene, one in results.items():
         for file in sorted(one.values.get("simplified", {}).values(), key=lambda file: file["goal"]):

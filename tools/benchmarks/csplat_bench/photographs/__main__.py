@@ -1,15 +1,15 @@
-"""Train a scene, make files of several sizes of it, judge them, and draw them beside published ones.
+"""Train a scene, make files of several sizes of it, judge them, and plot them with published ones.
 
     python -m csplat_bench.photographs tools/benchmarks/photographs/lego800.toml FOLDER --lpips alex.npz
     python -m csplat_bench.photographs tools/benchmarks/photographs/lego800.toml --tables --markdown
 
-FOLDER is the data set. A configuration file says with which words `csplat train` is called: `trainings`, by name,
+FOLDER is the data set. A configuration file has the arguments of `csplat train`: `trainings`, by name,
 each from nothing or `after` another one, from whose end it goes on; `files`, by name, each `of` a training; `size`, if
 photographs are to be made smaller. Seconds are those of one training, or one file, on top of those before it. A file
 that is not made by `csplat train` says `by` what: `finetune` or `encode` of the trained PLY, FOLDER among its words
 where that is to look at photographs. A file `without` what others have is drawn apart from them. Trainings lie in
---work as NAME-TRAINING.ply, with their checkpoints, files beside them. Figures of the held-out photographs are kept in
-NAME.json beside the configuration file, and drawn in NAME.svg: an interrupted run goes on where it ended. PSNR is the
+--work as NAME-TRAINING.ply, with their checkpoints, files next to them. Figures of the held-out photographs are kept in
+NAME.json next to the configuration file, and drawn in NAME.svg: an interrupted run goes on where it ended. PSNR is the
 mean over the photographs, as papers print it, and pooled; LPIPS is AlexNet's.
 """
 

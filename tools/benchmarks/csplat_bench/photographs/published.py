@@ -12,12 +12,12 @@ class Published:
     """A file as it was published.
 
     Attributes:
-        method: as its authors call it.
+        method: name that its authors use.
         psnr: mean over the test views, dB.
-        size_bytes: of the file.
+        size_bytes: size of the file.
         ssim, lpips: means; `None` where they were not given. LPIPS is VGG's: not to be compared with AlexNet's.
         network: whether a decoder has to evaluate neural networks.
-        source: where the figures stand.
+        source: where the figures are published.
     """
 
     method: str

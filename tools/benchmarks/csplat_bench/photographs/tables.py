@@ -41,9 +41,9 @@ def tables(known: Mapping[str, Any], name: str, *, markdown: bool = False) -> st
     """Everything that is known of a scene.
 
     Args:
-        known: as it is kept.
-        name: of the scene, as published figures are kept.
-        markdown: as documents have tables.
+        known: the stored results.
+        name: name of the scene, as published figures are kept.
+        markdown: format tables in Markdown.
     """
     if "trainings" not in known:
         return "nothing is known yet"
@@ -99,8 +99,8 @@ def plot(known: Mapping[str, Any], name: str, path: Path) -> None:
     """Draw PSNR over bytes; nothing where no file is known.
 
     Args:
-        known: as it is kept.
-        name: of the scene, as published figures are kept.
+        known: the stored results.
+        name: name of the scene, as published figures are kept.
         path: an SVG, replaced. The same results give the same bytes.
     """
     files = [one for _, one in _by_size(known)]

@@ -6,7 +6,7 @@
 One line per scene and mode: medians over the views of the data folder's cameras (640 by 480; else virtual ones) and
 over rounds. `ms` is wall-clock time; `CPU ms` is the time of all threads together, which another program on the
 machine disturbs less. `dB` is the PSNR against the standard mode, pooled over the views. Scenes called NAME@COUNT are
-split as training splits them, and thinned until so many splats lie in view (median of the cameras).
+split as training splits them, and pruned until the given number of splats is in view (median of the cameras).
 
 What pictures and gradients are off the exact twin: `pytest -rP tests/test_render_forward.py` and `…_gradients.py`.
 """

@@ -9,7 +9,7 @@ The baseline is trained first: Lego at 200×200, 1,000 splats from first to last
 background. The splats start at random in the scene's box and nothing moves, adds or removes any. Figures are means and
 standard deviations over the 200 test views. Sizes are those of the published rule (raw float32, or codebooks in float32
 and indices of ceil(log2 K) bits; MiB) and those of .csplat files. What was measured is kept in out/study/NAME.json, and
-measured once. A baseline with LPIPS in its loss wants torch.
+measured once. A baseline with LPIPS in its loss requires torch.
 """
 
 from __future__ import annotations

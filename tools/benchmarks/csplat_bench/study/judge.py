@@ -41,7 +41,7 @@ class Views:
         """Mean and standard deviation over views (of these views: divided by their number) of each figure.
 
         Args:
-            model: what is judged.
+            model: the model to judge.
             quick: PSNR alone.
         """
         errors, alike, distances = list[float](), list[float](), list[float]()

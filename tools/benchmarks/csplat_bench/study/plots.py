@@ -35,7 +35,7 @@ def draw(results: Results, folder: Path) -> list[Path]:
 
     Args:
         results: by name of the scene, what is kept of it.
-        folder: where they go, as SVG.
+        folder: folder for the SVG files.
     """
     known = {name: one for name, one in results.items() if "baseline" in one["rows"]}
     drawn = []

@@ -59,9 +59,9 @@ class Row:
     """One line of a table.
 
     Attributes:
-        name: what tables call it.
-        reduction: what is done to the scene.
-        preset: of the .csplat file.
+        name: name in tables.
+        reduction: the reduction of the scene.
+        preset: preset of the .csplat file.
         decoded: scores are those of the decoded file; otherwise of the scene in float32, before it is coded.
         tuned: the file is tuned by the photographs, bytes being part of the loss.
     """
@@ -87,7 +87,7 @@ class Row:
 
 
 def rows_of_baseline() -> list[Row]:
-    """The published rows, with the distilled one beside, and what the study left as future work."""
+    """Return the published rows, with the distilled one, and those that the study left as future work."""
     pruned = {tau: Reduction(tau, sh_degree=0) for tau in (0.005, 0.01, 0.02)}
     study = [Row("baseline"), Row("SH 0", Reduction(sh_degree=0)), Row("SH 0 distilled", _distilled())]
     study += [Row(f"SH 0, τ {tau:g}", reduction) for tau, reduction in pruned.items()]

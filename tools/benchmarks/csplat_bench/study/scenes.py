@@ -48,11 +48,11 @@ class Subject:
     """A scene that strategies are tried on.
 
     Attributes:
-        name: what tables and files call it.
+        name: name in tables and file names.
         source: the scene.
-        ply: where it lies.
+        ply: path of the PLY.
         training: seconds and options of its training; {} where it was not trained here.
-        views: what it is judged by.
+        views: views by which it is judged.
         teachers: cameras that a lower SH degree is distilled by; None for virtual ones.
         judged_by: in words.
         photographs: by which files are tuned; None where there are none.
@@ -127,8 +127,8 @@ def larger(subject: Subject, width: int, count: int) -> Subject:
 
     Args:
         subject: with square pictures.
-        width: of the renders, pixels.
-        count: of the test cameras, evenly spread.
+        width: width of the renders, pixels.
+        count: number of the test cameras, evenly spread.
     """
     cameras = [subject.views.cameras[number * len(subject.views.cameras) // count] for number in range(count)]
     scaled = [_scaled(camera, width / camera.W) for camera in cameras]

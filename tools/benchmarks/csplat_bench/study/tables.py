@@ -1,4 +1,4 @@
-"""Tables of the study: its published rows beside ours, and what each scene came to."""
+"""Tables of the study: its published rows next to ours, and the results of each scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Published:
     Attributes:
         mib: raw float32, or codebooks and indices, MiB.
         ratio: to the baseline.
-        splats: that are left.
+        splats: number of splats kept.
         psnr, psnr_std: dB, mean and standard deviation over views.
         ssim, lpips: means.
     """
@@ -53,7 +53,7 @@ def tables(results: Results, *, markdown: bool = False) -> str:
 
     Args:
         results: by name of the scene, what is kept of it.
-        markdown: as documents have tables.
+        markdown: format tables in Markdown.
     """
     parts = []
     for name, one in results.items():

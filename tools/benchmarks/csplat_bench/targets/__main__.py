@@ -52,8 +52,8 @@ class Row:
 
     Attributes:
         name: unique in its scene.
-        arguments: of `csplat encode`.
-        all_splats: whether every splat of the source has to be there.
+        arguments: arguments of `csplat encode`.
+        all_splats: whether every splat of the source is kept.
     """
 
     name: str

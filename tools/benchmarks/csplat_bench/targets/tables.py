@@ -23,8 +23,8 @@ class File(TypedDict, total=False):
 
     Attributes:
         psnr: by cameras that no search knows, dB. stated: by the command.
-        all_splats: whether every splat of the source had to be there.
-        machine: where another one than that of the build measured it.
+        all_splats: whether every splat of the source was kept.
+        machine: the machine that measured it, if not that of the build.
     """
 
     bytes: int
@@ -75,7 +75,7 @@ def tables(known: Results, *, markdown: bool) -> str:
 
     Args:
         known: by scene.
-        markdown: as a guide has it.
+        markdown: format tables in Markdown.
     """
     parts = [*_bytes_tables(known), *_seconds_tables(known), _means_table(known)]
     return laid_out([*parts, _dominated_table(known), _failed_table(known)], markdown=markdown)
@@ -93,7 +93,7 @@ def at_equal_psnr(before: Rows, now: Rows, name: str) -> Ratio | None:
 
     Args:
         before, now: rows by name.
-        name: of the row.
+        name: name of the row.
 
     Returns:
         `None` where it was not measured twice.

@@ -50,7 +50,7 @@ class Steps:
 
 
 def measured(folder: Path, count: int, size: tuple[int, int], warm: int, steps: int, threads: int | None) -> Steps:
-    """Train so many splats: first until their sizes are realistic, then by the clock."""
+    """Train `count` splats: first until their sizes are realistic, then with time measured."""
     data = load(folder, size)
     data.read()
     pictures = data.train
@@ -77,7 +77,7 @@ def measured(folder: Path, count: int, size: tuple[int, int], warm: int, steps: 
 def _walk(
     pictures: Sequence[Picture], options: TrainOptions, parameters: Parameters, steps: int
 ) -> tuple[dict[str, list[float]], list[float], CpuEngine]:
-    """Make steps of training; the seconds of each stage, the mean squared errors, and who made the steps."""
+    """Train for some steps; return the seconds of each stage, the mean squared errors, and the engine."""
     spent: dict[str, float] = {}
 
     def clocked(name: str, call: Callable[..., Any]) -> Callable[..., Any]:

@@ -4,7 +4,7 @@
     python -m csplat_bench.viewer --quick                     # the sample alone
     python -m csplat_bench.viewer --gpu                       # let Chromium use the machine's GPU
 
-Wants Chromium and playwright. Without --gpu pictures are drawn by SwiftShader, a GL on the CPU, whose frames say
+Requires Chromium and playwright. Without --gpu pictures are drawn by SwiftShader, a GL on the CPU, whose frames say
 nothing about a GPU's. Times are medians. Scenes of other sizes are copies side by side.
 """
 
@@ -64,7 +64,7 @@ def _draw_files(
 
 
 def _encoded(scene: Scene, preset: str, cache: Path, size: int | None = None) -> File:
-    """A file of a scene, or of so many splats of copies of it; made once."""
+    """Return a file of a scene, or of copies of it with `size` splats; made once."""
     name = scene.name if size is None else f"{scene.name}-{size // 1000}k"
     path = cache / f"{name}.{preset}.viewer.csplat"
     if not path.exists():

@@ -18,7 +18,7 @@ asked kB  all that was sent: less than the files where the viewer leaves some ou
 ms count from the first request for the scene, kB is what had been sent by then. Pictures are drawn by SwiftShader, a GL
 on the CPU, which shares the cores with decoders and is in all times; bytes keep coming meanwhile, so that on a slower
 line, or with a GPU, a first picture takes fewer of them. Medians of --runs, by turns. --out keeps the three pictures of
-each on a sheet for every scene: look at them. Wants Chromium, playwright, npm. Status 1 where a viewer shows nothing.
+each on a sheet for every scene: look at them. Requires Chromium, playwright, npm. Status 1 if a viewer fails.
 """
 
 from __future__ import annotations

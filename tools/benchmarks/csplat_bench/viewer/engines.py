@@ -3,9 +3,9 @@
     python -m csplat_bench.viewer.engines scene.csplat
     python -m csplat_bench.viewer.engines scene.csplat --engines webkit --runs 1
 
-Prints how long each takes from the address to a scene that is drawn whole, and says where one does not: a file that is
+Prints how long each takes from the address to a scene that is drawn whole, and reports failures: a file that is
 opened then, and the scene's own with another way up, have to come right as well. Status 1 where something does not.
-Wants Chromium and playwright; firefox-esr; WebKitWebDriver with MiniBrowser (Debian: webkit2gtk-driver); xvfb-run.
+Requires Chromium and playwright; firefox-esr; WebKitWebDriver with MiniBrowser (Debian: webkit2gtk-driver); xvfb-run.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def _firefox() -> Iterator[Drive]:
                     raise InputError(f"firefox: {error['message']}")
                 return result
 
-            answer()  # who it is
+            answer()  # the greeting of the driver
             version = call("NewSession")["capabilities"]["browserVersion"]
             call("SetTimeouts", script=1000 * _PATIENCE, pageLoad=1000 * _PATIENCE)
             yield (

@@ -1,4 +1,4 @@
-"""Forms in which a scene can go over a line, all of the same PLY, and who writes them."""
+"""Forms in which a scene can be sent, all from the same PLY, and the programs that write them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["FORMS", "Form", "size_of"]
 
 _LEVELS = ("25%", "6%")  # shares of the splats in the levels below the finest
 
-#: Writes a scene into an empty folder, gives the file that viewers open; the words are those that run splat-transform.
+#: Writes a scene into an empty folder, returns the file that viewers open; the words are splat-transform's command.
 Writer = Callable[[Scene, Path, Sequence[str]], Path]
 
 
@@ -27,7 +27,7 @@ class Form:
     """A way to write a scene down.
 
     Attributes:
-        title: as the table has it.
+        title: title in the table.
         axes_of: the format whose axes its files have, as `csplat formats` names it.
         write: makes the files.
         foreign: whether splat-transform is needed for it.

@@ -36,7 +36,7 @@ class Line:
         self._bytes_per_second = bits_per_second / 8.0
         self._latency = latency_seconds
         self._lock = threading.Lock()
-        self._free = 0.0  # when what has been asked for will have passed
+        self._free = 0.0  # monotonic time, seconds, at which all requested bytes will have passed
         self._open = 0
         self._ended = 0.0
 
@@ -84,7 +84,7 @@ class Line:
         time.sleep(max(0.0, wait))
 
     def note(self, size: int) -> None:
-        """Note that so many bytes have been sent."""
+        """Note that `size` bytes have been sent."""
         with self._lock:
             self.sent.append((time.time(), size))
 

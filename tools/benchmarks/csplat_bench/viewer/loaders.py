@@ -1,15 +1,15 @@
-"""Measure the loaders of .csplat in engines: what they take, and what they do beside showing a scene.
+"""Measure the loaders of .csplat in engines: their memory, and their behaviour other than showing a scene.
 
     python -m csplat_bench.viewer.loaders
     python -m csplat_bench.viewer.loaders --scenes lego60k --engines three,spark
 
 Encodes scenes (balanced), lets the engines open them in Chromium at 320x240 from a server on the same machine, and
-does what a page does; how soon something is to be seen says `viewer.arrival`. Bytes per splat on the JavaScript heap,
+does what a page does; `viewer.arrival` measures how soon something is visible. Bytes per splat on the JavaScript heap,
 arrays included, and of WebGL's textures and buffers, once all is there and garbage is collected. `abort`: what comes
 of a load that is ended, and within how many ms. `damaged`: codes of the errors for a file with a flipped bit and for
 half a file. `20 loads`: how many MB of heap and of GPU are taken after the last of twenty loads and disposals that
 were not after the second. `same`: the picture against that of the PLY decoded from the file in the same engine, dB.
-Wants Chromium, playwright, npm.
+Requires Chromium, playwright, npm.
 """
 
 from __future__ import annotations
@@ -107,9 +107,9 @@ class Trial:
 
     Args:
         page: playwright's.
-        address: of the folder that `stage.opened_page` serves.
+        address: address of the folder that `stage.opened_page` serves.
         engine: name of its page.
-        camera: as `stage.pinhole` has it.
+        camera: a camera as returned by `stage.pinhole`.
     """
 
     def __init__(self, page: Any, address: str, engine: str, camera: dict[str, Any]) -> None:
@@ -125,7 +125,7 @@ class Trial:
         return self
 
     def show(self, file: str, *, moved: bool = True, **options: object) -> dict[str, Any]:
-        """Show a file of the folder, with the camera where it was unless moved; what pages/trial.mjs says of it."""
+        """Show a file of the folder, with the camera unchanged unless `moved`; return the report of pages/trial.mjs."""
         words = [f"{self.address}{file}", self.camera if moved else None, options]
         said: dict[str, Any] = self.page.evaluate("(words) => trial.show(...words)", words)
         return said
@@ -135,7 +135,7 @@ class Trial:
         self.page.evaluate("trial.remove()")
 
     def repeat(self, file: str, times: int) -> None:
-        """Show a file and take it away, so many times."""
+        """Show a file and take it away, `times` times."""
         self.page.evaluate("(words) => trial.repeat(...words)", [f"{self.address}{file}", self.camera, times])
 
     def taken(self) -> tuple[float, float]:

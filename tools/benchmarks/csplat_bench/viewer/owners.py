@@ -10,7 +10,7 @@ same with the engine's own rules (`rules.py`) in ours; `SH` how much of what SH 
 it is all. `stands` is how the engine's world, whose y is up, holds the scene; `PLY` how near the picture is to that of
 the PLY in the same engine, dB. Where csplat is among the formats, by `codec/js/engines`, all others are written from
 what its file holds. --out keeps the pictures, and all of a scene on one sheet. Status 1 where one is mirrored, on its
-head, of wrong SH or absent. Wants Chromium, playwright, npm.
+head, of wrong SH or absent. Requires Chromium, playwright, npm.
 """
 
 from __future__ import annotations

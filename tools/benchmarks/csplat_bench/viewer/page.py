@@ -96,7 +96,7 @@ def drawn(page: Any, file: File, runs: int) -> Drawn:
 
 @contextmanager
 def _served(page: Any, file: File, view: list[Any]) -> Iterator[Any]:
-    """Serve a file as `csplat view` does and open it from somewhere; yields what the engine says of it."""
+    """Serve a file as `csplat view` does and open it from somewhere; yields the engine's report."""
     with open_scene(str(file.path), preset="balanced") as scene, open_server(scene) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
         thread.start()

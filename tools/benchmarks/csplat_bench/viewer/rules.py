@@ -24,7 +24,7 @@ class Engine:
     """A program that draws splats.
 
     Attributes:
-        title: as people write it.
+        title: the usual spelling.
         reads: formats, as `csplat formats` names them.
         clips: whether it cuts the colour of a splat to 0..1, also that of degree 0 before it adds the others.
         thin: whether it widens splats by half as much as we do.

@@ -5,7 +5,7 @@
     python -m csplat_bench.codec.decoders --no-peers --scenes '' --extra scene.ply      # ours alone, a scene of yours
 
 Times are from bytes in memory to arrays, all checks included. All decoders hold the same scene at the same time and
-take turns, so that what else the machine does hits all alike. A cell says M splats/s (median of the runs), and how many
+take turns, so that what else the machine does hits all alike. A cell has M splats/s (median of the runs), and how many
 times as fast that is as SPZ's own library at the same place with its file of version 4, all values as float32: the
 library in C++ for C and Python, @adobe/spz for Node and for Chromium (median of the ratios within a turn). Peak is how
 much a new process grows at most while it decodes for the first time, as a multiple of the arrays that come out; first
@@ -13,7 +13,7 @@ is how many times as long that decoding takes as later ones; both of the scene w
 deliver anything but float32, or not all of SH, do less and are there for information.
 
 Others get files that their owners' libraries write by default, which keep less than ours (codec/FIGURES.md). Packages
-and programs are made in a folder (--peers): it wants npm; cc; git, c++, zlib and libzstd with headers; Chromium and
+and programs are made in a folder (--peers): it requires npm; cc; git, c++, zlib and libzstd with headers; Chromium and
 playwright. What cannot be had is left out, and said. Whether our decoders agree: csplat_bench.codec.decoders.agree.
 """
 
@@ -68,10 +68,10 @@ class Row:
         scene, splats, sh_degree: name, number of splats and SH degree of the scene.
         place, decoder, delivers: `place`, `name` and `delivers` of `Decoder`.
         file, file_bytes: its suffix and size.
-        first_seconds, seconds: of the first decoding of a process or page; of each run, after many more.
+        first_seconds, seconds: time of the first decoding of a process or page, and of each run after many more.
         array_bytes: size of the decoded arrays.
-        growth_bytes: of the process, decoding for the first time.
-        ratio: how many times as fast it is as the reference.
+        growth_bytes: growth of the process during the first decoding.
+        ratio: speed relative to the reference.
     """
 
     scene: str

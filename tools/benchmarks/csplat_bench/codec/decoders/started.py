@@ -102,7 +102,7 @@ DECODERS = [
 
 
 def built(wanted: Sequence[Decoder], peers: Path, chromium: str) -> list[Decoder]:
-    """Build what decoders need into a folder; gives those that can be had, and tells of the others.
+    """Build what decoders need into a folder; return the available ones, and report the others.
 
     Args:
         wanted: decoders.

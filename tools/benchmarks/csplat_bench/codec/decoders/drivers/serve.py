@@ -1,4 +1,4 @@
-"""serve.py FILE THREADS: says "ready", then decodes for every line that comes in: seconds, bytes of arrays."""
+"""serve.py FILE THREADS: prints "ready", then decodes for every line that comes in: seconds, bytes of arrays."""
 
 import sys
 import time
