@@ -1,6 +1,6 @@
 """Boundary cases: for each rule of the registry about a field, files whose field holds what is just not allowed.
 
-What refuses them is written by hand, in the decoders and in the validator; a rule that says something else is found.
+The checks that refuse them are written by hand, in the decoders and in the validator; a rule that differs is found.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Case:
         rule: rule of the registry.
         base: the valid file.
         name: name of the field in it.
-        value: what an element of it holds instead.
+        value: the value that replaces an element of it.
         suffix: tells the cases of a rule apart.
     """
 
@@ -63,7 +63,7 @@ class Case:
 
     @property
     def changes(self) -> dict[str, Any]:
-        """Field to value: the field, and those that must follow it so that nothing else is wrong."""
+        """Changed fields and their values: the field, and others that depend on it, so that nothing else is wrong."""
         changes = {self.name: self._with(self.name, self.value)}
         prefix, _, field = self.name.rpartition(".")
         if (self.rule.structure, field) == ("tile_record", "splat_count"):
@@ -175,7 +175,7 @@ def _places(built: Built, rule: Rule) -> Iterator[str]:
 
 
 def _beyond(rule: Rule, code: str) -> Iterator[tuple[str, float]]:
-    """Yield the values next to those that a rule allows and the field's struct code holds; of a mask, bits."""
+    """Yield the nearest forbidden values that the field's struct code can hold; for a mask, bits."""
     if isinstance(rule, Choice):
         yield from ((f"is_{value}", value) for value in rule.others)
     elif isinstance(rule, Mask):

@@ -13,7 +13,7 @@ END_OF_BLOCK = 256
 
 _FIXED, _DYNAMIC = 1, 2
 _ORDER = (16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15)
-_REPEATS = {16: (3, 2), 17: (3, 3), 18: (11, 7)}  # of the code length code: fewest repetitions, extra bits
+_REPEATS = {16: (3, 2), 17: (3, 3), 18: (11, 7)}  # symbols of the code length code: fewest repetitions, extra bits
 _FIXED_LITERALS = {s: 8 if s < 144 else 9 if s < 256 else 7 if s < 280 else 8 for s in range(288)}
 _FIXED_DISTANCES = dict.fromkeys(range(32), 5)
 
@@ -149,7 +149,7 @@ def deflate_fixed(data: bytes, last_bits: int = 0) -> bytes:
     """Return one block of fixed Huffman codes; runs become matches at distance 1.
 
     Args:
-        data: what to code.
+        data: the bytes to code.
         last_bits: the unused bits after the block, 0 where a writer obeys the spec.
     """
     stream = Deflate().fixed()

@@ -53,7 +53,7 @@ of SH degree 1 in one tile, and a title. Each row of a table is one field; offse
 the order of the file.
 """
 
-#: What the spec's structures are called, and where they are defined.
+#: Names of the spec's structures, and the sections that define them.
 _SECTIONS: Final = {
     "header": "Header (4.2)",
     "index_head": "Index head (4.3)",

@@ -70,7 +70,7 @@ def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vec
     """Return a recipe's entry for the bytes that it made.
 
     Args:
-        recipe: what the entry is about.
+        recipe: the recipe of the entry.
         data: the file.
         pictures: a PNG for each of the recipe's views.
     """

@@ -27,7 +27,7 @@ class Mistake:
 
     Attributes:
         name: short name.
-        what: what a hurried implementer might do.
+        what: the mistake that a hurried implementer might make.
         clause: the clause of the spec that it breaks.
         apply: makes the decoder wrong until the stack is closed.
         by: class of decoders (spec 9.2) that it is judged as.
@@ -46,7 +46,7 @@ class Caught:
 
     Attributes:
         language: language of the decoder.
-        mistake: what is wrong with it.
+        mistake: its mistake.
         failed: the checks that failed.
     """
 

@@ -29,7 +29,7 @@ def mutant(rng: random.Random, bases: Sequence[Built]) -> tuple[bytes, bool]:
     """Return a damaged file and whether its checksums were repaired.
 
     Args:
-        rng: where all chance comes from.
+        rng: source of all random choices.
         bases: valid files with the places of their fields.
     """
     data, repaired, _ = mutant_of(rng, rng.choice(bases), bases)
@@ -40,7 +40,7 @@ def mutant_of(rng: random.Random, base: Built, bases: Sequence[Built]) -> tuple[
     """Damage a file: the bytes, whether checksums were repaired, whether the fields still lie where they were.
 
     Args:
-        rng: where all chance comes from.
+        rng: source of all random choices.
         base: the file, with the places of its fields.
         bases: others, whose chunks may be put in.
     """

@@ -18,7 +18,7 @@ from csplat_conformance.serving import Served
 __all__ = ["ADAPTER", "SOURCES", "CDecoder", "c_folder", "compile_c", "missing_c"]
 
 ADAPTER = Path("tools", "adapter.c")
-SOURCES = ("csplat.c", "inflate.c")  # of the decoder, which then wants no library
+SOURCES = ("csplat.c", "inflate.c")  # sources of the decoder, which then needs no library
 _MEMORY = 3_000_000  # kibibytes of address space: an allocation without bound fails at once
 
 
@@ -51,7 +51,7 @@ def compile_c(out: Path, *words: str | Path) -> None:
 
     Args:
         out: the file to write.
-        words: what else the command line has.
+        words: further arguments of the command line.
 
     Raises:
         InputError: the compiler is not here, or does not take them.
@@ -66,7 +66,7 @@ def compile_c(out: Path, *words: str | Path) -> None:
 
 
 class CDecoder(Served):
-    """A process of the adapter that decodes the files it is told of.
+    """A process of the adapter that decodes the files it is given.
 
     Args:
         program: the adapter, compiled; None for the checkout's, which is compiled when it is first asked.

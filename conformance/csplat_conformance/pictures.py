@@ -15,7 +15,7 @@ __all__ = ["PSNR_CAP", "U8", "psnr", "read_png", "write_png"]
 
 U8 = NDArray[np.uint8]
 
-#: What equal pictures score, in dB.
+#: Score of equal pictures, dB.
 PSNR_CAP = 99.0
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"

@@ -46,7 +46,7 @@ def answered(ended: Ended, outdir: Path, *, keep_floats: bool = False) -> Answer
     """Read what a decoder left.
 
     Args:
-        ended: how it ended.
+        ended: how the process ended.
         outdir: the folder it was given.
         keep_floats: as for `ask`.
     """

@@ -40,7 +40,7 @@ class Status(StrEnum):
 
     PASSED = "passed"
     WARNED = "warned"  #: passed: legal, and far worse than need be
-    DECLINED = "declined"  #: what may be refused was refused
+    DECLINED = "declined"  #: refused an input that may be refused
     NOT_PROVED = "not proved"  #: nothing contradicts it, nothing shows it
     FAILED = "failed"  #: the answer is wrong
     CRASHED = "crashed"  #: ended by a signal
@@ -49,8 +49,8 @@ class Status(StrEnum):
     WRONG_ANSWER = "wrong answer"  #: the status of the protocol, without the line or the files that go with it
     NO_OUTPUT = "no output"  #: success is claimed, nothing was written
     PARTIAL_OUTPUT = "partial output"  #: a file was left that is cut short, or by a run that failed
-    REFUSED = "refused"  #: what must be accepted was refused
-    SKIPPED = "skipped"  #: not looked at; the message says why
+    REFUSED = "refused"  #: refused an input that must be accepted
+    SKIPPED = "skipped"  #: not checked; the message gives the reason
 
 
 _GOOD = frozenset((Status.PASSED, Status.WARNED, Status.DECLINED, Status.NOT_PROVED, Status.SKIPPED))

@@ -127,7 +127,7 @@ def run_command(
 
     Args:
         command: command line of the decoder with `{input}` and `{outdir}`; None to test a renderer alone.
-        choice: what is run.
+        choice: settings of the run.
         render: command line of the renderer with `{input}`, `{camera}` and `{out}` or `{outdir}`, for L4.
         progress: called with the number of vectors that are done.
 

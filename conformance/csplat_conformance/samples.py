@@ -68,7 +68,7 @@ class View:
 
     Attributes:
         camera: K, viewmat, W, H and near, as a camera file has them.
-        psnr: what a renderer's picture has to reach against the reference, in dB.
+        psnr: PSNR that a renderer's picture must reach against the reference, dB.
     """
 
     camera: dict[str, Any]
@@ -84,13 +84,13 @@ class Recipe:
         why: one line: what it shows, why it hurts.
         clauses: ids that it covers; for invalid files first the one it breaks.
         data: makes the file.
-        scene: what it must decode to; None where it must be refused.
-        code: error code where it must be refused.
+        scene: the scene that it must decode to; None if it must be refused.
+        code: error code, if it must be refused.
         offset: the defect's byte, if a single one is to blame.
         also: further codes that a decoder may report.
         optional: type of the chunk in whose payload the defect lies, `META`: decoders that leave it unread (CHK-6)
             accept the file. Empty where every decoder refuses it.
-        views: how it has to look, for scenes that are rendered.
+        views: reference views, for scenes that are rendered.
     """
 
     name: str

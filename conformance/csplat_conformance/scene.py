@@ -65,14 +65,14 @@ class Block:
     Attributes:
         coding: registry value.
         rows: [n, C] integers: q of LEVELS, MORTON and AXIS, lattice integers of OFFSET and SIGNED, bits of RAW;
-            of SPARSE those of the splats that the mask names.
+            for SPARSE, only of the splats that the mask names.
         how: coding of the stream of these.
-        exponent: exponent of OFFSET, SIGNED and SPARSE.
-        offsets: offsets of OFFSET, one per column; for SHAPE's summand one.
-        mask: mask of SPARSE, a bit per splat.
+        exponent: exponent, for OFFSET, SIGNED and SPARSE.
+        offsets: offsets, for OFFSET one per column; for SHAPE's summand one.
+        mask: mask, for SPARSE, a bit per splat.
         mask_how: coding of its stream.
-        bits: per axis, of MORTON.
-        codebook: id, of CODEBOOK.
+        bits: bits per axis, for MORTON.
+        codebook: id, for CODEBOOK.
         indices: n of them; none in a block that is not the first of its codebook.
         index_how: coding of their stream.
         summands: n common summands, of kind SHAPE in the block of the scales.
@@ -98,14 +98,14 @@ class Block:
 
 @dataclass(frozen=True)
 class Tile:
-    """A tile. Attributes that `blocks` lacks are left out; corner and extent are those of the means' rows.
+    """A tile. Attributes that `blocks` lacks are left out; corner and extent are computed from the means' rows.
 
     Attributes:
         blocks: attribute (registry value) to block.
         corner: lattice integers.
         exponent: exponent of the means.
         extras: blocks RAW, one per extra column.
-        tables: ids, or None for those that the blocks use.
+        tables: ids of codebooks, or None for those that the blocks use.
         order: attributes of layer 0 as their blocks follow one another.
         tails: layer to bytes after the last block.
         unknown: layers that this version does not have, and their payloads.
@@ -238,7 +238,7 @@ def attribute_named(name: str) -> int:
 
 
 def band_of(attribute: int) -> int:
-    """Return the SH band of an attribute; 0 for those of layer 0."""
+    """Return the SH band of an attribute; 0 for attributes of layer 0."""
     return _spec.ATTRIBUTE_LAYER[attribute]
 
 

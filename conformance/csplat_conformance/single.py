@@ -220,7 +220,7 @@ def main() -> int:
     farthest: dict[str, dict[str, tuple[int, float]]] = {}
     for source in sources if files else [*sources, _of_seeds()]:
         for name, accuracy, values, exact in source:
-            # Flushed ones are told apart from those that are off.
+            # Subnormal values, which may be flushed to zero, are left out.
             kept = (exact == 0) | (np.abs(exact) >= _SMALLEST)
             distances = np.abs(values[kept].astype(np.float64) - exact[kept])
             old = farthest.setdefault(name, {}).get(accuracy, (0, 0.0))

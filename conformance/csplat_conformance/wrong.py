@@ -4,9 +4,9 @@ Usage:
     python -m csplat_conformance.wrong             # the table: mistake, vectors failed, clauses
     python -m csplat_conformance.wrong --only python --vectors
 
-The mistakes of the Python decoder replace one of its functions, those of the JavaScript decoder a piece of its text.
+The mistakes of the Python decoder replace a function, those of the JavaScript decoder a piece of its text.
 Some have it decode in single precision, badly, and are judged by the class *renderer*.
-Of refusals the code does not count, as of any decoder that is not ours.
+The code of a refusal does not count, as for any decoder that is not ours.
 """
 
 from __future__ import annotations

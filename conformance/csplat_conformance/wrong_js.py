@@ -23,11 +23,11 @@ class Edit:
 
     Attributes:
         name: short.
-        what: what a hurried implementer might do.
+        what: the mistake that a hurried implementer might make.
         clause: the clause of the spec that it breaks.
         file: module of the decoder.
         old: a piece of its text that occurs once.
-        new: what stands there instead.
+        new: its replacement.
     """
 
     name: str

@@ -33,7 +33,7 @@ def _cut_to_size(right: Wrong, data: Any) -> memoryview:
 
 
 def crc_but(unchecked: str) -> Wrong:
-    """Return what checks all CRCs but those of one clause."""
+    """Return a mistake that checks all CRCs but those of one clause."""
 
     def wrong(right: Wrong, covered: memoryview, stored: int, at: int, clause: str) -> None:
         if clause != unchecked:
@@ -92,7 +92,7 @@ def _constants(**values: int) -> Callable[[ExitStack], None]:
 
 
 def _without_tails(stack: ExitStack) -> None:
-    """Take the structures' own sizes for those of the records."""
+    """Use the structures' own sizes in place of the sizes in the file."""
     right = _spec.unpack_index_head
 
     def unpack(data: Any, at: int) -> _spec.IndexHead:

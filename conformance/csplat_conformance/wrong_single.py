@@ -39,7 +39,7 @@ def single_precision(gpu: Gpu) -> Apply:
 
 
 def off_by(ulps: int) -> Apply:
-    """Return what makes means, scales and colours so many numbers of binary32 larger."""
+    """Return a mistake that makes means, scales and colours larger by `ulps` ulps of binary32."""
 
     def wrong(right: Wrong, integers: Any, step: float, out: Any, **options: Any) -> None:
         right(integers, step, out, **options)

@@ -31,11 +31,11 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 STEPS_MAX = 0.75  #: lattice steps; rounding leaves 0.5, and 0.71 next to alpha 0 where it looks for the nearest alpha
-ONE_SIDED = 0.95  #: of the errors; of 40 fair coins so many fall alike once in 10^9 throws
+ONE_SIDED = 0.95  #: share of the errors with one sign; 40 fair coins are this one-sided once in 10^9 throws
 _CUT_MAX = 1.05  # lattice steps: cutting alone leaves 1 at most
 _ENOUGH = 40  # different values
 _ROWS_MAX = 4096  # splats that are looked at: enough to see a habit
-_SAME_TURN = 0.8  # of the cosine of half the angle between two rotations that are taken for the same
+_SAME_TURN = 0.8  # smallest cosine of half the angle between two rotations that count as the same
 _QUESTION = "cut instead of rounded?"
 
 
@@ -45,8 +45,8 @@ def find_cuts(
     """Look for them.
 
     Args:
-        source: what was encoded.
-        decoded: what the file decodes to.
+        source: the encoded scene.
+        decoded: the decoded file.
         header: header of the file.
         index: [N] which splat of the source each of the file is.
         stated: the measures to look at.
@@ -98,7 +98,7 @@ def _mean_steps(source: Source, decoded: SplatModel, header: SceneHeader, index:
 
 
 def _opacity_steps(source: Source, decoded: SplatModel, header: SceneHeader, index: I64) -> float:
-    """Return the largest error of alpha, or of its root where the levels are those of roots, in steps."""
+    """Return the largest error of alpha, or of its root if the levels are of roots, in steps."""
     record = header.attribute(_spec.ATTRIBUTE_OPACITIES)
     ours, theirs = decoded.opacities.astype(np.float64), source.opacities[index].astype(np.float64)
     if record.mapping == _spec.MAPPING_SQUARE:

@@ -101,7 +101,7 @@ def _field_at(data: bytes, at: int) -> str:
     """Name what lies at a byte: a field, or the chunk; nothing where the file is not one."""
     try:
         built = mapped(data)
-    except Exception:  # noqa: BLE001 - a file that breaks clauses may end the walk anywhere, and is told of elsewhere
+    except Exception:  # noqa: BLE001 - a file that breaks clauses may end the walk anywhere, and is reported elsewhere
         return ""
     for name, entry in built.fields.items():
         if entry.offset <= at < entry.offset + entry.size:

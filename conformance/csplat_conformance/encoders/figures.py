@@ -1,4 +1,4 @@
-"""Sizes and PSNR of other encoders on the inputs, as information beside one's own."""
+"""Sizes and PSNR of other encoders on the inputs, for comparison with one's own."""
 
 from __future__ import annotations
 

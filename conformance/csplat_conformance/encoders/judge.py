@@ -52,8 +52,8 @@ def judge_content(one: Input, source: Source, scene: Scene, index: Path | None) 
 
     Args:
         one: the input.
-        source: what it stands for.
-        scene: what the file holds.
+        source: the scene of the input.
+        scene: the decoded scene.
         index: the encoder's own source index, `None` where none was asked for.
 
     Returns:
@@ -111,7 +111,7 @@ def _wrong_counts(source: Source, scene: Scene, pairs: Pairs) -> list[Wrong]:
 
 
 def _wrong_facts(source: Source, decoded: SplatModel) -> list[Wrong]:
-    """A PLY says nothing of axes, unit and filters: a file that does has guessed."""
+    """A PLY does not specify axes, unit and filters: an encoder that states them has guessed."""
     facts = {
         "axes": (decoded.coordinate_system, UNSPECIFIED),
         "unit_metres": (decoded.unit_metres, None),

@@ -23,9 +23,9 @@ def check_index(path: Path, source: Source, count: int, pairs: Pairs) -> tuple[P
 
     Args:
         path: the .npy file.
-        source: what was encoded.
+        source: the encoded scene.
         count: splats of the file.
-        pairs: which source splat is near to each of them.
+        pairs: the source splat near each of them.
 
     Returns:
         The pairs with the encoder's own index if it is right, as they are if not; and what is wrong.
@@ -40,7 +40,7 @@ def check_index(path: Path, source: Source, count: int, pairs: Pairs) -> tuple[P
     index = found.astype(np.int64)
     paired = np.flatnonzero(pairs.source_index >= 0)
     near = pairs.source_index[paired]
-    # Splats with equal centres are told apart by nobody but the encoder.
+    # Only the encoder can tell splats with equal centres apart.
     off = paired[(source.means[index[paired]] != source.means[near]).any(axis=1)]
     if len(off):
         text = (

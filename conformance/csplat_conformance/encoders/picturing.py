@@ -1,4 +1,4 @@
-"""L4: how a file looks, beside its source."""
+"""L4: renders of a file compared with those of its source."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def judge_pictures(
 
     Args:
         one: the input.
-        source: what it stands for.
-        scene: what the file holds.
-        pairs: which splat of the source each of the file's is.
+        source: the scene of the input.
+        scene: the decoded scene.
+        pairs: the source splat of each decoded splat.
         size_bytes: size of the file.
         pictures: compares.
-        psnr_min: dB, that is asked; an input may want more or less by so much.
+        psnr_min: lowest PSNR to pass, dB; an input shifts it by its own difference from the default.
     """
     model, decoded = source.model(scene.model.origin), scene.model
     psnr = pictures(model, decoded)

@@ -22,8 +22,8 @@ def judge_errors(one: Input, scene: Scene, pairs: Pairs) -> tuple[Verdict, str]:
 
     Args:
         one: the input.
-        scene: what the file holds.
-        pairs: which splat of the source each of its splats is.
+        scene: the decoded scene.
+        pairs: the source splat of each of its splats.
 
     Returns:
         The verdict, and why only pictures can judge the rest; nothing where they need not.
@@ -33,7 +33,7 @@ def judge_errors(one: Input, scene: Scene, pairs: Pairs) -> tuple[Verdict, str]:
         return Verdict(Status.SKIPPED, _UNKNOWN), ""
     stated = scene.stated_errors
     if stated is None:
-        # Of nothing there are no errors.
+        # An empty scene has no errors.
         return (Verdict(Status.NOT_PROVED, _SILENT), _SILENT) if len(scene.model) else (Verdict(Status.PASSED), "")
     proof = prove(source, scene.model, scene.header, stated, pairs.source_index)
     details = proof.as_json()["measures"]
@@ -43,7 +43,7 @@ def judge_errors(one: Input, scene: Scene, pairs: Pairs) -> tuple[Verdict, str]:
         return Verdict(Status.FAILED, in_short(proof.failures), proof.clauses, details=details), why
     coarse = coarse_errors(one, source, proof)
     warnings = [*coarse.values()]
-    if len(scene.model) and not stated.refitted:  # what was fitted anew moved on purpose
+    if len(scene.model) and not stated.refitted:  # refitted values differ on purpose
         names = frozenset(record.measure for record in stated.records) - coarse.keys()
         warnings += find_cuts(source, scene.model, scene.header, pairs.source_index, names)
     message = in_short((unproved,) * bool(unproved) + tuple(warnings))

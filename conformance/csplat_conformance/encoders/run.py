@@ -62,18 +62,18 @@ def run_encoder(
 ) -> Report:
     """Run an encoder over the inputs.
 
-    It is started for each: status 0 and a complete file at `{out}`, or status 1, a line that says why and no file.
-    Where it wrote a file it is started once more, after all others: the bytes have to be the same.
+    It is started for each: status 0 and a complete file at `{out}`, or status 1, a line with the reason and no file.
+    If it wrote a file, it is started once more, after all others: the bytes have to be the same.
 
     Args:
         command: its command line, with `{ply}` and `{out}`, and perhaps `{index}`, where it writes which splat of the
             source each splat of the file is.
         choice: settings of the run.
-        pictures: judges L4; without it the level is skipped, or fails where nothing else can judge.
-        no_pictures: why it is.
+        pictures: judges L4; without it the level is skipped, or fails if nothing else can judge.
+        no_pictures: why there is no judge of L4.
         progress: called with the number of steps done and the total.
         run: runs the command line with `ply`, `out` and `index` put in, within some seconds, in this process; on
-            threads, as many as `choice.jobs` says. Without it processes are started, each in an empty working
+            `choice.jobs` threads. Without it processes are started, each in an empty working
             directory, and `AGAIN_SECONDS` go by before a repetition.
 
     Raises:
@@ -192,7 +192,7 @@ def _try_all(
 
 
 def _forget(folder: Path, one: Input, first: Trial, again: Trial | None) -> None:
-    """Remove a repetition that gave the same file; where another one came out, whoever keeps files wants both."""
+    """Remove a repetition that gave the same file; if the files differ, keep both."""
     if again is not None and again.wrote and first.out.read_bytes() == again.out.read_bytes():
         place = _place(folder, one)
         shutil.rmtree(place.with_name(place.name + _AGAIN))

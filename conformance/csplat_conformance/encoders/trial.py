@@ -56,7 +56,7 @@ def try_once(command: str, one: Input, folder: Path, seconds: float, run: Runner
     Args:
         command: its command line.
         one: the input.
-        folder: where input and output lie; what is in the way there is replaced.
+        folder: folder for input and output; existing files are replaced.
         seconds: it may take.
         run: runs it in this process; without it a process is started, in an empty working directory of its own.
 

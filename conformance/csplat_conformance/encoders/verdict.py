@@ -9,7 +9,7 @@ from csplat_conformance.report import Status
 
 __all__ = ["Verdict", "Wrong", "failed", "in_short"]
 
-#: What is wrong: the clause that is broken, an empty one where it is none, and a line.
+#: A defect: the broken clause, empty if there is none, and a line about it.
 Wrong = tuple[str, str]
 
 _SHOWN = 2

@@ -1,4 +1,4 @@
-"""The inputs as files, for whoever wants them without a run."""
+"""Write the inputs as files, for use without a run."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def write_inputs(folder: Path, pattern: str | None = None) -> dict[str, Any]:
     """Write the PLY of every input, `ordinary/degree_3.ply`, and a list of them, `inputs.json`.
 
     Args:
-        folder: where; what is in the way is replaced.
+        folder: folder for the files; existing ones are replaced.
         pattern: shell patterns of the inputs' names; `None` for all.
 
     Returns:
-        What the list says: `inputs`, of each `name`, `file`, `why`, `refusal` (`must`, `may` or `no`) and `expected`,
+        The list: `inputs`, each with `name`, `file`, `why`, `refusal` (`must`, `may` or `no`) and `expected`,
         `null` where it must be refused: `splats` of the source (SRC-1), `rows` of the PLY, `sh_degree`,
         `extra_columns`, `apart` (no two different centres are nearer), `renders` (whether pictures are compared) and
         `psnr_min` (dB, unless another is asked for; `null` where they are not).
@@ -71,7 +71,7 @@ def _expected(one: Input, data: bytes) -> dict[str, Any] | None:
 
 
 def _rows(data: bytes) -> int:
-    """Return what the header says: `element vertex 64`."""
+    """Return the number of rows in the header: 64 for `element vertex 64`."""
     # A comment may say anything, `end_header` and `element vertex 9` too.
     for line in data.split(b"\n"):
         words = line.split()

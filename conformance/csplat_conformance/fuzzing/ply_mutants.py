@@ -58,9 +58,9 @@ class Ply:
     """A PLY taken apart.
 
     Attributes:
-        lines: of the header, without `end_header`; none where there is no header.
-        body: what follows the header.
-        newline: what ends a line of the header.
+        lines: lines of the header, without `end_header`; none if there is no header.
+        body: the bytes after the header.
+        newline: end of a line of the header.
     """
 
     lines: tuple[bytes, ...]

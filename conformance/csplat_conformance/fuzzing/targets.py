@@ -104,7 +104,7 @@ class DecoderTarget:
 
     def seeds(self, paths: Iterable[Path]) -> list[Built]:
         """Return the valid vectors with all their fields, and the given files."""
-        # By the sizes of the vectors: to build all of them for those that are small takes two seconds.
+        # Selected by the size of the vector's file: building all scenes to select small ones takes two seconds.
         small = {vector.name for vector in load() if (VECTORS / vector.file).stat().st_size <= _LARGEST_SEED}
         scenes = [recipe.scene for recipe in sound_recipes() if recipe.scene is not None and recipe.name in small]
         return [build(scene) for scene in scenes] + [mapped(p.read_bytes()) for p in paths]
@@ -122,7 +122,7 @@ class DecoderTarget:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
-                # One thread is three times as fast on small files; now and then as many as there are.
+                # One thread is three times as fast on small files; now and then all are used.
                 model = decoder.decode(data, limits=LIMITS, threads=1 if chance % 16 else None)
                 if len(model) > LIMITS.splats:
                     return "finding", "more splats than the limits allow"

@@ -42,5 +42,5 @@ class ValidatorTarget(DecoderTarget):
         clause = getattr(error, "clause", "")
         if not clauses:
             return "finding", f"refused with {error.code} ({clause}), but the validator finds nothing"
-        # Where several clauses are broken the validator may see the same damage as another one's.
+        # If several clauses are broken, the validator may attribute the same damage to another one.
         return (error.code if clause in clauses else "another clause"), ""

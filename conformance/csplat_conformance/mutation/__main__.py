@@ -2,12 +2,12 @@
 
 Usage:
     python -m csplat_conformance.mutation                                  # 400 mutants of the Python decoder
-    python -m csplat_conformance.mutation --decoder javascript --jobs 2    # wants node, and `npm ci` before
-    python -m csplat_conformance.mutation --decoder c                      # wants cc
+    python -m csplat_conformance.mutation --decoder javascript --jobs 2    # requires node, and `npm ci` before
+    python -m csplat_conformance.mutation --decoder c                      # requires cc
 
 A mutant is caught where a vector fails. Whatever passes them all reads damaged files, too: one that differs from the
 right decoder there is missed by the vectors; the others may be equivalent, or out of the vectors' reach, or show
-themselves too rarely. Of refusals neither code nor clause counts, as of any decoder that is not ours.
+themselves too rarely. Neither code nor clause of a refusal counts, as for any decoder that is not ours.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _DECODERS: Final[dict[str, Callable[[Sequence[bytes]], Decoder]]] = {
     "javascript": JavaScriptDecoder,
     "c": NativeDecoder,
 }
-_decoder: Decoder  # of a worker, which is forked with it
+_decoder: Decoder  # the decoder of a worker, which is forked with it
 
 
 def main() -> int:

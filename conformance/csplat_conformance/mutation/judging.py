@@ -1,4 +1,4 @@
-"""Ask a mutant about the vectors, and those that pass about fuzzed files."""
+"""Run mutants on the vectors, and those that pass on fuzzed files."""
 
 from __future__ import annotations
 

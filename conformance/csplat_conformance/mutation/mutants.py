@@ -102,7 +102,7 @@ def sample(decoder: Decoder, count: int, seed: int) -> list[Mutant]:
 
 
 def score(results: Sequence[Result]) -> float:
-    """Return the share, in per cent, of those caught among those that show a difference at all."""
+    """Return the share, in per cent, of caught mutants among those that show a difference at all."""
     counts = [sum(result.fate is fate for result in results) for fate in (Fate.CAUGHT, Fate.MISSED)]
     return 100.0 * counts[0] / max(1, sum(counts))
 
@@ -118,7 +118,7 @@ def table(
     Args:
         results: all of a run.
         texts: the modules by the names of their files.
-        fates: those that are listed, in this order.
+        fates: the fates to list, in this order.
         seen: head of the column that holds `by`.
     """
     lines = [f"| fate | where | was | is | {seen} |", "|---|---|---|---|---|"]

@@ -37,7 +37,7 @@ _ARITHMETIC: Final = {
     ast.BitXor: ("^", "&"),
 }
 _NAMES: Final = {"min": "max", "max": "min", "any": "all", "all": "any"}
-#: Whose text says nothing about what a decoder decodes.
+#: Nodes whose text has no influence on what a decoder decodes.
 _WORDS: Final = (ast.JoinedStr, ast.arg)
 
 

@@ -43,7 +43,7 @@ class PythonDecoder:
 
     Args:
         files: fuzzed ones.
-        processor_seconds: that a mutant may take for all vectors and files.
+        processor_seconds: CPU time that a mutant may take for all vectors and files.
     """
 
     def __init__(self, files: Sequence[bytes], processor_seconds: int = _PROCESSOR_SECONDS) -> None:

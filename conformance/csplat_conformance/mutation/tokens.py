@@ -85,7 +85,7 @@ def _changes(text: str, tokens: list[_Token]) -> Iterator[tuple[int, int, str]]:
         end = _end_of_call(tokens, at)
         if end and token.text in _WORDS:
             if token.text == "fail":
-                stays = last == "return" and tokens[end].text == ";"  # what follows is not skipped any more
+                stays = last == "return" and tokens[end].text == ";"  # the code after it is no longer skipped
                 yield (tokens[at - 1].start, tokens[end].end, ";") if stays else (token.start, tokens[end - 1].end, "1")
             at = end
             continue

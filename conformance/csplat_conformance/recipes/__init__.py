@@ -39,7 +39,7 @@ __all__ = ["all_recipes", "exact_floats", "sound_recipes"]
 
 
 def sound_recipes() -> list[Recipe]:
-    """Return those of valid files, in a twentieth of the time: the others are built here to be broken."""
+    """Return the recipes of valid files, in a twentieth of the time: the others build a file and break it."""
     makers = (
         valid_recipes,
         valid_stream_recipes,

@@ -76,7 +76,7 @@ def files() -> dict[Path, bytes]:
 
 
 def _pictures(recipe: Recipe) -> dict[Path, bytes]:
-    """Return the reference pictures of a recipe: those that are there, unless they differ from the equations."""
+    """Return the reference pictures of a recipe: the existing ones, unless they differ from the equations."""
     result = {}
     for number, view in enumerate(recipe.views):
         path = VECTORS / picture_name(recipe.name, number)

@@ -26,9 +26,9 @@ class Case:
     Attributes:
         name: name of the vector, behind `deflate_`.
         why: one line.
-        clause: that it breaks, or shows.
+        clause: the clause that it breaks, or shows.
         coded: the stream.
-        output: what it gives; of a broken one, what comes out of a decoder that does not notice.
+        output: its decoded bytes; for a broken one, the output of a decoder that does not notice.
     """
 
     name: str

@@ -1,6 +1,6 @@
 """Invalid files in which nothing but the one rule is broken: a decoder that does not check it finds all else right.
 
-Where a field is overwritten in a whole file, something else often refuses it, too: an index that says too many entries
+If a field is overwritten in a whole file, another check often refuses it, too: an index that states too many entries
 leads to a stream that is too short. Here sizes, counts and streams follow the defect.
 """
 

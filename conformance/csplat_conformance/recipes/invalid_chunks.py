@@ -253,7 +253,7 @@ def _texts() -> list[Recipe]:
     options = scene(chunks=(Chunk(_spec.CHUNK_OPTIONS, b"[]"),))
     garbage = scene(chunks=(Chunk(meta, b"{}", Stream(1, coder="deflate", coded=b"\xff\xff")),))
     tail = scene(chunks=(Chunk(meta, b"{}", tail=b"\0"),))
-    runs = 1024  # of 65,536 spaces: beyond the default budget, and 3 kB in the file
+    runs = 1024  # runs of 65,536 spaces: beyond the default budget, and 3 kB in the file
     values = b"{}" + b" " * runs
     packed = values + b"\0\0" + b"\xff" * runs + b"\0\0" + b"\xff" * runs
     spaces = Stream(1, (_spec.TRANSFORM_RUN_LENGTH,), "deflate_fixed", packed=packed)

@@ -81,7 +81,7 @@ def _index() -> list[Recipe]:
             "E_INDEX",
             base,
             {"index.directory_count": 65535},
-            ("E_VALUE",),  # the records that follow, read as those of chunks, break DIR-1
+            ("E_VALUE",),  # the records that follow, read as chunk records, break DIR-1
             at="index.head_size",
         ),
         patched(

@@ -15,7 +15,7 @@ __all__ = ["bad_text_recipes", "good_text_recipes"]
 
 _META, _CAMS, _OPTS = _spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS
 
-#: What JSN-1 refuses, by the name of the vector: the text and what is wrong with it.
+#: Texts that JSN-1 refuses, by the name of the vector: the text and its defect.
 _BAD: Final = {
     "word_short": (b'{"a":nul}', "null without its last letter"),
     "word_wrong": (b'{"a":nulx}', "null with another last letter"),

@@ -159,7 +159,7 @@ class _ByDisk:
 
     @property
     def _shares(self) -> tuple[int, int]:
-        """Processes, and splats of the part that each has: as many as have parts that are large enough."""
+        """Number of processes, and splats per part: as many processes as have large enough parts."""
         for workers in range(os.cpu_count() or 1, 1, -1):
             most = (self._memory // workers - _WORKER_BYTES) // self._row_bytes
             if CAN_COPY and most >= self.sizes.worth_a_process:
@@ -188,7 +188,7 @@ class _ByDisk:
     # Without a source index ------------------------------------------------------------------------
 
     def matches(self, bounds: Mapping[str, float]) -> NDArray[Any]:
-        """As of `Way`: [N] int8."""
+        """Implement `Way.matches`; [N] int8."""
         header, origin = self.opened.header, self.opened.facts.origin
         workers, most = self._shares
         cells = Cells.of(header, self.scene.count, most)
@@ -211,7 +211,7 @@ class _ByDisk:
         return found
 
     def farthest(self, bounds: Mapping[str, float], rows: I64) -> dict[str, Worst]:
-        """As of `Way`: what is near is gathered from all parts, and compared as in memory."""
+        """Implement `Way.farthest`: near splats are gathered from all parts, and compared as in memory."""
         if self._spool is None or not len(rows):
             return {}
         header = self.opened.header
@@ -251,7 +251,7 @@ class _ByDisk:
     # With a source index ---------------------------------------------------------------------------
 
     def pairs(self, source_index: NDArray[Any]) -> Pairs:
-        """As of `Way`; `source_index` may be mapped. Memory for a number of four or eight bytes a source splat."""
+        """Implement `Way.pairs`; `source_index` may be mapped. Takes four or eight bytes of memory per source splat."""
         count = self.opened.header.splat_count
         check_source_index(source_index, self.scene.count, count)
         groups = self._groups()

@@ -64,10 +64,10 @@ def match(
         source: M splats.
         decoded: N splats; its origin may be another one.
         bounds: largest error by measure, to which comes what SER-7 allows. `means` is among them; measures that are
-            not named are not looked at.
+            not named are not compared.
         radii: [N], how near the partner's centre is expected.
-        far: where there is none, the search goes on up to the bound.
-        reach: of all of the scene, as `Source.reach` has it, where the splats are a part of it.
+        far: if there is no partner within the radius, continue the search up to the bound.
+        reach: `Source.reach` of the whole scene, if the splats are a part of it.
         candidates_max: number of splats of one cell that are compared to find one partner.
         threads: number of threads, one per core by default. The result does not depend on it.
         progress: called with the progress.

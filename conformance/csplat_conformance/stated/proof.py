@@ -127,7 +127,7 @@ def prove_by(
         measures, wrong = _prove_pairs(way, header, bounds, source_index)
     elif not wrong and "means" in bounds:
         measures, wrong = _prove_matches(way, bounds)
-    elif not wrong:  # nothing says how far to look
+    elif not wrong:  # there is no bound to search within
         silent = tuple(way.names) if header.splat_count else ()
     measures.sort(key=lambda one: way.names.index(one.name))
     clauses = tuple(dict.fromkeys(clause for clause, _ in wrong))
@@ -217,7 +217,7 @@ def _prove_matches(way: Way, bounds: Bounds) -> tuple[list[MeasureProof], Wrong]
             f" nearest source splat {one.source_splat}"
             for name, one in worst.items()
         ]
-    # Of which measures the others are beyond is not known.
+    # It is not known which bounds the others exceed.
     open_ = len(alone) > some
     measures = [
         MeasureProof(

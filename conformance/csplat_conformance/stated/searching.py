@@ -50,12 +50,12 @@ class Search:
     workers: int
 
     def search(self, found: I8, *, far: bool) -> Iterator[int]:
-        """Look for the partners of those that have none, and say of how many source splats it is done.
+        """Look for the partners of splats that have none; yield the number of source splats searched.
 
         Args:
             found: [N], `FOUND`, `UNMATCHED` or `UNDECIDED` by splat of the file; changed in place when all is done,
                 so that the order of the cells does not matter.
-            far: as far as the bound reaches, instead of as near as the file's lattice puts partners.
+            far: search up to the bound, instead of only as near as the file's lattice puts partners.
 
         Raises:
             OSError: the source cannot be read; or a process was killed.

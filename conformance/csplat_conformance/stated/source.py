@@ -102,7 +102,7 @@ class Source:
         )
 
     def reach(self, origin: tuple[float, float, float]) -> float:
-        """Return the largest magnitude among its coordinates and those of a file's origin, scene units."""
+        """Return the largest magnitude of its coordinates and of a file's origin, scene units."""
         farthest = 0.0
         for axis in range(3):
             column, own = self.means[:, axis], self.origin[axis]

@@ -80,13 +80,13 @@ class Spool:
     _size: int = 0
 
     def add(self, source: Source, rows: NDArray[Any], keys: I64, numbers: I64) -> None:
-        """Take some splats, those of a key in the order in which they come.
+        """Add some splats; splats of one key stay in the order in which they are added.
 
         Args:
             source: splats of that layout.
-            rows: [n] which of its splats.
-            keys: [n] what each is to be found under.
-            numbers: [n] what is said of each.
+            rows: [n] indices of its splats.
+            keys: [n] key of each.
+            numbers: [n] number stored with each.
 
         Raises:
             OSError: they cannot be written.
@@ -123,7 +123,7 @@ class Spool:
         return {key: sum(count for _, count in parts) for key, parts in sorted(self._parts.items())}
 
     def sources(self, key: int, most: int) -> Iterator[tuple[Source, I64]]:
-        """Read the splats of a key, so many at a time at most, and their numbers. Processes may do it together.
+        """Yield the splats of a key, at most `most` at a time, and their numbers. Several processes may read.
 
         Raises:
             OSError: they cannot be read.

@@ -15,7 +15,7 @@ from csplat_conformance.validator.reading import Payload, place
 __all__ = ["Chunk", "check_coverage", "check_frame", "chunk_record", "read_directory", "registered_flags"]
 
 _SINGLE = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
-#: Where a chunk of the whole file, or one of a layer, belongs among others (4.3.6).
+#: The first layer that this version does not have; the order of its chunks is not checked (4.3.6).
 _LAST = max(_spec.LAYER_NAMES) + 1
 
 
@@ -26,11 +26,11 @@ class Chunk:
     Attributes:
         name: `META`, `CODB.2.0`, `TILE.0.1`.
         kind: its type.
-        flags: those of the record, or those registered for TILE.
+        flags: flags of the record, or the flags registered for TILE.
         record: directory or layer record; both have `size` and `offset`.
         identity: codebook id, or place of the tile.
         layer: layer of the record.
-        whole: whether its bytes are there and are no other chunk's.
+        whole: whether its bytes exist and belong to no other chunk.
     """
 
     name: str
@@ -139,7 +139,7 @@ def _check_single(findings: Findings, chunks: Sequence[Chunk]) -> None:
 
 def _check_codebook_chunks(findings: Findings, chunks: Sequence[Chunk], index: Index, start: int) -> None:
     if len(index.codebooks) != index.head.record.codebook_count:
-        return  # what the records ask for is not known: they have been named already
+        return  # the codebooks that they need are not known: the violations have been noted
     wanted = {
         (identity, layer)
         for identity, book in index.codebooks.items()
@@ -162,9 +162,9 @@ def check_coverage(findings: Findings, chunks: Sequence[Chunk], start: int, file
     Args:
         findings: where violations are added.
         chunks: all of the file.
-        start: where the index ends.
-        file_size: as the header says.
-        data_size: bytes that there are.
+        start: end of the index.
+        file_size: size of the file in the header.
+        data_size: size of the data.
     """
     ordered = sorted(chunks, key=lambda chunk: (chunk.offset, chunk.size))
     expected = covered = start
@@ -196,7 +196,7 @@ def check_frame(view: memoryview, chunk: Chunk, clause: str, findings: Findings)
     Args:
         view: the file.
         chunk: the chunk.
-        clause: the one that wants the payload to end with its last structure.
+        clause: the clause that requires the payload to end with its last structure.
         findings: where violations are added.
     """
     at, end = chunk.offset, chunk.offset + chunk.size
@@ -212,5 +212,5 @@ def check_frame(view: memoryview, chunk: Chunk, clause: str, findings: Findings)
         found = getattr(header.record, key)
         if found != wanted:
             findings.of("CHK-3", header, key, f"{found!r}, its record wants {wanted!r}")
-    # The record's size is the one that COV-1 has proved: the payload ends where it says.
+    # COV-1 has proved the record's size: the payload ends there.
     return Payload(view, at + _spec.CHUNK_HEADER_SIZE, end, chunk.name, clause, findings)

@@ -76,7 +76,7 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: Books) ->
     if stream.elements is not None:
         table = stream.elements.astype(np.int64).reshape(columns, size).T
         where = (stream.head.offset, f"{payload.name}/entries")
-        # What splats make of unsound entries would be told once more for each tile.
+        # Without this, splats of invalid entries would be reported again for each tile.
         if _check_entries(findings, index, book, of_layer, table, where):
             books[chunk.identity, chunk.layer] = table
     payload.finish()

@@ -36,10 +36,10 @@ def read_coded(reader: TileReader, payload: Payload, name: str, attribute: int, 
         payload: stands behind the block head.
         name: name of the block.
         attribute: registry value.
-        at: where the block head begins.
+        at: offset of the block head.
 
     Raises:
-        UnreadableError: how many streams follow is not known.
+        UnreadableError: the number of streams that follow is not known.
     """
     params = payload.structure(
         _spec.unpack_codebook_params, _spec.CODEBOOK_PARAMS_SIZE, _spec.CODEBOOK_PARAMS_OFFSETS, f"{name}.params"

@@ -92,7 +92,7 @@ class Placed(Generic[T]):
     Attributes:
         record: its fields.
         offset: byte of the file where it begins.
-        name: what its fields are called, `tile[0]`.
+        name: prefix of its fields' names, `tile[0]`.
         places: offset of each field in it.
     """
 

@@ -80,7 +80,7 @@ def read_records(view: memoryview, end: int, findings: Findings) -> Index:
 
     Args:
         view: the file.
-        end: where the index's CRC begins, as the header says; no more than the data's end.
+        end: offset of the index's CRC by the header, at most the end of the data.
         findings: where violations are added.
     """
     start = _spec.HEADER_SIZE

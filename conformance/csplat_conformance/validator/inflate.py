@@ -1,4 +1,4 @@
-"""DEFLATE (RFC 1951, spec 6.2) bit by bit. Slow: it says what is wrong with a stream that zlib refuses."""
+"""DEFLATE (RFC 1951, spec 6.2) bit by bit. Slow: it finds what is wrong with a stream that zlib refuses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class CodedError(Exception):
 
     Args:
         clause: COD-1, COD-2, COD-5 to COD-8.
-        message: how.
+        message: how it is broken.
         within: byte of the coded bytes that is to blame.
     """
 
@@ -44,7 +44,7 @@ class Inflater:
         self._out = bytearray()
 
     def inflate(self, size: int) -> bytes:
-        """Return what the final block completes, or more than `size` bytes as soon as there are so many.
+        """Return what the final block completes, or more than `size` bytes as soon as there are more.
 
         Raises:
             CodedError: by COD-2 where the stream is cut or no DEFLATE, by COD-5 to COD-8.

@@ -27,10 +27,10 @@ class Payload:
 
     Args:
         view: the whole file.
-        at: where the payload begins.
-        end: where it ends.
+        at: offset of the payload.
+        end: offset of its end.
         name: name of the chunk, `TILE.0.0`.
-        clause: the one that wants the payload to end with its last structure.
+        clause: the clause that requires the payload to end with its last structure.
         findings: where violations are added.
     """
 

@@ -28,7 +28,7 @@ class Stream:
     """A stream that has been stepped over.
 
     Attributes:
-        head: where it lies, and its fields.
+        head: its head: offset and fields.
         elements: [count], `None` where a violation keeps them from being known.
     """
 
@@ -77,7 +77,7 @@ def read_stream(
     # Even where the head is wrong the coder can be tried, as long as it has a sane size to fill.
     most = count_max if count is None else _ELEMENTS_MAX
     if count is not None and count > most:
-        sound = False  # what asks for so many has been refused
+        sound = False  # the field that requires more has been refused
     if not sound and head.record.packed_size > 3 * width_max * most:
         return Stream(head, None)
     try:

@@ -44,9 +44,9 @@ def read_tiles(view: memoryview, at: int, end: int, index: Index, findings: Find
 
     Args:
         view: the file.
-        at: where they begin.
-        end: where the index's CRC begins.
-        index: what stands before them.
+        at: offset of the first.
+        end: offset of the index's CRC.
+        index: the part of the index before them.
         findings: where violations are added.
     """
     tiles: list[Tile] = []

@@ -29,7 +29,7 @@ def check_integers(findings: Findings, index: Index, attribute: int, rows: I64, 
         attribute: registry value; not means.
         rows: [C, n] integers, before the lifting of 7.1.
         exponent: exponent of the block.
-        where: what is to blame.
+        where: the place to blame.
 
     Returns:
         Whether all clauses hold that could be looked at.
@@ -119,7 +119,7 @@ def check_box(
         record: the tile record.
         rows: [3, n], the integers q.
         box: the record's `corner`.
-        stream: that of the means.
+        stream: the stream of the means.
         sound: TIL-7 to TIL-9 hold.
     """
     lows, highs = rows.min(axis=1).tolist(), rows.max(axis=1).tolist()

@@ -1,6 +1,6 @@
 """Reference inputs for encoders: PLY files made by recipe, and the sources that they stand for.
 
-`ordinary/` an encoder must take; `nasty/` it may refuse, with status 1 and a line that says why, but must not get
+`ordinary/` an encoder must take; `nasty/` it may refuse, with status 1 and a line with the reason, but must not get
 wrong; `broken/` it must refuse. Splats keep a distance of `apart` from one another, so that a decoded splat has one
 source alone.
 """
