@@ -7,13 +7,13 @@ The law, for a file of n splats whose attributes keep q dB each, with x = E(p) t
 
 - `sh` is in proportion to the coefficients that are kept; a codebook costs its indices and its entries instead, and
   errs by what too few of these leave.
-- `removal` is a power of the splats that are gone, beyond those that no view needs; a refit divides it.
+- `removal` is a power of the number of pruned splats, not counting those that no view needs; a refit divides it.
 - `missing` is what the scene shows without its upper bands.
 - `ceiling` bounds what any precision reaches: the search has to notice that finer steps gain nothing.
 
 A plateau of q and jumps (every other step of q loses some dB) break the monotony that a search likes to rely on. Each
-view sees the same error; those that judge may see more of all of it, or of removal.
-`AnalyticScene.smallest` and `best` find the best file by trying everything: what a search is compared with.
+view sees the same error; test views may see more of all of it, or of removal.
+`AnalyticScene.smallest` and `best` find the best file by trying everything, as a reference for the search.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ import numpy as np
 from csplat import EncodeOptions, SplatModel
 from csplat.encoder import PRESETS
 
-USUAL_QUALITY = 42.0  # dB that each attribute keeps: where bytes per splat are those of the scene
-QUALITIES = np.arange(24.0, 110.0, 0.2)  # dB, those that a search may ask for
+USUAL_QUALITY = 42.0  # dB that each attribute keeps when bytes per splat are those of the scene
+QUALITIES = np.arange(24.0, 110.0, 0.2)  # dB, the qualities that a search may request
 PSNR_CAP = 99.0  # dB
 BOOKS = tuple(2**power for power in range(5, 13))
 
@@ -65,14 +65,14 @@ DECIDING = Views()
 
 @dataclass(frozen=True)
 class Contents:
-    """A file as the encoder was asked for it.
+    """A request for a file.
 
     Attributes:
         options: options of the encoder, without any that is still to be chosen.
-        splats: how many it holds.
-        refitted: those that are left were fitted to what the source looks like.
-        graded: splats are sorted by importance.
-        draft: a refit through its quantisers was left out.
+        splats: number of splats.
+        refitted: whether the kept splats were fitted to renders of the source.
+        graded: whether splats are sorted by importance.
+        draft: whether a refit through its quantisers was left out.
     """
 
     options: EncodeOptions
@@ -84,25 +84,25 @@ class Contents:
 
 @dataclass(frozen=True)
 class AnalyticScene:
-    """A scene, and what files of it cost.
+    """A scene, and the cost of files of it.
 
     Attributes:
-        splats, sh_degree: of the scene.
+        splats, sh_degree: number of splats and SH degree of the scene.
         unneeded: splats that no view needs.
         removal_psnr: PSNR once half of the others are gone, dB, before a refit.
-        removal_power: with which the error grows with the splats that are gone.
-        mended: dB by which a refit makes that error less. tuned: dB that a refit through a file's quantisers gains.
+        removal_power: exponent with which the error grows with the number of pruned splats.
+        mended: dB by which a refit reduces that error. tuned: dB that a refit through a file's quantisers gains.
         shown: PSNR of the scene with bands up to degree 0, 1 and 2 alone, dB.
-        frame_bytes: of a file without splats. splat_bytes, sh_bytes: per splat at the usual quality.
-        rate: by what share bytes grow with each dB.
-        lost: dB between what each attribute keeps and what renders do.
-        grading: by what bytes are multiplied where splats are sorted by importance.
-        index_bytes, entry_bytes: of a codebook of SH, per splat and per entry.
+        frame_bytes: bytes of a file without splats. splat_bytes, sh_bytes: bytes per splat at the usual quality.
+        rate: share by which bytes grow with each dB.
+        lost: dB between the quality of the attributes and that of renders.
+        grading: factor of the bytes if splats are sorted by importance.
+        index_bytes, entry_bytes: bytes of a codebook of SH, per splat and per entry.
         book_psnr: PSNR that a codebook of one entry for 64 splats leaves, dB. book_octave: dB with twice the entries.
         ceiling: dB that no precision exceeds.
         plateau: from and to which quality more of it gains nothing; what is above gains as much less.
         jump: dB that every other step of 0.6 dB of quality loses.
-        packing: by what bytes are multiplied where a file is not packed as tightly as can be.
+        packing: factor of the bytes of a file that is not packed as tightly as possible.
         preset_saving: a preset, and the share by which its own file is smaller than others of its quality.
     """
 
@@ -131,7 +131,7 @@ class AnalyticScene:
     preset_saving: tuple[str, float] = ("", 0.0)
 
     def model(self) -> SplatModel:
-        """Return so many splats, none of which matters: all that is asked of them is how many there are."""
+        """Return a model with this number of splats; their values do not matter."""
         n, bands = self.splats, (self.sh_degree + 1) ** 2 - 1
         return SplatModel(
             means=np.zeros((n, 3), np.float32),
@@ -197,7 +197,7 @@ class AnalyticScene:
         return float(self._seen(self.missing(sh_degree), self.removed(splats, refitted=refitted), views))
 
     def removed(self, splats: Any, *, refitted: bool) -> Any:
-        """Return the error of removal where so many splats are left."""
+        """Return the error of removal if this number of splats is kept."""
         needed = self.splats - self.unneeded
         gone = np.maximum(0, needed - splats) / (0.5 * needed)
         return error_of(self.removal_psnr + self.mended * refitted) * gone**self.removal_power
@@ -240,7 +240,7 @@ class AnalyticFile:
     """A file, as long as its size says; it cannot be read.
 
     Attributes:
-        scene, contents: what it was made of.
+        scene, contents: the scene and the request that it was made from.
     """
 
     scene: AnalyticScene

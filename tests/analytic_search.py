@@ -25,13 +25,13 @@ from csplat_tools.optimise.trials import Trials
 
 @dataclass(frozen=True)
 class Found:
-    """A search that came to its end.
+    """The result of a search.
 
     Attributes:
-        file: that was chosen.
+        file: the chosen file.
         tried: every file that was made, in order.
-        judged: those that the judging views were shown.
-        report: as users get it.
+        judged: the files that the test views were shown.
+        report: the report that users get.
     """
 
     file: AnalyticFile
@@ -58,12 +58,12 @@ def search(
         scene: the scene.
         options: knobs of the encoder that the caller fixed.
         keep_all: no splat may be removed.
-        judging: what the judging views see; usually what the deciding ones do.
-        photo_psnr: PSNR of the source against photographs, dB, which decide a loss.
+        judging: the test views; by default they see the same as the validation views.
+        photo_psnr: PSNR of the source against photographs, dB; photographs decide a loss.
         grades: splats may be sorted by importance.
         effort: effort of the refit.
         tried: receives the files that are made, even if the search is refused.
-        target: as for `Target`.
+        target: arguments of `Target`.
     """
     encoding, model, asked = options or EncodeOptions(), scene.model(), Target(**target)
     judge, decider = _Judge(scene, judging or Views()), _Judge(scene, Views())
@@ -87,14 +87,14 @@ def search(
 
 
 def analytic_removal(scene: AnalyticScene, *, grades: bool = False, effort: int = 3) -> Removal:
-    """Return who says how many splats may go."""
+    """Return the object that decides how many splats may be pruned."""
     how = SimplifyOptions(effort=effort)
     return _Removal(scene.model(), None, how, grades=grades, progress=None, psnr=None, scene=scene)
 
 
 @dataclass(eq=False)
 class _Judge:
-    """Views, which see what the law says. Remembers the files that it was shown."""
+    """Views that see the errors of the law. Remembers the files that it was shown."""
 
     scene: AnalyticScene
     views: Views
@@ -157,7 +157,7 @@ class _Splats:
         contents = Contents(options, len(self.model), self.refits, graded=graded, draft=quick and self.refits)
         return SimpleNamespace(write=lambda _: _encoded(AnalyticFile(self.scene, contents)))
 
-    def said(self, trial):  # noqa: ARG002  # the file says nothing of it
+    def said(self, trial):  # noqa: ARG002  # the file does not record it
         return None
 
 
@@ -184,7 +184,7 @@ class _Session:
 
 @dataclass(eq=False)
 class _Removal(Removal):
-    """The order of removal and the refit that the law gives, in place of those that are measured."""
+    """The order of removal and the refit that the law gives, in place of measured ones."""
 
     scene: AnalyticScene = None
 

@@ -5,7 +5,7 @@ to an area by `@pytest.mark.area(name="engines")`. `make test` leaves out every 
 recorded hash; `make test-all` runs all of them.
 
     python tests/areas.py list                # each area, and whether its sources have changed
-    python tests/areas.py changed             # names of those that have
+    python tests/areas.py changed             # names of areas that have changed
     python tests/areas.py expression          # the -m expression of `make test`
     python tests/areas.py expression --fast   # the same of `make check`: no slow tests, areas or shared scenes
     python tests/areas.py extras              # the extras of pyproject.toml that changed areas need

@@ -48,7 +48,7 @@ PRESETS = ("fast", "balanced", "small")
 #: Scenes that are not in the project; their folder, see tests/conftest.py.
 SHARED = Path(os.environ.get("CSPLAT_DATA", ROOT.parent / "shared" / "data"))
 SHARED_SCENES = ("ply/lego60k.ply", "ply/plane3.ply", "ply/donut.ply", "sog/angel.sog")
-#: What a group's goldens may depend on, beyond the code.
+#: Dependencies of a group's goldens, beyond the code.
 DEPENDS = {
     "encode": ("numpy", "deflate"),
     "shared": ("numpy", "deflate"),
@@ -355,8 +355,8 @@ def differences(golden: Json, found: Json, *, loosely: bool = False, where: str 
     """Return a line for each difference between a golden and what was found, with its place.
 
     Args:
-        golden: what is recorded.
-        found: what the code makes now.
+        golden: the recorded value.
+        found: the value that the code computes now.
         loosely: the environment differs: hashes do not count, and numbers need only be near.
         where: place of both in the JSON.
     """

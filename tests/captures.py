@@ -1,4 +1,4 @@
-"""A small scene, and photographs of it, for tests of what learns from photographs. Wants the extra [render]."""
+"""A small scene, and photographs of it, for tests of what learns from photographs. Requires the extra [render]."""
 
 import json
 import math
@@ -32,7 +32,7 @@ def views_of(seen_from, photographs=()):
 
 
 def shell(coefficients):
-    """300 overlapping splats on a sphere, whose colours vary smoothly, with so many SH coefficients above degree 0."""
+    """Return 300 overlapping splats on a sphere, of smoothly varying colours, with SH coefficients above degree 0."""
     rng = np.random.default_rng(0)
     means = rng.standard_normal((300, 3))
     means /= np.linalg.norm(means, axis=1, keepdims=True)

@@ -100,7 +100,7 @@ class Site:
     Attributes:
         requests: all that came, in order.
         ranges: False for a server that ignores Range and answers 200 with everything.
-        bytes_per_second: bytes per second of each answer to a path that a test added; 0 for as fast as it goes.
+        bytes_per_second: speed of each answer to a path that a test added; 0 for no limit.
         policy: the Content-Security-Policy of all answers, if any.
     """
 
@@ -110,7 +110,7 @@ class Site:
         self.bytes_per_second = 0
         self.policy = ""
         self._files: dict[str, bytes | Path] = {}
-        self._web = web_files()  # of the package that is being tested, a checkout or a wheel
+        self._web = web_files()  # from the package that is being tested, a checkout or a wheel
         site = self
 
         class Handler(BaseHTTPRequestHandler):

@@ -25,7 +25,7 @@ pytest_plugins = ["chromium"]  # the fixtures `browser`, `tab` and `site`
 
 SHARED = Path(os.environ.get("CSPLAT_DATA", ROOT.parent / "shared" / "data"))
 
-#: Programs and files of others: CONTRIBUTING.md says how to fill it.
+#: Programs and files of others: CONTRIBUTING.md describes how to fill it.
 PEERS = Path(os.environ.get("CSPLAT_PEERS", ROOT / "out" / "peers")).absolute()
 
 

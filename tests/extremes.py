@@ -1,7 +1,7 @@
 """Scenes at the extremes, as PLY files hold them: shared by the tests of the group `extremes`.
 
 All are made of one ordinary object, a shell of 300 overlapping splats about two units across. `CONDITIONS` names them;
-`codec/EXTREMES.md` says what becomes of each. `python tests/extremes.py` prints that page's figures.
+`codec/EXTREMES.md` describes the result of each. `python tests/extremes.py` prints that page's figures.
 """
 
 from __future__ import annotations

@@ -37,8 +37,8 @@ class Learnt:
     Attributes:
         half: half its splats.
         trained: splats that learnt from photographs of it.
-        losses: losses of each step.
-        tuned: what its tuned file decodes to, or why it cannot be tuned.
+        losses: loss of each step.
+        tuned: the decoded scene of its tuned file, or why it cannot be tuned.
     """
 
     half: SplatModel
@@ -60,7 +60,7 @@ class Chain:
         decoded: the scene of the file.
         proof: proof of the file's stated errors.
         pictures: renders of source and decoded scene, in the modes `fast` and `exact`.
-        learnt: of `LEARNT` alone.
+        learnt: the scene after learning; only for conditions in `LEARNT`.
     """
 
     source: SplatModel

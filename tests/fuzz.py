@@ -44,13 +44,13 @@ from csplat_conformance.fuzzing.targets import DecoderTarget, OthersTarget, miss
 from csplat_conformance.fuzzing.validating import ValidatorTarget
 
 TARGETS = ("decoder", "others", "validator", "ply", "formats")
-REPLAYED_MAX = 20  # files whose fate is told one by one
+REPLAYED_MAX = 20  # files whose fate is printed one by one
 SECONDS_PER_CASE = 5
 HANG_SECONDS = 60  # in native code, where no alarm arrives
 MEMORY_ABOVE_START = 256_000_000  # bytes of resident memory; the limits allow 32 MB of arrays
 ADDRESS_SPACE_ABOVE_START = 2_000_000_000  # allocations beyond this fail with MemoryError at once
-TRACED_SHARE = 0.5  # of the cases: tracing takes three times as long
-GROWN_SHARE = 0.5  # of the cases start from the corpus that grew, the others from the seeds
+TRACED_SHARE = 0.5  # share of the cases that are traced: tracing takes three times as long
+GROWN_SHARE = 0.5  # share of the cases that start from the corpus that grew, the others from the seeds
 GROWN_MAX = 4000
 PLAIN_SEEDS = 20  # seeds that a plain run reads as they are, to warm up; the conformance suite reads them all
 SOURCE_BYTES_MAX = 20_000

@@ -13,13 +13,13 @@ the fact, or the change makes no difference.
 1. The tests run once on an unchanged copy of the project, and coverage notes which of them reach which lines
    (`reach.py`). What a fixture of a wider scope runs counts for every test that uses it, and what `once(name, make)`
    computes for every test that asks for the name. Python processes that tests start are traced, too; what runs only in
-   forked processes, or in those started without our environment, counts as not reached. The map is kept beside the
+   forked processes, or in those started without our environment, counts as not reached. The map is kept next to the
    state, in `maps`, until a Python file changes. Tests that fail here judge no mutant.
 2. Each mutant is written into a copy of the project, one copy for each job and always at the same place, so that numba
    finds there what it has compiled. For a mutant in a kernel or at module level, it compiles the modules that import
    it anew.
 3. The tests that reach the mutant's statement run in a forked process, the quickest first, until one fails. Five times
-   what they took, and 60 s, is the time limit. Coverage sees neither inside compiled kernels nor who uses a constant
+   what they took, and 60 s, is the time limit. Coverage sees neither the inside of kernels nor uses of a constant
    of a module: for these run the tests that reach any function of the module, then those that reach modules that
    import it.
 
@@ -76,7 +76,7 @@ class Verdict:
     """The verdict on a mutant.
 
     Attributes:
-        fate: what became of it.
+        fate: the outcome.
         by: the test that fails.
         tests: number of tests that were to judge it.
         left_out: number of tests that reach it, but are beyond the budget.
@@ -94,7 +94,7 @@ class Package:
     """A package and its mutants.
 
     Args:
-        project: where it is.
+        project: the project that contains it.
         name: the package's name.
         patterns: files in it that are changed; none for all.
     """
@@ -216,8 +216,8 @@ class Suite:
     Attributes:
         project: the product.
         trees: a copy of it with these tests for each job.
-        map: which tests reach which lines.
-        importers: who imports which module of the packages.
+        map: the tests that reach each line.
+        importers: the modules that import each module of the packages.
         budget: seconds that the tests of a mutant may take, by what they took on the unchanged tree.
     """
 
@@ -245,7 +245,7 @@ class Suite:
             project: the product.
             trees: one for each job.
             packages: names of the packages that are mapped.
-            expression: which tests, as of pytest's `-m`.
+            expression: selection of tests, as for pytest's `-m`.
             patterns: names of files in `tests`; none for all.
             budget: seconds that the tests of a mutant may take.
             folder: folder of maps.
@@ -293,9 +293,9 @@ class State:
     """The mutants of a package and what became of them, kept in a file.
 
     Args:
-        file: where.
+        file: path of the file.
         package: the package.
-        settings: what the choice of mutants depends on.
+        settings: settings that the choice of mutants depends on.
 
     Raises:
         ValueError: the file is of other sources or settings.
@@ -327,7 +327,7 @@ class State:
         return [_mutant(one) for one in entries if not suite or suite not in one.get("suites", {})]
 
     def note(self, mutant: Mutant, verdict: Verdict, suite: str = "") -> None:
-        """Keep a verdict; one of another suite beside that of this one."""
+        """Keep a verdict; the verdict of another suite is kept next to this one's."""
         entry = next((one for one in self.entries if _mutant(one) == mutant), asdict(mutant))
         if suite:
             entry.setdefault("suites", {})[suite] = asdict(verdict)

@@ -169,7 +169,7 @@ def float32_errors(
     """Compare float32 gradients with float64 ones.
 
     Where a comparison (alpha against 1/255, say) fell the other way in float32, a pixel gives one splat another
-    gradient: as many splats as there are such pixels are left out, those that differ most.
+    gradient: for each such pixel one splat is left out, those that differ most.
 
     Returns:
         The number of these pixels, and the relative error of each group of parameters.

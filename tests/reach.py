@@ -110,7 +110,7 @@ class Tree:
     """A copy of the project in which one file may be changed.
 
     Args:
-        folder: where it lies.
+        folder: folder of the copy.
         project: whose product it is.
         suite: the checkout that gives `tests` and `pyproject.toml`.
     """
@@ -237,7 +237,7 @@ class Tree:
             if any(Path(getattr(module, "__file__", None) or "/").absolute().is_relative_to(one) for one in own):
                 del sys.modules[name]
         os.chdir(self.root)
-        sys.modules["__main__"] = types.ModuleType("__main__")  # which multiprocessing would import again
+        sys.modules["__main__"] = types.ModuleType("__main__")  # multiprocessing would import the old one again
         os.environ |= {"PYTHONPATH": os.pathsep.join(paths), "NUMBA_CACHE_DIR": str(numba_cache)}
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         sys.dont_write_bytecode = False
@@ -270,7 +270,7 @@ class Place:
     """A statement and what surrounds it.
 
     Attributes:
-        lines: the statement's lines; those of its head where it has a body.
+        lines: the statement's lines; only those of its head if it has a body.
         is_traced: it runs when a function is called, and coverage sees that.
         is_compiled: it is in a function that is compiled.
     """
@@ -359,7 +359,7 @@ class Recorder:
     """A plugin of pytest that tells coverage which test or fixture runs, and notes how long each takes.
 
     Attributes:
-        uses: what each test and each fixture uses.
+        uses: fixtures that each test and each fixture uses.
         scopes: scopes of the fixtures.
         seconds: time of each, without that of what it uses.
         passed: tests whose call passed.
@@ -450,8 +450,8 @@ class Map:
         root: the tree that was traced.
         lines: file with coverage's data.
         tests: the tests that pass there.
-        failed: those that do not.
-        uses: what each test and each fixture uses.
+        failed: the tests that fail there.
+        uses: fixtures that each test and each fixture uses.
         scopes: scopes of the fixtures.
         seconds: time of each test and each fixture, without that of what it uses.
     """
@@ -471,10 +471,10 @@ class Map:
 
         Args:
             tree: the tree, unchanged.
-            packages: names of those that are traced.
-            expression: which tests, as of pytest's `-m`; empty for all.
+            packages: names of the packages that are traced.
+            expression: selection of tests, as for pytest's `-m`; empty for all.
             patterns: names of files in `tests`; none for all.
-            folder: where maps are.
+            folder: folder of maps.
 
         Raises:
             RuntimeError: pytest did not run.
@@ -501,7 +501,7 @@ class Map:
 
         Args:
             place: the statement.
-            levels: texts of files: of its own, of those that import it, of those that import these, and so on.
+            levels: texts of files by level: its own file, files that import it, files that import these, and so on.
         """
         contexts = self._contexts(next(iter(levels[0])))
         names = {name for line in place.lines for name in contexts.get(line, ())}
@@ -520,7 +520,7 @@ class Map:
         return list(chosen)
 
     def affordable(self, tests: Sequence[str], seconds: float) -> list[str]:
-        """Return the first of the tests, as many as take no longer than this together, fixtures included."""
+        """Return the first tests that together take no longer than `seconds`, fixtures included."""
         parts: set[str] = set()
         for count, test in enumerate(tests):
             parts |= {test} | self._closure(test)
@@ -558,7 +558,7 @@ class Map:
         return {test for test in self.tests if test in names or not names.isdisjoint(self._closure(test))}
 
     def _ordered(self, tests: Iterable[str]) -> list[str]:
-        """Sort tests by time, fixtures included; those that use slow fixtures of their file stay together."""
+        """Sort tests by time, fixtures included; tests that use slow fixtures of their file stay together."""
         total = {test: self._sum([test, *self._closure(test)]) for test in tests}
         groups: dict[str, float] = {}  # least time of the tests of a file that stay together
         ranks: dict[str, tuple[float, str]] = {}

@@ -1,6 +1,6 @@
 """The Python module of SPZ's repository, on csplat: so its own tests judge our reader, writer and turning.
 
-`test_format_spz.py` runs them, and says which fail: what csplat has no counterpart for is absent here.
+`test_format_spz.py` runs them, and lists which fail: functions without a counterpart in csplat are absent here.
 """
 
 from dataclasses import replace
@@ -34,7 +34,7 @@ class UnpackOptions:
 
 
 def _flat(name, zeros=0):
-    """A property of flat float32: so many zeros a splat where nothing was put."""
+    """Return a property of flat float32 values: `zeros` zeros per splat if nothing was assigned."""
     return property(
         lambda cloud: cloud.arrays.get(name, np.zeros(zeros and zeros * cloud.num_points, np.float32)),
         lambda cloud, values: cloud.arrays.update({name: np.array(values, np.float32)}),

@@ -1,6 +1,6 @@
 """Stores of files that are read in parts: in memory, and a web server and an S3 on this machine.
 
-All but the S3 may be as bad as they are told.
+All but the S3 can be made to misbehave.
 """
 
 import io
@@ -36,8 +36,8 @@ class FileSystem:
     Attributes:
         files: by name.
         protocol: one name, or several.
-        ranges: whether it gives parts of files.
-        cut_after: requests from which on half of what is wanted comes; `None`: never.
+        ranges: whether it returns parts of files.
+        cut_after: number of requests after which only half of a range is returned; `None`: never.
         answer: is raised in place of any answer.
         asked, sent: requests so far, and bytes that came of them.
     """

@@ -1,4 +1,4 @@
-"""Tables of cases with one verdict per case: a single test checks them all, and names those that fail."""
+"""Tables of cases with one verdict per case: a single test checks them all, and names the cases that fail."""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import TypeVar

@@ -63,7 +63,7 @@ def test_answers_wait_and_the_line_knows_when_it_is_quiet(folder):
     line = Line(1e9, 0.2)
     with line.serve(folder) as address:
         got(address, "/page.html")
-        assert line.begun is None  # what is not a scene comes as fast as it goes
+        assert line.begun is None  # files other than scenes are not slowed down
         start = time.time()
         thread = threading.Thread(target=got, args=(address, "/scenes/a.bin", "bytes=0-9"))
         thread.start()

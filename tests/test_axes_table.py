@@ -90,11 +90,11 @@ def test_all_that_shows_a_scene_agrees_on_up(tmp_path, make_model, make, words, 
     assert f"\nup           {shown}\n" in call("info", tmp_path / "b.csplat")
     model = read_ply(tmp_path / "b.ply")
     assert (scene.coordinate_system, scene.metadata.get("up")) == (model.coordinate_system, model.metadata.get("up"))
-    upright(orbit_cameras(model, 2, 64, 48), up or (0, -1, 0))  # where nobody says it: as in a PLY
+    upright(orbit_cameras(model, 2, 64, 48), up or (0, -1, 0))  # without a recorded up: as in a PLY
 
 
 def in_page(path):
-    """The scene in its page, and what the page is told beside it."""
+    """Return the scene in its page, and the parameters that the page has in addition."""
     page = path.with_suffix(".html")
     call("export-html", path, page, "--force")
     text = page.read_text("utf-8")

@@ -1,4 +1,4 @@
-"""`csplat batch`: which scenes, what is done twice, what ends in the middle, and what is told of it."""
+"""`csplat batch`: selection of scenes, repetition, interruption, and reports."""
 
 import json
 import os
@@ -56,7 +56,7 @@ def names(tasks):
     return [one.output for one in tasks]
 
 
-# which scenes
+# selection of scenes
 
 
 def test_a_folder_is_searched_and_keeps_its_paths(scenes):
@@ -142,7 +142,7 @@ def test_a_manifest_in_another_encoding_is_refused_in_a_line(tmp_path):
         find_tasks(str(tmp_path / "list.csv"), "encode", ".csplat")
 
 
-# what is done, and not done again
+# work that is done, and not done again
 
 
 @pytest.mark.usefixtures("here")
@@ -170,7 +170,7 @@ def test_nothing_is_done_twice_but_what_failed_or_changed(scenes, tmp_path, here
     here.ran = 0
     again = run(scenes, out)
     assert (1, {"a.csplat", "sub/b.csplat"}) == (here.ran, set(again.done_before))  # the text is tried again
-    csplat.write_ply(scenes / "text.splat", make_model(5, 0))  # the content says what it is
+    csplat.write_ply(scenes / "text.splat", make_model(5, 0))  # the content determines the format
     csplat.write_ply(scenes / "a.ply", make_model(41, 1))
     (out / "sub" / "b.csplat").unlink()
     again = run(scenes, out)
@@ -286,7 +286,7 @@ def test_scenes_wait_for_memory_and_one_that_wants_all_of_it_is_refused():
 def test_a_scene_that_wants_more_than_all_of_it_fails(scenes, tmp_path):
     done = run(scenes, tmp_path / "out", ("convert",), ending=".ply", match="*.spz", memory_bytes=10**6)
     assert ["E_LIMIT"] == [one.code for one in done.failures]
-    done = run(scenes, tmp_path / "out", match="*.ply", memory_bytes=10**6)  # encode is told to keep to what there is
+    done = run(scenes, tmp_path / "out", match="*.ply", memory_bytes=10**6)  # the limit is passed on to encode
     assert ["E_INPUT"] == [one.code for one in done.failures]
 
 
@@ -347,7 +347,7 @@ def test_the_journal_of_a_process_that_was_killed_is_read_and_goes_on(tmp_path):
 @pytest.mark.usefixtures("here")
 def test_a_batch_that_is_interrupted_goes_on_where_it_ended(scenes, tmp_path, make_model):
     stuck, out = scenes / "stuck.ply", tmp_path / "out"
-    os.mkfifo(stuck)  # of no size: it comes last
+    os.mkfifo(stuck)  # without a size: it comes last
     command = [sys.executable, "-m", "csplat_tools", "batch", str(scenes), str(out), "--workers", "1"]
     batch = subprocess.Popen(
         [*command, "--no-thumbnails", "--", *FAST],

@@ -22,7 +22,7 @@ from csplat_conformance.validator import validate
 def beyond():
     """Cases and their files, by name.
 
-    Those that are vectors all decoders and the validator meet anyway: of a mask the first bit and the last. Of the bits
+    Vectors are run by all decoders and the validator anyway: for a mask the first bit and the last. Of the bits
     between them in reserved fields every third is here, in flags all.
     """
     vectors = {vector.data: vector.error for vector in load() if vector.error}
@@ -44,7 +44,7 @@ def named(rule):
     return f"{rule.structure}.{rule.field} {getattr(rule, 'of', '')}".rstrip()
 
 
-#: Vectors with so many splats or entries that only their index is read.
+#: Vectors with too many splats or entries to read more than their index.
 OF_MANY = {"extreme/codebook_of_65536", "extreme/codebooks_of_many_splats", FULL_TILE}
 
 
@@ -61,7 +61,7 @@ def valid():
         by_structure = {}
         for name, field in built.fields.items():
             by_structure.setdefault(field.structure, {})[name] = field
-        # Which coding a block has tells its streams apart.
+        # A block's coding determines the meaning of its streams.
         codings = {name: field for name, field in built.fields.items() if name.endswith(".coding")}
         for structure, fields in by_structure.items():
             found.setdefault(structure, []).append(replace(built, fields=codings | fields))

@@ -241,7 +241,7 @@ def test_camera_files_of_other_programs_are_read(tmp_path):
     assert [] == failures(FOREIGN, check)
 
 
-#: Files that are wrong, and what the error says.
+#: Invalid files, and the text of the error.
 WRONG = {
     "INRIA, no focal length": ([standing(), standing(fx=None)], "camera 1: fx is None, expected a number"),
     "INRIA, no position": ([standing(position=None)], "camera 0: rotation and position have other shapes"),

@@ -199,7 +199,7 @@ def test_wrong_settings_are_usage_errors(tmp_path, ply, setting, expected):
     assert expected in " ".join(result.stderr.replace("│", "").split())
 
 
-#: What a process without numba imports and says, as JSON; its last word is a list of command lines.
+#: A process without numba that prints its imports and output as JSON; its last argument is a list of command lines.
 WITHOUT_NUMBA = """
 import contextlib, io, json, sys
 sys.modules["numba"] = None

@@ -178,7 +178,7 @@ def test_everything_is_measured_and_printed(capture, tmp_path, capsys):
     assert (301 * 248, 300 * 248) == (steps["none"]["size_bytes"], steps["prune unseen"]["size_bytes"])
     assert steps["none"]["psnr"] == pytest.approx(steps["prune unseen"]["psnr"], abs=1e-3)
     assert steps["+ Morton order"]["size_bytes"] == row["after_bytes"]
-    # What was tuned in memory, and files of it in either order, score the same.
+    # The tuned scene in memory, and files of it in either order, score the same.
     tuned = [steps[name]["psnr"] for name in ("+ fine-tuning", "+ entropy coding", "+ Morton order")]
     assert tuned == pytest.approx([row["after"]["psnr"]] * 3, abs=1e-5)
     assert steps["+ quantisation"]["psnr"] == pytest.approx(row["before"]["psnr"], abs=1e-5)

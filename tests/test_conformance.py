@@ -66,7 +66,7 @@ def test_integers_are_refused_with_the_same_code():
 
 
 def test_the_built_in_run_passes_every_vector_once_per_level():
-    # Of the vectors named from a to c; a step of the gate, `csplat conformance decoder`, takes all of them.
+    # The vectors named from a to c; a step of the gate, `csplat conformance decoder`, runs all of them.
     report = runner.run_builtin(Choice(pattern="*/[a-c]*"))
     valid, invalid = (
         [one.name for one in vectors if one.name.split("/")[1][0] in "abc"] for vectors in (VALID, INVALID)

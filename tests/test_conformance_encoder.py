@@ -146,7 +146,7 @@ PRESET_DEPENDENT = (
 @pytest.mark.slow
 def test_our_encoder_passes_on_every_input():
     # CNF-5, CNF-6, SRC-3
-    names = [name for name in INPUTS if name != "ordinary/surfaces"]  # another 3,644 splats as those of "glossy"
+    names = [name for name in INPUTS if name != "ordinary/surfaces"]  # another 3,644 splats like those of "glossy"
     report = run_encoder(PLACES, EncoderChoice(",".join(names), INTEGRITY, jobs=1), run=encoder_here())
 
     assert [] == report.failures

@@ -5,7 +5,7 @@ import io
 import json
 import re
 import sys
-import xml.etree.ElementTree as ET  # what is parsed is our own
+import xml.etree.ElementTree as ET  # only our own output is parsed
 from pathlib import Path
 
 import pytest
@@ -102,7 +102,7 @@ RECORDED = (
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A folder with the answers of our decoder: files of a vector, and its status and words as JSON beside them."""
+    """A folder with the answers of our decoder: files of a vector, with its status and words as JSON next to them."""
     folder = tmp_path_factory.mktemp("decoder")
     for vector in VECTOR_LIST:
         if vector.name in RECORDED:
@@ -134,7 +134,7 @@ def test_our_decoder_passes_by_the_protocol_with_codes_clauses_and_offsets_and_n
 @needs_node
 @pytest.mark.slow
 def test_the_javascript_decoder_passes_by_the_protocol():
-    # One for each kind of thing that its adapter says; the next test has all of them, in one process.
+    # One vector for each kind of answer of its adapter; the next test runs all vectors, in one process.
     names = ["extreme/extra_names", "invalid/quat_radicand"]
     report = run_command(JS_ADAPTER, Choice(pattern=",".join(names), exact=True))
 

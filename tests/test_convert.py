@@ -200,7 +200,7 @@ BOTH = [one.name for one in formats.formats() if one.open is not None and one.wr
 
 
 def made(number):
-    """A scene of a few splats; those of other numbers have other counts, degrees and sizes."""
+    """Return a scene of a few splats; its count, degree and sizes depend on the number."""
     rng, count, degree = np.random.default_rng(number), 1 + number % 5, number % 4
     return SplatModel(
         means=((1e-3, 1.0, 50.0)[number % 3] * rng.standard_normal((count, 3))).astype(np.float32),

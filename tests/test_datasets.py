@@ -654,7 +654,7 @@ def test_nothing_is_decoded_before_it_is_asked_for(request, monkeypatch, kind, s
     monkeypatch.setattr(ImageFile.ImageFile, "load", lambda file: decoded.add(file.filename) or decode(file))
     data = load(folder, size)
     wanted = (size or (W, H))[::-1]
-    assert (kind == "blender") == len(decoded)  # whether there is transparency, one image tells
+    assert (kind == "blender") == len(decoded)  # one image is enough to tell whether there is transparency
     assert all(picture.has_alpha == (kind == "blender") for picture in (*data.train, *data.test))
     assert data.background == ((1.0, 1.0, 1.0) if kind == "blender" else (0.0, 0.0, 0.0))
     decoded.clear()

@@ -89,7 +89,7 @@ def extremes(field):
 
 @pytest.mark.slow
 def test_every_field_at_its_extremes_is_refused_or_decoded_within_limits():
-    # Of each field of a structure the first place and the last.
+    # The first and the last place of each field of a structure.
     places = {}
     for name, field in BUILT.fields.items():
         if not name.endswith("crc"):
@@ -97,7 +97,7 @@ def test_every_field_at_its_extremes_is_refused_or_decoded_within_limits():
     tried = 0
     first = {names[0] for names in places.values()}
     for name in first | {names[-1] for names in places.values()}:
-        # Of the last place of a field every other one.
+        # Every other value at the last place of a field.
         for value in [*extremes(BUILT.fields[name])][:: 1 if name in first else 2]:
             check_one(BUILT.patched({name: value}))
             tried += 1

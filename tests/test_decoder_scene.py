@@ -97,7 +97,7 @@ def test_one_codebook_for_all_bands(escaped):
 
 @pytest.mark.slow
 def test_tiles_longer_than_a_run_of_the_decoder():
-    # The slow reference says what some splats hold: the first, those about the end of the first run, the last.
+    # The slow reference computes some splats: the first, those around the end of the first run, the last.
     count, entries = 17_000, {1: rows_of(0, 5, 9, -60, 60)}
     blocks, index = tile(3, count, 0).blocks, np.array(rows_of(1, count, 1, 0, 5)).ravel()
     escapes, place = rows_of(2, np.count_nonzero(index == 5), 9, -900, 900), np.cumsum(index == 5) - 1
@@ -111,7 +111,7 @@ def test_tiles_longer_than_a_run_of_the_decoder():
         codebooks = (Codebook(4, _spec.CODEBOOK_KIND_SH, entries, (1, 1)),)
         return replace(made, attributes=attributes(1, ycocg=True), codebooks=codebooks)
 
-    box = {*means.argmin(axis=0).tolist(), *means.argmax(axis=0).tolist()}  # which holds for part of the tile too
+    box = {*means.argmin(axis=0).tolist(), *means.argmax(axis=0).tolist()}  # holds for part of the tile, too
     rows = sorted(box | {*range(100), *range(16_300, 16_500), *range(count - 50, count)})
     data, part = build(described(range(count))).data, described(rows)
     assert_same(decode(data, tiles=[0]), assert_decodes(part).select(slice(0, len(rows))), rows)

@@ -66,7 +66,7 @@ def test_a_decoder_that_gives_something_else_fails(tmp_path, make_model, answer,
 
 
 class Told:
-    """A decoder that takes as long as it is told, for ever the same seconds in turn, or fails."""
+    """A decoder that takes given seconds, in turn and for ever, or fails."""
 
     def __init__(self, seconds):
         self.seconds = seconds

@@ -224,7 +224,7 @@ def test_an_ablation_takes_away_one_part_at_a_time_and_puts_it_back(tmp_path, mo
 
 
 def test_measures_whole_and_simplified_files_beside_a_peer_and_goes_on_where_it_ended(tmp_path, monkeypatch, capsys):
-    """A part of the scene that ships, beside a peer that was judged before."""
+    """Compare a part of the scene that ships with a peer that was judged before."""
     part = tmp_path / "part.ply"
     write_ply(part, read_ply(scenes.SAMPLE).select(slice(None, None, 4)))
     monkeypatch.setattr(scenes, "SAMPLE", part)

@@ -1,4 +1,4 @@
-"""README and documentation: links lead somewhere, figures are those that were measured, what is shown runs."""
+"""README and documentation: links lead somewhere, figures are the measured ones, examples run."""
 
 import itertools
 import json
@@ -87,7 +87,7 @@ def test_the_readme_states_what_was_measured(sample_path):
 
 
 def test_the_encoder_still_writes_files_of_the_sizes_that_the_readme_states():
-    """It writes the recorded ones, says test_behaviour.py."""
+    """That it writes the recorded ones is tested in test_behaviour.py."""
     recorded = json.loads((ROOT / "tests" / "behaviour.json").read_text("utf-8"))["encode"]["goldens"]
     for name, one in MEASURED["presets"].items():
         assert recorded[f"sample {name}"]["size_bytes"] == pytest.approx(one["bytes"], rel=0.02)

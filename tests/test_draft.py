@@ -1,4 +1,4 @@
-"""Drafts: geometry is shown before colours are coded, and a file is written with what it says of itself."""
+"""Drafts: geometry is shown before colours are coded, and its file records options and source."""
 
 import re
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The samples of codec/EMBEDDING.md, as they stand there: each runs, and gives what the text says."""
+"""The samples of codec/EMBEDDING.md, unchanged: each runs, and gives the result in the text."""
 
 import json
 import re
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "codec" / "EMBEDDING.md").read_text("utf-8")
 FAST = EncodeOptions(preset="fast")
 
-# What `points.mjs` uses of three.js. Types of the arguments are checked; how three.js draws is its own affair.
+# The parts of three.js that `points.mjs` uses. Types of the arguments are checked, but not what three.js draws.
 THREE = """
 const typed = (value, kind) => { if (!(value instanceof kind)) throw new TypeError(`${value} is no ${kind.name}`); };
 export const SRGBColorSpace = 'srgb';

@@ -130,7 +130,7 @@ def test_inputs_show_what_lint_knows(tmp_path):
             found |= {finding.id for finding in lint_ply(tmp_path / "in.ply")}
     known = set(re.findall(r"^\| `([a-z0-9-]+)` \|", lint.__doc__, re.MULTILINE))
 
-    # Discs (2DGS) have a third scale that no column says, and a source cannot either.
+    # Discs (2DGS) have a third scale for which there is no column, and no place in a source.
     assert {"flat-scales", *OTHER_PROGRAMS, *OTHER_FORMATS} == known - found
 
 

@@ -107,7 +107,7 @@ def test_the_working_directory_stays_empty():
     writes = program("import sys; open('core', 'w'); open(sys.argv[2], 'w'); sys.exit(0)")
     refuses = program("import sys; open('log', 'w'); sys.exit('error: no')")
 
-    assert "empty file" in first(run_encoder(writes, FILES))[2]  # an invalid file says enough
+    assert "empty file" in first(run_encoder(writes, FILES))[2]  # an invalid file needs no further report
     assert (
         "refused, but left log in its working directory"
         == first(run_encoder(refuses, EncoderChoice("nasty/empty", ("L1",))))[2]

@@ -19,7 +19,7 @@ from csplat_trainer.options import TrainOptions
 from csplat_trainer.outputs import Outputs
 from csplat_trainer.tuning import FinetuneOptions, View, Views, tune
 
-GAINS = np.array([0.7, 1.3, 0.8, 1.2, 0.9, 1.1, 0.75, 1.25, 1.0])  # of the photographs that teach; those that judge: 1
+GAINS = np.array([0.7, 1.3, 0.8, 1.2, 0.9, 1.1, 0.75, 1.25, 1.0])  # of training photographs; test: 1
 LONGER = {**QUICK, "iterations": 300, "refine_every": 50, "lr_means": 2e-3, "background": "black"}
 
 
@@ -64,7 +64,7 @@ def test_slopes_are_those_of_the_loss_with_the_correction():
 def test_gains_are_found_and_the_scene_is_as_bright_as_the_mean(uneven):
     options = TrainOptions(**{**LONGER, "iterations": 450})
     plain, corrected = (train(uneven, replace(options, lr_exposure=rate)) for rate in (0.0, 0.05))
-    assert corrected.log["entries"][-1]["psnr"] > plain.log["entries"][-1]["psnr"]  # of what teaches
+    assert corrected.log["entries"][-1]["psnr"] > plain.log["entries"][-1]["psnr"]  # PSNR on the training photographs
     found = np.array(corrected.log["exposures"])
     assert np.abs(found.mean(axis=0)).max() < 1e-4
     assert np.corrcoef(np.exp(found[:, 0].mean(axis=1)), GAINS)[0, 1] > 0.5  # 80 splats hardly hold the scene

@@ -52,7 +52,7 @@ def chains(once):
 
 
 def assert_each(chains, check):
-    """Call a check with the name and the chain of each condition; fail with the names of those that it fails for."""
+    """Call a check with the name and the chain of each condition; fail with the names of conditions that fail."""
     failures = {}
     for name, chain in chains.items():
         try:
@@ -186,7 +186,7 @@ def test_each_preset_lies_within_the_stated_errors(name, preset):
 @pytest.mark.parametrize("name", MOST)
 def test_the_ends_of_quality_hold_what_they_state(name, preset, quality):
     decoded = assert_proved(name, encoded(name, preset, quality))
-    if preset == "balanced" and name != "exploded":  # of which any step moves the edges of infinitely bright splats
+    if preset == "balanced" and name != "exploded":  # any step moves the edges of its infinitely bright splats
         assert judge(name, (160, 120)).psnr(decoded) >= QUALITIES[quality]
 
 

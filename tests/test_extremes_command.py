@@ -36,7 +36,7 @@ def run(*words):
 
 
 def refused(*words):
-    """Run a command that is to fail: one line says why."""
+    """Run a command that is to fail: one line gives the reason."""
     done = run(*words)
     assert 1 == done.exit_code
     errors = [line for line in done.stderr.splitlines() if not line.startswith(("note: ", "repair: "))]

@@ -127,7 +127,7 @@ def test_measured_importances_serve_what_stands_before_a_giant_background():
     assert len(scalar) < 1.26 * len(guessed)
     found = [judge("giant background").psnr(decode(data)) for data in (guessed, measured, scalar)]
     assert [found[0], found[2]] == pytest.approx([28.7, 41.0], abs=0.7)
-    assert found[1] == pytest.approx(40.4, abs=2.5)  # how 300 splats cluster turns on the last digit of a weight
+    assert found[1] == pytest.approx(40.4, abs=2.5)  # the clusters of 300 splats depend on the last digit of a weight
 
 
 @LONG
@@ -150,7 +150,7 @@ def test_training_begins_at_centres_and_brings_the_loss_down(name):
     losses = result.log["losses"]
     assert_finite(result.model)
     assert COUNT == len(result.model)
-    # Points without colours start with those of the photographs, which is near the end for splats that are all alike.
+    # Points without colours start with the photographs' colours, nearly the final ones if all splats are alike.
     assert np.mean(losses[-10:]) < max(0.92 * np.mean(losses[:10]), 0.03)
 
 

@@ -21,7 +21,7 @@ ORBIT = ("--orbit", 4, "--size", "64x48")
 
 @pytest.fixture(scope="module")
 def ply(tmp_path_factory):
-    """A scene that says which way is up, which is a search otherwise."""
+    """Return a scene with a recorded up direction, which would otherwise be searched for."""
     rng, path = np.random.default_rng(0), tmp_path_factory.mktemp("film") / "scene.ply"
     model = SplatModel(
         means=rng.standard_normal((200, 3)).astype(np.float32),

@@ -521,7 +521,7 @@ def test_views_that_judge_teach_unless_they_are_kept_aside():
 # the command
 
 BARE = ("--set", "sh-coding=none,shape-codebook-size=0")  # neither SH nor codebooks, which take time
-BRIEF = ("--preset", "fast", "--iterations", 1, *BARE)  # where learning does not matter, either
+BRIEF = ("--preset", "fast", "--iterations", 1, *BARE)  # for tests in which learning does not matter, either
 
 
 def invoke(*words):

@@ -1,4 +1,4 @@
-"""FLIP: what the package's own example says, and what is said where it is absent."""
+"""FLIP: the result of the package's own example, and the message if the package is absent."""
 
 import importlib
 

@@ -30,7 +30,7 @@ def built(bounds, words, sh=(), *, comments=(), chunk_count=None, colours=True, 
 
 
 ROW = [0, 10, -1, 4, 10, 1, -8, -7, -6, -4, -3, -2, 0.5, 0, 0, 1.5, 1, 1]
-# Of the largest component the index, then three of ten bits; 511.5 would be 0.
+# The index of the largest component, then three components of ten bits; 511.5 would be 0.
 WORD = (2047 << 21 | 1023 << 11 | 0, 1 << 30 | 1023 << 20 | 511 << 10 | 512, 0, 255 << 24 | 0 << 16 | 255 << 8 | 51)
 SMALL = built([ROW], [WORD, (0, 0, 0xFFFFFFFF, 0)], [[0, 255, 128, *range(3, 9)], range(9)], comments=["made by hand"])
 

@@ -91,7 +91,7 @@ def test_version_2_means_what_it_says(tmp_path):
     np.testing.assert_allclose(model.sh0, flat["sh0.webp"][:, :3] / 64 - 2)
     np.testing.assert_allclose(model.opacities, flat["sh0.webp"][:, 3] / 255, rtol=1e-6)
     np.testing.assert_allclose(model.shN[0], pictures["palette.webp"][0, -3:, :3] / 128 - 1)
-    three = (flat["quats.webp"][1, :3] / 255 * 2 - 1) / 2**0.5  # of splat 1 x is left out
+    three = (flat["quats.webp"][1, :3] / 255 * 2 - 1) / 2**0.5  # x of splat 1 is left out
     quat = np.array([three[0], np.sqrt(max(0, 1 - (three**2).sum())), *three[1:]])
     np.testing.assert_allclose(model.quats[1], quat / np.linalg.norm(quat), atol=1e-6)
     assert model.antialiased

@@ -228,7 +228,7 @@ def test_a_scene_without_axes_is_taken_as_right_down_forward(tmp_path, make_mode
     csplat.write(tmp_path / "a.spz", model)
     found = filed(tmp_path / "a.spz")
     assert (model.means * [1, -1, -1]).tolist() == found.means.tolist()
-    flips = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1]  # of y and z, in the order of the coefficients
+    flips = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1]  # signs for flipped y and z, by coefficient
     np.testing.assert_allclose(np.clip(model.shN * np.c_[flips], -1, 127 / 128), found.shN, atol=1 / 64)
     csplat.write(tmp_path / "b.spz", make_model(5, 3, means=model.means, coordinate_system="RDF"))
     assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()

@@ -1,4 +1,4 @@
-"""Any format in, any format out: what is told apart, read in blocks, written, refused."""
+"""Any format in, any format out: detection, reading in blocks, writing, refusals."""
 
 import io
 import zipfile

@@ -1,4 +1,4 @@
-"""Frozen scenes: what `Frozen.seen` says is, bit for bit, what a decoder of the file sees, however values move."""
+"""Frozen scenes: `Frozen.seen` returns, bit for bit, what a decoder of the file returns, however values move."""
 
 import numpy as np
 import pytest

@@ -324,7 +324,7 @@ def test_tiles_of_a_grade_are_as_coarse_as_it_is(model):
     weights = unequal(model).means
     assert (
         weights[grades.index == 0].mean() > weights[grades.index == grades.index.max()].mean()
-    )  # what matters most comes first
+    )  # the most important splats come first
 
 
 @pytest.mark.parametrize("multiple", [2, 3, 7])

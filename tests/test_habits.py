@@ -1,4 +1,4 @@
-"""Habits of the tests: no test replaces what is private to the product, and whatever is skipped says why."""
+"""Habits of the tests: no test replaces private parts of the product, and every skip has a reason."""
 
 import ast
 import re
@@ -8,7 +8,7 @@ import pytest
 
 TESTS = Path(__file__).resolve().parent
 
-#: What the text of a file contains if it replaces something private: no other file is parsed, which takes a while.
+#: Words in the text of a file that replaces something private: no other file is parsed, which takes a while.
 REPLACES = re.compile(
     r"""(?:setattr|delattr|patch|object)\b(?s:.{0,200}?)["'](?:[\w.]*\.)?_\w+["']|(?<!self)(?<!cls)\._\w+ *[-+*/|]?= """
 )
@@ -16,7 +16,7 @@ REPLACES = re.compile(
 #: Calls that skip, or expect a failure; all but the first take the reason as an argument of its place.
 CALLS = ("pytest.importorskip", "pytest.skip", "pytest.xfail")
 
-#: Skips and expected failures in the text of a file, and those that obviously have a reason.
+#: Skips and expected failures in the text of a file, and the ones that obviously have a reason.
 SKIPS = re.compile(r"pytest\.(?:mark\.)?(?:importorskip|skip|skipif|xfail)\b")
 EXPLAINED = re.compile(
     r"""pytest\.(?:importorskip|mark\.skipif)\([^()]*?\breason=f?["'][^"']|pytest\.(?:skip|xfail)\((?!\)|""|'')"""

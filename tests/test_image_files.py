@@ -28,9 +28,9 @@ from tables import failures
 from csplat_trainer.data import load
 from csplat_trainer.data.image_files import match_names
 
-POSES = [to_opengl(camera) for camera in cameras(10)]  # of the frames of `write_transforms`
+POSES = [to_opengl(camera) for camera in cameras(10)]  # poses of the frames of `write_transforms`
 
-#: Listed name, names that are there, which of them it is, or what the error says; words of the note.
+#: Listed name, existing names, the one that matches or the text of the error; words of the note.
 NAMES = {
     "as it is": ("a/1.png", ["a/1.png", "1.png", "A/1.PNG"], "a/1.png", None),
     "a dot": ("./a//1.png", ["a/1.png"], "a/1.png", None),

@@ -128,7 +128,7 @@ READ = {
     "float TIFF": ("a.tif", lambda p: Image.fromarray(RAMP.astype(np.float32)).save(p), GREY, 0),
 }
 
-#: File, how it is written, and what the error says.
+#: File, how it is written, and the text of the error.
 REFUSED = {
     "float beyond 1": (
         "a.tif",

@@ -1,4 +1,4 @@
-"""The guide for implementers: its code runs, and its example has the numbers that it says."""
+"""The guide for implementers: its code runs, and its example has the numbers in the text."""
 
 import math
 import re

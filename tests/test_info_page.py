@@ -1,4 +1,4 @@
-"""`csplat info --page`: one page about one file, and what stands beside it; hardest places, and views worth showing."""
+"""`csplat info --page`: one page about one file, compared with its source; hardest places, and views worth showing."""
 
 import html
 import json
@@ -46,7 +46,7 @@ def files(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(files):
-    """The page of the file beside its source."""
+    """Return the page of the file compared with its source."""
     path = files[0].with_name("page.html")
     result = invoke(files[0], "--page", path, "--source", files[1])
     assert 0 == result.exit_code, result.output

@@ -71,7 +71,7 @@ def test_the_error_of_any_lane_reaches_the_caller():
 
 
 def test_an_error_waits_for_the_lanes_that_still_write():
-    """Afterwards nothing is written any more, and the threads are those of before."""
+    """Afterwards nothing more is written, and the number of threads is as before."""
 
     def slow(lane, _lanes, written):
         if lane == 0:

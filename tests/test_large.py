@@ -177,7 +177,7 @@ def test_a_full_disk_is_said_before_and_survived_within(model, whole, tmp_path, 
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def fill(stage, _done):
-        if stage == "sorting":  # of each bucket a part can be written
+        if stage == "sorting":  # a part of each bucket can be written
             resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
 
     try:
@@ -259,7 +259,7 @@ def test_buckets_are_neighbours_and_hold_every_splat_once(model):
 def test_a_bucket_that_the_sample_misjudged_is_cut_into_equal_parts():
     rng = np.random.default_rng(1)
     means = rng.normal(0, 1, (COUNT, 3)).astype(np.float32)
-    means[buckets.sample_rows(COUNT)] += 100.0  # what is looked at lies where nothing else is
+    means[buckets.sample_rows(COUNT)] += 100.0  # the sampled rows lie apart from all others
     parts = bucket_rows(means)
     assert np.array_equal(np.arange(COUNT), np.sort(np.concatenate(parts)))
     assert max(map(len, parts)) <= WHOLE
@@ -359,4 +359,4 @@ def test_only_large_files_and_small_memories_make_a_command_look_whether_a_scene
     assert may_leave(ply, 4 << 20, memory_bytes=1, resume=True)
     csplat_file = tmp_path / "scene.csplat"
     csplat_file.write_bytes(b"CSPLAT")
-    assert may_leave(csplat_file, 5 << 20, memory_bytes=1 << 40)  # how large it becomes, its size does not say
+    assert may_leave(csplat_file, 5 << 20, memory_bytes=1 << 40)  # its size does not tell how large it becomes

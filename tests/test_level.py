@@ -19,7 +19,7 @@ def rolled(viewmat, degrees):
 
 
 def around(count, *, pitch=0.0, spread=360.0, rolls=0.0, seed=0):
-    """Cameras that look outwards, so many degrees below the horizon, and are held nearly level."""
+    """Return cameras that look outwards, `pitch` degrees below the horizon, and are held nearly level."""
     first = np.array([0.0, 0.0, 1.0])
     second, rng = np.cross(UP, first), np.random.default_rng(seed)
     for a in np.radians(np.linspace(0.0, spread, count, endpoint=False)):

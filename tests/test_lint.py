@@ -1,4 +1,4 @@
-"""Each defect on its own: what lint calls it, what reading makes of it, what strict says."""
+"""Each defect on its own: its name in lint, the result of reading, and the error of strict reading."""
 
 import numpy as np
 import pytest

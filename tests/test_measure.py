@@ -1,4 +1,4 @@
-"""Measured errors are those of the definition in the spec, computed here splat by splat."""
+"""Measured errors agree with the definition in the spec, computed here splat by splat."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Mutants of a small package, and the map that says which tests reach them."""
+"""Mutants of a small package, and the map of the tests that reach them."""
 
 import hashlib
 import json

@@ -110,7 +110,7 @@ def test_a_coding_that_more_precision_hardly_betters_is_no_choice(fine, stalls):
 
 
 def test_what_views_that_judge_see_of_removal_says_where_a_file_has_to_stand():
-    """Removal errs by 0.45 of what is allowed for those that decide: what those that judge leave is added."""
+    """Removal takes 0.45 of the allowed error on the validation views; what it leaves of it on the test views is added."""
     allowed, gains = error_of_psnr(34.0), TUNING_GAINS
     part = SimpleNamespace(refits=True, psnr=psnr_of_mse(0.45 * allowed) - gains)
 

@@ -133,7 +133,7 @@ def test_a_film_sways_around_the_view_that_a_scene_is_shown_from_first():
     assert 0.05 < np.ptp(places[:, 1]) < 0.5 * np.ptp(places[:, 2])  # up and down
     assert all(camera.viewmat[2, :3] @ -camera.position > 0.99 * np.linalg.norm(camera.position) for camera in cameras)
     unread = SplatModel(**{**known, "metadata": {"view": {"K": 1}, "up": [0, -1, 0]}})
-    assert len(orbit_cameras(unread, 24, 64, 48)) == 24  # the arc of a scene that says nothing
+    assert len(orbit_cameras(unread, 24, 64, 48)) == 24  # the arc for a scene without a readable view
 
 
 def test_one_camera_that_is_known_makes_a_film_that_stands_still():

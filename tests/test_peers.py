@@ -1,6 +1,6 @@
 """Files of other programs are read, and theirs read ours: each property of a splat, within a step of the format.
 
-SPZ's own library is installed on demand. CONTRIBUTING.md says where the other programs are to lie and how to get them;
+SPZ's own library is installed on demand. CONTRIBUTING.md describes where to put the other programs and how to get them;
 tests of a program that is absent are skipped.
 """
 
@@ -172,7 +172,7 @@ NOT_ANTIALIASED = {"gltf", "splat", "gsply"}
 def bounds(format, writer, reach):
     """Return the tolerance of each property: half a step of the format, or the error of its codebooks."""
     alpha = 0.5 / 255
-    cut = 2 if writer == "splat-transform" else 1  # where csplat rounds
+    cut = 2 if writer == "splat-transform" else 1  # csplat rounds
     names = ("means", "degrees", "scales", "opacities", "sh0", "shN")
     table = {
         "ply": (0, 1e-4, 0, 1e-6, 0, 0),
@@ -254,6 +254,6 @@ def test_files_of_splat_transform_hold_the_grid_that_they_were_made_of(name, for
     np.testing.assert_allclose(model.scales, np.log(0.1), atol=1 / 32)
     np.testing.assert_allclose(model.opacities, 0.9, atol=0.5 / 255)
     colours = [[x, z, 0.5] for z in (1 / 3, 2 / 3) for x in (1 / 3, 2 / 3)]
-    spz = path.suffix == ".spz"  # its bytes are no colours; those of the older ones were written as if they were
+    spz = path.suffix == ".spz"  # its bytes are not colours; older fixtures were written as if they were
     level = model.sh0 * (0.15 if spz and forward > 0 else 0.28209479) + 0.5
     np.testing.assert_allclose(level, colours, atol=0.006)

@@ -86,7 +86,7 @@ def test_photographs_judge_both_scenes(scene, files, tmp_path):
     judged = result["photographs"]
     assert "test" == judged["split"]
     assert 2 == judged["a"]["views"] == judged["b"]["views"]
-    assert judged["a"]["psnr"] > 50.0  # what rounding to bytes leaves
+    assert judged["a"]["psnr"] > 50.0  # after rounding to bytes
     assert judged["b"]["psnr"] == pytest.approx(result["psnr"], abs=0.2)
     assert judged["b"]["ssim"] < judged["a"]["ssim"]
     assert judged["a"]["lpips"] is None

@@ -53,7 +53,7 @@ def test_files_of_trainings_are_made_judged_and_drawn(tmp_path, capsys):
         path = work / f"lego800-{name}.csplat"
         assert one["size_bytes"] == path.stat().st_size
         words = ["compare", str(work / f"lego800-{one['training']}.ply"), str(path), "--data", str(data), "--json"]
-        compared = json.loads(CliRunner().invoke(app, words).stdout)["photographs"]  # of the size of the training
+        compared = json.loads(CliRunner().invoke(app, words).stdout)["photographs"]  # at the training's size
         assert one["psnr_mean"] == pytest.approx(compared["b"]["psnr_mean"], abs=1e-6)
         assert known["trainings"][one["training"]]["psnr"] == pytest.approx(compared["a"]["psnr"], abs=1e-6)
     assert len(read_ply(work / "lego800-more.ply")) == known["trainings"]["more"]["splats"]
@@ -63,6 +63,6 @@ def test_files_of_trainings_are_made_judged_and_drawn(tmp_path, capsys):
     drawn = (tmp_path / "lego800.svg").read_text()
     assert "csplat train" in drawn
     assert "csplat finetune, without a price" in drawn
-    shutil.rmtree(work)  # what is known is not made again
+    shutil.rmtree(work)  # known results are not made again
     assert not run(main, [str(config), str(data), "--work", str(work), "--files", "tuned"])
     assert printed == capsys.readouterr().out

@@ -14,7 +14,7 @@ import csplat
 
 ROOT = Path(__file__).resolve().parent.parent
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
-PUBLISHING = ("npm publish ", "gh release create ")  # what a release does after everything was built and tested
+PUBLISHING = ("npm publish ", "gh release create ")  # commands of a release after everything was built and tested
 
 
 def make_targets():

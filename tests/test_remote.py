@@ -51,7 +51,7 @@ def box(data):
 
 @pytest.fixture
 def store(data, monkeypatch):
-    """A file system that fsspec has for URLs of `store://`, and for those of the web."""
+    """A file system that fsspec uses for URLs of `store://` and of the web."""
     system = FileSystem({"scene.csplat": data})
     core = SimpleNamespace(url_to_fs=lambda url, **_: (system, url.partition("://")[2].rpartition("/")[2]))
     monkeypatch.setitem(sys.modules, "fsspec", SimpleNamespace(core=core))

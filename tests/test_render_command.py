@@ -26,7 +26,7 @@ def ply(tmp_path):
         opacities=np.ones(1, np.float32),
         sh0=np.array([[1.7, -1.8, -1.8]], np.float32),
         shN=np.zeros((1, 3, 3), np.float32),
-        metadata={"up": [0, -1, 0]},  # which is a search otherwise
+        metadata={"up": [0, -1, 0]},  # otherwise it would be searched for
     )
     path = tmp_path / "ball.ply"
     write_ply(path, model)

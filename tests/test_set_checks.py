@@ -1,4 +1,4 @@
-"""Data sets that contradict themselves: sizes, lenses and poses that cannot be those of the images."""
+"""Data sets that contradict themselves: sizes, lenses and poses that do not fit the images."""
 
 import json
 import struct
@@ -23,7 +23,7 @@ POSE = np.array(to_opengl(cameras(10)[0]))
 SHEARED = POSE @ np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
 PIXELS = 51.47  # the focal length of the set, about
 
-#: Fields of transforms.json, and what the error says.
+#: Fields of transforms.json, and the text of the error.
 FIELDS = {
     "an angle in degrees": (
         {"fl_x": None, "fl_y": None, "camera_angle_x": 50.0},
@@ -48,7 +48,7 @@ FIELDS = {
     "width and height swapped": ({"w": H, "h": W}, "24 16 in 32×48 pixels, expected about 16 24"),
 }
 
-#: transform_matrix of a frame, and what the error says.
+#: transform_matrix of a frame, and the text of the error.
 MATRICES = {
     "by columns": (POSE.T, "frame 0: transform_matrix has the last row .* expected 0 0 0 1: .* it is transposed"),
     "another last row": (np.vstack([POSE[:3], [0, 0, 0, 2]]), "has the last row 0 0 0 2, expected 0 0 0 1 "),

@@ -80,7 +80,7 @@ def test_is_never_larger_than_without(make_model, count):
     model = make_model(count, 1)  # random shapes: nothing to gain
     plain, _ = encoded(model)
     result, _ = encoded(model, shape_codebook_size=4096)
-    assert len(result.data) <= len(plain.data) + len('"shape_codebook_size":4096,')  # it says what was asked
+    assert len(result.data) <= len(plain.data) + len('"shape_codebook_size":4096,')  # it records the requested options
     if count < 1000:
         assert not books(result.data)
 
@@ -191,7 +191,7 @@ if __name__ == "__main__":
 def test_same_bytes_at_any_number_of_threads(tmp_path):
     program = tmp_path / "digest.py"
     program.write_text(DIGEST)
-    blas = "1" if (os.cpu_count() or 1) > 1 else "2"  # not as many as here
+    blas = "1" if (os.cpu_count() or 1) > 1 else "2"  # another number than here
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": blas, "OMP_NUM_THREADS": blas}
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
     done = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True, check=True)

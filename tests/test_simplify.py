@@ -370,7 +370,7 @@ def test_the_command_takes_cameras_and_prints_json_and_says_how_long_it_takes(so
     report = json.loads(result.stdout)
     assert report["decided_psnr"] >= 30.0
     assert {"cameras": "cameras.json", "views": 10} == report["judged_by"]
-    assert report["views"]["used"] >= 10  # so few cameras judge alone; virtual ones teach, but those that are the same
+    assert report["views"]["used"] >= 10  # so few are all test views; training views are virtual, without equal ones
 
 
 def test_outputs_of_one_place_and_inputs_as_outputs_are_refused(source, tmp_path):

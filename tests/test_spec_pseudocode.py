@@ -271,7 +271,7 @@ def rotation_of(quat):
 
 
 def lengths_of_codes(count):
-    """Yield all code lengths of 0 to 4 bits for so many symbols."""
+    """Yield all code lengths of 0 to 4 bits for this number of symbols."""
     for number in range(5**count):
         yield [number // 5**i % 5 for i in range(count)]
 

@@ -95,7 +95,7 @@ def test_codebooks_are_counted_with_their_indices(make_model):
     assert {"means": (16, 16), "sh0": (5, 5), "shN": (1, 1)} == {n: book.sizes for n, book in found.books.items()}
     assert 2 * 16 * 3 * 4 + 1001 == sizes["means"]  # eight bits
     assert 2 * 5 * 3 * 4 + (1001 * 6 + 7) // 8 == sizes["sh0"]
-    assert 2 * 9 * 4 == sizes["shN"]  # one entry wants no index
+    assert 2 * 9 * 4 == sizes["shN"]  # one entry needs no index
     assert 1001 * 16 == sizes["quats"]
     assert sum(sizes.values()) == found.size_bytes
 
@@ -259,7 +259,7 @@ def test_a_clustered_file_states_its_errors_against_the_source(source, text):
     by_coding = measure_errors(clustered, scene.model, np.searchsorted(
         np.flatnonzero(source.opacities > 0.2), result.source_index))  # fmt: skip
     rms = {record.measure: record.rms for record in scene.stated_errors.records}
-    assert rms["sh0"] > 5 * by_coding["sh0"][1]  # what clustering did is most of it
+    assert rms["sh0"] > 5 * by_coding["sh0"][1]  # most of it comes from clustering
     said = scene.options["reduced"]["kmeans"]
     assert set(ATTRIBUTES) == set(said)
     assert 2 == len(said["sh0"]["sizes"])

@@ -11,7 +11,7 @@ from csplat.errors import InputError
 
 
 def read(stream: bytes) -> tuple[_spec.StreamHead, list[int]]:
-    """Undo a stream as spec 6 says, one integer at a time."""
+    """Undo a stream as specified in section 6, one integer at a time."""
     head = _spec.unpack_stream_head(stream)
     coded = stream[_spec.STREAM_HEAD_SIZE :]
     assert head.coded_size == len(coded)

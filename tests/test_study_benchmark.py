@@ -119,7 +119,7 @@ def run(folder, *words):
 
 
 def test_everything_is_trained_measured_printed_and_drawn(small, capsys):
-    assert 1 == run(small)  # what wants torch is left out, and that is said
+    assert 1 == run(small)  # rows that require torch are left out, with a message
     said = capsys.readouterr()
     assert "study1k-lpips: a loss with LPIPS needs torch" in said.err
     assert "80 (1,000)" in said.out  # ours, and theirs

@@ -385,7 +385,7 @@ def test_a_brief_search_tries_fewer_files():
     assert 38.0 <= brief.file.psnr() <= 38.4
 
 
-# bounds beside a target, and what is reported
+# bounds in addition to a target, and the report
 
 
 def test_a_file_that_exceeds_a_bound_is_no_result():

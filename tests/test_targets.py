@@ -1,4 +1,4 @@
-"""Targets as users write them: what a command line asks for, what it refuses, what it says; largest errors."""
+"""Targets on the command line: what it accepts, what it refuses, its messages; largest errors."""
 
 import json
 from dataclasses import replace

@@ -20,7 +20,7 @@ from csplat_tools.files import scenes
 from csplat_tools.files.convert import decode_file
 
 VECTORS = load()
-#: Those of several tiles or with extra columns, and some of the others; not those of many splats.
+#: Vectors of several tiles or with extra columns, and some others; none with many splats.
 VALID = [
     vector
     for number, vector in enumerate(vector for vector in VECTORS if not vector.error)

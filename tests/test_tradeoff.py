@@ -53,7 +53,7 @@ POINT = {
     "render", "attribute_bytes", "first_picture_bytes", "partial",
 }  # fmt: skip
 QUICK = ["--what", "precision=36:40"]
-SPLATS = 100  # of the scene: what is swept costs by the splat
+SPLATS = 100  # splats of the scene: the cost of a sweep is proportional to it
 
 
 def invoke(*words):
@@ -249,7 +249,7 @@ def test_what_is_fetched_suffices():
             if layer > 1:
                 data[record.offset : record.offset + record.size] = bytes(record.size)
                 kept -= record.size
-    for chunk in header.directory:  # of a file without codebooks: what says something of the whole
+    for chunk in header.directory:  # in a file without codebooks: the chunks about the whole file
         data[chunk.offset + 8 : chunk.offset + chunk.size] = bytes(chunk.size - 8)
         kept -= chunk.size
     assert fetched_bytes(header, 1) == kept
@@ -277,7 +277,7 @@ def test_stages_are_timed_by_their_names():
     assert {"codebook": 2.5, "tiles": 5.5} == clock.seconds
 
 
-# which files no other one beats
+# files that no other one beats
 
 
 FRONTS = (
@@ -517,7 +517,7 @@ def test_memory_that_runs_out_costs_one_point(setting, monkeypatch):
 
 @pytest.mark.slow
 def test_nothing_is_overwritten_unless_forced(capture, tmp_path, monkeypatch):
-    plots = {name: PLOTS[name] for name in ("size-quality", "attribute-bytes", "sh-layers")}  # of each kind one
+    plots = {name: PLOTS[name] for name in ("size-quality", "attribute-bytes", "sh-layers")}  # one of each kind
     monkeypatch.setattr("csplat_tools.tradeoffs.page.PLOTS", plots)
     (tmp_path / "plots").mkdir()
     plot = tmp_path / "plots" / "size-quality.svg"

@@ -109,7 +109,7 @@ def test_a_run_begins_with_photographs_of_half_the_size(make_data, make_model, t
     monkeypatch.setattr(CpuEngine, "step", watched)
     options = TrainOptions(**QUICK, half_size=0.5)
     resumed_as_if_never_stopped(make_data(make_model), options, tmp_path)
-    assert [SIZE // 2] * 30 + [SIZE] * 30 == widths[:60]  # of the run that did not stop
+    assert [SIZE // 2] * 30 + [SIZE] * 30 == widths[:60]  # widths of the run that did not stop
 
 
 @pytest.mark.slow
@@ -369,7 +369,7 @@ def test_the_command_goes_on_where_it_stopped(file_runs, tmp_path):
         file_runs.made(f"{name}.csplat", *files, *more)
     first, again, further = ((file_runs.folder / f"{name}.csplat").read_bytes() for name in ("a", "again", "further"))
     assert first == again
-    assert first != further  # another scene, for which the tuning that there was says nothing
+    assert first != further  # another scene: the existing tuning does not apply
 
 
 @pytest.mark.slow

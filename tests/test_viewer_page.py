@@ -196,7 +196,7 @@ def test_mouse_and_keys_move_the_camera(viewer, light):
     page.emulate_media(reduced_motion="reduce")
     page.evaluate("csplatViewer.rig.orbit(0.5, 0.2)")
     page.keyboard.press("r")
-    assert viewer.home == viewer.pose  # at once: a person wants no motion
+    assert viewer.home == viewer.pose  # at once: the user prefers no motion
 
 
 @pytest.mark.area(name="chromium")
@@ -266,7 +266,7 @@ def test_the_file_says_where_to_stand(viewer, make_model):
     viewer.settle()
     assert list(np.ravel(cameras[0]["viewmat"])) == viewer.viewmat
 
-    view = look_at([0.0, -3.0, -5.0])  # of the metadata: it goes before the cameras
+    view = look_at([0.0, -3.0, -5.0])  # the view of the metadata: it has precedence over the cameras
     metadata = {"view": view, "title": "A <b>cloud</b>", "licence": "CC0"}
     viewer.show(encode(make_model(100, 0, cameras=[look_at([1.0, 1.0, 5.0])], metadata=metadata)))
     assert list(np.ravel(view["viewmat"])) == viewer.viewmat
@@ -360,7 +360,7 @@ def test_turning_upright_can_be_kept(viewer, make_model, tmp_path):
     viewer.show(kept.read_bytes())
     assert [0, 0, 1] == viewer.home["up"]
     assert viewer.hides("#upright")
-    page.click("#help")  # what it says may be wrong, and a phone has no keys
+    page.click("#help")  # its answer may be wrong, and a phone has no keys
     page.click("#help-upright")
     assert viewer.hides("#help-dialog")
     assert not viewer.hides("#upright")

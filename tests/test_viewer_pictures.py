@@ -72,7 +72,7 @@ def in_front(distance=3.0, size=128, fov=50.0, **fields):
 
 
 def make(means, **fields):
-    """Return a model of splats with these means; fields that are not given are those of small grey balls."""
+    """Return a model of splats with these means; fields that are not given make small grey balls."""
     n = len(means)
     arrays = {
         "quats": np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
@@ -97,7 +97,7 @@ def test_the_sample_looks_as_the_rasteriser_draws_it_at_a_fraction_of_its_memory
     stats = engine.stats()
     assert len(model) == stats["splatsResident"]
     assert 236 == stats["expandedBytesPerSplat"]
-    assert stats["gpuBytesPerSplat"] < 40  # of few splats; rows of textures are whole
+    assert stats["gpuBytesPerSplat"] < 40  # for few splats; rows of textures are whole
 
 
 @pytest.mark.parametrize("preset", ["balanced", "fast"])
@@ -137,7 +137,7 @@ def test_background_and_degree_can_be_chosen(engine, part, camera):
 def test_every_format_of_the_picture_is_good_enough(engine, part, camera):
     data = encode(part, FAST)
     model = decode(data)
-    assert "RGBA32F" == engine.stats()["pictureFormat"]  # what all other pictures have
+    assert "RGBA32F" == engine.stats()["pictureFormat"]  # the format of all other pictures
     for wanted, least in (("RGBA16F", GOOD), ("RGBA8", 38)):
         engine.page.evaluate("engine.close()")
         engine.start(json.dumps({"pictureFormat": wanted}))

@@ -1,4 +1,4 @@
-"""Views that teach, decide and judge: none has two roles, and whoever judges says the same of the same scene."""
+"""Training, validation and test views: none has two roles, and the same test views score the same scene alike."""
 
 import json
 import shutil

@@ -185,7 +185,7 @@ def test_refuses_no_cameras():
 def test_weighted_quantiles():
     values = np.array([5.0, 1.0, 3.0, 2.0, 4.0])
     assert np.allclose([1.0, 3.0, 5.0], weighted_quantiles(values, np.ones(5), (0.2, 0.6, 1.0)))
-    weights = np.array([1.0, 3.0, 0.0, 0.0, 0.0])  # of the values 5 and 1
+    weights = np.array([1.0, 3.0, 0.0, 0.0, 0.0])  # weights of the values 5 and 1
     assert np.allclose([1.0, 3.0, 5.0], weighted_quantiles(values, weights, (0.75, 0.875, 1.0)))
 
 

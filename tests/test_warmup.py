@@ -1,4 +1,4 @@
-"""Warming up: what it compiles is all that the commands run, and it says so."""
+"""Warming up compiles all that the commands run, and reports it."""
 
 import json
 import os
@@ -14,7 +14,7 @@ pytestmark = [
     pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system"),
 ]
 
-# The versions of each kernel that are known after warming up, and those that using it for a scene adds.
+# The versions of each kernel after warming up, and the versions that using it for a scene adds.
 _USE = """
 import json, os, sys
 import numpy as np

@@ -17,8 +17,8 @@ from PIL import Image
 
 W, H = 48, 40
 FOCAL = 42.0  # pixels
-VIEWS = 16  # of which every eighth is held out
-DISTANCE = 3.2  # of the cameras from the centre of a ball of radius 1
+VIEWS = 16  # views, of which every eighth is held out
+DISTANCE = 3.2  # distance of the cameras from the centre of a ball of radius 1
 _SAMPLES = 3  # rays along each side of a pixel
 
 SETTINGS = "refine_start=50,refine_every=25,lr_means=1e-3"

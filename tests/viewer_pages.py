@@ -1,4 +1,4 @@
-"""Page objects: the viewer's page and a page with its engine, in the words of a person who looks at scenes."""
+"""Page objects: the viewer's page and a page with its engine, in terms of what a user does and sees."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ class ViewerPage:
         site: the server of scenes.
     """
 
-    SIZE: ClassVar = (240, 180)  # of the window: the tools take up most of a smaller one
+    SIZE: ClassVar = (240, 180)  # size of the window: the tools take up most of a smaller one
 
     def __init__(self, tab: Tab, site: Site) -> None:
         self.tab, self.page, self.site = tab, tab.page, site
         self._numbers = itertools.count()
 
     def load(self, query: str = "") -> None:
-        """Load the served page with parameters, and wait until it shows its scene or says why it does not."""
+        """Load the served page with parameters, and wait until it shows its scene or an error."""
         self.visit(self.site.url(VIEWER + query))
 
     def visit(self, url: str) -> None:

@@ -40,7 +40,7 @@ def unpack(wheel: Path, folder: Path) -> None:
 
 
 def kernel_cache(folder: Path) -> Path:
-    """Return the folder for compiled kernels of these sources; those of other sources are removed."""
+    """Return the folder for compiled kernels of these sources; kernels of other sources are removed."""
     total = hashlib.sha256()
     for package in ("csplat_render", "csplat_trainer"):
         for path in sorted((folder / package).rglob("*.py")):

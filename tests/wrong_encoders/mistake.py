@@ -48,12 +48,12 @@ class Mistake:
         inputs: patterns of the reference inputs that show it; a pattern without a match is not an error.
         ply: changes the bytes of the input before they are read.
         scene: changes what was read.
-        keep: which splats of it are encoded, and in which order; the others count as pruned.
+        keep: indices of the splats to encode, in order; the others count as pruned.
         stage: changes reader and encoder until it is left.
         options: options of the encoder.
         honest: the errors that the file states are measured at the end against this scene of the input.
         data: changes the file.
-        index: changes the mapping from splats of the file to those of the source.
+        index: changes the mapping from splats of the file to splats of the source.
         end: takes input and output, the encoder's bytes, and ends the process as it pleases.
         starts: it needs a process of its own to end in.
     """

@@ -31,7 +31,7 @@ def rows(change):
 
 
 def kept(which):
-    """Return a change that leaves out rows: `which` is given the columns, and says which stay."""
+    """Return a change that leaves out rows: `which` takes the columns and returns the rows to keep."""
 
     def run(data):
         ply = plyfile.PlyData.read(io.BytesIO(data))

@@ -105,7 +105,7 @@ def real_matrix(integers):
 
 
 def wrapped(bits):
-    """Keep so many bits of an integer, as a cast does."""
+    """Return a function that keeps the lowest `bits` bits of a signed integer, as a cast does."""
     return lambda n: ((n + 2 ** (bits - 1)) % 2**bits) - 2 ** (bits - 1)
 
 

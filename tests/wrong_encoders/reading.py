@@ -1,4 +1,4 @@
-"""Mistakes in what a PLY says: columns, rows, numbers, header."""
+"""Mistakes in reading a PLY: columns, rows, numbers, header."""
 
 import io
 
@@ -90,7 +90,7 @@ def one_byte_early(head, body):
 
 
 def faces_forgotten(head, body):
-    """Take the data of another element, which stand first, for those of the splats."""
+    """Take the data of another element, which come first, for the splats' data."""
     lines, kept, own = head.split(b"\n"), [], True
     for line in lines:
         own = line.startswith(b"element vertex") or (own and not line.startswith(b"element"))
