@@ -99,7 +99,7 @@ def main() -> int:
 
 
 def version_of(text: str) -> str:
-    """Return the version that the text of a module states; SystemExit where it states none."""
+    """Return the version that the text of a module states; SystemExit if it states none."""
     match = re.search(r'(?m)^__version__ = "([^"]+)"$', text)
     if match is None:
         raise SystemExit("no line `__version__ = ...`")
@@ -107,7 +107,7 @@ def version_of(text: str) -> str:
 
 
 def with_version(path: Path, line: str, version: str) -> str:
-    """Return the text of a file with its version renewed; SystemExit where it does not name one version."""
+    """Return the text of a file with its version renewed; SystemExit if it does not name one version."""
     text, count = re.subn(line, rf"\g<1>{version}\g<2>", path.read_text(encoding="utf-8"))
     if count != 1:
         raise SystemExit(f"{path.relative_to(ROOT).as_posix()}: {count} places for the version, expected 1")
@@ -312,7 +312,7 @@ def rules_module(registry: Registry) -> str:
 
 
 def rules_of(registry: Registry) -> Iterator[tuple[str, Field, Registry]]:
-    """Yield each rule with its structure and field, its error filled in; SystemExit where one contradicts the rest."""
+    """Yield each rule with its structure and field, its error filled in; SystemExit if one contradicts the rest."""
     codes = {entry["name"] for entry in enum_named(registry, "error")["entries"]}
     for structure in registry["structure"]:
         for field, (name, _, _, *rules) in zip(fields_of(structure), structure["fields"], strict=True):
@@ -332,7 +332,7 @@ def rules_of(registry: Registry) -> Iterator[tuple[str, Field, Registry]]:
 
 
 def enum_named(registry: Registry, name: str) -> Registry:
-    """Return an enumeration; SystemExit where there is none of the name."""
+    """Return an enumeration; SystemExit if there is none of the name."""
     for enum in registry["enum"]:
         if enum["name"] == name:
             found: Registry = enum
@@ -451,7 +451,7 @@ def with_types(text: str, registry: Registry) -> str:
 
 
 def between(text: str, begin: str, new: str, end: str) -> str:
-    """Return the text with what stands between two marks replaced; SystemExit where the marks are not there once."""
+    """Return the text with what stands between two marks replaced; SystemExit if the marks are not there once."""
     if text.count(begin) != 1 or end not in text.split(begin)[1]:
         raise SystemExit(f"no place for what follows {begin.strip()!r}")
     before, rest = text.split(begin)

@@ -143,7 +143,7 @@ class AnalyticScene:
         )
 
     def options_of(self, contents: Contents) -> dict[str, Any]:
-        """Return what the encoder chooses where the options leave it open, under the names of a file's options."""
+        """Return what the encoder chooses if the options leave it open, under the names of a file's options."""
         asked = contents.options
         degree = self.sh_degree if asked.sh_degree is None else min(asked.sh_degree, self.sh_degree)
         coding = "scalar" if asked.sh_coding == "auto" else asked.sh_coding
@@ -213,12 +213,12 @@ class AnalyticScene:
     # by trying everything
 
     def smallest(self, psnr: float, views: Views = DECIDING, *, keep_all: bool = False) -> float:
-        """Return the size of the smallest file of a PSNR; infinite where there is none."""
+        """Return the size of the smallest file of a PSNR; infinite if there is none."""
         sizes = [np.where(psnr_of(e) >= psnr, s, np.inf).min() for s, e in self._files(views, keep_all=keep_all)]
         return float(min(sizes))
 
     def best(self, size_bytes: int, views: Views = DECIDING, *, keep_all: bool = False) -> float:
-        """Return the PSNR of the best file of a size; negative infinity where there is none."""
+        """Return the PSNR of the best file of a size; negative infinity if there is none."""
         found = [np.where(s <= size_bytes, psnr_of(e), -np.inf).max() for s, e in self._files(views, keep_all=keep_all)]
         return float(max(found))
 

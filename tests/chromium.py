@@ -13,7 +13,7 @@ that is loaded already, and take a tab of their own only when they need another 
         assert 206 in [one.status for one in site.requests]
 
 Every file of such tests has `pytestmark = IN_CHROMIUM`: they are slow, and run on one worker, which starts one browser.
-Where Chromium or playwright is absent the tests are skipped with the reason; with CI=true that is a failure.
+If Chromium or playwright is absent, the tests are skipped with the reason; with CI=true that is a failure.
 """
 
 from __future__ import annotations
@@ -195,7 +195,7 @@ class Site:
 
 
 def absent(reason: str) -> None:
-    """Skip the test, or fail where nothing may be absent."""
+    """Skip the test, or fail if nothing may be absent."""
     if os.environ.get("CI") == "true":
         pytest.fail(f"CI=true, and {reason}")
     pytest.skip(reason)

@@ -30,7 +30,7 @@ PEERS = Path(os.environ.get("CSPLAT_PEERS", ROOT / "out" / "peers")).absolute()
 
 
 def of_peers(name: str) -> Path:
-    """A file or folder of others; a test is skipped where it is absent."""
+    """A file or folder of others; a test is skipped if it is absent."""
     if not (PEERS / name).exists():
         pytest.skip(f"{name} is absent ({PEERS}); CSPLAT_PEERS names the folder of others, see CONTRIBUTING.md")
     return PEERS / name

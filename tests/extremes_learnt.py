@@ -35,7 +35,7 @@ BLACK = np.zeros(3, np.float32)
 
 
 def learnt_from(name: str) -> SplatModel:
-    """The scene, in fewer copies where it is a million."""
+    """The scene, in fewer copies if it is a million."""
     return scene(name)[0].select(slice(COPIES))
 
 

@@ -6,5 +6,5 @@ __all__ = ["heed_interrupts"]
 
 
 def heed_interrupts():
-    """Make a child process heed SIGINT, also where the tests run in the background of a shell, which ignores it."""
+    """Make a child process heed SIGINT, also when the tests run in the background of a shell, which ignores it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -57,7 +57,7 @@ from csplat_conformance.mutation.operators import python_mutants
 
 #: Packages that every map covers, so that one map serves all of them.
 MAPPED = ("csplat.encoder", "csplat_tools.optimise", "csplat_trainer")
-#: Imported once, before processes are forked, where the project depends on them. None of them knows the project.
+#: Imported once, before processes are forked, if the project depends on them. None of them knows the project.
 PRELOADED = ("hypothesis.strategies", "numpy", "numba", "scipy.spatial", "PIL.Image", "rich.console", "typer")
 
 _FIRST_TESTS, _FIRST_FILES = 30, 3  # run before the others are even collected: most mutants fail one of these

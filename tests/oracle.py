@@ -47,7 +47,7 @@ VIEW = Camera(
 )
 
 _STEP = 1e-5  # step of finite differences: their error is about its square
-_FLIPPED = 1e-4  # colours differ by more where a comparison fell the other way
+_FLIPPED = 1e-4  # colours differ by more if a comparison falls the other way
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def float32_errors(
 ) -> tuple[int, dict[str, float]]:
     """Compare float32 gradients with float64 ones.
 
-    Where a comparison (alpha against 1/255, say) fell the other way in float32, a pixel gives one splat another
+    If a comparison (alpha against 1/255, say) falls the other way in float32, a pixel gives one splat another
     gradient: for each such pixel one splat is left out, those that differ most.
 
     Returns:

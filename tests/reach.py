@@ -550,7 +550,7 @@ class Map:
         """Return all that a test or a fixture uses, directly or not."""
         if name not in self._closures:
             used = frozenset(self.uses.get(name, ()))
-            self._closures[name] = used  # ends the recursion where a name uses itself
+            self._closures[name] = used  # ends the recursion when a name uses itself
             self._closures[name] = used.union(*(self._closure(one) for one in used))
         return self._closures[name]
 

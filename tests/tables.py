@@ -15,7 +15,7 @@ def failures(cases: Mapping[str, T] | Iterable[T], check: Callable[[T], None]) -
 
     Args:
         cases: by name, or objects with a `name`.
-        check: raises an error where a case is wrong, as `assert` and `pytest.raises` do.
+        check: raises an error if a case is wrong, as `assert` and `pytest.raises` do.
 
     Raises:
         ValueError: there are no cases, or two of one name.

@@ -110,7 +110,7 @@ def test_a_coding_that_more_precision_hardly_betters_is_no_choice(fine, stalls):
 
 
 def test_what_views_that_judge_see_of_removal_says_where_a_file_has_to_stand():
-    """Removal takes 0.45 of the allowed error on the validation views; what it leaves of it on the test views is added."""
+    """Removal takes 0.45 of the allowed error on the validation views; what it leaves on the test views is added."""
     allowed, gains = error_of_psnr(34.0), TUNING_GAINS
     part = SimpleNamespace(refits=True, psnr=psnr_of_mse(0.45 * allowed) - gains)
 
@@ -496,7 +496,7 @@ def test_what_nobody_looked_at_is_told_and_a_loss_there_by_name(beside, said):
 
 
 def test_views_elsewhere_are_the_same_ones_nearer_and_farther(scene):
-    """Nearer by 0.6, or by less where they would be inside of what they look at."""
+    """Nearer by 0.6, or by less if they would be inside of what they look at."""
     centre = scene_frame(scene).centre
     near, usual, far = (elsewhere(scene)[kind] for kind in ("nearer", "beside", "farther"))
     shares = []

@@ -140,7 +140,7 @@ def test_where_files_jump_a_smaller_one_beside_is_found():
 
 
 def test_what_is_packed_loosely_for_speed_is_not_written():
-    """Even where it is smaller: here tighter packing makes files larger."""
+    """Even if it is smaller: here tighter packing makes files larger."""
     for scene in (NO_CODEBOOK, WITHOUT_SH):
         found = search(replace(scene, packing=0.97), psnr=38.0, keep_all=True)
         assert found.file.contents.options.deflate_level is None

@@ -1,4 +1,4 @@
-"""`csplat_bench.targets`: two builds at equal PSNR, files that others beat, and what goes on where it ended."""
+"""`csplat_bench.targets`: two builds at equal PSNR, files that others beat, and what continues where it stopped."""
 
 import json
 import math

@@ -139,7 +139,7 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(make_data, make_model, t
 
 
 def test_a_scene_has_the_origin_of_its_data_set(make_data, make_model, tmp_path):
-    """Also where the run goes on with images that are measured from another one."""
+    """Also if the run goes on with images that are measured from another one."""
     data, place = make_data(make_model), np.array((500123.0, 4649876.0, 214.0))
     options = TrainOptions(**{**QUICK, "iterations": 30})
     plain = train(data, options).model

@@ -95,7 +95,7 @@ def test_cameras_stand_all_around_an_object():
     offsets = np.array([camera.position - frame.centre for camera in virtual_cameras(ball())])
     angles = np.sort(np.degrees(np.arctan2(offsets[:, 2], offsets[:, 0])))
     assert np.diff(np.append(angles, angles[0] + 360.0)).max() < 100.0
-    assert (offsets[:, 1] < 0.0).all()  # above: y points down where nothing else is said
+    assert (offsets[:, 1] < 0.0).all()  # above: y points down unless another up is recorded
 
 
 @pytest.mark.slow

@@ -41,7 +41,7 @@ def autograd_gradients(
 
     Args:
         arrays: the six of the splats, float64.
-        view: from where.
+        view: the camera.
         weights: [H, W, 3], [H, W], [H, W].
         background: behind everything.
         antialiased: scale opacities by what the dilation added.

@@ -145,7 +145,7 @@ def settle(outcomes: Iterable[Outcome]) -> tuple[list[Outcome], list[str]]:
         outcomes: what `judge` returned for all vectors.
 
     Returns:
-        The same, but that a broken payload which was accepted is a failure where others of its type were refused; and
+        The same, but that a broken payload which was accepted is a failure if others of its type were refused; and
         for each type of which some were accepted a line.
     """
     result, notes = list(outcomes), []

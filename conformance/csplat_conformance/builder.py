@@ -1,6 +1,6 @@
 """Turn a declared scene into the bytes of a csplat file, field by field as the spec lists them.
 
-It shares no code with the encoder, checks nothing, and writes nonsense where the scene declares nonsense.
+It shares no code with the encoder, checks nothing, and writes nonsense if the scene declares nonsense.
 Every field of the result has a name (`tile[0].extent`, `TILE.0.0/sh0.stream.count`), so that a vector can
 overwrite it afterwards.
 """

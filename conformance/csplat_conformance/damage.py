@@ -89,7 +89,7 @@ def flips(
 
 
 def prefixes(data: bytes, count: int, progress: Callable[[str, int], None] | None = None) -> Found:
-    """Cut the file at `count` lengths, evenly spread, 0 and all but one byte among them; all where there are fewer."""
+    """Cut the file at `count` lengths, evenly spread, 0 and all but one byte among them; all if there are fewer."""
     last = len(data) - 1
     lengths = range(len(data)) if count > last else sorted({i * last // max(1, count - 1) for i in range(count)})
     result = Found("prefixes")

@@ -150,7 +150,7 @@ def deflate_fixed(data: bytes, last_bits: int = 0) -> bytes:
 
     Args:
         data: the bytes to code.
-        last_bits: the unused bits after the block, 0 where a writer obeys the spec.
+        last_bits: the unused bits after the block, 0 if a writer obeys the spec.
     """
     stream = Deflate().fixed()
     at = 0

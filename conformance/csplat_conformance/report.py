@@ -170,7 +170,7 @@ def _remark(one: Outcome) -> str:
 
 
 def _aligned(rows: Sequence[Sequence[str]], *, right: bool = False) -> list[str]:
-    """Lay out rows in columns: all but the first to the right where asked for, the last never padded."""
+    """Lay out rows in columns: all but the first to the right if requested, the last never padded."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
     lines = []
     for row in rows:

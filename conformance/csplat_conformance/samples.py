@@ -89,7 +89,7 @@ class Recipe:
         offset: the defect's byte, if a single one is to blame.
         also: further codes that a decoder may report.
         optional: type of the chunk in whose payload the defect lies, `META`: decoders that leave it unread (CHK-6)
-            accept the file. Empty where every decoder refuses it.
+            accept the file. Empty if every decoder refuses it.
         views: reference views, for scenes that are rendered.
     """
 

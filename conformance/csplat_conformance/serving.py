@@ -60,7 +60,7 @@ class Served:
         self._process = None
 
     def resident_bytes(self) -> int:
-        """Return what the process holds in memory now; 0 where nobody can tell."""
+        """Return what the process holds in memory now; 0 if nobody can tell."""
         if self._process is None:
             return 0
         try:

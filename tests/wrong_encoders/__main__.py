@@ -32,7 +32,7 @@ def main():
 
 
 def table(names):
-    """Print the mistakes as a table in Markdown; the status is 1 where one goes unnoticed."""
+    """Print the mistakes as a table in Markdown; the status is 1 if one goes unnoticed."""
     began, missed = time.process_time(), []
     print(f"| {' | '.join(HEADER)} |\n|{'---|' * len(HEADER)}")
     for name in names:

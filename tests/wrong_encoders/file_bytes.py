@@ -25,7 +25,7 @@ def index_field(name, change):
 
 
 def swapped_layers(data):
-    """Exchange the records of the first two layers of the first tile, where it has two."""
+    """Exchange the records of the first two layers of the first tile, if it has two."""
     built = mapped(data)
     if "tile[0].layer[1].layer" not in built.fields:
         return data

@@ -29,7 +29,7 @@ def command_of(name: str) -> str:
 
 
 def inputs_of(mistake: Mistake) -> list[str]:
-    """Names of the reference inputs that show a mistake; none where there is no such input."""
+    """Names of the reference inputs that show a mistake; none if there is no such input."""
     patterns = mistake.inputs.split(",")
     return [one.name for one in all_inputs() if any(fnmatch(one.name, pattern) for pattern in patterns)]
 

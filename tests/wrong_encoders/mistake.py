@@ -43,8 +43,8 @@ class Mistake:
     Attributes:
         why: the author's wrong belief.
         harm: the harm that it does.
-        caught: level and clause that ought to find it; the clause is empty where it is no clause that is broken, and
-            both are where there is nothing to find.
+        caught: level and clause that ought to find it; the clause is empty if no clause is broken, and
+            both are empty if there is nothing to find.
         inputs: patterns of the reference inputs that show it; a pattern without a match is not an error.
         ply: changes the bytes of the input before they are read.
         scene: changes what was read.

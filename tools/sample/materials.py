@@ -106,6 +106,6 @@ def _cap_colour(g: Garden, x: float, y: float, z: float, item: int) -> Material:
 
 @compiled
 def ramp(low: float, high: float, value: float) -> float:
-    """0 below, 1 above, smooth between; the other way round where low > high."""
+    """0 below, 1 above, smooth between; the other way round if low > high."""
     t = min(1.0, max(0.0, (value - low) / (high - low)))
     return t * t * (3.0 - 2.0 * t)

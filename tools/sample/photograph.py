@@ -32,11 +32,11 @@ _HIT = 4e-4  # scene units
 
 
 def photograph(garden: Garden, camera: Camera) -> tuple[U8, F64]:
-    """Take one picture, two rays to a pixel, four where these two do not agree.
+    """Take one picture, two rays to a pixel, four if these two do not agree.
 
     Args:
         garden: the garden; it stands upright in a world with y down.
-        camera: from where.
+        camera: the camera.
 
     Returns:
         Picture [H, W, 4] uint8, straight alpha: the share of a pixel's rays that hit something; and

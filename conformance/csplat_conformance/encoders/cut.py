@@ -1,4 +1,4 @@
-"""Signs that an encoder cuts where it means to round: legal, honest where the errors say so, and twice as coarse.
+"""Signs that an encoder truncates instead of rounding: legal, honest if the stated errors cover it, twice as coarse.
 
 Two signs are looked for, in the measures that a file states:
 
@@ -30,7 +30,7 @@ __all__ = ["ONE_SIDED", "STEPS_MAX", "find_cuts"]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-STEPS_MAX = 0.75  #: lattice steps; rounding leaves 0.5, and 0.71 next to alpha 0 where it looks for the nearest alpha
+STEPS_MAX = 0.75  #: lattice steps; rounding leaves 0.5, and 0.71 next to alpha 0 if it looks for the nearest alpha
 ONE_SIDED = 0.95  #: share of the errors with one sign; 40 fair coins are this one-sided once in 10^9 throws
 _CUT_MAX = 1.05  # lattice steps: cutting alone leaves 1 at most
 _ENOUGH = 40  # different values
@@ -112,7 +112,7 @@ def _opacity_steps(source: Source, decoded: SplatModel, header: SceneHeader, ind
 def _one_sided(
     measure: str, name: str, source: NDArray[np.floating], decoded: NDArray[np.floating]
 ) -> Iterator[tuple[str, str]]:
-    """Yield a line where nearly all errors lie on one side."""
+    """Yield a line if nearly all errors lie on one side."""
     theirs, ours = source.astype(np.float64).ravel(), decoded.astype(np.float64).ravel()
     theirs, first = np.unique(theirs, return_index=True)
     ours = ours[first]

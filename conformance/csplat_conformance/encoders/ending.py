@@ -17,7 +17,7 @@ _LINE_MAX = 200  # characters of a program's line that are shown
 
 
 def judge_end(one: Input, trial: Trial) -> Verdict | None:
-    """Judge how the program ended; `None` where there is a file to look at."""
+    """Judge how the program ended; `None` if there is a file to look at."""
     ended = trial.ended
     if ended.status is not None:
         return Verdict(ended.status, _with_line(ended.message, ended))
@@ -64,7 +64,7 @@ def wrong_habits(first: Trial, again: Trial | None) -> list[Wrong]:
 
     Args:
         first: the run that is judged.
-        again: the same from another folder, later; `None` where there was none.
+        again: the same from another folder, later; `None` if there was none.
     """
     wrong: list[Wrong] = [("", trace) for trace in first.traces]
     if again is None:
@@ -98,7 +98,7 @@ def _first_difference(one: bytes, other: bytes) -> int:
 
 
 def _field_at(data: bytes, at: int) -> str:
-    """Name what lies at a byte: a field, or the chunk; nothing where the file is not one."""
+    """Name what lies at a byte: a field, or the chunk; nothing if the file is not one."""
     try:
         built = mapped(data)
     except Exception:  # noqa: BLE001 - a file that breaks clauses may end the walk anywhere, and is reported elsewhere

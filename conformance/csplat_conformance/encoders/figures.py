@@ -14,7 +14,7 @@ _SPELT = {"spz": "SPZ"}
 
 
 def figures_of(name: str) -> dict[str, dict[str, Any]]:
-    """Return by encoder `bytes` and `psnr` of an input; nothing where none were measured."""
+    """Return by encoder `bytes` and `psnr` of an input; nothing if none were measured."""
     return _all().get(name, {})
 
 

@@ -54,7 +54,7 @@ def judge_content(one: Input, source: Source, scene: Scene, index: Path | None) 
         one: the input.
         source: the scene of the input.
         scene: the decoded scene.
-        index: the encoder's own source index, `None` where none was asked for.
+        index: the encoder's own source index, `None` if none was asked for.
 
     Returns:
         The verdict, and which splat of the source each of the file is: by the encoder's own index, if it is right.

@@ -41,12 +41,12 @@ class Asked:
 def judge_input(one: Input, first: Trial, again: Trial | None, asked: Asked) -> Iterator[Outcome]:
     """Judge what became of an input.
 
-    L4 is judged where it is asked for, and where L3 is asked for and proves nothing.
+    L4 is judged if it is requested, and if L3 is requested and proves nothing.
 
     Args:
         one: the input.
         first: the run that is judged.
-        again: a second one; `None` where the first wrote no file.
+        again: a second one; `None` if the first wrote no file.
         asked: the checks to make.
     """
 
@@ -90,7 +90,7 @@ def _judge_pictures(one: Input, scene: Scene, pairs: Pairs, size_bytes: int, alo
         scene: the decoded scene.
         pairs: the source splat of each decoded splat.
         size_bytes: size of the file.
-        alone: why nothing but pictures can judge it; nothing where errors are proved.
+        alone: why nothing but pictures can judge it; nothing if errors are proved.
         asked: the checks to make.
     """
     if not one.renders or one.source is None:

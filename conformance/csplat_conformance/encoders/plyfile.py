@@ -24,7 +24,7 @@ _TYPE_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i2": "short", "i4"
 
 @dataclass
 class Splats:
-    """Rows of a PLY, as they stand in it: float32, or float64 where a PLY of doubles holds more than that.
+    """Rows of a PLY, as they stand in it: float32, or float64 if a PLY of doubles holds more than that.
 
     Attributes:
         means: [N, 3].

@@ -26,7 +26,7 @@ def judge_errors(one: Input, scene: Scene, pairs: Pairs) -> tuple[Verdict, str]:
         pairs: the source splat of each of its splats.
 
     Returns:
-        The verdict, and why only pictures can judge the rest; nothing where they need not.
+        The verdict, and why only pictures can judge the rest; nothing if they need not.
     """
     source = one.source() if one.source is not None else None
     if source is None or pairs.strays or pairs.surplus:

@@ -24,9 +24,9 @@ def write_inputs(folder: Path, pattern: str | None = None) -> dict[str, Any]:
 
     Returns:
         The list: `inputs`, each with `name`, `file`, `why`, `refusal` (`must`, `may` or `no`) and `expected`,
-        `null` where it must be refused: `splats` of the source (SRC-1), `rows` of the PLY, `sh_degree`,
+        `null` if it must be refused: `splats` of the source (SRC-1), `rows` of the PLY, `sh_degree`,
         `extra_columns`, `apart` (no two different centres are nearer), `renders` (whether pictures are compared) and
-        `psnr_min` (dB, unless another is asked for; `null` where they are not).
+        `psnr_min` (dB, unless another is asked for; `null` if they are not).
 
     Raises:
         InputError: the pattern matches no input.

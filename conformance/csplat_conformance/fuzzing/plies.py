@@ -121,7 +121,7 @@ class PlyTarget(FileTarget):
 
 
 def _linted(path: Path) -> list[str] | None:
-    """Return ids of the errors that lint finds, None where it refuses to look."""
+    """Return ids of the errors that lint finds, None if it refuses to look."""
     try:
         return [finding.id for finding in lint_ply(path) if finding.kind == "error"]
     except InputError:

@@ -44,7 +44,7 @@ class Case:
 
     Attributes:
         data: the file.
-        source: makes what it can be mutated from again, of the target's own type; None where nothing can.
+        source: makes what it can be mutated from again, of the target's own type; None if nothing can.
         notes: names that are counted, such as `(not repaired)`.
     """
 
@@ -131,7 +131,7 @@ class DecoderTarget:
             return error.code, ""
 
     def smaller(self, data: bytes, corpus: Sequence[Built]) -> Generator[bytes, bytes | None, None]:
-        """Undo one changed byte after the other, where the length is that of a seed."""
+        """Undo one changed byte after the other, if the length is that of a seed."""
         same = [base for base in corpus if len(base.data) == len(data)]
         if not same:
             return

@@ -5,7 +5,7 @@ Usage:
     python -m csplat_conformance.mutation --decoder javascript --jobs 2    # requires node, and `npm ci` before
     python -m csplat_conformance.mutation --decoder c                      # requires cc
 
-A mutant is caught where a vector fails. Whatever passes them all reads damaged files, too: one that differs from the
+A mutant is caught if a vector fails. Whatever passes them all reads damaged files, too: one that differs from the
 right decoder there is missed by the vectors; the others may be equivalent, or out of the vectors' reach, or show
 themselves too rarely. Neither code nor clause of a refusal counts, as for any decoder that is not ours.
 """

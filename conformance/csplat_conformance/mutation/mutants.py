@@ -84,7 +84,7 @@ class Decoder(Protocol):
         ...
 
     def attempt(self, mutant: Mutant) -> Result:
-        """Run the vectors, and where all pass the fuzzed files."""
+        """Run the vectors, and if all pass the fuzzed files."""
         ...
 
 

@@ -177,7 +177,7 @@ def _tell(writing: int, line: str) -> None:
 
 
 def _line(reading: int, otherwise: str) -> str:
-    """Return the next line, or other words where none comes in time."""
+    """Return the next line, or other words if none comes in time."""
     line, end = b"", time.monotonic() + _SECONDS
     while not line.endswith(b"\n"):
         ready = select.select([reading], [], [], max(0.0, end - time.monotonic()))[0]

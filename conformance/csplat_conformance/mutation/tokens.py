@@ -107,7 +107,7 @@ def _change(text: str, token: _Token) -> Iterator[tuple[int, int, str]]:
 
 
 def _end_of_call(tokens: list[_Token], at: int) -> int:
-    """Return the number of the token behind a word and its brackets, or 0 where none follow."""
+    """Return the number of the token behind a word and its brackets, or 0 if none follow."""
     if tokens[at].kind != "word" or at + 1 == len(tokens) or tokens[at + 1].text != "(":
         return 0
     depth = 0

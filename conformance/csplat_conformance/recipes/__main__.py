@@ -4,7 +4,7 @@ Usage:
     python -m csplat_conformance.recipes           # write what is out of date, remove what no recipe makes
     python -m csplat_conformance.recipes --check   # write nothing, exit 1 and name what is out of date
 
-Reference pictures need the packages of the extra `render`; where they are absent, the pictures are left as they are.
+Reference pictures need the packages of the extra `render`; if they are absent, the pictures are left as they are.
 A picture is out of date when it differs visibly: exponentials may round differently on another machine.
 """
 

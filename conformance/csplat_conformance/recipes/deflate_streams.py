@@ -60,7 +60,7 @@ def _place(case: Case) -> str:
 
 
 def _scene(case: Case) -> Scene:
-    """Return a scene that has the stream: as opacities, or where it is long as band 3."""
+    """Return a scene that has the stream: as opacities, or if it is long as band 3."""
     how = Stream(coder="deflate", coded=case.coded)
     if len(case.output) < _FAR:
         n = len(case.output)

@@ -34,7 +34,7 @@ class Measured(NamedTuple):
     Attributes:
         max: the largest.
         rms: root of the mean square over the splats.
-        worst: the decoded splat that has the largest; 0 where there is none.
+        worst: the decoded splat that has the largest; 0 if there is none.
     """
 
     max: float

@@ -103,7 +103,7 @@ class Way(Protocol):
         ...
 
     def matches(self, bounds: Mapping[str, float]) -> NDArray[Any]:
-        """For each splat of the file `UNMATCHED`, `UNDECIDED`, or something else where it has a partner."""
+        """For each splat of the file `UNMATCHED`, `UNDECIDED`, or something else if it has a partner."""
         ...
 
     def farthest(self, bounds: Mapping[str, float], rows: I64) -> dict[str, Worst]:

@@ -45,7 +45,7 @@ class Source:
 
     @classmethod
     def of(cls, model: SplatModel) -> Source:
-        """Return the source that a model is; its centres in doubles, where it has them."""
+        """Return the source that a model is; its centres in doubles, if it has them."""
         doubles = model.means_double
         return cls(
             model.means if doubles is None else doubles,

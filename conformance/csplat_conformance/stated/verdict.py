@@ -36,8 +36,8 @@ class MeasureProof:
         name: name in the registry of stated errors.
         stated_max, stated_rms: errors in the file; `None` if it does not state the measure.
         measured_max, measured_rms: errors of the pairs; `None` without a source index.
-        holds: nothing contradicts the statement; `None` where there is none.
-        worst: the splat with the largest error. Without a source index it is there only where a splat has no partner
+        holds: nothing contradicts the statement; `None` if there is none.
+        worst: the splat with the largest error. Without a source index it is there only if a splat has no partner
             because of this measure.
     """
 

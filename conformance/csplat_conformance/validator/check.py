@@ -123,7 +123,7 @@ def _check(
 
 
 def _read_header(view: memoryview, findings: Findings) -> Header | None:
-    """HDR-1 to HDR-4, HDR-11; `None` where nothing more can be said."""
+    """HDR-1 to HDR-4, HDR-11; `None` if nothing more can be said."""
     magic = bytes(view[: len(_spec.MAGIC)])
     if len(view) < _spec.HEADER_SIZE:
         if _spec.MAGIC.startswith(magic):
@@ -226,7 +226,7 @@ def _read_tile_chunks(
 
 
 def _told_apart(payload: Payload, findings: Findings, read: Callable[[], None]) -> bool:
-    """Read a payload; note the rest of it as not looked at where its structure is lost."""
+    """Read a payload; note the rest of it as not checked if its structure is lost."""
     try:
         read()
     except UnreadableError:

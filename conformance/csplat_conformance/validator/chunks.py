@@ -160,7 +160,7 @@ def check_coverage(findings: Findings, chunks: Sequence[Chunk], start: int, file
     """COV-1; marks the chunks whose bytes can be read, and remarks on another order than 4.3.6 recommends.
 
     Args:
-        findings: where violations are added.
+        findings: receives the violations.
         chunks: all of the file.
         start: end of the index.
         file_size: size of the file in the header.
@@ -197,7 +197,7 @@ def check_frame(view: memoryview, chunk: Chunk, clause: str, findings: Findings)
         view: the file.
         chunk: the chunk.
         clause: the clause that requires the payload to end with its last structure.
-        findings: where violations are added.
+        findings: receives the violations.
     """
     at, end = chunk.offset, chunk.offset + chunk.size
     stored, computed = chunk.record.record.crc, zlib.crc32(view[at:end])

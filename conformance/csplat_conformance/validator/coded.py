@@ -104,7 +104,7 @@ def _read_indices(reader: TileReader, payload: Payload, name: str, book: Codeboo
 
 
 def _find_first(reader: TileReader, book: CodebookAt, params: Params) -> First:
-    """CBK-4. An unknown one is returned where there is none, or where its block could not be read."""
+    """CBK-4. An unknown one is returned if there is none, or if its block could not be read."""
     identity, count = params.record.codebook_id, params.record.escape_count
     first = reader.first.get(identity)
     opener = first_attribute(book)
@@ -155,7 +155,7 @@ def _read_escapes(reader: TileReader, payload: Payload, name: str, attribute: in
 
 
 def _served(first: First, entries: I64) -> I64 | None:
-    """The entries of the splats that are not escaped, [C, n]; `None` where something is not known."""
+    """The entries of the splats that are not escaped, [C, n]; `None` if something is not known."""
     if first.indices is None or first.escaped is None:
         return None
     rows: I64 = entries[first.indices[~first.escaped].astype(np.intp)].T

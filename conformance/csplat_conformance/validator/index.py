@@ -67,7 +67,7 @@ class Index:
 
 
 def scaled(step: float, exponent: int, *, single: bool = False) -> float | None:
-    """Return step × 2^exponent, `None` where it is not finite or subnormal in binary64, or binary32 (TIL-9, LAT-1)."""
+    """Return step × 2^exponent, `None` if it is not finite or subnormal in binary64, or binary32 (TIL-9, LAT-1)."""
     if abs(exponent) > 4096:  # beyond any pair of binary64 values, and not worth such an integer
         return None
     product = Fraction(step) * Fraction(2) ** exponent
@@ -81,7 +81,7 @@ def read_records(view: memoryview, end: int, findings: Findings) -> Index:
     Args:
         view: the file.
         end: offset of the index's CRC by the header, at most the end of the data.
-        findings: where violations are added.
+        findings: receives the violations.
     """
     start = _spec.HEADER_SIZE
     head = place(view, _spec.unpack_index_head, _spec.INDEX_HEAD_OFFSETS, start, "index")

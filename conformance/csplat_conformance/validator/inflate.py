@@ -47,7 +47,7 @@ class Inflater:
         """Return what the final block completes, or more than `size` bytes as soon as there are more.
 
         Raises:
-            CodedError: by COD-2 where the stream is cut or no DEFLATE, by COD-5 to COD-8.
+            CodedError: by COD-2 if the stream is cut or no DEFLATE, by COD-5 to COD-8.
         """
         final = 0
         while not final:

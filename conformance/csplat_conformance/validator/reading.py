@@ -31,7 +31,7 @@ class Payload:
         end: offset of its end.
         name: name of the chunk, `TILE.0.0`.
         clause: the clause that requires the payload to end with its last structure.
-        findings: where violations are added.
+        findings: receives the violations.
     """
 
     def __init__(self, view: memoryview, at: int, end: int, name: str, clause: str, findings: Findings) -> None:

@@ -29,7 +29,7 @@ class Stream:
 
     Attributes:
         head: its head: offset and fields.
-        elements: [count], `None` where a violation keeps them from being known.
+        elements: [count], `None` if a violation keeps them from being known.
     """
 
     head: Placed[_spec.StreamHead]
@@ -53,7 +53,7 @@ def read_stream(
         count: elements that its place requires; `None` for texts, which say themselves.
         width_max: bytes of an element at most.
         signed: two's complement of `width` bytes.
-        count_max: budget of elements where `count` is `None`.
+        count_max: budget of elements if `count` is `None`.
 
     Raises:
         UnreadableError: the payload ends before the stream does.
@@ -74,7 +74,7 @@ def read_stream(
     at = payload.take(size, f"{what}.coded")
     if not coder_known:
         return Stream(head, None)
-    # Even where the head is wrong the coder can be tried, as long as it has a sane size to fill.
+    # Even if the head is wrong the coder can be tried, as long as it has a sane size to fill.
     most = count_max if count is None else _ELEMENTS_MAX
     if count is not None and count > most:
         sound = False  # the field that requires more has been refused
@@ -119,7 +119,7 @@ def _check_transforms(findings: Findings, head: Placed[_spec.StreamHead]) -> boo
 
 
 def _check_packed(findings: Findings, head: Placed[_spec.StreamHead], sound: bool) -> bool:
-    """STR-4, STR-5; they say something only where count, width and transforms are known."""
+    """STR-4, STR-5; they say something only if count, width and transforms are known."""
     if not sound:
         return False
     size, packed = head.record.count * head.record.width, head.record.packed_size

@@ -47,7 +47,7 @@ def read_tiles(view: memoryview, at: int, end: int, index: Index, findings: Find
         at: offset of the first.
         end: offset of the index's CRC.
         index: the part of the index before them.
-        findings: where violations are added.
+        findings: receives the violations.
     """
     tiles: list[Tile] = []
     head = index.head.record

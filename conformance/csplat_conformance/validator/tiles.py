@@ -31,7 +31,7 @@ class First:
     """The tile's first block of a codebook, which holds the indices for all.
 
     Attributes:
-        indices: [n], `None` where they could not be read or name no entry.
+        indices: [n], `None` if they could not be read or name no entry.
         escaped: [n] bool, `None` likewise.
         escape_count: number of escapes in the block.
     """
@@ -50,7 +50,7 @@ class TileReader:
         index: index of the file.
         tile: its record.
         books: entries by codebook id and layer.
-        findings: where violations are added.
+        findings: receives the violations.
         read_coded: reads what follows the head of a block coded CODEBOOK.
         first: by codebook id.
         lost: layers of which blocks are missing, because they could not be told apart.
@@ -236,7 +236,7 @@ def read_columns(
     """Read and check a block coded LEVELS, OFFSET or SIGNED.
 
     Returns:
-        [C, count] integers, `None` where a violation keeps them from being known or in range; and the exponent.
+        [C, count] integers, `None` if a violation keeps them from being known or in range; and the exponent.
     """
     columns = _spec.ATTRIBUTE_COLUMNS[attribute]
     exponent, offsets, sound = 0, [0] * columns, True
@@ -257,7 +257,7 @@ def read_columns(
 
 
 def read_exponent(reader: TileReader, payload: Payload, name: str, attribute: int, *, fixed: bool) -> tuple[int, bool]:
-    """Read lattice parameters: the exponent, and whether LAT-1, or LAT-2 where it is fixed, holds."""
+    """Read lattice parameters: the exponent, and whether LAT-1, or LAT-2 if it is fixed, holds."""
     params = payload.structure(
         _spec.unpack_lattice_params, _spec.LATTICE_PARAMS_SIZE, _spec.LATTICE_PARAMS_OFFSETS, name
     )

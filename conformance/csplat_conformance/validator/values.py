@@ -24,7 +24,7 @@ def check_integers(findings: Findings, index: Index, attribute: int, rows: I64, 
     """Check the integers of a block, or of the part of it that one stream or one codebook gives.
 
     Args:
-        findings: where violations are added.
+        findings: receives the violations.
         index: index of the file.
         attribute: registry value; not means.
         rows: [C, n] integers, before the lifting of 7.1.
@@ -114,7 +114,7 @@ def check_box(
     """TIL-10 and MEA-1.
 
     Args:
-        findings: where violations are added.
+        findings: receives the violations.
         index: index of the file.
         record: the tile record.
         rows: [3, n], the integers q.

@@ -32,7 +32,7 @@ _LARGE = 2_000_000  # splats: one run, fewer programs
 
 @dataclass(frozen=True)
 class Measured:
-    """A preset: its file, from arrays, and in a whole process; that is `None` where it reached the cap."""
+    """A preset: its file, from arrays, and in a whole process; that is `None` if it reached the cap."""
 
     size_bytes: int
     encode: Run

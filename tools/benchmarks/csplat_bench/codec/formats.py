@@ -41,7 +41,7 @@ class Row:
         name: name of the format; of another program's file behind the program.
         size_bytes: size of the file.
         psnr: dB against the PLY; or why there is none.
-        write_seconds, read_seconds: `None` where they are not ours.
+        write_seconds, read_seconds: `None` if they are not ours.
         splats: number of splats in the scene.
     """
 

@@ -24,7 +24,7 @@ class Point:
     Attributes:
         psnr: against the source, dB.
         size_bytes: size of the file.
-        quality: the encoder's option; 0 where it has none.
+        quality: the encoder's option; 0 if it has none.
         seconds: time of encoding.
     """
 
@@ -62,7 +62,7 @@ def rate_at(series: Series, psnr: float) -> Rate | None:
         psnr: dB.
 
     Returns:
-        `None` where no point is good enough.
+        `None` if no point is good enough.
     """
     found: list[Rate] = []
     for how, points in series.items():
@@ -82,7 +82,7 @@ def bytes_between(points: Sequence[Point], psnr: float, gap: float = _GAP) -> fl
         gap: between the two points, at most, dB.
 
     Returns:
-        `None` where a side has no point, or the two are further apart.
+        `None` if a side has no point, or the two are further apart.
     """
     below = max((one for one in points if one.psnr <= psnr), key=lambda one: one.psnr, default=None)
     above = min((one for one in points if one.psnr >= psnr), key=lambda one: one.psnr, default=None)
@@ -133,7 +133,7 @@ def bracket(
         points: the points measured so far.
         goal: PSNR, dB.
         measure: encodes at a quality.
-        start: quality to begin with where nothing is known.
+        start: quality to begin with if nothing is known.
         limits: limits of the quality.
         ceiling: bytes of another series at the goal; one that is not going to be below is given up.
         most: measurements at most; then what is there has to do.
@@ -159,7 +159,7 @@ def bracket(
 def _expected(points: Sequence[Point], goal: float) -> float:
     """Bytes at a PSNR above all points, by the straight line through the best two; too few rather than too many.
 
-    Curves of log(bytes) bend upwards. 0 where a point is above.
+    Curves of log(bytes) bend upwards. 0 if a point is above.
     """
     if not points or any(one.psnr >= goal for one in points):
         return 0.0

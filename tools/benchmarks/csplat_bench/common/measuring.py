@@ -74,10 +74,10 @@ def run_timed(command: Sequence[str], runs: int, cap_seconds: float) -> Timing |
 
 
 def reset_peak(process: int | None = None) -> int:
-    """Reset the high-water mark where the kernel allows it; return the size before the call, bytes.
+    """Reset the high-water mark if the kernel allows it; return the size before the call, bytes.
 
     Args:
-        process: its number; this one if left out. Of another nothing but 0 is known where there is no /proc.
+        process: its number; this one if left out. Of another nothing but 0 is known if there is no /proc.
     """
     with contextlib.suppress(OSError):
         (_of(process) / "clear_refs").write_text("5")
@@ -88,7 +88,7 @@ def reset_peak(process: int | None = None) -> int:
 
 
 def peak_bytes(process: int | None = None) -> int:
-    """Largest resident size since the mark was reset, or ever where it cannot be."""
+    """Largest resident size since the mark was reset, or ever if it cannot be reset."""
     return _status("VmHWM", process) or (0 if process else _max_rss())
 
 

@@ -52,7 +52,7 @@ def find_splat_transform(folder: Path) -> tuple[list[str] | None, str]:
     """Install splat-transform and a node that is new enough into a folder, if they are not there.
 
     Returns:
-        The command, `None` where it cannot be had; and its version, or the reason.
+        The command, `None` if it cannot be had; and its version, or the reason.
     """
     script = folder / "node_modules" / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
     if not script.exists() or _node(folder) is None:
@@ -68,7 +68,7 @@ def find_splat_transform(folder: Path) -> tuple[list[str] | None, str]:
 
 
 def npm_install(folder: Path, packages: Sequence[str]) -> str:
-    """Install npm packages into a folder; gives the reason where that fails, else nothing."""
+    """Install npm packages into a folder; returns the reason if that fails, else nothing."""
     npm = shutil.which("npm")
     if npm is None:
         return "npm is not installed"
@@ -86,7 +86,7 @@ def npm_install(folder: Path, packages: Sequence[str]) -> str:
 
 def npm_pinned(folder: Path, packages: Mapping[str, str]) -> str:
     """Install npm packages that a folder does not have, of a version or of all that begin with it; gives the reason
-    where that fails.
+    if that fails.
     """
     absent = []
     for name, version in packages.items():
@@ -110,7 +110,7 @@ def _node(folder: Path) -> str | None:
 
 
 def transform(command: Sequence[str], scene: Scene, folder: Path, runs: int = 1) -> list[Peer]:
-    """Let splat-transform write SPZ, and SOG where that takes minutes at most."""
+    """Let splat-transform write SPZ, and SOG if that takes minutes at most."""
     peers = [_written("SPZ", command, scene.path, folder / f"{scene.name}.spz", runs)]
     if scene.sh_degree == 0 or scene.splat_count <= _SOG_SH_SPLATS:
         peers.append(_written("SOG", [*command, *_SOG], scene.path, folder / f"{scene.name}.sog", 1))

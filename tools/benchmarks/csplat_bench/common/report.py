@@ -21,7 +21,7 @@ Machine = dict[str, str]
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]], *, markdown: bool = False) -> str:
-    """Lay out a table; nothing where it has no rows."""
+    """Lay out a table; nothing if it has no rows."""
     lines = [[str(cell) for cell in row] for row in rows]
     if not lines:
         return ""

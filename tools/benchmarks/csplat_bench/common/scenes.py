@@ -139,7 +139,7 @@ def _made_of(name: str) -> str:
 
 
 def given_cameras(name: str) -> list[Camera]:
-    """The eight cameras of the data folder for a scene, or for what it was made of; nothing where it has none."""
+    """The eight cameras of the data folder for a scene, or for what it was made of; nothing if it has none."""
     path = DATA / "psnr_cameras" / f"{_made_of(name)}.json"
     return load_cameras(path) if path.exists() else []
 

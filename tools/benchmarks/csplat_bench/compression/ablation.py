@@ -63,7 +63,7 @@ def ablation(bench: Bench, tuned: Tuned) -> list[Step]:
 
 
 def _served_colours(frozen: Frozen, shN: NDArray[np.float32]) -> SplatModel:
-    """The scene before quantisation, SH by codebook where one serves."""
+    """The scene before quantisation, SH by codebook if it has one."""
     model = frozen.draft.model
     if frozen.book is None:
         return model
@@ -76,7 +76,7 @@ def _served_colours(frozen: Frozen, shN: NDArray[np.float32]) -> SplatModel:
 def _served_shapes(
     frozen: Frozen, model: SplatModel, quats: NDArray[np.float32], scales: NDArray[np.float32]
 ) -> SplatModel:
-    """The scene before quantisation, shapes by codebook where one serves."""
+    """The scene before quantisation, shapes by codebook if it has one."""
     if frozen.shapes is None:
         return model
     own = frozen.shapes.escaped[:, None]

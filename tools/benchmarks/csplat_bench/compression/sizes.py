@@ -35,7 +35,7 @@ class Book:
 
 
 def books_of(frozen: Frozen) -> tuple[Book | None, Book | None]:
-    """The codebooks of a frozen scene, of SH and of shapes; `None` where the encoder made none."""
+    """The codebooks of a frozen scene, of SH and of shapes; `None` if the encoder made none."""
     colours, shapes = frozen.book, frozen.shapes
     return (
         None if colours is None else Book(colours.size, len(colours.escaped)),

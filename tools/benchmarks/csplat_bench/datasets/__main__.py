@@ -6,12 +6,12 @@
 
 Known are Mip-NeRF 360 (images_4 outdoors, images_2 indoors), Tanks and Temples (train, truck), Deep Blending
 (drjohnson, playroom) and NeRF-synthetic; any other COLMAP, Blender or transforms.json set is scored too. Pictures wider
-than 1600 pixels are scaled down to that; every 8th picture is held out where the set names no test pictures.
+than 1600 pixels are scaled down to that; every 8th picture is held out if the set names no test pictures.
 
 Each scene is trained, written as a PLY, scored on its held-out pictures, encoded with each preset, and the decoded
 files are scored on the same pictures. PSNR is the mean over the pictures, as papers print it; SSIM has INRIA's window;
 LPIPS is AlexNet's. A scene whose PLY lies in --out is not trained again; the PLY of another trainer may be laid there.
-Where other programs want the same cores, OPENBLAS_NUM_THREADS=1 keeps LPIPS from waiting for its own threads.
+If other programs need the same cores, OPENBLAS_NUM_THREADS=1 keeps LPIPS from waiting for its own threads.
 """
 
 from __future__ import annotations

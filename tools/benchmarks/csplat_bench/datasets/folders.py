@@ -33,7 +33,7 @@ class SceneFolder:
         path: its folder.
         kind: `COLMAP`, `BLENDER` or `TRANSFORMS`.
         protocol: the benchmark set it belongs to; `OTHER` for any other.
-        scene: its name in the set's tables; the folder's where there are none.
+        scene: its name in the set's tables; the folder's if there are none.
         key: names its files; no two scenes have the same.
     """
 

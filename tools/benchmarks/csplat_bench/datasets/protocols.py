@@ -140,7 +140,7 @@ C3DGS: dict[str, Published] = {
 
 
 def published_means(protocol: Protocol, scenes: Sequence[str]) -> Published:
-    """Means of 3DGS's figures over these scenes; size and time where they are all scenes of the set.
+    """Means of 3DGS's figures over these scenes; size and time if they are all scenes of the set.
 
     Args:
         protocol: one of `PROTOCOLS`.
@@ -160,7 +160,7 @@ def published_means(protocol: Protocol, scenes: Sequence[str]) -> Published:
 
 
 def published_splats(protocol: Protocol) -> int | None:
-    """Splats of 3DGS, mean over a set, as the size of its files tells; `None` where no size is printed."""
+    """Splats of 3DGS, mean over a set, as the size of its files tells; `None` if no size is printed."""
     size_mb, _ = _THREE_DGS_MEANS.get(protocol.slug, (None, None))
     return None if size_mb is None else round(size_mb * 1e6 / _INRIA_SPLAT_BYTES)
 

@@ -24,7 +24,7 @@ class Record(TypedDict, total=False):
     Attributes:
         key: names its files. title, scene, set, kind: see `SceneFolder`.
         images, size, protocol_size, remarks: see `PictureChoice`.
-        settings: options of its training, and what that took; `None` where it was trained elsewhere.
+        settings: options of its training, and what that took; `None` if it was trained elsewhere.
         test_views, pixels, background, splats, sh_degree, files: the images and files that were scored.
         scoring: whatever the scores depend on.
     """

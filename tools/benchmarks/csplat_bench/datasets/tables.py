@@ -44,7 +44,7 @@ def scenes_table(records: Sequence[Record], *, markdown: bool) -> str:
 
 
 def means_table(records: Sequence[Record], *, markdown: bool) -> str:
-    """Means over the scenes of each benchmark set; nothing where there is none of them."""
+    """Means over the scenes of each benchmark set; nothing if there is none of them."""
     lines: list[list[str]] = []
     for protocol in PROTOCOLS:
         own = [one for one in records if one["set"] == protocol.slug]

@@ -6,9 +6,9 @@
     python -m csplat_bench.distortion simplified --offsets= --psnr 45   # wherever SPZ is
     python -m csplat_bench.distortion tables --markdown           # print what was measured, plot it
 
-Peers are written in the same run, by splat-transform: SPZ, and SOG where that takes minutes at most (one iteration of
+Peers are written in the same run, by splat-transform: SPZ, and SOG if that takes minutes at most (one iteration of
 its k-means). PSNR is against the source from the cameras of the data folder (psnr_cameras/NAME.json). What was measured
-is kept scene by scene in tools/benchmarks/distortion/NAME.json: an interrupted run goes on where it ended; --again
+is kept scene by scene in tools/benchmarks/distortion/NAME.json: an interrupted run continues where it stopped; --again
 forgets.
 """
 
@@ -68,7 +68,7 @@ _QUALITIES = (20.0, 110.0)  # dB, between which the encoder's is looked for
 _LOSS = (5.0, 12.0)  # dB between what each attribute keeps by itself and what all keep, without and with SH, about
 _GRID_TRIES = 4  # files at most for one point of a curve
 GRID = (-9.0, -6.0, -3.0, 3.0, 6.0)  # dB from the PSNR of SPZ at which the curve is drawn, too
-_GRID_FAR = (-16.0, -12.5)  # likewise, without SH, where SPZ is far above what pictures need
+_GRID_FAR = (-16.0, -12.5)  # likewise, without SH, if SPZ is far above what pictures need
 
 
 class Part(StrEnum):

@@ -5,7 +5,7 @@
     python -m csplat_bench.distortion.ablation --tables --markdown # print what was measured
 
 Files are those of `csplat encode --target-psnr`. What was measured is kept scene by scene in
-tools/benchmarks/ablation/NAME.json: an interrupted run goes on where it ended; --again forgets.
+tools/benchmarks/ablation/NAME.json: an interrupted run continues where it stopped; --again forgets.
 """
 
 from __future__ import annotations

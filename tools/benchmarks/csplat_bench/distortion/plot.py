@@ -24,7 +24,7 @@ _ABOVE = 3.0  # dB above the best peer that are shown
 
 
 def plot(results: Mapping[str, Measured], path: Path) -> None:
-    """Draw the curves; nothing where nothing is known.
+    """Draw the curves; nothing if nothing is known.
 
     Args:
         results: by scene.
@@ -111,7 +111,7 @@ def _xy(one: Measured, points: list[Point]) -> tuple[list[float], list[float]]:
 
 
 def _elsewhere(axis: Axes, one: Measured) -> None:
-    """Boxes for what others were found to take on other scenes; bands where their PSNR is not known."""
+    """Boxes for what others were found to take on other scenes; bands if their PSNR is not known."""
     from matplotlib.patches import Rectangle
 
     (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()

@@ -15,7 +15,7 @@ class Published:
         method: name that its authors use.
         psnr: mean over the test views, dB.
         size_bytes: size of the file.
-        ssim, lpips: means; `None` where they were not given. LPIPS is VGG's: not to be compared with AlexNet's.
+        ssim, lpips: means; `None` if they were not given. LPIPS is VGG's: not to be compared with AlexNet's.
         network: whether a decoder has to evaluate neural networks.
         source: where the figures are published.
     """

@@ -96,7 +96,7 @@ def _their_row(one: Published) -> list[str]:
 
 
 def plot(known: Mapping[str, Any], name: str, path: Path) -> None:
-    """Draw PSNR over bytes; nothing where no file is known.
+    """Draw PSNR over bytes; nothing if no file is known.
 
     Args:
         known: the stored results.

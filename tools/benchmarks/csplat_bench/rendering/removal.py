@@ -4,7 +4,7 @@
     python -m csplat_bench.rendering.removal pass                               # the pass compared with a render
     python -m csplat_bench.rendering.removal tables                             # print what was measured
 
-What was measured is kept scene by scene in out/removal/NAME.json: a run that is interrupted goes on where it ended.
+What was measured is kept scene by scene in out/removal/NAME.json: a run that is interrupted continues where it stopped.
 PSNR is against the source, on cameras that decided nothing: those of the data folder (psnr_cameras/NAME.json).
 """
 

@@ -10,7 +10,7 @@ __all__ = ["Facts", "How", "Known", "Measured", "Results", "Scored", "Survivors"
 
 
 class Scored(TypedDict):
-    """Scores on some views: PSNR pooled, then means and deviations over views; `None` where not measured."""
+    """Scores on some views: PSNR pooled, then means and deviations over views; `None` if not measured."""
 
     views: int
     psnr: float
@@ -23,7 +23,7 @@ class Scored(TypedDict):
 
 
 class How(TypedDict):
-    """All that a line depends on; `tuned` where a file was."""
+    """All that a line depends on; `tuned` if a file was."""
 
     name: str
     reduction: dict[str, Any]

@@ -51,11 +51,11 @@ class Subject:
         name: name in tables and file names.
         source: the scene.
         ply: path of the PLY.
-        training: seconds and options of its training; {} where it was not trained here.
+        training: seconds and options of its training; {} if it was not trained here.
         views: views by which it is judged.
         teachers: cameras that a lower SH degree is distilled by; None for virtual ones.
         judged_by: in words.
-        photographs: by which files are tuned; None where there are none.
+        photographs: by which files are tuned; None if there are none.
     """
 
     name: str
@@ -89,7 +89,7 @@ def baselines(iterations: int, count: int) -> dict[str, Capture]:
 
 
 def open_subject(name: str, known: Mapping[str, Capture], out: Path, lpips: Distance | None, views: int = 0) -> Subject:
-    """Find a scene, train it where it has to be trained, and read what it is judged by.
+    """Find a scene, train it if it has to be trained, and read what it is judged by.
 
     Args:
         name: one of `BASELINES`, `OTHERS`, `OWN`.

@@ -7,7 +7,7 @@
 
 Every file is written by the command line in a process of its own, and judged from sixteen virtual cameras that no
 search consults: those of `psnr`, but for the seed. What was measured is kept in tools/benchmarks/targets/NAME.json,
-file by file: an interrupted run goes on where it ended. A row is *beaten* where another file of the same scene is
+file by file: an interrupted run continues where it stopped. A row is *beaten* if another file of the same scene is
 smaller by more than 1 % and better by more than 0.1 dB; files that hold every splat are compared among themselves.
 """
 

@@ -13,7 +13,7 @@ from csplat_bench.common.report import Table, laid_out
 __all__ = ["Build", "File", "Known", "Ratio", "at_equal_psnr", "dominated", "kind_of", "tables"]
 
 _BUILDS = ("before", "now")
-_BYTES_PER_DB = 0.045  # share of the bytes that a decibel costs, where no two files say it
+_BYTES_PER_DB = 0.045  # share of the bytes that a decibel costs, if it cannot be taken from two files
 _SMALLER, _BETTER = 0.01, 0.1  # share of the bytes, and dB, by which one file beats another
 _GUESSED = "≈ "  # before what they say
 
@@ -96,7 +96,7 @@ def at_equal_psnr(before: Rows, now: Rows, name: str) -> Ratio | None:
         name: name of the row.
 
     Returns:
-        `None` where it was not measured twice.
+        `None` if it was not measured twice.
     """
     if not all(name in dict(_files(rows)) for rows in (before, now)):
         return None

@@ -13,7 +13,7 @@ that was drawn, and compared with the finished one: the last in this viewer, whe
 first     the first picture that is not black
 25 dB     the first of this PSNR against the finished one
 whole     the finished one
-asked kB  all that was sent: less than the files where the viewer leaves some out, more where it asks for bytes twice
+asked kB  all that was sent: less than the files if the viewer leaves some out, more if it asks for bytes twice
 
 ms count from the first request for the scene, kB is what had been sent by then. Pictures are drawn by SwiftShader, a GL
 on the CPU, which shares the cores with decoders and is in all times; bytes keep coming meanwhile, so that on a slower
@@ -255,7 +255,7 @@ def _watched(page: Any, line: Line, viewer: str, url: str, camera: dict[str, Any
 
 
 def _arrival(scene: str, form: str, viewer: str, file_bytes: int, each: Sequence[Watched | str]) -> Arrival:
-    """Medians of some runs; nothing where one failed."""
+    """Medians of some runs; nothing if one failed."""
     names = scene, FORMS[form].title, VIEWERS[viewer][0]
     runs = [one.seen for one in each if isinstance(one, Watched)]
     if len(runs) < len(each):

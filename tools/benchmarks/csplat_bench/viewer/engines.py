@@ -4,7 +4,7 @@
     python -m csplat_bench.viewer.engines scene.csplat --engines webkit --runs 1
 
 Prints how long each takes from the address to a scene that is drawn whole, and reports failures: a file that is
-opened then, and the scene's own with another way up, have to come right as well. Status 1 where something does not.
+opened then, and the scene's own with another way up, have to come right as well. Status 1 if something does not.
 Requires Chromium and playwright; firefox-esr; WebKitWebDriver with MiniBrowser (Debian: webkit2gtk-driver); xvfb-run.
 """
 

@@ -6,10 +6,10 @@
 
 Writes a scene in every format, lets the engines' own loaders read it in Chromium, and compares pictures with those of
 csplat's rasteriser of the PLY, from where SH shows most of eight places around the scene: dB. `by its rules` is the
-same with the engine's own rules (`rules.py`) in ours; `SH` how much of what SH changes there the engine shows, 1 where
+same with the engine's own rules (`rules.py`) in ours; `SH` how much of what SH changes there the engine shows, 1 if
 it is all. `stands` is how the engine's world, whose y is up, holds the scene; `PLY` how near the picture is to that of
-the PLY in the same engine, dB. Where csplat is among the formats, by `codec/js/engines`, all others are written from
-what its file holds. --out keeps the pictures, and all of a scene on one sheet. Status 1 where one is mirrored, on its
+the PLY in the same engine, dB. If csplat is among the formats, by `codec/js/engines`, all others are written from
+what its file holds. --out keeps the pictures, and all of a scene on one sheet. Status 1 if one is mirrored, on its
 head, of wrong SH or absent. Requires Chromium, playwright, npm.
 """
 
@@ -68,7 +68,7 @@ class Shown:
             picture.
         psnr: PSNR against our picture, and against ours by the engine's rules, dB.
         wrong: the best PSNR against the latter mirrored or on its head, dB.
-        sh: how far the picture lies on the way from ours without SH to ours, by these rules; 1 where there is none.
+        sh: how far the picture lies on the way from ours without SH to ours, by these rules; 1 if there is none.
         ply: PSNR against the picture of the PLY in the same engine, dB.
     """
 

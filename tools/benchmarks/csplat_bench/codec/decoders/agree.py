@@ -5,7 +5,7 @@
 
 Python decodes each file with `csplat.decoder`, Node.js with `codec/js`; the float arrays of spec 3, the integer arrays
 of spec 9.2 and the extra columns must have the same bytes, and what one refuses the other must refuse with the same
-code. Status 1 where something differs.
+code. Status 1 if something differs.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Compared:
     """One file, decoded twice.
 
     Attributes:
-        verdict: in words; begins with DIFFERENT where they do.
+        verdict: in words; begins with DIFFERENT if they differ.
         size_bytes: total size of all arrays.
         sums: SHA-256 by array, of the Python decoder.
     """
