@@ -204,7 +204,7 @@ def differences(source, found, format, allowed):
 
 
 def degrees(a, b):
-    """Between rotations, where half turns about axes of a splat change nothing."""
+    """Return the angles between rotations; half turns about axes of a splat do not count."""
     w, x, y, z = b.T
     turns = np.stack([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])
     cosine = np.abs(np.einsum("ij,tji->ti", a, turns)).max(0) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)

@@ -103,11 +103,11 @@ class Way(Protocol):
         ...
 
     def matches(self, bounds: Mapping[str, float]) -> NDArray[Any]:
-        """For each splat of the file `UNMATCHED`, `UNDECIDED`, or something else if it has a partner."""
+        """Return `UNMATCHED`, `UNDECIDED`, or something else if it has a partner, for each splat of the file."""
         ...
 
     def farthest(self, bounds: Mapping[str, float], rows: I64) -> dict[str, Worst]:
-        """By measure the splat that is farthest beyond its bound, of some that have no partner."""
+        """Return by measure the splat farthest beyond its bound, of some that have no partner."""
         ...
 
 

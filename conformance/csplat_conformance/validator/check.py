@@ -1,4 +1,4 @@
-"""From the first byte to the last: header, index, chunks."""
+"""Validate a file from the first byte to the last: header, index, chunks."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class Row:
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """As the table has them."""
+        """The cells of its table row."""
         rate = None if self.read_seconds is None else self.splats / self.read_seconds / 1e6
         psnr = self.psnr if isinstance(self.psnr, str) else f"{self.psnr:.1f}"
         return (

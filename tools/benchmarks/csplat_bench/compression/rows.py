@@ -87,7 +87,7 @@ class Memory(TypedDict):
 
 
 class Known(TypedDict, total=False):
-    """By kind and name, all that is known of a scene."""
+    """All results of a scene, by kind and name."""
 
     settings: dict[str, Any]
     machine: Machine

@@ -9,7 +9,7 @@ photographs are to be made smaller. Seconds are those of one training, or one fi
 that is not made by `csplat train` says `by` what: `finetune` or `encode` of the trained PLY, FOLDER among its words
 where that is to look at photographs. A file `without` what others have is drawn apart from them. Trainings lie in
 --work as NAME-TRAINING.ply, with their checkpoints, files next to them. Figures of the held-out photographs are kept in
-NAME.json next to the configuration file, and plotted in NAME.svg: an interrupted run goes on where it stopped. PSNR is the
+NAME.json next to the configuration file, and plotted in NAME.svg: an interrupted run continues. PSNR is the
 mean over the photographs, as papers print it, and pooled; LPIPS is AlexNet's.
 """
 

@@ -141,7 +141,7 @@ class Arrival:
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """As the table has them."""
+        """The cells of its table row."""
         start = self.scene, self.form, self.viewer, _kilobytes(self.file_bytes)
         if self.seen is None:
             return *start, *("-",) * 6, self.failed

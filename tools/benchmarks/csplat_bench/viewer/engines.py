@@ -122,7 +122,7 @@ def _chromium() -> Iterator[Drive]:
 
 @contextmanager
 def _firefox() -> Iterator[Drive]:
-    """By Marionette: `LENGTH:[0, number, command, parameters]`, answered by `LENGTH:[1, number, error, result]`."""
+    """Drive Firefox by Marionette: `LENGTH:[0, id, command, values]`, answered by `LENGTH:[1, id, error, result]`."""
     port = _free_port()
     with tempfile.TemporaryDirectory() as profile:
         Path(profile, "user.js").write_text(
@@ -155,7 +155,7 @@ def _firefox() -> Iterator[Drive]:
 
 @contextmanager
 def _webkit() -> Iterator[Drive]:
-    """By WebDriver (W3C)."""
+    """Drive WebKit by WebDriver (W3C)."""
     browsers = sorted(Path("/usr/lib").glob("*/webkit2gtk-*/MiniBrowser"))
     if not browsers:
         raise InputError("WebKit's MiniBrowser is not installed: on Debian it comes with webkit2gtk-driver")

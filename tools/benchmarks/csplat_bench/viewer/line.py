@@ -64,7 +64,7 @@ class Line:
 
     @contextmanager
     def asked(self) -> Iterator[None]:
-        """For the time of a request."""
+        """Count a request as open while the context lasts, after the latency."""
         with self._lock:
             self.begun = self.begun or time.time()
             self._open += 1

@@ -1,4 +1,4 @@
-"""By which rules other engines draw splats, and our pictures by the same: what is left over is the file's doing."""
+"""Rules by which other engines draw splats, and our pictures by the same: what still differs is due to the file."""
 
 from __future__ import annotations
 
