@@ -1,4 +1,4 @@
-"""Memory that scenes share which are worked on at the same time."""
+"""The memory budget that scenes processed at the same time share."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ __all__ = ["Budget"]
 
 
 class Budget:
-    """Lets a scene begin when there is memory for it. Owns how much is left.
+    """A gate that lets a scene begin when there is memory for it. Owns the number of bytes left.
 
     Args:
-        allowed: bytes that were allowed; `None`: nobody said.
-        free: bytes that are used where nobody said; `None`: no limit.
-        has_option: the command keeps to less where it is told to, by `--memory`.
+        allowed: bytes that the user allowed; `None`: not specified.
+        free: bytes to use if `allowed` is not specified; `None`: no limit.
+        has_option: the command has `--memory`, and can keep to less than it would need.
     """
 
     def __init__(self, allowed: int | None, free: int | None = None, *, has_option: bool = False) -> None:
@@ -30,16 +30,16 @@ class Budget:
 
     @contextmanager
     def gate(self, need: int) -> Iterator[tuple[str, ...]]:
-        """Wait until there is so much; give it back at the end.
+        """Wait for memory, reserve it, and release it at the end.
 
         Args:
-            need: bytes.
+            need: bytes to reserve.
 
         Yields:
             Options for the command.
 
         Raises:
-            LimitError: it is more than is allowed for all.
+            LimitError: more is needed than the user allowed for all scenes together.
         """
         if self._total is None:
             yield ()
@@ -59,7 +59,7 @@ class Budget:
                 self._changed.notify_all()
 
     def stop(self) -> None:
-        """Let go of all that wait: nothing is begun any more."""
+        """Release all threads that wait: no scene is to begin any more."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()

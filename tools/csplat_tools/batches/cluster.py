@@ -1,4 +1,4 @@
-"""A batch on a cluster of Dask: each scene is a task, done by a process beside the one of Dask's worker."""
+"""A batch on a Dask cluster: each scene is a task, run in a process of its own next to that of Dask's worker."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from csplat_tools.batches.workers import Worker
 
 __all__ = ["on_cluster"]
 
-_here = threading.local()  # the process of each thread of a Dask worker; it ends with that
+_here = threading.local()  # holds the process of each thread of a Dask worker; it ends with the worker
 
 
 def on_cluster(jobs: Sequence[Job], dask: Any) -> Generator[tuple[Record, bool], None, None]:
-    """Do jobs on a cluster; give each as soon as it has ended, with whether anything was done.
+    """Process scenes on a cluster; yield the record of each when it ends, and whether anything was done.
 
-    Dask gives the scenes of a machine that it lost to others, some times.
+    Dask moves the scenes of a lost machine to others, a limited number of times.
 
     Args:
         jobs: scenes, under paths that all machines have.
@@ -37,9 +37,9 @@ def on_cluster(jobs: Sequence[Job], dask: Any) -> Generator[tuple[Record, bool],
         import distributed
     except ModuleNotFoundError as error:
         raise missing(error, "dask[distributed]", extra="scale") from None
-    dasks: Any = distributed  # it has no types
+    dasks: Any = distributed  # the package has no types
     with dasks.Client(dask, set_as_default=False) if isinstance(dask, str) else nullcontext(dask) as client:
-        run = uuid4().hex  # Dask knows tasks by name, and one of an earlier batch is another one
+        run = uuid4().hex  # Dask identifies tasks by name; those of an earlier batch must not be taken for these
         tasks = {client.submit(_do, job, key=f"{job.task.output}-{run}"): job for job in jobs}
         try:
             for future in dasks.as_completed(list(tasks), loop=client.loop):
@@ -57,7 +57,7 @@ def _do(job: Job) -> tuple[Record, bool]:
 def _result(future: Any, job: Job) -> tuple[Record, bool]:
     try:
         record, worked = future.result()
-    except (Exception, CancelledError) as error:  # noqa: BLE001  # whatever a cluster says of a task that it gave up
+    except (Exception, CancelledError) as error:  # noqa: BLE001  # any error of a task that the cluster gave up
         words = " ".join(str(error).split()) or type(error).__name__
         return replace(job.record, code="E_CLUSTER", error=words), True
     return record, worked

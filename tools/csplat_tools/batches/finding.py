@@ -1,4 +1,4 @@
-"""Which scenes a batch has: those of a folder, or the lines of a manifest."""
+"""Find the scenes of a batch: in a folder, or in the lines of a manifest."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ _MANIFESTS = (".jsonl", ".csv", ".txt")
 _COLUMNS = ("path", "output", "options")
 _ONE_LEVEL, _LEVELS = FOLDER_NAMES
 _OWN = ".csplat"
-#: What INRIA's trainer writes next to its scenes: the points that it began with.
+#: The file that INRIA's trainer writes next to its scenes, with the points that it began with.
 _POINTS, _SCENES = "input.ply", "point_cloud"
 _OTHER_GPU = re.compile(r"_rank[1-9]\d*\.pt$")  # gsplat's checkpoints, which are read with that of the first GPU
-#: What a command takes of a folder, where that is not everything: by name, whether it wants this project's own files.
+#: Commands that do not take every scene of a folder: True takes only .csplat files, False leaves them out.
 _WANTS_OWN = {"encode": False, "decode": True, "extract": True}
 
 
 @dataclass(frozen=True)
 class Task:
-    """A scene, and where what is made of it goes.
+    """A scene, and the output that is made from it.
 
     Attributes:
         source: its path, or a URL.
         output: a path within the folder of outputs, with slashes; or a URL.
-        options: of its own, behind those of all.
+        options: options of this scene alone; they follow those of all scenes.
     """
 
     source: str
@@ -49,28 +49,27 @@ class Task:
 
 @dataclass(frozen=True)
 class _Found:
-    """A scene whose output may have no name yet; `within`: its path in the folder, where it is in it."""
+    """A scene whose output may have no name yet; `within` is the path that names it within the folder of outputs."""
 
     task: Task
     within: str
 
 
 def find_tasks(scenes: str, command: str, ending: str, *, match: str = "*", without: Path | None = None) -> list[Task]:
-    """The scenes of a folder, sorted, or of a manifest in its order.
+    """Return the scenes of a folder, sorted, or those of a manifest in its order.
 
     Args:
-        scenes: a folder, searched with all that are in it for names that `csplat formats` lists, without the input.ply
-            of INRIA's trainer; or a manifest: lines
-            of JSON (.jsonl), or of path, output and options with commas between them, or as spreadsheets write it
-            semicolons or tabs (.csv, .txt).
-        command: what is done with them: `encode` leaves .csplat files out, `decode` takes no others.
-        ending: of outputs that have no name.
-        match: which names of a folder, as shells have it.
-        without: a folder that is not searched: that of the outputs.
+        scenes: a folder, searched with its subfolders for names that `csplat formats` lists, without the input.ply
+            of INRIA's trainer; or a manifest: lines of JSON (.jsonl), or of path, output and options, separated by
+            commas or, as spreadsheets write them, by semicolons or tabs (.csv, .txt).
+        command: the command that is run on the scenes: `encode` leaves .csplat files out, `decode` takes no others.
+        ending: file name ending of outputs that have no name.
+        match: shell pattern of the names that are taken from a folder.
+        without: a folder that is not searched, such as that of the outputs.
 
     Raises:
-        InputError: it is neither; a line says nothing; there is no scene, or two have one output.
-        OSError: it cannot be read.
+        InputError: `scenes` is neither; a line has no path; there is no scene, or two have the same output.
+        OSError: `scenes` cannot be read.
     """
     path = Path(scenes)
     path.stat()
@@ -112,8 +111,8 @@ def starting_points(folder: Path, names: Sequence[str] | None = None) -> list[st
     """List the files of a folder that are no scenes, but points that INRIA's trainer began with.
 
     Args:
-        folder: that is searched.
-        names: of files in it, with slashes; `None`: all.
+        folder: the folder that is searched.
+        names: names of files in it, with slashes; `None`: all files.
     """
     found = [one.relative_to(folder).as_posix() for one in folder.rglob(_POINTS)] if names is None else names
     return [
@@ -124,7 +123,7 @@ def starting_points(folder: Path, names: Sequence[str] | None = None) -> list[st
 
 
 def _is_part(name: str, names: Sequence[str]) -> bool:
-    """Whether a file belongs to a scene whose levels are folders beneath it, or to that of another GPU."""
+    """Return True if a file is part of a scene with levels in subfolders, or another GPU's part of a checkpoint."""
     path = PurePosixPath(name)
     if (gpu := _OTHER_GPU.search(name)) and f"{name[: gpu.start()]}_rank0.pt" in names:
         return True
@@ -132,7 +131,7 @@ def _is_part(name: str, names: Sequence[str]) -> bool:
 
 
 def _listed(manifest: Path) -> Iterator[_Found]:
-    """The lines of a manifest. Paths are relative to its folder."""
+    """Yield the scenes of a manifest's lines. Paths are relative to its folder."""
     text = read_text(manifest)
     lines = _json_lines(manifest, text) if manifest.suffix.lower() == ".jsonl" else _table_lines(text)
     for number, fields in lines:
@@ -166,7 +165,7 @@ def _json_lines(manifest: Path, text: str) -> Iterator[tuple[int, dict[str, Any]
 
 
 def _table_lines(text: str) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Give the rows of a table with their cells by column; a heading may name the columns in another order."""
+    """Yield each row's line number and its cells by column; a heading may name the columns in another order."""
     rows = csv.reader(text.splitlines(), skipinitialspace=True, delimiter=_separator(text))
     columns: Sequence[str] = _COLUMNS
     for row in _rows(rows):
@@ -198,13 +197,13 @@ def _separator(text: str) -> str:
 
 
 def _within(source: str) -> str:
-    """A path of a manifest as one within the folder of outputs; its last part where it leads elsewhere."""
+    """Return a manifest's path as one within the folder of outputs; its last part if it leads elsewhere."""
     path = PurePosixPath(source.partition("?")[0])
     return path.name if is_url(source) or leads_out(str(path)) else str(path)
 
 
 def leads_out(name: str, flavour: type[PurePath] = PurePath) -> bool:
-    """Return whether a relative path leads out of its folder, as the paths of this system are read.
+    """Return True if a relative path leads out of its folder, read as POSIX or as this system reads paths.
 
     Args:
         name: parts separated by `/`, or as the system does.
@@ -214,7 +213,7 @@ def leads_out(name: str, flavour: type[PurePath] = PurePath) -> bool:
 
 
 def _named(found: Sequence[_Found], root: str, ending: str) -> list[Task]:
-    """Give outputs names: the source's with another ending, or behind its own where two would get the same name."""
+    """Name the outputs: the source's name with another ending, or with one appended if two names would be the same."""
     short = [one.task.output or _output(one.within, root, ending, whole=False) for one in found]
     counts = Counter(short)
     return [

@@ -1,4 +1,4 @@
-"""What is known of a scene before anything is done with it: what it holds, and what work on it is expected to take."""
+"""Inspect a scene before work on it begins: its content, and the time and memory that a command is expected to take."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from csplat_tools.files.scenes import FOLDER_NAMES, size_of
 
 __all__ = ["RENDERER_BYTES", "Expected", "Look", "content_hash", "expect", "look"]
 
-_FILE_SPLAT_BYTES = 16.0  # where the number of splats is not known: about as .splat, SPZ and SOG have it or more
+_FILE_SPLAT_BYTES = 16.0  # bytes per splat if a file does not state its count; .splat, SPZ and SOG have about as many
 _UNBOUNDED = 1 << 62
-#: Bytes of a process beside its command: the renderer draws the small picture.
+#: Bytes that a process holds in addition to its command: the renderer draws the thumbnail.
 RENDERER_BYTES = 160_000_000
-#: Seconds and bytes that a scene takes, and those that each splat takes, by command; `encode` says it itself. Measured
-#: at SH degree 3 on two cores, 120,000 to 1.1 million splats; bytes are a fifth more.
+#: By command: seconds per scene, seconds per splat, bytes per scene, bytes per splat; `encode` predicts its own if it
+#: can. Measured at SH degree 3 on two cores with 120,000 to 1.1 million splats; bytes include a margin of a fifth.
 _COSTS = {
     "encode": (0.1, 40e-6, 120e6, 750.0),
     "decode": (0.05, 2.5e-6, 60e6, 300.0),
     "convert": (0.05, 9e-6, 140e6, 150.0),
     "extract": (0.02, 0.1e-6, 40e6, 30.0),
 }
-_OTHER_BYTES = (340e6, 3000.0)  # of commands that render: a guess on the safe side
+_OTHER_BYTES = (340e6, 3000.0)  # bytes per scene and per splat of commands that render: a guess on the safe side
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Look:
     """A scene's file.
 
     Attributes:
-        sha256: of its content; of a folder, of its files and their names.
-        size_bytes: of all of it.
-        splats: N; `None` where the file does not say.
-        format: the name of its format; "" where it has none.
-        encode_seconds, encode_bytes: what encoding it in memory takes; `None` where that is not known.
+        sha256: hash of its content; for a folder, of its files and their names.
+        size_bytes: size of the file, or of all files of a folder.
+        splats: number of splats; `None` if the file does not state it.
+        format: the name of its format; "" if it has none.
+        encode_seconds, encode_bytes: expected time and memory of encoding it in memory; `None` if not known.
     """
 
     sha256: str
@@ -59,11 +59,11 @@ class Look:
 
 @dataclass(frozen=True)
 class Expected:
-    """What a scene is expected to take.
+    """The time and memory that a command is expected to take for a scene.
 
     Attributes:
-        seconds: on two cores, with SH degree 3; `None` where nothing is known of the command.
-        memory_bytes: of the process at most.
+        seconds: expected time on two cores with SH degree 3; `None` if nothing is known of the command.
+        memory_bytes: expected peak memory of the process.
     """
 
     seconds: float | None
@@ -71,22 +71,22 @@ class Expected:
 
 
 def look(path: Path) -> Look:
-    """Read a scene's head, and hash it; what is wrong with it the command says.
+    """Read a scene's header and hash its content; defects of the scene are left for the command to report.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     size, content = size_of(path), content_hash(path)
     try:
         name = format_of(path).name
         found = expected(path, EncodeOptions(), Scale(memory_bytes=_UNBOUNDED))
-    except (CsplatError, ValueError, MemoryError):  # of such a file nothing is foretold
+    except (CsplatError, ValueError, MemoryError):  # no prediction for such a file
         return Look(content, size, None, "")
     return Look(content, size, found.count, name, found.seconds, found.needs.memory_bytes)
 
 
 def expect(command: str, known: Look) -> Expected:
-    """What a command takes that does what it does without options."""
+    """Return the time and memory that a command with default options is expected to take."""
     splats = known.splats if known.splats is not None else known.size_bytes / _FILE_SPLAT_BYTES
     if command == "encode" and known.encode_bytes is not None:
         return Expected(known.encode_seconds, RENDERER_BYTES + known.encode_bytes)
@@ -98,10 +98,10 @@ def expect(command: str, known: Look) -> Expected:
 
 
 def content_hash(path: Path) -> str:
-    """SHA-256 of a file; of a scene of several files, or of a folder, of their names and contents.
+    """Return the SHA-256 of a file; for a scene of several files or a folder, that of their names and contents.
 
     Raises:
-        OSError: one cannot be read.
+        OSError: a file cannot be read.
     """
     files = _files(path)
     if files == [path]:
@@ -112,7 +112,7 @@ def content_hash(path: Path) -> str:
 
 
 def _files(path: Path) -> list[Path]:
-    """The files of a scene, or of a folder of results."""
+    """List the files of a scene, or of a folder of results."""
     folder = path.parent if path.name.lower() in FOLDER_NAMES else path
     if folder.is_dir():
         return sorted(one for one in folder.rglob("*") if one.is_file())
@@ -120,7 +120,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _beside(path: Path) -> Iterator[Path]:
-    """Files that a glTF names; what is none names none."""
+    """Yield the buffer files that a glTF names and that exist in its folder; none if the JSON cannot be parsed."""
     try:
         buffers = json.loads(path.read_bytes()).get("buffers", [])
         names = [unquote(one["uri"]) for one in buffers if not one.get("uri", "data:").startswith("data:")]

@@ -1,4 +1,4 @@
-"""`index.html`: a batch as one page that opens from a disk, and fetches nothing."""
+"""`index.html`: the report of a batch as one page that opens from a disk and loads nothing else."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from csplat_tools.pages.parts import definitions, document, table
 __all__ = ["PAGE", "make_page", "write_page"]
 
 PAGE = "index.html"
-_PICTURES_MAX = 1000  # 4 kB each
+_PICTURES_MAX = 1000  # thumbnails on the page, 4 kB each
 _HEADS = ("scene", "splats", "source, kB", "output, kB", "share, %", "bytes per splat", "seconds", "memory, MB")
 
 
@@ -32,7 +32,7 @@ def write_page(records: Sequence[Record], folder: Path) -> None:
 
 
 def make_page(records: Sequence[Record], folder: Path) -> str:
-    """Totals, what failed, and a table of all scenes that are done, with their pictures."""
+    """Return the page: totals, scenes that failed, and a table of all scenes that are done, with thumbnails."""
     done = [one for one in records if one.state == "done"]
     title = f"{folder.resolve().name}: {len(records):,} scenes"
     return document(

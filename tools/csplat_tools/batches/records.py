@@ -1,7 +1,7 @@
 """`batch.jsonl`: a line for each scene that ended, and for each run that began.
 
-A line is written at once, so that whoever ends the program leaves whole lines behind, but perhaps the last. When a run
-ends by itself one line for each scene is left.
+A line is written at once, so that a program that is killed leaves whole lines behind, except perhaps the last. When a
+run ends by itself, one line remains for each scene.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from csplat_tools.files.streams import write_bytes
 __all__ = ["JOURNAL", "Journal", "Record", "open_journal", "read_journal"]
 
 JOURNAL = "batch.jsonl"
-_LOCK = ".batch.lock"  # on Windows
+_LOCK = ".batch.lock"  # file that is locked, on Windows only
 _BEGUN = "begun"
 
 
 @dataclass(frozen=True)
 class Record:
-    """What became of a scene.
+    """The outcome of one scene.
 
     Attributes:
-        path: of the source, or its URL.
-        output: within the folder of outputs, or a URL.
-        command: with its options, as words.
-        version: of the program.
+        path: path of the source, or its URL.
+        output: path within the folder of outputs, or a URL.
+        command: the command with its options, as words.
+        version: version of the program.
         state: `done` or `failed`.
-        sha256: of the source's content; "" where it could not be read.
-        code: of the error, `E_INPUT`, or `ENOENT`; "" where there is none.
-        error: what went wrong, one line.
-        source_bytes, output_bytes: of the files.
-        output_sha256: of the output's content; where the scene failed, of what an earlier run had left.
-        splats: of the source, or of the result where the command says so.
-        seconds: of the command.
-        memory_bytes: the most that its process held.
-        remarks: what the command said besides.
+        sha256: hash of the source's content; "" if it could not be read.
+        code: code of the error, such as `E_INPUT` or `ENOENT`; "" if there is none.
+        error: the error in one line.
+        source_bytes, output_bytes: sizes of the files.
+        output_sha256: hash of the output's content; if the scene failed, of the output that an earlier run left.
+        splats: number of splats of the result if the command reports it, else of the source.
+        seconds: time that the command took.
+        memory_bytes: peak memory of its process.
+        remarks: other messages of the command.
     """
 
     path: str
@@ -64,7 +64,7 @@ class Record:
 
     @property
     def key(self) -> tuple[str, tuple[str, ...], str]:
-        """What the output is made of: where this is the same it is not made again."""
+        """The inputs of the output: if they are the same again, it is not made again."""
         return self.sha256, self.command, self.version
 
     def as_json(self) -> dict[str, Any]:
@@ -76,11 +76,11 @@ class Journal:
     """The records of a folder. Owns them, and the open file that lines are appended to.
 
     Args:
-        folder: that of the outputs.
+        folder: the folder of outputs.
 
     Attributes:
-        records: by output, the last of each.
-        pending: outputs that a run which did not end by itself was to write: they are nobody else's.
+        records: the last record of each output.
+        pending: outputs that a run which did not end by itself was to write; files there belong to the batch.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -107,19 +107,19 @@ class Journal:
         write_bytes(str(self._path), "".join(lines).encode())
 
     def close(self) -> None:
-        """Close the file; what stands in it stays."""
+        """Close the file and keep its content."""
         self._file.close()
 
     def _write_line(self, line: bytes) -> None:
         left = memoryview(line + b"\n")
-        while left:  # a full disk takes a part, and then none
+        while left:  # a full disk writes a part, and then raises
             left = left[self._file.write(left) :]
         os.fsync(self._file.fileno())  # an output that is there after a power cut has to be known
 
 
 @contextmanager
 def open_journal(folder: Path) -> Iterator[Journal]:
-    """Open the records of a folder, which one program at a time may do.
+    """Open the records of a folder; only one program at a time may do so.
 
     Raises:
         InputError: another batch is at work there.
@@ -136,9 +136,9 @@ def open_journal(folder: Path) -> Iterator[Journal]:
 
 
 def read_journal(folder: Path) -> tuple[dict[str, Record], set[str]]:
-    """Records and what is pending, as `Journal` has them; nothing where there is no journal.
+    """Read the records and the pending outputs as in `Journal`; both are empty if there is no journal.
 
-    Lines that are none are left out: a half one, or one of another version.
+    Lines that cannot be parsed are left out: an incomplete one, or one of another version.
 
     Raises:
         OSError: it cannot be read.

@@ -24,25 +24,26 @@ from csplat_tools.batches.workers import Worker, WorkerLostError
 
 __all__ = ["Batch", "CommandLineError", "Step", "batch", "plan"]
 
-_GIVEN = ("threads", "memory", "resume")  # options that are given to a command that has them
-_FREE_SHARE = 0.9  # of the memory that is free: what a batch takes of which no number is said
+_GIVEN = ("threads", "memory", "resume")  # options that the batch passes to a command that has them
+_FREE_SHARE = 0.9  # fraction of the free memory that a batch uses if `memory_bytes` is not given
 
 
 class CommandLineError(InputError):
-    """The command of a batch, or its options, are none."""
+    """The command of a batch does not exist, or its options are wrong."""
 
     code = "E_USAGE"
 
 
 @dataclass(frozen=True)
 class Step:
-    """How far a batch has come.
+    """The progress of a batch.
 
     Attributes:
-        iteration, iterations: scenes that ended, and all.
-        failed: of these.
-        share: of the work that is done, by the sizes of the sources, 0 to 1; what was done before is none.
-        record: of the scene that ended now.
+        iteration, iterations: number of scenes that ended, and of all.
+        failed: number of scenes that failed so far.
+        share: fraction of the work that is done, by the sizes of the sources, 0 to 1; scenes that were done before
+            do not count.
+        record: record of the scene that has just ended.
     """
 
     iteration: int
@@ -54,12 +55,12 @@ class Step:
 
 @dataclass(frozen=True)
 class Batch:
-    """What became of a batch.
+    """The outcome of a batch.
 
     Attributes:
-        folder: of the outputs.
-        records: of all scenes, in their order.
-        done_before: outputs that an earlier run had made, of the same files with the same command.
+        folder: the folder of outputs.
+        records: records of all scenes, in their order.
+        done_before: outputs that an earlier run had made from the same files with the same command.
     """
 
     folder: Path
@@ -96,27 +97,26 @@ def batch(
     thumbnails: bool = True,
     progress: Callable[[Step], object] | None = None,
 ) -> Batch:
-    """Do the same with many scenes: what `csplat batch` calls.
+    """Run one command on many scenes, as `csplat batch` does.
 
-    What is done already is not done again: where the content of a source, the command with its options and the version
-    of the program are those of `batch.jsonl`, and the output is there as it was left. Scenes that failed are tried
-    again.
+    A scene is not done again if its content, the command with its options and the version of the program are those in
+    `batch.jsonl`, and the output is unchanged. Scenes that failed are tried again.
 
     Args:
-        scenes: a folder, with all that are in it; or a manifest, see `find_tasks`.
-        folder: of the outputs; made if need be. `batch.jsonl` and `index.html` are written there, too.
-        command: that takes a scene and an output, with its options.
-        ending: of the outputs; `None`: that of the command.
-        match: which names of a folder, as `*.ply`.
-        workers: processes at a time; `None`: one per core.
-        memory_bytes: what they may hold together, by what scenes are expected to want; a scene that wants more alone
-            fails, or is given so much where the command has `--memory`. `None`: most of what is free, and a scene that
-            wants more alone is tried alone.
-        dask: of a cluster: the address of its scheduler, or a `dask.distributed.Client`. Its machines see the same
-            files; `workers` and `memory_bytes` are the cluster's affair.
+        scenes: a folder, with its subfolders; or a manifest, see `find_tasks`.
+        folder: the folder of outputs; made if need be. `batch.jsonl` and `index.html` are written there, too.
+        command: a command that takes a scene and an output, with its options.
+        ending: file name ending of the outputs; `None`: that of the command.
+        match: shell pattern of the names that are taken from a folder, such as `*.ply`.
+        workers: number of processes at a time; `None`: one per core.
+        memory_bytes: memory that the processes may hold together, by the expected need of each scene; a scene that
+            needs more by itself fails, or gets this limit by `--memory` if the command has that option. `None`: most
+            of the free memory, and a scene that needs more is tried alone.
+        dask: a cluster: the address of its scheduler, or a `dask.distributed.Client`. Its machines see the same
+            files; the cluster decides on `workers` and `memory_bytes` itself.
         force: outputs that no batch has written may be replaced.
-        thumbnails: draw a small picture of each, where the extra `render` is installed.
-        progress: is told of each scene that ended.
+        thumbnails: draw a small render of each scene if the extra `render` is installed.
+        progress: called with a `Step` for each scene that ended.
 
     Returns:
         A record for each scene; those that failed are among them.
@@ -127,7 +127,7 @@ def batch(
         >>> [(one.path, one.error) for one in found.failures]  # doctest: +SKIP
 
     Raises:
-        InputError: there is no scene, or a manifest says nothing, or another batch is at work in the folder.
+        InputError: there is no scene, or a manifest is invalid, or another batch is at work in the folder.
         OSError: the folder cannot be written.
     """
     target = Path(folder)
@@ -167,10 +167,10 @@ def plan(
     match: str = "*",
     workers: int | None = None,
 ) -> list[Planned]:
-    """What `batch` would do with each scene, how long that takes and how much memory; nothing is written.
+    """Return what `batch` would do with each scene, with expected time and memory; nothing is written.
 
     Raises:
-        InputError, OSError: as of `batch`.
+        InputError, OSError: as for `batch`.
     """
     target = Path(folder)
     with closing(Worker()) as first:
@@ -190,10 +190,10 @@ def _prepared(
     ending: str | None,
     match: str,
 ) -> tuple[list[Task], frozenset[str]]:
-    """Scenes, once their command lines are known to be right, and the options that the command has.
+    """Find the scenes, check their command lines, and return them with the options of `_GIVEN` that the command has.
 
     Raises:
-        CommandLineError: one is wrong.
+        CommandLineError: a command line is wrong.
     """
     said = _checked(worker, command)
     wanted = said["ending"] if ending is None else ending
@@ -231,7 +231,7 @@ def _jobs(
 
 
 def _may_begin(job: Job) -> bool:
-    """Whether a file that is found in the output's place from now on is this run's."""
+    """Return True if a file found in the output's place from now on belongs to this batch."""
     output = job.task.output
     known = job.pending or (job.earlier is not None and job.earlier.output_sha256)
     return not is_url(output) and bool(known or not (Path(job.folder) / output).exists())
@@ -243,7 +243,7 @@ def _noted(
     journal: Journal,
     progress: Callable[[Step], object] | None,
 ) -> frozenset[str]:
-    """Write a line for each scene as it ends; of those that were done before, give the outputs."""
+    """Write a line for each scene as it ends; return the outputs of scenes that were done before."""
     before = set()
     with closing(ended):
         for step, worked in _steps(ended, jobs):
@@ -258,7 +258,7 @@ def _noted(
 
 
 def _steps(ended: Iterable[tuple[Record, bool]], jobs: Sequence[Job]) -> Iterator[tuple[Step, bool]]:
-    """How far it has come with each."""
+    """Yield the progress of the batch with each scene that ends, and whether anything was done for it."""
     sizes = {one.task.output: 1.0 + source_bytes(one) for one in jobs}
     whole, done, failed = sum(sizes.values()), 0.0, 0
     for number, (record, worked) in enumerate(ended, 1):

@@ -1,4 +1,4 @@
-"""What is done with one scene, here or on a machine of a cluster: look, leave as it is or run the command, say so."""
+"""Process one scene, here or on a machine of a cluster: inspect it, run the command unless done before, record it."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ _PART_BYTES = 16 << 20
 
 @dataclass(frozen=True)
 class Job:
-    """A scene that is to be done.
+    """A scene to be processed.
 
     Attributes:
         task: the scene.
-        command: with the options of all, as words.
-        folder: of the outputs, absolute.
-        earlier: what became of it before.
-        pending: the output may be there by a run that did not end by itself.
-        force: whatever is there may be replaced.
-        threads: of the command; `None`: it has no such option.
-        resumes: the command goes on with a folder OUT.work that is left, where it is told to, by `--resume`.
-        thumbnail: whether a picture is wanted.
+        command: the command with the options of all scenes, as words.
+        folder: the folder of outputs, absolute.
+        earlier: the record of an earlier run; `None`: there is none.
+        pending: the output may have been left by a run that did not end by itself.
+        force: an existing output may be replaced, whoever wrote it.
+        threads: number of threads for the command; `None`: it has no such option.
+        resumes: the command has `--resume`, with which it goes on from a folder OUT.work that was left.
+        thumbnail: draw a small render, too.
     """
 
     task: Task
@@ -58,21 +58,21 @@ class Job:
 
     @property
     def record(self) -> Record:
-        """Of a failure; what is known is added."""
+        """The record of a failed scene; results are filled in when they are known."""
         before = "" if self.earlier is None else self.earlier.output_sha256
         return Record(self.task.source, self.task.output, self.words, __version__, "failed", output_sha256=before)
 
 
 @dataclass(frozen=True)
 class Planned:
-    """What would be done.
+    """The work that a batch would do for a scene.
 
     Attributes:
-        job: with whom.
+        job: the scene.
         look: the scene's file; `None`: it cannot be read.
-        is_done: nothing would.
-        seconds: that are expected; `None`: nothing is known of the command.
-        memory_bytes: that are expected.
+        is_done: the output is there already, and nothing would be done.
+        seconds: expected time; `None`: nothing is known of the command.
+        memory_bytes: expected peak memory.
     """
 
     job: Job
@@ -82,12 +82,12 @@ class Planned:
     memory_bytes: int
 
 
-#: Gives a scene its memory, in which the command runs: asked for bytes, it gives options for the command.
+#: Reserves memory while a scene's command runs: called with a number of bytes, it yields options for the command.
 Gate = Callable[[int], AbstractContextManager[tuple[str, ...]]]
 
 
 def plan_job(job: Job, worker: Worker) -> Planned:
-    """Look at a scene and say what would be done; nothing is."""
+    """Inspect a scene and return what would be done, without doing it."""
     try:
         with _here(job.task.source) as source:
             found = _looked(worker, source)
@@ -99,15 +99,15 @@ def plan_job(job: Job, worker: Worker) -> Planned:
 
 
 def do_job(job: Job, worker: Worker, gate: Gate | None = None) -> tuple[Record, bool]:
-    """Do a scene, if it is not done.
+    """Process a scene, unless its output is there already.
 
     Args:
         job: the scene.
-        worker: the process that does it.
+        worker: the process that runs the command.
         gate: waits for memory; `None`: there is enough.
 
     Returns:
-        What became of it, and whether anything was done.
+        The record of the scene, and whether anything was done.
     """
     record = job.record
     try:
@@ -136,7 +136,7 @@ class SceneError(CsplatError):
 
 
 def _ran(job: Job, record: Record, worker: Worker, source: Path, output: Path, options: tuple[str, ...]) -> Record:
-    """Run the command, and note what it says."""
+    """Run the command, and return the record with its results."""
     output.parent.mkdir(parents=True, exist_ok=True)
     if output.exists() and not is_url(job.task.output) and not job.force and not _is_ours(job, output):
         raise SceneError(f"{job.task.output} is there already, and not by this batch: --force replaces it", "E_INPUT")
@@ -180,17 +180,17 @@ def _looked(worker: Worker, source: Path) -> Look:
 
 
 def _is_done(job: Job, found: Look) -> bool:
-    """Whether what the command would make is there, unchanged."""
+    """Return True if the command's output is there already, unchanged."""
     earlier = job.earlier
     if earlier is None or earlier.state != "done" or earlier.key != (found.sha256, job.words, __version__):
         return False
     if is_url(job.task.output):
-        return True  # what lies there cannot be looked at for nothing
+        return True  # checking the file there would mean to download it
     return _is_ours(replace(job, pending=False), Path(job.folder) / job.task.output)
 
 
 def _is_ours(job: Job, output: Path) -> bool:
-    """Whether a batch left what is there."""
+    """Return True if a batch wrote the output that is there, or may have written it."""
     if job.pending:
         return True
     known = job.earlier.output_sha256 if job.earlier is not None else ""
@@ -203,10 +203,10 @@ def _is_ours(job: Job, output: Path) -> bool:
 
 @contextmanager
 def _here(source: str) -> Iterator[Path]:
-    """A scene on this machine.
+    """Yield the path of a scene on this machine; a URL is downloaded for that time.
 
     Raises:
-        CsplatError, OSError: it cannot be fetched.
+        CsplatError, OSError: the scene cannot be downloaded.
     """
     if not is_url(source):
         yield Path(source)
@@ -221,7 +221,7 @@ def _here(source: str) -> Iterator[Path]:
 
 @contextmanager
 def _placed(job: Job) -> Iterator[Path]:
-    """Where the command writes; what goes elsewhere is sent there at the end."""
+    """Yield the path that the command is to write; if the output is a URL, the file is sent there at the end."""
     if not is_url(job.task.output):
         yield Path(job.folder) / job.task.output
         return

@@ -1,4 +1,4 @@
-"""Scenes on the processes of this machine."""
+"""Distribute scenes over the processes of this machine."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def spread(
     do: Callable[[Job, Worker], T],
     stop: Callable[[], object] = lambda: None,
 ) -> Generator[T, None, None]:
-    """Do jobs, the largest first, and give what comes of each; the processes end with it, also where it is closed.
+    """Process jobs, the largest first, and yield each result; the processes end with the generator, or its closing.
 
     Args:
-        jobs: scenes.
-        workers: as many are at work at a time.
-        do: what a thread does with a scene and the process that it has.
-        stop: is called when it ends.
+        jobs: the scenes.
+        workers: the processes, each with a thread; as many scenes are processed at a time.
+        do: called by a thread with a scene and the thread's process.
+        stop: called when the generator ends.
     """
     todo: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
     ended: queue.SimpleQueue[T | Exception] = queue.SimpleQueue()
@@ -44,7 +44,7 @@ def spread(
         while (job := todo.get()) is not None and not stopped.is_set():
             try:
                 ended.put(do(job, worker))
-            except Exception as error:  # noqa: BLE001  # a defect, which the thread that waits is to raise
+            except Exception as error:  # noqa: BLE001  # a defect of csplat, raised in the thread that waits
                 ended.put(error)
 
     with ThreadPoolExecutor(len(workers)) as pool:
@@ -67,7 +67,7 @@ def spread(
 
 
 def source_bytes(job: Job) -> int:
-    """Bytes of a source, as far as they are known for nothing."""
+    """Return the size of a source in bytes; 0 if it is a URL or cannot be read."""
     with suppress(OSError):
         return 0 if is_url(job.task.source) else size_of(Path(job.task.source))
     return 0

@@ -1,4 +1,4 @@
-"""A small picture of a scene."""
+"""Draw small renders of scenes."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from csplat_tools.files.streams import write_bytes
 
 __all__ = ["THUMBNAIL_SIZE", "prepare_thumbnails", "write_thumbnail"]
 
-#: Width and height, pixels.
+#: Width and height of a thumbnail, pixels.
 THUMBNAIL_SIZE = (128, 96)
 
-_FINER = 2  # drawn so many times as large, and averaged
+_FINER = 2  # factor by which a thumbnail is drawn larger before it is averaged down
 _JPEG_QUALITY = 85
-_SPLATS_MAX = 300_000  # of larger scenes every second, third, ... splat is drawn, and wider
+_SPLATS_MAX = 300_000  # of scenes with more splats every Nth is drawn, scaled up to cover the same area
 
 
 @cache
 def prepare_thumbnails() -> bool:
-    """Load the renderer; compile it, which takes up to a minute, where that was not done before.
+    """Load the renderer; compile it, which takes up to a minute, if that was not done before.
 
     Returns:
-        Whether pictures can be drawn here: not without the extra `render`.
+        True if thumbnails can be drawn here; this requires the extra `render`.
     """
     try:
         need_pictures()
@@ -45,10 +45,10 @@ def prepare_thumbnails() -> bool:
 
 
 def write_thumbnail(path: Path, scenes: Sequence[Path]) -> bool:
-    """Draw the first of files that is a scene, as a JPEG.
+    """Draw a JPEG of the first of several files that is a scene.
 
     Returns:
-        Whether there is a picture: it is a decoration, and nothing fails for want of one.
+        True if a thumbnail was written; it is optional, and no error is raised without one.
     """
     for scene in scenes:
         try:
@@ -80,7 +80,7 @@ def _jpeg(model: SplatModel) -> bytes:
 
 
 def _thinned(path: Path) -> SplatModel:
-    """A scene, or as many of its splats as a small picture wants, so large that they cover as much."""
+    """Read a scene, or every Nth splat of a large one, scaled up to cover as much."""
     with open_scene(path) as scene:
         step = max(1, -(-scene.count // _SPLATS_MAX))
         facts = replace(scene.facts, extra={}) if scene.facts.extra else scene.facts

@@ -1,4 +1,4 @@
-"""Processes that run commands one after the other, each of which may end without taking anything else along."""
+"""Worker processes that run commands one after the other; a crash of one leaves the rest of the batch running."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from csplat.system import NEW_GROUP_FLAGS, interrupt_process
 
 __all__ = ["Worker", "WorkerLostError", "remove_left"]
 
-_PROGRAM = "csplat_tools.cli.serving"  # started by its name: it stands on a floor above
-_PATIENCE = 10.0  # seconds that a process has to tidy up
+_PROGRAM = "csplat_tools.cli.serving"  # started by its name: `cli` is above this package and may not be imported here
+_PATIENCE = 10.0  # seconds that an interrupted process has to tidy up before it is killed
 
 Process = subprocess.Popen[str]
 
 
 class WorkerLostError(CsplatError):
-    """A process ended before it answered. `str()` says how, in a few words."""
+    """A process ended before it answered. Its text tells how, in a few words."""
 
     code = "E_WORKER"
 
 
 class Worker:
-    """A process that is started when it is first asked, and again when it was lost. Owns it.
+    """A process that is started with the first request, and again after it was lost. Owns the process.
 
-    One thread asks; `close` may be called by another.
+    Requests come from one thread; `close` may be called by another.
     """
 
     def __init__(self) -> None:
@@ -42,10 +42,10 @@ class Worker:
         self._closed = False
 
     def ask(self, what: str, **values: Any) -> dict[str, Any]:
-        """Ask what `csplat_tools.cli.serving.answer` answers.
+        """Send a request, and return the answer of `csplat_tools.cli.serving.answer`.
 
         Raises:
-            WorkerLostError: it ended, or was closed. What it had begun to write is left behind, see `pid`.
+            WorkerLostError: the process ended, or was closed. Files that it had begun to write remain, see `pid`.
         """
         process = self._started()
         assert process.stdin is not None
@@ -63,11 +63,11 @@ class Worker:
 
     @property
     def pid(self) -> int | None:
-        """Number of the process, or of the one that was lost last; it is in names of temporary files."""
+        """Number of the process, or of the one that was lost last; names of its temporary files contain it."""
         return None if self._process is None else self._process.pid
 
     def close(self) -> None:
-        """End the process: it has some seconds to remove what it had begun to write. Nothing can be asked any more."""
+        """End the process, which has some seconds to remove unfinished files. No request is possible any more."""
         with self._lock:
             self._closed = True
             _end(self._process)
@@ -81,13 +81,13 @@ class Worker:
                 _end(self._process)
                 self._process = subprocess.Popen(  # noqa: S603  # this interpreter
                     [sys.executable, "-m", _PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._said,
-                    encoding="utf-8", start_new_session=True,  # an interrupt at the terminal is for who started it
+                    encoding="utf-8", start_new_session=True,  # an interrupt at the terminal is for the parent alone
                     creationflags=NEW_GROUP_FLAGS,
                 )  # fmt: skip
             return self._process
 
     def _lost(self, process: Process) -> str:
-        """How a process ended, and what it said last."""
+        """Describe how a process ended, with the last line of its standard error."""
         status = process.wait()
         with self._lock:
             if self._closed:
@@ -101,7 +101,7 @@ class Worker:
 
 
 def _end(process: Process | None) -> None:
-    """End a process, and close what leads to it."""
+    """End a process, and close the pipes to it."""
     if process is None:
         return
     interrupt_process(process)
@@ -112,12 +112,12 @@ def _end(process: Process | None) -> None:
         process.wait()
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:
-            with suppress(OSError):  # what could not be sent to it
+            with suppress(OSError):  # data that could not be sent to it
                 pipe.close()
 
 
 def remove_left(output: Path, pid: int) -> None:
-    """Remove what a process that was lost had begun to write in the place of an output; see `atomic_writer`."""
+    """Remove temporary files that a lost process had begun to write for an output; see `atomic_writer`."""
     for left in output.parent.glob(f".*.{pid}.*.tmp"):
         if left.name.startswith(f".{output.name}."):
             left.unlink(missing_ok=True)
