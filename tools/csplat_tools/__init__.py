@@ -5,8 +5,8 @@
     >>> compared = csplat_tools.compare("scene.ply", found.data)  # doctest: +SKIP
 
 The commands call these functions. A *scene* is a `SplatModel`, or a file of either kind: a path, an open binary file,
-or bytes. What renders wants the packages of the extra `render`, and says so. The names load their modules when first
-used.
+or bytes. Functions that render require the packages of the extra `render`, and raise an error that says so. The names
+load their modules when first used.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ __all__ = [
     "tradeoff",
 ]
 
-#: Of the program and of the format.
+#: Versions of the program and of the format.
 VERSIONS = f"csplat {__version__}, format {VERSION_MAJOR}.{VERSION_MINOR}"
 
 _MODULE_OF = {

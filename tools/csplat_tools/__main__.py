@@ -1,4 +1,4 @@
-"""`csplat`: where the installed script, and `python -m csplat_tools`, begin."""
+"""`csplat`: entry point of the installed script, and of `python -m csplat_tools`."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 def main() -> None:
     """Run the program.
 
-    The commands are imported here, not above: an interrupt while they load ends as quietly as a later one. The
-    versions alone want none of them.
+    The commands are imported here, not above: an interrupt while they load ends as quietly as a later one. Printing
+    the versions requires none of them.
     """
     if sys.argv[1:] == ["--version"]:
-        with suppress(OSError):  # a full disk is told below
+        with suppress(OSError):  # a full disk is reported below
             os.write(sys.stdout.fileno(), f"{VERSIONS}\n".encode())  # data, before there is a console
             return
     try:

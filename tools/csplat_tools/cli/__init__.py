@@ -1,1 +1,1 @@
-"""One module per command: it parses, calls a library function, prints."""
+"""The commands, one module each: they parse options, call a library function, and print."""

@@ -1,4 +1,4 @@
-"""The commands together: what `csplat` runs. Each is imported when it is wanted: all take half a second."""
+"""The `csplat` program with all its commands. A command is imported when it is used: all take half a second."""
 
 from __future__ import annotations
 
@@ -43,27 +43,27 @@ _MODULES = {
 
 
 def command_function(name: str) -> Any:
-    """What defines a command: a function, or a typer of several; `None`: there is no such command."""
+    """Return what defines a command: a function, or a typer of several; `None` if there is no such command."""
     if name not in _MODULES:
         return None
     return getattr(import_module(f"csplat_tools.cli.{_MODULES[name]}"), name.replace("-", "_"))
 
 
 class _Commands(TyperGroup):
-    """Looks commands up in `_MODULES`. Owns those that were imported."""
+    """The group of all commands, looked up in `_MODULES`. Owns those that were imported."""
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  # typer's
         return list(_MODULES)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002  # typer's
-        # A name that is none is compared with all of them, to say which one may be meant.
+        # An unknown name is compared with all commands, so that the error can suggest one.
         for name in {cmd_name} & _MODULES.keys() or _MODULES:
             if name not in self.commands:
                 self.commands[name] = _imported(name)
         return self.commands.get(cmd_name)
 
     def main(self, *args: Any, **how: Any) -> Any:
-        """Run a command line, and end; typer would draw a box about what is wrong with it."""
+        """Run a command line, and exit; typer would draw a box around the message of a wrong one."""
         if not how.get("standalone_mode", True):
             return super().main(*args, **how)
         try:
@@ -75,7 +75,7 @@ class _Commands(TyperGroup):
 
 
 def _imported(name: str) -> Any:
-    """The command of a name, or the group of commands."""
+    """Import the command of a name, or a group of commands."""
     found = command_function(name)
     alone = typer.Typer(rich_markup_mode="rich")
     if isinstance(found, typer.Typer):

@@ -25,7 +25,7 @@ from csplat_tools.files.console import format_about, format_bytes, format_second
 
 __all__ = ["batch"]
 
-_SHOWN_MAX = 50  # failures that are told on standard error; the page has all
+_SHOWN_MAX = 50  # failures listed on standard error; the page lists all
 
 
 @command(one_of=(("dask", "workers"), ("dask", "memory"), ("dask", "dry_run")))
@@ -96,7 +96,7 @@ def batch(
 
 
 def _words() -> Callable[[Step], str]:
-    """What says in a line how far it has come, from now on."""
+    """Return a function that describes the progress in a line, with the time left counted from now on."""
     begun = time.monotonic()
 
     def words(step: Step) -> str:
@@ -140,7 +140,7 @@ def _planned_json(planned: list[Planned]) -> list[dict[str, object]]:
 
 
 def _planned_text(planned: list[Planned]) -> str:
-    """A table, and what all of it takes."""
+    """Return a table of the planned work, and the total time."""
     rows = []
     for one in planned:
         seen = one.look

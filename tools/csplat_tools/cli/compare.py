@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["compare"]
 
-_INDEX_BYTES = 1 << 27  # of a source index that is read as a whole
+_INDEX_BYTES = 1 << 27  # largest size of a source index, which is read as a whole
 
 _PAIRING = {
     "index": "pairs from the source index",

@@ -30,7 +30,7 @@ from csplat_tools.files.streams import STANDARD_STREAM, write_bytes
 __all__ = ["conformance"]
 
 _OURS = "-m csplat_tools encode {ply} {out} --source-index {index} --quiet"
-#: What a run is asked for, and a folder of inputs is not.
+#: Options of a run, which exclude --write-inputs.
 _OF_A_RUN = ("program", "level", "min_psnr", "keep", "timeout", "jobs", "junit", "verbose")
 
 conformance = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
@@ -38,7 +38,7 @@ conformance = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
 
 @dataclass(frozen=True)
 class Run(Group):
-    """How a suite is run, and reported beside the JSON."""
+    """Options of a run of the suite, and of its reports in addition to the JSON."""
 
     filters: Annotated[
         list[str] | None,
@@ -55,23 +55,23 @@ class Run(Group):
 
     @property
     def pattern(self) -> str | None:
-        """The names that are wanted, as the library has them."""
+        """Patterns of the checks to run, joined by commas as the library takes them; `None`: all."""
         return _joined(self.filters)
 
     def check(self, out: Output) -> None:
-        """Refuse the places of reports before anything is run; XML may go to a terminal."""
+        """Refuse unusable paths of reports before anything is run; XML may go to a terminal."""
         to_stdout = self.junit == STANDARD_STREAM
         if to_stdout and out.as_json:
             raise typer.BadParameter("--json and --junit - both want standard output")
         out.check(None if to_stdout else self.junit)
 
     def publish(self, report: Report, out: Output, nothing: str) -> None:
-        """Give the report, in every form that is wanted, and end with its status.
+        """Publish the report in every form that was requested, and exit with status 1 if it did not pass.
 
         Args:
-            report: of the run.
-            out: where results go.
-            nothing: what is said where nothing was checked.
+            report: the report of the run.
+            out: the options that tell where results go.
+            nothing: message if nothing was checked.
 
         Raises:
             typer.Exit: a check failed, or there was none.
@@ -233,11 +233,12 @@ def _checked_folder(name: str, *, force: bool) -> Path:
 
 
 def _picture_judge(levels: Sequence[str], *, quiet: bool) -> tuple[PictureJudge | None, str]:
-    """Return what judges pictures, or why nothing does.
+    """Return a function that measures the PSNR of renders, or `None` and the reason.
 
     Args:
-        levels: those wanted. At L4 every file is rendered, at L3 alone hardly one: the renderer then waits for it.
-        quiet: say nothing of what it takes.
+        levels: levels to be checked. At L4 every file is rendered, and the renderer is prepared at once; at L3 alone
+            hardly any is, and it is prepared at the first.
+        quiet: print nothing while the renderer is compiled.
     """
     if not {"L3", "L4"} & {*levels}:
         return None, ""

@@ -1,4 +1,4 @@
-"""Exit statuses of the commands, and how what goes wrong on purpose is told."""
+"""Exit statuses of the commands, and one-line messages for expected errors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _AGAIN = "copy or download it again"
 _NEWER = "a newer csplat may know it"
 _BROKEN = ("the file contradicts itself", f"{_AGAIN}; `csplat verify` lists all that is wrong")
 _DAMAGED = ("the file is damaged", _AGAIN)
-#: By code of the format: what is wrong, and what helps. `tools/viewer/messages.mjs` says the same in the viewer.
+#: By error code of the format: the defect, and the remedy. The viewer has the same in `tools/viewer/messages.mjs`.
 _WORDS = {
     "E_MAGIC": ("not a .csplat file", "`csplat encode` makes one of a PLY"),
     "E_VERSION": ("written in another version of the format", _NEWER),
@@ -41,7 +41,7 @@ _WORDS = {
         "`csplat decode` and `csplat verify` take scenes of any size",
     ),
 }
-_LOST_URL = re.compile(r"([a-z][a-z0-9+]+):/+(.+)")  # as a path has it, which drops a slash
+_LOST_URL = re.compile(r"([a-z][a-z0-9+]+):/+(.+)")  # a URL read as a path, which loses a slash
 _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 _OS_ADVICE = {
     errno.ENOENT: "is the name right?",
@@ -52,18 +52,18 @@ _OS_ADVICE = {
     errno.EDQUOT: "no half of a file was left; make room, or name another place",
 }
 
-#: What typer raises of a command line. It names one kind alone.
+#: Base class of the errors that typer raises for a command line; typer exports only one of its subclasses.
 WrongCommandLine: type[Exception] = typer.BadParameter.__bases__[0]
-_SAYS_NOTHING = re.compile(r"^Invalid value: |(?<=: )Value error, |\.$")  # in its words
+_SAYS_NOTHING = re.compile(r"^Invalid value: |(?<=: )Value error, |\.$")  # empty phrases of typer's messages
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 def guarded(command: Callable[P, T]) -> Callable[P, T]:
-    """Turn what goes wrong on purpose into one line on standard error and status 1.
+    """Turn expected errors into one line on standard error and status 1.
 
-    Defects of csplat itself still end in a traceback: that is what a report of them needs.
+    Defects of csplat itself still end in a traceback: a bug report needs it.
     """
 
     @functools.wraps(command)
@@ -91,9 +91,9 @@ def guarded(command: Callable[P, T]) -> Callable[P, T]:
 
 
 def refuse_command_line(error: Any) -> NoReturn:
-    """Say what is wrong with a command line in one line, as other errors are told, and end with status 2."""
+    """Print in one line what is wrong with a command line, in the form of other errors, and exit with status 2."""
     message = " ".join(_SAYS_NOTHING.sub("", error.format_message()).split())
-    if message:  # of a command line without a word, help is printed already
+    if message:  # empty for a command line without arguments: help is printed already
         of = error.ctx.command_path if error.ctx is not None else "csplat"
         helps = f"`{of} --help`" if error.ctx is not None else "`csplat COMMAND --help`"
         note(f"error: {of}: {message}; {helps} says what is possible (E_USAGE)")
@@ -106,7 +106,7 @@ def _fail(message: str) -> NoReturn:
 
 
 def _csplat_error(error: CsplatError) -> str:
-    """Which file, what is wrong in plain words, what exactly, what to do, and the code."""
+    """Return the message of an error: the file, the defect in plain words, the details, the remedy, and the code."""
     what, advice = _WORDS.get(error.code, ("", "") if isinstance(error, InputError) else _BROKEN)
     message = str(error)
     parts = [error.path] if error.path is not None and Path(error.path).name not in message else []
@@ -127,7 +127,7 @@ def _os_error(error: OSError) -> str:
 
 
 def _drop_stdout() -> None:
-    """Let the interpreter flush into nothing when it ends: nobody reads it any more."""
+    """Redirect standard output to the null device, so that the interpreter's flush at exit cannot fail."""
     try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError):

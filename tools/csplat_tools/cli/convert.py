@@ -29,7 +29,7 @@ _COLUMNS = ("format", "endings", "read", "written", "SH degree", "axes", "exact"
 
 @dataclass(frozen=True)
 class _Changes(Group):
-    """What becomes of the scene on its way."""
+    """Options that change the scene on its way."""
 
     to_axes: Annotated[
         str | None,
@@ -58,11 +58,18 @@ class _Changes(Group):
     ] = False
 
     def parse(self) -> None:
-        """Refuse numbers and axes that are none."""
+        """Refuse invalid numbers and axes."""
         self.filters(None)
 
     def filters(self, sh_degree: int | None) -> Filters:
-        """What is asked for."""
+        """Return the filters that the options specify.
+
+        Args:
+            sh_degree: leave out the SH bands above; `None`: keep all.
+
+        Raises:
+            typer.BadParameter: a number or the axes are invalid.
+        """
         if self.scale is not None and not (math.isfinite(self.scale) and self.scale > 0.0):
             raise typer.BadParameter(f"--scale is {self.scale:g}, wanted a number above 0")
         x, y, z = parse_numbers("--rotate", self.rotate, 3) or (0.0, 0.0, 0.0)

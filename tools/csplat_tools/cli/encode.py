@@ -36,12 +36,12 @@ __all__ = ["encode"]
 _TARGET = "Targets (one of the first four, which want the render extra)"
 _ROOM = "Large scenes"
 _RENDERED = ("target_psnr", "target_size", "max_loss", "keep")
-_WHOLE = (*_RENDERED, "max_error", "importance", "source_index")  # what wants the scene in memory
+_WHOLE = (*_RENDERED, "max_error", "importance", "source_index")  # options that need the scene in memory
 
 
 @dataclass(frozen=True)
 class Goal(Group):
-    """What the file is to keep to."""
+    """Options of the target that the file is to meet."""
 
     one_of: ClassVar[Sequence[tuple[str, ...]]] = (_RENDERED, ("keep", "keep_all"), ("effort", "keep_all"))
     needs: ClassVar[Mapping[str, tuple[str, ...]]] = {
@@ -80,21 +80,21 @@ class Goal(Group):
 
     @property
     def is_rendered(self) -> bool:
-        """Whether pictures are rendered to meet it."""
+        """True if meeting the target requires rendering."""
         return any(getattr(self, name) is not None for name in _RENDERED)
 
     def read(self, unit_metres: float | None) -> Target | None:
-        """What is asked for; `None`: nothing.
+        """Return the target; `None` if no option specifies one.
 
         Args:
-            unit_metres: how long a unit of the scene is, where that is known.
+            unit_metres: length of a scene unit in metres, if known.
 
         Raises:
-            InputError: it is nothing that can be asked for.
+            InputError: the target is invalid.
         """
         if not self.is_rendered and self.max_error is None:
             return None
-        from csplat_tools.optimise.target import Target, parse_max_error  # wants the renderer's names
+        from csplat_tools.optimise.target import Target, parse_max_error  # imports names of the renderer
 
         size = parse_bytes(self.target_size)
         loss = None if self.max_loss is None else parse_decibels(self.max_loss)
@@ -105,7 +105,7 @@ class Goal(Group):
 
 @dataclass(frozen=True)
 class Room(Group):
-    """Where a large scene lies while it is encoded."""
+    """Options for encoding scenes larger than memory."""
 
     memory: Annotated[
         str | None,
@@ -139,10 +139,10 @@ class Room(Group):
     ] = False
 
     def read(self) -> Scale:
-        """What was asked for.
+        """Return the options as the library takes them.
 
         Raises:
-            InputError: the memory is no size.
+            InputError: --memory is not a size.
         """
         return Scale(parse_bytes(self.memory), self.work, self.resume, self.dask)
 
@@ -232,7 +232,7 @@ def encode(
             raise typer.BadParameter("--grades with a codebook of shapes: its entries have one precision")
         if not goal.is_rendered and importance is None:
             raise typer.BadParameter("--grades says nothing without a target or --importance: views sort the splats")
-    try:  # what is wrong with it without regard to the scene
+    try:  # errors of the target that do not depend on the scene
         goal.read(1.0)
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
@@ -267,7 +267,7 @@ def encode(
 
 
 def _say_expected(source: str, options: EncodeOptions, scale: Scale, out: Output) -> None:
-    """What an encoding would take."""
+    """Report memory, disk space and time that an encoding would take."""
     with source_path(source) as local, out.bar() as progress:
         if progress is not None:
             progress("opening", 0.0)
@@ -292,7 +292,7 @@ def _reach(
     encoding: EncodeOptions,
     progress: Progress | None,
 ) -> EncodedScene:
-    """The file that keeps to the target."""
+    """Encode a scene to the target; called by `encode_file` with the last three arguments."""
     import csplat_tools
     from csplat_tools.files.importance import read_weights
 
@@ -332,7 +332,7 @@ def _stated(encoded: Encoded) -> list[str]:
 
 
 def _psnr(encoded: Encoded, threads: int | None) -> float | None:
-    """About how like its source a scene looks that is not too large; `None` where that is known, or not soon."""
+    """Return an approximate PSNR in dB; `None` if it is known already, or if measuring it would take long."""
     made = encoded.made
     if made is None or made.said.get("psnr") is not None or find_spec("numba") is None:
         return None
@@ -340,7 +340,7 @@ def _psnr(encoded: Encoded, threads: int | None) -> float | None:
 
 
 def _summary(encoded: Encoded, psnr: float | None, source: str, output: str) -> str:
-    """The last line: what it took, and what became of it."""
+    """Return the last line: counts, time, sizes and quality."""
     report = encoded.report
     per_splat = f" ({report.size_bytes / report.splat_count:.2f} bytes per splat)" if report.splat_count else ""
     ratio = encoded.source_bytes / report.size_bytes

@@ -18,7 +18,7 @@ __all__ = ["ENCODER", "Encoding", "Facts", "Preset"]
 
 _SCENE = "What the PLY may not say"
 
-#: What `--set` takes of the encoder.
+#: The dataclass whose fields `--set` takes for the encoder, as `module:name`.
 ENCODER = "csplat.encoder.options:EncodeOptions"
 
 Preset = Annotated[PresetName, typer.Option(metavar="|".join(PRESETS), help="Speed against size.")]
@@ -26,7 +26,7 @@ Preset = Annotated[PresetName, typer.Option(metavar="|".join(PRESETS), help="Spe
 
 @dataclass(frozen=True)
 class Facts(Upright):
-    """How a PLY is read, and what it may not say."""
+    """Options of reading a PLY, and metadata that it may lack."""
 
     strict: Annotated[
         bool, typer.Option("--strict", hidden=True, help="Refuse a PLY with defects instead of repairing it.")
@@ -49,13 +49,13 @@ class Facts(Upright):
     ] = None
 
     def read(self) -> SceneOverrides:
-        """What the scene is told."""
+        """Return the metadata that the options specify."""
         return replace(self.upright(), unit_metres=self.unit_metres, antialiased=self.antialiased, licence=self.licence)
 
 
 @dataclass(frozen=True)
 class Encoding(Group):
-    """How the encoder works."""
+    """Options of the encoder."""
 
     preset: Preset = "balanced"
     attribute_psnr: Annotated[
@@ -82,14 +82,14 @@ class Encoding(Group):
     ] = None
 
     def options(self, facts: Facts, settings: Settings) -> EncodeOptions:
-        """Options of the encoder.
+        """Return the options of the encoder.
 
         Args:
-            facts: says which columns are carried.
-            settings: those that have no option.
+            facts: specifies whether extra columns are carried.
+            settings: values of `--set`.
 
         Raises:
-            typer.BadParameter: one is out of its range.
+            typer.BadParameter: an option is out of its range.
         """
         own = {one.name: getattr(self, one.name) for one in fields(self)}
         return chosen(EncodeOptions, **own, **settings.of(EncodeOptions), keep_extra=facts.keep_extra)

@@ -1,4 +1,4 @@
-"""Groups of options that belong together, and the one that every command has: where results go."""
+"""Groups of options that belong together, and the one that every command has: its results."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ class Group:
     """Options that belong together: the fields, with their defaults.
 
     Class attributes:
-        one_of: of each of these options one at most may be given.
-        needs: options that say nothing unless one of others is given.
+        one_of: groups of options, of each of which at most one may be given.
+        needs: options that have no effect unless one of the named others is given.
     """
 
     one_of: ClassVar[Sequence[tuple[str, ...]]] = ()
     needs: ClassVar[Mapping[str, tuple[str, ...]]] = {}
 
     def parse(self) -> None:
-        """Refuse words that say nothing, before any work is done.
+        """Refuse invalid values before any work is done.
 
         Raises:
-            typer.BadParameter: there are such.
+            typer.BadParameter: a value is invalid.
         """
 
 
 @dataclass(frozen=True)
 class Output(Group):
-    """Where results go: the same for every command."""
+    """Options that tell where results go, the same for every command."""
 
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False
     report: Annotated[str | None, typer.Option(metavar="FILE.json", help="Write the result as JSON.")] = None
@@ -59,15 +59,16 @@ class Output(Group):
         """Refuse files before any work is done for them.
 
         Args:
-            outputs: what the command writes, or `-`; `None` for what is not wanted.
-            inputs: what it reads: none of them may be written.
-            named: by option, what it writes beside them, which cannot be `-`, nor be named as something else.
-            force: they may be replaced, whatever the user says.
+            outputs: files that the command writes, or `-`; `None` for one that is not requested.
+            inputs: files that it reads; none of them may be written.
+            named: other files that it writes, by option; they cannot be `-`, and their names must not end like those
+                of other kinds of files.
+            force: existing files may be replaced, even without --force.
 
         Raises:
-            InputError: one exists, two are the same, or one has the name of something else.
+            InputError: a file exists, two are the same, or one has a name for another kind of file.
             OSError: an input does not exist, or the folder of an output.
-            typer.BadParameter: two of them want standard output, or one that cannot go there.
+            typer.BadParameter: two outputs would go to standard output, or one that cannot.
         """
         files = {"--report": self.report, **(named or {})}
         for name, path in files.items():
@@ -81,11 +82,11 @@ class Output(Group):
                 check_name(path, _ENDINGS[name], name)
 
     def publish(self, result: Any, text: str = "") -> None:
-        """Give the result: as JSON into `--report` and with `--json`, else as text.
+        """Publish the result: as JSON to the file of `--report`, and to standard output with `--json`, else as text.
 
         Args:
             result: JSON-compatible, without NaN and infinities.
-            text: what people read on standard output; nothing where a file is the result.
+            text: the result for people; empty if the result is a file.
         """
         if self.report is not None:
             write_json(self.report, result)
@@ -95,32 +96,32 @@ class Output(Group):
             say(text)
 
     def remark(self, *lines: str) -> None:
-        """Tell people on standard error, unless they asked for silence."""
+        """Print remarks on standard error, unless `--quiet` is given."""
         for line in () if self.quiet else lines:
             note(line)
 
     def foretell(self, expected: Callable[[], float], sooner: str) -> None:
-        """Tell people how long work takes, if that is long: they may choose otherwise.
+        """Announce how long the work takes if it is long, so that people may choose otherwise.
 
         Args:
-            expected: looks how many seconds; not called where nobody is told.
-            sooner: what takes less.
+            expected: estimates the seconds; not called with `--quiet`.
+            sooner: advice on what takes less time.
         """
         seconds = 0.0 if self.quiet else expected()
         if seconds > WORTH_SAYING:
             note(f"this takes about {format_about(seconds)} here; {sooner}")
 
     def findings(self, findings: Sequence[Finding], name: str = "") -> None:
-        """Tell what was noticed in a file that is not usual; what was repaired is told in any case.
+        """Print unusual findings in a file, unless `--quiet` is given; repairs are printed in any case.
 
         Args:
-            findings: of the file.
-            name: of the file, where a command reads several.
+            findings: findings in the file.
+            name: name of the file, if a command reads several.
         """
         for one in findings:
             if one.kind == "repair" or not (self.quiet or one.usual):
                 note(f"{name}: {one}" if name else str(one))
 
     def bar(self) -> AbstractContextManager[Progress | None]:
-        """The progress bar, see `progress_bar`."""
+        """Return the progress bar, see `progress_bar`."""
         return progress_bar(quiet=self.quiet)

@@ -1,8 +1,8 @@
-"""How commands take options: groups that are declared once, spread over a command line, and checked in one place.
+"""Build commands from functions with groups of options, which are declared once and checked in one place.
 
-A command is a function whose parameters are arguments, options, and groups of options: subclasses of `Group`. What
-`command` makes of it is what typer runs: a group arrives as one typed value, and which options exclude each other or
-want another one is said beside them.
+A command is a function whose parameters are arguments, options, and groups of options: subclasses of `Group`.
+`command` turns it into a function for typer: each group arrives as one typed value, and declares itself which options
+exclude each other or require another one.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ Scene = Annotated[
     str, typer.Argument(metavar="SCENE", help="A PLY, a .csplat file, another of `csplat formats`, or -.")
 ]
 Seed = Annotated[int, typer.Option(min=0, hidden=True, help="Of all random choices.")]
-#: Of an option, in whichever panel.
+#: Arguments of `typer.Option` for --effort; commands add a panel.
 EFFORT: dict[str, Any] = {
     "metavar": "1..9", "min": 1, "max": 9, "show_default": False, "help": "Work for fewer bytes, usually 3."
 }  # fmt: skip
@@ -100,10 +100,10 @@ _ReadAs = Annotated[
     ),
 ]
 _READ_AS = "read_as"
-_MORE = re.compile(r"\n *---\n")  # in a docstring: what follows is for --help-all
+_MORE = re.compile(r"\n *---\n")  # in a docstring: the text below this line is shown by --help-all only
 _HELP_ALL = "help_all"
-_ALIAS = "output_option"  # `-o`, beside the argument
-_EXCLUDED_MAX = 6  # options that one excludes and that say so themselves
+_ALIAS = "output_option"  # parameter of `-o`, the other way to give the argument `output`
+_EXCLUDED_MAX = 6  # an option that excludes more is not named in the help of each of them
 T = TypeVar("T")
 
 
@@ -116,24 +116,25 @@ def command(
     beside: str | None = None,
     reads: bool = False,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make of a function what typer runs: groups are spread, options are checked, errors end in one line.
+    """Turn a function into one that typer runs: groups are expanded, options are checked, errors end in one line.
 
-    An argument `output` may be given as `-o`, too. What is made has an attribute `parsed`, which takes the same options
-    and checks them without doing anything.
+    An argument `output` may be given as `-o`, too. The resulting function has an attribute `parsed`, which takes the
+    same options and checks them without doing anything.
 
     Args:
         one_of, needs: as in `Group`, for options of several groups or of none.
-        settings: dataclasses of which `--set` takes what has no option, as `module:name`; they come as a parameter
-            `settings` of type `Settings`.
-        serves: it goes on until it is ended: nobody waits for it.
-        beside: without an output it writes one beside the source, with this ending.
-        reads: it reads scenes in any format, and takes `--from`.
+        settings: dataclasses, as `module:name`, whose fields without an option `--set` takes; the values arrive as a
+            parameter `settings` of type `Settings`.
+        serves: the command runs until it is stopped, and shows no progress.
+        beside: file name ending of the output that is written next to the source if none is given; `None`: an output
+            is required.
+        reads: the command reads scenes in any format, and takes `--from`.
     """
 
     def made(function: Callable[..., None]) -> Callable[..., None]:
         hints = get_type_hints(function, include_extras=True)
         own = [one.replace(annotation=hints[one.name]) for one in inspect.signature(function).parameters.values()]
-        own.sort(key=lambda one: one.annotation is Output)  # what every command has comes last
+        own.sort(key=lambda one: one.annotation is Output)  # the group that every command has comes last
         groups: dict[str, type[Group]] = {one.name: one.annotation for one in own if _is_group(one.annotation)}
         exclusive = [*one_of, *(names for kind in groups.values() for names in kind.one_of)]
         wanting = {name: those for kind in groups.values() for name, those in kind.needs.items()} | dict(needs or {})
@@ -196,13 +197,13 @@ def _is_hidden(one: inspect.Parameter) -> bool:
 
 
 def _help_all(more: Callable[[], str]) -> inspect.Parameter:
-    """The option that shows what `--help` leaves out."""
+    """Return the option that shows what `--help` leaves out."""
 
     def show(context: typer.Context, wanted: bool) -> None:
         if wanted and not context.resilient_parsing:
             for option in context.command.params:
                 option.hidden = option.name in (_HELP_ALL, _ALIAS)  # type: ignore[attr-defined]  # arguments have it, too
-            # Where rich draws the help it is printed already, and nothing comes back.
+            # If rich draws the help, it is printed already, and the returned text is empty.
             say("\n\n".join(part for part in (context.get_help(), more()) if part))
             raise typer.Exit
 
@@ -217,7 +218,7 @@ def _keyword(name: str, default: object, annotation: Any) -> inspect.Parameter:
 
 
 def _more_help(function: Callable[..., None], settings: Sequence[str], options: Mapping[str, str]) -> str:
-    """What `--help-all` says beside the options: the docstring behind its line, and the settings."""
+    """Return the text that `--help-all` adds to the options: the docstring below its `---`, and the settings."""
     parts = [inspect.cleandoc("\n" + one) for one in _MORE.split(function.__doc__ or "")[1:]]
     parts += [describe_settings(settings, options)] * bool(settings)
     return "\n\n".join(parts)
@@ -236,7 +237,7 @@ def _fields(kind: type[Group]) -> list[inspect.Parameter]:
 
 
 def _own(one: inspect.Parameter) -> list[inspect.Parameter]:
-    """A parameter as typer is to see it; that of the output twice."""
+    """Return a parameter as typer is to see it; for the output two: the argument and `-o`."""
     one = one.replace(kind=inspect.Parameter.KEYWORD_ONLY)
     if one.annotation is Settings:
         return [one.replace(default=None, annotation=_Set)]
@@ -250,7 +251,7 @@ def _own(one: inspect.Parameter) -> list[inspect.Parameter]:
 
 
 def _one_output(output: str | None, alias: str | None, source: str | None, beside: str | None) -> str:
-    """The output; where none is given the name of the source with another ending, if the command has one."""
+    """Return the output; if none is given, the source's name with the ending `beside`, if the command has one."""
     if (output, alias) == (None, None) and beside is not None and source not in (None, STANDARD_STREAM):
         return str(Path(source).with_suffix(beside))
     if (output is None) == (alias is None):
@@ -259,11 +260,11 @@ def _one_output(output: str | None, alias: str | None, source: str | None, besid
 
 
 def _spelling(one: inspect.Parameter) -> str:
-    """An option as users write it; nothing for an argument."""
+    """Return an option as users write it; empty for an argument."""
     info = next(iter(getattr(one.annotation, "__metadata__", ())), None)
     if not isinstance(info, OptionInfo):
         return ""
-    given: list[object] = [info.default]  # inside of Annotated a name may stand in the default's place
+    given: list[object] = [info.default]  # inside of Annotated the first name is taken for the default
     given.extend(info.param_decls or ())
     declared = [word for word in given if isinstance(word, str) and word.startswith("--")]
     return declared[0].partition("/")[0] if declared else "--" + one.name.replace("_", "-")
@@ -272,13 +273,13 @@ def _spelling(one: inspect.Parameter) -> str:
 def _saying_what_excludes_it(
     one: inspect.Parameter, shown: Mapping[str, str], exclusive: Sequence[tuple[str, ...]]
 ) -> inspect.Parameter:
-    """The same option; its help says which other one it excludes. Of three and more the name of the panel says it.
+    """Return an option whose help names the other one that it excludes; for three and more the panel's name does that.
 
-    Where one excludes many, its own help says it, and not that of each of them.
+    If an option excludes many others, only its own help names them.
 
     Args:
         one: the option.
-        shown: how those options are spelt that `--help` shows.
+        shown: spelling of the options that `--help` shows, by name.
         exclusive: as `one_of` of `Group`.
     """
     pairs = [names for names in exclusive if len(names) == 2]
@@ -298,10 +299,10 @@ def _check(
     exclusive: Sequence[tuple[str, ...]],
     needs: Mapping[str, tuple[str, ...]],
 ) -> None:
-    """Refuse options that exclude each other, and those that say nothing without others.
+    """Refuse options that exclude each other, and those that have no effect without others.
 
     Raises:
-        typer.BadParameter: there are such.
+        typer.BadParameter: such options are given.
     """
     for names in exclusive:
         those = [options[name] for name in names if name in given]

@@ -1,4 +1,4 @@
-"""Values of options that several commands understand alike."""
+"""Parse values of options that several commands have in common."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Width and height from `640x480`.
+    """Parse width and height from `640x480`.
 
     Raises:
-        typer.BadParameter: it is something else.
+        typer.BadParameter: the text is not a size.
     """
     found = re.fullmatch(r"([1-9][0-9]{0,4})[xX]([1-9][0-9]{0,4})", text.strip())
     if found is None:
@@ -39,19 +39,19 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_bytes(text: str | None) -> int | None:
-    """Bytes from `2GB`; `None` where nothing was given.
+    """Parse a number of bytes from `2GB`; return `None` for `None`.
 
     Raises:
-        InputError: it is something else.
+        InputError: the text is not a size.
     """
     return None if text is None else parse_size_bytes(text)
 
 
 def parse_numbers(option: str, text: str | None, count: int) -> tuple[float, ...] | None:
-    """So many finite numbers from `1,0.5,-2`; `None` where nothing was given.
+    """Parse `count` finite numbers from text such as `1,0.5,-2`; return `None` for `None`.
 
     Raises:
-        typer.BadParameter: it is something else.
+        typer.BadParameter: the text is not that many finite numbers.
     """
     if text is None:
         return None
@@ -65,10 +65,10 @@ def parse_numbers(option: str, text: str | None, count: int) -> tuple[float, ...
 
 
 def parse_colour(text: str) -> tuple[float, float, float]:
-    """Red, green and blue, 0 to 1, from `1,0.5,0`; `black` and `white` have names.
+    """Parse red, green and blue, 0 to 1, from `1,0.5,0`, `black` or `white`.
 
     Raises:
-        typer.BadParameter: it is something else.
+        typer.BadParameter: the text is not a colour.
     """
     if text.lower() in _NAMED:
         return _NAMED[text.lower()]
@@ -83,10 +83,10 @@ def parse_colour(text: str) -> tuple[float, float, float]:
 
 
 def parse_up(text: str) -> Direction:
-    """A direction from `y`, `-y`, or `0,-1,0.1`, at unit length.
+    """Parse a direction from `y`, `-y`, or `0,-1,0.1`, and return it at unit length.
 
     Raises:
-        typer.BadParameter: it is something else.
+        typer.BadParameter: the text is not a direction.
     """
     found = re.fullmatch(r"([+-]?)([xyz])", text.strip().lower())
     if found is not None:
@@ -99,16 +99,16 @@ def parse_up(text: str) -> Direction:
 
 
 def up_word(axis: Direction) -> str:
-    """An axis, or its opposite, as `parse_up` takes it."""
+    """Return an axis, or its opposite, as `parse_up` takes it."""
     at = next(k for k, value in enumerate(axis) if value)
     return ("-" if axis[at] < 0.0 else "") + "xyz"[at]
 
 
 def parse_axes(text: str) -> str:
-    """Three letters: directions of +x, +y and +z.
+    """Check axes: three letters, the directions of +x, +y and +z.
 
     Raises:
-        typer.BadParameter: they are something else.
+        typer.BadParameter: the text is not such axes.
     """
     try:
         check_axes(text)
@@ -118,10 +118,10 @@ def parse_axes(text: str) -> str:
 
 
 def parse_decibels(text: str) -> float:
-    """A number of decibels: `0.3`, `0.3dB`, `0.3 dB`.
+    """Parse a number of decibels: `0.3`, `0.3dB`, `0.3 dB`.
 
     Raises:
-        typer.BadParameter: it is something else.
+        typer.BadParameter: the text is not a number of decibels.
     """
     number = text.strip()
     if number.lower().endswith("db"):

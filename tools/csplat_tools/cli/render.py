@@ -30,7 +30,7 @@ _OTHER_FILMS = (".avi", ".m4v", ".mkv", ".mov", ".mpg", ".webm")
 
 @dataclass(frozen=True)
 class _Views(Views):
-    """From where pictures are made, all of them, and how large."""
+    """Options of the views to render, which are all views of the cameras or the data set, and of their size."""
 
     needs: ClassVar[Mapping[str, tuple[str, ...]]] = dict.fromkeys(("images", "test_every", "split"), ("data",))
 

@@ -18,7 +18,7 @@ from csplat_tools.files.streams import check_name
 
 __all__ = ["sensitivity"]
 
-#: What it costs, in pictures of all views.
+#: Cost of the measurement, in renders of all views.
 _PASSES = 4.4
 _SHOWN = {"colour": "colour (largest of the SH coefficients)", "opacity": "opacity", "shape": "shape, over its size"}
 

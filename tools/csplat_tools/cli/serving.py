@@ -1,7 +1,7 @@
-"""`python -m csplat_tools.cli.serving`: commands one after the other in one process, which `csplat batch` starts.
+"""`python -m csplat_tools.cli.serving`: a worker process of `csplat batch` that runs commands one after the other.
 
 A request is a line of JSON on standard input, its answer one on standard output. When the input ends so does the
-process, also in the middle of a command: who asked is gone.
+process, even in the middle of a command: the parent is gone.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ __all__ = ["answer", "main"]
 _ERROR = "error: "
 _CODE = re.compile(r"\b(E_[A-Z0-9_]+)\b|\((E[A-Z]+)\)$")
 _REMARKS_MAX = 20
-_OWN = ("force", "report", "as_json", "quiet", "output_option")  # options that batch gives
+_OWN = ("force", "report", "as_json", "quiet", "output_option")  # options that the batch gives itself
 _FILES = (
     "page",
     "source_index",
@@ -43,14 +43,14 @@ _FILES = (
     "resume",
     "work",
     "dry_run",
-)  # that name what all would share, or do none
+)  # options that name a file which all scenes would share, or that do no work
 
 
 def main() -> None:
     """Answer requests until there are none."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever libraries print is no answer
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what a shell starts in the background
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # output of libraries must not be taken for an answer
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background processes ignore it
     requests: queue.SimpleQueue[str | None] = queue.SimpleQueue()
     busy = threading.Event()
 
@@ -58,7 +58,7 @@ def main() -> None:
         for line in sys.stdin:
             requests.put(line)
         requests.put(None)
-        if busy.is_set():  # what the command waits for is interrupted, too
+        if busy.is_set():  # interrupts a waiting command, too
             interrupt_main_thread()
 
     threading.Thread(target=listen, daemon=True).start()
@@ -72,7 +72,7 @@ def main() -> None:
 
 
 def answer(request: dict[str, Any]) -> dict[str, Any]:
-    """Do what is asked for: `check` or `run` a command line, or `look` at a scene."""
+    """Answer a request: `check` or `run` a command line, or `look` at a scene."""
     asked: dict[str, Callable[..., dict[str, Any]]] = {
         "check": _check,
         "look": _look,
@@ -85,8 +85,8 @@ def _check(words: Sequence[str]) -> dict[str, Any]:
     """Parse a command, its options, and files that need not exist.
 
     Returns:
-        `wrong`: what is wrong, in a line, or "". Else `ending`: of its outputs, "" where that is free; `options`: what
-        it has, by name.
+        `wrong`: the error in one line, or "". Without an error also `ending`: the file name ending of the command's
+        outputs, "" if it may have any; `options`: names of the options that the command has.
     """
     name, *rest = words
     function = command_function(name)
@@ -133,7 +133,7 @@ def _os_code(error: OSError) -> str:
 
 
 def _run(words: Sequence[str], thumbnail: str = "", scenes: Sequence[str] = ()) -> dict[str, Any]:
-    """Run a command line, and draw the first of scenes that can be read."""
+    """Run a command line, and draw a thumbnail of the first of several scenes that can be read."""
     out, err = io.StringIO(), io.StringIO()
     _forget_peak()
     begun = time.perf_counter()
@@ -143,10 +143,10 @@ def _run(words: Sequence[str], thumbnail: str = "", scenes: Sequence[str] = ()) 
             app(list(words), prog_name="csplat")
         except SystemExit as end:
             status = end.code if isinstance(end.code, int) else FAILED if end.code else 0
-        except Exception as error:  # noqa: BLE001  # a defect: it is one scene's, and has to be reported
+        except Exception as error:  # noqa: BLE001  # a defect of csplat: it is reported for this scene, and the batch goes on
             err.write(traceback.format_exc() + f"{_ERROR}a defect of csplat: {error!r} (E_DEFECT)\n")
     seconds = time.perf_counter() - begun
-    if status == 130:  # not ours: who interrupted this process wants it to end
+    if status == 130:  # interrupted from outside: this process is to end
         raise KeyboardInterrupt
     lines = [line for line in err.getvalue().splitlines() if line.strip()]
     told = [line for line in lines if line.startswith(_ERROR)]
@@ -176,13 +176,13 @@ def _json(text: str) -> Any:
 
 
 def _forget_peak() -> None:
-    """Let the system measure this process's largest memory anew; where it cannot, that of all scenes so far counts."""
+    """Reset the system's peak memory of this process; if that fails, the peak of all scenes so far is reported."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", "ascii")
 
 
 def _peak() -> int | None:
-    """The most memory that this process held, bytes."""
+    """Return the peak memory of this process in bytes; `None` if the system does not report it."""
     with suppress(OSError, ValueError):
         for line in Path("/proc/self/status").read_text("utf-8", "replace").splitlines():
             if line.startswith("VmHWM:"):

@@ -1,4 +1,4 @@
-"""`--set NAME=VALUE`: what options of the library have no option of their own on the command line."""
+"""`--set NAME=VALUE`: options of the library that have no option of their own on the command line."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ _READERS: dict[type, tuple[Callable[[str], Any], str]] = {
 
 @dataclass(frozen=True)
 class Settings:
-    """What was set.
+    """The values of `--set`.
 
     Attributes:
-        values: by dataclass of the library and by field.
+        values: values by dataclass of the library and by field.
     """
 
     values: dict[type, dict[str, Any]]
 
     def of(self, kind: type) -> dict[str, Any]:
-        """What was set of a dataclass."""
+        """Return the values that were set for a dataclass, by field."""
         return self.values.get(kind, {})
 
 
 def read_settings(texts: Sequence[str], kinds: Sequence[str], taken: Collection[str]) -> Settings:
-    """Settings from `position-bits=12,scale-step=0.1`.
+    """Parse settings such as `position-bits=12,scale-step=0.1`.
 
     Args:
-        texts: values of `--set`, each with settings between commas.
-        kinds: dataclasses that have them, as `module:name`; imported where anything is set.
-        taken: names that options have.
+        texts: values of `--set`, each with settings separated by commas.
+        kinds: dataclasses whose fields may be set, as `module:name`; imported only if anything is set.
+        taken: names of fields that have an option of their own.
 
     Raises:
         typer.BadParameter: there is no such setting, one is given twice, or its value is of another type.
@@ -73,7 +73,7 @@ def read_settings(texts: Sequence[str], kinds: Sequence[str], taken: Collection[
 
 
 def describe_settings(kinds: Sequence[str], taken: Collection[str]) -> str:
-    """The names, and what the dataclasses say of each; for `--help-all`."""
+    """Return the names of the settings, with their descriptions from the dataclasses' docstrings, for `--help-all`."""
     lines = []
     try:
         found = _imported(kinds)
@@ -94,13 +94,13 @@ def _imported(kinds: Sequence[str]) -> list[type]:
 
 
 def _names(kind: type, taken: Collection[str]) -> list[tuple[str, type]]:
-    """Fields of plain types, words among them, that no option is named after."""
+    """Return the fields of plain types, including Literal words, that have no option of their own, with their types."""
     hints = get_type_hints(kind)
     found = []
     for one in fields(kind):
         hint = hints[one.name]
         each_of = (hint,) if get_origin(hint) is Literal else get_args(hint) or (hint,)
-        # Which words there are the dataclass says when it is made.
+        # The dataclass checks the words of a Literal when it is created.
         types = [str if get_origin(each) is Literal else each for each in each_of if each is not type(None)]
         if one.name not in taken and len(types) == 1 and types[0] in _READERS:
             found.append((one.name, types[0]))

@@ -22,8 +22,8 @@ from csplat_tools.files.streams import check_name, write_array, write_model
 __all__ = ["simplify"]
 
 _TARGET = "Target (one of them)"
-#: What it costs, in pictures of all views that teach: of a share (donut 9, plane3 19), and of a target, which looks for
-#: one (20 and 45); half of that is fitting.
+#: Cost in renders of all training views: for --keep (measured: donut 9, plane3 19), and for a target, which searches
+#: for the share to keep (20 and 45); half of the cost is fitting.
 _PASSES = (20.0, 45.0)
 _OPTIONS = "csplat_tools.optimise.simplify.options:SimplifyOptions"
 

@@ -23,7 +23,7 @@ from csplat_trainer.outputs import Outputs
 __all__ = ["train"]
 
 _DEFAULT = TrainOptions()
-_KEEP = 0.8  # of the splats, of a file: of those that training makes some are hardly seen
+_KEEP = 0.8  # default fraction of the trained splats that OUT.csplat keeps: some of them are hardly seen
 
 
 @command(

@@ -71,7 +71,7 @@ def view(
             try:
                 opened.serve_forever(poll_interval=0.1)
             except KeyboardInterrupt:
-                out.remark("")  # behind the ^C of the terminal
+                out.remark("")  # ends the line with the terminal's ^C
 
 
 @command(beside=".html", reads=True)
@@ -142,7 +142,7 @@ def export_element(
 
 
 def _scene_wishes(scene: ViewScene, cameras: str | None, upright: Upright, out: Output) -> dict[str, str]:
-    """Return what the page is told of a scene: cameras relative to its origin, which way seems to be up."""
+    """Return the page's parameters of a scene: cameras relative to its origin, and the estimated up direction."""
     wishes = {}
     if cameras is not None:
         report: list[str] = []

@@ -1,4 +1,4 @@
-"""Options that say from where a scene is looked at."""
+"""Options that specify the views of a scene."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Near = Annotated[
 
 @dataclass(frozen=True)
 class Upright(Group):
-    """How a scene stands, instead of how it says it does."""
+    """Options of the scene's orientation, which override what the scene declares."""
 
     up: Annotated[str | None, typer.Option(metavar="-y|X,Y,Z", help="Which way is up.")] = None
     axes: Annotated[
@@ -37,21 +37,21 @@ class Upright(Group):
     ] = None
 
     def parse(self) -> None:
-        """Refuse a direction or axes that are none."""
+        """Refuse an invalid direction or axes."""
         self.upright()
 
     def upright(self) -> SceneOverrides:
-        """What the scene is told."""
+        """Return the up direction and axes that the options specify, as overrides of the scene's own."""
         up = None if self.up is None else parse_up(self.up)
         return SceneOverrides(None if self.axes is None else parse_axes(self.axes), up=up)
 
     def seeming(self, axis: Direction | None, output: Output, *, shown: bool = True) -> Direction | None:
-        """What is up where neither the user nor the scene says it; the user hears of it.
+        """Return the estimated up direction, with a remark, if neither the user nor the scene specifies one.
 
         Args:
-            axis: what `seeming_up` finds.
-            output: whether remarks are wanted.
-            shown: whether it stands so in what the command makes.
+            axis: the estimate of `seeming_up`; `None`: there is none.
+            output: prints remarks.
+            shown: True if the command's result shows the scene with this direction up.
         """
         if axis is None or (self.up, self.axes) != (None, None):
             return None
@@ -110,35 +110,39 @@ class Views(Group):
     ] = None
 
     def parse(self) -> None:
-        """Refuse a colour or a size that is none."""
+        """Refuse an invalid colour or size."""
         _ = self.colour, None if self.size is None else parse_size(self.size)
 
     @property
     def inputs(self) -> tuple[str | None, str | None]:
-        """What is read."""
+        """Files that are read: the camera file and the data set."""
         return self.cameras, self.data
 
     @property
     def colour(self) -> tuple[float, float, float] | None:
-        """What is behind the scene; `None`: as usual."""
+        """Background colour, red, green, blue, 0 to 1; `None`: the default."""
         return None if self.background is None else parse_colour(self.background)
 
     def photographs(self, near: float | None = None) -> DataOptions | None:
-        """The data set; `None` without one."""
+        """Return the options of the data set; `None` without one.
+
+        Args:
+            near: near plane of the photographs; `None`: one that suits.
+        """
         size = None if self.size is None else parse_size(self.size)
         return None if self.data is None else DataOptions(self.data, size, self.images, self.test_every, near)
 
     def find(
         self, model: SplatModel, output: Output, *, near: float | None = None, every: int = 1, **how: Any
     ) -> ViewSet:
-        """Find views of a scene, and say what the user should know of them.
+        """Find views of a scene, and print remarks about them.
 
         Args:
             model: the scene.
-            output: whether remarks are wanted.
+            output: prints remarks.
             near: near plane of the photographs; `None`: one that suits.
-            every: as of `find_view_set`.
-            how: what else `find_view_set` is told; handed on, so that its defaults stand in one place.
+            every: as for `find_view_set`.
+            how: other arguments of `find_view_set`, passed on so that its defaults are defined in one place.
         """
         data = self.photographs(near)
         found = find_view_set(model, cameras=self.cameras, data=data, background=self.colour, every=every, **how)
@@ -155,7 +159,7 @@ class Views(Group):
 
 @dataclass(frozen=True)
 class Virtual(Group):
-    """Virtual views that teach."""
+    """Options of the virtual training views."""
 
     views: Annotated[
         int | None,
@@ -171,10 +175,10 @@ class Virtual(Group):
     ] = None
 
     def parse(self) -> None:
-        """Refuse a size that is none."""
+        """Refuse an invalid size."""
         self.given()
 
     def given(self) -> dict[str, Any]:
-        """What is asked for, as `find_view_set` takes it."""
+        """Return the options that are given, as arguments of `find_view_set`."""
         size = None if self.view_size is None else parse_size(self.view_size)
         return {name: value for name, value in (("count", self.views), ("size", size)) if value is not None}
