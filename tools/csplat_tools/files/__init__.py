@@ -1,1 +1,1 @@
-"""Scenes, arrays, pictures and packages as files: found by their paths, written whole or not at all."""
+"""Read and write scenes, arrays and images as files, which are written whole or not at all; load optional packages."""

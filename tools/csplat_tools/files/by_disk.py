@@ -1,4 +1,4 @@
-"""Encoding a scene that may not fit the memory: what `csplat encode --memory` does."""
+"""Encode a scene that may not fit in memory, as `csplat encode --memory` does."""
 
 from __future__ import annotations
 
@@ -20,25 +20,26 @@ from csplat_tools.files.streams import STANDARD_STREAM
 
 __all__ = ["ByDisk", "Expected", "Scale", "encode_by_disk", "expected", "read_degree"]
 
-_FOLDS = 4  # a scene in memory, in times of a PLY's bytes; of others it has to be looked at
-#: By SH degree: seconds per million splats to read once, and to code; seconds for a codebook. Within a tenth of what
-#: copies of fox120k took at `balanced`: 10 M and 100 M of degree 0, 3 M of 1, 2 and 3, 30 M of 3.
+_FOLDS = 4  # memory of a scene as a multiple of its PLY's size; other formats have to be opened to tell
+#: By SH degree: seconds per million splats to read once, and to code; seconds for a codebook. Within a tenth of the
+#: times measured with copies of fox120k at `balanced`: 10 M and 100 M splats of degree 0, 3 M of degrees 1, 2 and 3,
+#: 30 M of degree 3.
 _SECONDS = ((0.2, 3.1, 0.0), (0.35, 7.0, 8.0), (0.45, 7.3, 12.0), (0.55, 8.0, 20.0))
-#: By preset and SH degree, bytes of a file per splat.
+#: Bytes per splat of a file, by preset and SH degree 0 to 3.
 _FILE_BYTES = {"fast": (9.0, 9.5, 10.0, 11.0), "balanced": (6.5, 8.0, 8.5, 9.0), "small": (5.0, 6.5, 7.0, 7.5)}
-_SMALL = 4 << 20  # bytes of a file of any format that fits every memory
+_SMALL = 4 << 20  # bytes: a file up to this size, in any format, fits in every memory
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Where a scene lies while it is encoded.
+    """Options for encoding scenes larger than memory.
 
     Attributes:
-        memory_bytes: a bound; `None`: half of what is free.
-        folder: the working folder; `None`: beside the file.
-        resume: go on with what the folder has.
+        memory_bytes: bound on the memory; `None`: half of the free memory.
+        folder: the working folder; `None`: next to the file.
+        resume: go on from the content of the working folder.
         cluster: address of a Dask scheduler.
-        by_disk: a scene of several buckets does not stay in memory, even where it would fit.
+        by_disk: a scene of several buckets does not stay in memory, even if it would fit.
     """
 
     memory_bytes: int | None = None
@@ -48,7 +49,7 @@ class Scale:
     by_disk: bool = False
 
     def may_leave_memory(self, path: Path) -> bool:
-        """Whether it has to be found out if a scene fits the memory."""
+        """Return True if a scene may not fit in memory, and has to be opened to tell."""
         if self.cluster is not None or self.resume or self.by_disk:
             return True
         bound = default_bytes() if self.memory_bytes is None else self.memory_bytes
@@ -58,7 +59,7 @@ class Scale:
 
 @dataclass(frozen=True)
 class ByDisk:
-    """A scene that was encoded without being in memory."""
+    """The outcome of encoding a scene that was not in memory."""
 
     facts: SplatModel
     report: EncodeReport
@@ -66,9 +67,10 @@ class ByDisk:
 
 
 def read_degree(options: EncodeOptions) -> int | None:
-    """Return the SH degree to read a scene with that is to be encoded: what is dropped of it is part of its errors.
+    """Return the SH degree with which to read a scene to be encoded; `None` keeps all bands.
 
-    A file of a higher degree than models have is readable only where bands are to be left out.
+    Bands that the encoder drops are read, too, because they are part of the declared errors. A file of a higher degree
+    than models have is readable only if bands are to be left out.
     """
     return None if options.sh_degree is None else MAX_SH_DEGREE
 
@@ -83,24 +85,24 @@ def encode_by_disk(
     strict: bool,
     progress: Progress | None,
 ) -> ByDisk | LoadedModel | None:
-    """Encode a scene by way of the disk, or give it where it fits the memory.
+    """Encode a scene by way of the disk, or return it if it fits in memory.
 
     Args:
         local: the scene, in any format.
         target: the file to write.
-        options: of the encoder.
-        facts: what the scene does not say.
+        options: options of the encoder.
+        facts: overrides of the scene's metadata.
         scale: memory, disk, workers.
-        strict: refuse what would be repaired.
-        progress: is told the stages.
+        strict: refuse defects that would be repaired.
+        progress: progress callback.
 
     Returns:
-        What was encoded; or the scene, read, as `read_source` has it; `None` where it fits the memory and its format
-        has a reader that is quicker from the beginning.
+        The outcome of the encoding; or the scene in memory, as `read_source` returns it; `None` if it fits in memory
+        and its format has a reader that is faster from the beginning.
 
     Raises:
-        CsplatError: as of `encode_scene`; or it is too large to go to standard output.
-        OSError: likewise.
+        CsplatError: as for `encode_scene`; or the scene is too large to go to standard output.
+        OSError: as for `encode_scene`.
     """
     if progress is not None:
         progress("opening", 0.0)
@@ -138,13 +140,13 @@ def encode_by_disk(
 
 @dataclass(frozen=True)
 class Expected:
-    """What an encoding will take.
+    """The expected cost of an encoding.
 
     Attributes:
-        count, sh_degree: of the scene.
+        count, sh_degree: number of splats and SH degree that will be encoded.
         needs: memory, disk, workers.
-        seconds: about, by what was measured (`_SECONDS`) on one core, here with as many as will work.
-        file_bytes: of the file, about, at the preset's precision.
+        seconds: approximate time, from measurements on one core (`_SECONDS`) and the number of workers.
+        file_bytes: approximate size of the file at the preset's precision.
     """
 
     count: int
@@ -154,7 +156,7 @@ class Expected:
     file_bytes: int
 
     def as_json(self) -> dict[str, Any]:
-        """Everything, JSON-compatible."""
+        """Return everything as JSON-compatible values."""
         return {
             "splats": self.count,
             "sh_degree": self.sh_degree,
@@ -168,11 +170,11 @@ class Expected:
 
 
 def expected(local: Path, options: EncodeOptions, scale: Scale) -> Expected:
-    """Say what encoding a scene will take, without looking at its splats.
+    """Estimate the cost of encoding a scene, without looking at its splats.
 
     Raises:
-        CsplatError: it cannot be read, or the memory is too little.
-        OSError: it cannot be read.
+        CsplatError: the scene is not valid, or the memory is too little.
+        OSError: the scene cannot be read.
     """
     with open_scene(local, sh_degree=read_degree(options)) as opened:
         needs = needs_of(opened, options, scale.memory_bytes, by_disk=scale.by_disk)

@@ -38,20 +38,20 @@ __all__ = [
 ]
 
 _PATIENCE = 2.0  # seconds for which a terminal shows nothing
-_EVERY = 10.0  # seconds from one line to the next where there is no terminal
+_EVERY = 10.0  # seconds from one line to the next if standard error is not a terminal
 _LOOK = 0.2  # seconds from one look at the clock to the next
-_ENOUGH = (0.03, 1.0)  # share and seconds of a stage from which the rest of it is judged
-_TOLD = 2  # reports of steps from which the others are judged,
-_SPREAD = (0.8, 2.0)  # how much less and more they may take: a scene that grows takes longer,
-_ABOUT = (0.6, 1.7)  # the same of work that is foretold by how long pictures take
-_STAGES = 2  # that are shown at a time: those that were told last
-_WORKING = "working"  # where no stage is known
-_MINUTES_FROM = 100.0  # seconds
+_ENOUGH = (0.03, 1.0)  # fraction done and seconds of a stage from which its remaining time is estimated
+_TOLD = 2  # reports of steps from which the time of the others is estimated
+_SPREAD = (0.8, 2.0)  # range of that estimate, as factors: a scene that grows takes longer
+_ABOUT = (0.6, 1.7)  # the same for estimates from the time that renders take
+_STAGES = 2  # number of stages shown at a time: those that were reported last
+_WORKING = "working"  # shown if no stage is known
+_MINUTES_FROM = 100.0  # seconds from which durations are given in minutes
 
-#: Seconds of work that are foretold.
+#: Work that takes more seconds than this is announced.
 WORTH_SAYING = 10.0
 
-#: What is told how far long work has come: the name of the stage, and how much of it is done, 0 to 1.
+#: Progress callback: called with the name of the stage, and the fraction of it that is done, 0 to 1.
 Progress = Callable[[str, float], None]
 
 
@@ -61,22 +61,22 @@ def say(text: str) -> None:
 
 
 def say_json(value: Any) -> None:
-    """Print data for machines. NaN and infinities do not occur in it: JSON has none."""
+    """Print a value as JSON. It must not contain NaN or infinities: JSON has none."""
     say(json.dumps(value, indent=2, allow_nan=False))
 
 
 def finite(value: float | None) -> float | None:
-    """The same; `None`, as JSON has neither, for NaN and infinities."""
+    """Return the value; `None` for NaN and infinities, which JSON does not have."""
     return value if value is not None and math.isfinite(value) else None
 
 
 def note(text: str) -> None:
-    """Print what is not data."""
+    """Print a message on standard error."""
     _echo(text, sys.stderr)
 
 
 class Step(Protocol):
-    """How far a long run has come."""
+    """The progress of a long run: the current iteration, and the number of all."""
 
     @property
     def iteration(self) -> int: ...
@@ -90,10 +90,10 @@ S = TypeVar("S", bound=Step)
 
 @contextmanager
 def progress_bar(*, quiet: bool = False) -> Iterator[Progress | None]:
-    """Show how far work has come; inside of another one, that one goes on.
+    """Show progress; within another progress bar, that one is used.
 
     Yields:
-        The callback that is told; `None` where nothing is shown.
+        The progress callback; `None` if nothing is shown.
     """
     with _displayed(quiet=quiet) as display:
         yield None if display is None else display.tell
@@ -103,19 +103,22 @@ def progress_bar(*, quiet: bool = False) -> Iterator[Progress | None]:
 def step_progress(
     name: str, tell: Callable[[S], str], *, quiet: bool = False, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[Callable[[S], None] | None]:
-    """Show the steps of a long run as `progress_bar` does, in words of its own, and soon how long all of them take.
+    """Show the steps of a long run as `progress_bar` does, with a text of its own, and announce the time they take.
 
     Args:
-        name: of what is done.
-        tell: says in a line where a run stands, and what is left.
+        name: name of the run.
+        tell: describes in a line the state of a run, and what is left.
         quiet: show nothing.
-        clock: seconds.
+        clock: returns seconds.
+
+    Yields:
+        A callback for each step; `None` if nothing is shown.
     """
     told: list[tuple[float, int]] = []
 
     def show(now: S) -> None:
         told.append((clock(), now.iteration))
-        if len(told) == _TOLD:  # the first steps, which load and compile, say nothing of the others
+        if len(told) == _TOLD:  # the first steps load and compile: their time is not that of the others
             (begun, first), (seconds, last) = told[0], told[-1]
             left = (seconds - begun) / max(1, last - first) * (now.iterations - last)
             if left > WORTH_SAYING:
@@ -129,7 +132,7 @@ def step_progress(
 
 @dataclass
 class _Stage:
-    """When a stage began, and what was told of it last."""
+    """A stage of the work: the time it began, and the last report of it."""
 
     begun: float
     done: float = 0.0
@@ -137,14 +140,14 @@ class _Stage:
 
 
 class Display:
-    """What people see who wait. Owns when work and its stages began, and the bars.
+    """The display of progress. Owns the times at which work and its stages began, and the bars.
 
-    A terminal shows nothing for two seconds, then a bar for each stage that goes on. Elsewhere there is a line every
-    ten seconds. `tick` is called often, whether anything was told or not: work that says nothing is seen to go on.
+    A terminal shows nothing for two seconds, then a bar for each stage that goes on. Otherwise a line is printed every
+    ten seconds. `tick` is called often, whether there was a report or not: silent work is seen to go on, too.
 
     Args:
-        terminal: whether standard error is one.
-        clock: seconds.
+        terminal: True if standard error is a terminal.
+        clock: returns seconds.
     """
 
     def __init__(self, *, terminal: bool, clock: Callable[[], float] = time.monotonic) -> None:
@@ -155,22 +158,22 @@ class Display:
         self._tasks: dict[str, TaskID] = {}
 
     def tell(self, stage: str, done: float, words: str | None = None) -> None:
-        """Note how far a stage has come.
+        """Record the progress of a stage.
 
         Args:
-            stage: its name. What falls back has begun anew.
-            done: 0 to 1.
-            words: instead of share and time left.
+            stage: its name.
+            done: fraction that is done, 0 to 1; if it is less than before, the stage has begun anew.
+            words: text to show instead of percentage and time left.
         """
         with self._lock:
             known = self._stages.pop(stage, None)
             if known is None or done < known.done:
                 known = _Stage(self._clock())
             known.done, known.words = done, words
-            self._stages[stage] = known  # behind the others: told last
+            self._stages[stage] = known  # last in the order: reported last
 
     def tick(self) -> None:
-        """Show what is to be seen now."""
+        """Update the bars, or print a line if one is due."""
         with self._lock:
             now = self._clock()
             going = [(name, stage) for name, stage in self._stages.items() if stage.done < 1.0][-_STAGES:]
@@ -184,14 +187,14 @@ class Display:
                 note(f"{text}; {minutes}:{seconds:02d} so far")
 
     def close(self) -> None:
-        """Take the bars away; they come again with the next tick."""
+        """Remove the bars; the next tick shows them again."""
         with self._lock:
             if self._bars is not None:
                 self._bars.stop()
             self._bars, self._tasks = None, {}
 
     def _move(self, going: Sequence[tuple[str, _Stage]], now: float) -> None:
-        """Bring the bars up to date; those of stages that ended go."""
+        """Update the bars, and remove those of stages that ended."""
         if self._bars is None:
             self._bars = _new_bars()
             self._bars.start()
@@ -200,7 +203,7 @@ class Display:
         for name, stage in going:
             if name not in self._tasks:
                 self._tasks[name] = self._bars.add_task(name, words="")
-            total = 1.0 if stage.done > 0.0 else None  # a bar that only says that something goes on
+            total = 1.0 if stage.done > 0.0 else None  # None: a bar that only shows that work goes on
             self._bars.update(self._tasks[name], completed=stage.done, total=total, words=_words(stage, now))
         self._bars.refresh()
 
@@ -231,23 +234,23 @@ def format_bytes(size_bytes: int) -> str:
 
 
 def format_seconds(seconds: float) -> str:
-    """Format a duration for people, who do not count: `12 s`, `3 minutes`."""
+    """Format a duration for people, rounded: `12 s`, `3 minutes`."""
     return f"{seconds:.0f} s" if seconds < _MINUTES_FROM else f"{seconds / 60.0:.0f} minutes"
 
 
 def format_about(seconds: float) -> str:
-    """Format how long work may take that takes about so long: `20 to 50 s`."""
+    """Format an estimated duration as a range: `20 to 50 s`."""
     return format_range(_ABOUT[0] * seconds, _ABOUT[1] * seconds)
 
 
 def format_range(least: float, most: float) -> str:
-    """Format what lies between two durations: `20 to 50 s`, `2 to 5 minutes`."""
+    """Format a range of durations: `20 to 50 s`, `2 to 5 minutes`."""
     if most < _MINUTES_FROM:
         return f"{least:.0f} to {most:.0f} s"
     return f"{max(1.0, least / 60.0):.0f} to {most / 60.0:.0f} minutes"
 
 
-_displays: list[Display] = []  # the one that is shown: there is one standard error
+_displays: list[Display] = []  # the display that is shown, at most one: there is one standard error
 
 
 @contextmanager
@@ -287,7 +290,7 @@ def _displayed(*, quiet: bool) -> Iterator[Display | None]:
 
 
 def _words(stage: _Stage, now: float) -> str:
-    """How far a stage has come, and how long the rest of it takes if it goes on like that."""
+    """Return the percentage done of a stage, and an estimate of the time left."""
     if stage.words is not None:
         return stage.words
     if stage.done <= 0.0:
@@ -299,7 +302,7 @@ def _words(stage: _Stage, now: float) -> str:
 
 
 def _new_bars() -> Bars:
-    """Bars on standard error that vanish in the end. They redirect nothing: data stays on standard output."""
+    """Return bars on standard error that vanish in the end. They redirect nothing: data stays on standard output."""
     from rich.console import Console  # takes longer to import than most commands to run
     from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as Bars
@@ -314,5 +317,5 @@ def _new_bars() -> Bars:
 def _echo(text: str, stream: TextIO) -> None:
     for display in _displays:
         display.close()  # bars and lines on one terminal do not mix
-    encoding = stream.encoding or "utf-8"  # file names and metadata may hold what it cannot
+    encoding = stream.encoding or "utf-8"  # file names and metadata may hold characters that it cannot represent
     stream.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")

@@ -1,4 +1,4 @@
-"""PLY to .csplat and back: what `csplat encode` and `csplat decode` do, apart from the command line."""
+"""Convert PLY to .csplat and back: `csplat encode` and `csplat decode` without the command line."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ __all__ = [
 
 @dataclass(frozen=True)
 class EncodedScene:
-    """A file, and what whoever made it has to say.
+    """An encoded file, with the report of the search that made it, if any.
 
     Attributes:
-        result: of the encoder.
-        key: under which name a report has `said`.
-        said: what was looked for, tried and chosen, JSON-compatible.
-        lines: what a user should know of that, a sentence each.
+        result: the encoder's result.
+        key: name of the entry of a JSON report that holds `said`; "": none.
+        said: report of the target, the candidates and the choice, JSON-compatible.
+        lines: remarks for the user, a sentence each.
     """
 
     result: EncodeResult
@@ -50,21 +50,21 @@ class EncodedScene:
     lines: tuple[str, ...] = ()
 
 
-#: Makes a file of a scene.
+#: Encodes a scene, with a progress callback.
 Encoder = Callable[[SplatModel, EncodeOptions, Progress | None], EncodedScene]
 
 
 @dataclass(frozen=True)
 class Encoded:
-    """What an encoding took and gave.
+    """The outcome of an encoding.
 
     Attributes:
-        source: the scene, as it was encoded; of one that did not stay in memory, all but its splats.
+        source: the scene as it was encoded; without its splats if it did not stay in memory.
         report: choices and errors.
-        made: the file; `None` where it did not stay in memory.
-        findings: what lint noticed in the PLY.
+        made: the encoded file; `None` if the scene did not stay in memory.
+        findings: findings of lint in the PLY.
         source_bytes: size of the PLY.
-        seconds: reading, encoding and writing.
+        seconds: time of reading, encoding and writing.
     """
 
     source: SplatModel
@@ -103,19 +103,19 @@ def read_source(
     sh_degree: int | None = None,
     progress: Progress | None = None,
 ) -> LoadedModel:
-    """Read a scene in any format, repaired where that is safe.
+    """Read a scene in any format, and repair defects if that is safe.
 
     Args:
         file: a path, or `-`; an open binary file; or bytes.
-        facts: what it does not say.
-        strict: refuse what would be repaired.
+        facts: overrides of the scene's metadata.
+        strict: refuse defects that would be repaired.
         keep_extra: carry columns that splats do not have.
-        sh_degree: leave out the SH bands above, also of a file of a higher degree than 3; `None`: keep all.
-        progress: is told the stage.
+        sh_degree: leave out the SH bands above, even of a file of a higher degree than 3; `None`: keep all.
+        progress: progress callback.
 
     Raises:
-        CsplatError: it cannot be used.
-        OSError: it cannot be read.
+        CsplatError: the scene is not usable.
+        OSError: the scene cannot be read.
     """
     findings: list[Finding] = []
     report = progress or (lambda _stage, _done: None)
@@ -145,16 +145,16 @@ def encode_file(
 
     Args:
         source: a PLY, or `-`.
-        target: the file to write, or `-`. Whether it may be replaced has been settled before.
-        options: of the encoder; `keep_extra` holds for reading too.
-        facts: what the PLY does not say.
-        strict: refuse what would be repaired.
-        importance: a .npy file with one weight per splat of the PLY as read, or what `csplat sensitivity` wrote.
+        target: the file to write, or `-`. The caller has checked that it may be replaced.
+        options: options of the encoder; `keep_extra` applies to reading, too.
+        facts: overrides of the PLY's metadata.
+        strict: refuse defects that would be repaired.
+        importance: a .npy file with one weight per splat of the PLY as read, or a file of `csplat sensitivity`.
         prune_unseen: leave out the splats that no view of the sensitivities saw.
-        source_index: a .npy file to write: which splat of the PLY as read each splat of the file is.
-        encoder: does more than to encode; `importance` is not for it.
-        scale: where the scene may lie. It has to lie in memory for an `encoder`, an importance or a source index.
-        progress: is told the stages.
+        source_index: a .npy file to write: for each splat of the file, its index in the PLY as read.
+        encoder: encodes instead of the plain encoder, such as a target search; it does not get `importance`.
+        scale: memory, disk and workers. An `encoder`, an importance or a source index requires the scene in memory.
+        progress: progress callback.
 
     Raises:
         CsplatError: the PLY or the options cannot be used.
@@ -183,7 +183,7 @@ def encode_file(
             raise InputError("only what `csplat sensitivity` wrote says which splats no view saw")
         made = EncodedScene(encode_with_report(model, options, progress=progress))
     else:
-        from csplat_tools.files.importance import encode_by_importance  # wants names of trainer and renderer
+        from csplat_tools.files.importance import encode_by_importance  # imports names of trainer and renderer
 
         made = EncodedScene(
             encode_by_importance(model, options, importance, prune_unseen=prune_unseen, progress=progress)
@@ -208,15 +208,15 @@ def decode_file(
 
     Args:
         source: the file, or `-`.
-        target: the PLY to write, or `-`. Whether it may be replaced has been settled before.
-        sh_degree: leave out the bands above.
+        target: the PLY to write, or `-`. The caller has checked that it may be replaced.
+        sh_degree: leave out the SH bands above.
         absolute: add the origin and write doubles.
-        max_splats: refuse more; `None`: none are too many.
-        facts: what the PLY is to say instead of what the file does.
-        progress: called with the stage's name and the share done.
+        max_splats: refuse a scene of more splats; `None`: no limit.
+        facts: overrides of the file's metadata for the PLY.
+        progress: called with the stage's name and the fraction done.
 
     Returns:
-        How many splats were written, and their SH degree.
+        The number of splats written, and their SH degree.
 
     Raises:
         CsplatError: the file is not valid, or too large; then there is no PLY.
@@ -225,7 +225,7 @@ def decode_file(
     with mapped_csplat(source) as data:
         opened = open_tiles(data, limits=None if max_splats is None else Limits(splats=max_splats))
         decoded = Scene(opened.header.splat_count, opened.facts, opened.models)
-        # All bands are decoded, even if not all are wanted: damage anywhere gives no PLY.
+        # All bands are decoded, even if some are left out: damage anywhere gives no PLY.
         scene = Filters(sh_degree=sh_degree).applied((facts or SceneOverrides()).applied_to_all(decoded))
         if is_one_way(target):
             for _ in watched(decoded, "checking", progress).blocks():

@@ -1,4 +1,4 @@
-"""From any format to any other: what `csplat convert` and `csplat formats` do, apart from the command line."""
+"""Convert scenes from any format to any other: `csplat convert` and `csplat formats` without the command line."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ __all__ = ["Converted", "convert_file", "format_rows"]
 
 @dataclass(frozen=True)
 class Converted:
-    """What became of a scene.
+    """The outcome of a conversion.
 
     Attributes:
         source_format, target_format: names of the formats.
-        count, sh_degree: of what was written, or would be.
-        source_bytes, size_bytes: of the files; the latter is about what is expected where nothing was written, `None`
-            where that cannot be said.
-        lost: what the target has no place for.
+        count, sh_degree: number of splats and SH degree of the scene that was written, or would be.
+        source_bytes, size_bytes: sizes of the files; the latter is an estimate if nothing was written, `None` if it
+            cannot be estimated.
+        lost: contents that the target has no place for.
         rounded: names of the arrays that the target rounds.
-        axes: before and after.
-        findings: what was noticed in the source.
+        axes: axes before and after.
+        findings: findings in the source.
     """
 
     source_format: str
@@ -62,7 +62,7 @@ class Converted:
         }
 
     def losses(self) -> str:
-        """One line: what is lost on the way."""
+        """Describe in one line the contents and precision that are lost; empty if there are none."""
         words = [*self.lost, *([f"precision of {', '.join(self.rounded)}"] if self.rounded else [])]
         return "; ".join(words)
 
@@ -84,19 +84,19 @@ def convert_file(
 
     Args:
         source: a file, or a folder, or `-`.
-        target: what to write; its name says the format where `write_as` does not. Whether it may be replaced has been
-            settled before.
-        read_as: the name of the source's format, where its content does not say it.
-        write_as: the name of the target's.
-        level: of a source that has the scene several times; 0 is the finest.
-        facts: what the source does not say.
-        filters: what becomes of the scene on the way.
-        no_loss: refuse where anything is lost.
+        target: the file or folder to write; its name determines the format unless `write_as` does. The caller has
+            checked that it may be replaced.
+        read_as: the name of the source's format, if its content does not tell.
+        write_as: the name of the target's format.
+        level: level of detail to read from a source that has several; 0 is the finest.
+        facts: overrides of the source's metadata.
+        filters: changes of the scene on the way.
+        no_loss: refuse if anything would be lost.
         dry_run: write nothing.
-        progress: is told how many splats are read; some formats want them twice.
+        progress: called with the fraction of splats that is read; some formats read them twice.
 
     Raises:
-        CsplatError: the source is not whole, the target cannot hold it, or something would be lost and must not be.
+        CsplatError: the source is not whole, the target cannot hold it, or `no_loss` is set and something is lost.
         OSError: a file cannot be read or written.
     """
     writes = named_by(Path(target)) if write_as is None else named(write_as)
@@ -125,7 +125,7 @@ def convert_file(
 
 
 def format_rows() -> list[tuple[str, ...]]:
-    """A row for each format: name, endings, whether it is read and written, SH degree, axes, what it carries."""
+    """Return a row for each format: name, endings, if it is read, if it is written, SH degree, axes, exact, carried."""
     return [
         (
             one.name,

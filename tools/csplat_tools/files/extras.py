@@ -1,4 +1,4 @@
-"""What a plain install leaves out, and one line that says how to get it."""
+"""Load optional packages, or raise a one-line error that tells how to install them."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _PHOTOGRAPHS = (
     ("numba", None),
     ("scipy", None),
     ("PIL", "pillow"),
-)  # what reading and rendering them needs
+)  # modules needed to read and render photographs, with the package's name if it is another
 
 
 def need_renderer() -> None:
-    """Import what rendering needs: better absent now than after the minutes that reading may take.
+    """Import the package that rendering needs, to fail before the minutes that reading may take.
 
     Raises:
         InputError: numba is not installed.
@@ -41,11 +41,11 @@ def prepare_renderer(
     """Compile the renderer, or load what was compiled before; say so if it takes its time.
 
     Args:
-        quiet: say nothing.
-        gradients: what training runs too.
-        simplify: what simplification runs too, gradients among it.
-        ssim: what SSIM runs too.
-        lpips: what LPIPS runs too.
+        quiet: print nothing.
+        gradients: compile the gradients that training runs, too.
+        simplify: compile the functions that simplification runs, too, gradients among them.
+        ssim: compile SSIM, too.
+        lpips: compile LPIPS, too.
 
     Raises:
         InputError: numba is not installed.
@@ -66,10 +66,10 @@ def prepare_renderer(
 
 
 def need_trainer(*, plots: bool = False) -> None:
-    """Import what training on the CPU needs: torch is not among it. Before, threads learn to wait frugally.
+    """Import the packages that training on the CPU needs (not torch), after setting how OpenMP threads wait.
 
     Args:
-        plots: what drawing needs, too.
+        plots: import the package for plots, too.
 
     Raises:
         InputError: a package is not installed.
@@ -81,7 +81,7 @@ def need_trainer(*, plots: bool = False) -> None:
 
 
 def need_pictures() -> None:
-    """Import what writing pictures needs.
+    """Import the package that writing images needs.
 
     Raises:
         InputError: pillow is not installed.
@@ -90,7 +90,7 @@ def need_pictures() -> None:
 
 
 def need_film() -> None:
-    """Import what writing MP4 needs.
+    """Import the package that writing MP4 needs.
 
     Raises:
         InputError: PyAV is not installed.
@@ -99,7 +99,7 @@ def need_film() -> None:
 
 
 def need_plots() -> None:
-    """Import what drawing plots needs.
+    """Import the package that drawing plots needs.
 
     Raises:
         InputError: matplotlib is not installed.
@@ -108,7 +108,7 @@ def need_plots() -> None:
 
 
 def need_photographs() -> None:
-    """Import what reading data sets needs.
+    """Import the packages that reading data sets needs.
 
     Raises:
         InputError: a package is not installed.
@@ -136,8 +136,8 @@ def _need(module: str, package: str | None = None, *, extra: str = "render") -> 
 def _wait_frugally() -> None:
     """Let the threads of GNU OpenMP sleep soon while they wait for each other.
 
-    They spin for milliseconds otherwise, and where another program wants the same cores, a training
-    step waits for a thread that waits for a core: measured, 57 instead of 470 ms. Read when the
-    library is loaded, so set before; what the user has set stays.
+    They spin for milliseconds otherwise, and if another program uses the same cores, a training step waits for a
+    thread that waits for a core; measured 57 instead of 470 ms per step. The library reads the variable when it is
+    loaded, so it is set before; a value that the user has set is kept.
     """
     os.environ.setdefault("GOMP_SPINCOUNT", _FRUGAL_SPINS)

@@ -1,4 +1,4 @@
-"""What a file may not say of its scene."""
+"""Overrides of a scene's metadata, which a file may lack."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ __all__ = ["SceneOverrides"]
 
 @dataclass(frozen=True)
 class SceneOverrides:
-    """What a PLY may not say of its scene; `None` keeps what it says.
+    """Overrides of a scene's metadata, which a PLY may lack; `None` keeps the file's own.
 
     Attributes:
         coordinate_system, unit_metres, antialiased: as in `SplatModel`.
-        licence: goes into the metadata.
-        up: which direction is up, see `with_up`.
+        licence: text for the metadata.
+        up: the direction that is up, see `with_up`.
     """
 
     coordinate_system: str | None = None
@@ -29,7 +29,7 @@ class SceneOverrides:
     up: Direction | None = None
 
     def applied(self, model: SplatModel) -> SplatModel:
-        """Return the model with these facts."""
+        """Return the model with these overrides."""
         changes: dict[str, Any] = {
             name: value for name in ("unit_metres", "antialiased") if (value := getattr(self, name)) is not None
         }
@@ -39,5 +39,5 @@ class SceneOverrides:
         return with_up(model, self.up, self.coordinate_system)
 
     def applied_to_all(self, scene: Scene) -> Scene:
-        """Return the scene with these facts."""
+        """Return the scene with these overrides."""
         return replace(scene, facts=self.applied(scene.facts), blocks=lambda: map(self.applied, scene.blocks()))

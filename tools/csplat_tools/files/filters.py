@@ -1,4 +1,4 @@
-"""Changes of a scene on its way from one file to another, some splats at a time."""
+"""Change a scene on its way from one file to another, some splats at a time."""
 
 from __future__ import annotations
 
@@ -18,24 +18,25 @@ __all__ = ["Filters", "isolated"]
 B = NDArray[np.bool_]
 F64 = NDArray[np.float64]
 
-_CELL = 0.01  # of a scene's extent: so near its neighbours a splat has to be, however small it is
-_SPREAD = 4.0  # of its own standard deviation: so near they may be, however fine the cells
-_COMPANY = 8  # splats, itself included: with fewer around it a splat floats
+_CELL = 0.01  # fraction of a scene's extent: distance within which neighbours count for any splat
+_SPREAD = 4.0  # standard deviations of a splat: distance within which neighbours count if that is farther
+_COMPANY = 8  # number of splats, itself included: with fewer in its neighbourhood a splat is a floater
 
 
 @dataclass(frozen=True)
 class Filters:
-    """What becomes of a scene, in the order of the fields; what is not given changes nothing.
+    """Changes of a scene, applied in the order of the fields; `None` and False change nothing.
 
     Attributes:
-        to_axes: turn it to these, as in `SplatModel`; where it says none, from x right, y down, z forward.
-        rotate: about x, y, z in this order, degrees, counter-clockwise as seen from the tip of the axis.
-        scale: make it so many times as large, about the origin of its coordinates.
-        translate: add to all positions, scene units.
+        to_axes: turn the scene to these axes, as in `SplatModel`; a scene without axes is taken to have x right,
+            y down, z forward.
+        rotate: rotate about x, y, z in this order, degrees, counter-clockwise as seen from the tip of the axis.
+        scale: factor by which the scene is enlarged about the origin of its coordinates.
+        translate: offset added to all positions, scene units.
         crop_box: keep splats whose centres lie between two corners, x y z each.
         crop_sphere: keep splats whose centres lie within a sphere, x y z and radius.
         drop_floaters: drop splats that have next to no others around them.
-        sh_degree: leave out the bands above.
+        sh_degree: leave out the SH bands above.
     """
 
     to_axes: str | None = None
@@ -48,7 +49,7 @@ class Filters:
     sh_degree: int | None = None
 
     def applied(self, scene: Scene) -> Scene:
-        """The scene as it is to be written."""
+        """Return the changed scene."""
         if self.to_axes is not None:
             scene = in_axes(scene, self.to_axes)
         if self.rotate is not None:
@@ -75,14 +76,14 @@ class Filters:
 
 
 def isolated(points: F64, sizes: F64) -> B:
-    """Which splats have next to no others around them: within 1 % of the extent, or four times their own size.
+    """Find splats with next to no others around them: within 1 % of the extent, or four times their own size.
 
     Args:
         points: [N, 3] centres.
         sizes: [N] standard deviations, scene units.
 
     Returns:
-        [N] bool.
+        [N] bool, True for isolated splats.
     """
     if len(points) < _COMPANY:
         return np.zeros(len(points), np.bool_)
@@ -130,7 +131,7 @@ def _kept(scene: Scene, keep: Callable[[SplatModel], B]) -> Scene:
 
 
 def _without_floaters(scene: Scene) -> Scene:
-    """Looks at centres and sizes of all splats, 16 bytes each."""
+    """Drop isolated splats; holds centres and sizes of all splats in memory, 16 bytes each."""
     points, sizes = np.empty((scene.count, 3), np.float32), np.empty(scene.count, np.float32)
     at = 0
     for model in scene.blocks():

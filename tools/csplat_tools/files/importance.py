@@ -1,4 +1,4 @@
-"""How much splats matter, as a file says it: weights (.npy), or what `csplat sensitivity` wrote (.npz)."""
+"""Encode by importance read from a file: weights (.npy), or the output of `csplat sensitivity` (.npz)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from csplat_trainer.sensitivity_file import StoredSensitivity, read_sensitivity
 
 __all__ = ["encode_by_importance", "read_importance", "read_weights", "weights_of"]
 
-_ZIP = b"PK"  # what a .npz begins with
+_ZIP = b"PK"  # first bytes of a .npz file
 _ONE_GRADE = (
     "all splats are of one grade: weights alone do not say how precise they have to be, nor do virtual views inside of"
     " surroundings; `csplat sensitivity` from cameras does"
@@ -30,8 +30,8 @@ def read_importance(path: str, model: SplatModel) -> NDArray[Any] | Importance |
     """Read weights from a .npy file, or sensitivities from a .npz file.
 
     Raises:
-        InputError: it is neither, or is about another scene.
-        OSError: it cannot be read.
+        InputError: the file is neither, or belongs to another scene.
+        OSError: the file cannot be read.
     """
     with Path(path).open("rb") as stream:
         begin = stream.read(len(_ZIP))
@@ -39,14 +39,14 @@ def read_importance(path: str, model: SplatModel) -> NDArray[Any] | Importance |
 
 
 def weights_of(found: NDArray[Any] | Importance | StoredSensitivity, model: SplatModel) -> NDArray[Any] | Importance:
-    """What the encoder wants of what a file says.
+    """Return the importance that the encoder takes, from the content of a file.
 
-    Virtual views do not stand where the cameras inside surroundings do: of what those show, they show too little to
-    say how coarse it may be. So they grade no splats there.
+    Virtual views do not look from where the cameras of a surrounding scene were: they show too little of it to tell
+    how coarsely it may be quantised. So such sensitivities do not sort splats into quantisation classes.
 
     Args:
-        found: by `read_importance`.
-        model: the scene that it is about.
+        found: the result of `read_importance`.
+        model: the scene.
     """
     if not isinstance(found, StoredSensitivity):
         return found
@@ -57,25 +57,26 @@ def weights_of(found: NDArray[Any] | Importance | StoredSensitivity, model: Spla
 
 
 def read_weights(path: str, model: SplatModel) -> NDArray[Any] | Importance:
-    """Read what the encoder wants of a file, see `read_importance`."""
+    """Read the importance that the encoder takes from a file, see `read_importance`."""
     return weights_of(read_importance(path, model), model)
 
 
 def encode_by_importance(
     model: SplatModel, options: EncodeOptions, path: str, *, prune_unseen: bool, progress: Progress | None = None
 ) -> EncodeResult:
-    """Encode a scene by how much its splats matter.
+    """Encode a scene with the importance of its splats.
 
     Args:
         model: the scene.
-        options: of the encoder.
+        options: options of the encoder.
         path: a file as `read_importance` takes it.
         prune_unseen: leave out the splats that no view of the sensitivities saw.
-        progress: is told the stages.
+        progress: progress callback.
 
     Raises:
-        InputError: the file is none, is about another scene, does not say what was seen, or nothing would be left.
-        OSError: it cannot be read.
+        InputError: the file is invalid, belongs to another scene, or `prune_unseen` is set and it does not tell which
+            splats were seen, or none was.
+        OSError: the file cannot be read.
     """
     found = read_importance(path, model)
     stored = found if isinstance(found, StoredSensitivity) else None
@@ -93,7 +94,7 @@ def encode_by_importance(
         model.select(rows), options, importance=weights.select(rows) if isinstance(weights, Importance) else None,
         origin=Origin(len(model), rows), said={"pruned": said}, progress=progress,
     )  # fmt: skip
-    if stored.missed_share > 0.0:  # not where no view was kept aside: then it is not a number
+    if stored.missed_share > 0.0:  # False for NaN: no view was held out
         missed = (
             f"{100 * stored.missed_share:.1f} % of the splats are left out although views that were kept aside saw"
             " them: `csplat sensitivity` with more views misses fewer"
@@ -103,12 +104,12 @@ def encode_by_importance(
 
 
 def _unheeded(options: EncodeOptions, weights: NDArray[Any] | Importance) -> tuple[str, ...]:
-    """What an importance does not say, though it is asked for."""
+    """Return a note if quantisation classes were requested and the importance cannot provide them."""
     if (options.grades or 1) == 1 or (isinstance(weights, Importance) and weights.curvatures is not None):
         return ()
     return (_ONE_GRADE,)
 
 
 def _noted(result: EncodeResult, *notes: str) -> EncodeResult:
-    """The same, with sentences for the user."""
+    """Return the result with notes for the user added."""
     return replace(result, report=replace(result.report, notes=(*result.report.notes, *notes)))

@@ -1,4 +1,4 @@
-"""Pictures of renders: to 8 bits, side by side, and as PNG files."""
+"""Convert renders to 8 bits, lay them side by side, and write them as PNG files."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def picture_names(images: Sequence[str | None]) -> list[str]:
     """Name pictures, without an ending, no two alike.
 
     Args:
-        images: what the cameras say their photographs are called: `images/0007.jpg`, or nothing.
+        images: names of the cameras' photographs, such as `images/0007.jpg`, or `None`.
 
     Returns:
-        The photographs' own names; numbers where a camera has none; both where names are not unique.
+        The photographs' own names; a number for a camera without one; both if the names are not unique.
     """
     stems = [_stem(image) for image in images]
     numbers = [f"{number:0{_DIGITS}d}" for number in range(len(stems))]
@@ -44,13 +44,13 @@ def check_folder(folder: str, names: Sequence[str], *, force: bool) -> Path:
     """Make a folder for files; refuse if that would replace some.
 
     Args:
-        folder: may be there already.
-        names: of the files to be written.
-        force: they may be replaced.
+        folder: the folder; it may exist already.
+        names: names of the files to be written.
+        force: existing files may be replaced.
 
     Raises:
-        InputError: it is no folder; two names are the same; or one of the files exists, or is not a file.
-        OSError: it cannot be made.
+        InputError: `folder` is not a folder; two names are the same; or one of the files exists, or is not a file.
+        OSError: the folder cannot be made.
     """
     path = Path(folder)
     if path.exists() and not path.is_dir():
@@ -66,19 +66,19 @@ def check_folder(folder: str, names: Sequence[str], *, force: bool) -> Path:
 
 
 def to_bytes(values: F32) -> U8:
-    """Round 0..1 to 0..255; what lies beyond is cut off, NaN is 0."""
+    """Round 0..1 to 0..255; values outside are clipped, NaN becomes 0."""
     clipped = np.clip(np.nan_to_num(values, nan=0.0), 0.0, 1.0)
     result: U8 = np.rint(clipped * 255.0).astype(np.uint8)
     return result
 
 
 def panels(a: F32, b: F32, amplification: float, photograph: F32 | None = None) -> U8:
-    """Lay side by side one picture, another, and the amplified magnitude of their difference.
+    """Lay side by side two images and the amplified magnitude of their difference.
 
     Args:
         a, b: [H, W, 3], 0..1.
-        amplification: what the difference is multiplied with.
-        photograph: [H, W, 3], before the others, if there is one.
+        amplification: factor by which the difference is multiplied.
+        photograph: [H, W, 3], placed before the others, if there is one.
 
     Returns:
         [H, 3 W, 3], or [H, 4 W, 3] with a photograph.
@@ -93,7 +93,7 @@ def write_png(path: Path, pixels: NDArray[Any]) -> None:
 
     Raises:
         InputError: pillow is not installed.
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     need_pictures()
     from PIL import Image
@@ -104,7 +104,7 @@ def write_png(path: Path, pixels: NDArray[Any]) -> None:
 
 
 def _stem(image: str | None) -> str:
-    """The last part of a name, whatever system it comes from, without its ending and what no file name may hold."""
+    """Return the last part of a path of any system, without its ending and characters that file names may not hold."""
     if image is None:
         return ""
     name = PureWindowsPath(PurePosixPath(image).name).name  # never leads out of the folder

@@ -1,4 +1,4 @@
-"""Scenes in any format, for commands that look at splats."""
+"""Read scenes in any format, for commands that look at splats."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ __all__ = [
     "ply_splat_bytes", "size_of", "watched", "without_bands", "without_extra",
 ]  # fmt: skip
 
-#: Files that stand for all that lies beside them: SOG as a folder, and with levels.
+#: Names of files that stand for the whole folder they are in: SOG as a folder, and with levels.
 FOLDER_NAMES = ("meta.json", "lod-meta.json")
 
 #: Formats that unpack nothing when they are opened, and whose readers take all splats at once in fewer passes.
 READ_ANEW = ("ply", "csplat")
-_SMALL = 1 << 20  # bytes of a file of any format that fits every memory
-#: What comparing takes in memory beside the arrays: the program; of a splat what is drawn and searched.
+_SMALL = 1 << 20  # bytes: a file up to this size, in any format, fits in every memory
+#: Bytes that a comparison takes in addition to the scenes' arrays: for the program, and per splat drawn and searched.
 _BASE_BYTES, _SPLAT_BYTES = 200_000_000, 320
 
 
 @dataclass(frozen=True, eq=False)
 class LoadedModel:
-    """A scene, and what the file says of it.
+    """A scene in memory, with the metadata of its file.
 
     Attributes:
         model: the splats.
-        size_bytes: of the file; of a model that was in no file, that of its plain PLY.
-        header: of a .csplat file; `None` for a PLY.
-        stated_errors: of a .csplat file that states them.
-        name: of the file.
-        findings: what was noticed while it was read.
+        size_bytes: size of the file; for a model without a file, of its plain PLY.
+        header: header of a .csplat file; `None` for other formats.
+        stated_errors: declared errors of a .csplat file; `None` if it has none.
+        name: name of the file.
+        findings: findings while it was read.
     """
 
     model: SplatModel
@@ -58,21 +58,21 @@ class LoadedModel:
     findings: tuple[Finding, ...] = ()
 
     def _repr_html_(self) -> str | None:
-        """What a notebook shows of it: see `SplatModel`."""
-        return self.model._repr_html_()  # a protocol of notebooks, and public there
+        """Return the HTML that a notebook shows, see `SplatModel`."""
+        return self.model._repr_html_()  # notebooks' protocol, and public there
 
-    def sample(self, progress: Progress | None = None) -> tuple[SplatModel, int]:  # noqa: ARG002  # as of `OpenedScene`
-        """All splats, each of which stands for itself."""
+    def sample(self, progress: Progress | None = None) -> tuple[SplatModel, int]:  # noqa: ARG002  # as in `OpenedScene`
+        """Return all splats, and 1: each stands for itself."""
         return self.model, 1
 
     @property
     def count(self) -> int:
-        """N."""
+        """Number of splats."""
         return len(self.model)
 
     @property
     def facts(self) -> SplatModel:
-        """What the scene says beside its splats."""
+        """The scene's metadata, as fields of the model itself."""
         return self.model
 
     def as_json(self) -> dict[str, Any]:
@@ -86,10 +86,10 @@ class OpenedScene:
 
     Attributes:
         scene: the splats, some at a time.
-        size_bytes: of the file.
-        path: of the file.
-        memory_bytes: what may be taken by those who look at it, about.
-        sample_splats: number of splats in the sample, at most.
+        size_bytes: size of the file.
+        path: path of the file.
+        memory_bytes: approximate bound on the memory for working with the scene.
+        sample_splats: largest number of splats in the sample.
     """
 
     scene: Scene
@@ -100,7 +100,7 @@ class OpenedScene:
     _sample: list[SplatModel] = field(default_factory=list, init=False)
 
     def sample(self, progress: Progress | None = None) -> tuple[SplatModel, int]:
-        """Every so-manieth splat, without SH bands; and for how many splats each stands. It is kept.
+        """Return every Nth splat, without SH bands, and N. The sample is read once and kept.
 
         Raises:
             CsplatError: the scene is not whole.
@@ -117,18 +117,18 @@ class OpenedScene:
 
     @property
     def count(self) -> int:
-        """N."""
+        """Number of splats."""
         return self.scene.count
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What was noticed while it was read."""
+        """Findings while it was read."""
         extra = list(self.facts.extra)
         return (*self.scene.findings, *([dropped_columns(extra)] if extra and self.scene.format == "ply" else []))
 
     @property
     def facts(self) -> SplatModel:
-        """What the scene says beside its splats."""
+        """The scene's metadata, as a model without splats."""
         return self.scene.facts
 
     def as_json(self) -> dict[str, Any]:
@@ -154,12 +154,13 @@ SceneLike = SplatModel | LoadedModel | File
 
 
 def load_model(scene: SceneLike, *, sh_degree: int | None = None) -> LoadedModel:
-    """Read a scene in any format (`csplat formats`); which one its content tells.
+    """Read a scene in any format (`csplat formats`), which is detected by its content.
 
     Args:
-        scene: the file: a path, an open binary file, or bytes; as a path `-` is standard input. What is a model, or
-            loaded already, stays as it is.
-        sh_degree: leave out the SH bands above of a file, also of one of a higher degree than 3; `None`: keep all.
+        scene: the file: a path, an open binary file, or bytes; the path `-` is standard input. A model, or a scene
+            that is loaded already, is taken as it is.
+        sh_degree: leave out the SH bands above when reading a file, even one of a higher degree than 3; `None`: keep
+            all.
 
     Examples:
         >>> import csplat_tools
@@ -168,9 +169,9 @@ def load_model(scene: SceneLike, *, sh_degree: int | None = None) -> LoadedModel
         (SplatModel(1000 splats, sh_degree=3), 1, True)
 
     Raises:
-        CsplatError: it is not valid, or no file.
-        LimitError: it does not fit the memory that is free.
-        OSError: it cannot be read.
+        CsplatError: the scene is not valid, or not a file.
+        LimitError: the scene does not fit in the free memory.
+        OSError: the file cannot be read.
     """
     if isinstance(scene, LoadedModel):
         return scene
@@ -197,19 +198,19 @@ def _loaded(local: Path, sh_degree: int | None = None) -> LoadedModel:
 def opened_scenes(
     given: Sequence[SceneLike | OpenedScene], memory_bytes: int | None = None
 ) -> Iterator[Sequence[LoadedModel] | Sequence[OpenedScene]]:
-    """Read scenes that are to be compared, all into memory, or none where they do not fit together.
+    """Read scenes that are to be compared: all into memory, or none if they do not fit together.
 
     Args:
-        given: as of `load_model`. Beside a model, or what is loaded already, all are read into memory; what is opened
-            already, all of it, stays so.
-        memory_bytes: bound, about; `None`: half of what is free.
+        given: scenes as for `load_model`. If one is a model or loaded already, all are read into memory; if all are
+            opened already, they stay so.
+        memory_bytes: approximate bound on the memory; `None`: half of the free memory.
 
     Yields:
         The scenes; they can be read as long as the context lasts.
 
     Raises:
-        CsplatError: as of `load_model`, but for memory; or less is allowed than the disk wants.
-        OSError: one cannot be read.
+        CsplatError: as for `load_model`; files that do not fit in memory are opened instead.
+        OSError: a file cannot be read.
     """
     opened = [one for one in given if isinstance(one, OpenedScene)]
     if opened:
@@ -264,13 +265,13 @@ def _in_memory(opened: OpenedScene) -> LoadedModel:
 
 
 def _together_bytes(found: Sequence[OpenedScene]) -> float:
-    """Bytes of memory that comparing takes, all splats at once."""
+    """Return the bytes of memory that a comparison takes with all splats in memory."""
     arrays = sum(one.count * ply_splat_bytes(one.facts.sh_degree) for one in found)
     return _BASE_BYTES + arrays + _SPLAT_BYTES * max(one.count for one in found)
 
 
 def size_of(path: Path) -> int:
-    """Bytes of a file, or of all files of a folder."""
+    """Return the size in bytes of a file, or of all files of a folder."""
     if path.name.lower() in FOLDER_NAMES:
         path = path.parent
     if not path.is_dir():
@@ -279,22 +280,22 @@ def size_of(path: Path) -> int:
 
 
 def ply_splat_bytes(sh_degree: int) -> int:
-    """What a splat takes in a PLY of the INRIA trainer, whose columns are floats: 248 bytes at SH degree 3.
+    """Return the bytes of a splat in a PLY of the INRIA trainer, whose columns are floats: 248 at SH degree 3.
 
-    Position and normal, opacity, scale and rotation are 14; the rest are colours.
+    Position, normal, opacity, scale and rotation have 14 columns; the others are colours.
     """
     return 4 * (14 + 3 * (sh_degree + 1) ** 2)
 
 
 def watched(scene: Scene, stage: str, progress: Progress | None) -> Scene:
-    """The same scene; who goes through its blocks, to write them, tells how far it has come."""
+    """Return the scene with blocks that report progress while they are iterated over to be written."""
     if progress is None:
         return scene
     told = scenes.watched(scene, stage, progress)
 
     def blocks() -> Iterator[SplatModel]:
         yield from told.blocks()
-        progress("writing", 0.0)  # or going through it once more, which begins anew
+        progress("writing", 0.0)  # or another pass over the scene, which begins anew
 
     return replace(scene, blocks=blocks)
 

@@ -1,4 +1,4 @@
-"""Sizes in bytes, as people write them."""
+"""Parse sizes in bytes as people write them."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from csplat.errors import InputError
 
 __all__ = ["NUMBER", "parse_size_bytes"]
 
-#: A regular expression of a number, as its first group.
+#: A regular expression for a number, which is its first group.
 NUMBER = r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
 
 _UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
-_LEAST_FILE = 64  # bytes of a header
+_LEAST_FILE = 64  # bytes of a file's header: no file is smaller
 
 
 def parse_size_bytes(text: str) -> int:
-    """Bytes from `5MB`, `300 kB`, `1.5MiB` or `123456`; MB is 10⁶, MiB is 2²⁰.
+    """Parse a number of bytes from `5MB`, `300 kB`, `1.5MiB` or `123456`; MB is 10⁶, MiB is 2²⁰.
 
     Raises:
-        InputError: it is something else.
+        InputError: the text is not a size, or is smaller than any file.
     """
     found = re.fullmatch(NUMBER + r"\s*([kmg]?i?b?)", text.strip(), re.IGNORECASE)
     unit = None if found is None else _UNITS.get(found[2].lower())

@@ -1,7 +1,7 @@
 """Files, standard input and standard output of the commands.
 
-`-` is standard input or output. A file appears under its name only when it is complete, and none
-is replaced unless asked.
+`-` is standard input or output. A file appears under its name only when it is complete, and an existing one is
+replaced only with `force`.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ __all__ = [
 
 STANDARD_STREAM = "-"
 
-_OURS = ("ply", "csplat")  # names of formats
+_OURS = ("ply", "csplat")  # names of the formats that commands other than `convert` write
 _PLY_MAGICS = (b"ply\n", b"ply\r")
 
-#: By the endings of input and output, `*` for any, the command that makes one of the other.
+#: The command that makes an output from an input, by their file name endings; `*`: any.
 _MAKERS = {
     (".csplat", ".ply"): "decode",
     (".ply", ".csplat"): "encode",
@@ -66,7 +66,7 @@ _MAKERS = {
     ("*", ".npz"): "sensitivity",
 }
 
-#: Endings of what csplat does not write, or beside a scene alone.
+#: File name endings that csplat does not write, or not for scenes.
 _OTHERS = {".csv", ".gif", ".jpg", ".json", ".mp4", ".npy", ".pdf", ".png", ".svg", ".txt", ".webp", ".xml"}
 
 
@@ -74,7 +74,7 @@ class _StandardInput(io.BytesIO):
     name = "standard input"
 
 
-_free: set[Path] = set()  # names that nobody had when they were checked: whoever takes one meanwhile keeps it
+_free: set[Path] = set()  # names that were free when checked: a file written there meanwhile is not replaced
 
 
 def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> None:
@@ -113,12 +113,12 @@ def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[
     """Refuse outputs before any work is done for them: each as `check_output` does, or two of them in one place.
 
     Args:
-        paths: the files to be written, or `-`; None for those that are not wanted.
+        paths: the files to be written, or `-`; None for those that are not requested.
         force: existing files may be replaced.
         inputs: files that the command reads, folders or URLs; None for those that are not given.
 
     Raises:
-        InputError: as `check_output`; or two paths name the same file.
+        InputError: as for `check_output`; or two paths name the same file.
         OSError: an input does not exist, or the folder of an output.
     """
     outputs = [path for path in paths if path is not None]
@@ -129,22 +129,22 @@ def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[
     read = tuple(path for path in inputs if path is not None and not is_url(path))
     for path in read:
         if path != STANDARD_STREAM:
-            Path(path).stat()  # an OSError that names it, before anything that takes time
+            Path(path).stat()  # an OSError that names it, before any work is done
     for path in outputs:
         check_output(path, force=force, inputs=read)
 
 
 def check_name(path: str, wanted: str, writer: str, source: str = "") -> None:
-    """Refuse an output whose name says that it is something else than what is written.
+    """Refuse an output whose name is that of another kind of file.
 
     Args:
         path: the output, or `-`.
-        wanted: the ending that it might have.
-        writer: the name of the command that has it for an argument, or the option that it is the value of.
-        source: the input of that command; what it can be made into is told.
+        wanted: file name ending of the files that are written.
+        writer: the name of the command whose argument it is, or the option whose value it is.
+        source: the input of that command; with it the message suggests a command that makes such a file, if any.
 
     Raises:
-        InputError: the name ends otherwise, as files of another kind do. The message has what was meant.
+        InputError: the name ends like those of another kind of file. The message suggests what was meant.
     """
     target, suffix = Path(path), Path(path).suffix.lower()
     if suffix == wanted:
@@ -166,18 +166,18 @@ def check_name(path: str, wanted: str, writer: str, source: str = "") -> None:
 
 @contextmanager
 def local_path(file: File) -> Iterator[Path]:
-    """Give the path of a file that can be read twice; `-`, named pipes, open files and bytes are copied first.
+    """Yield the path of a file that can be read twice; `-`, named pipes, open files and bytes are copied first.
 
     Raises:
-        InputError: it is no file.
-        OSError: it cannot be read.
+        InputError: `file` is not a file.
+        OSError: the file cannot be read.
     """
     with naming(file), kept_path(file) as path:
         yield path
 
 
 def kept_path(file: File) -> AbstractContextManager[Path]:
-    """As `local_path`, but errors that occur while it is open are not said to be about this file."""
+    """Like `local_path`, but errors raised while it is open are not attributed to this file."""
     if isinstance(file, str) and file == STANDARD_STREAM:
         return local_file(sys.stdin.buffer, "standard input")
     return local_file(file)
@@ -185,7 +185,7 @@ def kept_path(file: File) -> AbstractContextManager[Path]:
 
 @contextmanager
 def naming(file: object) -> Iterator[None]:
-    """Note in errors which file they are about, if it has a name."""
+    """Set the path of errors that do not name a file yet, if this file has a name."""
     try:
         yield
     except CsplatError as error:
@@ -196,11 +196,11 @@ def naming(file: object) -> Iterator[None]:
 
 @contextmanager
 def source_path(file: File) -> Iterator[Path]:
-    """Give the path of a scene to be encoded; what is no path of a file goes into a temporary one first.
+    """Yield the path of a scene to be encoded; anything but a path is copied to a temporary file first.
 
     Raises:
-        InputError: it is a .csplat file.
-        OSError: it cannot be read.
+        InputError: the scene is a .csplat file.
+        OSError: the scene cannot be read.
     """
     with local_path(file) as local:
         if is_csplat(local):
@@ -213,12 +213,12 @@ def source_path(file: File) -> Iterator[Path]:
 
 
 def is_csplat(path: Path) -> bool:
-    """Whether a file is one for the decoder, by its first bytes, or by its name where they are damaged.
+    """Return True if a file is a .csplat file, by its first bytes, or by its name if they are damaged.
 
     A PLY is not, whatever its name; nor is a folder (an unbundled SOG).
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     if path.is_dir():
         return False
@@ -229,13 +229,13 @@ def is_csplat(path: Path) -> bool:
 
 @contextmanager
 def mapped_csplat(path: str) -> Iterator[bytes | mmap]:
-    """Give the bytes of a .csplat file, memory-mapped where that is possible.
+    """Yield the bytes of a .csplat file, memory-mapped if possible.
 
-    Whether they are valid is for the decoder to say; only a PLY is recognised and refused here.
+    Their validity is checked by the decoder; only files of other known formats are recognised and refused here.
 
     Raises:
-        InputError: it is a PLY.
-        OSError: it cannot be read.
+        InputError: the file is in another format.
+        OSError: the file cannot be read.
     """
     is_path = path != STANDARD_STREAM
     data = mapped(path) if is_path else sys.stdin.buffer.read()
@@ -249,11 +249,11 @@ def mapped_csplat(path: str) -> Iterator[bytes | mmap]:
 
 
 def csplat_file(path: str) -> File:
-    """What `csplat.open` takes of a .csplat file that is named by a path, a URL, or `-`.
+    """Return the argument of `csplat.open` for a .csplat file given by a path, a URL, or `-`.
 
     Raises:
-        InputError: the path is that of a file in another format.
-        OSError: it cannot be read.
+        InputError: the file is in another format.
+        OSError: the file cannot be read.
     """
     if path == STANDARD_STREAM:
         data = sys.stdin.buffer.read()
@@ -280,7 +280,7 @@ def write_bytes(path: str, data: bytes) -> None:
 
 @contextmanager
 def _output_stream(path: str) -> Iterator[BinaryIO]:
-    """Give standard output for `-`, else what `open_output` gives."""
+    """Yield standard output for `-`, else the stream of `open_output`."""
     if path == STANDARD_STREAM:
         yield sys.stdout.buffer
         sys.stdout.buffer.flush()
@@ -291,13 +291,13 @@ def _output_stream(path: str) -> Iterator[BinaryIO]:
 
 @contextmanager
 def whole_output(path: str) -> Iterator[BinaryIO]:
-    """As `_output_stream`; standard output gets what is written when all of it is, too."""
+    """Like `_output_stream`, but data goes to standard output, too, only when it is complete."""
     if path != STANDARD_STREAM:
         with open_output(path) as stream:
             yield stream
         return
     with TemporaryFile() as spool, _output_stream(path) as stream:
-        yield cast(BinaryIO, spool)  # on Windows a wrapper of one
+        yield cast(BinaryIO, spool)  # on Windows a wrapper of a file
         spool.seek(0)
         shutil.copyfileobj(spool, stream)
 
@@ -307,8 +307,8 @@ def open_output(path: str) -> Iterator[BinaryIO]:
     """Open a file that takes its name when it is complete. One that was free when it was checked has to be free still.
 
     Raises:
-        InputError: somebody else has taken the name.
-        OSError: it cannot be written.
+        InputError: another program has written a file of that name meanwhile.
+        OSError: the file cannot be written.
     """
     target = Path(path).resolve()
     try:
@@ -322,19 +322,19 @@ def open_output(path: str) -> Iterator[BinaryIO]:
 
 
 def write_json(path: str, value: Any) -> None:
-    """Write JSON; NaN and infinities do not occur in it: JSON has none."""
+    """Write a value as JSON. It must not contain NaN or infinities: JSON has none."""
     write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
 def write_model(path: str, model: SplatModel | Scene, *, absolute: bool) -> None:
-    """Write a PLY, or one to standard output."""
+    """Write a PLY to a file, or to standard output for `-`; `absolute` adds the origin and writes doubles."""
     write: Callable[..., None] = write_scene_ply if isinstance(model, Scene) else write_ply
     with _output_stream(path) as stream:
         write(stream, model, absolute=absolute)
 
 
 def is_one_way(path: str) -> bool:
-    """Whether what is written there cannot be taken back: standard output, a device, a named pipe."""
+    """Return True if data written to a path cannot be taken back: standard output, a device, a named pipe."""
     return path == STANDARD_STREAM or (Path(path).exists() and not Path(path).is_file())
 
 
