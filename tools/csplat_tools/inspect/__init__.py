@@ -1,1 +1,1 @@
-"""What is in a file, whether it is valid, whether its stated errors hold, and how it differs from its source."""
+"""Inspect a file: its content, its validity, its declared errors, and its differences from the source."""

@@ -1,4 +1,4 @@
-"""How far the splats of one scene lie from those of another, where it is known or can be found which is which."""
+"""Measure the errors of a scene's splats against those of its source, if the pairs are known or can be found."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["AttributeErrors", "attribute_errors", "attribute_errors_by_disk"]
 
 Pairing = Literal["index", "order", "search"]
 
-_NEAR = 0.01  # of the scene's spread: splats of one order are nearer to each other, shuffled ones far from it
+_NEAR = 0.01  # fraction of the scene's spread: splats in the same order are nearer than this, shuffled ones far off
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class AttributeErrors:
     """Errors of pairs of splats.
 
     Attributes:
-        pairing: how the pairs are known. `index`: from a source index. `order`: both scenes hold as many splats, and
-            the centres say that the order is the same. `search`: a source splat within the errors that the file
-            states, which need not be the one that it was.
-        matched: splats of the other scene that have a partner; only these are measured.
-        unmatched: those that have none.
+        pairing: how the pairs are known. `index`: from a source index. `order`: both scenes hold the same number of
+            splats, and the centres show that the order is the same. `search`: a source splat was found within the
+            errors that the file declares, which need not be the original one.
+        matched: number of splats of the other scene that have a partner; only these are measured.
+        unmatched: number of those that have none.
         errors: largest and rms error by measure, in the order of the registry.
     """
 
@@ -45,7 +45,7 @@ class AttributeErrors:
     errors: dict[str, tuple[float, float]]
 
     def as_json(self) -> dict[str, Any]:
-        """Return everything as JSON-compatible values; what overflowed is `null`."""
+        """Return everything as JSON-compatible values; an error that overflowed is `null`."""
         return {
             "pairing": self.pairing,
             "matched": self.matched,
@@ -66,13 +66,13 @@ def attribute_errors(
     """Measure the errors of a scene's splats against those of its source.
 
     Args:
-        source: the scene it was made from.
-        other: what became of it.
-        source_index: [N] integers, which source splat each splat of `other` is. `None`: not known.
-        progress: is told how far a search has come.
+        source: the scene that `other` was made from.
+        other: the scene whose errors are measured.
+        source_index: [N] integers, the source splat of each splat of `other`; `None`: not known.
+        progress: progress callback of a search.
 
     Returns:
-        The errors; `None` where it cannot be found out which splat is which.
+        The errors; `None` if the pairs of splats cannot be found.
 
     Raises:
         InputError: `source_index` is not one index of a source splat for each splat of `other`.
@@ -103,11 +103,11 @@ def attribute_errors_by_disk(
     *,
     progress: Progress | None = None,
 ) -> AttributeErrors | None:
-    """As `attribute_errors`, of scenes not in memory: nothing is searched for; an index is used of .csplat files."""
+    """Like `attribute_errors` for scenes not in memory: without a search, and a source index only for .csplat files."""
     if source_index is not None:
         if not is_csplat(other.path):
             return None
-        # All is measured of a file that states nothing, and may do so.
+        # Of a file that declares no errors, and says that it was refitted, all errors are measured.
         nothing = StatedErrors(source.count, 0, source.facts.sh_degree, refitted=True, records=())
         opened = replace(open_tiles(other.path), stated_errors=nothing)
         proof = prove_by_disk(source.scene, opened, source_index, memory_bytes=source.memory_bytes, progress=progress)
@@ -124,7 +124,7 @@ def attribute_errors_by_disk(
 
 
 def _beside(a: Scene, b: Scene, progress: Progress | None) -> Iterator[tuple[int, SplatModel, SplatModel]]:
-    """Splats of two scenes of as many, some at a time, and the number of the first of them."""
+    """Yield splats of two scenes of equal number, some at a time, with the number of the first of them."""
     first = scenes.watched(a, "measuring splats", progress or (lambda _stage, _share: None)).blocks()
     second = scenes.watched(b, "", lambda _stage, _share: None).blocks()
     start, ours, theirs = 0, a.facts, b.facts
@@ -141,7 +141,7 @@ def _errors(source: Source, other: SplatModel, index: NDArray[Any]) -> dict[str,
 
 
 def _same_order(source: SplatModel, other: SplatModel) -> bool:
-    """Whether splat i of one stands for splat i of the other: of a shuffled scene half the splats are far off."""
+    """Return True if splat i of one scene is splat i of the other: in a shuffled scene half the splats are far off."""
     if len(source) != len(other) or not len(source):
         return False
     means = source.means.astype(np.float64)

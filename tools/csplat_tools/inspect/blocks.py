@@ -1,7 +1,7 @@
-"""Walk through the blocks of a file by their heads: how many bytes each attribute takes, and how it is coded.
+"""Walk through the blocks of a file by their heads, to find the bytes and the codings of each attribute.
 
 Nothing is inflated and no CRC is computed: only the heads are touched, so that a memory-mapped file of any size is
-described at once. Every length is checked against what remains.
+described at once. Every length is checked against the bytes that remain.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ _STREAM_CLAUSE = "STR-6"
 
 @dataclass
 class AttributeUse:
-    """What one attribute takes, over all tiles.
+    """The bytes and codings of one attribute, over all tiles.
 
     Attributes:
-        block_bytes: of the blocks in tiles: heads, parameters and streams.
-        codebook_bytes: of the codebook chunks with the attribute's columns.
-        codings, coders: names, and how many blocks or streams use them.
-        escaped_count: splats whose values lie beside a codebook.
+        block_bytes: size of the blocks in tiles: heads, parameters and streams.
+        codebook_bytes: size of the codebook chunks with the attribute's columns.
+        codings, coders: number of blocks or streams that use each, by name.
+        escaped_count: number of splats whose values are coded as escapes instead of codebook entries.
     """
 
     block_bytes: int = 0
@@ -39,12 +39,12 @@ class AttributeUse:
 
     @property
     def size_bytes(self) -> int:
-        """Everything that the attribute takes."""
+        """All bytes of the attribute."""
         return self.block_bytes + self.codebook_bytes
 
 
 def attribute_use(data: bytes | mmap, header: SceneHeader) -> dict[str, AttributeUse]:
-    """Add up what each attribute takes.
+    """Add up the bytes and codings of each attribute.
 
     Args:
         data: the file.
@@ -147,7 +147,7 @@ def _walk_codebook(
     use.escaped_count += params.escape_count
     if params.escape_count:
         escape = _spec.unpack_block_head(cursor.take(_spec.BLOCK_HEAD_SIZE))
-        if escape.coding == _spec.CODING_CODEBOOK:  # not for ever deeper
+        if escape.coding == _spec.CODING_CODEBOOK:  # otherwise the recursion would not be bounded
             raise FormatError(_spec.ERROR_STREAM, cursor.at, "CBK-5", found="coding codebook")
         _walk_coding(cursor, attribute, escape.coding, codebooks, use)
 
@@ -160,7 +160,7 @@ def _walk_stream(cursor: _Cursor, use: AttributeUse) -> None:
 
 
 def _first_attribute(record: _spec.CodebookRecord, band: int) -> int:
-    """Id of the attribute whose columns a codebook chunk holds; for SH that of the band."""
+    """Return the id of the attribute whose columns a codebook chunk holds; for SH that of the band."""
     if record.kind == _spec.CODEBOOK_KIND_SH:
         name = f"sh{band}"
     else:

@@ -1,4 +1,4 @@
-"""Two scenes compared in everything: what `csplat compare` does, apart from the command line."""
+"""Compare two scenes in size, errors of the splats and renders: `csplat compare` without the command line."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ __all__ = ["USUAL_WEIGHTS", "Comparison", "compare"]
 
 F32 = NDArray[np.float32]
 
-#: Instead of a file of LPIPS weights: look for them where they usually are.
+#: Given instead of a file of LPIPS weights: look for them in the usual places.
 USUAL_WEIGHTS = "auto"
 
-_PIXEL_BYTES = 13  # of a picture of the source, which is kept
+_PIXEL_BYTES = 13  # bytes per pixel of a render of the source, which is kept
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
-    """What was found out about two scenes.
+    """The outcome of comparing two scenes.
 
     Attributes:
-        a: the source; opened alone where both do not fit the memory together.
-        b: what became of it; likewise.
-        attributes: errors of its splats; `None` where it cannot be found out which splat is which, as mostly without
-            a source index where they are not in memory.
-        quality: what pictures say.
-        ignored: splats of A that were not drawn because they hold NaN or infinities.
-        cameras: where they were taken from: the name of a camera file or of a data set, or `virtual`.
-        photographs: what A's and B's pictures score against the photographs of a data set, as `Scores` says, by the
-            keys `split`, `a` and `b`; `None` where there is no data set.
-        background, mode: of the pictures.
-        notes: what the user should know of the views.
-        seconds: reading what was not in memory, matching, rendering and writing.
+        a: the source; opened, but not in memory, if both do not fit together.
+        b: the scene compared with it; likewise.
+        attributes: errors of B's splats; `None` if the pairs of splats cannot be found, which is the usual case
+            without a source index if the scenes are not in memory.
+        quality: scores of B's renders against A's.
+        ignored: number of splats of A that were not drawn because they hold NaN or infinities.
+        cameras: source of the views: the name of a camera file or of a data set, or `virtual`.
+        photographs: scores of A's and B's renders against the photographs of a data set, as JSON of `Scores`, by the
+            keys `split`, `a` and `b`; `None` if there is no data set.
+        background, mode: background colour and renderer mode.
+        notes: remarks about the views.
+        seconds: time of reading scenes that were not in memory, matching, rendering and writing.
     """
 
     a: LoadedModel | OpenedScene
@@ -74,7 +74,7 @@ class Comparison:
 
     @property
     def ratio(self) -> float:
-        """How many times B is smaller than A."""
+        """Size of A divided by that of B."""
         return self.a.size_bytes / self.b.size_bytes
 
     def as_json(self) -> dict[str, Any]:
@@ -114,24 +114,24 @@ def compare(
     prepare: Callable[[], object] | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Comparison:
-    """Compare a scene with its source, as `csplat compare` does. Wants the packages of the render extra.
+    """Compare a scene with its source, as `csplat compare` does. Requires the packages of the render extra.
 
     Args:
-        a: the source: a model, or a file of either kind.
-        b: what became of it, likewise.
-        views: those that judge are looked from; where they are photographs, these judge A and B, too. `None`: the
-            eight virtual ones of `psnr`, 640×480, in front of black (`find_view_set`).
-        source_index: [N] which splat of A each splat of B is.
-        lpips: a file of LPIPS weights, or `auto` for the usual places; it is not computed if left out.
+        a: the source: a model, or a file in any format.
+        b: the scene compared with it, likewise.
+        views: its test views are rendered; if they have photographs, A and B are scored against these, too. `None`:
+            the eight virtual views of `psnr`, 640×480, in front of black (`find_view_set`).
+        source_index: [N] the splat of A that each splat of B is.
+        lpips: a file of LPIPS weights, or `auto` for the usual places; LPIPS is not computed if left out.
         pictures: a folder for one PNG per view: the photograph if there is one, A, B, and their amplified difference.
-        amplification: of the difference.
-        background: red, green, blue, 0..1; if left out that of the views.
-        mode: of the renderer.
-        force: existing pictures may be replaced.
-        memory_bytes: what may be taken, about; by way of the disk, if that is too little for both files. `None`: half
-            of what is free. Photographs come to it.
-        prepare: is called when all that is named has been read and checked, before the first picture.
-        progress: is told the stage and the share of it that is done, 0 to 1.
+        amplification: factor by which the difference is amplified.
+        background: red, green, blue, 0..1; that of the views if left out.
+        mode: mode of the renderer.
+        force: existing files of `pictures` may be replaced.
+        memory_bytes: approximate memory that may be taken; the disk is used if that is too little for both files.
+            `None`: half of the free memory. Photographs are not included.
+        prepare: called when all inputs have been read and checked, before the first render.
+        progress: called with the stage and the fraction of it that is done, 0 to 1.
 
     Examples:
         >>> import csplat_tools
@@ -140,8 +140,8 @@ def compare(
         (12.3, 41.2, (0.00021, 0.00009))
 
     Raises:
-        CsplatError: a file is not valid, or exists; or no view judges; or the renderer is not installed; or the disk
-            has no room for the splats of a scene that does not fit the memory, or the bound is too low even so.
+        CsplatError: a file is not valid, or exists; or there are no test views; or the renderer is not installed; or
+            the disk has no room for the splats of a scene that does not fit in memory, or the bound is too low even so.
         OSError: a file cannot be read or written.
     """
     start = time.perf_counter()
@@ -184,7 +184,7 @@ def _measured(
     source_index: NDArray[np.integer[Any]] | None,
     progress: Progress | None,
 ) -> tuple[SplatModel | Sliced, SplatModel | Sliced, AttributeErrors | None]:
-    """What draws either scene, and the errors of its splats."""
+    """Return a renderable form of each scene, and the errors of B's splats."""
     if isinstance(source, LoadedModel) and isinstance(other, LoadedModel):
         return source.model, other.model, attribute_errors(source, other, source_index, progress=progress)
     assert isinstance(source, OpenedScene), "both are in memory, or none"
@@ -206,7 +206,7 @@ def _measured(
 
 
 class _Both:
-    """Scores A's and B's pictures against the photographs."""
+    """Scorer of A's and B's renders against the photographs."""
 
     def __init__(self, judge: Judge, distance: Distance | None) -> None:
         self._judge, self._distance = judge, distance
@@ -221,7 +221,7 @@ class _Both:
 
 
 class _Sheets:
-    """Writes one PNG per view, named as its photograph."""
+    """Writer of one PNG per view, named after its photograph."""
 
     def __init__(
         self, folder: str, names: Sequence[str], photographs: Judge | None, amplification: float, *, force: bool

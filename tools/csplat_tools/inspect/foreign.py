@@ -1,4 +1,4 @@
-"""What is in a scene of any other format: for `csplat info`."""
+"""Describe scenes in formats other than .csplat, for `csplat info`."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ __all__ = ["describe_foreign"]
 
 
 def describe_foreign(source: str) -> tuple[dict[str, Any], str]:
-    """Say what a file tells before its splats are read.
+    """Describe a file by what is known of it before its splats are read.
 
     Args:
         source: a scene in any format, or `-`.
 
     Returns:
-        JSON-compatible values, and the same for people.
+        JSON-compatible values, and the same as text.
 
     Raises:
-        InputError: it is in no format that is read, or not whole.
-        OSError: it cannot be read.
+        InputError: the file is in no format that is read, or not whole.
+        OSError: the file cannot be read.
     """
     with local_path(source) as path, open_scene(path) as scene:
         facts, size, count = scene.facts, size_of(path), scene.count

@@ -1,4 +1,4 @@
-"""What an encoding looks like, in a second: the PSNR of `csplat compare`, from smaller renders."""
+"""Estimate the PSNR of `csplat compare` in a second, from smaller renders."""
 
 from __future__ import annotations
 
@@ -11,30 +11,31 @@ from csplat_tools.views import comparison_cameras
 
 __all__ = ["SIZE", "SPLATS_MAX", "glance"]
 
-#: Of the renders; smaller ones average what is wrong away: half of 640×480 says 0.4 dB more, this 0.2 at most.
+#: Width and height of the renders, pixels; smaller ones average errors away: half of 640×480 gives 0.4 dB too much,
+#: this 0.2 at most.
 SIZE = (480, 360)
-#: More splats take longer to render than anybody wants to wait for a remark.
+#: Largest number of splats: more take longer to render than a remark is worth.
 SPLATS_MAX = 1_000_000
 
 
 def glance(
     source: SplatModel, data: bytes, *, threads: int | None = None, splats_max: int = SPLATS_MAX
 ) -> float | None:
-    """About the PSNR of a file against its source.
+    """Return the approximate PSNR of a file against its source.
 
-    The views are those of `csplat compare`; only their size is another one.
+    The views are those of `csplat compare`, at another size.
 
     Args:
-        source: what was encoded.
+        source: the scene that was encoded.
         data: the file.
-        threads: how many; `None` for all.
-        splats_max: larger scenes are not rendered.
+        threads: number of threads; `None` for all.
+        splats_max: scenes of more splats are not rendered.
 
     Returns:
-        dB; `None` if there are no splats or too many, or if the renderer is not compiled yet, which takes longer than
-        the encoding, or cannot draw them.
+        PSNR in dB; `None` if there are no splats or too many, if the renderer is not compiled yet, which takes longer
+        than the encoding, or if it cannot draw them.
     """
-    from csplat_render.warmup import is_compiled  # wants numba
+    from csplat_render.warmup import is_compiled  # requires numba
 
     if not 0 < len(source) <= splats_max or not is_compiled():
         return None

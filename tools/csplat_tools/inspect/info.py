@@ -1,4 +1,4 @@
-"""Everything that a file says of itself without being decoded: `csplat info`."""
+"""Collect what is known of a .csplat file without decoding it, for `csplat info`."""
 
 from __future__ import annotations
 
@@ -35,14 +35,15 @@ class Span:
 
 @dataclass(frozen=True)
 class AttributeFacts:
-    """What one attribute takes, and how it is coded.
+    """The size and coding of one attribute.
 
     Attributes:
-        size_bytes: everything; codebook_bytes: of that, its columns of codebooks.
-        bits_per_splat: of everything; `None` without splats.
-        codings, coders: names, and how many blocks or streams use them.
-        escaped_splats: those whose values lie beside a codebook.
-        mapping, step, chroma_shift, levels: of its record; `None` where it has none.
+        size_bytes: all bytes of the attribute.
+        codebook_bytes: those among them of its columns of codebooks.
+        bits_per_splat: average over all splats; `None` without splats.
+        codings, coders: number of blocks or streams that use each, by name.
+        escaped_splats: number of splats whose values are coded as escapes instead of codebook entries.
+        mapping, step, chroma_shift, levels: fields of the attribute's record; `None` if it has none.
     """
 
     size_bytes: int
@@ -69,7 +70,7 @@ class LayerFacts:
 
 @dataclass(frozen=True)
 class CodebookFacts:
-    """A codebook: the SH bands that it serves, how many entries, bytes of its chunks."""
+    """A codebook: its kind, the SH bands that it covers, the number of entries, and the bytes of its chunks."""
 
     id: int
     kind: str
@@ -84,12 +85,13 @@ class FileFacts:
 
     Attributes:
         header: header and index.
-        attributes, layers: by name, in the order of the registry.
-        codebooks: in the order of the index.
-        overhead: what is no attribute, by name: header, index, chunks of the whole file, frames of the tiles' chunks.
-        cameras: how many; `None` without the chunk, as all that follows.
-        options, metadata: JSON of the file.
-        stated_errors: what it stands for, and how nearly.
+        attributes, layers: attributes and layers by name, in the order of the registry.
+        codebooks: codebooks in the order of the index.
+        overhead: bytes outside attributes, by name: header, index, chunks of the whole file, frames of the tiles'
+            chunks.
+        cameras: number of cameras; `None` without the chunk, as for all that follows.
+        options, metadata: the file's JSON.
+        stated_errors: the source of which the file is an encoding, and the declared error bounds.
     """
 
     header: SceneHeader
@@ -104,13 +106,13 @@ class FileFacts:
 
     @property
     def bytes_per_splat(self) -> float | None:
-        """Of the whole file; `None` without splats."""
+        """Size of the whole file divided by the number of splats; `None` without splats."""
         count = self.header.splat_count
         return self.header.file_size / count if count else None
 
     @property
     def spans(self) -> dict[str, Span]:
-        """Splats, lattice exponents and bits per axis of the tiles; nothing where there is none."""
+        """Ranges of splat count, lattice exponent and bits per axis over the tiles; empty without tiles."""
         tiles = self.header.tiles
         columns = {
             "splats": [one.splat_count for one in tiles],
@@ -120,7 +122,7 @@ class FileFacts:
         return {name: Span(min(values), max(values)) for name, values in columns.items() if values}
 
     def as_json(self) -> dict[str, Any]:
-        """Everything, JSON-compatible."""
+        """Return everything as JSON-compatible values."""
         header, tiles = self.header, self.header.tiles
         up = up_of(self.metadata or {}, header.coordinate_system)
         largest = {"max_scale": finite(max(tile.max_scale for tile in tiles))} if tiles else {}
@@ -164,7 +166,7 @@ def describe_file(data: bytes | mmap) -> FileFacts:
     """Describe a file by its header, its index, the heads of its blocks, and its small chunks.
 
     Args:
-        data: all of the file; of a memory-mapped one little is touched.
+        data: the whole file; little of a memory-mapped one is touched.
 
     Raises:
         FormatError: header, index, block heads or one of the small chunks are not valid.
@@ -188,7 +190,7 @@ def describe_file(data: bytes | mmap) -> FileFacts:
 
 
 def byte_shares(data: bytes | mmap, header: SceneHeader) -> dict[str, int]:
-    """Bytes of each attribute, and as `overhead` of everything else.
+    """Return the bytes of each attribute, and as `overhead` those of everything else.
 
     Raises:
         FormatError: heads contradict each other.

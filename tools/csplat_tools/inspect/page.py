@@ -1,4 +1,4 @@
-"""One page about one file: `csplat info --page`."""
+"""The HTML report on a file: `csplat info --page`."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _SCENE = {
 
 @dataclass(frozen=True)
 class _Beside:
-    """What a comparison with the source gave, as HTML."""
+    """The results of a comparison with the source, as text and HTML."""
 
     facts: dict[str, str]
     pictures: str
@@ -76,15 +76,16 @@ def write_page(
     """Write the page.
 
     Args:
-        path: of the page.
-        name: of the file that it is about, or `-`.
-        data: the file. facts: what it says of itself.
-        source: a scene that it is compared with, which wants the renderer.
-        progress: is told how far the comparison has come.
+        path: path of the page.
+        name: name of the file that it describes, or `-`.
+        data: the file.
+        facts: the file's description of itself.
+        source: a scene with which it is compared; this requires the renderer.
+        progress: progress callback of the comparison.
 
     Raises:
         CsplatError: the file or the source is not valid.
-        OSError: the source cannot be read, or the page not be written.
+        OSError: the source cannot be read, or the page cannot be written.
     """
     title = "standard input" if name == STANDARD_STREAM else PurePath(name).name
     beside = None if source is None else _compared(data, source, progress)
@@ -92,7 +93,7 @@ def write_page(
 
 
 def make_page(title: str, facts: FileFacts, beside: _Beside | None = None) -> str:
-    """The page as text: the same for the same file and source."""
+    """Return the page as HTML: the same for the same file and source."""
     count = facts.header.splat_count
     return document(
         f"{title}: what is in it",
@@ -108,7 +109,7 @@ def make_page(title: str, facts: FileFacts, beside: _Beside | None = None) -> st
 
 
 def _compared(data: bytes | mmap, source: str, progress: Progress | None) -> _Beside:
-    """Render both: by the views of `psnr`, and by views that are worth showing."""
+    """Render file and source: from the views of `psnr` for the scores, and from others to show the hardest place."""
     from csplat_render.judge import Judge
     from csplat_tools.pages.hardest import PICTURES, HardestPlace, picture_row
     from csplat_tools.views import find_view_set, showing_cameras

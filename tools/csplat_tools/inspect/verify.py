@@ -1,4 +1,4 @@
-"""Check a file and prove what it states: what `csplat verify` does, apart from the command line."""
+"""Check a file and verify its declared errors: `csplat verify` without the command line."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from csplat_tools.files.streams import mapped_csplat, source_path
 
 __all__ = ["Verified", "verify_file"]
 
-_INDEX_BYTES = 1 << 27  # of a source index that is read as a whole
+_INDEX_BYTES = 1 << 27  # largest size of a source index, which is read as a whole
 
 
 @dataclass(frozen=True)
 class Verified:
-    """What became of a file.
+    """The outcome of verifying a file.
 
     Attributes:
-        validation: every violation of the spec, and what was looked at.
-        proof: of its stated errors; `None` where no source was given, or where the file breaks a clause.
+        validation: every violation of the spec, and the checks that were made.
+        proof: verification of the declared errors; `None` if no source was given, or if the file breaks a clause.
     """
 
     validation: Validation
@@ -37,11 +37,11 @@ class Verified:
 
     @property
     def holds(self) -> bool:
-        """Whether the file conforms, and what it states was not disproved."""
+        """True if the file conforms, and its declared errors were not disproved."""
         return self.validation.conforms and (self.proof is None or self.proof.holds)
 
     def as_json(self) -> dict[str, Any]:
-        """Everything, JSON-compatible."""
+        """Return everything as JSON-compatible values."""
         found, proof = self.validation, self.proof
         return {
             "holds": self.holds,
@@ -68,18 +68,19 @@ def verify_file(
     memory_bytes: int | None = None,
     progress: Progress | None = None,
 ) -> Verified:
-    """Look for every violation in a file; if there is none and a source is given, prove its stated errors.
+    """Look for every violation in a file; if there is none and a source is given, verify its declared errors.
 
     Args:
         path: the file, or `-`.
         source: the PLY that it was made from.
         source_index: the .npy file that the encoder wrote.
-        max_splats: refuse more (LIM-1); `None`: none are too many.
-        memory_bytes: what the proof may take; by way of the disk, if that is too little. `None`: half of what is free.
-        progress: is told how far validating and matching have come.
+        max_splats: refuse a scene of more splats (LIM-1); `None`: no limit.
+        memory_bytes: memory that the verification may take; it uses the disk if that is too little. `None`: half of
+            the free memory.
+        progress: progress callback for validating and matching.
 
     Raises:
-        CsplatError: source or index cannot be read; or the disk has no room for the proof.
+        CsplatError: source or index are not valid; or the disk has no room for the verification.
         OSError: a file cannot be read.
     """
     rows = None if source_index is None else read_array(source_index, most_bytes=_INDEX_BYTES)
@@ -95,7 +96,7 @@ def _proved(
 ) -> Proof:
     opened = open_tiles(data)
     header, stated = opened.header, opened.stated_errors
-    degree = MAX_SH_DEGREE  # of a file of more bands none above can have been encoded, and errors are of the others
+    degree = MAX_SH_DEGREE  # bands above cannot be encoded, and declared errors do not include them
     with source_path(source) as local:
         if fits_memory(opened, stated.source_count if stated else 0, size_of(local), memory_bytes):
             model = formats.read(local, keep_extra=bool(header.extras), sh_degree=degree)

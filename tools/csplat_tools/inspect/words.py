@@ -1,4 +1,4 @@
-"""What a file holds, in words: for the text and for the page of `csplat info`."""
+"""Describe the content of a file in words, for the text and the HTML page of `csplat info`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["coding_words", "headline", "other_metadata", "place_words", "scene_w
 
 
 def headline(facts: FileFacts) -> str:
-    """Format, size, bytes per splat."""
+    """Return a headline: format version, profile, size, bytes per splat."""
     header, per_splat = facts.header, facts.bytes_per_splat
     average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
     version = f"csplat {header.version[0]}.{header.version[1]}"
@@ -24,7 +24,7 @@ def headline(facts: FileFacts) -> str:
 
 
 def scene_words(facts: FileFacts) -> dict[str, str]:
-    """The scene, by what is told."""
+    """Return descriptions of the scene, by title."""
     header = facts.header
     words = place_words(header, header.splat_count, facts.metadata or {})
     words["tiles"] = _tiles(facts)
@@ -43,12 +43,12 @@ def scene_words(facts: FileFacts) -> dict[str, str]:
 
 
 def place_words(said: SceneHeader | SplatModel, count: int, metadata: Mapping[str, Any]) -> dict[str, str]:
-    """How many splats there are, and how they lie.
+    """Return the number of splats, the axes, the up direction, the unit, the origin and flags in words, by title.
 
     Args:
-        said: what a file says of them.
-        count: N.
-        metadata: of the scene.
+        said: header of a .csplat file, or metadata of another one.
+        count: number of splats.
+        metadata: metadata of the scene.
     """
     flags = [name for name in ("antialiased", "flat") if getattr(said, name)]
     up = up_of(metadata, said.coordinate_system)
@@ -63,7 +63,7 @@ def place_words(said: SceneHeader | SplatModel, count: int, metadata: Mapping[st
 
 
 def other_metadata(facts: FileFacts) -> dict[str, object]:
-    """The metadata that `scene_words` does not tell."""
+    """Return the metadata that `scene_words` does not describe."""
     metadata = dict(facts.metadata or {})
     if TrainedOn.of(metadata) is not None:
         del metadata[TRAINING]
@@ -74,7 +74,7 @@ def other_metadata(facts: FileFacts) -> dict[str, object]:
 
 
 def coding_words(attribute: AttributeFacts) -> str:
-    """How an attribute is coded."""
+    """Describe how an attribute is coded."""
     words = ["+".join(attribute.codings)]
     if attribute.step is not None:
         words.append(f"step {attribute.step:.4g}")
