@@ -1,4 +1,4 @@
-"""The one search: the file of a scene that keeps to a target, by every move that files have.
+"""Search for the file of a scene that meets a target, over precision, coding of SH and number of splats.
 
-`target` and `bounds` want no renderer.
+`target` and `bounds` do not need the renderer.
 """

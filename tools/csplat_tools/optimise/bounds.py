@@ -1,4 +1,4 @@
-"""Largest errors as targets: steps are made finer, or coarser, until the file states no larger ones."""
+"""Encode within largest errors: steps are made finer, or coarser, until the file declares no larger errors."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from csplat_tools.files.console import Progress
 
 __all__ = ["Bounded", "Weights", "meet_bounds"]
 
-#: How much splats matter, as for the encoder.
+#: Importance of the splats, as for the encoder.
 Weights = NDArray[Any] | Importance
 
-_TRIES = 12
-_NEAR = 0.9  # of a bound that is good enough; below it a coarser step is tried
-_AIM = 0.97
-_FASTEST = 8.0  # times finer or coarser from one try to the next
+_TRIES = 12  # largest number of files
+_NEAR = 0.9  # fraction of a bound that is good enough; below it a coarser step is tried
+_AIM = 0.97  # fraction of a bound at which a new step aims
+_FASTEST = 8.0  # largest factor from one step to the next
 _KNOBS = {
     "means": ("position_error", "position_step", "position_bits"),
     "covariance": ("scale_step", "quat_levels", "shape_codebook_size"),
@@ -37,8 +37,9 @@ class Bounded:
     """A file whose errors keep within bounds.
 
     Attributes:
-        encoding: options of the encoder. result: their file.
-        encodes: how many files were made.
+        encoding: options of the encoder.
+        result: the file that they give.
+        encodes: number of files that were made.
     """
 
     encoding: EncodeOptions
@@ -54,18 +55,18 @@ def meet_bounds(
     importance: Weights | None = None,
     progress: Progress | None = None,
 ) -> Bounded:
-    """Find steps with which no splat errs by more than is allowed.
+    """Find steps with which no splat's error exceeds the bounds.
 
     Args:
         source: the scene.
-        encoding: everything else; steps of measures that are not bounded stay as they are.
+        encoding: the other options; steps of measures that are not bounded are kept.
         bounds: largest error by measure.
-        importance: how much splats matter, as for the encoder.
-        progress: is told the encoder's stages.
+        importance: importance of the splats, as for the encoder.
+        progress: progress callback.
 
     Returns:
-        The file. The largest errors that it states are within the bounds, and where float32 and the lattices allow it
-        near them.
+        The file. The largest errors that it declares are within the bounds, and near them if float32 and the lattices
+        allow it.
 
     Raises:
         InputError: the caller fixed a step that a bound would have to choose, or no step keeps to a bound.
@@ -86,7 +87,7 @@ def meet_bounds(
         else:
             wrong = {name: ratio for name, ratio in ratios.items() if ratio > 1.0}
             if best is not None:
-                break  # a coarser step was one too many
+                break  # the last coarser step was too coarse
             changed = _finer(options, wrong)
             if changed == options or files == _TRIES:
                 break
@@ -101,7 +102,7 @@ def meet_bounds(
 
 
 def _started(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, float]) -> EncodeOptions:
-    """The options with first guesses for the steps of what is bounded."""
+    """Return the options with first guesses for the steps of the bounded measures."""
     chosen: dict[str, Any] = {}
     for name, bound in bounds.items():
         knobs = _KNOBS[_family(name)]
@@ -133,7 +134,7 @@ def _started(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, f
 
 
 def _finer(options: EncodeOptions, ratios: Mapping[str, float]) -> EncodeOptions:
-    """Steps for errors that are that many times what is allowed; coarser ones where they are less."""
+    """Return the options with steps finer by the ratios of errors to bounds; coarser for ratios below 1."""
     chosen: dict[str, Any] = {}
     for name, ratio in ratios.items():
         factor = min(max(_AIM / max(ratio, 1e-9), 1.0 / _FASTEST), _FASTEST)
@@ -154,12 +155,12 @@ def _finer(options: EncodeOptions, ratios: Mapping[str, float]) -> EncodeOptions
 
 
 def _a_step(wanted: float) -> float:
-    """The nearest step that the encoder takes."""
+    """Return the nearest step that the encoder accepts."""
     return min(max(wanted, 1e-6), 1e3)
 
 
 def _levels(levels: int | None, factor: float) -> int:
-    """Levels for steps that are that many times as coarse."""
+    """Return the number of levels for steps that are `factor` times as coarse."""
     count = levels or 1
     scaled = math.ceil(count / factor) if factor < 1.0 else math.floor(count / factor)
     return scaled if scaled != count else count + (1 if factor < 1.0 else 0)
@@ -170,5 +171,5 @@ def _family(name: str) -> str:
 
 
 def _within(value: float, low: int, high: int) -> int:
-    """Rounded up; bounds near 0 ask for more levels than there are numbers."""
+    """Clip a value, which may be infinite for bounds near 0, to a range, and round it up."""
     return math.ceil(min(max(value, low), high))

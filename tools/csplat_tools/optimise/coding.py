@@ -1,4 +1,4 @@
-"""What to keep of SH, how to code it, whether splats are graded: tried near the goal, compared by what they cost."""
+"""Choose SH bands, their coding and quantisation classes from files near the goal, by their expected cost."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from csplat_tools.optimise.trials import Coding, Part, Trial
 
 __all__ = ["Codings"]
 
-_LARGEST_SH = 1e4  # larger values are no escapes of a codebook at every quality
-_SHARE_AT = (38.0, 1 / 64, 0.4)  # dB of a file, entries of its SH codebook per splat, and how many octaves a dB is
-_SHARE_STEP = 4.0
-_FITTED = 2.0  # times as many per splat where others were taken away: those that stay differ more
-_SHARES = (1 / 4096, 1 / 4)
-_ADAPTIVE = 1.0  # coarseness of the SH of unimportant splats, beside the preset's, where importance was measured
-_DROPPED = 5.0  # dB above the goal: what bands that are left out may cost, a third of the error
-_NONE_DROPPED = 1.0  # the same without any: a file of no SH is the quickest to try
-_FIRST_TRIES, _TRIES = 4, 2  # files that bring a coding near the goal, at most
-_CLOSER = 3  # files that bring what seems best nearer still
-_GRADED = 1.0  # dB that grades are worth, about
-_BOOKED = 0.7  # dB by which a codebook's file is better than one of values one by one, at the same precision
-_UNSURE = (0.02, 0.04)  # of the bytes: what a file says of the cost on the goal, and for every dB that it lies beside
-_OFF = 1.5  # dB: a codebook that is so much worse than values one by one is too small, one so much better too large
-_CLOSE = 0.1  # of the bytes: a codebook that costs so much more than values one by one may win in another size
+_LARGEST_SH = 1e4  # scenes with larger SH values get no codebook: at some qualities its escapes cannot code them
+_SHARE_AT = (38.0, 1 / 64, 0.4)  # PSNR of a file in dB, usual codebook entries per splat there, octaves of them per dB
+_SHARE_STEP = 4.0  # factor from one codebook size to the next that is tried
+_FITTED = 2.0  # factor of the entries per splat after pruning: the splats that are kept differ more
+_SHARES = (1 / 4096, 1 / 4)  # least and most codebook entries per splat
+_ADAPTIVE = 1.0  # `adaptive` that is tried instead of the preset's for SH coded one by one, if importance was measured
+_DROPPED = 5.0  # dB above the goal that a scene without the upper bands has to reach: they take a third of the error
+_NONE_DROPPED = 1.0  # dB above the goal below which fewer bands are not tried; without SH at all, enough for a try
+_FIRST_TRIES, _TRIES = 4, 2  # largest number of files to bring the first coding, and others, near the goal
+_CLOSER = 3  # files that may bring the best coding nearer to the goal
+_GRADED = 1.0  # dB that quantisation classes gain, about
+_BOOKED = 0.7  # dB by which a file with a codebook is better than one of values coded one by one, at the same precision
+_UNSURE = (0.02, 0.04)  # uncertainty of an expected cost, as a fraction of the bytes: on the goal, and per dB off it
+_OFF = 1.5  # dB: a codebook whose file is below the goal by more is too small, one above it by more too large
+_CLOSE = 0.1  # fraction of the bytes: a codebook whose cost exceeds the best by less may win with another size
 
 
 @dataclass(eq=False)
 class Codings:
-    """Compares codings for the splats of one scene. Owns what the scene shows without its upper bands.
+    """Codings for the splats of one scene, to be compared. Owns the PSNR of the scene without its upper bands.
 
     Attributes:
         source: the scene.
-        encoding: what the caller fixed is not chosen here.
-        gradable: something was measured by which splats may be graded.
+        encoding: the caller's options; those that are set are not chosen here.
+        gradable: measurements exist by which splats can be sorted into quantisation classes.
     """
 
     source: SplatModel
@@ -48,11 +48,11 @@ class Codings:
     _truncated: dict[int, float] = field(default_factory=dict, init=False)
 
     def usual(self, part: Part, psnr: float = _SHARE_AT[0]) -> list[Coding]:
-        """One coding of each kind that may be: values one by one, a codebook, none.
+        """Return one coding of each kind that is possible: values one by one, a codebook, or none.
 
         Args:
             part: the splats.
-            psnr: of files near the goal, about, dB.
+            psnr: approximate PSNR of files near the goal, dB.
         """
         if not self._degree or self.encoding.sh_coding == "none":
             return [Coding("none")]
@@ -62,20 +62,20 @@ class Codings:
         if self.encoding.sh_coding != "auto":
             return kinds[self.encoding.sh_coding]
         huge = float(np.abs(self.source.shN).max(initial=0.0)) > _LARGEST_SH
-        plain = huge or self.encoding.preset == "fast"  # a codebook for each precision that is tried takes too long
+        plain = huge or self.encoding.preset == "fast"  # making a codebook for each precision takes too long
         return [scalar] if plain else [scalar, *kinds["codebook"]]
 
     def best(self, solver: Solver, part: Part, start: float, *, brief: bool = False) -> list[Trial]:
-        """Try what may be best.
+        """Try the codings that may be best.
 
         Args:
             solver: brings files near the goal.
             part: the splats.
-            start: PSNR that each attribute is to keep, to begin with.
-            brief: only one coding of each kind.
+            start: PSNR of each attribute for the first file, dB.
+            brief: try only one coding of each kind.
 
         Returns:
-            One file of each coding that was tried, what costs least first.
+            One file of each coding that was tried, the least costly first.
         """
         tried = _Tried(solver, part, start)
         first, *others = self.usual(part, solver.goal.psnr or _SHARE_AT[0])
@@ -108,7 +108,7 @@ class Codings:
         return self.source.sh_degree if fixed is None else min(fixed, self.source.sh_degree)
 
     def _degrees(self, solver: Solver) -> list[int]:
-        """The fewest bands that hide what is missing from the goal, by what the scene itself shows without others."""
+        """Return the SH degrees worth a try below the full one, by the PSNR of the unquantised scene at each."""
         wanted = solver.goal.psnr
         if wanted is None:
             wanted = max((trial.decided_psnr for trial in solver.trials.made), default=0.0)
@@ -118,7 +118,7 @@ class Codings:
                 self._truncated[degree] = solver.trials.decider.psnr(without_bands(self.source, degree))
             shown = self._truncated[degree]
             if shown <= wanted + _NONE_DROPPED:
-                break  # fewer bands show less
+                break  # fewer bands have a lower PSNR
             if shown >= wanted + _DROPPED:
                 found = {degree}
             elif degree == 0:
@@ -133,7 +133,7 @@ class _Tried:
     Attributes:
         solver: brings files near the goal.
         part: the splats.
-        start: PSNR that each attribute is to keep, to begin with.
+        start: PSNR of each attribute for the first file, dB.
         found: the files.
     """
 
@@ -144,21 +144,21 @@ class _Tried:
 
     @property
     def best(self) -> Coding:
-        """What is expected to cost least; of a PSNR, among what is near enough for that to be known."""
+        """The coding with the least expected cost; for a PSNR, codings too far from the goal to tell come last."""
         unknown = {coding: self.solver.goal.size_bytes is None and self.is_off(coding) for coding in self.found}
         return min(self.found, key=lambda coding: (unknown[coding], self.solver.expected(self.found[coding])))
 
     def ordered(self) -> list[Trial]:
-        """The files, what costs least first."""
+        """Return the files, the least costly first."""
         return sorted(self.found.values(), key=self.solver.cost)
 
     def add(self, coding: Coding, *, finer: float = 0.0, sized: bool = True) -> float:
-        """What a coding is expected to cost; a first file says whether a second one is worth it.
+        """Try a coding, with a second file if the first one is promising, and return its expected cost.
 
         Args:
-            coding: what is tried, if it was not yet.
-            finer: dB by which it wants more precision than the best one so far, about.
-            sized: another size of a codebook may be tried instead of other steps.
+            coding: the coding; nothing is made if it was tried before.
+            finer: approximate precision that it needs in addition to that of the best one so far, dB.
+            sized: a codebook of another size may be tried later instead of other steps.
         """
         solver, found = self.solver, self.found
         if not found:
@@ -174,13 +174,14 @@ class _Tried:
         return solver.expected(found[coding])
 
     def resize(self, book: Coding) -> None:
-        """Codebooks of other sizes by steps, as long as it pays; where one is far off, the way that this says."""
+        """Try smaller or larger codebooks, step by step as long as it pays; only one way if one is far off the goal."""
         above, stalled = self.solver.about(self.found[book]), self.solver.is_stalled(self.found[book])
         ways = ((1 / _SHARE_STEP, above < -_OFF or stalled), (_SHARE_STEP, above > _OFF))
         for factor in [factor for factor, is_wrong in ways if not is_wrong]:
             coding, gained = book, False
             while (after := _resized(coding, factor)) is not None:
-                # Where one is too small for any precision, smaller ones are, too, though no file of theirs says so yet.
+                # If a codebook is too small for any precision, so are smaller ones, even if their files do not show
+                # it yet: go on to larger ones.
                 pays = self.add(after) < self.add(coding)
                 if not pays and not (factor > 1.0 and self.solver.is_stalled(self.found[after])):
                     break
@@ -189,13 +190,13 @@ class _Tried:
                 break
 
     def bring_closer(self) -> None:
-        """More files of what seems best, until it lies so near the goal that it may be taken for it."""
+        """Make more files of the best coding, until one is near enough to the goal for its cost to be trusted."""
         for _ in range(_CLOSER):
             best = self.best
             self.found[best] = self.solver.closer(self.found[best])
 
     def is_off(self, coding: Coding) -> bool:
-        """Whether another size of its codebook is likelier to bring it near the goal than other steps."""
+        """Return True if another codebook size is likelier to bring a coding near the goal than other steps."""
         if coding.share is None:
             return False
         above = self.solver.about(self.found[coding])
@@ -204,21 +205,21 @@ class _Tried:
         return is_far and _SHARES[0] <= share <= _SHARES[1]
 
     def _quality(self) -> float:
-        """The precision at which the best of those tried would meet the goal."""
+        """Return the PSNR of each attribute at which the best coding so far would meet the goal, dB."""
         known = min(self.found.values(), key=self.solver.cost)
         assert known.quality is not None
         return known.quality - self.solver.about(known)
 
 
 def _resized(book: Coding, factor: float) -> Coding | None:
-    """A codebook of so many times the entries, or as many as there may be; `None` where it has these."""
+    """Return the coding with `factor` times the codebook entries, within limits; `None` if that changes too little."""
     before = book.share or 0.0
     share = min(max(before * factor, _SHARES[0]), _SHARES[1])
     return replace(book, share=share) if abs(math.log2(share / before)) >= 1.0 else None
 
 
 def _share(psnr: float) -> float:
-    """Entries of a codebook per splat that are usual at a PSNR."""
+    """Return the codebook entries per splat that are usual at a PSNR."""
     usual, share, octaves = _SHARE_AT
     wanted = share * math.pow(2.0, octaves * (psnr - usual))
     return min(max(wanted, _SHARES[0] * _SHARE_STEP), _SHARES[1] / _SHARE_STEP)

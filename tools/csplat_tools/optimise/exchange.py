@@ -1,9 +1,9 @@
-"""What splats and bits are worth in pictures: the one error model that the search decides by.
+"""The rate-distortion model of the search, in the number of splats and the error of quantisation.
 
-A decibel costs the share s of a file's bytes, so that quantisation which errs by Q takes bytes in proportion to
-n · Q^-k for n splats, k = 10 / ln(10) · s. With P(n) the error of what was removed, a file that may err by D is
-smallest where n · (D - P(n))^-k is; one of a given size is best where P(n) + Q · (n / N)^(1 / k) is least, Q being what
-quantisation costs while N splats are there.
+A decibel costs the fraction s of a file's bytes, so that quantisation with the error Q takes bytes in proportion to
+n · Q^-k for n splats, k = 10 / ln(10) · s. With P(n) the error of pruning, a file whose error may be D is smallest for
+the n that minimises n · (D - P(n))^-k; a file of a given size is best for the n that minimises
+P(n) + Q · (n / N)^(1 / k), where Q is the error of quantisation with N splats.
 """
 
 from __future__ import annotations
@@ -17,40 +17,40 @@ __all__ = ["BYTES_PER_DB", "LEAST_QUANTISED", "error_at_size", "error_of_psnr", 
 
 F64 = NDArray[np.float64]
 
-#: Share of the bytes that a decibel costs, about: 0.035 without SH, 0.05 with it.
+#: Fraction of the bytes that a decibel costs, about; measured 0.035 without SH, 0.05 with it.
 BYTES_PER_DB = 0.045
 
-#: Share of a file's error that quantisation is taken to have, at least.
+#: Least fraction of a file's error that is attributed to quantisation.
 LEAST_QUANTISED = 0.1
 
 
 def error_of_psnr(psnr: float) -> float:
-    """The mean squared error of a PSNR in dB."""
+    """Return the mean squared error of a PSNR in dB."""
     return math.pow(10.0, -psnr / 10.0)
 
 
 def error_at_size(left: F64, removed: F64, quantised: float, slope: float) -> F64:
-    """The error of files of one size.
+    """Return the mean squared error of files of one size.
 
     Args:
-        left: splats, in units of those for which quantisation costs `quantised`.
-        removed: what the others' removal costs.
-        quantised: mean squared error.
-        slope: share of the bytes that a decibel costs.
+        left: number of kept splats, relative to the number at which quantisation costs `quantised`.
+        removed: mean squared error of pruning the others.
+        quantised: mean squared error of quantisation.
+        slope: fraction of the bytes that a decibel costs.
     """
     return np.asarray(removed + quantised * left ** (1.0 / price_of_bytes(slope)))
 
 
 def log_bytes_at_error(left: F64, removed: F64, allowed: float, most: float, slope: float) -> F64:
-    """The logarithm of the bytes of files that err alike, but for a constant; infinite where too much is removed.
+    """Return the log bytes of files with equal error, up to a constant; infinite if pruning takes too much of it.
 
     Args:
-        left: splats, in any unit.
-        removed: what the others' removal costs.
-        allowed: mean squared error.
-        most: share of it that removal may take: what is left for quantisation would else be a small difference of
-            numbers that are not known well.
-        slope: share of the bytes that a decibel costs.
+        left: number of kept splats, in any unit.
+        removed: mean squared error of pruning the others.
+        allowed: mean squared error of the files.
+        most: largest fraction of it that pruning may take: beyond, the rest for quantisation would be a small
+            difference of numbers that are not known well.
+        slope: fraction of the bytes that a decibel costs.
     """
     fits = removed <= most * allowed
     spare = np.where(fits, allowed - removed, 1.0)
@@ -58,9 +58,9 @@ def log_bytes_at_error(left: F64, removed: F64, allowed: float, most: float, slo
 
 
 def price_of_bytes(slope: float) -> float:
-    """The power k with which bytes grow while the error falls.
+    """Return k: bytes are proportional to the error to the power of -k.
 
     Args:
-        slope: share of the bytes that a decibel costs.
+        slope: fraction of the bytes that a decibel costs.
     """
     return slope * 10.0 / math.log(10.0)

@@ -1,4 +1,4 @@
-"""Splats of which others were taken away, fitted to what the source looks like: what a file of fewer splats holds."""
+"""The splats kept after pruning, refitted to renders of the source: the content of a file of fewer splats."""
 
 from __future__ import annotations
 
@@ -32,28 +32,28 @@ I64 = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Seen = Callable[[SplatModel], float]
 
-_GRADED = 4_000  # splats; what is left of smaller scenes is too alike
-_LEAST_LEFT = 0.2  # of the fit's error, that is left to bands and quantisation
-_MOST_BANDS = 0.7  # of what the fit leaves, that bands which are left out may take
-_BAND_TRIES, _FEWER_BANDS = 2, 4.0  # where they take more: again, with so much less of them
-_CARRIED_STEPS = 480  # of a fit that begins where another ended
-_FILE_STEPS = 480  # through the quantisers of a file
-_SENSITIVITY_VIEWS = (120, 40)  # that say how precise the splats have to be, without and with SH
+_GRADED = 4_000  # least number of splats for quantisation classes: fewer are too similar
+_LEAST_LEFT = 0.2  # fraction of the fit's error that is at least left to bands and quantisation
+_MOST_BANDS = 0.7  # fraction of the error left by the fit that leaving out bands may take at most
+_BAND_TRIES, _FEWER_BANDS = 2, 4.0  # if they take more: number of tries, each with the bound divided by this factor
+_CARRIED_STEPS = 480  # steps of a fit that starts from the result of another
+_FILE_STEPS = 480  # steps of a fit through the quantisers of a file
+_SENSITIVITY_VIEWS = (120, 40)  # number of views to measure the sensitivity of splats, without and with SH
 
 
 @dataclass(eq=False)
 class FittedSplats:
-    """So many splats of a scene, fitted.
+    """The splats of a scene that are kept after pruning, refitted.
 
     Attributes:
-        session: the scene, its views, the order in which its splats go.
-        gone: how many went.
-        allowed: PSNR that files are to have by the views that decide, dB: what the fit leaves of that error says which
-            SH bands are worth their bits; `None`: the fit's own error does.
-        seen: PSNR of some splats by the views that decide, dB.
-        grades: they may be sorted into grades, if views can say how.
-        progress: is told the stages.
-        before: another number of them that was fitted: where this fit begins.
+        session: the scene, its views, and the pruning order of its splats.
+        gone: number of pruned splats.
+        allowed: PSNR that files are to have on the validation views, dB: the error that the fit leaves below it
+            determines which SH bands are worth their bits; `None`: the fit's own error does.
+        seen: measures the PSNR of some splats on the validation views, dB.
+        grades: the splats may be sorted into quantisation classes, if there are enough.
+        progress: progress callback.
+        before: a fit with another number of splats, from which this one starts.
     """
 
     session: Session
@@ -70,32 +70,32 @@ class FittedSplats:
 
     @cached_property
     def rows(self) -> I64:
-        """[N] int64, which of the source they are."""
+        """[N] int64, the source splats that are kept."""
         return self.session.pruned(self.gone)
 
     @property
     def gradable(self) -> bool:
-        """Whether they may be sorted into grades: where views can say how, and there are many."""
+        """True if the splats may be sorted into quantisation classes: `grades` is set, and there are enough."""
         return self.grades and len(self.rows) >= _GRADED
 
     @property
     def model(self) -> SplatModel:
-        """The splats before they are quantised, fitted."""
+        """The refitted splats before quantisation."""
         return self._fitted
 
     @cached_property
     def fitted_psnr(self) -> float:
-        """Of these by the views that decide, dB."""
+        """PSNR of the refitted splats, with all bands, on the validation views, dB."""
         return self.seen(self.model)
 
     @cached_property
     def banded(self) -> tuple[SplatModel, Mask | None]:
-        """The same without the SH bands that are not worth their bits, and which bands stay; `None`: all do."""
+        """The splats without the SH bands that are not worth their bits, and a mask of kept bands; `None`: all."""
         session, model = self.session, self.model
         if not session.options.bands or not model.sh_degree:
             return model, None
         error, most = error_of_psnr(session.checked.psnr(model)), math.inf
-        if self.allowed is not None:  # views that teach and those that decide see errors of different size
+        if self.allowed is not None:  # training and validation views see errors of different size
             fitted, allowed = error_of_psnr(self.fitted_psnr), error_of_psnr(self.allowed)
             error *= max(allowed / fitted - 1.0, _LEAST_LEFT)
             most = max(fitted + _MOST_BANDS * (allowed - fitted), (1.0 + _LEAST_LEFT) * fitted)
@@ -110,16 +110,16 @@ class FittedSplats:
 
     @property
     def shown(self) -> SplatModel:
-        """What is quantised."""
+        """The splats that are quantised: refitted, without the bands that are left out."""
         return self.banded[0]
 
     @property
     def psnr(self) -> float:
-        """Of what is quantised by the views that decide, dB."""
-        return self._banded_psnr  # a cached property of this name would not be the protocol's for pyright
+        """PSNR of `shown` on the validation views, dB."""
+        return self._banded_psnr  # pyright does not take a cached property for the protocol's
 
     def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:
-        """Quantise and code them; unless quick, after they were adjusted through the quantisers."""
+        """Quantise and code the splats; unless `quick`, they are refitted through the quantisers before."""
         session, refit = self.session, self.session.options.refit
         start = self.banded[0]
         draft = Draft.of(
@@ -135,13 +135,13 @@ class FittedSplats:
             progress=self.progress,
         )  # fmt: skip
         shown = [replace(start, **vars(frozen.seen(values)), means_double=None) for values in (frozen.start(), held)]
-        if self.seen(shown[1]) < self.seen(shown[0]):  # a handful of splats may be too few for steps so long
+        if self.seen(shown[1]) < self.seen(shown[0]):  # steps of this length may be too long for a handful of splats
             held, shown = frozen.start(), shown[:1]
         self._check_psnr = session.checked.psnr(shown[-1])
         return frozen.coded(held, self.progress)
 
     def said(self, trial: Trial | None) -> Mapping[str, Any]:
-        """How many there were, what decided, and how good renders of the last file are."""
+        """Return the entry for a file's options: splats of the source, number of views, and PSNRs of the file."""
         session = self.session
         said = {"splats": len(session.source), "views": len(session.taught)}
         figures = {} if trial is None else {"decided_psnr": round(trial.decided_psnr, 3)}
@@ -161,11 +161,11 @@ class FittedSplats:
             return start
         if self.before is not None:
             start, steps = _carried(self.before.model, self.before.rows, start, self.rows), _CARRIED_STEPS
-        self.before = None  # as large as the scene, and nobody else may need it
+        self.before = None  # as large as the scene, and perhaps not used elsewhere
         return self._adjusted(start, steps)
 
     def _left_out(self, error: float) -> tuple[SplatModel, Mask]:
-        """The splats without the bands that are not worth their bits where files err by so much; those that stay."""
+        """Return the splats without the bands that are not worth their bits at a squared error, and the kept bands."""
         session, model = self.session, self.model
         stays = band_mask(self._removal, error * self._removal.value_count / max(1, len(model)))
         banded = without(model, stays)
@@ -174,7 +174,7 @@ class FittedSplats:
         return banded, stays
 
     def _adjusted(self, model: SplatModel, steps: int, free: Mask | None = None) -> SplatModel:
-        """Adjust what may be other than zero."""
+        """Refit the splats; with `free`, only these SH coefficients beyond the first."""
         session = self.session
         return adjust(
             model, session.taught, session.wanted, session.options, steps=session.options.steps(steps), free=free,
@@ -189,7 +189,7 @@ class FittedSplats:
 
     @cached_property
     def _removal(self) -> Removal:
-        """How much pictures depend on each splat, its bands and its colours."""
+        """The error of removing each splat and each of its SH bands, and the weights of their colours."""
         session = self.session
         return measure_removal(
             self.model, session.views.used, background=session.options.background, threads=session.options.threads,
@@ -198,7 +198,7 @@ class FittedSplats:
 
     @cached_property
     def _measured(self) -> Importance:
-        """How much they depend on all else, too."""
+        """The importance of the splats, with Gauss–Newton blocks of the other attributes."""
         session, count = self.session, _SENSITIVITY_VIEWS[self.model.sh_degree > 0]
         found = measure_sensitivity(
             self.model, evenly(session.views.used, count), background=session.options.background, magnitudes=False,
@@ -208,7 +208,7 @@ class FittedSplats:
 
 
 def _carried(before: SplatModel, its_rows: I64, start: SplatModel, rows: I64) -> SplatModel:
-    """Splats of the source as another fit left them, as far as they were among those; `rows` ascend."""
+    """Return splats of the source with the values of another fit for those that it had; `rows` ascend."""
     _, there, here = np.intersect1d(its_rows, rows, assume_unique=True, return_indices=True)
 
     def carried(own: NDArray[np.float32], its: NDArray[np.float32]) -> NDArray[np.float32]:

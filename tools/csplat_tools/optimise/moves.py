@@ -1,4 +1,4 @@
-"""The moves of a search, in their order: codings of the whole scene, fewer splats, the goal itself, the presets."""
+"""The steps of a search, in order: codings of the whole scene, fewer splats, files on the goal, the presets."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from csplat_tools.optimise.trials import Coding, Trial, Trials, Whole
 
 __all__ = ["Moves"]
 
-_LOSS = (5.0, 8.5)  # dB between what each attribute keeps by itself and what all keep at 30 dB, without and with SH
-_LOSS_GROWS = (0.0, 0.22)  # with every dB above
-_USUAL = (7.0, 42.0)  # bytes per splat, and the PSNR of attributes at which they are usual
-_COUNTS = 3  # numbers of splats that are fitted; twice as many, if need be, until there is a file
-_WORTH = 0.02  # of the bytes: another number of splats that is foreseen to save less is not worth a fit
-_CLOSE = 0.04  # of the splats: a number that is no farther from one that was tried is not worth a fit either
-_SPARE = 0.7  # dB above the goal: splats whose fit is worse leave too little of the error to quantisation
-_FEWER = 0.7  # of the splats, where a size holds none of their files
-_ALL_BUT = 0.02  # of the splats; fewer are not worth a fit
-_LEAST_LEFT = 0.15  # share of the error that is allowed that is left to quantisation
-_WITHIN_REACH = 0.1  # of the bytes: so much another coding may save
-_PAYS = 0.01  # of the bytes: what is expected to take so much more may take less
-_PAYS_DEARLY = 0.03  # of the bytes: what other splats have to promise, whose files are adjusted before they are judged
-_COMMON = 0.1  # of the bytes: by so much all files may be dearer that are adjusted, if one was; more was its own fault
-_FAR = 0.03  # of the bytes
-_BANDS_GROW = (34.0, 0.055)  # dB from where splats with SH are cheaper to keep, and by which share with every dB above
-_PRESETS = (-1.0, 2.5)  # dB above the goal: presets whose own files are expected there are asked
+_LOSS = (5.0, 8.5)  # dB from the PSNR of all attributes to that of each alone, at 30 dB, without and with SH
+_LOSS_GROWS = (0.0, 0.22)  # dB that this grows with every dB above 30, without and with SH
+_USUAL = (7.0, 42.0)  # usual bytes per splat, and the PSNR of each attribute in such files
+_COUNTS = 3  # numbers of splats for which a fit is made; up to twice as many until there is a file
+_WORTH = 0.02  # fraction of the bytes: a number of splats that is predicted to save less is not worth a fit
+_CLOSE = 0.04  # fraction of the splats: a number that differs less from one that was tried is not worth a fit
+_SPARE = 0.7  # dB above the goal: a fit whose PSNR is lower leaves too little of the error to quantisation
+_FEWER = 0.7  # factor from one number of splats to a smaller one if none of its files fits the size
+_ALL_BUT = 0.02  # fraction of the splats: pruning fewer is not worth a fit
+_LEAST_LEFT = 0.15  # fraction of the allowed error that is at least left to quantisation
+_WITHIN_REACH = 0.1  # fraction of the bytes that another coding may save
+_PAYS = 0.01  # fraction of the bytes: a file that is expected to take this much more may turn out smaller
+_PAYS_DEARLY = 0.03  # fraction of the bytes that pruned splats have to promise: their files take a fit each
+_COMMON = 0.1  # fraction of the bytes: largest excess of one refitted file that is expected of the others, too
+_FAR = 0.03  # fraction of the bytes: presets are not tried if files of all splats cost this much more than the best
+_BANDS_GROW = (34.0, 0.055)  # dB above which splats with SH are cheaper to keep, and by which fraction per dB
+_PRESETS = (-1.0, 2.5)  # dB above the goal: presets whose own files are expected in this range are tried
 
 
 @dataclass(eq=False)
 class Moves:
-    """Looks for the coding, the splats and the precision.
+    """The search for the coding, the splats and the precision.
 
     Attributes:
         solver: brings files near the goal, and onto it.
-        codings: what may be done to SH.
+        codings: the possible codings of SH.
         whole: all splats.
-        removal: takes some away; `None`: all have to stay.
+        removal: prunes splats; `None`: all are kept.
     """
 
     solver: Solver
@@ -54,15 +54,15 @@ class Moves:
 
     @staticmethod
     def kept(trials: Trials, removal: Removal, left: int) -> Trial:
-        """The file of so many splats, at the precision that the options say."""
+        """Return the file of `left` splats at the precision of the options."""
         part = removal.fitted(left, None, trials.decider.psnr)
         return trials.make(part, Coding(None), None, quick=False)
 
     def best(self) -> Trial:
-        """The file on the goal that is smallest, or best.
+        """Return the smallest file that meets a PSNR or a loss, or the best one of a size.
 
         Raises:
-            InputError: there is none.
+            InputError: no file meets the goal.
         """
         tried = self.codings.best(self.solver, self.whole, self._start(), brief=self.removal is not None)
         if self.removal is not None:
@@ -82,12 +82,12 @@ class Moves:
         return best
 
     def _on_goal(self, tried: Sequence[Trial]) -> list[Trial]:
-        """Files on the goal, of what is expected to be best there; of more splats where all tried are too few."""
+        """Return files that meet the goal, made from the most promising; with more splats if all tried were too few."""
         found, failed, dearer = list[Trial](), list[Trial](), 0.0
         for trial in sorted(tried, key=self.solver.cost):
             others = [one for one in tried if one.part.refits and one.splats > trial.splats]
             if any(one.part is trial.part for one in failed) and others:
-                continue  # what more splats make of it first
+                continue  # files of more splats come first
             if self._pays(trial, found, dearer):
                 expected, on = self.solver.cost(trial), self.solver.on(trial.part, trial.coding)
                 if on is not None and trial.part.refits:
@@ -99,11 +99,11 @@ class Moves:
         return found
 
     def _may_be_written(self, trial: Trial) -> bool:
-        """Whether it is no draft; where views that judge set the level, of what they looked at."""
+        """Return True if a file is no draft and, if the goal is measured on the test views, has been scored on them."""
         return trial.is_packed and (trial.is_judged or not self.solver.goal.is_judged)
 
     def _start(self) -> float:
-        """The PSNR of attributes to begin with."""
+        """Return the PSNR of each attribute for the first file, dB."""
         goal, has_sh = self.solver.goal, self.codings.usual(self.whole) != [Coding("none")]
         if goal.size_bytes is None:
             psnr = goal.psnr or 0.0
@@ -112,7 +112,7 @@ class Moves:
         return bounded(_USUAL[1] + math.log(per_splat / _USUAL[0]) / BYTES_PER_DB)
 
     def _removed(self, removal: Removal, whole: Trial) -> list[Trial]:
-        """Files near the goal of some numbers of splats, each of which says which to try next."""
+        """Return files near the goal for several numbers of splats, each predicted from the files before."""
         solver, goal, splats = self.solver, self.solver.goal, len(self.whole.model)
         slope, found, seen = self._slope_of_counts(whole), list[Trial](), solver.trials.decider.psnr
         allowed = None if goal.psnr is None else solver.level(self.whole)
@@ -124,7 +124,7 @@ class Moves:
             if left > (1.0 - _ALL_BUT) * splats:
                 if found or removal.options.is_brief:
                     break
-                left = splats  # through the quantisers of their files they are adjusted all the same
+                left = splats  # all splats: they are still refitted through the quantisers of their files
             part = removal.fitted(left, allowed, seen)
             if allowed is not None and part.fitted_psnr < allowed + _SPARE:
                 if found:
@@ -145,12 +145,12 @@ class Moves:
                 if goal.size_bytes is None:
                     left = _more(left)
                 elif len(part.rows) > left or left == 1:
-                    break  # nobody saw the others
+                    break  # no more splats can be pruned: no view saw the others
                 else:
                     left = int(left * _FEWER)
                 continue
             if goal.psnr is not None:
-                # What bands that are left out cost is no matter of how many splats there are.
+                # The error of bands that are left out does not depend on the number of splats.
                 allowed = solver.level(part)
                 wanted = _without(allowed, error_of_psnr(part.psnr) - error_of_psnr(part.fitted_psnr))
                 left, saved = removal.next_at_psnr(len(part.rows), part.fitted_psnr, wanted, slope)
@@ -162,16 +162,17 @@ class Moves:
         return found
 
     def _slope_of_counts(self, whole: Trial) -> float:
-        """What a decibel costs where it decides how many splats stay.
+        """Return the fraction of the bytes that a decibel costs, for the choice of the number of splats.
 
-        The more of SH a file needs, the less the next splat takes beside those that matter more: it has fewer bands.
+        The more SH a file needs, the fewer bytes the next splat takes compared with more important ones: it has fewer
+        bands.
         """
         above = (self.solver.goal.psnr or whole.decided_psnr) - _BANDS_GROW[0]
         has_sh = whole.coding.sh != "none"
         return self.solver.slope(whole) * (1.0 + _BANDS_GROW[1] * max(above, 0.0) * has_sh)
 
     def _of_more(self, trial: Trial) -> Trial | None:
-        """A file on the goal of more splats, where those of a trial turned out to be too few for any precision."""
+        """Return a file that meets the goal with more splats than a trial that cannot; `None` if there is none."""
         left = _more(trial.splats)
         all_stay = trial.part is self.whole or left > (1.0 - _ALL_BUT) * len(self.whole.model)
         if self.removal is None or self.solver.goal.psnr is None or all_stay:
@@ -181,7 +182,7 @@ class Moves:
         return self.solver.on(best.part, best.coding)
 
     def _first_left(self, removal: Removal, whole: Trial, slope: float) -> int:
-        """How many splats to begin with."""
+        """Return the number of splats to begin with."""
         goal, seen = self.solver.goal, self.solver.trials.decider.psnr
         if goal.psnr is not None:
             return removal.first_at_psnr(goal.psnr, slope, seen)
@@ -189,24 +190,30 @@ class Moves:
         return removal.first_at_size(goal.size_bytes or 0, near, slope, seen)
 
     def _pays(self, trial: Trial, found: list[Trial], dearer: float) -> bool:
-        """Whether a file near the goal may be better on it than those there, of which one was so much dearer."""
+        """Return True if a file near the goal is worth bringing onto it.
+
+        Args:
+            trial: the file.
+            found: files that meet the goal already.
+            dearer: logarithm by which a refitted file among them exceeded its expected cost.
+        """
         best = self.solver.goal.best(found)
         if best is None:
             return True
         again = any(one.part is trial.part for one in found)
-        # What lies on a PSNR costs its bytes, whatever may be foreseen of fewer.
+        # A file that meets a PSNR costs its bytes, even if fewer were predicted.
         known = math.log(best.size_bytes) if self.solver.goal.size_bytes is None else self.solver.cost(best)
         saved = known - self.solver.cost(trial) - dearer * trial.part.refits
         return saved > (_PAYS_DEARLY if trial.part.refits else _PAYS if again else -_PAYS)
 
     def _presets(self, tried: Sequence[Trial]) -> None:
-        """Make the presets' own files where they are expected near the goal: no search is to be worse than they are."""
+        """Make the presets' own files if they are expected near the goal: a search must not be worse than a preset."""
         goal, plain = self.solver.goal, [trial for trial in tried if trial.part is self.whole]
         if not goal.is_judged:
             return
         near = min(plain, key=lambda trial: (trial.coding.graded, self.solver.cost(trial)))
         if self.solver.cost(near) > min(map(self.solver.cost, tried)) + _FAR:
-            return  # presets have all splats in one grade, too
+            return  # presets keep all splats in one class, too
         lost = (near.quality or 0.0) - self.solver.about(near)
         for name, preset in PRESETS.items():
             expected = preset.quality[near.coding.sh == "none"] - lost
@@ -231,22 +238,22 @@ class Moves:
 
 
 def _is_asked(name: str, preset: str) -> bool:
-    """Whether a preset's file may be one of a search that was asked for with a preset: `fast` is for who wants that."""
+    """Return True if a search with a preset may use another preset's file: `fast` only if it is the one requested."""
     return name == preset if "fast" in (name, preset) else True
 
 
 def _more(splats: int) -> int:
-    """A number of splats to try where so many are too few."""
+    """Return the next larger number of splats to try."""
     return math.ceil(splats / _FEWER)
 
 
 def _without(psnr: float, error: float) -> float:
-    """The PSNR that is left to ask for where part of the error that it allows is taken."""
+    """Return the PSNR of the error that remains of a PSNR's allowance after another error is subtracted."""
     allowed = error_of_psnr(psnr)
     return psnr_of_mse(max(allowed - max(error, 0.0), _LEAST_LEFT * allowed))
 
 
 def _finer(quality: float, psnr: float, fitted_psnr: float) -> float:
-    """The PSNR of attributes where what was removed has taken its share of the error already."""
+    """Return the PSNR of each attribute, raised because pruning has taken its part of the error already."""
     left = max(_LEAST_LEFT, 1.0 - error_of_psnr(fitted_psnr) / error_of_psnr(psnr))
     return bounded(quality + psnr_of_mse(left))

@@ -1,9 +1,9 @@
-"""`optimise`: the smallest file at a PSNR or a loss, the best one within a size, by every move that files have.
+"""`optimise`: the smallest file at a PSNR or a loss, or the best one within a size.
 
-Moves are the precision, from which all steps follow; what is kept of SH and how it is coded; grades; how many splats
-stay, the others being fitted to what the source looks like. Every kind of file is brought near the goal by a few tries
-and compared by what it would cost on it; what is best there is brought onto it, and the presets' own files are asked
-whether they are better. Nothing is tried that is not expected to pay.
+The search chooses the precision, from which all steps follow; the SH bands and their coding; quantisation classes; and
+the number of splats, which are refitted to renders of the source after pruning. Every kind of file is brought near the
+goal by a few tries, and compared by its expected cost there; the best are brought onto the goal, and compared with the
+presets' own files. Nothing is tried that is not expected to pay.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from csplat_tools.views.timing import picture_seconds
 
 __all__ = ["check", "expected_pictures", "expected_seconds", "optimise"]
 
-#: What a target costs, in pictures of 640x480, without removal (380 to 690 of plane3, donut, lego60k and fox120k) and
-#: with it: whatever the effort, and by how much work that is (plane3 at 40 dB at 1, 3 and 7: as 0.6 to 1 to 4).
+#: Cost of a target in renders of 640x480: without pruning (measured 380 to 690 with plane3, donut, lego60k, fox120k),
+#: and with it, a fixed part and one that grows with the effort (plane3 at 40 dB, effort 1, 3 and 7: as 0.6 to 1 to 4).
 _PICTURES = 520.0
 _PICTURES_OF_FEWER = (600.0, 2400.0)
 _INSIDE = (
@@ -57,16 +57,16 @@ def optimise(
     simplifying: SimplifyOptions | None,
     progress: Progress | None,
 ) -> tuple[Trial, Report]:
-    """Look for the file by its pictures. The report does not know the seconds yet.
+    """Search for the file that meets a target, by rendering candidates. The report has no seconds yet.
 
     Args:
         source: the scene.
-        target: what is asked for, and not largest errors alone.
-        views: teach, decide and judge; no view does two of these.
+        target: the target, which must not be largest errors alone.
+        views: training, validation and test views; they do not overlap.
         encoding, keep_all, importance, simplifying, progress: as for `encode_to`.
 
     Raises:
-        InputError: it is out of reach, no splat shows, or a loss is asked for without photographs.
+        InputError: the target is out of reach, no splat shows, or a loss is requested without photographs.
     """
     views = with_deciders(views)
     judge = views.judge(source, threads=encoding.threads)
@@ -117,9 +117,9 @@ def expected_seconds(
     keep_all: bool,
     simplifying: SimplifyOptions | None = None,
 ) -> float:
-    """About how long a target takes here, for a person who may choose otherwise.
+    """Estimate the seconds that a target takes on this machine.
 
-    By how long the views that judge take now: what is done costs so many pictures of them, whatever the machine.
+    Renders some test views to measure their time: the search costs about a fixed number of such renders on any machine.
     """
     pictures = expected_pictures(encoding, target, keep_all=keep_all, simplifying=simplifying)
     return pictures * picture_seconds(source, views.judges, threads=encoding.threads)
@@ -128,23 +128,23 @@ def expected_seconds(
 def expected_pictures(
     encoding: EncodeOptions, target: Target, *, keep_all: bool, simplifying: SimplifyOptions | None = None
 ) -> float:
-    """Return as how many pictures of the judging views a target costs, about."""
+    """Return the approximate cost of a target as a number of renders of the test views."""
     if _all_stay(target, encoding, keep_all=keep_all):
         return _PICTURES
     return _PICTURES_OF_FEWER[0] + _PICTURES_OF_FEWER[1] * (simplifying or SimplifyOptions()).work
 
 
 def _all_stay(target: Target, encoding: EncodeOptions, *, keep_all: bool) -> bool:
-    """Whether no splat is left out: where that is asked, where errors are bounded, and where speed comes first."""
+    """Return True if no splat may be pruned: by `keep_all`, bounded errors, extra columns, or the preset `fast`."""
     blocked = keep_all or bool(target.max_error) or encoding.preset == "fast" or encoding.keep_extra
     return target.keep is None and blocked
 
 
 def check(source: SplatModel, target: Target, encoding: EncodeOptions, *, keep_all: bool) -> None:
-    """Refuse what no search can meet.
+    """Refuse targets that no search can meet.
 
     Raises:
-        InputError: there are no splats, or two things that exclude each other are asked for.
+        InputError: there are no splats, or the target contradicts an option.
     """
     if not len(source):
         raise InputError("a scene without splats has no size or quality to choose")
@@ -155,13 +155,13 @@ def check(source: SplatModel, target: Target, encoding: EncodeOptions, *, keep_a
 
 
 def _is_empty(judge: Judge) -> bool:
-    """Whether all pictures that judge are of one colour each."""
+    """Return True if every test image has a single colour."""
     pictures = (judge.look(number).picture for number in range(len(judge.cameras)))
     return all(np.ptp(picture, axis=(0, 1)).max() == 0.0 for picture in pictures)
 
 
 def _seen_elsewhere(source: SplatModel, found: Trial, views: ViewSet, threads: int | None) -> dict[str, float]:
-    """PSNR from views that had no part in the search, by kind."""
+    """Return the PSNR from views that had no part in the search, by kind."""
     model, judged = decode(found.result.data), elsewhere(source).items()
     return {
         kind: round(Judge.of_source(source, cameras, views.background, threads=threads).psnr(model), 3)
@@ -170,6 +170,6 @@ def _seen_elsewhere(source: SplatModel, found: Trial, views: ViewSet, threads: i
 
 
 def _photographed(source: SplatModel, found: Trial, views: ViewSet, threads: int | None) -> dict[str, float]:
-    """PSNR of file and source by the photographs that judge."""
+    """Return the PSNR of file and source against the test photographs, dB."""
     judge = views.photograph_judge(threads=threads)
     return {"file": judge.psnr(decode(found.result.data)), "source": judge.psnr(source)}

@@ -1,4 +1,4 @@
-"""`encode_to`: a target in the words of programs, and who meets it. What renders is imported where it is wanted."""
+"""`encode_to`: encode to a target (size, PSNR, loss, ...). The renderer is imported only if it is needed."""
 
 from __future__ import annotations
 
@@ -38,29 +38,30 @@ def encode_to(
     simplifying: SimplifyOptions | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Optimised:
-    """Encode a scene so that its file keeps to a target: what `csplat encode` calls where one is given.
+    """Encode a scene to a target, as `csplat encode` does if one is given.
 
-    One of `psnr`, `size`, `loss` and `keep` is wanted, or `errors`, alone or beside one of the first two. All but
-    `errors` alone render pictures, which takes minutes, and want the packages of the render extra.
+    Give one of `psnr`, `size`, `loss` and `keep`, or `errors`, alone or together with one of the first two. All but
+    `errors` alone require rendering, which takes minutes, and the packages of the render extra.
 
     Args:
-        scene: a model, or a file of either kind.
-        psnr: dB of the file's renders against the source's, at least, pooled over the views that judge; the smallest
-            such file is looked for.
-        size: bytes at most, or text as "5MB"; the best picture within them is looked for.
-        loss: dB that the PSNR against the photographs of `views` may be below the source's; the smallest such file.
-        keep: share of the splats that stay, above 0, at most 1, at the precision of the preset.
+        scene: a model, or a file in any format.
+        psnr: least PSNR of the file's renders against the source's, dB, pooled over the test views; the smallest such
+            file is searched.
+        size: largest size in bytes, or as text such as "5MB"; the file with the best PSNR within it is searched.
+        loss: dB that the PSNR against the photographs of `views` may be below the source's; the smallest such file is
+            searched.
+        keep: fraction of the splats to keep, above 0, at most 1, at the precision of the preset.
         errors: the largest error of any splat, by measure: `means` in scene units, `covariance` relative,
             `opacities`, `sh0`, `sh1`, `sh2`, `sh3`.
-        views: teach, decide and judge; `None`: virtual ones around the scene (`find_view_set`).
-        options: knobs that are set here are not chosen. The preset "fast" tries no codebooks and keeps all splats.
-        keep_all: every splat stays as it is: a sixth of the time.
-        importance: how much splats matter, as for the encoder.
-        simplifying: how splats are removed and fitted; its background is that of the views.
-        progress: is told the stage and the share of it that is done, 0 to 1; `print` will do.
+        views: training, validation and test views; `None`: virtual ones around the scene (`find_view_set`).
+        options: options that are set here are not chosen. The preset "fast" tries no codebooks and keeps all splats.
+        keep_all: keep every splat as it is, which takes a sixth of the time.
+        importance: importance of the splats, as for the encoder.
+        simplifying: options of pruning and fitting; the background is that of the views.
+        progress: called with the stage and the fraction of it that is done, 0 to 1; `print` will do.
 
     Returns:
-        The file's bytes (`data`), what the encoder says of it (`result`), and how it was found (`report`).
+        The file's bytes (`data`), the encoder's result (`result`), and the report of the search (`report`).
 
     Examples:
         >>> import csplat, csplat_tools
@@ -73,9 +74,9 @@ def encode_to(
         SplatModel(1000 splats, sh_degree=3)
 
     Raises:
-        InputError: there are no splats, a knob is set that the target has to choose, or it is out of reach.
-        CsplatError: the file is none.
-        OSError: it cannot be read.
+        InputError: there are no splats, an option is set that the target has to choose, or the target is out of reach.
+        CsplatError: the scene is not valid.
+        OSError: the file cannot be read.
     """
     start = time.perf_counter()
     target = Target(psnr, parse_size_bytes(size) if isinstance(size, str) else size, loss, keep, dict(errors or {}))
@@ -100,7 +101,7 @@ def encode_to(
 
 
 def _bounded(source: SplatModel, target: Target, bounded: Bounded, start: float) -> Optimised:
-    """The file that keeps to largest errors and to nothing else; nothing is rendered."""
+    """Return the file for a target of largest errors alone, for which nothing was rendered."""
     result = bounded.result
     report = Report(
         goal=target.as_json(),

@@ -1,4 +1,4 @@
-"""How many splats may go: exact errors of their removal, what a fit of the others mends, and what bits are worth."""
+"""Choose how many splats to prune, from exact pruning errors, the gain of a refit, and the rate-distortion model."""
 
 from __future__ import annotations
 
@@ -30,32 +30,32 @@ F64 = NDArray[np.float64]
 Cost = Callable[[F64, F64], F64]
 Seen = Callable[[SplatModel], float]
 
-_USUAL_BYTES = (8.0, 11.0)  # of a splat in files that are worth looking at, without and with SH
-_FRAME_BYTES = 1_000  # of a file without splats: header, index, options, stated errors
-_MOST_REMOVED = 0.7  # of the error that a PSNR allows
-_LEAST_REMOVED = 0.01  # of the error, that what was removed is taken to have
-_MENDED, _MENDS_MORE = 8.0, 1.0  # dB that a fit makes removal err by less, about, and with twice the work
-_FAR = 2.0  # times the error that a PSNR allows: what is removed together mostly errs by several times the sum
-_FARTHER = 4.0  # times the error of an order, where that was too little
-_CALIBRATIONS = 3
-_AGREED = 0.05  # of the splats
-_GROWS = 0.85  # power of the error of removal with which that of what is left grows, once it is fitted, about
-_GROW = (0.5, 1.1)  # between which two fits may say what it is
-_NOTHING = 1e-12
+_USUAL_BYTES = (8.0, 11.0)  # bytes per splat of files of useful quality, without and with SH
+_FRAME_BYTES = 1_000  # bytes of a file without splats: header, index, options, declared errors
+_MOST_REMOVED = 0.7  # largest fraction of the error allowed by a PSNR that pruning may take
+_LEAST_REMOVED = 0.01  # least fraction of the error that is attributed to pruning
+_MENDED, _MENDS_MORE = 8.0, 1.0  # dB by which a refit reduces the pruning error, about, and more with twice the work
+_FAR = 2.0  # multiple of the error allowed by a PSNR at which an order ends: splats together err by more than the sum
+_FARTHER = 4.0  # multiple of its error to which an order that was too short is continued
+_CALIBRATIONS = 3  # largest number of times that a first number of splats is corrected by validation views
+_AGREED = 0.05  # fraction of the splats: a correction below this ends them
+_GROWS = 0.85  # power of the pruning error with which the error after a refit grows, about
+_GROW = (0.5, 1.1)  # range of that power if it is taken from two fits
+_NOTHING = 1e-12  # least mean squared error, to divide by
 
 
 @dataclass(eq=False)
 class Removal:
-    """Takes splats out of a scene and fits the others. Owns views, source's pictures and order, made when asked for.
+    """Prunes a scene and refits the kept splats. Owns views, renders of the source and pruning order, made when needed.
 
     Attributes:
         source: the scene.
-        views: those that teach and those that decide.
-        options: how splats are removed and fitted.
-        grades: what is left may be sorted into grades.
-        progress: is told the stages.
-        psnr: that is looked for, dB: far below it no order is needed; `None`: some other target is.
-        left: splats that are to stay, if that is asked: the order is made for so many.
+        views: the training and validation views.
+        options: options of pruning and fitting.
+        grades: kept splats may be sorted into quantisation classes.
+        progress: progress callback.
+        psnr: target PSNR, dB: the order ends far below it; `None`: another kind of target.
+        left: number of splats to keep, if the target specifies it: the order is made for that number.
     """
 
     source: SplatModel
@@ -71,7 +71,7 @@ class Removal:
 
     @property
     def session(self) -> Session:
-        """What all numbers of splats share."""
+        """The views, renders and pruning order that are shared by all numbers of splats."""
         if self._session is None:
             allowed = math.inf if self.psnr is None else _FAR * error_of_psnr(self.psnr)
             self._session = prepare(self.source, self.views, self.left, self.options, self.progress, allowed=allowed)
@@ -79,14 +79,19 @@ class Removal:
 
     @property
     def view_count(self) -> int:
-        """Small views in which removal was measured, pass by pass; 0 where it was not."""
+        """Number of small renders in which pruning errors were measured, over all passes; 0 if they were not."""
         if self._session is None:
             return 0
         views, later = self._session.views, max(0, len(self._session.order.rounds) - 1)
         return len(self._session.taught) + len(views.used) * later + len(views.check)
 
     def fitted(self, left: int, allowed: float | None, seen: Seen) -> FittedSplats:
-        """So many splats, or those that no view saw if they are more; see `FittedSplats`."""
+        """Return `left` splats, refitted; more if no view saw so many that cannot be pruned. See `FittedSplats`.
+
+        Args:
+            left: number of splats to keep.
+            allowed, seen: as for `FittedSplats`.
+        """
         gone = len(self.source) - left
         if gone > len(self.session.order.rows):
             self._extend(left, math.inf)
@@ -95,24 +100,24 @@ class Removal:
         return self._fitted
 
     def first_at_psnr(self, psnr: float, slope: float, seen: Seen) -> int:
-        """How many splats to begin with for the smallest file of a PSNR.
+        """Return the number of splats to begin with for the smallest file of a PSNR.
 
-        Views that decide show more or less of what is removed than those that taught: measured, and allowed for.
+        Validation views show more or less of the pruning error than training views; this is measured and corrected.
 
         Args:
-            psnr: dB.
-            slope: share of the bytes that a decibel costs.
-            seen: PSNR of some of the source's splats by the views that decide, dB.
+            psnr: target PSNR, dB.
+            slope: fraction of the bytes that a decibel costs.
+            seen: measures the PSNR of some of the source's splats on the validation views, dB.
         """
         return self._calibrated(_at_psnr(psnr, slope), seen)
 
     def first_at_size(self, size_bytes: int, near: tuple[int, float] | None, slope: float, seen: Seen) -> int:
-        """How many to begin with for the best file of a size.
+        """Return the number of splats to begin with for the best file of a size.
 
         Args:
-            size_bytes: of the file.
-            near: splats and PSNR of a file of about that size; `None`: there is none.
-            slope, seen: as above.
+            size_bytes: size of the file.
+            near: number of splats and PSNR in dB of a file of about that size; `None`: there is none.
+            slope, seen: as for `first_at_psnr`.
         """
         if near is None:
             usual = (size_bytes - _FRAME_BYTES) / _USUAL_BYTES[self.source.sh_degree > 0]
@@ -120,24 +125,25 @@ class Removal:
         return self._calibrated(_at_size(near[0], error_of_psnr(near[1]), slope), seen)
 
     def next_at_psnr(self, left: int, fitted_psnr: float, psnr: float, slope: float) -> tuple[int, float]:
-        """How many splats are likely to make the smallest file of a PSNR, and the share of the bytes that this saves.
+        """Predict the number of splats for the smallest file of a PSNR, and the saving as a logarithm of bytes.
 
         Args:
-            left: so many were fitted,
-            fitted_psnr: and have this PSNR before they are quantised, dB.
-            psnr, slope: as above.
+            left: number of splats of the last fit.
+            fitted_psnr: their PSNR before quantisation, dB.
+            psnr, slope: as for `first_at_psnr`.
         """
         removed = max(error_of_psnr(fitted_psnr), _LEAST_REMOVED * error_of_psnr(psnr))
         before, self._before = self._before, (left, removed)
         return self._next(_at_psnr(psnr, slope), (left, removed), self._growing(before, (left, removed)))
 
     def next_at_size(self, left: int, fitted_psnr: float, psnr: float, slope: float) -> tuple[int, float]:
-        """How many are likely to make the best file of a size, and the share of the bytes that the gain is worth.
+        """Predict the number of splats for the best file of a size, and the gain as a logarithm of bytes.
 
         Args:
-            left: of so many splats there is a file of that size.
-            fitted_psnr: theirs before they were quantised. psnr: of the file, dB.
-            slope: as above.
+            left: number of splats of a file of that size.
+            fitted_psnr: their PSNR before quantisation, dB.
+            psnr: PSNR of the file, dB.
+            slope: as for `first_at_psnr`.
         """
         error = error_of_psnr(psnr)
         removed = max(min(error_of_psnr(fitted_psnr), error), _LEAST_REMOVED * error)
@@ -145,7 +151,7 @@ class Removal:
         return self._next(_at_size(left, quantised, slope), (left, removed), _GROWS)
 
     def _next(self, cost: Cost, known: tuple[int, float], power: float) -> tuple[int, float]:
-        """Splats left where a cost is least, and by how much it is less than what is known."""
+        """Return the number of kept splats with the least cost, and by how much it is below the known one."""
         left, least = self._least(cost, known, power)
         return left, float(cost(*map(np.atleast_1d, known))[0]) - least
 
@@ -163,19 +169,23 @@ class Removal:
         return left
 
     def _growing(self, before: tuple[int, float] | None, known: tuple[int, float]) -> float:
-        """The power with which errors grow once splats are fitted, by two numbers of them and their errors."""
+        """Return the power with which the error after a refit grows with the pruning error, from two fits.
+
+        Args:
+            before, known: number of splats and mean squared error of two fits; `None`: there was only one.
+        """
         if before is None or before[0] == known[0]:
             return _GROWS
         removed = math.log(self._error(known[0]) / self._error(before[0]))
         return min(max(math.log(known[1] / before[1]) / removed, _GROW[0]), _GROW[1]) if removed else _GROWS
 
     def _least(self, cost: Cost, known: tuple[int, float] | None, power: float = _GROWS) -> tuple[int, float]:
-        """Splats left where a cost of their number and of the error of the others is least, and that cost.
+        """Return the number of kept splats with the least cost, and that cost.
 
         Args:
-            cost: of both.
-            known: so many splats have this error once they are fitted; `None`: what a fit usually mends.
-            power: with which that grows where more is removed.
+            cost: takes the numbers of kept splats and their errors after a refit.
+            known: number of splats and mean squared error of a fit; `None`: the usual gain of a refit is assumed.
+            power: power of the pruning error with which the error after a refit grows.
         """
         while True:
             errors = self._errors()
@@ -193,13 +203,13 @@ class Removal:
         return _MENDED + _MENDS_MORE * math.log2(self.options.work)
 
     def _goes_on(self) -> bool:
-        """Let the order go on until removal errs by several times as much; false where it goes no further."""
+        """Continue the pruning order until its error is several times as large; return False if it cannot be."""
         before = self.session.order
         self._extend(None, _FARTHER * float(before.errors.sum()))
         return len(self.session.order.rows) > len(before.rows)
 
     def _extend(self, left: int | None, enough: float) -> None:
-        """Let the order go on, see `removal_order`."""
+        """Continue the pruning order, see `removal_order`."""
         session = self.session
         order = removal_order(
             self.source, session.sides, session.options, left, self.progress, enough=enough, start=session.order
@@ -207,14 +217,14 @@ class Removal:
         self._session = replace(session, order=order)
 
     def _error(self, left: int) -> float:
-        """Mean squared error of the removal of all but so many, as predicted."""
+        """Return the predicted mean squared error of pruning all but `left` splats."""
         errors = self._errors()
         return max(float(errors[min(len(self.source) - left, len(errors) - 1)]), _NOTHING)
 
     def _errors(self) -> F64:
         session = self.session
         sums = np.concatenate([[0.0], np.cumsum(session.order.errors)]) / session.value_count
-        return sums[: len(self.source)]  # one stays
+        return sums[: len(self.source)]  # at least one splat is kept
 
 
 def _at_psnr(psnr: float, slope: float) -> Cost:
@@ -222,6 +232,6 @@ def _at_psnr(psnr: float, slope: float) -> Cost:
 
 
 def _at_size(splats: int, quantised: float, slope: float) -> Cost:
-    # In bytes, as at a PSNR.
+    # As a logarithm of bytes, as for a PSNR.
     power = price_of_bytes(slope)
     return lambda left, removed: power * np.log(error_at_size(left / splats, removed, quantised, slope))

@@ -1,4 +1,4 @@
-"""What a search says of the file that it found."""
+"""The report of a search on the file that it found."""
 
 from __future__ import annotations
 
@@ -11,27 +11,32 @@ from csplat_tools.files.console import format_bytes
 
 __all__ = ["Optimised", "Report"]
 
-_LESS = 1.0  # dB below the PSNR, that are worth a word
+_LESS = 1.0  # dB: a PSNR from elsewhere that is lower by more is pointed out
 
 
 @dataclass(frozen=True)
 class Report:
-    """A search.
+    """The report of a search.
 
     Attributes:
-        goal: what was asked, by name.
-        size_bytes, splats: of the file. splats_before: of the scene.
-        encodes: how many files were made. seconds: for everything.
-        reached: largest errors of the file, by measure, where they are bounded.
-        psnr: of the file against the source, dB; `None` where nothing was rendered, as all that follows.
-        photographs: PSNR of `file` and `source` by the photographs that judge, where there are some.
-        worst_psnr: of the worst view. spread: what other such views would make of the PSNR, one standard deviation, dB.
+        goal: the target, by name.
+        size_bytes, splats: size of the file and its number of splats.
+        splats_before: number of splats of the scene.
+        encodes: number of files that were made.
+        seconds: time of the whole search.
+        reached: largest errors of the file by measure, for those that are bounded.
+        psnr: PSNR of the file against the source, dB; `None` if nothing was rendered, as for all that follows.
+        photographs: PSNR of `file` and `source` against the test photographs, if there are any.
+        worst_psnr: PSNR of the worst view, dB.
+        spread: standard deviation of the PSNR over other choices of such views, dB.
         elsewhere: PSNR from virtual views that had no part in the search, dB: `beside` those of `psnr`, and the same
             `nearer` and `farther`.
-        views: that judged. views_of: where they come from. renders: pictures that were judged.
-        removal_views, sensitivity_views: small views in which removal and the precision wanted were measured.
-        chosen, tried: files, see `Trial.as_json`.
-        why, sure: sentences.
+        views: number of test views.
+        views_of: source of the views: `virtual`, or a name.
+        renders: number of renders that were scored.
+        removal_views, sensitivity_views: number of small renders to measure pruning errors, and sensitivities.
+        chosen, tried: the chosen file and all files, see `Trial.as_json`.
+        why, sure: explanations of the choice, and of the reliability of the PSNR.
     """
 
     goal: dict[str, Any]
@@ -57,11 +62,11 @@ class Report:
     sure: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """Everything, JSON-compatible."""
+        """Return everything as JSON-compatible values."""
         return asdict(self)
 
     def lines(self) -> tuple[str, ...]:
-        """What a user should know of it, a sentence each."""
+        """Return the report for users, a sentence each."""
         goal = self.goal
         asked = [f"{name} within {bound:g}" for name, bound in goal.get("max_error", {}).items()]
         if "size_bytes" in goal:
@@ -101,11 +106,11 @@ class Report:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Optimised:
-    """A file that keeps to a target.
+    """A file that meets a target.
 
     Attributes:
-        result: of the encoder; its source index is into the source.
-        report: how it was found.
+        result: the encoder's result; its source index refers to the source.
+        report: the report of the search.
     """
 
     result: EncodeResult
@@ -118,5 +123,5 @@ class Optimised:
 
     @property
     def data(self) -> bytes:
-        """The file."""
+        """The bytes of the file."""
         return self.result.data

@@ -1,4 +1,4 @@
-"""Reports of searches: what was reached and tried, why this file, and how sure it is."""
+"""Build the report of a search: the results, the files tried, the reasons for the choice, and its reliability."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from csplat_tools.views import counted_views
 
 __all__ = ["reported"]
 
-_FAR = 0.3  # dB above a target
+_FAR = 0.3  # dB: a PSNR that exceeds the target by more is explained
 
 
 def reported(
     target: Target, found: Trial, trials: Trials, *, splats_before: int, views_of: str, remarks: Sequence[str],
     **numbers: Any,
 ) -> Report:  # fmt: skip
-    """Report a search.
+    """Build the report of a search.
 
     Args:
-        target: what was asked.
-        found: the file.
-        trials: all that were tried.
-        splats_before: of the scene.
-        views_of: where the views that judge come from: `virtual`, or a name.
-        remarks: further sentences.
-        numbers: what else `Report` holds.
+        target: the target.
+        found: the chosen file.
+        trials: all files that were tried.
+        splats_before: number of splats of the scene.
+        views_of: source of the test views: `virtual`, or a name.
+        remarks: further sentences for `why`.
+        numbers: the other fields of `Report`.
     """
     errors, spread = found.errors, spread_of(found.errors)
     worst = min(psnr_of_mse(float(error)) for error in errors)
@@ -63,7 +63,7 @@ def reported(
 
 
 def _why(target: Target, found: Trial, trials: Trials, splats_before: int) -> list[str]:
-    """Sentences: how SH is coded and among what that was chosen, and how many splats went."""
+    """Return sentences on the coding of SH, the alternatives, and the number of pruned splats."""
     codings = list(dict.fromkeys(_coding(trial) for trial in trials.made if trial.part is found.part))
     if found.quality is None:
         lines = [f"{_coding(found)}, at the precision of the preset {found.options.preset}"]

@@ -1,4 +1,4 @@
-"""One number looked for by trials: false position between what is too low and what is too high."""
+"""Find a root by trials: false position between a place that is too low and one that is too high."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from dataclasses import dataclass
 
 __all__ = ["FLATTEST", "Window", "meet"]
 
-#: Of the slope that is expected, the least that two trials are believed: what they say may be noise.
+#: Least slope that is taken from two trials, as a fraction of the expected one: a smaller one may be noise.
 FLATTEST = 0.15
 
-_STEEPEST = 4.0  # the most
-_STALLED = 0.03  # of the bounds; over a shorter way values that do not grow may be noise
-_INSIDE = 0.08  # of a bracket: a trial never lies nearer to its ends
+_STEEPEST = 4.0  # largest slope that is taken from two trials, as a multiple of the expected one
+_STALLED = 0.03  # fraction of the range: over a shorter distance, values that do not grow may be noise
+_INSIDE = 0.08  # fraction of a bracket: a trial is never nearer to its ends
 
 
 @dataclass(frozen=True)
 class Window:
-    """Where a value is to come to lie.
+    """The range in which a value is to lie.
 
     Attributes:
-        low, high: within is good enough.
-        aim: what a trial is made for.
+        low, high: values between these are good enough.
+        aim: the value that a trial aims at.
     """
 
     low: float
@@ -41,24 +41,24 @@ def meet(
     flattest: float = FLATTEST,
     patience: int = 2,
 ) -> list[tuple[float, float]]:
-    """Try places until a value that grows with them lies in a window.
+    """Try places until the value of an increasing function lies in a window.
 
     Args:
-        measure: the value at a place; dear.
-        window: where the value is to lie.
-        start: where to try first.
-        slope: of the value, about, above 0.
+        measure: returns the value at a place; expensive.
+        window: the range in which the value is to lie.
+        start: the first place to try.
+        slope: approximate slope of the value, above 0.
         bounds: the least and the largest place.
-        tries: how many at most.
-        known: places and values from before; where there are some, `start` says nothing.
-        flattest: how much less steep than `slope` two trials may say that the value is.
-        patience: after so many long steps one after the other that gained next to nothing no more are tried.
+        tries: largest number of trials.
+        known: places and values from before; if there are any, `start` is not used.
+        flattest: least slope that is taken from two trials, as a fraction of `slope`.
+        patience: number of consecutive long steps without a gain after which the search ends.
 
     Returns:
-        Places and values in the order in which they were tried, those known first; the last one lies in the window
-        where any does. Fewer than `tries` where a bound is the best that there is, or values grow no more.
+        Places and values in the order in which they were tried, those known first; the last one lies in the window if
+        any does. Fewer than `tries` if a bound is the best possible place, or the values do not grow any more.
     """
-    points = sorted(known, key=lambda point: -abs(point[1] - window.aim))  # what is nearest to the aim comes last
+    points = sorted(known, key=lambda point: -abs(point[1] - window.aim))  # the nearest to the aim comes last
     if points and window.low <= points[-1][1] <= window.high:
         return points
     for _ in range(tries):
@@ -82,7 +82,7 @@ def _next(
     bounds: tuple[float, float],
     patience: int,
 ) -> float | None:
-    """Where to try next, by a slope that is expected and the least; None where a bound was tried, or nothing grows."""
+    """Return the next place to try; None if a bound was tried already, or the values do not grow any more."""
     below = max((point for point in points if point[1] < window.low), default=None)
     above = min((point for point in points if point[1] > window.high), default=None)
     if below is not None and above is not None and above[0] > below[0]:
@@ -95,14 +95,14 @@ def _next(
         if value < window.low and all(
             _stalled(points[: len(points) - back], slope, bounds) for back in range(patience)
         ):
-            return None  # it grows no more
+            return None  # the values do not grow any more
         slope = min(max(seen, least), _STEEPEST * slope)
     wanted = min(max(place + (window.aim - value) / slope, bounds[0]), bounds[1])
     return None if any(wanted == tried for tried, _ in points) else wanted
 
 
 def _stalled(points: list[tuple[float, float]], slope: float, bounds: tuple[float, float]) -> bool:
-    """Whether the last step went far and gained next to nothing; one that did may have crossed a plateau."""
+    """Return True if the last step was long and gained next to nothing; a single one may have crossed a plateau."""
     if len(points) < 2:
         return False
     (before, low), (place, high) = points[-2:]

@@ -1,4 +1,4 @@
-"""How much pictures depend on each splat: measured for `csplat sensitivity`, for tuning, and for grades."""
+"""Measure how much renders depend on each splat, for `csplat sensitivity`, tuning and quantisation classes."""
 
 from __future__ import annotations
 
@@ -33,20 +33,21 @@ __all__ = [
 Weights = NDArray[Any] | Importance
 
 _NOTHING = "a scene without splats has no sensitivities"
-_GONE = 0.4  # share of the splats for whose removal virtual views have to agree before there are enough
-_GIVEN = 40  # cameras that are enough, of those given
-_VIRTUAL = {False: (120, 120), True: (80, 60)}  # small virtual ones, without and with SH; for small scenes and large
-_LARGE = 40_000  # splats: of fewer, half of the views would change the size of files by a per cent
+_GONE = 0.4  # fraction of the splats on whose removal virtual views have to agree before there are enough views
+_GIVEN = 40  # number of cameras that suffice if cameras are given
+_VIRTUAL = {False: (120, 120), True: (80, 60)}  # by `has SH`: number of small virtual views, for small and large scenes
+_LARGE = 40_000  # splats of a large scene: for fewer, half of the views would change the size of files by a per cent
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSensitivity:
-    """What was found.
+    """The sensitivities of a scene.
 
     Attributes:
-        model: the scene. found: by splat.
-        source: where the views came from, see `sensitivity_file.SOURCES`.
-        missed_share: share of the splats that only views that were kept aside saw; NaN where none were.
+        model: the scene.
+        found: the sensitivities by splat.
+        source: kind of the views, see `sensitivity_file.SOURCES`.
+        missed_share: fraction of the splats that only held-out views saw; NaN if none were held out.
     """
 
     model: SplatModel
@@ -55,12 +56,12 @@ class MeasuredSensitivity:
     missed_share: float
 
     def write(self, path: str) -> None:
-        """Write the file, all of it or nothing."""
+        """Write the file, whole or not at all."""
         with open_output(path) as stream:
             write_sensitivity(stream, self.model, self.found, self.source, self.missed_share)
 
     def as_json(self) -> dict[str, Any]:
-        """Counts, shares, and quantiles of every group, JSON-compatible."""
+        """Return counts, fractions, and quantiles of every group as JSON-compatible values."""
         at = (0.0, 0.5, 0.9, 0.99, 1.0)
         return {
             "splats": len(self.model),
@@ -85,11 +86,11 @@ def measure_scene(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> MeasuredSensitivity:
-    """Measure a scene from views that teach: of virtual ones as many as it takes, of others all.
+    """Measure the sensitivities of a scene from training views: all of them, or as many virtual ones as it takes.
 
     Args:
         model: the scene.
-        views: from where it is looked at. Where none teaches, it is measured from those that judge.
+        views: the views. Without training views, the test views are used.
         matrices, threads, progress: as for `measure_views`.
 
     Raises:
@@ -124,15 +125,16 @@ def measure_views(
     threads: int | None,
     progress: Progress | None = None,
 ) -> Sensitivity:
-    """Measure a scene from given views.
+    """Measure the sensitivities of a scene from given views.
 
     Args:
-        model: the scene. cameras: relative to its origin.
-        background: behind everything.
-        matrices: whether those of SH coefficients are measured too.
-        magnitudes: whether sensitivities are wanted beside the squares that weights are made of.
-        threads: how many; `None` for all.
-        progress: is told the stages.
+        model: the scene.
+        cameras: the views, relative to the scene's origin.
+        background: background colour.
+        matrices: measure the matrices of SH coefficients, too.
+        magnitudes: measure gradient magnitudes in addition to the squares from which weights are made.
+        threads: number of threads; `None` for all.
+        progress: progress callback.
 
     Raises:
         InputError: there are no splats, or no view shows any.
@@ -160,13 +162,13 @@ def measured_importance(
     threads: int | None,
     progress: Progress | None = None,
 ) -> Importance:
-    """What views say for the encoder: weights of SH, none far below what opacity and size suggest, and curvatures.
+    """Measure the importance for the encoder: SH weights, bounded below by opacity and size, and Gauss–Newton blocks.
 
     Args:
         model, cameras, background, threads, progress: as for `measure_views`.
 
     Raises:
-        InputError: as `measure_views`.
+        InputError: as for `measure_views`.
     """
     found = measure_views(
         model, cameras, background, matrices=False, magnitudes=False, threads=threads, progress=progress
@@ -176,10 +178,11 @@ def measured_importance(
 
 
 def measuring_views(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
-    """Views that say how precise splats have to be, of those that teach.
+    """Select the training views from which the precision that splats need is measured.
 
-    Virtual ones look from nearer and farther, from below and beside, too. Cameras like those that judge would say less
-    of what others see: plane3 graded by 40 of them has 42 dB by them and 39 by others; by these, 41 and 40.
+    Virtual training views look from nearer and farther, from below and from the side, too. Cameras like the test views
+    would show less of what others see: plane3 with quantisation classes from 40 of them has 42 dB on them and 39 on
+    others; from these views, 41 and 40.
     """
     return evenly(views.teaches, _VIRTUAL[source.sh_degree > 0][len(source) >= _LARGE] if views.virtual else _GIVEN)
 
@@ -193,19 +196,19 @@ def measured_for(
     inside: bool,
     progress: Progress | None = None,
 ) -> tuple[Importance | None, int]:
-    """Take what the caller knows, or measure the rest.
+    """Return the caller's importance, completed by measurements.
 
     Args:
         source: the scene.
-        views: those that teach measure.
-        encoding: knobs that are set; some leave nothing to grade.
-        importance: what the caller knows. Where it holds curvatures, nothing is measured; else it stays for SH.
-        inside: virtual views of surroundings, which do not say it.
-        progress: is told the stages.
+        views: the views, of which training views are used.
+        encoding: the caller's options; some leave nothing to sort into quantisation classes.
+        importance: the caller's importance. If it has curvatures, nothing is measured; else it is kept for SH.
+        inside: the views are virtual ones in a surrounding scene, from which nothing is measured.
+        progress: progress callback.
 
     Returns:
-        Weights and curvatures, `None` where nothing says them or they would change nothing; and in how many views they
-        were measured here.
+        Weights and curvatures, `None` if they are not known or would change nothing; and the number of views in which
+        they were measured here.
     """
     several = most_grades(len(source), encoding) > 1
     if isinstance(importance, Importance) and importance.curvatures is not None:
@@ -218,11 +221,11 @@ def measured_for(
     try:
         found = measured_importance(source, seen_from, views.background, threads=encoding.threads, progress=progress)
     except InputError:
-        return None, 0  # nothing shows
+        return None, 0  # no splat is visible
     if isinstance(importance, Importance):
         found = replace(importance, curvatures=found.curvatures)
     elif importance is not None:
         found = replace(found, sh=np.asarray(importance))
     if not encoding.shape_codebook_size:
-        found = replace(found, shape_metric=None)  # half of what it takes in memory
+        found = replace(found, shape_metric=None)  # half of the memory of `found`
     return found, len(seen_from)

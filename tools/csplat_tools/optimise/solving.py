@@ -1,4 +1,4 @@
-"""One goal, many kinds of file: near it, to compare them; exactly on it, to be the one that is written."""
+"""Find the precision at which a kind of file is near the goal, to compare kinds, or exactly on it, to be written."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ from csplat_tools.optimise.trials import Coding, Part, Trial, Trials
 
 __all__ = ["TUNING_GAINS", "Goal", "Solver", "bounded"]
 
-#: dB that an adjustment through the quantisers of a file gains, about: quick files are near the goal so far below it.
+#: dB that a refit through the quantisers of a file gains, about: quick files count as better by this.
 TUNING_GAINS = 1.1
 
-_QUALITIES = (24.0, 110.0)  # dB, between which the PSNR that each attribute keeps is looked for
+_QUALITIES = (24.0, 110.0)  # range in which the PSNR of each attribute is searched, dB
 
-_NEAR = Window(-0.8, 1.0, 0.1)  # dB above the goal: what says well enough what a file on it would cost
-_CLOSE = Window(-0.35, 0.4, 0.05)  # what is taken for the best
-_ON = Window(0.0, 0.15, 0.06)  # steps and codebooks jump by about as much from one precision to the next
-_ON_REFITTED = Window(0.0, 0.25, 0.1)  # the same of what quantisation does; each try takes pictures
-_WITHIN = Window(-0.35, 0.0, -0.12)  # of a size, in the dB that its bytes are worth
-_FEW, _SOME, _MANY = 3, 4, 6  # tries
+_NEAR = Window(-0.8, 1.0, 0.1)  # dB above the goal: near enough to predict the cost of a file on it
+_CLOSE = Window(-0.35, 0.4, 0.05)  # dB above the goal: near enough to choose the best coding
+_ON = Window(0.0, 0.15, 0.06)  # dB above the goal; PSNR jumps by about as much from one precision to the next
+_ON_REFITTED = Window(0.0, 0.25, 0.1)  # the same for the error of quantisation of refitted splats, whose tries are dear
+_WITHIN = Window(-0.35, 0.0, -0.12)  # range of a size target, in the dB that the bytes are worth
+_FEW, _SOME, _MANY = 3, 4, 6  # largest numbers of tries
 _JUMP = 0.25  # dB by which a file may be worse than one of less precision by chance
-_ROUGH = 16  # levels of opacity: with fewer, files jump from one precision to the next
-_BESIDE = (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)  # dB of precision beside what was found, where files jump
-_APART = 0.5  # dB between two files that say what a decibel costs
-_SLOPES = (0.02, 0.1)
-_PLATEAU = 1.5  # dB below the goal
-_FORESEEN = 2.0  # dB by which what quantisation does may be better than it has to be, for that to be believed
-_EVEN = 0.5  # of the slope that is expected: what quantisation does is hardly less steep
-_STALLED = (2.0, 0.25)  # dB of precision that have to gain as much of each, or no precision reaches the goal
-_GROWS = {"codebook": 0.6}  # dB of a file with every dB that its attributes keep, about, where it is not 1
+_ROUGH = 16  # levels of opacity: with fewer, the PSNR of files jumps from one precision to the next
+_BESIDE = (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)  # dB of precision next to the one found that are tried if the PSNR jumps
+_APART = 0.5  # least difference of two files from which the cost of a decibel is taken, dB
+_SLOPES = (0.02, 0.1)  # range of the fraction of the bytes that a decibel costs
+_PLATEAU = 1.5  # dB below the goal: files that are lower are predicted with the steepest slope
+_FORESEEN = 2.0  # dB: quantisation that is better than it has to be by more counts only as the whole file is better
+_EVEN = 0.5  # least slope from two refitted files, as a fraction of the expected: quantisation is hardly less steep
+_STALLED = (2.0, 0.25)  # dB of precision, and the gain per dB that they must bring, or no precision reaches the goal
+_GROWS = {"codebook": 0.6}  # dB of a file's PSNR per dB of its attributes' PSNR, about, for codings where it is not 1
 
 
 @dataclass(frozen=True)
 class Goal:
-    """What is looked for.
+    """The goal of a search.
 
     Attributes:
-        psnr: dB of renders against the source's; beside a loss, what is likely to keep to it.
-        size_bytes: of the file, at most.
-        photo_psnr: dB against photographs, beside `psnr`.
-        photo_slope: by what that grows with every dB of `psnr`, about: little, where a file's own error is little.
-        max_error: largest errors of splats by measure, at most; a file that exceeds one is no result.
+        psnr: least PSNR of renders against the source's, dB; with `photo_psnr`, the value that is likely to meet it.
+        size_bytes: largest size of the file.
+        photo_psnr: least PSNR against photographs, dB.
+        photo_slope: growth of that with every dB of `psnr`, about: little if a file's own error is little.
+        max_error: largest errors of splats by measure; a file that exceeds one is no result.
     """
 
     psnr: float | None = None
@@ -56,7 +56,12 @@ class Goal:
     max_error: Mapping[str, float] = field(default_factory=dict)
 
     def above(self, trial: Trial, slope: float = BYTES_PER_DB) -> float:
-        """By how many dB a file is better than what is looked for; of a size, by how many its bytes are more."""
+        """Return by how many dB a file is above the goal; for a size, the dB that its excess bytes are worth.
+
+        Args:
+            trial: the file.
+            slope: fraction of the bytes that a decibel costs.
+        """
         if self.size_bytes is not None:
             return math.log(trial.size_bytes / self.size_bytes) / slope
         if self.photo_psnr is not None:
@@ -65,11 +70,11 @@ class Goal:
 
     @property
     def is_judged(self) -> bool:
-        """Whether the views that judge say where files stand: those of a PSNR."""
+        """True if files are measured on the test views: the goal is a PSNR."""
         return self.size_bytes is None and self.photo_psnr is None
 
     def is_met(self, trial: Trial) -> bool:
-        """Whether a file keeps to it."""
+        """Return True if a file meets the goal."""
         errors = trial.result.report.errors
         if any(errors[name][0] > most for name, most in self.max_error.items() if name in errors):
             return False
@@ -77,7 +82,7 @@ class Goal:
         return above <= 0.0 if self.size_bytes is not None else above >= 0.0
 
     def best(self, trials: list[Trial]) -> Trial | None:
-        """Of the files that keep to it, the smallest; of a size, the one whose renders are best."""
+        """Return the smallest file that meets the goal; for a size, the one with the best validation PSNR."""
         good = [trial for trial in trials if self.is_met(trial)]
         if self.size_bytes is not None:
             return max(good, key=lambda trial: trial.decided_psnr, default=None)
@@ -86,30 +91,30 @@ class Goal:
 
 @dataclass(eq=False)
 class Solver:
-    """Finds the precision at which files of some splats and a coding are where a goal is.
+    """The search for the precision at which files of given splats and coding meet the goal.
 
     Attributes:
         trials: makes the files.
-        goal: what is looked for.
+        goal: the goal.
     """
 
     trials: Trials
     goal: Goal
 
     def near(self, part: Part, coding: Coding, start: float, tries: int = _FEW) -> Trial:
-        """A file near the goal, or the nearest of a few.
+        """Return a file near the goal, or the nearest of a few.
 
         Args:
             part: its splats.
-            coding: of their colours.
-            start: PSNR that each attribute is to keep, to begin with.
-            tries: files at most.
+            coding: the coding of their colours.
+            start: PSNR of each attribute for the first file, dB.
+            tries: largest number of files.
         """
         self._approach(part, coding, start, _NEAR, tries, self.about)
         return self._nearest(part, coding)
 
     def closer(self, trial: Trial) -> Trial:
-        """One more file of its kind, if it lies too far from the goal to say what it would cost there; or itself."""
+        """Return a file if it is close to the goal; else make one more of its kind, and return the nearest of all."""
         if _CLOSE.low <= self.about(trial) <= _CLOSE.high:
             return trial
         assert trial.quality is not None
@@ -118,7 +123,7 @@ class Solver:
         return self._nearest(trial.part, trial.coding)
 
     def on(self, part: Part, coding: Coding) -> Trial | None:
-        """The best file that keeps to the goal, of some splats and a coding of which there are files near it."""
+        """Return the best file that meets the goal, for splats and a coding with files near it; `None` if none does."""
         known = self._nearest(part, coding)
         assert known.quality is not None
         if self.goal.size_bytes is not None:
@@ -137,7 +142,7 @@ class Solver:
         return packed if self.goal.is_met(packed) else None
 
     def try_beside(self, best: Trial) -> None:
-        """Where files jump, try precisions beside that of a file on the goal, and pack the smallest that is on it."""
+        """Try precisions next to that of a file on the goal if the PSNR jumps, and pack the smallest that meets it."""
         made, levels = self.trials.of(best.part, best.coding), best.result.report.options["opacity_levels"]
         if self.goal.size_bytes is not None or best.part.refits or not (levels < _ROUGH or _jumps(made)):
             return
@@ -151,15 +156,15 @@ class Solver:
             self.trials.make(found.part, found.coding, found.quality, quick=False).let_judge()
 
     def cost(self, trial: Trial) -> float:
-        """What a file like this one costs on the goal, see `expected`; infinitely much where it is not near it."""
+        """Return the expected cost of a file like this one on the goal, see `expected`; infinite if it is not near."""
         above = self.about(trial)
         far = above < _NEAR.low if self.goal.size_bytes is None else above > _NEAR.high
         return math.inf if far else self.expected(trial)
 
     def expected(self, trial: Trial) -> float:
-        """What a file like this one is expected to cost on the goal: a logarithm of bytes, but for a constant.
+        """Return the expected cost of a file like this one on the goal: a logarithm of bytes.
 
-        Infinitely much where no precision of its kind gets there.
+        The cost is infinite if no precision of its kind reaches the goal.
         """
         if self.is_stalled(trial):
             return math.inf
@@ -170,16 +175,16 @@ class Solver:
         return math.log(trial.size_bytes) - self.slope(trial) * (above - far) - _SLOPES[1] * far
 
     def about(self, trial: Trial) -> float:
-        """By how many dB a file is better than the goal, or larger, as far as the views that decide say.
+        """Return by how many dB a file is above the goal, as far as validation views tell.
 
-        A quick file of fitted splats counts as what its adjustment is going to make of it.
+        A quick file of refitted splats counts as better by the expected gain of the refit through its quantisers.
         """
         if not self.goal.is_judged:
             return self.goal.above(trial)
         return trial.decided_psnr + self._gained(trial) - self.level(trial.part)
 
     def is_stalled(self, trial: Trial) -> bool:
-        """Whether its kind is below a PSNR, and more precision hardly makes it better: a codebook is too small."""
+        """Return True if its kind of file is below a PSNR and more precision hardly helps: a codebook is too small."""
         made = [one for one in self.trials.of(trial.part, trial.coding) if one.is_careful == trial.is_careful]
         if self.goal.size_bytes is not None or len(made) < 2:
             return False
@@ -194,7 +199,7 @@ class Solver:
         return 0.0 if trial.is_careful or not trial.part.refits else TUNING_GAINS
 
     def slope(self, trial: Trial) -> float:
-        """The share of the bytes that a decibel of what quantisation does costs here."""
+        """Return the fraction of the bytes that a decibel of quantisation error costs for files of this kind."""
         for other in self.trials.of(trial.part, trial.coding):
             apart = _quantised(other, other.decided_psnr - trial.decided_psnr)
             alike = (other.is_careful, other.options.deflate_level) == (trial.is_careful, trial.options.deflate_level)
@@ -203,9 +208,9 @@ class Solver:
         return BYTES_PER_DB
 
     def level(self, part: Part) -> float:
-        """What the goal is by the views that decide, dB: they see errors larger or smaller than those that judge.
+        """Return the goal as a PSNR on the validation views, dB; their errors differ from those of the test views.
 
-        Errors of removal more so than others: so it is not the same for all splats and for some.
+        They differ most for errors of pruning, so the level depends on the splats.
         """
         goal = self.goal.psnr or 0.0
         if not self.goal.is_judged:
@@ -218,15 +223,16 @@ class Solver:
         return goal + nearest.decided_psnr - nearest.psnr
 
     def _level_of_fit(self, part: Part, allowed: float) -> float:
-        """The same of fitted splats before a file of theirs was adjusted: what removal leaves to quantisation.
+        """Return the level for refitted splats without a file yet: the pruning error plus the rest for quantisation.
 
-        That errs alike in all views, and removal does not: both see what it costs, less what adjustment mends of it.
+        Errors of quantisation are alike in all views, and errors of pruning are not: these are measured on both kinds
+        of views, reduced by the expected gain of the refit through the quantisers.
         """
         decided, judged = (error_of_psnr(psnr + TUNING_GAINS) for psnr in (part.psnr, self.trials.judged_psnr(part)))
         return psnr_of_mse(decided + max(allowed - judged, LEAST_QUANTISED * allowed))
 
     def is_hopeless(self, part: Part) -> bool:
-        """Whether views that judge see that removal took nearly all of the error that a PSNR allows."""
+        """Return True if pruning takes nearly all of the error that a PSNR allows, measured on the test views."""
         if not (self.goal.is_judged and part.refits):
             return False
         judged = error_of_psnr(self.trials.judged_psnr(part) + TUNING_GAINS)
@@ -252,7 +258,7 @@ class Solver:
             value = above(trial)
             if not fewer:
                 return value
-            # Where removal takes most of the error, what is near enough in all is near enough.
+            # If pruning takes most of the error, a file whose total error is near enough is near enough.
             quantised = _quantised(trial, value)
             return min(quantised, window.high) if 0.0 <= value <= _ON.high else quantised
 
@@ -274,9 +280,9 @@ class Solver:
 
 
 def _quantised(trial: Trial, above: float) -> float:
-    """By how many dB what quantisation does to some splats is better than a goal that their file is `above`.
+    """Return by how many dB the quantisation of a file is better than needed, if the whole file is `above` the goal.
 
-    What was removed errs at any precision; only the rest grows evenly with it, and bytes with that.
+    The error of pruning is the same at any precision; only the rest falls evenly with it, and the bytes follow that.
     """
     total, goal = error_of_psnr(trial.decided_psnr), error_of_psnr(trial.decided_psnr - above)
     removed = min(error_of_psnr(trial.part.psnr), (1.0 - LEAST_QUANTISED) * min(total, goal))
@@ -284,11 +290,11 @@ def _quantised(trial: Trial, above: float) -> float:
 
 
 def _jumps(trials: Sequence[Trial]) -> bool:
-    """Whether a file is worse than another of less precision, by more than chance."""
+    """Return True if a file is worse than another of less precision, by more than chance."""
     ordered = [one.decided_psnr for one in sorted(trials, key=lambda trial: trial.quality or 0.0)]
     return any(after < before - _JUMP for before, after in pairwise(ordered))
 
 
 def bounded(quality: float) -> float:
-    """A PSNR of attributes where it may be looked for, dB."""
+    """Clip a PSNR of attributes to the range of the search, dB."""
     return min(max(quality, _QUALITIES[0]), _QUALITIES[1])

@@ -1,4 +1,4 @@
-"""What is asked of a file: a size, a PSNR, a loss, a share of the splats, largest errors; how a user writes it."""
+"""The target of an encoding (size, PSNR, loss, fraction of the splats, largest errors), and parsing of error bounds."""
 
 from __future__ import annotations
 
@@ -18,23 +18,24 @@ __all__ = ["Target", "parse_max_error"]
 
 _LENGTHS = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
 _IN_UNITS = "means"  # the one measure that is a length
-_LOSSES = (0.001, 60.0)  # dB
+_LOSSES = (0.001, 60.0)  # allowed range of `max_loss`, dB
 
 
 @dataclass(frozen=True)
 class Target:
-    """What a file is to keep to: one of the first four, largest errors alone or beside a PSNR or a size.
+    """The target of a file: one of the first four, or largest errors alone or together with a PSNR or a size.
 
     Attributes:
-        psnr: dB of its renders against the source's at least; the smallest file that reaches them is looked for.
-        size_bytes: its size at most; the best picture within it is looked for.
-        max_loss: dB that its PSNR against photographs may be below the source's, 0.001 to 60; the smallest such file.
-        keep: share of the splats that stay, above 0, at most 1, at the precision of the preset.
-        max_error: by measure of the format (means in scene units, covariance relative, opacities, sh0, sh1, sh2, sh3),
-            the largest error of any splat.
+        psnr: least PSNR of its renders against the source's, dB; the smallest such file is searched.
+        size_bytes: largest size; the file with the best PSNR within it is searched.
+        max_loss: dB that its PSNR against photographs may be below the source's, 0.001 to 60; the smallest such file
+            is searched.
+        keep: fraction of the splats to keep, above 0, at most 1, at the precision of the preset.
+        max_error: the largest error of any splat, by measure of the format: means in scene units, covariance relative,
+            opacities, sh0, sh1, sh2, sh3.
 
     Raises:
-        InputError: nothing is asked for, or too much, or a value is out of range.
+        InputError: no target is given, or several, or a value is out of range.
     """
 
     psnr: float | None = None
@@ -70,16 +71,16 @@ class Target:
 
     @property
     def is_rendered(self) -> bool:
-        """Whether pictures have to be rendered to meet it."""
+        """True if meeting the target requires rendering."""
         return any(getattr(self, name) is not None for name in _ASKED)
 
     def count(self, splats: int) -> int:
-        """How many of so many splats stay, one at least; for `keep`."""
+        """Return the number of splats to keep of `splats`, at least one; only for a target with `keep`."""
         assert self.keep is not None
         return max(1, round(self.keep * splats))
 
     def as_json(self) -> dict[str, Any]:
-        """What is asked, by name."""
+        """Return the values that are set, by name."""
         said = {name: getattr(self, name) for name in _ASKED if getattr(self, name) is not None}
         return {**said, "max_error": dict(self.max_error)} if self.max_error else said
 
@@ -88,14 +89,14 @@ _ASKED = {"psnr": "a PSNR", "size_bytes": "a size", "max_loss": "a loss", "keep"
 
 
 def parse_max_error(text: str, unit_metres: float | None) -> dict[str, float]:
-    """Bounds by measure from `means=0.001,opacities=0.01`.
+    """Parse bounds by measure from `means=0.001,opacities=0.01`.
 
     Args:
-        text: what a user wrote; lengths with a unit as `means=2mm` are taken where the scene's unit is known.
-        unit_metres: length of a scene unit; `None` where nobody knows.
+        text: the user's text; lengths with a unit such as `means=2mm` are accepted if the scene's unit is known.
+        unit_metres: length of a scene unit in metres; `None` if it is not known.
 
     Raises:
-        InputError: it is something else; or a length has a unit and the scene has none.
+        InputError: the text is invalid; or a length has a unit, and the scene's unit is not known.
     """
     bounds: dict[str, float] = {}
     for part in text.split(","):
@@ -111,7 +112,7 @@ def parse_max_error(text: str, unit_metres: float | None) -> dict[str, float]:
 
 
 def _factor(part: str, name: str, unit: str, unit_metres: float | None) -> float:
-    """What a number has to be multiplied by to be in scene units."""
+    """Return the factor that converts a number with a unit to scene units."""
     if not unit:
         return 1.0
     if name != _IN_UNITS or unit not in _LENGTHS:

@@ -1,4 +1,4 @@
-"""Files tried on the way to a target: which splats, how their colours are coded, how precisely; each is made once."""
+"""Candidate files of a search, given by splats, coding of their colours and precision; each is made once."""
 
 from __future__ import annotations
 
@@ -23,20 +23,21 @@ __all__ = ["Coding", "Part", "Trial", "Trials", "Whole", "spread_of"]
 
 F64 = NDArray[np.float64]
 Weights = NDArray[Any] | Importance
-_ENTRIES = (16, 8192)  # of a codebook that is chosen here, at least and at most
-_QUICK_LEVEL = 10  # of files that are compared: half of the time of the highest goes into the last per cent
+_ENTRIES = (16, 8192)  # least and largest number of entries of a codebook that is chosen here
+_QUICK_LEVEL = 10  # DEFLATE level of drafts: the highest spends half of its time on the last per cent
 
 
 @dataclass(frozen=True)
 class Coding:
-    """What is kept of SH, how it is coded, and whether splats are graded.
+    """The SH bands that are kept, their coding, and the use of quantisation classes.
 
     Attributes:
-        sh: "codebook", "scalar" or "none"; `None`: what the options say, as the plain encoder.
-        share: entries of a codebook per splat; `None`: what the options say.
-        degree: bands up to this one are kept; `None`: what the options say.
-        adaptive: how much coarser unimportant splats are; `None`: what the options say.
-        graded: splats are sorted into grades by what was measured, if anything was; else nothing measured is heeded.
+        sh: "codebook", "scalar" or "none"; `None`: as in the options, like the plain encoder.
+        share: entries of a codebook per splat; `None`: as in the options.
+        degree: bands up to this one are kept; `None`: as in the options.
+        adaptive: how much coarser unimportant splats are coded; `None`: as in the options.
+        graded: splats are sorted into quantisation classes by measurements, if there are any; False: measurements are
+            not used.
     """
 
     sh: ShCoding | None
@@ -46,7 +47,7 @@ class Coding:
     graded: bool = True
 
     def options(self, encoding: EncodeOptions, splats: int) -> EncodeOptions:
-        """Options of the encoder with this coding."""
+        """Return the encoder's options with this coding, for a file of `splats` splats."""
         return _options_of(self, encoding, splats)
 
 
@@ -75,30 +76,30 @@ class Part(Protocol):
 
     @property
     def shown(self) -> SplatModel:
-        """What of them is quantised: SH bands may be missing."""
+        """The splats that are quantised: SH bands may be left out."""
         ...
 
     @property
     def psnr(self) -> float:
-        """Of these by the views that decide, dB; infinite where they are the source's."""
+        """PSNR of `shown` on the validation views, dB; infinite for the source's own splats."""
         ...
 
     @property
     def refits(self) -> bool:
-        """Whether colours are fitted to the quantised geometry of a file: then it takes pictures to make."""
+        """True if encoding refits the splats through the quantisers of a file, which needs rendering."""
         ...
 
     @property
     def gradable(self) -> bool:
-        """Whether they may be sorted into grades."""
+        """True if the splats may be sorted into quantisation classes."""
         ...
 
     def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:
-        """Code them; quick is without that fit."""
+        """Quantise and code the splats; `quick` leaves out the refit through the quantisers."""
         ...
 
     def said(self, trial: Trial | None) -> Mapping[str, Any] | None:
-        """What a file's options say of them, and, if there is one, of how good it is; `None`: nothing."""
+        """Return the entry for a file's options: the splats and, with a file, its quality; `None`: no entry."""
         ...
 
 
@@ -108,8 +109,9 @@ class Whole:
 
     Attributes:
         model: the scene.
-        importance: what the caller says of the splats. measured: what views say of them, to grade them by.
-        progress: is told the encoder's stages.
+        importance: the caller's importance of the splats.
+        measured: importance measured from views, by which splats are sorted into quantisation classes.
+        progress: progress callback.
     """
 
     model: SplatModel
@@ -122,32 +124,33 @@ class Whole:
 
     @property
     def shown(self) -> SplatModel:
-        """All of it."""
+        """The whole scene."""
         return self.model
 
     def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:  # noqa: ARG002  # the protocol's
-        """Code them."""
+        """Quantise and code the splats."""
         weights = self.measured if graded and self.measured is not None else self.importance
         draft = Draft.of(self.model, options, importance=weights, progress=self.progress)
         return draft.coded(self.progress)
 
     def said(self, trial: Trial | None) -> None:  # as the protocol has it
-        """Nothing: the file holds the scene as it is."""
+        """Return no entry: the file holds the scene as it is."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One file.
+    """A candidate file.
 
     Attributes:
-        part, coding, quality: what it was made of, and the PSNR that each attribute was to keep; `None`: the preset's.
-        options: of the encoder.
-        is_careful: it is packed as tightly as the caller wants, and no fit of its colours was left out.
-        result: of the encoder.
-        judge: the source's renders in the views that judge.
-        decided_psnr: by the views that decide, dB: what files are compared by.
-        photo_psnr: by the photographs that decide, dB; NaN where none do.
-        decode: reads its bytes.
+        part, coding: its splats, and the coding of their colours.
+        quality: the PSNR of each attribute for which it was made, dB; `None`: that of the options.
+        options: options of the encoder.
+        is_careful: it is packed as tightly as the caller requires, and no refit was left out.
+        result: the encoder's result.
+        judge: scorer by the source's renders in the test views.
+        decided_psnr: PSNR on the validation views, dB, by which files are compared.
+        photo_psnr: PSNR against the validation photographs, dB; NaN if there are none.
+        decode: decodes its bytes.
     """
 
     part: Part
@@ -163,30 +166,30 @@ class Trial:
 
     @cached_property
     def errors(self) -> F64:
-        """[V] mean squared error by judging view, against the source."""
+        """[V] mean squared error against the source, by test view."""
         return self.judge.errors(self.decode(self.result.data))
 
     @property
     def psnr(self) -> float:
-        """Of these errors, pooled, dB: what a target asks for, and what files are not compared by."""
+        """PSNR of these errors, pooled, dB: targets refer to it, and files are not compared by it."""
         return psnr_of_mse(self.judge.pooled(self.errors))
 
     @property
     def is_judged(self) -> bool:
-        """Whether the views that judge looked at it yet."""
+        """True if the file has been scored on the test views."""
         return "errors" in vars(self)
 
     def let_judge(self) -> None:
-        """Have them look at it: only then may it be written for a PSNR."""
+        """Score the file on the test views: only then may it be written for a PSNR target."""
         _ = self.errors
 
     @property
     def is_packed(self) -> bool:
-        """Whether it is packed as tightly as the caller wants."""
+        """True if the file is packed as tightly as the caller requires."""
         return self.is_careful or self.part.refits
 
     def told(self, result: EncodeResult) -> Trial:
-        """The same file, which says more of itself; who looked at this one need not look again."""
+        """Return the file with another result, whose options have more entries; its score is kept."""
         other = replace(self, result=result)
         vars(other).update({name: vars(self)[name] for name in ("errors",) if name in vars(self)})
         return other
@@ -198,16 +201,16 @@ class Trial:
 
     @property
     def splats(self) -> int:
-        """Splats of the file."""
+        """Number of splats of the file."""
         return self.result.report.splat_count
 
     @property
     def grades(self) -> int:
-        """How many grades its splats are sorted into."""
+        """Number of quantisation classes of its splats."""
         return len(self.result.report.options.get("grades", {}).get("splats", [0]))
 
     def as_json(self) -> dict[str, Any]:
-        """Say what was tried and what came of it."""
+        """Return settings, size and PSNR as JSON-compatible values."""
         options = self.result.report.options
         return {
             "splats": self.splats,
@@ -226,16 +229,16 @@ class Trial:
 
 @dataclass(eq=False)
 class Trials:
-    """Makes files and judges them, each once. Owns all that were made.
+    """Makes candidate files and scores them, each once. Owns all that were made.
 
     Attributes:
-        encoding: the caller's knobs, which no choice overrides.
-        judge: the source's renders in the views that judge: they say where a file stands, and choose nothing.
-        decider: in the views that decide: by them files are compared.
-        photographs: those that decide, where a loss against photographs is the target.
-        made: every file, in order.
-        progress: is told which file is made.
-        decode: reads the bytes of a file; another encoder than csplat's, such as a formula, brings its own.
+        encoding: the caller's options, which no choice overrides.
+        judge: scorer by the source's renders in the test views, on which a PSNR target is measured; it chooses nothing.
+        decider: scorer by those in the validation views, on which files are compared.
+        photographs: scorer by validation photographs, if the target is a loss against photographs.
+        made: all files, in order.
+        progress: progress callback, called with each file that is made.
+        decode: decodes the bytes of a file; an encoder other than csplat's, such as a formula in tests, brings its own.
     """
 
     encoding: EncodeOptions
@@ -249,11 +252,11 @@ class Trials:
 
     @property
     def renders(self) -> int:
-        """How many pictures were rendered of them."""
+        """Number of renders made of the files."""
         return sum(len(self.decider.cameras) + one.is_judged * len(self.judge.cameras) for one in self.made)
 
     def judged_psnr(self, part: Part) -> float:
-        """Of what a part quantises by the views that judge, dB: how much of the error that they allow removal took."""
+        """Return the PSNR of a part before quantisation on the test views, dB: the error that pruning takes."""
         if part not in self._judged:
             self._judged[part] = self.judge.psnr(part.shown)
         return self._judged[part]
@@ -261,15 +264,15 @@ class Trials:
     def make(
         self, part: Part, coding: Coding, quality: float | None, *, quick: bool, encoding: EncodeOptions | None = None
     ) -> Trial:
-        """Make a file, if there is none like it yet.
+        """Make a file, or return the one that was made with the same arguments.
 
         Args:
             part: its splats.
-            coding: of their colours.
-            quality: PSNR that each attribute is to keep; `None`: what the options say.
-            quick: pack it less tightly where that is most of the work (what is decoded is the same), and leave out a
-                last fit of its colours.
-            encoding: knobs, instead of those that all files share.
+            coding: the coding of their colours.
+            quality: PSNR of each attribute, dB; `None`: that of the options.
+            quick: pack it less tightly if that is most of the work (the decoded splats are the same), and leave out
+                the refit through the quantisers.
+            encoding: options of the encoder, instead of those that all files share.
         """
         options = coding.options(encoding or self.encoding, len(part.model))
         options = options if quality is None else replace(options, attribute_psnr=quality)
@@ -297,7 +300,7 @@ class Trials:
         return self.made[-1]
 
     def of(self, part: Part, coding: Coding, *, careful: bool = False) -> list[Trial]:
-        """Files of some splats and a coding, at whatever quality; those that might be written, or all."""
+        """Return files of given splats and coding, at any quality; with `careful`, only those that might be written."""
         wanted = coding.options(self.encoding, len(part.model))
         made = [one for one in self.made if one.part is part and one.quality is not None]
         made = [one for one in made if one.coding.options(self.encoding, len(part.model)) == wanted]
@@ -305,7 +308,7 @@ class Trials:
 
 
 def spread_of(errors: F64) -> float:
-    """How much a PSNR over views would change with other views: one standard deviation in dB, by jackknife.
+    """Return one standard deviation of a PSNR over other choices of views, in dB, by jackknife.
 
     Args:
         errors: [V] mean squared error by view.

@@ -1,4 +1,4 @@
-"""Model only what a scene requires: fewer splats, their colours fitted anew, fewer SH bands."""
+"""Simplify a scene: prune splats, refit the others, and leave out SH bands."""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
-"""What stays, moved towards what the source looks like by gradient descent, one small view after the other.
+"""Refit kept splats to renders of the source by gradient descent, one small view after the other.
 
-Where splats have gone, their neighbours have to cover more, and where values are quantised others may make up for it:
-colours, opacities, scales and rotations together. Steps as long as what is wrong is large. Least squares over all views
-at once (colours alone are linear) follow the views that teach and lose on others; this does not: after three looks at
-each view it gains as much on views that it never saw. Centres stay: moved as well, scenes with few views lose.
+Where splats were pruned, their neighbours have to cover more, and where values are quantised others may make up for it:
+colours, opacities, scales and rotations are fitted together. The step length is proportional to the error. Least
+squares over all views at once (which are linear for colours alone) overfit the training views; this does not: after
+three passes over the views it gains as much on held-out views. Centres are fixed: if they move, too, scenes with few
+views get worse.
 """
 
 from __future__ import annotations
@@ -33,16 +34,16 @@ __all__ = ["adjust", "adjust_frozen"]
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: Of the first steps, where all is wrong by one: per unit of the error's root mean square, at most `_LARGEST_ERROR`.
+#: Learning rates of the first steps per unit of the root mean square error, which counts up to `_LARGEST_ERROR`.
 _RATES = {"logits": 1.95, "scales": 0.39, "quats": 0.023, "sh0": 0.1, "shN": 0.04}
-_SH_FACTOR = 2.0  # so much longer steps without SH, through quantisers as long ones
-_LARGEST_ERROR = 0.04
-_BETA2 = 0.98  # of Adam: errors fall so fast that it may not remember steps for longer
-_LAST_RATE = 0.02  # share of the rates that is left in the last steps
-_SLOPE = 0.07  # share of the bytes that a decibel costs once splats were adjusted, about
+_SH_FACTOR = 2.0  # factor of the step length for scenes without SH; not used through quantisers
+_LARGEST_ERROR = 0.04  # root mean square error, 0 to 1, above which steps do not become longer
+_BETA2 = 0.98  # Adam's decay rate of squared gradients: errors fall too fast for a longer memory
+_LAST_RATE = 0.02  # fraction of the rates that is left in the last steps
+_SLOPE = 0.07  # fraction of the bytes that a decibel costs after a refit, about
 _COUNT_EVERY = 50  # steps between counts of a file's integers
-_CENTRE_BITS = 24.0  # of a splat's centre, about, which does not move
-_SAMPLE = 8  # one view of so many says how large the error is
+_CENTRE_BITS = 24.0  # bits of a splat's centre, about, which is fixed
+_SAMPLE = 8  # every Nth view is rendered to measure the error
 
 
 def adjust(
@@ -60,14 +61,14 @@ def adjust(
     Args:
         model: the scene.
         cameras: the views.
-        wanted: [H, W, 3], what is to be seen from each.
+        wanted: [H, W, 3], the reference image of each view.
         options: background, seed of the order of views, threads.
-        steps: each looks at one view.
-        free: [N, K], which SH coefficients beyond the first may change; None for all.
-        progress: is told how much is done.
+        steps: number of steps, one view each.
+        free: [N, K], mask of the SH coefficients beyond the first that may change; None for all.
+        progress: progress callback.
 
     Returns:
-        The scene; splats that no view shows are as they were.
+        The scene; splats that no view shows are unchanged.
     """
     scene, teaching = _Floats.of(model, free), _Teaching(cameras, wanted, options, model.antialiased)
     factor = 1.0 if model.sh_degree else _SH_FACTOR
@@ -84,10 +85,10 @@ def adjust_frozen(
     steps: int,
     progress: Progress | None = None,
 ) -> FreeValues:
-    """The same through the quantisers of a file, whose bytes count: what is seen is what a decoder sees of it.
+    """Refit splats through the quantisers of a file, so that renders are those of the decoded file; its bytes count.
 
     Args:
-        frozen: what the encoder decided.
+        frozen: the encoder's quantisation.
         cameras, wanted, options, steps, progress: as for `adjust`.
 
     Returns:
@@ -100,14 +101,14 @@ def adjust_frozen(
     quantised = max(rms**2 - removed**2, LEAST_QUANTISED * rms**2)
     if math.isfinite(quantised):
         values = sum(picture.size for picture in wanted) / len(wanted)
-        # By how much it grows where a share of the bytes is saved; half of it, as views give half of its gradient.
+        # Growth of the error per saved fraction of the bytes; half of it, because views give half of its gradient.
         scene.price = 0.5 * quantised * values / price_of_bytes(_SLOPE)
     _descend(scene, teaching, steps, _length(rms), progress)
     return scene.tuned.held.copy()
 
 
 class _Scene(Protocol):
-    """Values that move, and what is seen of them."""
+    """The values that are fitted, and the splats that are rendered from them."""
 
     def seen(self) -> Splats: ...
 
@@ -115,7 +116,7 @@ class _Scene(Protocol):
 
 
 class _Teaching:
-    """Views, and what is to be seen from them."""
+    """Training views with their reference images."""
 
     def __init__(
         self, cameras: Sequence[Camera], wanted: Sequence[F32], options: SimplifyOptions, antialiased: bool
@@ -125,27 +126,27 @@ class _Teaching:
         self._background, self._antialiased = options.background, antialiased
 
     def wrong(self, splats: HasSplats, view: int) -> F32:
-        """What a view shows too much, [H, W, 3]."""
+        """Return the error of a view's render, [H, W, 3]: positive if it is too bright."""
         drawn = self.rasteriser.forward(
             splats, self.cameras[view], background=self._background, antialiased=self._antialiased
         )
-        # Straight through what pictures do not show: a colour beyond 1 is pulled back only where less is wanted.
+        # Straight-through gradient of the clipping: a colour above 1 is pulled back only if the reference is darker.
         return np.clip(drawn.rgb, 0.0, 1.0) - np.clip(self.wanted[view], 0.0, 1.0)
 
     def rms(self, splats: HasSplats) -> float:
-        """How wrong a sample of the views is: the root mean square."""
+        """Return the root mean square error over a sample of the views."""
         sample = range(0, len(self.cameras), _SAMPLE)
         errors = [np.mean(np.square(self.wrong(splats, view), dtype=np.float64)) for view in sample]
         return math.sqrt(np.mean(errors))
 
 
 def _length(rms: float) -> float:
-    """Of the first steps, where pictures are so wrong."""
+    """Return the length of the first steps for a root mean square error; 0 if it is not finite."""
     return min(rms, _LARGEST_ERROR) if math.isfinite(rms) else 0.0
 
 
 def _descend(scene: _Scene, teaching: _Teaching, steps: int, length: float, progress: Progress | None) -> None:
-    """Move the values of a scene, by Adam."""
+    """Fit the values of a scene by Adam."""
     count = len(teaching.cameras)
     rng = np.random.default_rng(teaching.seed)
     order = np.concatenate([rng.permutation(count) for _ in range(-(-steps // count))])
@@ -159,7 +160,7 @@ def _descend(scene: _Scene, teaching: _Teaching, steps: int, length: float, prog
 
 @dataclass(eq=False)
 class _Floats:
-    """Values that nothing quantises."""
+    """Values without quantisation."""
 
     means: F32
     parameters: Parameters
@@ -180,11 +181,14 @@ class _Floats:
         slopes: dict[str, Any] = {name: getattr(gradients, name) for name in ("quats", "scales", "sh0", "shN")}
         slopes["logits"] = gradients.opacities * alphas * (np.float32(1.0) - alphas)
         if self.free is not None:
-            gradients.shN[:] *= self.free[:, :, None]  # the rasteriser's, until its next
+            gradients.shN[:] *= self.free[:, :, None]  # in place: the rasteriser's buffer, valid until its next pass
         adam_step(self.parameters, slopes, rates)
 
     def moved(self, before: SplatModel) -> SplatModel:
-        """What moved; the rest bit for bit as it was, and what is beyond float32 too. No step may follow."""
+        """Return the scene with the splats that changed; the others, and any that overflowed, are kept bit for bit.
+
+        No step may follow: the optimiser's state is released.
+        """
         self.parameters.first, self.parameters.second = {}, {}  # as large as the scene, each
         values, alphas, start = self.parameters.values, self.parameters.alphas, _moving(before)
         moved = np.zeros(len(before), bool)
@@ -204,7 +208,7 @@ class _Floats:
 
 
 def _moving(model: SplatModel) -> dict[str, F32]:
-    """Values of a scene that move."""
+    """Return the values of a scene that are fitted."""
     values = from_model(model, model.sh_degree)
     del values["means"]
     return values
@@ -212,7 +216,7 @@ def _moving(model: SplatModel) -> dict[str, F32]:
 
 @dataclass(eq=False)
 class _Quantised:
-    """Values of a frozen scene; `price`: squared error of a picture that all bits of the file are worth."""
+    """Values that pass through quantisers; `price`: squared error of a render that all bits together are worth."""
 
     tuned: TunedScene
     price: float = 0.0

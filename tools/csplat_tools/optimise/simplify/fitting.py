@@ -1,4 +1,4 @@
-"""What stays, fitted to what the source looks like, and which SH bands it needs."""
+"""Refit kept splats to renders of the source, and choose the SH bands that they need."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ __all__ = ["BAND_STEPS", "FIT_STEPS", "Fit", "fit"]
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: Of a fit, and of one after bands were left out.
+#: Steps of a fit, and of the one after bands were left out.
 FIT_STEPS, BAND_STEPS = 960, 160
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A scene that was fitted.
+    """A refitted scene.
 
     Attributes:
         model: the scene.
-        stays: [N, d], which SH bands are not zero; None where that was not asked.
+        stays: [N, d], mask of the SH bands that are kept; None if bands were not chosen.
     """
 
     model: SplatModel
@@ -48,15 +48,15 @@ def fit(
     deciding: int | None = None,
     progress: Progress | None = None,
 ) -> Fit:
-    """Adjust the splats; set bands to zero that are not worth their bits, and adjust the others once more.
+    """Refit the splats; set bands to zero that are not worth their bits, and refit the others once more.
 
     Args:
         model: the scene, with the source's values.
         cameras: the views.
-        wanted: what the source looks like there.
-        options: whether to fit and to choose bands, steps, background.
-        deciding: so many of the views, the first ones, say which bands stay; `None`: all do.
-        progress: is told how much is done.
+        wanted: [H, W, 3], the source's render of each view.
+        options: `refit` and `bands`, effort, background.
+        deciding: number of views, from the first on, by which bands are chosen; `None`: all.
+        progress: progress callback.
     """
     if options.refit:
         model = adjust(model, cameras, wanted, options, steps=options.steps(FIT_STEPS), progress=progress)

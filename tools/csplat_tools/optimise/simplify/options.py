@@ -1,4 +1,4 @@
-"""How a simplification goes about it."""
+"""Options of a simplification."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from csplat_tools.views import VIEW_SIZE, usual_views
 
 __all__ = ["SimplifyOptions"]
 
-_USUAL = 3  # effort
+_USUAL = 3  # default effort
 
 
 @dataclass(frozen=True)
 class SimplifyOptions:
-    """How to go about it.
+    """Options of a simplification.
 
     Attributes:
-        rounds: how often errors are measured anew on the way, at least 1.
-        refit: fit colours, opacities, scales and rotations of what stays to the source's renders.
-        effort: how much work that is, 1 to 9: each one less than 3 takes half of the steps of descent, every two more
-            twice as many; below 3 a target tries fewer things.
+        rounds: number of times that errors are measured anew while splats are pruned, at least 1.
+        refit: fit colours, opacities, scales and rotations of the kept splats to the source's renders.
+        effort: amount of work, 1 to 9: each one less than 3 halves the steps of descent, every two more double them;
+            below 3 a target tries fewer candidates.
         bands: set SH bands to zero that are worth less than their bits.
-        keep_unseen: splats that no view shows stay.
-        view_size: of the pictures that teach, width and height in pixels; `None`: as is usual for so many splats.
-        views: virtual views at most, where no views are given; `None`: likewise.
-        background: red, green, blue behind those; of views that are given theirs counts.
-        seed: of those, and of the order in which views are looked at.
-        threads: how many; None for all. The result does not depend on it.
+        keep_unseen: keep splats that no view shows.
+        view_size: width and height of training renders, pixels; `None`: chosen by the number of splats.
+        views: largest number of virtual views if no views are given; `None`: chosen by the number of splats.
+        background: red, green, blue behind virtual views; given views have their own.
+        seed: seed of the virtual views, and of the order in which views are used.
+        threads: number of threads; None for all. The result does not depend on it.
 
     Raises:
         InputError: a value is out of range.
@@ -56,22 +56,22 @@ class SimplifyOptions:
             raise InputError(f"view_size is {self.view_size}, wanted pixels")
 
     def pictures(self, splats: int) -> tuple[int, tuple[int, int]]:
-        """How many views teach at most, and the width and height of their pictures, of a scene of so many splats."""
+        """Return the largest number of training views, and the width and height of their renders, for N splats."""
         views, size = usual_views(splats)
         return self.views or views, self.view_size or size
 
     def steps(self, usual: int) -> int:
-        """Steps of descent in place of so many, which are usual: fewer, where pictures are larger and views fewer."""
+        """Return the number of steps in place of the usual one, by effort; fewer if renders are larger than usual."""
         larger = math.sqrt(math.prod(self.view_size or VIEW_SIZE) / math.prod(VIEW_SIZE))
         return max(1, round(usual * self.work / max(1.0, larger)))
 
     @property
     def work(self) -> float:
-        """How many times as much work as is usual."""
+        """The amount of work as a multiple of that with the default effort."""
         octaves = self.effort - _USUAL
         return 2.0 ** (octaves / 2 if octaves > 0 else octaves)
 
     @property
     def is_brief(self) -> bool:
-        """Whether a target tries fewer things."""
+        """True if a target tries fewer candidates."""
         return self.effort < _USUAL

@@ -1,4 +1,4 @@
-"""Which splats go, in which order: by the exact error of their removal, measured anew round after round."""
+"""Find the pruning order of splats, by the exact error of removing each, measured anew in every round."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ __all__ = ["Order", "Round", "Side", "removal_order", "seen_by"]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-_LEAST_SHARE = 0.01  # of the splats that stay, at the end of an order that is made to be cut anywhere
-_ROUND_SHARE = 0.72  # of what is left stays after each round of such an order: what hid a splat may have gone
+_LEAST_SHARE = 0.01  # fraction of the splats that is left at the end of an order without a given target
+_ROUND_SHARE = 0.72  # fraction left after each round of such an order: splats that hid another may have been pruned
 
 
 @dataclass(frozen=True)
 class Round:
-    """One round.
+    """One round of pruning.
 
     Attributes:
-        removed: how many splats went.
+        removed: number of pruned splats.
         largest: the largest error of one of them, as a sum over pixels, channels and views.
         predicted: sum of their errors.
     """
@@ -45,12 +45,12 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class Order:
-    """In which order splats go.
+    """A pruning order.
 
     Attributes:
-        rows: [G] int64, source splats, the first to go first; those that never go are not among them.
-        errors: [G], error of each one's removal when its round came.
-        rounds: what each round took.
+        rows: [G] int64, source splats in the order of pruning, without those that are never pruned.
+        errors: [G], error of removing each, as measured in its round.
+        rounds: the rounds.
     """
 
     rows: I64
@@ -58,7 +58,7 @@ class Order:
     rounds: tuple[Round, ...]
 
     def kept(self, splat_count: int, gone: int) -> I64:
-        """Source splats that are left when `gone` are removed, ascending."""
+        """Return the source splats that are kept if `gone` are pruned, ascending."""
         stays = np.ones(splat_count, bool)
         stays[self.rows[:gone]] = False
         return np.flatnonzero(stays)
@@ -70,14 +70,14 @@ class Side:
 
     Attributes:
         cameras: the views.
-        removal: what they say of the splats that are left; the last time they were asked.
+        removal: the removal errors of the splats that are left, as last measured in these views.
     """
 
     cameras: Sequence[Camera]
     removal: Removal
 
     def of_rows(self, rows: NDArray[Any]) -> Side:
-        """The same of some of the splats."""
+        """Return the views with the errors of some of the splats."""
         return replace(self, removal=self.removal.of_rows(rows))
 
 
@@ -91,17 +91,17 @@ def removal_order(
     enough: float = math.inf,
     start: Order | None = None,
 ) -> Order:
-    """Find out in which order splats go.
+    """Find the pruning order of splats.
 
     Args:
         model: the source.
-        sides: views, and what they say of the source. Rounds ask one side after the other, and what the others said
-            before still counts: twice the views, at the price of one side's.
-        options: rounds.
-        left: splats that are to stay; None for an order that may be cut anywhere.
-        progress: is told how much is done.
-        enough: such an order ends with the round in which the sum of all errors exceeds this.
-        start: goes on from there.
+        sides: views with the removal errors of the source. Rounds measure one side after the other, and the last
+            measurements of the others still count: with two sides, twice the views at the cost of one.
+        options: rounds, background, threads, `keep_unseen`.
+        left: number of splats to keep; None for an order that may be cut anywhere.
+        progress: progress callback.
+        enough: an order without `left` ends with the round in which the sum of all errors exceeds this.
+        start: an order to continue.
     """
     count = len(model)
     rows, sides = np.arange(count), list(sides)
@@ -137,12 +137,12 @@ def removal_order(
 
 
 def seen_by(sides: Sequence[Side]) -> Removal:
-    """What all of them say."""
+    """Return the sum of the removal errors over all sides."""
     return functools.reduce(operator.add, [side.removal for side in sides])
 
 
 def _targets(count: int, options: SimplifyOptions, left: int | None, now: int) -> list[int]:
-    """How many splats are left after each round, each time fewer."""
+    """Return the number of splats left after each round, in decreasing order."""
     last = max(1, round(count * _LEAST_SHARE)) if left is None else left
     if left is not None:
         targets = [round(count + (last - count) * number / options.rounds) for number in range(1, options.rounds + 1)]

@@ -1,4 +1,4 @@
-"""`simplify`: remove what no picture needs, round after round, and fit the colours of the rest."""
+"""`simplify`: prune splats that renders do not need, round after round, and refit the others."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ __all__ = ["Session", "Simplified", "find_decider", "most_gone", "prepare", "sim
 
 F32 = NDArray[np.float32]
 I64 = NDArray[np.int64]
-_TRIES = 3  # fits on the way to a target PSNR
-_AGREE_ON = 0.5  # of the splats, at least, where views have to agree: where little goes, fits want as many of them
-_BANDS_WORTH = 1.0  # dB that absent SH bands may cost; a fit that loses more has failed
+_TRIES = 3  # largest number of fits on the way to a target PSNR
+_AGREE_ON = 0.5  # least fraction of the splats on whose removal views have to agree: fits need the views in any case
+_BANDS_WORTH = 1.0  # dB that leaving out SH bands may cost; a fit that loses more has failed
 
 
 @dataclass(frozen=True, eq=False)
 class Simplified:
-    """A smaller scene.
+    """A simplified scene.
 
     Attributes:
         model: the scene.
-        source_index: [N] int64, which splat of the source each one is.
-        threshold: the largest error that a removed splat had: what a splat's bits are worth.
-        stays: [N, d], which SH bands are not zero; None where bands were not looked at.
-        report: what was removed and why, predicted and measured errors, views, seconds; JSON-compatible.
+        source_index: [N] int64, the source splat that each splat was.
+        threshold: the largest error of a pruned splat: what a splat's bits are worth.
+        stays: [N, d], mask of the SH bands that are kept; None if bands were not chosen.
+        report: pruned splats by reason, predicted and measured errors, views, seconds; JSON-compatible.
     """
 
     model: SplatModel
@@ -58,19 +58,20 @@ class Simplified:
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """A source, its views, and in which order its splats go: what several simplifications of one scene share.
+    """A source, its views, and its pruning order, which several simplifications of one scene share.
 
     Attributes:
         source: the scene.
-        options: how to go about it.
-        around: from where it is looked at.
-        views: those that teach, and others.
-        taught: those that the others are fitted to; virtual ones are as many again at least: a fit follows its views.
-        sides: the same in two parts, and what each says of the source; that of views that are given is one.
-        wanted: what the source looks like from these.
-        order: of removal.
-        checked: judges by views that were not used.
-        seconds: by stage.
+        options: options of the simplification.
+        around: all views of the scene.
+        views: the training views whose removal errors agree with those of held-out views, and the latter.
+        taught: views that splats are fitted to: the training views and, if they are virtual, at least as many others,
+            because a fit follows its views.
+        sides: the same views with the source's removal errors: two parts if they are virtual, else one.
+        wanted: [H, W, 3], the source's render of each view of `taught`.
+        order: the pruning order.
+        checked: scorer by held-out views.
+        seconds: time by stage.
     """
 
     source: SplatModel
@@ -86,19 +87,19 @@ class Session:
 
     @property
     def value_count(self) -> int:
-        """Pixels times channels of what is taught."""
+        """Pixels times channels of all views of `taught`."""
         return sum(side.removal.value_count for side in self.sides)
 
     def pruned(self, gone: int) -> I64:
-        """Source splats that are left when the first `gone` of the order are removed."""
+        """Return the source splats that are kept if the first `gone` of the order are pruned."""
         return self.order.kept(len(self.source), gone)
 
     def threshold(self, gone: int) -> float:
-        """The largest error among the first `gone`."""
+        """Return the largest removal error among the first `gone` splats."""
         return float(self.order.errors[:gone].max(initial=0.0))
 
     def fitted(self, rows: I64, progress: Progress | None = None) -> Fit:
-        """Fit what is left."""
+        """Refit the given splats of the source."""
         left, deciding = self.source.select(rows), len(self.views.used)
         return fit(left, self.taught, self.wanted, self.options, deciding=deciding, progress=progress)
 
@@ -112,15 +113,15 @@ def prepare(
     *,
     allowed: float = math.inf,
 ) -> Session:
-    """Render the source, find the order of removal.
+    """Render the source, and find the pruning order.
 
     Args:
         source: the scene.
-        views: from where it is looked at; None for virtual views.
-        left: splats that are to stay; None if it is not known yet.
-        options: how to go about it.
-        progress: is told how much is done.
-        allowed: mean squared error of the removal of all that may be asked to go, about; the order ends there.
+        views: views of the scene; None for virtual views.
+        left: number of splats to keep; None if it is not known yet.
+        options: options of the simplification.
+        progress: progress callback.
+        allowed: approximate mean squared error of pruning at which the order may end.
     """
     seconds = {}
     start = time.perf_counter()
@@ -149,7 +150,7 @@ def prepare(
 
 
 def _pictures(source: SplatModel, cameras: Sequence[Camera], options: SimplifyOptions) -> list[F32]:
-    """What the source looks like; the renderer's memory ends with it."""
+    """Render the source from all cameras; the renderer's memory is released at the end."""
     draw = renderer(source, options.background, threads=options.threads)
     return [draw(camera).rgb for camera in cameras]
 
@@ -164,22 +165,22 @@ def simplify(
     options: SimplifyOptions | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Simplified:
-    """Remove splats until a target is met, fit the others, drop SH bands: what `csplat simplify` calls.
+    """Prune splats to a target, refit the others, and leave out SH bands, as `csplat simplify` does.
 
-    One of `keep`, `psnr` and `loss` is wanted. Wants the packages of the render extra.
+    Give one of `keep`, `psnr` and `loss`. Requires the packages of the render extra.
 
     Args:
-        scene: a model, or a file of either kind.
-        keep: share of the splats that stay, above 0, at most 1.
-        psnr: dB against the source's renders by the views that decide, at least; as few splats as that allows stay.
+        scene: a model, or a file in any format.
+        keep: fraction of the splats to keep, above 0, at most 1.
+        psnr: least PSNR against the source's renders on the validation views, dB; as few splats as possible are kept.
         loss: dB that the PSNR against the photographs of `views` may fall.
-        views: what stays is fitted in those that teach; those that decide say how much may go. `None`: virtual ones,
-            as many as it takes.
-        options: how to go about it.
-        progress: is told the stage and the share of it that is done, 0 to 1.
+        views: the kept splats are fitted to training views, and validation views determine how many may be pruned.
+            `None`: virtual views, as many as it takes.
+        options: options of the simplification.
+        progress: called with the stage and the fraction of it that is done, 0 to 1.
 
     Returns:
-        The smaller scene; its splats are in the source's order.
+        The simplified scene; its splats are in the source's order.
 
     Examples:
         >>> import csplat_tools
@@ -188,9 +189,10 @@ def simplify(
         (4464, 39.6)
 
     Raises:
-        InputError: a scene without splats, views that do not teach or decide, or a target that even the source misses.
-        CsplatError: the file is none.
-        OSError: it cannot be read.
+        InputError: the scene has no splats, training or validation views are missing, or even the source misses the
+            target.
+        CsplatError: the scene is not valid.
+        OSError: the file cannot be read.
     """
     need_renderer()
     target = Target(psnr, None, loss, keep)
@@ -213,11 +215,11 @@ def simplify(
 
 
 def find_decider(session: Session, target: Target) -> tuple[Judge, float]:
-    """Who decides how much may go, and the PSNR that is to be reached, 99 where none is asked for.
+    """Return the validation scorer and the PSNR that is to be reached, dB; 99 if the target has none.
 
     Args:
-        session: the views that decide are none of those that judge.
-        target: what is asked for.
+        session: the views; validation views are not among the test views.
+        target: the target.
     """
     around, threads = session.around, session.options.threads
     if target.max_loss is not None:
@@ -227,7 +229,7 @@ def find_decider(session: Session, target: Target) -> tuple[Judge, float]:
 
 
 def _judged(session: Session, model: SplatModel) -> dict[str, Any]:
-    """What the views that judge say of the result; nothing where none do."""
+    """Return the scores of the result on the test views, for the report; empty if there are none."""
     around, threads = session.around, session.options.threads
     if not around.judges:
         return {}
@@ -242,7 +244,7 @@ def _judged(session: Session, model: SplatModel) -> dict[str, Any]:
 
 
 def _finished(session: Session, gone: int, judge: Judge | None, progress: Progress | None) -> Simplified:
-    """Remove, fit, and say how good it is."""
+    """Prune and refit, and measure the result."""
     rows, threshold = session.pruned(gone), session.threshold(gone)
     pruned = session.source.select(rows)
     fitted = session.fitted(rows, progress)
@@ -254,7 +256,7 @@ def _finished(session: Session, gone: int, judge: Judge | None, progress: Progre
     model, stays = fitted.model, fitted.stays
     worth = 0.0 if stays is None else _BANDS_WORTH
     if report["check_psnr"] < report["check_psnr_pruned"] - worth and session.options.refit:
-        model, stays = pruned, None  # overfitted: what was not looked at is worse than before
+        model, stays = pruned, None  # overfitted: held-out views are worse than before
         report["check_psnr"], report["refit_refused"] = report["check_psnr_pruned"], True
     if judge is not None:
         report["decided_psnr_pruned"], report["decided_psnr"] = judge.psnr(pruned), judge.psnr(model)
@@ -262,7 +264,7 @@ def _finished(session: Session, gone: int, judge: Judge | None, progress: Progre
 
 
 def _search(session: Session, judge: Judge, goal: float, progress: Progress | None) -> Simplified:
-    """The fewest splats that reach a PSNR: bisect along the order without a fit, then allow for what a fit gains."""
+    """Find the fewest splats that reach a PSNR: bisect along the order without a fit, then allow for the fit's gain."""
     if judge.psnr(session.source) < goal:
         raise InputError(f"even the source is below the target of {goal:.2f} dB: its renders are not its pictures")
     best, gain = None, 0.0
@@ -284,7 +286,14 @@ def _search(session: Session, judge: Judge, goal: float, progress: Progress | No
 
 
 def most_gone(session: Session, judge: Judge, goal: float, lowest: int = 0) -> int:
-    """How many splats may go before the PSNR, without a fit, falls below a goal."""
+    """Return the number of splats that may be pruned before the PSNR, without a fit, falls below a goal.
+
+    Args:
+        session: the scene and its pruning order.
+        judge: the scorer.
+        goal: least PSNR, dB.
+        lowest: a number of splats that is known to be possible.
+    """
     low, high = lowest, len(session.order.rows)
     while high - low > max(1, len(session.source) // 200):
         middle = (low + high) // 2
@@ -304,7 +313,7 @@ def _unchanged(session: Session, judge: Judge) -> Simplified:
 
 
 def _report(session: Session, result: Simplified, target: Target) -> dict[str, Any]:
-    """What was removed and why, what was predicted and what was found."""
+    """Return the report: pruned splats by reason, views, rounds, predicted and measured errors."""
     source, views = session.source, session.views
     stays = np.zeros(len(source), bool)
     stays[result.source_index] = True
