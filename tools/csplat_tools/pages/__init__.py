@@ -1,1 +1,1 @@
-"""What the HTML pages of the commands share: their look, their script, bars, and pictures of the hardest place."""
+"""Common parts of the HTML reports of commands: style, script, bars, plots, and images of the hardest place."""

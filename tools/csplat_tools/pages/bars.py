@@ -1,4 +1,4 @@
-"""Bytes by attribute as horizontal bars: an SVG that takes the colours of the page, or stands alone."""
+"""Draw bytes by attribute as horizontal bars: an SVG that takes the colours of the page, or stands alone."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _COLOURS = {
 }
 _OTHER = "#bbbbbb"
 
-_WIDTH, _ROW, _BAR = 820, 24, 17  # pixels
-_LETTER, _SIZE = 7.2, 13  # about how wide a letter is, and how high
-_GAP = 10
+_WIDTH, _ROW, _BAR = 820, 24, 17  # width of the figure, height of a row and of its bar, pixels
+_LETTER, _SIZE = 7.2, 13  # approximate width of a letter, and the font size, pixels
+_GAP = 10  # pixels between text and bar
 
-#: Of a picture that stands alone: the colour of letters and of the ground, by the reader's setting.
+#: Style of an SVG that stands alone: colours of text and background by the reader's light or dark setting.
 STANDALONE = (
     "<style>svg{color:#1d2126}.ground{fill:#ffffff}"
     "@media (prefers-color-scheme:dark){svg{color:#e4e8ed}.ground{fill:#14171b}}</style>"
@@ -38,12 +38,12 @@ STANDALONE = (
 
 @dataclass(frozen=True)
 class Bar:
-    """A row.
+    """A row of the figure.
 
     Attributes:
-        label: before it.
+        label: text before the bar.
         parts: bytes by attribute, in this order from left to right.
-        text: behind it.
+        text: text after the bar.
     """
 
     label: str
@@ -56,8 +56,8 @@ def draw_bars(bars: Sequence[Bar], *, key: bool, inline: bool = True) -> str:
 
     Args:
         bars: the rows, at least one.
-        key: whether the colours are named above: not where the labels do it.
-        inline: for a page: letters have its colour; else with a ground of its own.
+        key: name the colours above the bars, if the labels do not.
+        inline: for a page, whose text colour is used; else with a background of its own.
     """
     names = [name for name in _COLOURS if any(bar.parts.get(name) for bar in bars)]
     names += sorted({name for bar in bars for name in bar.parts if bar.parts[name]} - set(names))
@@ -77,7 +77,7 @@ def draw_bars(bars: Sequence[Bar], *, key: bool, inline: bool = True) -> str:
 
 
 def attribute_figure(sizes: Mapping[str, int]) -> str:
-    """What each attribute takes, of bytes by attribute that are all of a file: a figure for a page."""
+    """Return a figure for a page with the bytes of each attribute, whose sum is the size of the file."""
     whole = sum(sizes.values())
     bars = [
         Bar(name, {name: size}, f"{format_bytes(size)}, {100.0 * size / whole:.1f} %") for name, size in sizes.items()
@@ -101,7 +101,7 @@ def _row(bar: Bar, left: float, scale: float, top: float) -> list[str]:
 
 
 def _key(names: Sequence[str]) -> tuple[list[str], int]:
-    """Coloured squares and their names, in as many lines as they take, and how high these are."""
+    """Return coloured squares with their names, in as many lines as they take, and the height of these in pixels."""
     parts, across, top = list[str](), 0.0, 0
     for name in names:
         width = _ROW + _LETTER * len(name) + _GAP

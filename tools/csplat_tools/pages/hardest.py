@@ -1,4 +1,4 @@
-"""Where a file differs most from its source, as pictures: the place in its view, and the same piece of both."""
+"""Find the place where a file differs most from its source, and show it: in its view, and as a piece of both."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 
-#: Of the differences that are shown.
+#: Factor by which the differences that are shown are amplified.
 AMPLIFICATION = 10.0
 
-#: What a row of pictures shows, in words.
+#: Description of a row of pictures, for the page.
 PICTURES = (
     "The piece of a view with the largest error: where it is, the source, the file, and their difference times"
     f" {AMPLIFICATION:g}. The pictures are compressed for this page; no number is measured on them."
 )
 
-_SHARE = 4  # the piece is so many times narrower and lower than the view
-_SIDE = 480  # pixels; larger pictures are made smaller, or a page with photographs would be tens of megabytes
+_SHARE = 4  # width and height of a view divided by those of the piece
+_SIDE = 480  # largest side of an image, pixels: a page with larger photographs would have tens of megabytes
 _WEBP = {"quality": 94, "method": 4}
 
 
@@ -39,8 +39,8 @@ class Place:
     """A piece of a view.
 
     Attributes:
-        view: its number.
-        psnr: of the piece, dB.
+        view: number of the view.
+        psnr: PSNR of the piece, dB.
         where: [h, w, 3] uint8, the whole view of the source, with a frame around the piece.
         source, decoded, difference: [h, w, 3] uint8, the piece; the difference is amplified.
     """
@@ -54,14 +54,14 @@ class Place:
 
 
 class HardestPlace:
-    """Is shown one view after the other, and keeps the piece with the largest error."""
+    """A search through views, one after the other, for the piece with the largest error."""
 
     def __init__(self) -> None:
         self._error = -1.0
         self._place: tuple[int, slice, slice, F32, F32] | None = None
 
     def look(self, number: int, source: F32, decoded: F32) -> None:
-        """Look at a view: its number, and [H, W, 3] in 0..1 of source and decoded file."""
+        """Examine a view, given by its number and the renders of source and decoded file, [H, W, 3] in 0..1."""
         errors: F64 = np.asarray(squared_error(source, decoded).sum(axis=2), np.float64)
         height, width = (max(1, side // _SHARE) for side in errors.shape)
         sums = _window_sums(errors, height, width) / (height * width)
@@ -72,7 +72,7 @@ class HardestPlace:
             self._place = (number, rows, columns, source, decoded)
 
     def found(self) -> Place | None:
-        """The piece, its pictures reduced to a size for a page; `None` where no view was looked at."""
+        """Return the piece, with images reduced to a size for a page; `None` if no view was examined."""
         if self._place is None:
             return None
         number, rows, columns, source, decoded = self._place
@@ -82,11 +82,11 @@ class HardestPlace:
 
 
 def picture_row(place: Place, name: str) -> str:
-    """The pictures of a place beside each other.
+    """Return HTML that shows the images of a place side by side.
 
     Args:
-        place: what was found.
-        name: of the file.
+        place: the place.
+        name: name of the file.
     """
     words = {
         f"view {place.view}": place.where,
@@ -98,11 +98,11 @@ def picture_row(place: Place, name: str) -> str:
 
 
 def pictures_beside(pictures: Mapping[str, U8], name: str) -> str:
-    """Pictures beside each other, reduced to a size for a page.
+    """Return HTML that shows images side by side, reduced to a size for a page.
 
     Args:
-        pictures: [h, w, 3] uint8, by what is said below each.
-        name: of what they show.
+        pictures: [h, w, 3] uint8, by caption.
+        name: name of their subject, for the alternative text.
     """
     images = ""
     for word, pixels in pictures.items():
@@ -115,7 +115,7 @@ def pictures_beside(pictures: Mapping[str, U8], name: str) -> str:
 
 
 def _window_sums(values: F64, height: int, width: int) -> F64:
-    """Sums over all windows of a size: [H − height + 1, W − width + 1]."""
+    """Return the sums over all windows of a size: [H − height + 1, W − width + 1]."""
     total = np.zeros((values.shape[0] + 1, values.shape[1] + 1))
     np.cumsum(np.cumsum(values, axis=0), axis=1, out=total[1:, 1:])
     sums: F64 = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
@@ -123,7 +123,7 @@ def _window_sums(values: F64, height: int, width: int) -> F64:
 
 
 def _framed(picture: F32, rows: slice, columns: slice) -> U8:
-    """The whole view, reduced, with a frame that shows on any ground."""
+    """Return the whole view, reduced, with a frame that is visible on any background."""
     shown = _reduced(to_bytes(picture)).copy()
     factor = shown.shape[0] / picture.shape[0]
     top, bottom, left, right = (round(factor * at) for at in (rows.start, rows.stop, columns.start, columns.stop))
@@ -136,7 +136,7 @@ def _framed(picture: F32, rows: slice, columns: slice) -> U8:
 
 
 def _data_uri(pixels: U8) -> str:
-    """A picture as text that an `img` element takes: WebP, or PNG where pillow was built without it."""
+    """Return an image as a data URI for an `img` element: WebP, or PNG if pillow was built without it."""
     from PIL import Image, features
 
     kind, options = ("WEBP", _WEBP) if features.check("webp") else ("PNG", {})

@@ -1,4 +1,4 @@
-"""Parts of a page that opens from a disk and fetches nothing: style, script, a policy that allows these two, tables."""
+"""Parts of an HTML report that opens from a disk and loads nothing else: style, script, their policy, tables."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ for (const button of document.querySelectorAll('button.copy')) {
 
 
 def document(title: str, parts: Sequence[str]) -> str:
-    """A whole page, of parts of its body; empty ones are left out."""
+    """Return a whole page from the parts of its body; empty ones are left out."""
     body = "\n".join(part for part in parts if part)
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -128,12 +128,12 @@ def document(title: str, parts: Sequence[str]) -> str:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], words: Collection[int] = ()) -> str:
-    """A table: names to the left, numbers to the right.
+    """Return a table: names to the left, numbers to the right.
 
     Args:
         header: titles of the columns.
         rows: their cells.
-        words: places of columns that hold words, beside the first.
+        words: indices of columns that hold words, in addition to the first.
     """
     kinds = ["words" if place in words else "" if place else "name" for place in range(len(header))]
     marks = [f' class="{kind}"' if kind else "" for kind in kinds]
@@ -146,24 +146,24 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], words: Collectio
 
 
 def definitions(entries: Mapping[str, str], kind: str = "") -> str:
-    """Terms and what they mean; of kind `legend` in columns."""
+    """Return a list of terms and their meanings; of kind `legend` it is laid out in columns."""
     mark = f' class="{kind}"' if kind else ""
     lines = [f"<dt>{escape(key)}</dt> <dd>{escape(value)}</dd>" for key, value in entries.items()]
     return f"<dl{mark}>\n" + "\n".join(f"<div>{line}</div>" if kind else line for line in lines) + "\n</dl>"
 
 
 def copy_button(name: str, text: str) -> str:
-    """A button that copies what `command_line` of this name shows; only where scripts run."""
+    """Return a button that copies the text of the `command_line` of this name; it is shown only if scripts run."""
     return f'<button type="button" class="copy" data-from="{name}" title="{escape(text)}">copy</button>'
 
 
 def command_line(name: str, text: str) -> str:
-    """A command to be copied."""
+    """Return a command as an element that `copy_button` finds by its name."""
     return f'<code id="{name}">{escape(text)}</code>'
 
 
 def _policy() -> str:
-    """A Content Security Policy: this style, this script, pictures that are in the page, and no network."""
+    """Return a Content Security Policy that allows this style, this script, embedded images, and no network."""
     return (
         f"default-src 'none'; script-src '{_hash(_SCRIPT)}'; style-src '{_hash(_STYLE)}'; img-src data:;"
         " connect-src 'none'; base-uri 'none'; form-action 'none'"

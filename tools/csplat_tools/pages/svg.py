@@ -1,4 +1,4 @@
-"""Plots as SVG that can stand inside a page whose policy allows no style attributes, and that repeat bit for bit."""
+"""Draw plots as SVG without style attributes, which a page's policy forbids, and reproducible bit for bit."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 __all__ = ["INK", "drawn", "hover"]
 
-#: Stands for the colour of text until the picture is written: no other one is exactly this.
+#: Placeholder for the colour of text until the SVG is written: no other colour is exactly this.
 INK = "#123457"
 
 _SVG = "{http://www.w3.org/2000/svg}"
 _XLINK = "{http://www.w3.org/1999/xlink}"
-_BLACK = "#1d2126"  # where no style is understood
+_BLACK = "#1d2126"  # colour of text for readers that do not support styles
 # `font` is no attribute of SVG; older versions of matplotlib write sizes so.
 _FONT = re.compile(r"^(?:\S+\s+)*?(?P<size>[0-9.]+px)\s")
 _SETTINGS: dict[Any, Any] = {  # matplotlib's types name every key there is
@@ -46,7 +46,7 @@ _SETTINGS: dict[Any, Any] = {  # matplotlib's types name every key there is
 
 
 def hover(plot: str, name: str) -> str:
-    """The id of what stands for a point in a plot, made of letters and digits alone."""
+    """Return the id of a point's mark in a plot: `point-` and hexadecimal digits, whatever the names contain."""
     return f"point-{hashlib.sha256(f'{plot}/{name}'.encode()).hexdigest()[:12]}"
 
 
@@ -61,12 +61,12 @@ def drawn(
     """Draw a figure.
 
     Args:
-        draw: is given an empty figure.
+        draw: called with an empty figure.
         size: width and height, inches.
-        name: of the plot: ids inside begin with it, so that several plots can share a page.
-        inline: for a page, whose colour lines and letters have; else with a prologue and a ground, light or dark as
-            the reader has set it.
-        titles: by id, what appears where the mouse rests.
+        name: name of the plot: ids inside begin with it, so that several plots can share a page.
+        inline: for a page, whose text colour lines and letters take; else with an XML prologue and a background, light
+            or dark by the reader's setting.
+        titles: texts that appear when the mouse rests on a mark, by its id.
 
     Returns:
         The SVG, the same for the same figure and version of matplotlib.
@@ -100,7 +100,7 @@ def _text(root: ET.Element) -> str:
 
 
 def _clean(root: ET.Element, name: str, titles: Mapping[str, str]) -> None:
-    """Styles become attributes, ids those of this plot, and points get titles."""
+    """Turn styles into attributes, prefix ids with the plot's name, and add the titles of points."""
     for element in list(root.iter()):
         element.tag = element.tag.removeprefix(_SVG)
         for child in list(element):
@@ -116,7 +116,7 @@ def _clean(root: ET.Element, name: str, titles: Mapping[str, str]) -> None:
             label = ET.Element("title")
             label.text = title
             element.insert(0, label)
-    # What matplotlib's own style element says, for this picture alone.
+    # The content of matplotlib's own style element, for this SVG alone.
     root.set("stroke-linejoin", "round")
     root.set("stroke-linecap", "butt")
     root.set("role", "img")
@@ -132,7 +132,7 @@ def _own_id(key: str, value: str, name: str, titles: Mapping[str, str]) -> str:
 
 
 def _as_attributes(style: str) -> dict[str, str]:
-    """`fill: none; stroke: red` as attributes; the page chooses the font."""
+    """Parse `fill: none; stroke: red` into attributes; the font is left to the page."""
     found: dict[str, str] = {}
     for part in style.split(";"):
         key, _, value = (piece.strip() for piece in part.partition(":"))

@@ -1,1 +1,1 @@
-"""What people look at: pictures, films, the viewer and its page."""
+"""Output for people to look at: renders, films, the viewer and its page."""

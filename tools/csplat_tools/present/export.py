@@ -1,12 +1,12 @@
-"""One HTML file with a scene, the viewer and the decoder inside: it opens from a disk, without a network.
-Beside it one script with the viewer alone, for pages of others.
+"""Export one HTML file with a scene, the viewer and the decoder inside, which opens from a disk without a network.
+Also export one script with the viewer alone, for other pages.
 
 A page that was opened as `file:` may not import modules from neighbouring files, and its worker may not import at
 all: origins of such pages equal no other, not even that of their own blobs, which WebKit refuses to a worker's
 `import`, and Chromium to a worker that is a module. So the modules become functions of one classic script. The page
-runs it, and so does the worker, made from a blob of the same text, which a function knows of itself. A policy in the
-page forbids it the network. All of it is ASCII: a server that names another charset would change what the policy has
-digests of.
+runs it, and so does the worker, which is made from a blob of the same text; a function can read its own source. A
+policy in the page forbids the network. The page is ASCII: if a server declared another charset, the text would no
+longer match the digests in the policy.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from csplat_tools.present.webroot import ELEMENT, PAGE, WORKER, web_files
 
 __all__ = ["Exported", "export_element", "export_page", "link_modules"]
 
-# Statements that import: `import { a, b as c } from '…'`, `import * as a from '…'`, `import '…'`.
+# Import statements: `import { a, b as c } from '…'`, `import * as a from '…'`, `import '…'`.
 _IMPORT = re.compile(
     r"""^import\s+(?:(?:\*\s+as\s+(?P<all>[\w$]+)|(?P<some>\{[^}]*\}))\s+from\s+)?(['"])(?P<name>[^'"\n]+)\3;""",
     re.MULTILINE,
 )
-# Statements that export: what is declared, and `export { a, b as c };`.
+# Export statements: of a declaration, and `export { a, b as c };`.
 _DECLARED = re.compile(r"^export\s+(?=(?:const|class|(?:async\s+)?function\s*\*?)\s+(?P<name>[\w$]+))", re.MULTILINE)
 _LISTED = re.compile(r"^export\s+\{(?P<names>[^}]*?),?\s*\};", re.MULTILINE)
 _STATEMENT = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
-# Lines that are nothing but comments. What stands so in templates is GLSL, which may lose them, too.
+# Lines with nothing but comments. Inside template strings these are GLSL comments, which are removed, too.
 _COMMENT = re.compile(r"^ *(?://.*|/\*\*(?:(?!\*/)[\s\S])*\*/)\n", re.MULTILINE)
 _STYLE = '<link rel="stylesheet" href="viewer.css">'
 _SCRIPT = '<script type="module" src="main.mjs"></script>'
@@ -81,12 +81,12 @@ _SCENE = """\
 
 @dataclass(frozen=True)
 class Exported:
-    """A page.
+    """An exported page.
 
     Attributes:
-        page: the file.
-        code_bytes: what viewer and decoder take of it.
-        scene_bytes: what the scene takes of it, coded as text; a third more than its file.
+        page: the HTML file.
+        code_bytes: bytes of viewer and decoder in it.
+        scene_bytes: bytes of the scene in it, as base64; a third more than its file.
     """
 
     page: bytes
@@ -95,11 +95,11 @@ class Exported:
 
 
 def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None) -> Exported:
-    """Put a scene and all that shows it into one page.
+    """Put a scene, the viewer and the decoder into one page.
 
     Args:
-        scene: a .csplat file.
-        name: of the file, which the page shows.
+        scene: the bytes of a .csplat file.
+        name: name of the file, which the page shows.
         wishes: parameters of the page.
 
     Raises:
@@ -130,7 +130,7 @@ def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None
 
 
 def export_element() -> bytes:
-    """Make one script of all that shows scenes: pages that run it know the element `<csplat-view>`.
+    """Make one script of viewer and decoder: pages that run it have the element `<csplat-view>`.
 
     Raises:
         InputError: the installation is not complete.
@@ -139,16 +139,16 @@ def export_element() -> bytes:
 
 
 def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]:
-    """Make functions of the modules that entries import, and of those that these import in turn.
+    """Turn the entry modules, and all that they import in turn, into functions.
 
     Args:
         texts: source texts of modules by their paths.
         entries: paths of the modules to begin with.
 
     Returns:
-        By path, each module behind those that it imports: an element of a list of functions, with its comma. Each
-        takes a function that gives what another one exports, by its number in this order, and returns what it
-        exports itself. (An import is no live binding then; modules export nothing that changes.)
+        By path, each module after those that it imports: an element of a list of functions, with its comma. Each
+        takes a function that returns the exports of another module, by its number in this order, and returns its own
+        exports. (Imports are not live bindings then; no module exports a value that changes.)
     """
     found: dict[str, str] = {}
     numbers: dict[str, int] = {}
@@ -176,13 +176,13 @@ def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]
 
 
 def _texts() -> dict[str, str]:
-    """Text files of the viewer and the decoder by their paths; modules without comments, a fifth of what is sent."""
+    """Return the text files of viewer and decoder by path; modules without comments, which are a fifth of them."""
     texts = {path: file.read_text("utf-8") for path, file in web_files().items()}
     return {path: _COMMENT.sub("", text) if path.endswith(".mjs") else text for path, text in texts.items()}
 
 
 def _program(texts: Mapping[str, str], entry: str, before: str = "") -> str:
-    """A classic script that runs a module, and its worker, with all that they import; ASCII.
+    """Return a classic script in ASCII that runs a module, and its worker, with all that they import.
 
     Args:
         texts: source texts by their paths.
@@ -198,30 +198,30 @@ def _program(texts: Mapping[str, str], entry: str, before: str = "") -> str:
         "ENTRY": str(order.index(entry)),
     }
     script = re.sub("MODULES|WORKER|BEFORE|ENTRY", lambda match: parts[match[0]], _PROGRAM)
-    script = script.encode("ascii", "backslashreplace").decode()  # \x… and \u… mean the same in JavaScript
+    script = script.encode("ascii", "backslashreplace").decode()  # JavaScript has the same \x… and \u… escapes
     assert "\\U000" not in script, "JavaScript spells characters beyond U+FFFF otherwise"
     return script
 
 
 def _as_function(path: str, text: str) -> str:
-    """A module without imports, as a function that returns what it exports."""
+    """Return a module, whose imports are replaced already, as a function that returns its exports."""
     names = [match["name"] for match in _DECLARED.finditer(text)]
     names += [re.sub(r"([\w$]+)\s+as\s+([\w$]+)", r"\2: \1", match["names"]) for match in _LISTED.finditer(text)]
     text = _LISTED.sub("", _DECLARED.sub("", text))
     left = _STATEMENT.search(text)
     assert left is None, f"{path} has a statement that cannot be linked: {left[0] if left else ''}"
     text = text.replace(_START_WORKER, "link.startWorker()")
-    text = text.replace("import.meta.url", "document.baseURI")  # the module lies in the page
+    text = text.replace("import.meta.url", "document.baseURI")  # the module is part of the page
     return f"// {path}\n(link) => {{\n{text}return {{ {', '.join(names)} }};\n}},\n"
 
 
 def _json(value: object) -> str:
-    """JSON that can stand in a script element: nothing in it looks like markup."""
+    """Return JSON that is safe in a script element: nothing in it looks like markup."""
     return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def _policy(style: str, script: str) -> str:
-    """A Content Security Policy that allows what is inside the page and nothing from elsewhere."""
+    """Return a Content Security Policy that allows the content of the page and nothing from elsewhere."""
     hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (script, style)]
     return (
         f"default-src 'none'; script-src 'sha256-{hashes[0]}' 'wasm-unsafe-eval'; worker-src blob:;"

@@ -1,4 +1,4 @@
-"""Pictures one after the other as one file: animated WebP, GIF or PNG, or MP4."""
+"""Write renders as one film: animated WebP, GIF or PNG, or MP4."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ U8 = NDArray[np.uint8]
 
 _MP4 = "MP4"
 
-#: Names that end so are films, others are folders; with what pillow calls the format, which does not write MP4.
+#: File name endings of films, with pillow's names of the formats (it does not write MP4); other names are folders.
 FILM_ENDINGS = {".webp": "WEBP", ".gif": "GIF", ".png": "PNG", ".apng": "PNG", ".mp4": _MP4}
 
-#: Pictures per second.
+#: Frames per second.
 DEFAULT_FPS, MAX_FPS = 25.0, 100.0
 
-_TICKS = {"WEBP": 1000, "GIF": 100, "PNG": 1000, _MP4: 1000}  # per second: how finely the format tells time
-_MAX_SIDE = {"WEBP": 16383, "GIF": 65535, "PNG": 1 << 15, _MP4: 16384}
-_MAX_BYTES = 1 << 31  # of all pictures, which are in memory together
+_TICKS = {"WEBP": 1000, "GIF": 100, "PNG": 1000, _MP4: 1000}  # ticks per second of the format's clock
+_MAX_SIDE = {"WEBP": 16383, "GIF": 65535, "PNG": 1 << 15, _MP4: 16384}  # largest width or height, pixels
+_MAX_BYTES = 1 << 31  # largest size of all frames, which are in memory together
 _WEBP = {"quality": 90, "method": 4}
 _X264 = {
     "crf": "18",
     "preset": "medium",
-    "threads": "1",  # several: other bytes on other machines
-    "x264-params": "mbtree=0",  # with it two runs in four gave other bytes, on one thread, too
+    "threads": "1",  # with several, the bytes differ between machines
+    "x264-params": "mbtree=0",  # with mbtree two runs in four gave other bytes, even on one thread
 }
 _BT709 = 1  # matrix, primaries and transfer function, as H.264 numbers them
 _LIMITED_RANGE = 1  # as players expect: black is 16
 
 
 def is_film(path: str) -> bool:
-    """Whether a name is that of a film."""
+    """Return True if a path has the name of a film."""
     return Path(path).suffix.lower() in FILM_ENDINGS
 
 
@@ -52,12 +52,12 @@ def check_film(path: str, sizes: Sequence[tuple[int, int]], fps: float) -> None:
 
     Args:
         path: a name for which `is_film` holds.
-        sizes: width and height of its pictures, at least one.
-        fps: pictures per second, above 0.
+        sizes: width and height of its frames, at least one.
+        fps: frames per second, above 0.
 
     Raises:
-        InputError: the pictures differ in size, are too large or too many, or come too fast; or what writes such films
-            is not installed.
+        InputError: the frames differ in size, are too large or too many, or `fps` is too high; or the package that
+            writes such films is not installed.
     """
     kind = FILM_ENDINGS[Path(path).suffix.lower()]
     if kind == _MP4:
@@ -84,15 +84,15 @@ def write_film(path: str, frames: Sequence[U8], fps: float) -> None:
     """Write a film; the file appears when it is complete. An animation repeats for ever.
 
     Args:
-        path: its ending tells the format. WebP loses a little, GIF has 256 colours a picture, PNG loses nothing. MP4 is
-            H.264 with colours at half the resolution, as every player shows it; its sides are even, which may cost a
-            column and a row of pixels.
+        path: its ending determines the format. WebP loses a little, GIF has 256 colours a frame, PNG loses nothing.
+            MP4 is H.264 with colours at half the resolution, which every player can show; its sides are even, which
+            may cost a column and a row of pixels.
         frames: [H, W, 3] uint8 each, of one size, at least one.
-        fps: pictures per second; each lasts as near to that as the format can say, and all together exactly.
+        fps: frames per second; durations are rounded to the format's ticks without drift.
 
     Raises:
         InputError: pillow or PyAV is not installed, or was built without this format.
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     kind = FILM_ENDINGS[Path(path).suffix.lower()]
     write_bytes(path, _mp4(frames, fps) if kind == _MP4 else _animation(kind, frames, fps))
@@ -123,7 +123,7 @@ def _mp4(frames: Sequence[U8], fps: float) -> bytes:
     height, width = (side - side % 2 for side in frames[0].shape[:2])  # colours have half the resolution
     rate = Fraction(fps).limit_denominator(1001)
     with tempfile.TemporaryDirectory(prefix="csplat-") as folder:
-        film = Path(folder) / "film.mp4"  # written twice over: what a player reads first has to stand first
+        film = Path(folder) / "film.mp4"  # PyAV rewrites the file: the index for players has to come first
         options = {"movflags": "+faststart", "fflags": "+bitexact"}
         with av.open(film, "w", format="mp4", options=options) as container:
             try:
@@ -142,7 +142,7 @@ def _mp4(frames: Sequence[U8], fps: float) -> bytes:
 
 
 def _durations(count: int, fps: float, ticks: int) -> list[int]:
-    """Milliseconds that each picture stays, whole ticks of the format, without drifting."""
+    """Return the milliseconds of each frame, in whole ticks of the format, without drift."""
     ends = np.rint(np.arange(count + 1) * (ticks / fps)).astype(np.int64)
     lasting = np.maximum(np.diff(ends), 1) * (1000 // ticks)
     return [int(value) for value in lasting]

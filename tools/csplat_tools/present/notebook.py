@@ -1,7 +1,7 @@
-"""A scene at the end of a notebook's cell: the viewer's page in a frame, with the scene inside, turned with the mouse.
+"""Show a scene as the result of a notebook's cell: the viewer's page in a frame, with the scene inside.
 
-The page of `csplat export-html` is the text of the frame (`srcdoc`): it stands in the saved notebook, and no server is
-needed. The frame is a sandbox: what runs in it does not reach the notebook.
+The page of `csplat export-html` is the text of the frame (`srcdoc`): it is saved with the notebook, and no server is
+needed. The frame is a sandbox: its scripts cannot reach the notebook.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from csplat_tools.present.viewing import seeming_wishes
 
 __all__ = ["MOST_SPLATS", "most_visible", "scene_html"]
 
-#: A frame shows no more: some 9 bytes each, a third more as text, are kept with the notebook.
+#: Largest number of splats in a frame: some 9 bytes each, a third more as text, are saved with the notebook.
 MOST_SPLATS = 250_000
 
-_HEIGHT = 480  # pixels
+_HEIGHT = 480  # height of the frame, pixels
 
 
 def scene_html(model: SplatModel, *, most_splats: int = MOST_SPLATS) -> str:
-    """HTML that shows a scene, and how much of it.
+    """Return HTML that shows a scene, or the most visible part of a large one.
 
     Args:
-        model: the scene, of one splat at least.
-        most_splats: of a larger scene those are shown that cover most, and a line says so.
+        model: the scene, of at least one splat.
+        most_splats: of a larger scene only this many splats are shown, those that cover most, and a line says so.
 
     Returns:
-        A frame of all the width there is; the scene is coded by the preset `fast`. Self-contained: nothing is loaded
+        A frame of the full width, with the scene encoded by the preset `fast`. It is self-contained: nothing is loaded
         from elsewhere.
 
     Raises:
@@ -52,7 +52,7 @@ def scene_html(model: SplatModel, *, most_splats: int = MOST_SPLATS) -> str:
 
 
 def most_visible(model: SplatModel, count: int) -> SplatModel:
-    """The splats that cover most, by opacity × area, in their order; all of them where there are no more."""
+    """Return the `count` splats that cover most, by opacity × area, in their order; all if there are no more."""
     if len(model) <= count:
         return model
     covered = visible_opacity(model) * surface_areas(model)

@@ -1,4 +1,4 @@
-"""Pictures of a scene in a folder, or as a film: what `csplat render` does, apart from the command line."""
+"""Render a scene to PNG files in a folder, or to a film: `csplat render` without the command line."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ _DEFAULT_SIZE = (640, 480)
 
 @dataclass(frozen=True)
 class Rendered:
-    """Pictures that were written.
+    """The files that were written.
 
     Attributes:
-        files: in the order of the cameras.
-        ignored_count: splats that no picture shows because they hold NaN or infinities.
+        files: paths in the order of the cameras.
+        ignored_count: number of splats that were not drawn because they hold NaN or infinities.
     """
 
     files: tuple[Path, ...]
@@ -54,20 +54,20 @@ def find_cameras(
     split: Split = "test",
     report: list[str] | None = None,
 ) -> list[Camera]:
-    """Get the cameras that a command line names: a file's, a data set's, or those of an orbit.
+    """Return the cameras that a command line specifies: those of a file, of a data set, or of an orbit.
 
     Args:
-        model: the scene to orbit around; a data set's cameras are brought to its origin.
-        path: of a camera file.
-        orbit_count: how many cameras on a closed path; it leads along those of a file or a data set where one is named.
-        data: a data set, whose size counts, not `size`, unless there is an orbit.
-        size: width and height of the pictures; the file's own, or 640 by 480, if left out.
-        split: of a data set: which of its cameras.
-        report: takes lines on how the camera file of another program was understood.
+        model: the scene to orbit around; a data set's cameras are made relative to its origin.
+        path: path of a camera file.
+        orbit_count: number of cameras on a closed path, which follows those of a file or a data set if one is given.
+        data: a data set; its own size is used instead of `size`, unless there is an orbit.
+        size: width and height of the renders; the file's own, or 640 by 480, if left out.
+        split: the part of a data set whose cameras are used.
+        report: receives lines on how the camera file of another program was understood.
 
     Raises:
-        InputError: none of the three is given, or both a file and a set; the file or the set is none; a picture of that
-            size would be distorted.
+        InputError: none of the three is given, or both a file and a set; the file or the set is invalid; a render of
+            that size would be distorted.
     """
     if (path, orbit_count, data) == (None, None, None) or None not in (path, data):
         raise InputError("wanted the cameras: a file of them, a data set, or a number for an orbit")
@@ -77,7 +77,7 @@ def find_cameras(
     elif data is not None:
         shots = (
             data if orbit_count is None else replace(data, size=None)
-        )  # where they were taken matters, not how large
+        )  # the cameras' positions are needed, not the size of their photographs
         found = find_view_set(model, data=shots, count=0, split=split)
         cameras = [*found.judges, *(() if orbit_count is None else (*found.teaches, *found.decides))]
         if not cameras:
@@ -104,16 +104,16 @@ def render_folder(
 
     Args:
         model: the scene.
-        cameras: where to stand. The pictures take the names of their photographs, or numbers.
-        folder: where the files go; it is made if need be.
-        background: red, green, blue, 0..1; `None`: what the scene says it was trained in front of, else black.
+        cameras: the views. Renders are named after their photographs, or by numbers.
+        folder: the folder for the files; it is made if need be.
+        background: red, green, blue, 0..1; `None`: that of the scene's training if known, else black.
         mode: `exact`, `standard` or `fast`.
-        depth: write NAME.depth.npy too, [H, W] float32: how far along the camera's axis what is seen there lies on
-            average, scene units; 0 where nothing is.
-        alpha: write NAME.alpha.png too, 255 where nothing of the background shows.
+        depth: write NAME.depth.npy, too, [H, W] float32: mean depth along the camera's axis, scene units; 0 where
+            there are no splats.
+        alpha: write NAME.alpha.png, too, 255 where the background is hidden completely.
         force: existing files may be replaced.
-        prepare: is called when the folder is found to be fit, before the first picture.
-        progress: is told how much is done.
+        prepare: called when the folder has been checked, before the first render.
+        progress: progress callback.
 
     Raises:
         InputError: a file exists; or the renderer is not installed.
@@ -157,15 +157,15 @@ def render_film(
 
     Args:
         model: the scene.
-        cameras: where to stand, at least one, with pictures of one size.
-        path: of the file; its ending tells the format, see `film`.
-        fps: pictures per second.
+        cameras: the views, at least one, of one size.
+        path: path of the file; its ending determines the format, see `film`.
+        fps: frames per second.
         background, mode, prepare, progress: see `render_folder`.
         force: an existing file may be replaced.
 
     Raises:
-        InputError: the file exists, or cannot hold these pictures; or the renderer is not installed.
-        OSError: it cannot be written.
+        InputError: the file exists, or its format cannot hold these frames; or the renderer is not installed.
+        OSError: the file cannot be written.
     """
     need_renderer()
     check_output(path, force=force)
@@ -201,17 +201,17 @@ def _pictures(
 
 @contextmanager
 def _removed_if_empty(folder: Path | None) -> Iterator[None]:
-    """Leave no empty folder behind where the first picture is refused."""
+    """Remove a new folder that is still empty if an error occurs."""
     try:
         yield
     except BaseException:
         if folder is not None:
-            with suppress(OSError):  # it holds something
+            with suppress(OSError):  # it is not empty
                 folder.rmdir()
         raise
 
 
 def _mean_depth(depth: F32, alpha: F32) -> F32:
-    """The renderer sums weight times depth, and alpha is the sum of the weights."""
+    """Return the mean depth: the renderer sums weight times depth, and alpha is the sum of the weights."""
     mean = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0.0)
     return mean.astype(np.float32)

@@ -1,6 +1,6 @@
 """A web server for one scene: the page, the decoder and the scene with HTTP Range; nothing else is reachable.
 
-Every path that is answered stands in a table, so that there is no way to any other file.
+Every path that is served is in a table, so that there is no way to any other file.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ _SECONDS_IDLE = 60.0
 
 @dataclass(frozen=True)
 class _Resource:
-    """What a path gives.
+    """The content of a path.
 
     Attributes:
-        open: gives its bytes, and their number.
-        media_type: for `Content-Type`.
-        tag: gives the entity tag of the bytes that `open` gave.
+        open: opens the content; returns a stream and its number of bytes.
+        media_type: value of `Content-Type`.
+        tag: returns the entity tag of a stream that `open` returned.
     """
 
     open: Callable[[], tuple[BinaryIO, int]]
@@ -62,7 +62,7 @@ class _Resource:
 
 
 class SceneServer(ThreadingHTTPServer):
-    """Serves a scene; `url` is the address of its page."""
+    """A server of one scene; `url` is the address of its page."""
 
     daemon_threads = True  # a browser keeps connections open; they do not keep the command alive
 
@@ -73,11 +73,11 @@ class SceneServer(ThreadingHTTPServer):
         super().__init__((host, port), _Handler)
         shown = f"[{host}]" if ":" in host else host
         self.url = f"http://{shown}:{self.server_address[1]}/"
-        # a page of the web that has its own name point here must not read the scene (DNS rebinding)
+        # a web page whose own name is made to resolve to this machine must not read the scene (DNS rebinding)
         self.local_only = shown in _LOOPBACK
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Say nothing of a browser that hangs up in the middle of an answer."""
+        """Ignore a browser that closes the connection in the middle of an answer."""
 
 
 @contextmanager
@@ -87,23 +87,23 @@ def open_server(
     """Open a server for a scene; `serve_forever` runs it.
 
     Args:
-        scene: what is shown.
+        scene: the scene to show.
         host: the address of a network interface, or `localhost`.
-        port: 0 for one that is free.
+        port: port number; 0 for one that is free.
         wishes: parameters of the page.
 
     Yields:
         The server, already listening.
 
     Raises:
-        InputError: the port is taken, or the host is none of this machine's.
+        InputError: the port is taken, or the host is no address of this machine.
     """
     place = f"scene/{scene.name}"
     resources = {path: _file(file) for path, file in web_files().items()}
     content = scene.content
     resources[place] = _bytes(content, ".csplat") if isinstance(content, bytes) else _file(content, ".csplat")
     parameters = {"scene": "/" + quote(place), **(wishes or {})}
-    if "camera" in parameters:  # too long for an address
+    if "camera" in parameters:  # too long for a URL
         resources["cameras.json"] = _bytes(parameters["camera"].encode(), ".json")
         parameters["camera"] = "/cameras.json"
     start = f"/{PAGE}?{urlencode(parameters)}"
@@ -122,14 +122,14 @@ def byte_range(header: str | None, size: int) -> tuple[int, int] | None:
 
     Args:
         header: its value.
-        size: bytes of what is asked for.
+        size: number of bytes of the resource.
 
     Returns:
-        First byte and number of bytes; `None` where everything is to be sent: there is no range, it is not
-        understood, or there are several.
+        First byte and number of bytes; `None` if everything is to be sent: there is no range, it is not understood, or
+        there are several.
 
     Raises:
-        ValueError: nothing of the range is there (status 416).
+        ValueError: no byte of the range exists (status 416).
     """
     match = re.fullmatch(r"bytes=\s*(\d*)-(\d*)\s*", header or "", re.ASCII | re.IGNORECASE)
     if match is None or match[1] == match[2] == "":
@@ -179,7 +179,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         try:
             stream, size = resource.open()
-        except OSError:  # the file has gone since the server began
+        except OSError:  # the file was removed since the server started
             self._refuse(HTTPStatus.NOT_FOUND, send=send)
             return
         with stream:
@@ -211,7 +211,7 @@ class _Handler(BaseHTTPRequestHandler):
         stream.seek(first)
         while length > 0:
             block = stream.read(min(length, _BLOCK_BYTES))
-            if not block:  # the file has become shorter: the browser sees that bytes are missing
+            if not block:  # the file was shortened: the browser notices that bytes are missing
                 self.close_connection = True
                 return
             self.wfile.write(block)

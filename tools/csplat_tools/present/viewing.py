@@ -1,4 +1,4 @@
-"""Scenes for the viewer: a .csplat file that has been looked at, or a PLY that is encoded for it."""
+"""Prepare scenes for the viewer: check a .csplat file, or encode a PLY."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = ["ViewScene", "open_scene", "seeming_wishes", "view_wishes"]
 
 
 _NONE = SceneOverrides()
-_SPLATS_LOOKED_AT = 2_000_000  # of a file that need not be decoded otherwise
+_SPLATS_LOOKED_AT = 2_000_000  # larger files are not decoded only to estimate the up direction
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,13 @@ class ViewScene:
     """A scene that the viewer can show.
 
     Attributes:
-        name: of the file, as the page shows it; ends in `.csplat`.
-        content: where the file lies, or its bytes.
-        size_bytes: of the file.
-        header: what it says of itself.
-        seems_up: which way seems to be up where the scene does not say it.
-        findings: what lint noticed in the PLY.
-        encoded_from: size of the PLY in bytes; 0 for a file that was one already.
+        name: name of the file that the page shows; ends in `.csplat`.
+        content: path of the file, or its bytes.
+        size_bytes: size of the file.
+        header: header of the file.
+        seems_up: estimated up direction, if the scene does not specify one.
+        findings: findings of lint in the PLY.
+        encoded_from: size of the PLY in bytes; 0 if the scene was a .csplat file already.
     """
 
     name: str
@@ -52,25 +52,25 @@ class ViewScene:
     encoded_from: int = 0
 
     def read(self) -> bytes:
-        """All bytes of the file."""
+        """Return the bytes of the file."""
         return self.content if isinstance(self.content, bytes) else self.content.read_bytes()
 
 
 @contextmanager
 def open_scene(path: str, *, preset: PresetName, progress: Progress | None = None) -> Iterator[ViewScene]:
-    """Get a scene ready: check the header of a .csplat file, encode a PLY.
+    """Prepare a scene: check the header of a .csplat file, or encode a file of another format.
 
     Args:
-        path: a file of either kind, or `-`.
-        preset: of the encoder, for a PLY.
-        progress: is told the stages of reading and encoding.
+        path: the file, or `-`.
+        preset: preset of the encoder.
+        progress: progress callback of reading and encoding.
 
     Yields:
-        The scene; the file of standard input is there as long as the context.
+        The scene; a copy of standard input exists as long as the context.
 
     Raises:
         CsplatError: the file is not valid.
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     with local_path(path) as local:
         stem = "scene" if path == STANDARD_STREAM else Path(path).stem or "scene"
@@ -83,13 +83,13 @@ def view_wishes(
     report: list[str] | None = None,
     origin: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> dict[str, str]:
-    """Put options into words that the page understands.
+    """Translate options into parameters of the page.
 
     Args:
-        camera: a camera file, see `load_cameras`. The page looks from the first and steps through all of them.
-        facts: axes and up instead of the scene's.
-        report: takes lines on how the camera file of another program was understood.
-        origin: the scene's.
+        camera: a camera file, see `load_cameras`. The page begins with the first camera and steps through all of them.
+        facts: overrides of the scene's axes and up direction.
+        report: receives lines on how the camera file of another program was understood.
+        origin: the scene's origin.
 
     Returns:
         Parameters of the page.
@@ -109,7 +109,7 @@ def view_wishes(
 
 
 def seeming_wishes(up: Direction | None) -> dict[str, str]:
-    """Parameters of the page for which way seems to be up: it asks for them last."""
+    """Return the page's parameters for an estimated up direction, which has the lowest priority there."""
     return {} if up is None else {"seems": _words(up)}
 
 
@@ -136,7 +136,7 @@ def _seems_up(path: Path, header: SceneHeader) -> Direction | None:
     try:
         return seeming_up(decode(path, sh_degree=0))
     except CsplatError:
-        return None  # the page shows what is whole, and says what is wrong
+        return None  # the page shows the intact part, and reports the error
 
 
 def _encoded(path: Path, stem: str, preset: PresetName, progress: Progress | None) -> ViewScene:

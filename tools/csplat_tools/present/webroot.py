@@ -1,6 +1,6 @@
-"""Where the page of the viewer and the JavaScript decoder lie: in a checkout, or in the installed package.
+"""Locate the page of the viewer and the JavaScript decoder, in a checkout or in the installed package.
 
-Both places have `tools/viewer` and `codec/js` beside each other, as the modules' imports want it.
+Both places have the folders `tools/viewer` and `codec/js` under one root, as the modules' imports require.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from csplat.errors import InputError
 
 __all__ = ["ELEMENT", "PAGE", "WORKER", "web_files"]
 
-#: The page, the element for other pages, and the module that both start as a worker, below the root.
+#: Paths below the root: the page, the element for other pages, and the module that both start as a worker.
 PAGE = "tools/viewer/index.html"
 ELEMENT = "tools/viewer/element.mjs"
 WORKER = "tools/viewer/worker.mjs"
@@ -23,7 +23,7 @@ def web_files() -> dict[str, Path]:
     """Find every file that the page may load.
 
     Returns:
-        Paths below the root, with slashes, and where they lie: `tools/viewer/index.html`, `codec/js/decoder.mjs`, ...
+        Local files by their paths below the root, with slashes: `tools/viewer/index.html`, `codec/js/decoder.mjs`, ...
 
     Raises:
         InputError: the installation is not complete.

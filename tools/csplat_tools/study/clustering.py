@@ -1,8 +1,8 @@
-"""K-means, attribute by attribute: each splat's value becomes the entry of a codebook, or a sum of several.
+"""Cluster attributes by k-means: each splat's value becomes the entry of a codebook, or a sum of several.
 
-It is a step on the scene, the centres among its attributes: what a file makes of equal values is the encoder's matter.
-The search is the encoder's own, on a lattice as fine as its exact arithmetic allows; entries are then the float64 means
-of their splats. Same values, sizes and seed: same entries, at any number of threads.
+The step changes the scene, positions included; how equal values are stored in a file is left to the encoder. The search
+is the encoder's own, on a lattice as fine as its exact arithmetic allows; entries are then the float64 means of their
+splats. The same values, sizes and seed give the same entries at any number of threads.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ __all__ = ["ATTRIBUTES", "MAX_STAGES", "Book", "Clustered", "KMeans", "cluster_a
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U32 = NDArray[np.uint32]
-#: What has a codebook of its own, in the order of a model's fields.
+#: Attributes that have a codebook of their own, in the order of a model's fields.
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 MAX_STAGES = 4
-_MAX_SIZE = 1 << 16
-_NORM = 2000.0  # of the longest vector on the lattice: below 2,300 the search is exact on all of it
-_GROUPED = 2048  # entries from which only the nearest groups of them are searched
-_NEAR_GROUPS = 8
-_REFINEMENTS = 3  # halvings of the octave in which the size lies that an error share wants
+_MAX_SIZE = 1 << 16  # largest number of entries of a codebook
+_NORM = 2000.0  # norm of the longest vector in lattice units: below 2,300 the search is exact everywhere
+_GROUPED = 2048  # number of entries from which only the nearest groups of them are searched
+_NEAR_GROUPS = 8  # number of groups that are searched then
+_REFINEMENTS = 3  # bisections between two powers of two for the size that reaches an error share
 
 
 @dataclass(frozen=True)
 class KMeans:
-    """Which attributes are clustered, and how finely.
+    """The attributes to cluster, and the sizes of their codebooks.
 
     Attributes:
-        sizes: by attribute, an integer from 1: entries of a codebook; or a share above 0 and below 1: the codebook is
-            as small as leaves that share of the attribute's variance as squared error. Attributes that are not named
-            stay as they are.
-        stages: codebooks per attribute, each of what the one before left; all of the same size.
-        gauge: rotations and scales are first described in the one way that the encoder prefers of 24 equal ones;
-            otherwise rotations have only their sign fixed.
-        seed: of the clustering.
+        sizes: by attribute, an integer from 1: entries of a codebook; or a fraction above 0 and below 1: the codebook
+            is as small as possible with a squared error of that fraction of the attribute's variance. Attributes that
+            are not named are unchanged.
+        stages: codebooks per attribute, each for the residual of the one before; all of the same size.
+        gauge: bring rotations and scales to the encoder's canonical form, one of 24 equal ones; otherwise only the sign
+            of rotations is fixed.
+        seed: seed of the clustering.
 
     Raises:
         InputError: an attribute is not known, or a number is out of range.
@@ -82,9 +82,9 @@ class Book:
     """The codebooks of one attribute.
 
     Attributes:
-        floats: numbers of an entry.
-        sizes: entries, stage by stage; none: no codebook was worth its error, the values stay.
-        error_share: squared error as a share of the attribute's variance.
+        floats: number of values of an entry.
+        sizes: number of entries of each stage; empty: no codebook reached the error, and the values are unchanged.
+        error_share: squared error as a fraction of the attribute's variance.
     """
 
     floats: int
@@ -92,7 +92,7 @@ class Book:
     error_share: float
 
     def size_bytes(self, count: int) -> int:
-        """Bytes of entries in float32 and of indices of ceil(log2 K) bits for so many splats."""
+        """Return the bytes of entries in float32 and of indices of ceil(log2 K) bits for `count` splats."""
         if not self.sizes:
             return raw_bytes(self.floats, count)
         return raw_bytes(self.floats, sum(self.sizes)) + -(-count * index_bits(self.sizes) // 8)
@@ -100,11 +100,11 @@ class Book:
 
 @dataclass(frozen=True, eq=False)
 class Clustered:
-    """A scene of clustered values.
+    """A scene with clustered values.
 
     Attributes:
-        model: the scene; splats are in their order.
-        books: by attribute; those that were not clustered are absent.
+        model: the scene; the order of splats is unchanged.
+        books: codebooks by attribute, without those that were not clustered.
     """
 
     model: SplatModel
@@ -116,7 +116,7 @@ class Clustered:
         return sum(self.attribute_bytes().values())
 
     def attribute_bytes(self) -> dict[str, int]:
-        """The same by attribute."""
+        """Return the bytes of codebooks and indices, or of raw float32, by attribute."""
         count = len(self.model)
         floats = attribute_floats(self.model.sh_degree)
         return {
@@ -125,19 +125,19 @@ class Clustered:
         }
 
     def as_json(self) -> dict[str, Any]:
-        """Sizes and errors of the codebooks."""
+        """Return sizes and errors of the codebooks as JSON-compatible values."""
         return {name: {"sizes": list(book.sizes), "error_share": book.error_share} for name, book in self.books.items()}
 
 
 def parse_kmeans(text: str, *, stages: int = 1, seed: int = 0) -> KMeans:
-    """Read what a command line says: `256`, `means=4096,quats=256`, `256,means=4096`, `0.01`, `means=0.0001,sh0=64`.
+    """Parse `256`, `means=4096,quats=256`, `256,means=4096`, `0.01` or `means=0.0001,sh0=64`.
 
     Args:
-        text: numbers for all attributes or, after NAME=, for one; a number below 1 is a share of the variance.
+        text: numbers for all attributes or, after NAME=, for one; a number below 1 is a fraction of the variance.
         stages, seed: as in `KMeans`.
 
     Raises:
-        InputError: it says something else.
+        InputError: the text is invalid.
     """
     sizes: dict[str, float] = {}
     named: dict[str, float] = {}
@@ -161,13 +161,13 @@ def parse_kmeans(text: str, *, stages: int = 1, seed: int = 0) -> KMeans:
 def cluster_attributes(
     model: SplatModel, how: KMeans, *, threads: int | None = None, progress: Progress | None = None
 ) -> Clustered:
-    """Give each splat the values of codebook entries.
+    """Replace the values of each splat by codebook entries.
 
     Args:
         model: the scene.
-        how: which attributes, and how finely.
-        threads: worker threads, all processors unless told; no effect on the result.
-        progress: is told how much is done.
+        how: the attributes to cluster, and the sizes of their codebooks.
+        threads: number of threads; `None`: all processors. The result does not depend on it.
+        progress: progress callback.
     """
     wanted = {name: how.sizes[name] for name in ATTRIBUTES if name in how.sizes}
     model = _in_one_form(model, how)
@@ -194,7 +194,7 @@ def _tell(progress: Progress | None, number: int, count: int, share: float) -> N
 
 
 def _in_one_form(model: SplatModel, how: KMeans) -> SplatModel:
-    """One description of each shape: of equal ones, different descriptions would need entries of their own."""
+    """Bring shapes to one form: different descriptions of equal shapes would need entries of their own."""
     if "quats" not in how.sizes or not len(model):
         return model
     if how.gauge:
@@ -216,7 +216,7 @@ def _valid(name: str, values: F32) -> F32:
 def _served(
     values: F64, size: float, how: KMeans, threads: int | None, tell: Callable[[float], None]
 ) -> tuple[F64, tuple[int, ...]]:
-    """What stands for the values, and the sizes of the stages; none where half the splats' number is not enough."""
+    """Return the clustered values and the stages' sizes; no sizes if half as many entries as splats do not suffice."""
 
     def by(entries: int) -> tuple[F64, tuple[int, ...]]:
         return _stages(values, entries, how, threads)
@@ -263,7 +263,7 @@ def _stages(
 def _one_stage(
     values: F64, size: int, seed: int, threads: int | None, show: Callable[[int, int], None]
 ) -> tuple[F64, int]:
-    """The entries that stand for the values, splat by splat, and how many there are."""
+    """Return the entry of each splat's value, and the number of entries."""
     index = _distinct(values) if size >= len(values) else _assigned(values, size, seed, threads, show)
     count = int(index.max()) + 1
     held = np.bincount(index, minlength=count)
@@ -286,6 +286,6 @@ def _assigned(values: F64, size: int, seed: int, threads: int | None, show: Call
 
 
 def _error_share(values: F64, served: F64) -> float:
-    """Squared error as a share of the squared distance from the mean, 0 where all values are equal."""
+    """Return the squared error as a fraction of the squared distance from the mean; 0 if all values are equal."""
     spread = float(np.sum(np.square(values - values.mean(axis=0))))
     return float(np.sum(np.square(values - served))) / spread if spread > 0.0 else 0.0

@@ -1,8 +1,8 @@
-"""Fewer SH bands, whose colours are fitted anew to what the source looks like: the lower degree, distilled.
+"""Distil SH to a lower degree: the colours of fewer bands are refitted to renders of the source.
 
-With the geometry fixed a picture is linear in the coefficients, so the fit is a ridge least-squares problem that
-conjugate gradients solve (`csplat_render.refit`); nothing is trained. Few views overfit, far more than in a choice of
-splats: 300 splats of wild SH lost 0.7 dB on other views when 28 taught them degree 0, and gained 2.3 when 112 did.
+With fixed geometry a render is linear in the coefficients, so the fit is a ridge least-squares problem that conjugate
+gradients solve (`csplat_render.refit`); nothing is trained. Few views overfit, far more than for the choice of splats:
+300 splats with extreme SH lost 0.7 dB on other views if degree 0 was fitted to 28 views, and gained 2.3 with 112.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from csplat_tools.views import ViewSet, reduced
 __all__ = ["Teacher"]
 
 F32 = NDArray[np.float32]
-_STEPS = 8  # of conjugate gradients at most; more only follow the views that teach
+_STEPS = 8  # largest number of conjugate gradient steps; more overfit the training views
 
 
 @dataclass(frozen=True, eq=False)
 class Teacher:
-    """What a source looks like, for others to learn its colours from.
+    """Renders of a source, to which the colours of other scenes are fitted.
 
     Attributes:
         cameras: the views.
-        wanted: [H, W, 3], the source's renders there.
-        check: judges by views that nothing is fitted to.
+        wanted: [H, W, 3], the source's render of each.
+        check: scorer by views that nothing is fitted to.
         background: red, green, blue behind everything.
-        threads: how many; None for all. No result depends on it.
+        threads: number of threads; None for all. No result depends on it.
     """
 
     cameras: Sequence[Camera]
@@ -54,16 +54,15 @@ class Teacher:
         *,
         threads: int | None = None,
     ) -> Teacher:
-        """Look at a source.
+        """Render a source.
 
         Args:
             source: the scene.
-            views: colours are fitted in those that teach, and checked in those that decide. Pictures are made smaller
-                where they are large.
-            threads: how many.
+            views: colours are fitted to training views, and checked on validation views. Large views are reduced.
+            threads: number of threads.
 
         Raises:
-            InputError: no view teaches, or none decides.
+            InputError: there are no training or no validation views.
         """
         if not views.teaches:
             raise InputError("no view is left to learn colours from")
@@ -74,12 +73,12 @@ class Teacher:
         return cls(used, wanted, check, views.background, threads)
 
     def taught(self, model: SplatModel, sh_degree: int, progress: Progress | None = None) -> SplatModel:
-        """The scene with bands up to a degree, its colours such that it looks like the source as nearly as they can.
+        """Return the scene with SH up to a degree, with colours fitted to the source's renders.
 
         Args:
             model: the geometry, and the colours to start from, of the source's degree or less.
-            sh_degree: of the result, at most that of the model.
-            progress: is told how much is done.
+            sh_degree: SH degree of the result, at most that of the model.
+            progress: progress callback.
 
         Raises:
             InputError: the model has no such bands.

@@ -1,7 +1,7 @@
-"""Reduce and encode in one go, and state what that did to the source.
+"""Reduce and encode a scene in one step, with error bounds that refer to the source.
 
-Bands that are distilled are fitted to the geometry as a decoder will see it. The errors that the file of a clustered
-scene states are those against the source, which the encoder has not seen.
+Distilled bands are fitted to the quantised geometry. The errors that the file of a clustered scene declares are those
+against the source, which the encoder has not seen.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ def encode_reduced(
     views: ViewSet | None = None,
     progress: Progress | None = None,
 ) -> EncodeResult:
-    """Prune, take SH bands away, cluster, encode.
+    """Prune, leave out SH bands, cluster, and encode.
 
     Args:
         source: the scene.
-        reduction: what is done to it. Its `sh_degree`, where it is None, is that of `encoding`.
-        encoding: of the encoder.
-        views: those that teach and those that check what is distilled; None for virtual ones.
-        progress: is told the stages.
+        reduction: the steps. If its `sh_degree` is None, that of `encoding` is used.
+        encoding: options of the encoder.
+        views: training and validation views for distilling; None for virtual ones.
+        progress: progress callback.
 
     Returns:
-        The file, and which splat of the source each of its splats is. The file states its errors against the source;
-        colours that were distilled have none, and the options say how good renders are.
+        The file, with the source splat of each of its splats. The file declares its errors against the source;
+        distilled colours have none, and the options give the PSNR of renders.
 
     Raises:
-        InputError: as `reduce_model` and the encoder.
+        InputError: as for `reduce_model` and the encoder.
     """
     encoding = encoding or EncodeOptions()
     if reduction.sh_degree is None:
@@ -73,7 +73,7 @@ def encode_reduced(
 
 
 def _with_bands(model: SplatModel, sh_degree: int) -> SplatModel:
-    """The scene with zeros in further SH bands: the encoder is told of which degree the source was."""
+    """Return the scene with zeros in further SH bands, so that the encoder records the source's degree."""
     missing = (sh_degree + 1) ** 2 - 1 - model.shN.shape[1]
     zeros = np.zeros((len(model), missing, 3), np.float32)
     return replace(model, shN=np.concatenate([model.shN, zeros], axis=1))

@@ -1,4 +1,4 @@
-"""Remove splats by what they say of themselves, their opacity and size: no picture is looked at."""
+"""Prune splats by their own opacity and size, without rendering."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def prune_opacity(model: SplatModel, tau: float) -> tuple[SplatModel, I64]:
 
     Args:
         model: the scene; its alpha is the sigmoid of a PLY's logit, rounded once to float32.
-        tau: the threshold, at least 0 and less than 1. 0 removes what is wholly transparent.
+        tau: the threshold, at least 0 and less than 1. 0 prunes fully transparent splats.
 
     Returns:
-        The others, in their order, and which splat of the scene each one was, [N] int64.
+        The kept splats, in their order, and the index of each in the scene, [N] int64.
 
     Raises:
         InputError: the threshold is out of range, or nothing would be left.
@@ -36,15 +36,15 @@ def prune_opacity(model: SplatModel, tau: float) -> tuple[SplatModel, I64]:
 
 
 def prune_share(model: SplatModel, keep: float, *, by_area: bool = False) -> tuple[SplatModel, I64]:
-    """Keep a share of the splats: the most opaque ones, or those of the most opacity × surface.
+    """Keep a fraction of the splats: the most opaque ones, or those with the largest opacity × surface area.
 
     Args:
         model: the scene.
-        keep: the share, above 0, at most 1; one splat stays at least.
-        by_area: whether the surface counts.
+        keep: the fraction, above 0, at most 1; at least one splat is kept.
+        by_area: multiply the opacity by the surface area.
 
     Returns:
-        The others, in their order, and which splat of the scene each one was, [N] int64.
+        The kept splats, in their order, and the index of each in the scene, [N] int64.
     """
     keys = model.opacities.astype(np.float64)
     if by_area:
@@ -55,7 +55,7 @@ def prune_share(model: SplatModel, keep: float, *, by_area: bool = False) -> tup
 
 
 def check_threshold(tau: float) -> None:
-    """Refuse what is no threshold.
+    """Refuse an invalid opacity threshold.
 
     Raises:
         InputError: it is not a number of at least 0 and less than 1.

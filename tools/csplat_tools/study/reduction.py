@@ -1,4 +1,4 @@
-"""The strategies one after the other: prune, then take SH bands away, then cluster what is left."""
+"""Apply the strategies one after the other: prune, leave out SH bands, cluster."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ if TYPE_CHECKING:
 __all__ = ["Reduced", "Reduction", "find_teacher", "reduce_model", "reduced_by", "target_degree"]
 
 I64 = NDArray[np.int64]
-_ASIDE = 8  # one of so many virtual views checks
+_ASIDE = 8  # every Nth virtual view is held out for validation
 
 
 @dataclass(frozen=True)
 class Reduction:
-    """What is done to a scene, in this order.
+    """The steps of a reduction, in this order.
 
     Attributes:
-        prune_opacity: splats of at most this alpha go; None: all stay.
-        sh_degree: bands above it go; None: all stay.
-        distil: the bands that stay are fitted to renders of the source; otherwise they are as they were.
-        kmeans: which attributes are clustered; None: none is.
-        views: virtual views to distil by, and 16 more; one in eight of all checks.
-        seed: of the virtual views.
-        threads: how many; None for all. The result does not depend on it.
+        prune_opacity: prune splats of at most this alpha; None: keep all.
+        sh_degree: leave out the SH bands above; None: keep all.
+        distil: fit the remaining bands to renders of the source; otherwise they are unchanged.
+        kmeans: attributes to cluster; None: no clustering.
+        views: number of virtual views for distilling, to which 16 are added; one in eight is held out for validation.
+        seed: seed of the virtual views.
+        threads: number of threads; None for all. The result does not depend on it.
 
     Raises:
         InputError: a value is out of range.
@@ -68,9 +68,9 @@ class Reduced:
 
     Attributes:
         model: the scene.
-        source_index: [N] int64, which splat of the source each one is.
-        clustered: its codebooks; None where nothing was clustered.
-        said: what was done, JSON-compatible.
+        source_index: [N] int64, the source splat that each splat was.
+        clustered: its codebooks; None if nothing was clustered.
+        said: report of the steps, JSON-compatible.
     """
 
     model: SplatModel
@@ -80,7 +80,7 @@ class Reduced:
 
     @property
     def size_bytes(self) -> int:
-        """Bytes of raw float32 without an entropy coder, codebooks and indices where there are some."""
+        """Bytes without an entropy coder: raw float32, or codebooks and indices for clustered attributes."""
         if self.clustered is not None:
             return self.clustered.size_bytes
         return raw_bytes(sum(attribute_floats(self.model.sh_degree).values()), len(self.model))
@@ -93,13 +93,13 @@ def reduce_model(
     *,
     progress: Progress | None = None,
 ) -> Reduced:
-    """Prune, take SH bands away, cluster.
+    """Prune, leave out SH bands, and cluster.
 
     Args:
         source: the scene.
-        reduction: what is to be done.
-        views: those that teach and those that check what is distilled; None for virtual ones.
-        progress: is told how much is done.
+        reduction: the steps.
+        views: training and validation views for distilling; None for virtual ones.
+        progress: progress callback.
 
     Raises:
         InputError: nothing would be left; or there is nothing to distil, or too few views to do it by.
@@ -109,7 +109,7 @@ def reduce_model(
 
 
 def reduced_by(source: SplatModel, reduction: Reduction, teacher: Teacher | None, progress: Progress | None) -> Reduced:
-    """`reduce_model` by somebody who has looked at the source before; None: bands are taken away as they are."""
+    """Do as `reduce_model` with a given `Teacher`, which has rendered the source; None: bands are only left out."""
     rows = np.arange(len(source), dtype=np.int64)
     model, degree = source, target_degree(source, reduction)
     said: dict[str, Any] = {"splats": len(source)}
@@ -130,12 +130,12 @@ def reduced_by(source: SplatModel, reduction: Reduction, teacher: Teacher | None
 
 
 def target_degree(source: SplatModel, reduction: Reduction) -> int:
-    """SH degree of the result."""
+    """Return the SH degree of the result."""
     return source.sh_degree if reduction.sh_degree is None else min(reduction.sh_degree, source.sh_degree)
 
 
 def find_teacher(source: SplatModel, reduction: Reduction, views: ViewSet | None) -> Teacher | None:
-    """Who teaches the lower degree; None where nothing is distilled.
+    """Return the `Teacher` of the lower degree; None if nothing is distilled.
 
     Raises:
         InputError: there is nothing to distil, or there are fewer than two views.
@@ -147,7 +147,7 @@ def find_teacher(source: SplatModel, reduction: Reduction, views: ViewSet | None
         raise InputError(
             f"nothing to distil: the scene has SH of degree {source.sh_degree}, wanted a lower one than that"
         )
-    from csplat_tools.study.distilling import Teacher  # wants numba; the other strategies do not
+    from csplat_tools.study.distilling import Teacher  # requires numba; the other strategies do not
 
     if views is None:
         aside = max(1, reduction.views // _ASIDE)
