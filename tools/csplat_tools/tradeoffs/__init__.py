@@ -1,1 +1,1 @@
-"""What a scene costs and what it keeps, over everything that can be chosen: the work of `csplat tradeoff`."""
+"""Measure size, quality and time of a scene over many encoder settings, as `csplat tradeoff` does."""

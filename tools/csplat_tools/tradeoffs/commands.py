@@ -1,6 +1,6 @@
-"""The command that makes a file of the sweep again, for readers to paste into a shell.
+"""Build the command that makes a file of the sweep again, for readers to paste into a shell.
 
-Targets, removal and tuning depend on views, so that their commands name them as the sweep was told.
+Targets, pruning and tuning depend on views, so that their commands name the views of the sweep.
 """
 
 from __future__ import annotations
@@ -22,37 +22,37 @@ _REDUCED = "from pathlib import Path; from csplat import EncodeOptions, read_ply
 
 
 def file_name(setting: Setting, name: str) -> str:
-    """What the file of a point is called: `scene-target-40-dB.csplat`."""
+    """Return the file name of a point: `scene-target-40-dB.csplat`."""
     stem = "scene" if setting.path == STANDARD_STREAM else PurePath(setting.path).stem
     return f"{stem}-{re.sub(r'[^A-Za-z0-9.]+', '-', name)}.csplat"
 
 
 def encode_command(setting: Setting, name: str, preset: str, **options: Any) -> str:
-    """A file of `csplat encode` that takes no views.
+    """Return the command for a file of `csplat encode` that needs no views.
 
     Args:
         setting: the scene.
-        name: of the point.
-        preset: of the encoder.
-        options: others, as `sh_degree`, and their values.
+        name: name of the point.
+        preset: preset of the encoder.
+        options: other options, such as `sh_degree`, and their values.
     """
     return _line("encode", setting, name, "--preset", preset, *_options(options))
 
 
 def target_command(setting: Setting, name: str, preset: str, **options: Any) -> str:
-    """A file of `csplat encode` that views decide on; see `encode_command`."""
+    """Return the command for a file of `csplat encode` that depends on views; see `encode_command`."""
     return _line("encode", setting, name, *_options(options), "--preset", preset, *_views(setting))
 
 
 def finetune_command(setting: Setting, name: str, wanted: Wanted, keep: float | None) -> str:
-    """A file of `csplat finetune`."""
+    """Return the command for a file of `csplat finetune`."""
     options = {"keep": keep, "iterations": None if wanted.iterations == Wanted.iterations else wanted.iterations}
     itself = () if setting.views.photographs else ("--self",)
     return _line("finetune", setting, name, *itself, *_options(options), "--preset", wanted.preset, *_views(setting))
 
 
 def reduction_command(setting: Setting, name: str, preset: str, reduction: Reduction) -> str:
-    """A file of `csplat_tools.study`, which is no command but a library: a line of Python."""
+    """Return a line of Python for a file of `csplat_tools.study`, which is a library without a command."""
     names, before, others, views = ["Reduction", "encode_reduced"], "", [], ""
     if reduction.prune_opacity is not None:
         others.append(f"prune_opacity={reduction.prune_opacity!r}")
@@ -86,13 +86,13 @@ def _options(values: dict[str, Any]) -> list[str]:
 
 
 def _number(value: Any) -> str:
-    """As people write it, where that is exact."""
+    """Return a number in its short form if that is exact, else in full."""
     short = str(value) if isinstance(value, int) else f"{value:g}"
     return short if float(short) == value else repr(value)
 
 
 def _views(setting: Setting) -> list[str]:
-    """The options of `view_options.Views`."""
+    """Return the options of `view_options.Views`."""
     words, data = list[str](), setting.data
     if setting.cameras is not None:
         words += ["--cameras", setting.cameras]
@@ -107,7 +107,7 @@ def _views(setting: Setting) -> list[str]:
 
 
 def _arguments(setting: Setting) -> str:
-    """The same as arguments of `find_view_set`."""
+    """Return the views as arguments of `find_view_set`."""
     words, data = list[str](), setting.data
     if setting.cameras is not None:
         words.append(f"cameras={_text(setting.cameras)}")
@@ -120,5 +120,5 @@ def _arguments(setting: Setting) -> str:
 
 
 def _text(value: str) -> str:
-    """A string of Python, in quotation marks that a shell leaves alone."""
+    """Return a string literal of Python, in double quotation marks."""
     return json.dumps(value, ensure_ascii=False)

@@ -1,7 +1,7 @@
-"""Names or numbers beside the marks of a plot, so that none covers another one.
+"""Place names or numbers next to the marks of a plot, so that none covers another one.
 
-Each label tries places around its mark, near ones first, and takes the cheapest that is free; what lies farther away
-gets a line to its mark. Names are tried first. Where not all of them find a free place, numbers stand for them.
+Each label tries places around its mark, near ones first, and takes the cheapest that is free; a label that is farther
+away gets a line to its mark. Names are tried first. If not all of them find a free place, numbers are used instead.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ __all__ = ["label_marks"]
 
 Point = tuple[float, float]
 
-_SIZE = 8.5  # of letters, points
-_MARK = 4.0  # half the side of a mark, points, and some air
-_WIDER = 1.12  # fonts of readers may be wider than ours
-_TALLER = 1.25  # than its letters is a line
-_DISTANCES = (5.0, 8.0, 12.0, 17.0, 23.0, 30.0, 38.0, 48.0, 60.0, 74.0, 90.0)
-_DIRECTIONS = 24
-_LED = 9.0  # points from a mark, from which on a line leads to it
-_LINE_COST = 12.0  # for a label across a line of the plot, in points of distance
+_SIZE = 8.5  # font size of labels, points
+_MARK = 4.0  # half the side of a mark with some space, points
+_WIDER = 1.12  # factor of the text width: readers' fonts may be wider than ours
+_TALLER = 1.25  # height of a line as a multiple of the font size
+_DISTANCES = (5.0, 8.0, 12.0, 17.0, 23.0, 30.0, 38.0, 48.0, 60.0, 74.0, 90.0)  # tried distances from a mark, points
+_DIRECTIONS = 24  # number of directions tried at each distance
+_LED = 9.0  # points: a label at a larger distance gets a line to its mark
+_LINE_COST = 12.0  # cost of a label across a line of the plot, in points of distance
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class _Box:
         )
 
     def crosses(self, a: Point, b: Point) -> bool:
-        """Whether a line runs through the box (Liang and Barsky)."""
+        """Return True if the line from `a` to `b` crosses the box (Liang and Barsky)."""
         enter, leave = 0.0, 1.0
         for start, end, low, high in ((a[0], b[0], self.left, self.right), (a[1], b[1], self.bottom, self.top)):
             step = end - start
@@ -70,17 +70,17 @@ def label_marks(
     numbers: Sequence[str],
     lines: Sequence[Sequence[Point]] = (),
 ) -> bool:
-    """Write beside each mark what it is.
+    """Write a label next to each mark.
 
     Args:
-        axes: drawn, with its limits and its place in the figure.
-        marks: in data coordinates.
-        names: of the marks; an empty one stays without a label.
-        numbers: instead of the names, where these do not fit.
-        lines: corners of lines of the plot, which labels rather leave free.
+        axes: the axes, with their final limits and place in the figure.
+        marks: the marks in data coordinates.
+        names: names of the marks; a mark with an empty name gets no label.
+        numbers: labels to use instead if the names do not fit.
+        lines: corners of lines of the plot, which labels avoid if possible.
 
     Returns:
-        Whether there are numbers.
+        True if numbers were used.
     """
     from matplotlib.figure import Figure
 
@@ -120,7 +120,7 @@ def _write(axes: Axes, text: str, one: _Placed, mark: Point, scale: float) -> No
 def _placed(
     at: Sequence[Point], texts: Sequence[str], room: _Box, lines: Sequence[tuple[Point, Point]], *, forced: bool = False
 ) -> list[_Placed | None] | None:
-    """A place for each text; `None` where one finds none. The most crowded marks choose first."""
+    """Return a place for each text, or `None` if one has no free place. The most crowded marks choose first."""
     marks = [_Box(x - _MARK, y - _MARK, x + _MARK, y + _MARK) for x, y in at]
     crowd = [sum(1.0 / (1.0 + math.dist(one, other)) for other in at) for one in at]
     placed: list[_Placed | None] = [None] * len(at)
@@ -146,7 +146,7 @@ def _placed(
 
 
 def _candidates(mark: Point, text: str) -> list[tuple[_Placed, float]]:
-    """Places around a mark, near ones first, and how far away each is."""
+    """Return places for a text around a mark, near ones first, with their distances in points."""
     width, height = _WIDER * _text_width(text), _TALLER * _SIZE
     found = []
     for distance in _DISTANCES:
@@ -161,7 +161,7 @@ def _candidates(mark: Point, text: str) -> list[tuple[_Placed, float]]:
 
 
 def _hits(one: _Placed, place: int, marks: Sequence[_Box], others: Sequence[_Placed], room: _Box) -> Iterator[bool]:
-    """What might be covered, whether it is: what lies outside, marks, labels, their lines."""
+    """Yield for each possible conflict whether it occurs: with the frame, the marks, other labels and their lines."""
     box, lead = one.box, one.lead
     yield box.left < room.left or box.right > room.right or box.bottom < room.bottom or box.top > room.top
     for mark in marks:

@@ -1,4 +1,4 @@
-"""What times were taken on: every report says so."""
+"""Describe the machine on which times were measured, for reports."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def describe_machine(threads: int | None) -> dict[str, Any]:
     """Describe processor, cores, threads in use, system, and versions, JSON-compatible.
 
     Args:
-        threads: that were asked for; `None` for all.
+        threads: number of threads in use; `None` for all.
     """
     cores = core_count()
     return {
@@ -36,7 +36,7 @@ def describe_machine(threads: int | None) -> dict[str, Any]:
 
 
 def processor_name() -> str:
-    """The processor's model, as far as the system tells."""
+    """Return the processor's model, as far as the system reports it."""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         for line in cpuinfo.read_text("utf-8", "replace").splitlines():
@@ -46,7 +46,7 @@ def processor_name() -> str:
 
 
 def package_version(name: str) -> str:
-    """The version of an installed package, or `absent`."""
+    """Return the version of an installed package, or `absent`."""
     try:
         return version(name)
     except PackageNotFoundError:

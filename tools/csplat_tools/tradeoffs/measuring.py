@@ -1,4 +1,4 @@
-"""Everything that is measured about one file: bytes, pictures, and seconds."""
+"""Measure one file of a sweep: bytes, quality of renders, and seconds."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ __all__ = ["DECODE_RUNS", "TIMED_VIEWS", "Measurer", "fetched_bytes"]
 
 F32 = NDArray[np.float32]
 
-#: Decoding takes milliseconds: the median of so many runs is taken.
+#: Number of runs of decoding, which takes milliseconds: the median is reported.
 DECODE_RUNS = 3
-#: Views at most from which rendering is timed.
+#: Largest number of views from which rendering is timed.
 TIMED_VIEWS = 8
 
 
@@ -54,7 +54,7 @@ class StageClock:
         self._last = self.clock()
 
     def listening(self, report: Progress) -> Progress:
-        """Pass calls on, and note when they come. What passes before a stage is at 0 is not its own."""
+        """Return a callback that passes calls on, and records their times. Time before a stage's 0 is not counted."""
 
         def told(stage: str, done: float) -> None:
             with self._lock:
@@ -68,16 +68,16 @@ class StageClock:
 
 
 class Measurer:
-    """Measures files of one scene, all by the same judge. Owns what the source looks like.
+    """Measures files of one scene, all on the same test views. Owns the renders of the source.
 
     Args:
         setting: the scene and its views.
-        modes: of the renderer, which are timed.
-        threads: how many; `None` for all.
+        modes: modes of the renderer that are timed.
+        threads: number of threads; `None` for all.
 
     Attributes:
-        source_modes: what rendering the source takes, by mode.
-        source_photographs: the source's scores against photographs, where there are some.
+        source_modes: times of rendering the source, by mode.
+        source_photographs: the source's scores against photographs, if there are any.
     """
 
     def __init__(self, setting: Setting, modes: Sequence[Mode], threads: int | None) -> None:
@@ -100,7 +100,7 @@ class Measurer:
         """Make a file and measure it.
 
         Raises:
-            CsplatError: it cannot be made.
+            CsplatError: the file cannot be made.
         """
         clock, start = StageClock(), time.perf_counter()
         made = candidate.make(clock.listening(progress))
@@ -150,7 +150,7 @@ class Measurer:
         )
 
     def _decoded(self, data: bytes, sh_degree: int | None) -> tuple[SplatModel, float]:
-        """The scene, and seconds; the first run is one of those that count."""
+        """Decode the file, and return the scene and the median of the seconds; the first run is included."""
         seconds, models = [], list[SplatModel]()
         for _ in range(DECODE_RUNS):
             start = time.perf_counter()
@@ -159,7 +159,7 @@ class Measurer:
         return models[0], statistics.median(seconds)
 
     def _compared(self, decoded: SplatModel, hardest: HardestPlace | None) -> tuple[Scores, Scores | None]:
-        """Against the source's renders; without a `HardestPlace` neither by LPIPS nor by photographs."""
+        """Score against the source's renders; LPIPS and photographs are used only with a `HardestPlace`."""
         distance = None if hardest is None else self._setting.distance
         each = list[ViewScore]()
 
@@ -184,11 +184,11 @@ class Measurer:
         return Scores.of(each)
 
     def _mode_time(self, model: SplatModel, mode: Mode) -> ModeTime:
-        """Render the timed views, after one that is not timed: it allocates."""
+        """Time the renders of a model, after one that is not timed because it allocates."""
         shift = np.subtract(model.origin, self._setting.source.origin)
         views = [(relative_to(shift, camera), wanted) for camera, wanted in self._timed]
         draw = renderer(model, self._judge.background, mode=mode, threads=self._threads)
-        if mode != "exact":  # it takes seconds a picture, and keeps nothing from one to the next
+        if mode != "exact":  # a render takes seconds, and buffers are not kept from one to the next
             draw(views[0][0])
         seconds, error, count = [], 0.0, 0
         for camera, wanted in views:
@@ -201,15 +201,15 @@ class Measurer:
 
 
 def fetched_bytes(header: SceneHeader, sh_degree: int) -> int:
-    """Bytes that a decoder needs for a scene with the SH bands up to a degree.
+    """Return the bytes that a decoder needs for a scene with the SH bands up to a degree.
 
     Args:
-        header: of the file; its index says where everything lies.
-        sh_degree: the highest band that is wanted; 0 for what the first picture takes.
+        header: header and index of the file.
+        sh_degree: the highest band; 0 for the first picture of a viewer.
 
     Returns:
-        Header, index, the layers of all tiles up to this band and the codebooks that they need. What says something
-        about the whole file, stated errors and options, is not fetched, nor are extra columns.
+        Bytes of header, index, the layers of all tiles up to this band and the codebooks that they need. Chunks of the
+        whole file, such as declared errors and options, are not fetched, nor are extra columns.
     """
     wanted = {id_ for id_ in _spec.LAYER_NAMES if id_ <= sh_degree}  # layer d holds band d, layer 0 everything before
     tiles = sum(layer.size for tile in header.tiles for id_, layer in tile.layers.items() if id_ in wanted)

@@ -1,4 +1,4 @@
-"""What is swept, as a command line says it; nothing heavy is imported here."""
+"""Options of the sweep, and parsing of the `--what` text; nothing heavy is imported here."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from csplat_tools.files.sizes import parse_size_bytes
 
 __all__ = ["FAMILIES", "USUAL", "Wanted", "parse_what"]
 
-#: Groups of points, in the order in which they are measured: what is quick comes first.
+#: Groups of points, in the order in which they are measured: quick ones come first.
 FAMILIES = ("presets", "precision", "strategies", "targets", "simplify", "finetune")
-#: Those that are measured unless others are asked for: fine-tuning takes minutes for each point.
+#: Groups that are measured by default: without fine-tuning, which takes minutes for each point.
 USUAL = FAMILIES[:-1]
 
 _VALUES = {"precision": "attribute_psnr", "strategies": "opacities", "targets": "psnr", "simplify": "keep"}
@@ -26,20 +26,20 @@ _NUMBER = re.compile(r"[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?")
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which points are measured, and how.
+    """The points to measure, and their options.
 
     Attributes:
-        what: some of `FAMILIES`.
-        preset: of what is coded once splats, bands or colours have been left out, and of the targets.
-        attribute_psnr: of `EncodeOptions`, dB.
-        psnr: targets, dB.
-        sizes: targets, bytes.
-        keep: shares of the splats that simplification leaves.
-        opacities: splats of at most so much alpha are left out.
+        what: groups to measure, from `FAMILIES`.
+        preset: preset of all points outside the group `presets`.
+        attribute_psnr: values of `EncodeOptions.attribute_psnr`, dB.
+        psnr: target PSNRs, dB.
+        sizes: target sizes, bytes.
+        keep: fractions of the splats that simplification keeps.
+        opacities: thresholds; splats of at most this alpha are pruned.
         kmeans: entries of a codebook for each attribute.
-        modes: of the renderer, which are timed.
-        iterations: steps of fine-tuning.
-        threads: how many; `None` for all.
+        modes: modes of the renderer that are timed.
+        iterations: largest number of steps of fine-tuning.
+        threads: number of threads; `None` for all.
 
     Raises:
         InputError: a value is out of its range.
@@ -78,14 +78,14 @@ class Wanted:
 
 
 def parse_what(text: str, **how: Any) -> Wanted:
-    """What is swept, from `presets,precision=36:44,targets=40:2MB`.
+    """Parse the points of a sweep from `presets,precision=36:44,targets=40:2MB`.
 
     Args:
-        text: groups, and values of some; `usual` stands for all of `USUAL`. A group without `=` has the usual ones.
+        text: groups, and values of some; `usual` stands for all of `USUAL`. A group without `=` has default values.
         how: other fields of `Wanted`.
 
     Raises:
-        InputError: there is no such group, or a value is none.
+        InputError: there is no such group, or a value is invalid.
     """
     parts = [word.strip().split("=", 1) for word in text.split(",") if word.strip()]
     words = {name: values for name, *values in parts}

@@ -1,4 +1,4 @@
-"""The report as one page that opens from a disk, and fetches nothing."""
+"""The HTML report of a sweep, as one page that opens from a disk and loads nothing else."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from csplat_tools.views import VIRTUAL
 
 __all__ = ["check_plots", "make_page", "write_page", "write_plots"]
 
-_MOST_SHOWN = 9  # points with pictures: some 60 kB each
+_MOST_SHOWN = 9  # largest number of points with images, some 60 kB each
 _FRONT = ' class="front"'
 
 
 def make_page(tradeoff: Tradeoff) -> str:
-    """Write the page: plots, tables, commands, pictures, and how everything was measured."""
+    """Return the page: plots, tables, commands, images, and the conditions of measurement."""
     title = f"{tradeoff.setting.name}: size, quality and time"
     parts = [
         _head(tradeoff, title),
@@ -87,7 +87,7 @@ def _sorting(title: str) -> str:
 
 
 def _commands(tradeoff: Tradeoff) -> str:
-    """All commands as text, for readers without scripts."""
+    """Return all commands as text, for readers without scripts."""
     text = (
         "Each makes the same bytes as were measured here, run where the report was made. Those that begin with python"
         " are no commands of csplat; they want a Python that has csplat."
@@ -115,7 +115,7 @@ def _pictures(tradeoff: Tradeoff) -> str:
 
 
 def shown_points(tradeoff: Tradeoff) -> list[Point]:
-    """The points with pictures: the presets, and others of the front, evenly spread; the smallest file first."""
+    """Return the points with images: the presets, and others of the front, evenly spread; the smallest file first."""
     presets = [one for one in tradeoff.measured if one.family == "presets"]
     others = [one for one in tradeoff.front if one not in presets]
     room = max(0, _MOST_SHOWN - len(presets))
@@ -194,7 +194,7 @@ def check_plots(folder: str | None, *, force: bool) -> None:
     """Make the folder of the plots; refuse if they would replace files.
 
     Raises:
-        InputError: one of them exists.
+        InputError: one of the files exists.
         OSError: the folder cannot be made.
     """
     if folder is not None:
@@ -202,7 +202,7 @@ def check_plots(folder: str | None, *, force: bool) -> None:
 
 
 def write_plots(folder: str, tradeoff: Tradeoff) -> Sequence[str]:
-    """Write the plots that the sweep has something for, and return their paths."""
+    """Write the plots for which the sweep has data, and return their paths."""
     paths = []
     for name in PLOTS:
         text = draw_plot(name, tradeoff, inline=False)

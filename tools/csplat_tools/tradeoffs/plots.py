@@ -1,4 +1,4 @@
-"""The sweep drawn: size, quality and time, where the bytes go, and what fewer SH layers look like."""
+"""Plots of a sweep: size, quality and time, bytes by attribute, and quality with fewer SH layers."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 __all__ = ["PLOTS", "draw_plot"]
 
-_WIDE, _HIGH = 7.0, 4.4  # inches of 100 pixels
+_WIDE, _HIGH = 7.0, 4.4  # width and height of a plot, inches of 100 pixels
 
-# Colours that people tell apart whatever colours they see, on white and on black; markers say the same again.
+# Colours that colour-blind readers can tell apart, on white and on black; markers differ, too.
 _STYLES = {
     "presets": ("#d55e00", "s"),
     "precision": ("#2f83c9", "o"),
@@ -37,9 +37,10 @@ _NAMES = {
     "simplify": "simplified",
     "finetune": "fine-tuned",
 }
-_FEW, _MANY, _TICKS = (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0), 15  # ticks in each decade, and in all
-_LARGE = 1_000_000  # bytes of a file, from which on they are counted in MB
-_KEY_COLUMNS, _KEY_LINE = 4, 0.16  # of numbers and names, below a plot that stands alone; height in inches
+# Ticks in each decade of long and of short logarithmic axes; largest number of ticks of an axis.
+_FEW, _MANY, _TICKS = (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0), 15
+_LARGE = 1_000_000  # bytes of the largest file from which sizes are given in MB
+_KEY_COLUMNS, _KEY_LINE = 4, 0.16  # columns of the key below a plot that stands alone; height of its lines, inches
 
 Value = Callable[[Point], "float | None"]
 
@@ -48,12 +49,12 @@ def draw_plot(name: str, tradeoff: Tradeoff, *, inline: bool) -> str | None:
     """Draw one of `PLOTS`.
 
     Args:
-        name: which.
+        name: name of the plot.
         tradeoff: the sweep.
-        inline: for a page, whose colour of text it takes; else black on white.
+        inline: for a page, whose text colour it takes; else with colours and a background of its own.
 
     Returns:
-        An SVG; `None` where the sweep has nothing for it.
+        An SVG; `None` if the sweep has no data for it.
     """
     return PLOTS[name](tradeoff, name, inline)
 
@@ -140,7 +141,7 @@ def _layers(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
     return drawn(draw, (_WIDE, _HIGH), name, inline=inline)
 
 
-#: By name of the file, which is that of the plot, too; drawn in this order.
+#: Plots by name, which is that of the file, too; drawn in this order.
 PLOTS: dict[str, Callable[[Tradeoff, str, bool], str | None]] = {
     "size-quality": _quality,
     "size-photographs": _photographs,
@@ -160,7 +161,7 @@ def _scatter(
     inline: bool,
     line: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """A mark for each file, and beside it the file's name, or its number in the table where names do not fit."""
+    """Draw a mark for each file, labelled by its name, or by its number in the table if the names do not fit."""
     from matplotlib.figure import Figure
 
     points, marks = tradeoff.measured, list[tuple[float, float]]()
@@ -188,7 +189,7 @@ def _scatter(
 
 
 def _write_key(figure: Figure, lines: Sequence[str]) -> None:
-    """What numbers stand for, below a plot that no table is beside of; the plot keeps its height."""
+    """Write the key of the numbers below a plot that has no table next to it; the plot keeps its height."""
     from matplotlib.lines import Line2D
 
     figure.set_figheight(figure.get_figheight() + _KEY_LINE * (1 - len(lines) // -_KEY_COLUMNS))
@@ -200,7 +201,7 @@ def _write_key(figure: Figure, lines: Sequence[str]) -> None:
 
 
 def _titles(tradeoff: Tradeoff, plot: str) -> dict[str, str]:
-    """What appears where the mouse rests on a point."""
+    """Return the texts that appear when the mouse rests on a point, by the id of its mark."""
     return {
         hover(plot, one.name): f"{one.name}: {one.size_bytes} bytes, {one.psnr:.2f} dB, encoded in"
         f" {one.encode_seconds:.2f} s, decoded in {1000.0 * one.decode_seconds:.1f} ms"
@@ -209,7 +210,7 @@ def _titles(tradeoff: Tradeoff, plot: str) -> dict[str, str]:
 
 
 def _unit(tradeoff: Tradeoff) -> tuple[str, float]:
-    """In what sizes are told, and how many bytes it is."""
+    """Return the unit of sizes, and its number of bytes."""
     return ("MB", 1e6) if max(one.size_bytes for one in tradeoff.measured) >= _LARGE else ("kB", 1e3)
 
 
@@ -218,7 +219,7 @@ def _size_in(divisor: float) -> Value:
 
 
 def _plain_ticks(axes: Axes, which: str) -> None:
-    """Numbers as people write them on a logarithmic axis; more of them where the axis is short."""
+    """Put plain numbers on a logarithmic axis; more of them if the axis is short."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis = axes.xaxis if which == "x" else axes.yaxis

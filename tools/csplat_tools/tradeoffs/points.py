@@ -1,4 +1,4 @@
-"""What was found out about one way of storing a scene, and which of several ways no other one beats."""
+"""Results of the sweep for one way of storing the scene, and the Pareto front of several."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _QUALITY = ("psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips")
 
 @dataclass(frozen=True, eq=False)
 class TriedFile:
-    """A file, before anything is measured.
+    """A file that has not been measured yet.
 
     Attributes:
-        data: the file.
-        settings: how it was made, JSON-compatible.
-        stages: seconds by stage, where whoever made it knows them.
+        data: the bytes of the file.
+        settings: settings with which it was made, JSON-compatible.
+        stages: seconds by stage; empty if they are not known.
     """
 
     data: bytes
@@ -33,11 +33,11 @@ class TriedFile:
 
 @dataclass(frozen=True)
 class ModeTime:
-    """A mode of the renderer.
+    """Time and quality of a mode of the renderer.
 
     Attributes:
-        milliseconds: median over views.
-        psnr: against the source's renders of mode `standard`, pooled over the views that were timed, dB.
+        milliseconds: time of a render, median over views.
+        psnr: PSNR against the source's renders of mode `standard`, pooled over the views that were timed, dB.
     """
 
     milliseconds: float
@@ -50,14 +50,14 @@ class ModeTime:
 
 @dataclass(frozen=True)
 class Partial:
-    """A file of which the SH layers above a degree are not fetched.
+    """A file whose SH layers above a degree are not fetched.
 
     Attributes:
-        sh_degree: the highest band.
-        size_bytes: header, index, and the layers up to this band with their codebooks.
-        quality: against the source's renders.
-        decode_seconds: median of some runs.
-        render_milliseconds: of mode `standard`, median over views.
+        sh_degree: the highest band that is fetched.
+        size_bytes: bytes of header, index, and the layers up to this band with their codebooks.
+        quality: scores against the source's renders.
+        decode_seconds: time of decoding, median of some runs.
+        render_milliseconds: time of a render in mode `standard`, median over views.
     """
 
     sh_degree: int
@@ -82,8 +82,8 @@ class Failure:
     """A point that could not be measured.
 
     Attributes:
-        name, family: as of `Point`.
-        error: one line.
+        name, family: as in `Point`.
+        error: the error in one line.
     """
 
     name: str
@@ -101,21 +101,23 @@ class Point:
 
     Attributes:
         name: unique among the points.
-        family: which group it belongs to.
-        command: makes the same file.
-        settings: how the file was made, JSON-compatible.
-        size_bytes: of the file. sha256: of its bytes, in hexadecimal digits.
-        splats, sh_degree: of the file.
-        source_splats, source_bytes: of the scene, and of its PLY.
-        quality: against the source's renders.
-        photographs: against held-out photographs, where there are some.
-        encode_seconds: everything from the splats to the bytes. stages: what stages took of that, as far as known.
-        decode_seconds: from the bytes to the splats, median of some runs.
-        modes: the renderer's, by name.
-        attribute_bytes: by attribute, and everything else as `overhead`.
-        first_picture_bytes: header, index, and everything but the SH bands.
-        partial: quality by SH layers fetched, where it was looked at.
-        hardest: where it differs most from the source.
+        family: the group that it belongs to.
+        command: the command that makes the same file.
+        settings: settings with which the file was made, JSON-compatible.
+        size_bytes: size of the file.
+        sha256: hash of its bytes, in hexadecimal digits.
+        splats, sh_degree: number of splats and SH degree of the file.
+        source_splats, source_bytes: number of splats of the scene, and size of its PLY.
+        quality: scores against the source's renders.
+        photographs: scores against held-out photographs, if there are any.
+        encode_seconds: time from the splats to the bytes.
+        stages: seconds of its stages, as far as known.
+        decode_seconds: time from the bytes to the splats, median of some runs.
+        modes: times of the renderer's modes, by name.
+        attribute_bytes: bytes by attribute, and everything else as `overhead`.
+        first_picture_bytes: bytes of header, index, and everything but the SH bands.
+        partial: results with fewer SH layers, if they were measured.
+        hardest: the place where it differs most from the source.
     """
 
     name: str
@@ -141,22 +143,22 @@ class Point:
 
     @property
     def ratio(self) -> float:
-        """How many times the file is smaller than the source."""
+        """Size of the source divided by that of the file."""
         return self.source_bytes / self.size_bytes
 
     @property
     def bytes_per_source_splat(self) -> float | None:
-        """Bytes of the file over splats of the source; `None` where it has none."""
+        """Bytes of the file divided by the number of splats of the source; `None` if it has none."""
         return self.size_bytes / self.source_splats if self.source_splats else None
 
     @property
     def psnr(self) -> float:
-        """Against the source's renders, dB."""
+        """PSNR against the source's renders, dB."""
         return self.quality.psnr
 
     @property
     def photograph_psnr(self) -> float | None:
-        """Pooled over held-out photographs, dB."""
+        """PSNR pooled over held-out photographs, dB; `None` without photographs."""
         return None if self.photographs is None else self.photographs.psnr
 
     def as_json(self) -> dict[str, Any]:
@@ -188,14 +190,14 @@ class Point:
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Which of some points no other one beats.
+    """Return the indices of the points that no other one beats.
 
     Args:
-        points: (size, quality) each: a point beats another one where it is not larger and not worse, and one of
-            the two is better. Of equal ones the first counts.
+        points: (size, quality) each: a point beats another one if it is neither larger nor worse, and better in one of
+            the two. Of equal points only the first is returned.
 
     Returns:
-        Their places, the smallest size first.
+        Indices, the smallest size first.
     """
     front: list[int] = []
     best = -np.inf

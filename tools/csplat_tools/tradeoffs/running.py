@@ -1,4 +1,4 @@
-"""The sweep itself: point after point, none of which takes the others down with it."""
+"""Run the sweep point by point; a point that fails does not stop the others."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from csplat_tools.views import Colour, DataOptions
 
 __all__ = ["Tradeoff", "estimated_seconds", "tradeoff"]
 
-# Seconds by kind of point, on two cores: for each, by its scores and, of presets, those with fewer bands; for each
-# million splats; and for each second that eight pictures of the source take. An estimate that a person decides by.
+# Seconds by kind of point, on two cores: a fixed part (scores, and for presets those with fewer bands); per million
+# splats; and per second that eight renders of the source take. Only for the estimate that is shown to the user.
 _COSTS = {
     "presets": (3.6, 12.0, 10.0),
     "precision": (1.2, 12.0, 4.0),
     "strategies": (1.2, 12.0, 4.0),
     "k-means": (1.2, 250.0, 6.0),
     "distilled": (1.2, 40.0, 80.0),
-    "targets": (1.2, 0.0, 362.5),  # 2,900 pictures, see `optimiser`
+    "targets": (1.2, 0.0, 362.5),  # 2,900 renders, see `optimiser`
     "simplify": (1.2, 40.0, 250.0),
     "finetune": (1.2, 100.0, 500.0),
 }
@@ -39,14 +39,14 @@ _COSTS = {
 
 @dataclass(frozen=True, eq=False)
 class Tradeoff:
-    """What the sweep found.
+    """The results of a sweep.
 
     Attributes:
         setting: the scene and its views.
-        wanted: what was swept.
-        points: measured or not, in the order of the sweep.
-        source_modes: what rendering the source takes, by mode of the renderer.
-        source_photographs: the source's scores against photographs, where there are some.
+        wanted: the options of the sweep.
+        points: all points, measured or failed, in the order of the sweep.
+        source_modes: times of rendering the source, by mode of the renderer.
+        source_photographs: the source's scores against photographs, if there are any.
         machine: processor, system, versions.
     """
 
@@ -59,23 +59,23 @@ class Tradeoff:
 
     @property
     def measured(self) -> list[Point]:
-        """What could be measured, the smallest file first."""
+        """The points that were measured, the smallest file first."""
         return sorted((one for one in self.points if isinstance(one, Point)), key=lambda one: one.size_bytes)
 
     @property
     def failures(self) -> list[Failure]:
-        """What could not."""
+        """The points that could not be measured."""
         return [one for one in self.points if isinstance(one, Failure)]
 
     @property
     def front(self) -> list[Point]:
-        """What no other point beats in size and `psnr`, the smallest file first."""
+        """The points that no other one beats in size and `psnr`, the smallest file first."""
         measured = self.measured
         return [measured[place] for place in pareto_front([(one.size_bytes, one.psnr) for one in measured])]
 
     @property
     def photograph_front(self) -> list[Point]:
-        """The same by PSNR of photographs; empty where there are none."""
+        """The points that no other one beats in size and PSNR against photographs; empty without photographs."""
         known = [one for one in self.measured if one.photograph_psnr is not None]
         return [known[at] for at in pareto_front([(one.size_bytes, one.photograph_psnr or 0.0) for one in known])]
 
@@ -119,19 +119,19 @@ def tradeoff(
     say: Callable[[str], None] | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Tradeoff:
-    """Make every file that is wanted, and measure it: what `csplat tradeoff` calls; minutes, and the render extra.
+    """Make and measure all files of a sweep, as `csplat tradeoff` does. Takes minutes, and requires the render extra.
 
     Args:
-        scene: a model, or a PLY; or, instead of that and of all that is read, the `Setting` of an earlier sweep.
-        wanted: what is swept; `None`: presets, precision, strategies, targets and simplification.
-        cameras, data, background: by which views files are decided on and judged, as for `find_view_set`: by name,
-            so that the report can say how each file is made.
-        lpips: a file of LPIPS weights, or `auto`; it is not computed if left out.
-        say: is told in a line how long it may take, and each file as soon as it is measured.
-        progress: is told the stage and the share of it that is done, 0 to 1.
+        scene: a model, or a file; or the `Setting` of an earlier sweep, instead of this and all other inputs.
+        wanted: the points to measure; `None`: presets, precision, strategies, targets and simplification.
+        cameras, data, background: views by which files are chosen and scored, as for `find_view_set`; given by name,
+            so that the report can contain the command for each file.
+        lpips: a file of LPIPS weights, or `auto`; LPIPS is not computed if left out.
+        say: called with a line on the expected time, and with one for each file when it is measured.
+        progress: called with the stage and the fraction of it that is done, 0 to 1.
 
     Returns:
-        All points, measured or failed; those on the front; and all as JSON (`as_json`).
+        All points, measured or failed; those on the Pareto front; and everything as JSON (`as_json`).
 
     Examples:
         >>> import csplat_tools
@@ -140,8 +140,8 @@ def tradeoff(
 
     Raises:
         InputError: there is nothing to sweep, or not one point could be measured.
-        CsplatError: the file is none.
-        OSError: it cannot be read.
+        CsplatError: a file is not valid.
+        OSError: a file cannot be read.
     """
     need_renderer()
     if isinstance(scene, Setting):
@@ -171,7 +171,7 @@ def tradeoff(
 
 
 def estimated_seconds(kind: str, setting: Setting, wanted: Wanted, modes: dict[str, ModeTime]) -> float:
-    """About how long a point takes that is like those of a family."""
+    """Estimate the seconds that a point of a kind takes, by the number of splats and the time of a render."""
     each, by_splats, by_pictures = _COSTS[kind]
     milliseconds = next((one.milliseconds for name, one in modes.items() if name != "exact"), 100.0)
     steps = wanted.iterations / Wanted.iterations if kind == "finetune" else 1.0
@@ -188,7 +188,7 @@ def _measured(measurer: Measurer, candidate: Candidate, progress: Progress) -> P
 
 
 def _line(point: Point | Failure, number: int, count: int) -> str:
-    """One point, as soon as it is there."""
+    """Return a line on a point that has just been measured."""
     if isinstance(point, Failure):
         return f"{number}/{count} {point.name}: {point.error}"
     size, seconds = format_bytes(point.size_bytes), f"{point.encode_seconds:.1f} s"

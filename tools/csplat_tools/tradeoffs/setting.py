@@ -1,4 +1,4 @@
-"""The scene that is looked at, and from where."""
+"""The scene of a sweep, and its views."""
 
 from __future__ import annotations
 
@@ -21,15 +21,17 @@ __all__ = ["Setting", "read_setting"]
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """A scene, and by what its files are decided on and judged.
+    """A scene, and the views by which its files are chosen and scored.
 
     Attributes:
-        path: of the PLY, as it was given; `scene.ply` where none was.
-        name: of the file. source: its splats. source_bytes: its size.
-        findings: what lint noticed in it.
-        views: all files are judged by the same ones, which none of them was chosen by.
-        cameras, data, background: by which these were found, see `find_view_set`.
-        distance: LPIPS, if wanted.
+        path: path of the PLY, as it was given; `scene.ply` if none was.
+        name: name of the file.
+        source: its splats.
+        source_bytes: its size.
+        findings: findings of lint in it.
+        views: the views; all files are scored on the same test views, by which none was chosen.
+        cameras, data, background: arguments of `find_view_set` that gave the views.
+        distance: computes LPIPS; `None`: LPIPS is not computed.
     """
 
     path: str
@@ -55,13 +57,13 @@ def read_setting(
     """Read scene and views.
 
     Args:
-        scene: a model, or a PLY; as a path `-` is standard input.
+        scene: a model, or a file; the path `-` is standard input.
         cameras, data, background: as for `find_view_set`.
-        lpips: a file of LPIPS weights, or `auto`; it is not computed if left out.
+        lpips: a file of LPIPS weights, or `auto`; LPIPS is not computed if left out.
 
     Raises:
-        CsplatError: a file is not valid, no splat is left of it, or no view judges.
-        OSError: it cannot be read.
+        CsplatError: a file is not valid, the scene has no splats, or there are no test views.
+        OSError: a file cannot be read.
     """
     distance = None if lpips is None else load_lpips(None if lpips == "auto" else lpips)
     source = load_model(scene) if isinstance(scene, (SplatModel, LoadedModel)) else read_source(scene)

@@ -1,4 +1,4 @@
-"""The ways of storing a scene that are tried: each a name, a group, and how its file is made."""
+"""List the candidates of a sweep: ways of storing the scene, each with a name, a group, and a function to make it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from csplat_trainer.tuning import FinetuneOptions
 
 __all__ = ["Candidate", "candidates"]
 
-_MOST_DISTILLED = 2  # degrees 0 and 1: each takes as long as a simplification
+_MOST_DISTILLED = 2  # number of SH degrees that are distilled, 0 and 1: each takes as long as a simplification
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +39,12 @@ class Candidate:
     """A way of storing the scene.
 
     Attributes:
-        name: unique.
+        name: unique name.
         family: one of `FAMILIES`.
-        command: makes the same file for whoever pastes it into a shell.
-        make: makes the file; is told the callback that wants to know how far it has come.
-        is_partial: whether it is looked at with fewer SH layers, too.
-        cost: like which family's the time is that it takes; `None`: its own.
+        command: command line that makes the same file.
+        make: makes the file; called with a progress callback.
+        is_partial: measure it with fewer SH layers, too.
+        cost: kind of point in the estimates of time; `None`: that of the family.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Candidate:
 
 
 def candidates(setting: Setting, wanted: Wanted) -> list[Candidate]:
-    """List what is to be tried, what is quick first."""
+    """List the candidates, quick ones first."""
     makers = {
         "presets": _presets,
         "precision": _precisions,
@@ -85,7 +85,7 @@ def _precisions(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
 
 
 def _strategies(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
-    """Bands, splats and values taken away by simple rules; what looks at pictures comes last."""
+    """Yield candidates that reduce bands, splats and values by simple rules; those that need renders come last."""
 
     def strategy(name: str, reduction: Reduction, cost: str = "strategies") -> Candidate:
         how = replace(reduction, threads=wanted.threads)
@@ -129,7 +129,7 @@ def _simplified(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
 
 
 def _tuned(setting: Setting, wanted: Wanted) -> Iterator[Candidate]:
-    one_keep = wanted.keep[len(wanted.keep) // 2 :][:1]  # the middle one: each takes minutes
+    one_keep = wanted.keep[len(wanted.keep) // 2 :][:1]  # the middle one alone: each takes minutes
     for keep in (None, *one_keep):
         name = "tuned" if keep is None else f"tuned, keep {keep:g}"
         command = finetune_command(setting, name, wanted, keep)
@@ -160,7 +160,7 @@ def _made(result: EncodeResult, **said: Any) -> TriedFile:
 
 
 def _tune(setting: Setting, wanted: Wanted, keep: float | None, progress: Progress) -> TriedFile:
-    """The file that `csplat finetune` makes with its usual options."""
+    """Make the file of `csplat finetune` with its default options."""
     itself = not setting.views.photographs
     encoding = EncodeOptions(preset=wanted.preset, shape_codebook_size=SHAPE_ENTRIES, threads=wanted.threads)
     options = FinetuneOptions(iterations=wanted.iterations, byte_cost=BYTE_COST[itself])
@@ -174,7 +174,7 @@ def _tune(setting: Setting, wanted: Wanted, keep: float | None, progress: Progre
 
 
 def _tuning_views(setting: Setting) -> ViewSet:
-    """Those of `csplat finetune`: of photographs, all teach that do not judge; of virtual views, there are more."""
+    """Return the views of `csplat finetune`: all photographs that are not test views, or more virtual views."""
     views = setting.views
     if views.photographs:  # which are in memory already
         judging = {pose(camera) for camera in views.judges}

@@ -1,4 +1,4 @@
-"""The sweep as tables: for a terminal, and the cells for a page."""
+"""Tables of a sweep: as text for a terminal, and as cells for a page."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from csplat_tools.views import counted_views
 
 __all__ = ["MARK", "Column", "columns_of", "format_tradeoff", "mode_rows", "partial_rows", "views_line"]
 
-#: Before the names of points that no other one beats.
+#: Mark before the names of points on the Pareto front.
 MARK = "*"
 
 
-_LINE_MBITS = 10.0  # a phone on a middling day
+_LINE_MBITS = 10.0  # Mbit/s of a mobile connection, for the columns of download times
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Column:
     """A column of the table of points.
 
     Attributes:
-        title: above it.
-        hint: what it means, in a sentence.
-        value: of a point; `None` where it is not known.
-        digits: behind the decimal point.
-        detailed: for the page alone: a terminal is too narrow.
+        title: title of the column.
+        hint: its meaning, in a sentence.
+        value: returns the value of a point; `None` if it is not known.
+        digits: number of digits after the decimal point.
+        detailed: shown on the page only: a terminal is too narrow.
     """
 
     title: str
@@ -38,13 +38,13 @@ class Column:
     detailed: bool = False
 
     def text(self, point: Point) -> str:
-        """A cell."""
+        """Return the text of a point's cell."""
         value = self.value(point)
         return "-" if value is None else f"{value:.{self.digits}f}"
 
 
 def columns_of(tradeoff: Tradeoff) -> list[Column]:
-    """The columns that have anything to say for a sweep."""
+    """Return the columns for which a sweep has data."""
     columns = [
         Column("bytes", "Size of the file.", lambda one: one.size_bytes, 0),
         Column("bytes/splat", "Size of the file over the number of splats of the source: comparable between scenes.",
@@ -88,7 +88,7 @@ def columns_of(tradeoff: Tradeoff) -> list[Column]:
 
 
 def format_tradeoff(tradeoff: Tradeoff) -> str:
-    """All tables as text."""
+    """Return all tables as text."""
     columns = [one for one in columns_of(tradeoff) if not one.detailed]
     front = {one.name for one in tradeoff.front}
     rows: list[Sequence[object]] = [
@@ -122,7 +122,7 @@ def format_tradeoff(tradeoff: Tradeoff) -> str:
 
 
 def views_line(tradeoff: Tradeoff) -> str:
-    """From where the pictures are."""
+    """Describe the test views in a line."""
     setting = tradeoff.setting
     sizes = sorted({(camera.W, camera.H) for camera in setting.views.judges})
     size = f"{sizes[0][0]}x{sizes[0][1]}" if len(sizes) == 1 else f"{len(sizes)} sizes"
@@ -130,7 +130,7 @@ def views_line(tradeoff: Tradeoff) -> str:
 
 
 def mode_rows(tradeoff: Tradeoff) -> list[tuple[str, ...]]:
-    """What the renderer's modes take and lose: a header without its first cell, and a row for each mode."""
+    """Return times and PSNR of the renderer's modes: a header without its first cell, and a row for each mode."""
     shown = _presets(tradeoff) or tradeoff.front[-1:]
     header: tuple[str, ...] = (
         "source ms",
@@ -147,7 +147,7 @@ def mode_rows(tradeoff: Tradeoff) -> list[tuple[str, ...]]:
 
 
 def partial_rows(tradeoff: Tradeoff) -> list[tuple[str, ...]]:
-    """What files look like of which fewer SH layers are fetched: a header without its first cell, and the rows."""
+    """Return results for files with fewer SH layers fetched: a header without its first cell, and the rows."""
     rows: list[tuple[str, ...]] = [
         ("bytes", "of the file", "PSNR", "worst PSNR", "SSIM", "decode ms", "render ms"),
     ]
