@@ -1,1 +1,1 @@
-"""Scenes that are learnt from photographs, and files that are tuned until they look right."""
+"""Train scenes from photographs, and tune files to look like photographs or the source."""

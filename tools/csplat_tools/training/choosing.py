@@ -1,4 +1,4 @@
-"""What tuning looks at, and which splats its file is to hold: the inputs of `csplat finetune`."""
+"""Choose the inputs of `csplat finetune`: the views to tune by, and the splats that the file is to hold."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class Chosen:
     """The splats that the file will hold.
 
     Attributes:
-        model: the splats; their colours are fitted anew where others were taken away.
-        rows: [N] int64, which splats of the source they are, ascending.
-        importance: how much pictures depend on each.
-        said: what was done, JSON-compatible.
+        model: the splats; refitted if others were pruned.
+        rows: [N] int64, their indices in the source, ascending.
+        importance: the importance of each.
+        said: report of the choice, JSON-compatible.
     """
 
     model: SplatModel
@@ -46,9 +46,9 @@ class Chosen:
 
 
 def training_views(source: SplatModel, views: ViewSet, threads: int | None) -> Views:
-    """What the tuning looks at: photographs, or renders of the scene itself; none of those that judge.
+    """Return the views to tune by: photographs, or renders of the scene itself; none of them is a test view.
 
-    Where no view decides which step was best, some that teach do.
+    Without validation views to decide which step was best, some training views do.
     """
     behind = np.array(views.background, np.float32)
 
@@ -71,20 +71,20 @@ def choose_splats(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Chosen:
-    """Leave out what no view shows and what pictures need least, and weigh the others.
+    """Prune splats that no view shows and those that renders need least, and measure the importance of the others.
 
     Args:
         source: the scene.
-        views: those that teach say how much splats matter.
-        keep: share of the splats that stay, the others being those that pictures need least; `None`: all.
-        prune_unseen: leave out splats that no view shows that teaches or decides; `None`: if they took photographs.
-        importance: a file of weights of the source's splats; `None`: what stays is measured in these views, as
-            `csplat sensitivity` does.
-        threads: how many; `None` for all.
-        progress: is told the stages.
+        views: the views; importance is measured from training views.
+        keep: fraction of the splats to keep; those that renders need least are pruned; `None`: keep all.
+        prune_unseen: prune splats that no training or validation view shows; `None`: only if they are photographs.
+        importance: a file of weights of the source's splats; `None`: importance of the kept splats is measured in
+            these views, as by `csplat sensitivity`.
+        threads: number of threads; `None` for all.
+        progress: progress callback.
 
     Raises:
-        InputError: no view shows anything; or the file is none, or about another scene.
+        InputError: no view shows any splat; or the file is invalid, or belongs to another scene.
     """
     measuring = views.teaches[:VIEW_COUNT] if views.virtual else views.teaches
     looking = [*views.teaches, *views.decides]
@@ -119,7 +119,7 @@ def choose_splats(
 
 
 def _read(importance: str | None, source: SplatModel) -> NDArray[Any] | Importance | None:
-    """What a file says of the source's splats."""
+    """Read the importance of the source's splats from a file; return `None` for `None`."""
     if importance is None:
         return None
     given = read_importance(importance, source)
@@ -133,7 +133,7 @@ def _read(importance: str | None, source: SplatModel) -> NDArray[Any] | Importan
 def _simplified(
     model: SplatModel, views: ViewSet, keep: float, threads: int | None, progress: Progress | None
 ) -> tuple[SplatModel, I64]:
-    """A share of the splats, their colours fitted, and which they are."""
+    """Return a fraction of the splats, refitted, and their indices."""
     if keep >= 1.0:
         return model, np.arange(len(model))
     options = SimplifyOptions(threads=threads)

@@ -1,4 +1,4 @@
-"""From a scene and pictures to a file that was tuned to look like them: the work of `csplat finetune`."""
+"""Encode a scene and tune the file to look like photographs or the scene, as `csplat finetune` does."""
 
 from __future__ import annotations
 
@@ -45,36 +45,39 @@ __all__ = [
 
 I64 = NDArray[np.int64]
 
-#: Of learning rates, by whether the scene's own renders teach instead of photographs. Those can be met almost exactly:
-#: what long steps lose of that, short ones take long to find again.
+#: Factor of the learning rates; True: the scene's own renders are the reference instead of photographs. Those can be
+#: matched almost exactly: what long steps lose of that, short ones take long to regain.
 LEARNING_FACTOR = {False: 1.0, True: 0.03}
-#: Of bytes in the loss, which is that much smaller.
+#: Rate weight of a bit per splat in the loss; for the scene's own renders, whose loss is smaller, it is smaller, too.
 BYTE_COST = {False: 1e-4, True: 2e-5}
-#: What a clustering by sensitivities and a tuning can do with: `encode`, which has neither, makes none by itself.
+#: Entries of the codebook of shapes, which clustering by sensitivities and tuning make good use of; `encode`, which has
+#: neither, makes no such codebook by default.
 SHAPE_ENTRIES = 4096
-#: Of a splat in a tuned file, measured with all bands and the preset small: more splats of 8 bytes look worse.
+#: Bytes per splat of a tuned file, measured with all bands and the preset small: more splats of 8 bytes look worse.
 SPLAT_BYTES = 10
-#: Virtual views that teach where there are no photographs, and their size: more and larger than for other commands.
+#: Number of virtual training views without photographs, and their size: more and larger than for other commands.
 VIEWS, VIEW_SIZE = 480, (320, 240)
 
-_WITHIN = 1.02  # a draft may be so much too large: the price of bytes takes that before pictures suffer,
-_FREE = 1.03  # and so much too small: finer steps are not worth the time
-_TRIES = 3  # counts of splats, each from what the last one took; steps; tunings
-_FIXED = 1.2  # power of a share of bytes that is that of the splats: some bytes do not depend on them,
-_FEWER = 1.08  # and how many fewer stay of a tuned file that is too large
-_ENTRIES_DOUBLE = 6.0  # dB of all attributes that pay as twice the entries of a codebook of SH do,
-_BYTE, _MOST_ENTRIES, _USERS = 255, 1 << 15, 3  # if it has more than one byte tells apart; at most; splats of each
-_FINEST = 70.0  # dB of an attribute: renders are as good as the scene's
+_WITHIN = 1.02  # factor by which a draft may be too large: the rate weight saves that before renders get worse
+_FREE = 1.03  # factor by which a draft may be too small: finer steps are not worth the time
+_TRIES = 3  # largest number of splat counts, each predicted from the last file; of steps; of tunings
+_FIXED = 1.2  # power of a factor of bytes that gives the factor of splats: some bytes do not depend on splats
+_FEWER = 1.08  # divisor of the number of splats if a tuned file is too large
+_ENTRIES_DOUBLE = 6.0  # dB of all attributes at which twice the entries of an SH codebook pay
+_BYTE, _MOST_ENTRIES, _USERS = 255, 1 << 15, 3  # codebooks of more entries grow; up to this; least splats per entry
+_FINEST = 70.0  # dB of an attribute at which renders are as good as the scene's
 
-_RENDERS_ASIDE = 8  # one of so many renders decides, as well as those that teach,
-_MOST_ASIDE = 16  # but no more than these
+_RENDERS_ASIDE = 8  # one in this many renders is held out for validation
+_MOST_ASIDE = 16  # largest number of them
 
 
 def usually_aside(count: int, *, cameras: str | None, data: object | None) -> int | None:
-    """How many views decide which step was best: of photographs some that teach do, of few virtual views few.
+    """Return the default number of validation views, as `aside` for `find_view_set`.
+
+    With photographs it is 0, as `training_views` takes some training views; of few virtual views it is few.
 
     Args:
-        count: virtual views that teach.
+        count: number of virtual training views.
         cameras, data: as for `find_view_set`.
     """
     if data is not None:
@@ -102,31 +105,31 @@ def run_finetuning(
     training: Mapping[str, Any] | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Prune, freeze, tune, write, judge.
+    """Prune, fix the quantisation, tune, write the file, and score it.
 
     Args:
         source: the scene.
-        views: what the file is to look like.
+        views: views that the file is to match.
         output: the file to write, or `-`.
-        encoding: of the encoder.
-        options: of the tuning.
+        encoding: options of the encoder.
+        options: options of the tuning.
         files: checkpoints.
         size_bytes: as for `choose_and_finetune`.
-        psnr: in place of a size: of the views that decide, pooled, dB; the smallest file is written that reaches it, of
-            several that are made, and there are no checkpoints.
+        psnr: a target instead of a size: PSNR on the validation views, pooled, dB. Of several files that are made, the
+            smallest that reaches it is written, and there are no checkpoints.
         keep, prune_unseen, importance: as for `choose_splats`.
-        source_index: a .npy file to write: which splat of the scene each splat of the file is.
-        lpips: computes it, if wanted.
+        source_index: a .npy file to write: for each splat of the file, its index in the scene.
+        lpips: computes LPIPS; `None`: it is not computed.
         known: as for `judge_models`.
-        page: an HTML file to write, which shows what came of it.
-        training: log of the training before, for the page.
-        quiet: say nothing that is not wrong.
+        page: an HTML report to write.
+        training: log of the training before, for the report.
+        quiet: print only errors.
 
     Returns:
-        The report, JSON-compatible; under `log` options, losses and what each look at the views found.
+        The report, JSON-compatible; under `log` options, losses and the results of each validation.
 
     Raises:
-        CsplatError: an option or a file cannot be used.
+        CsplatError: an option or a file is not usable.
         OSError: a file cannot be read or written.
     """
     threads = encoding.threads
@@ -161,8 +164,9 @@ class TunedChoice:
     """A tuned file of some of a scene's splats.
 
     Attributes:
-        chosen: the splats. made: the file.
-        seconds: by stage.
+        chosen: the splats.
+        made: the file.
+        seconds: time by stage.
     """
 
     chosen: Chosen
@@ -171,12 +175,12 @@ class TunedChoice:
 
     @property
     def size_bytes(self) -> int:
-        """Of the file."""
+        """Size of the file."""
         return len(self.made.data)
 
     @property
     def psnr(self) -> float:
-        """Of the views that decide, pooled, dB."""
+        """PSNR on the validation views, pooled, dB."""
         return float(self.made.log["best_psnr"])
 
 
@@ -194,21 +198,21 @@ def choose_and_finetune(
     progress: Progress | None = None,
     on_step: Callable[[TuningStep], None] | None = None,
 ) -> TunedChoice:
-    """Choose the splats of the file, and have them tuned.
+    """Choose the splats of the file, and tune them.
 
     Args:
         source: the scene.
-        views: what the file is to look like.
-        encoding: of the encoder.
-        options: of the tuning.
-        size_bytes: of the file, at most: so many splats stay as it has room for, and the tuning keeps to it.
+        views: views that the file is to match.
+        encoding: options of the encoder.
+        options: options of the tuning.
+        size_bytes: largest size of the file: as many splats are kept as it has room for, and the tuning meets it.
         files: checkpoints.
-        keep, prune_unseen, importance: as for `choose_splats`; of `keep` at most stays.
+        keep, prune_unseen, importance: as for `choose_splats`; with `size_bytes`, `keep` is an upper bound.
         progress, on_step: as for `csplat_trainer.finetune`.
 
     Raises:
-        InputError: no file of the scene is as small.
-        CsplatError: as `choose_splats` and `csplat_trainer.finetune`.
+        InputError: no file of the scene is small enough.
+        CsplatError: as for `choose_splats` and `csplat_trainer.finetune`.
     """
     clock = Clock()
 
@@ -237,7 +241,7 @@ def choose_and_finetune(
         tries -= 1
         if not tries:
             raise InputError(f"the smallest file has {len(made.data):,} bytes, more than {size_bytes:,}")
-        outputs = replace(outputs, resume=None)  # of the tuning of more splats
+        outputs = replace(outputs, resume=None)  # that checkpoint is of the tuning of more splats
         share = (size_bytes / len(made.data)) ** 2 / _FEWER
         with clock.stage("choosing"):
             chosen = choose(max(1, int(share * len(chosen.model))) / len(source))
@@ -265,10 +269,10 @@ def _fitting(
     choose: Callable[[int], Chosen],
     progress: Progress | None,
 ) -> tuple[Chosen, EncodeOptions]:
-    """Splats and precision of a file that the tuning can bring to a size: fewer splats, or finer steps."""
+    """Return splats and options of a file that the tuning can bring to a size: fewer splats, or finer steps."""
 
     def room(encoding: EncodeOptions) -> tuple[float, dict[str, Any]]:
-        """How much larger a file may be than the draft, and what the encoder chose for that."""
+        """Return the factor from the size of a draft to the size allowed, and the options that the encoder chose."""
         draft = Draft.of(chosen.model, encoding, importance=chosen.importance, graded=False, progress=progress)
         made = draft.coded(progress).write()
         return size_bytes / len(made.data), made.report.options

@@ -1,4 +1,4 @@
-"""One page about a training and the file that was tuned after it: `--page` of train and finetune."""
+"""The HTML report on a training and the file that was tuned after it: `--page` of train and finetune."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ __all__ = ["Shown", "make_page", "show_views", "write_page"]
 
 U8 = NDArray[np.uint8]
 
-_VIEWS = 3  # that are shown
-_WIDE, _HIGH = 7.0, 3.4  # inches of a plot
+_VIEWS = 3  # number of views that are shown
+_WIDE, _HIGH = 7.0, 3.4  # width and height of a plot, inches
 _LINE, _OTHER = "#2f83c9", "#d55e00"
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A view that judges, as pictures.
+    """Images of a test view.
 
     Attributes:
-        name: of the photograph, or its number.
-        pictures: [H, W, 3] uint8 each, by what they are.
+        name: name of the photograph, or number of the view.
+        pictures: [H, W, 3] uint8 each, by caption.
     """
 
     name: str
@@ -51,13 +51,13 @@ class Shown:
 def show_views(
     source: SplatModel, models: Mapping[str, SplatModel], views: ViewSet, threads: int | None
 ) -> list[Shown]:
-    """Draw a few of the views that judge, beside what they ought to look like.
+    """Render a few of the test views, and return the renders next to the reference images.
 
     Args:
-        source: the scene, whose renders are shown where there are no photographs.
-        models: by what is said below the picture.
-        views: those that judge are shown, evenly spread.
-        threads: how many; `None` for all.
+        source: the scene, whose renders are the reference if there are no photographs.
+        models: models to render, by caption.
+        views: a few of its test views are shown, evenly spread.
+        threads: number of threads; `None` for all.
     """
     if not views.judges:
         return []
@@ -68,7 +68,7 @@ def show_views(
     rows: list[dict[str, U8]] = [{} for _ in places]
     for name, model in models.items():
         if model is source and not views.photographs:
-            continue  # it is what the others ought to look like
+            continue  # it is the reference itself
 
         def look(at: int, picture: NDArray[np.float32], seen: NDArray[np.float32], name: str = name) -> None:
             rows[at].setdefault(wanted, to_bytes(picture))
@@ -82,10 +82,10 @@ def show_views(
 def write_page(
     path: str, name: str, training: Mapping[str, Any] | None, file: Mapping[str, Any] | None, shown: Sequence[Shown]
 ) -> None:
-    """Write the page; arguments as of `make_page`.
+    """Write the page; the other arguments are as for `make_page`.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the page cannot be written.
     """
     write_bytes(path, make_page(PurePath(name).name, training, file, shown).encode())
 
@@ -93,13 +93,13 @@ def write_page(
 def make_page(
     title: str, training: Mapping[str, Any] | None, file: Mapping[str, Any] | None, shown: Sequence[Shown]
 ) -> str:
-    """The page as text.
+    """Return the page as HTML.
 
     Args:
         title: name of the scene or file.
         training: log of the training, if there was one.
         file: report of the file, if there is one, with its log.
-        shown: pictures.
+        shown: images of test views.
     """
     parts = [
         _head(title, training, file),

@@ -1,4 +1,4 @@
-"""What fine-tuning came to: sizes, pictures of source and decoded file on held-out views, times, bytes."""
+"""Report on fine-tuning: sizes, scores of source and decoded file on held-out views, times, bytes."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from csplat_tools.views import ViewSet
 
 __all__ = ["SCORES", "Judged", "as_report", "format_report", "judge_models", "score_rows"]
 
-#: Scores that are told, and with how many digits.
+#: Scores that are reported, with their number of digits after the decimal point.
 SCORES = {"psnr": 2, "psnr_mean": 2, "ssim": 4, "lpips": 4}
 
 
 @dataclass(frozen=True)
 class Judged:
-    """Scores on views that nothing was learnt from.
+    """Scores on test views, which were used neither for training nor for validation.
 
     Attributes:
-        by: what the views are.
-        views: how many.
-        scores: by name of the model: psnr (pooled), psnr_mean, ssim, lpips or `None`.
+        by: kind of the reference images, in words.
+        views: number of views.
+        scores: psnr (pooled), psnr_mean, ssim and lpips (or `None`) by name of the model.
     """
 
     by: str
@@ -46,15 +46,18 @@ def judge_models(
     *,
     known: Mapping[str, Mapping[str, float | None]] | None = None,
 ) -> Judged | None:
-    """Score models on views that nothing was learnt from: by photographs, else by renders of the source.
+    """Score models on test views: against photographs, else against renders of the source.
 
     Args:
         source: the scene.
-        models: by name; the source itself is left out where its renders judge.
-        views: those that judge are asked; `None` comes back where there are none.
-        lpips: computes it, if wanted.
-        threads: how many; `None` for all.
-        known: scores by name of models that were judged by the same photographs already.
+        models: models by name; the source itself is left out if its renders are the reference.
+        views: the views, of which test views are used.
+        lpips: computes LPIPS; `None`: it is not computed.
+        threads: number of threads; `None` for all.
+        known: scores by name of models that were scored against the same photographs before.
+
+    Returns:
+        The scores; `None` without test views.
     """
     if not views.judges:
         return None
@@ -79,15 +82,16 @@ def as_report(
     seconds: Mapping[str, float],
     said: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Gather everything, JSON-compatible.
+    """Build the report as JSON-compatible values.
 
     Args:
-        source: the scene, before anything was left out.
-        plain: the file of the same decisions without tuning. result: the tuned one.
-        judged: on held-out views; `None` where there are none.
-        log: of the tuning.
-        seconds: by stage.
-        said: of the splats that were left out.
+        source: the scene before pruning.
+        plain: the file with the same quantisation before tuning.
+        result: the tuned file.
+        judged: scores on test views; `None` if there are none.
+        log: log of the tuning.
+        seconds: time by stage.
+        said: report of the splats that were pruned.
     """
     shares = byte_shares(result.data, read_header(result.data))
     overhead = shares.pop("overhead")
@@ -106,7 +110,7 @@ def as_report(
         "judged_by": None if judged is None else judged.by,
         "judged_views": 0 if judged is None else judged.views,
         "scores": {} if judged is None else {name: dict(one) for name, one in judged.scores.items()},
-        "decoded_is_what_was_tuned": True,  # or the run had ended before
+        "decoded_is_what_was_tuned": True,  # otherwise the run would have ended with an error
         "validation": {
             "views": log["validation_views"],
             "kept_aside": log["kept_aside"],
@@ -124,7 +128,7 @@ def as_report(
 
 
 def format_report(report: Mapping[str, Any]) -> str:
-    """The report as text."""
+    """Return the report as text."""
     unseen = report["unseen"]
     gone = report["source_splats"] - report["splats"] - unseen
     words = [f"{unseen} that no view shows"] * bool(unseen) + [f"{gone} that pictures need least"] * bool(gone)
@@ -148,7 +152,7 @@ def format_report(report: Mapping[str, Any]) -> str:
 
 
 def score_rows(scores: Mapping[str, Mapping[str, float | None]]) -> list[tuple[str, ...]]:
-    """Rows of a table of scores, by name of the model; what was not measured is a dash."""
+    """Return the rows of a table of scores, one per model, with a dash for scores that were not measured."""
 
     def cell(value: float | None, digits: int) -> str:
         return "-" if value is None else f"{value:.{digits}f}"

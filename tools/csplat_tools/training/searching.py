@@ -1,4 +1,4 @@
-"""Which size a tuned file must have to look so well: sizes are tried, each with a tuning of its own."""
+"""Find the size that a tuned file needs to reach a PSNR: sizes are tried, each with a tuning of its own."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from csplat.errors import InputError
 
 __all__ = ["smallest_reaching"]
 
-_PER_DOUBLING = 1.25  # dB that twice the bytes bring, about, where nothing is known yet,
-_SLOPES = (0.3, 12.0)  # and what is believed of two files
-_NEAR = 0.1  # dB above what is wanted that are near enough
-_TRIES, _FARTHEST = 5, 2.0  # doublings from one try to the next
+_PER_DOUBLING = 1.25  # dB that twice the bytes bring, about, if there is only one file
+_SLOPES = (0.3, 12.0)  # range of this slope if it is taken from two files, dB per doubling
+_NEAR = 0.1  # dB above the target that are near enough
+_TRIES, _FARTHEST = 5, 2.0  # files after the first; largest change of size from the nearest file, in doublings
 
 
 class Tried(Protocol):
@@ -21,12 +21,12 @@ class Tried(Protocol):
 
     @property
     def size_bytes(self) -> int:
-        """Of the file."""
+        """Size of the file."""
         ...
 
     @property
     def psnr(self) -> float:
-        """Of the views that decide, pooled, dB."""
+        """PSNR on the validation views, pooled, dB."""
         ...
 
 
@@ -34,30 +34,30 @@ T = TypeVar("T", bound=Tried)
 
 
 def smallest_reaching(psnr: float, make: Callable[[int | None], T]) -> T:
-    """Find the smallest file that reaches a PSNR: of those made, until one is near enough above it.
+    """Make files until one is near enough above a PSNR, and return the smallest that reaches it.
 
-    PSNR is taken to be straight in the logarithm of the size between two files.
+    Between two files, PSNR is taken to be linear in the logarithm of the size.
 
     Args:
-        psnr: wanted, dB.
-        make: makes a file of so many bytes at most, first one of any size.
+        psnr: target PSNR, dB.
+        make: makes a file of at most a number of bytes; called first with `None`, for any size.
 
     Raises:
-        InputError: none of the files is good enough.
+        InputError: none of the files reaches the PSNR.
     """
     tried, least = [make(None)], 1.0
     for _ in range(_TRIES):
         if psnr <= tried[-1].psnr <= psnr + _NEAR:
             break
         size = _next(psnr + 0.5 * _NEAR, tried)
-        if size <= least:  # no file is as small: halfway to those that there are
+        if size <= least:  # no file can be that small: halfway to the smallest file
             size = math.sqrt(least * min(one.size_bytes for one in tried))
         try:
             tried.append(make(max(1, round(size))))
         except InputError:
             least = size
             continue
-        if tried[-1].size_bytes < 0.9 * size:  # there is nothing more to put into it
+        if tried[-1].size_bytes < 0.9 * size:  # a larger file is not possible
             break
     enough = [one for one in tried if one.psnr >= psnr]
     if not enough:
@@ -67,7 +67,7 @@ def smallest_reaching(psnr: float, make: Callable[[int | None], T]) -> T:
 
 
 def _next(psnr: float, tried: list[T]) -> float:
-    """The size at which a PSNR is to be expected, by the files nearest to it, on either side where there are such."""
+    """Return the size at which a PSNR is expected, from the two files nearest to it, on either side if possible."""
     near = sorted(tried, key=lambda one: abs(one.psnr - psnr))
     near[1:] = sorted(near[1:], key=lambda one: (one.psnr < psnr) == (near[0].psnr < psnr))
     octave = math.log2(near[0].size_bytes)

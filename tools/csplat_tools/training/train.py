@@ -1,4 +1,4 @@
-"""From a data set on disk to a trained PLY, or to a file that was tuned by the same photographs: `csplat train`."""
+"""Train a scene from a data set, and write a PLY, or a file tuned to the same photographs: `csplat train`."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from csplat_trainer.tuning import FinetuneOptions
 
 __all__ = ["run_training", "run_training_to_file", "tuning_after", "tuning_checkpoint"]
 
-_TUNING = 1 / 6  # of the steps of a training, those of the tuning that follows it,
-_BRIEF = 4_000  # and steps of one whose scene gains by the whole learning rates: a longer one has found what they find
+_TUNING = 1 / 6  # steps of the tuning that follows a training, as a fraction of the training's steps
+_BRIEF = 4_000  # training steps up to which a tuning uses full learning rates: after longer training they gain nothing
 
 
 def run_training(
@@ -48,15 +48,15 @@ def run_training(
     """Read a data set, train, write the scene.
 
     Args:
-        data: the data set; where it says nothing every eighth picture is held out.
+        data: the data set; every eighth image is held out if it does not specify test images.
         output: the PLY to write, or `-`.
-        options: of the training.
-        files: that are written, and read, on the way.
-        facts: what the scene is to say instead of what the set does.
-        plot: a PNG of the loss over the steps.
-        page: an HTML file to write, which shows what came of it.
-        threads: how many; `None` for all.
-        quiet: say nothing.
+        options: options of the training.
+        files: files that are written and read during training.
+        facts: overrides of the metadata that the set provides.
+        plot: a PNG to write with the loss over the steps.
+        page: an HTML report to write.
+        threads: number of threads; `None` for all.
+        quiet: print nothing.
 
     Returns:
         Options, losses and figures, JSON-compatible.
@@ -91,27 +91,27 @@ def run_training_to_file(
     page: str | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Read a data set, train, and tune a file by the same photographs; of the scene nothing else is written.
+    """Read a data set, train, and tune a file to the same photographs; the trained scene itself is not written.
 
     Args:
         data, options, facts, plot, page, quiet: as for `run_training`.
         output: the `.csplat` file to write, or `-`.
-        files: likewise; checkpoints of the tuning stand beside those of the training (`tuning_checkpoint`), and a run
-            goes on from them where the training had ended.
-        encoding: of the encoder; its threads hold for all.
-        tuning: of the tuning.
-        size_bytes: of the file, at most.
+        files: as for `run_training`; checkpoints of the tuning are next to those of the training
+            (`tuning_checkpoint`), and a run goes on from them if the training had ended.
+        encoding: options of the encoder; its number of threads applies to everything.
+        tuning: options of the tuning.
+        size_bytes: largest size of the file.
         psnr: as for `run_finetuning`.
 
     Returns:
         `training`, as `run_training` returns it, and `file`, as `run_finetuning` does.
 
     Raises:
-        InputError: as both.
+        InputError: as for both.
         OSError: a file cannot be read or written.
     """
     further = _tuning_outputs(files, options)
-    for one in _loaded(data).val:  # a damaged one is found before training; nobody keeps them until then
+    for one in _loaded(data).val:  # finds a damaged image before training; they are not kept
         _ = one.pixels, one.mask
     result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (facts or SceneOverrides()).applied(result.model)
@@ -127,14 +127,14 @@ def run_training_to_file(
 
 
 def tuning_after(training: TrainOptions, byte_cost: float | None = None) -> FinetuneOptions:
-    """How a scene is tuned that was trained so: the longer it was, the longer and in the smaller steps.
+    """Return the options of the tuning after a training: the longer it was, the more and the smaller steps.
 
     Args:
-        training: as it was trained.
-        byte_cost: of a bit per splat in the loss; `None`: the usual one.
+        training: options of the training.
+        byte_cost: rate weight of a bit per splat in the loss; `None`: the default.
 
     Raises:
-        InputError: the cost is out of its range.
+        InputError: the weight is out of its range.
     """
     usual = FinetuneOptions(seed=training.seed, byte_cost=BYTE_COST[False] if byte_cost is None else byte_cost)
     tuning = usual.scaled(min(1.0, _BRIEF / training.iterations))
@@ -143,15 +143,15 @@ def tuning_after(training: TrainOptions, byte_cost: float | None = None) -> Fine
 
 
 def tuning_checkpoint(path: str | Path) -> Path:
-    """Where the tuning keeps its checkpoint, by where the training does: run.npz, run.tuning.npz."""
+    """Return the path of the tuning's checkpoint from that of the training's: run.tuning.npz for run.npz."""
     return Path(f"{str(path).removesuffix('.npz')}.tuning.npz")
 
 
 def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
-    """Checkpoints of the tuning.
+    """Return the checkpoints of the tuning.
 
-    It goes on from its own where the run goes on, and the training, whose scene it tunes, had ended. A run that leaves
-    the checkpoint as it is makes another file of the training.
+    The tuning resumes from its own checkpoint if the run resumes from the one that it writes, and the training had
+    ended. A run that writes no checkpoint, or to another path, makes another file of the same training.
     """
     checkpoint = None if files.checkpoint is None else tuning_checkpoint(files.checkpoint)
     tuned = Outputs(checkpoint, files.checkpoint_every)
@@ -165,12 +165,12 @@ def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
 def _trained(
     data: DataOptions, options: TrainOptions, files: Outputs, *, plot: str | None, threads: int | None, quiet: bool
 ) -> TrainResult:
-    """Read, train, draw the loss, say what came of it."""
+    """Read the data set, train, plot the loss, and print a summary."""
     _check_inputs(options, files)
     pictures = _loaded(data)
     for line in () if quiet else pictures.report:
         note(line)
-    pictures.read()  # a damaged picture is found before kernels are compiled
+    pictures.read()  # finds a damaged image before kernels are compiled
     with thread_count(threads):
         if options.device == "cpu":
             prepare_renderer(quiet=quiet, gradients=True)
@@ -184,16 +184,16 @@ def _trained(
 
 
 def _loaded(data: DataOptions) -> DataSet:
-    """The data set; where it says nothing every eighth picture is held out."""
+    """Load the data set; every eighth image is held out if neither the user nor the set specifies test images."""
     every = 8 if data.test_every is None else data.test_every
     return load(data.path, data.size, images=data.images, test_every=every, near=data.near)
 
 
 def _check_inputs(options: TrainOptions, files: Outputs) -> None:
-    """Read what is small, or fail: before the data set is read and kernels are compiled, which takes its time.
+    """Check the small inputs, before the data set is read and kernels are compiled, which takes long.
 
     Raises:
-        InputError: weights, checkpoint or torch are absent or damaged, or what early pictures go to is no folder.
+        InputError: weights, checkpoint or torch are absent or damaged, or the path of early renders is not a folder.
     """
     if options.lpips_weight > 0.0:
         PerceptualLoss(load_lpips(files.lpips_weights))
