@@ -1,4 +1,4 @@
-"""From where a scene is looked at: views that teach, views that decide, views that judge."""
+"""Views of a scene by role: training views (teach), validation views (decide), and test views (judge)."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""How many views it takes to decide what is needed: more of them until they agree with those that were kept aside.
+"""Find out how many views a choice of splats needs: views are added until they agree with held-out views.
 
-A choice fits the views that it was made with better than others. How far it does is known without a render of the
-result: the predicted error of what is to go, on the views that chose it and on views that did not, has to be about the
-same.
+A choice of splats to prune suits the views that it was made with better than others. By how much is known without
+rendering the result: the predicted error of the pruned splats has to be about the same on the views that chose them
+and on held-out views.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ __all__ = ["AgreedViews", "find_views", "removal_keys"]
 F64 = NDArray[np.float64]
 
 _BATCH = 40  # virtual views that are added at a time
-# dB between what is predicted for used views and for others, below which there are enough. Fits follow their views
-# farther than choices do: at 1 dB lego60k stops at 40 views, and is 3 dB better on others with 160.
+# dB between the errors predicted for used and for held-out views, below which there are enough views. Fits overfit
+# their views more than choices do: at 1 dB lego60k stops at 40 views, and is 3 dB better on others with 160.
 _AGREED = 0.1
-_SETTLED = 0.005  # share of the splats that the check views alone show, below which there are enough
+_SETTLED = 0.005  # fraction of the splats that only the held-out views show, below which there are enough views
 
 
 @dataclass(frozen=True, eq=False)
 class AgreedViews:
-    """Cameras that teach, others to check by, and what those that teach say.
+    """Training views, held-out views, and the removal errors of a source.
 
     Attributes:
-        used: they teach.
-        check: they were kept aside.
-        removal: of the source, measured from `used`.
-        gap: dB by which the error that is predicted for the share that is to go is larger in `check` than in `used`.
+        used: the training views.
+        check: the held-out views.
+        removal: removal errors of the source, measured from `used`.
+        gap: dB by which the error predicted for the splats to be pruned is larger in `check` than in `used`.
     """
 
     used: list[Camera]
@@ -59,19 +59,20 @@ def find_views(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> AgreedViews:
-    """Take as many of the teaching views as it needs, and measure the source from them.
+    """Take as many training views as needed, and measure the removal errors of the source from them.
 
     Args:
         model: the source.
-        views: virtual ones are taken batch by batch until no new splats appear and they agree with some that are
-            kept apart; of others all, and those that decide check.
-        gone: share of the splats that is to go; what is predicted for it has to agree.
-        size: of the pictures; the user's cameras keep their shape and are never enlarged.
-        threads: how many; None for all.
-        progress: is told how much is done.
+        views: virtual training views are taken batch by batch until no new splats appear and they agree with some that
+            are held out; of other views all are taken, and validation views are the held-out ones.
+        gone: fraction of the splats to be pruned, whose predicted errors have to agree.
+        size: width and height of the renders, pixels; the user's cameras keep their aspect ratio and are never
+            enlarged.
+        threads: number of threads; None for all.
+        progress: progress callback.
 
     Raises:
-        InputError: no view teaches, or none decides.
+        InputError: there are no training or no validation views.
     """
 
     def measured(cameras: Sequence[Camera]) -> Removal:
@@ -84,7 +85,7 @@ def find_views(
         raise InputError(f"{found} cameras, wanted 2 at least: one that teaches, one that decides")
     every, check = reduced(views.teaches, size), reduced(views.decides, size)
     if views.virtual:
-        # What was taught is to hold elsewhere; whether it does, views of the same kind say.
+        # A choice has to be good on other views, too; this is checked on views of the same kind.
         every, check = _parted(every)
     checked = measured(check)
     count = min(_BATCH, len(every)) if views.virtual else len(every)
@@ -99,9 +100,9 @@ def find_views(
 
 
 def _parted(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
-    """Cameras to use, and some to check by.
+    """Split cameras into those to use, and some to hold out.
 
-    These are taken evenly from the whole sequence: its beginning is not spread as evenly as all of it.
+    The latter are taken evenly from the whole sequence: its beginning is not spread as evenly as all of it.
     """
     count = min(CHECKS, len(cameras) - 1)
     aside = set(np.linspace(0, len(cameras) - 1, count + 2).astype(int)[1:-1].tolist())
@@ -109,16 +110,16 @@ def _parted(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
 
 
 def removal_keys(opacities: NDArray[np.float32], removal: Removal, *, keep_unseen: bool = True) -> F64:
-    """By what splats go, the smallest first.
+    """Return the keys by which splats are pruned, the smallest first.
 
     Args:
-        opacities: [N], of a scene.
-        removal: of the same.
-        keep_unseen: what no view saw goes last, instead of first.
+        opacities: [N], opacities of a scene.
+        removal: its removal errors.
+        keep_unseen: prune splats that no view saw last, instead of first.
 
     Returns:
-        [N] float64: −1 where no picture can show a splat, its alpha being too small to be drawn; the error of its
-        removal; infinity for what no view saw.
+        [N] float64: −1 for a splat whose alpha is too small to be drawn; infinity, or −0.5 without `keep_unseen`, for
+        one that no view saw; else the error of its removal.
     """
     keys = np.where(removal.seen, removal.error, np.inf if keep_unseen else -0.5)
     keys[opacities < ALPHA_MIN] = -1.0
@@ -126,7 +127,7 @@ def removal_keys(opacities: NDArray[np.float32], removal: Removal, *, keep_unsee
 
 
 def _gap(model: SplatModel, used: Removal, check: Removal, gone: float) -> float:
-    """How much larger, in dB, the predicted error is where it was not looked at."""
+    """Return by how many dB the predicted error of the splats to be pruned is larger in held-out views."""
     keys = removal_keys(model.opacities, used)
     order = np.argsort(keys, kind="stable")[: int(gone * len(model))]
     order = order[np.isfinite(keys[order])]

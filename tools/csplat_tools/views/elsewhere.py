@@ -1,4 +1,4 @@
-"""Views that nothing was fitted to, chosen or judged by: what a file looks like from where nobody looked."""
+"""Views that are used neither for fitting, nor for choices, nor for the main score: they check a file elsewhere."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from csplat_tools.views import placing
 
 __all__ = ["elsewhere"]
 
-_SEED = 2000  # those that decide have 1000 and more
-_NEARER, _FARTHER = (0.6, 0.7, 0.8, 0.9), 2.0  # from the middle of the scene, times the usual
-_POINTS = 20_000
+_SEED = 2000  # seed of these views; validation views use 1000 and more
+_NEARER, _FARTHER = (0.6, 0.7, 0.8, 0.9), 2.0  # factors of the distance from the middle of the scene
+_POINTS = 20_000  # points that are sampled from the scene
 
 
 def elsewhere(source: SplatModel) -> dict[str, list[Camera]]:
-    """Virtual cameras as those of `psnr`, but others, and the same nearer to the scene's middle and farther from it.
+    """Place virtual cameras like those of `psnr` at other places, and the same nearer to and farther from the middle.
 
-    Nearer ones come no nearer than leaves them outside of what they look at.
+    Nearer ones stay outside of the objects that they look at.
 
     Args:
-        source: the scene; its own cameras are not looked at.
+        source: the scene; its own cameras are not used.
 
     Returns:
         12 cameras of each kind: `beside`, `nearer`, `farther`.
@@ -42,7 +42,7 @@ def elsewhere(source: SplatModel) -> dict[str, list[Camera]]:
 
 
 def _at(camera: Camera, centre: NDArray[np.float64], times: float) -> Camera:
-    """The camera with its distance from a centre multiplied."""
+    """Return the camera with its distance from a centre multiplied."""
     turn = camera.viewmat[:3, :3]
     eye = -turn.T @ camera.viewmat[:3, 3]
     return relative_to((1.0 - times) * (eye - centre), camera)

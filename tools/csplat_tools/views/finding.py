@@ -1,4 +1,4 @@
-"""`find_view_set`: the one place where it is said which views teach, which decide and which judge.
+"""`find_view_set`: assign views their roles: training (teach), validation (decide), and test (judge).
 
 | views | teach | decide | judge |
 |---|---|---|---|
@@ -34,24 +34,24 @@ if TYPE_CHECKING:
 
 __all__ = ["DataOptions", "comparison_cameras", "find_view_set", "with_deciders"]
 
-_ENOUGH = 40  # cameras of a file that they may teach and judge
-_JUDGE_EVERY, _MOST_JUDGES = 4, 24
-_DECIDE_EVERY = 8
-_MOST_DECIDING = 16  # of the photographs that a data set names for that
-_DECIDING_SEED = 1000
-_TEST_EVERY = 8
+_ENOUGH = 40  # number of cameras of a file from which they are split into all three roles
+_JUDGE_EVERY, _MOST_JUDGES = 4, 24  # every Nth of them is a test view, up to this number
+_DECIDE_EVERY = 8  # every Nth of the others is a validation view
+_MOST_DECIDING = 16  # largest number of a data set's validation photographs that are used
+_DECIDING_SEED = 1000  # seed of virtual validation views, added to the user's
+_TEST_EVERY = 8  # every Nth photograph is held out if nothing else is specified
 
 
 @dataclass(frozen=True)
 class DataOptions:
-    """A data set, as a command line names it. What is `None` the scene says, or else it is as usual.
+    """A data set, as a command line specifies it. For `None` the scene's own metadata is used, else the default.
 
     Attributes:
         path: the set's folder, or its transforms.json.
-        size: width and height to bring photographs to; usually as they are.
-        images: COLMAP sets: which folder of pictures; usually the reader chooses.
-        test_every: every so-manieth is held out where the set does not say so; usually 8.
-        near: near plane of the cameras, scene units; usually one that suits the set.
+        size: width and height to which photographs are scaled; default: no scaling.
+        images: folder of images of a COLMAP set; default: chosen by the reader.
+        test_every: every Nth photograph is held out if the set does not specify test images; default: 8.
+        near: near plane of the cameras, scene units; default: one that suits the set.
     """
 
     path: str
@@ -62,7 +62,7 @@ class DataOptions:
 
 
 def comparison_cameras(source: SplatModel, every: int = 1) -> list[Camera]:
-    """The cameras of `psnr`: virtual ones, chosen from the source alone, or from every so-manieth of its splats."""
+    """Return the cameras of `psnr`: virtual ones, chosen by the source alone, or by every Nth of its splats."""
     return virtual_cameras(source, *placing.VIRTUAL_SIZES.judging, seed=0, every=every)
 
 
@@ -79,23 +79,23 @@ def find_view_set(
     split: Split = "test",
     every: int = 1,
 ) -> ViewSet:
-    """Read or place views, and give each its role; see the table above.
+    """Read or place views, and assign each a role; see the table above.
 
     Args:
         source: the scene.
         cameras: a camera file, see `csplat_render.cameras.load_cameras`.
-        data: instead: a data set.
-        background: behind everything; `None`: what the scene says it was trained in front of, else black.
-        count: virtual views that teach; 16 more do, too, which a removal keeps apart to check what the others taught.
-            0: no virtual ones teach or decide.
-        size, seed: of virtual views. `None`, and for the count: as is usual for so many splats (`usual_views`).
-        aside: how many views decide; `None`: as many as the table says. 0: none that might teach.
-        split: of a data set: which photographs judge. Where those of the training do, nothing else has a role.
-        every: how many splats of the scene each of the source's stands for, where it is a part of them: for views that
-            judge.
+        data: a data set, instead of a camera file.
+        background: background colour; `None`: that of the scene's training if known, else black.
+        count: number of virtual training views, to which 16 are added that pruning holds out to check its choice; 0: no
+            virtual training or validation views. `None`: by the number of splats (`usual_views`).
+        size: width and height of virtual training views, pixels; `None`: by the number of splats.
+        seed: seed of virtual training and validation views.
+        aside: number of validation views; `None`: as in the table; 0: none that could be training views.
+        split: the photographs of a data set that are test views. With `train`, no view has another role.
+        every: the source is every Nth splat of the scene, by which virtual test views are placed; 1: all splats.
 
     Raises:
-        InputError: both are given, or one cannot be read, or has not as many views.
+        InputError: both are given, or one is not valid, or has too few views.
         OSError: a file cannot be read.
     """
     if cameras is not None and data is not None:
@@ -108,7 +108,7 @@ def find_view_set(
         return _of_data(source, data, background, aside, split)
     if cameras is None:
         judges = comparison_cameras(source, every)
-        judging = {pose(camera) for camera in judges}  # of a scene without splats all are alike
+        judging = {pose(camera) for camera in judges}  # in a scene without splats all views are alike
         teaches, decides = (_without(judging, part) for part in _virtual(source, count, size, seed, aside))
         notes = (
             () if every < 2 else (f"the scene is not in memory: one in {every} of its splats says where views stand",)
@@ -119,7 +119,7 @@ def find_view_set(
 
 
 def with_deciders(views: ViewSet) -> ViewSet:
-    """The same views; where none decides, every eighth of those that teach does."""
+    """Return the views; if there are no validation views, every eighth training view becomes one."""
     if views.decides:
         return views
     decides, teaches = _apart(views.teaches, None)
@@ -182,7 +182,7 @@ def _of_data(
 
 
 def _settled(data: DataOptions, said: TrainedOn | None) -> tuple[DataOptions, list[str]]:
-    """What the user asks for, else what the scene says; and where they contradict each other."""
+    """Return the user's options, completed by the scene's metadata, with remarks on contradictions."""
     values: dict[str, Any] = {}
     notes = []
     for name in (field.name for field in fields(data) if field.name != "path"):
@@ -196,7 +196,7 @@ def _settled(data: DataOptions, said: TrainedOn | None) -> tuple[DataOptions, li
 def _colour(
     background: Colour | None, said: TrainedOn | None, *, photographs: bool = False
 ) -> tuple[Colour, list[str]]:
-    """What is behind everything, and what is to be said of it, which matters most where photographs are compared."""
+    """Return the background colour, with remarks on it, which matter most if photographs are compared."""
     if background is not None:
         if said is not None and said.background != background:
             return background, [
@@ -210,7 +210,7 @@ def _colour(
 
 
 def _named_file(path: str) -> str:
-    """The name of a file or a folder, which is not that of virtual views."""
+    """Return the name of a file or a folder, changed if it is that of virtual views."""
     name = Path(path).resolve().name
     return f"./{name}" if name == VIRTUAL else name
 
@@ -226,7 +226,7 @@ def _moved(pictures: Sequence[Picture], shift: NDArray[np.float64]) -> list[Pict
 def _virtual(
     source: SplatModel, count: int, size: tuple[int, int], seed: int, aside: int | None
 ) -> tuple[list[Camera], list[Camera]]:
-    """Views that teach, and views that decide: like those of `psnr`, by which they are judged, but others."""
+    """Return virtual training and validation views; the latter are like the test views of `psnr`, at other places."""
     if count < 1:
         return [], []
     usual, width, height = placing.VIRTUAL_SIZES.deciding
@@ -236,7 +236,7 @@ def _virtual(
 
 
 def _apart(cameras: Sequence[Camera], aside: int | None) -> tuple[list[Camera], list[Camera]]:
-    """Some cameras that decide, spread among all, and the others that do not stand where those do."""
+    """Split cameras into validation views, evenly spread, and training views without those of the same pose."""
     count = len(cameras)
     if aside is None:
         every = min(_DECIDE_EVERY, count)
@@ -255,5 +255,5 @@ def _parted(cameras: Sequence[Camera], places: Collection[int]) -> tuple[list[Ca
 
 
 def _without(judging: Collection[bytes], cameras: Sequence[Camera]) -> list[Camera]:
-    """Those that stand where none judges."""
+    """Return the cameras whose pose is not among those of `judging`."""
     return [one for one in cameras if pose(one) not in judging]

@@ -1,6 +1,6 @@
-"""Virtual cameras that teach: many, small, spread evenly at any count; and a user's own, made as small.
+"""Place virtual training cameras: many, small, and evenly spread at any count; reduce the user's own to that size.
 
-Many small pictures overfit less than few large ones of as many pixels.
+Many small renders overfit less than few large ones with the same number of pixels.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ __all__ = [
 F64 = NDArray[np.float64]
 T = TypeVar("T")
 
-#: Virtual views that teach, unless others are asked for: how many at most; width and height of their pictures, pixels.
-#: Those of small scenes: see `usual_views`.
+#: Default number of virtual training views, and width and height of their renders, pixels, for small scenes; for larger
+#: ones see `usual_views`.
 VIEW_COUNT = 160
 VIEW_SIZE = (240, 180)
 
-#: Virtual views beside those that are asked for: whether what these taught holds elsewhere, they say.
+#: Number of virtual views in addition to those requested, with which choices made on the others are checked.
 CHECKS = 16
 
 
 @dataclass(frozen=True)
 class VirtualSizes:
-    """Virtual views that fit nothing: how many there are, and the width and height of their pictures in pixels.
+    """Numbers and sizes of virtual views that nothing is fitted to: count, width and height in pixels.
 
     Attributes:
-        judging: those of `psnr`.
-        deciding: those that decide.
-        elsewhere: those of `elsewhere`, of each kind.
+        judging: test views, those of `psnr`.
+        deciding: validation views.
+        elsewhere: views of `elsewhere`, of each kind.
     """
 
     judging: tuple[int, int, int] = (8, 640, 480)
@@ -58,29 +58,29 @@ class VirtualSizes:
     elsewhere: tuple[int, int, int] = (12, 320, 240)
 
 
-#: The usual ones, by which all published figures were measured.
+#: The default, with which all published figures were measured.
 VIRTUAL_SIZES = VirtualSizes()
 
-_PIXELS = 50  # of all views together, for every splat
-_LARGEST = 2.0  # times as wide and high: all pictures are in memory, and larger ones would be too few
-_POINTS = 20_000
-_OBJECT_DISTANCE = (0.95, 1.6)  # extents from the centre
-_OBJECT_HEIGHT = (-0.95, 0.98)  # sines of elevations: objects are looked at from below, too
-_OBJECT_OFFSET = 0.2  # how far beside the centre a camera looks, extents
-_AROUND_DISTANCE = (0.35, 1.45)
+_PIXELS = 50  # pixels of all views together per splat
+_LARGEST = 2.0  # largest factor of width and height: all renders are in memory, and larger ones would be too few
+_POINTS = 20_000  # points that are sampled from the scene
+_OBJECT_DISTANCE = (0.95, 1.6)  # distance from the centre of an object, extents
+_OBJECT_HEIGHT = (-0.95, 0.98)  # sines of elevations: objects are seen from below, too
+_OBJECT_OFFSET = 0.2  # largest offset of a camera's target from the centre, per axis, extents
+_AROUND_DISTANCE = (0.35, 1.45)  # the same for surrounding scenes
 _AROUND_HEIGHT = (-0.12, 0.7)
 _AROUND_OFFSET = 0.35
-_OUTWARDS = 5  # one view of so many looks away from the middle of surroundings
-_GOOD_DETAIL = 0.4  # of the best view's; views of walls from behind say nothing
-_CANDIDATES = 3  # for each view
+_OUTWARDS = 5  # one view in this many looks away from the middle of a surrounding scene
+_GOOD_DETAIL = 0.4  # least detail as a fraction of the best view's: views of walls from behind are useless
+_CANDIDATES = 3  # candidates for each view
 _STEPS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)  # powers of 1 / the root of x⁴ = x + 1
 
 
 def usual_views(splats: int) -> tuple[int, tuple[int, int]]:
-    """How many virtual views teach at most, and the width and height of their pictures, by how many splats there are.
+    """Return the default number of virtual training views, and their width and height, by the number of splats.
 
-    A picture costs by the splat, not by the pixel: of many splats, fewer and larger ones say more in less time. At the
-    same PSNR a file of 290,000 splats is 16 % smaller with 110 views of 348x261 than with 160 of 240x180.
+    The cost of a render grows with splats, not with pixels: for many splats, fewer and larger views are more efficient.
+    At the same PSNR a file of 290,000 splats is 16 % smaller with 110 views of 348x261 than with 160 of 240x180.
     """
     larger = min(max(math.sqrt(_PIXELS * splats / (VIEW_COUNT * math.prod(VIEW_SIZE))), 1.0), _LARGEST)
     width, height = (round(larger * side) for side in VIEW_SIZE)
@@ -88,17 +88,18 @@ def usual_views(splats: int) -> tuple[int, tuple[int, int]]:
 
 
 def camera_sequence(model: SplatModel, count: int, size: tuple[int, int] = VIEW_SIZE, *, seed: int = 0) -> list[Camera]:
-    """Virtual cameras around a scene, spread evenly at any count: the first ones of a longer list are the same.
+    """Place virtual cameras around a scene, evenly spread at any count: a longer list begins with the same cameras.
 
     Args:
-        model: the scene; its own cameras are not looked at.
-        count: how many.
-        size: width and height of the pictures, pixels.
-        seed: where the sequence begins.
+        model: the scene; its own cameras are not used.
+        count: number of cameras.
+        size: width and height of the renders, pixels.
+        seed: start of the sequence.
 
     Returns:
-        `count` cameras, by a low-discrepancy sequence over directions, distances and what they look at. Those that an
-        object hides from nearby are left out, and in surroundings those that show little detail.
+        `count` cameras, by a low-discrepancy sequence over directions, distances and targets. Cameras whose view is
+        hidden from nearby come last around an object, as do those that show little detail in a surrounding scene; of
+        more candidates than needed, the last are left out.
     """
     frame = scene_frame(model)
     K = intrinsics(*size, FIELD_OF_VIEW)
@@ -119,7 +120,7 @@ def camera_sequence(model: SplatModel, count: int, size: tuple[int, int] = VIEW_
 
 
 def reduced(cameras: Sequence[Camera], size: tuple[int, int] = VIEW_SIZE) -> list[Camera]:
-    """The same views in pictures of about as many pixels as `size` has, if they have more."""
+    """Reduce views to about as many pixels as `size` has, if they have more."""
     smaller = []
     for camera in cameras:
         factor = (size[0] * size[1] / (camera.W * camera.H)) ** 0.5
@@ -133,7 +134,7 @@ def reduced(cameras: Sequence[Camera], size: tuple[int, int] = VIEW_SIZE) -> lis
 
 
 def _sequence(count: int, seed: int) -> F64:
-    """[count, 6] points in the unit cube; the first three coordinates evenly spread, the others random."""
+    """Return [count, 6] points in the unit cube; the first three coordinates are evenly spread, the others random."""
     rng = np.random.default_rng(seed)
     start = rng.random(len(_STEPS))
     even = np.mod(start + np.arange(1, count + 1)[:, None] * np.array(_STEPS), 1.0)
@@ -165,6 +166,6 @@ def _in_surroundings(frame: Frame, number: int, point: F64, K: F64, size: tuple[
 
 
 def evenly(those: Sequence[T], most: int) -> list[T]:
-    """So many of those at most, spread over their order."""
+    """Return at most `most` of some items, evenly spread over their order."""
     places = np.linspace(0, len(those) - 1, min(most, len(those))).round().astype(int)
     return [those[i] for i in places]

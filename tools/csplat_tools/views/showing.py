@@ -1,8 +1,8 @@
-"""Views for pictures that people look at: what is shown there is what somebody would go and look at.
+"""Choose views whose images are worth showing to people.
 
-The views of `psnr` are spread all around a scene, whatever is there: of an indoor capture some look at the back of what
-no photograph shows, or at a wall from nearby; a scene that does not say which way is up may lie on its side. That is
-fair to files, but a picture of it tells nobody anything.
+The views of `psnr` are spread all around a scene, whatever they show: in an indoor capture some see the back of objects
+that no photograph shows, or a wall from nearby; a scene without a known up direction may lie on its side. That is fair
+to files, but such images are of no use to a reader.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from csplat_tools.views.viewset import VIRTUAL, ViewSet
 
 __all__ = ["showing_cameras"]
 
-_COUNT, _SIZE = 6, (640, 480)
-_TRIED, _POINTS, _SEED = 64, 40_000, 0
-_GOOD_DETAIL = 0.8  # of the best view's
+_COUNT, _SIZE = 6, (640, 480)  # largest number of views; their width and height, pixels
+_TRIED, _POINTS, _SEED = 64, 40_000, 0  # candidates; points sampled from the scene; seed of both
+_GOOD_DETAIL = 0.8  # least detail as a fraction of the best view's
 
 
 def showing_cameras(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
-    """Views to take pictures from.
+    """Return the views to show.
 
     Args:
         source: the scene.
-        views: a user's own views that judge are shown; where they are virtual, others are looked for.
+        views: the user's own test views are shown; if they are virtual, others are searched.
 
     Returns:
-        Cameras relative to the scene's origin: of many virtual ones those far apart that show fine splats with nothing
-        before them.
+        Cameras relative to the scene's origin: the test views, or virtual ones far apart from each other that show fine
+        splats with nothing in front of them.
     """
     if views.name != VIRTUAL or not len(source):
         return views.judges
     told = standing(source)
-    own = views.judges if told is source else ()  # they would show it lying on its side
+    own = views.judges if told is source else ()  # else they would show it lying on its side
     cameras = [*own, *camera_sequence(told, _TRIED, _SIZE, seed=_SEED)]
     cloud, nearest = sample_cloud(source, _POINTS, np.random.default_rng(_SEED)), HIDING * scene_frame(source).extent
     details = np.array([detail(cloud, camera, nearest) for camera in cameras])

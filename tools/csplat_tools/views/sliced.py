@@ -1,8 +1,8 @@
-"""Pictures of a scene that does not fit the memory: in slices of depth, by way of a file on the disk.
+"""Render a scene that does not fit in memory, in slices of depth, by way of a file on the disk.
 
-For each picture all splats are read once, and those that it shows are sorted into slices. These are drawn one after the
-other, the nearest first, each upon what the one before it left of the pixels: the picture is that of the whole scene,
-bit for bit, however it was cut.
+For each render all splats are read once, and the visible ones are sorted into slices. These are drawn one after the
+other, the nearest first, each with the transmittance that the one before it left: the render is that of the whole
+scene, bit for bit, however it was cut.
 """
 
 from __future__ import annotations
@@ -31,28 +31,28 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 STAGE = "drawing one picture by way of the disk"
-_LOOKED_AT = 1 << 19  # splats of a slice that is cut again
-_BASE_BYTES = 320_000_000  # program, samples, splats that wait for being written
-_BLOCKS = 16  # that are being decoded, or were, and lie in what the system has not been given back
-_FOLDS = 2.2  # of a splat's arrays: as records, and as arrays
-_SPLAT_BYTES = 300  # beside them: what the rasteriser knows of a splat
-_PAIR_BYTES = 5  # of a splat and a tile that it touches
-_FULL = 0.75  # of a slice: its limits come from a sample
-_READING = 0.6  # of the time for a picture
+_LOOKED_AT = 1 << 19  # approximate number of splats that are sampled to cut a slice again
+_BASE_BYTES = 320_000_000  # bytes of the program, samples, and splats that wait to be written
+_BLOCKS = 16  # blocks of splats in memory: being decoded, or freed and not yet returned to the system
+_FOLDS = 2.2  # memory of a drawn splat as a multiple of its arrays: it exists as a record, and in arrays
+_SPLAT_BYTES = 300  # bytes of the rasteriser per splat, in addition to these
+_PAIR_BYTES = 5  # bytes per pair of a splat and a tile that it touches
+_FULL = 0.75  # fraction of a slice's memory that is planned for, since its limits come from a sample
+_READING = 0.6  # fraction of the time of a render that reading takes, for progress
 
 
 @dataclass(frozen=True, eq=False)
 class Sliced:
     """A scene that is drawn without being in memory.
 
-    While a picture is drawn the disk takes as much as the arrays of the splats that it shows do, in the folder for
-    temporary files (TMPDIR), in a file of no name: it goes when the program ends, however that is.
+    A render takes as much disk space as the arrays of its visible splats, in an unnamed file in the folder for
+    temporary files (TMPDIR), which disappears when the program ends in any way.
 
     Attributes:
         scene: its splats.
-        sample, every: as `OpenedScene.sample` gives them.
-        memory_bytes: bound, about.
-        progress: is told how far a picture has come.
+        sample, every: as returned by `OpenedScene.sample`.
+        memory_bytes: approximate bound on the memory.
+        progress: progress callback of a render.
         slice_bytes: least bytes of memory for a slice.
     """
 
@@ -65,22 +65,22 @@ class Sliced:
 
     @property
     def origin(self) -> tuple[float, float, float]:
-        """What cameras are relative to."""
+        """The scene's origin, to which cameras are relative."""
         return self.scene.facts.origin
 
     @property
     def disk_bytes(self) -> int:
-        """Bytes of the disk that a picture may take."""
+        """Bytes of disk space that a render may take."""
         return self.scene.count * self.layout.dtype.itemsize
 
     @property
     def layout(self) -> Rows:
-        """Of splats on the disk."""
+        """Layout of splats on the disk."""
         return Rows.of(_source(self.scene.facts), ())
 
     @property
     def splat_bytes(self) -> float:
-        """Bytes of memory that a splat takes which is drawn, beside those of its pairs with tiles."""
+        """Bytes of memory of a drawn splat, without its pairs with tiles."""
         return _FOLDS * self.layout.dtype.itemsize + _SPLAT_BYTES
 
     @property
@@ -100,7 +100,7 @@ class Sliced:
     def renderer(
         self, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
     ) -> Callable[[Camera], RenderResult]:
-        """What draws the scene from camera after camera, as `csplat_render.judge.renderer`; `radii` are left out.
+        """Return a function that draws the scene from a camera, like `csplat_render.judge.renderer`, without `radii`.
 
         Raises:
             InputError: the mode is `exact`; while drawing: the disk has no room, or the scene is not whole.
@@ -111,7 +111,7 @@ class Sliced:
 
 
 class _Picture:
-    """One picture. Owns what is left of its pixels."""
+    """A render in progress. Owns the state of its pixels."""
 
     def __init__(self, scene: Sliced, camera: Camera, background: ArrayLike, mode: Mode, threads: int | None) -> None:
         from csplat_render.rasterise import Rasteriser  # numba takes a second to import
@@ -124,9 +124,9 @@ class _Picture:
         self._last: RenderResult | None = None
 
     def drawn(self) -> RenderResult:
-        """Draw it."""
+        """Draw all slices, and return the render."""
         limits = self._limits(map(_source, scene_of(self._scene.sample).blocks()), 1, self._scene.every)
-        self._draw(_source(self._scene.scene.facts))  # so that there is a picture, whatever comes
+        self._draw(_source(self._scene.scene.facts))  # so that there is a render even if no splat is visible
         self._sort_and_draw(self._blocks, self._scene.scene.count, limits, first=True)
         self._tell(1.0)
         assert self._last is not None, "something was drawn"
@@ -141,12 +141,12 @@ class _Picture:
             self._scene.progress(STAGE, share)
 
     def _looked(self, splats: HasSplats) -> tuple[F32, F64, int]:
-        """Depths, the bytes of memory that drawing takes, both 0 for what is not shown; and how many are ignored."""
+        """Return depths and bytes of memory for drawing, both 0 for invisible splats; and the number of ignored."""
         seen = self._rasteriser.seen(splats, self._camera, antialiased=self._scene.scene.facts.antialiased)
         return seen.near, np.where(seen.near > 0, self._splat_bytes + _PAIR_BYTES * seen.tiles, 0.0), seen.ignored
 
     def _blocks(self) -> Iterator[Source]:
-        """All splats of the scene."""
+        """Yield all splats of the scene."""
         for rows, block in self._scene.scene.numbered():
             self._tell(_READING * rows.start / max(1, self._scene.scene.count))
             yield _source(block)
@@ -154,13 +154,13 @@ class _Picture:
     def _sort_and_draw(
         self, blocks: Callable[[], Iterator[Source]], count: int, limits: F32, *, first: bool = False
     ) -> None:
-        """Sort splats into slices, and draw these; those that are too large are cut again.
+        """Sort splats into slices, and draw these; slices that are too large are cut again.
 
         Args:
             blocks: the splats, in order.
-            count: how many there are, at most.
-            limits: as of `slice_limits`.
-            first: whether this is the first time that they are looked at.
+            count: largest number of them.
+            limits: limits of the slices, as from `slice_limits`.
+            first: True for the first pass over the scene, in which splats are counted.
         """
         spool = opened_spool(self._layout, count)
         with closing(spool.stream):
@@ -181,7 +181,7 @@ class _Picture:
                 if sizes[key] <= self._scene.room_bytes or number == 1:
                     self._draw(next(read(number)))
                 elif 0 < key < len(limits) and np.nextafter(limits[key - 1], np.float32(np.inf)) == limits[key]:
-                    for part in read(max(1, int(number * self._full / sizes[key]))):  # of one depth: by their order
+                    for part in read(max(1, int(number * self._full / sizes[key]))):  # one depth: by order
                         self._draw(part)
                 else:
                     every = -(-number // _LOOKED_AT)
@@ -191,7 +191,7 @@ class _Picture:
         return (source for source, _ in spool.sources(key, most))
 
     def _limits(self, blocks: Iterator[Source], every: int, share: int, *, least: int = 1) -> F32:
-        """As `slice_limits`: by one in `every` of some splats, of which each stands for `share`."""
+        """Return limits as `slice_limits` does, from one in `every` of some splats; each stands for `share`."""
         looked = [[column[::every].copy() for column in self._looked(block)[:2]] for block in blocks]
         if not looked:
             return np.empty(0, np.float32)
@@ -209,16 +209,16 @@ class _Picture:
 
 
 def slice_limits(near: F32, taken: F64, pieces: int) -> F32:
-    """Depths that cut splats into slices of about as many bytes.
+    """Return depths that cut splats into slices of about equal size in bytes.
 
     Args:
-        near: [n] depths; 0 of what is not drawn.
-        taken: [n] bytes that each takes.
-        pieces: how many slices, at least.
+        near: [n] depths; 0 for splats that are not drawn.
+        taken: [n] bytes of each splat.
+        pieces: least number of slices.
 
     Returns:
-        Limits in rising order: a slice has its lower limit and not its upper one. A depth at which more than a slice
-        lies is a slice of its own: its upper limit is the next float.
+        Limits in ascending order: a slice includes its lower limit, but not its upper one. A depth with more splats
+        than fit into a slice is a slice of its own: its upper limit is the next float.
     """
     rows = np.flatnonzero(near)
     if pieces < 2 or not len(rows):
@@ -233,5 +233,5 @@ def slice_limits(near: F32, taken: F64, pieces: int) -> F32:
 
 
 def _source(model: SplatModel) -> Source:
-    """The splats as they are drawn: centres in float32."""
+    """Return the splats as they are drawn, with centres in float32."""
     return Source(model.means, model.quats, model.scales, model.opacities, model.sh0, model.shN)

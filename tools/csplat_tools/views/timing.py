@@ -1,4 +1,4 @@
-"""How long pictures of a scene take on this machine, now: what long work is foretold by."""
+"""Measure the time of renders on this machine, from which the time of long work is estimated."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from csplat_render.judge import Drawable, renderer
 
 __all__ = ["picture_seconds", "pictures_seconds"]
 
-_SAMPLES = 2  # cameras that are tried
-_SMALLER = 8  # times on each side, where a whole picture takes a minute: seconds grow with its pixels
+_SAMPLES = 2  # largest number of cameras that are rendered
+_SMALLER = 8  # divisor of width and height in mode `exact`, in which a render takes a minute: time grows with pixels
 
 
 def pictures_seconds(source: SplatModel, cameras: Sequence[Camera], *, mode: Mode = "standard") -> float:
-    """Seconds that all pictures take, by some of them; 0 where there are none."""
+    """Estimate the seconds that renders from all cameras take, from some of them; 0 without splats or cameras."""
     return len(cameras) * picture_seconds(source, cameras, mode=mode) if len(source) and cameras else 0.0
 
 
@@ -29,12 +29,12 @@ def picture_seconds(
     threads: int | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> float:
-    """Seconds that a picture takes, by some that are made and thrown away.
+    """Measure the seconds that a render takes, from some that are discarded.
 
     Args:
         source: the scene.
-        cameras: one at least.
-        mode, threads: of the renderer.
+        cameras: the views, at least one.
+        mode, threads: mode of the renderer, and its number of threads.
         clock: returns the seconds that have passed.
     """
     draw = renderer(source, (0.0, 0.0, 0.0), mode=mode, threads=threads)
@@ -43,7 +43,7 @@ def picture_seconds(
         times = _SMALLER**2
         tried = [resized(one, max(1, one.W // _SMALLER), max(1, one.H // _SMALLER)) for one in tried[:1]]
     else:
-        draw(tried[0])  # buffers are made, kernels loaded
+        draw(tried[0])  # not timed: allocates buffers and loads kernels
     start = clock()
     for camera in tried:
         draw(camera)

@@ -1,4 +1,4 @@
-"""`ViewSet`: from where a scene is looked at, and for what: views that teach, that decide, that judge."""
+"""`ViewSet`: the training, validation and test views of a scene."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Colour = tuple[float, float, float]
 BLACK: Colour = (0.0, 0.0, 0.0)
 WHITE: Colour = (1.0, 1.0, 1.0)
 
-#: The name of a set whose judging views are virtual: those of `psnr`.
+#: Name of a set whose test views are virtual: those of `psnr`.
 VIRTUAL = "virtual"
 
 #: Parts of a data set: the photographs that were held out of training, and the others.
@@ -33,20 +33,20 @@ SPLITS: tuple[Split, ...] = get_args(Split)
 
 @dataclass(frozen=True, eq=False)
 class ViewSet:
-    """Views of a scene. None has two roles: what was chosen by a view looks better there than elsewhere.
+    """The views of a scene by role. No view has two roles: a choice made by a view looks better there than elsewhere.
 
     Attributes:
-        name: where the judging views come from: `virtual`, or the name of a camera file or of a data set.
-        background: red, green, blue behind everything that teaches and decides; behind what judges, too, unless that
-            is virtual: `psnr` is on black.
-        teaches: what values are fitted to, and from where it is measured what splats are worth.
-        decides: what says how many splats stay, which step was best, when there is enough.
-        judges: what the scores in reports are about.
-        photographs: of a data set, in its order; each holds its camera, one of those above.
-        virtual: whether the views that teach and decide were placed around the scene by us.
-        origin: what all cameras are relative to: the scene's.
-        notes: what the user should know of how the set came about, a line each.
-        split: which photographs of a data set judge: those that were held out, or those of the training.
+        name: source of the test views: `virtual`, or the name of a camera file or of a data set.
+        background: red, green, blue behind training and validation views; behind test views, too, unless they are
+            virtual: `psnr` is on black.
+        teaches: training views, to which values are fitted, and from which importance is measured.
+        decides: validation views, by which the number of splats, the best step and the end of a search are chosen.
+        judges: test views, to which the scores in reports refer.
+        photographs: photographs of a data set, in its order; each has its camera, one of those above.
+        virtual: training and validation views were placed around the scene by csplat.
+        origin: the scene's origin, to which all cameras are relative.
+        notes: remarks for the user on the choice of views, a line each.
+        split: the photographs of a data set that are test views: the held-out ones, or those of the training.
 
     Raises:
         InputError: a view has two roles.
@@ -73,7 +73,7 @@ class ViewSet:
 
     @property
     def judging_background(self) -> Colour:
-        """What is behind everything where the views that judge look."""
+        """Background colour of the test views."""
         return BLACK if self.name == VIRTUAL else self.background
 
     def judge(
@@ -85,46 +85,46 @@ class ViewSet:
         threads: int | None = None,
         progress: Callable[[str, float], None] | None = None,
     ) -> Judge:
-        """What judges by renders of the source.
+        """Return the scorer by the source's renders in the test views.
 
         Args:
             source: the scene.
-            background: another one than is said above.
-            mode, threads: of the renderer.
-            progress: is told how much of the source is drawn.
+            background: a background colour instead of `judging_background`.
+            mode, threads: mode of the renderer, and its number of threads.
+            progress: progress callback of rendering the source.
 
         Raises:
-            InputError: no view judges.
+            InputError: there are no test views.
         """
         colour = background or self.judging_background
         return Judge.of_source(source, self.judges, colour, mode=mode, threads=threads, progress=progress)
 
     def decider(self, source: SplatModel, *, threads: int | None = None) -> Judge:
-        """What decides by renders of the source.
+        """Return the scorer by the source's renders in the validation views.
 
         Raises:
-            InputError: no view decides.
+            InputError: there are no validation views.
         """
         return Judge.of_source(source, self.decides, self.background, threads=threads)
 
     def photograph_judge(self, *, mode: Mode = "standard", threads: int | None = None) -> Judge:
-        """What judges by photographs.
+        """Return the scorer by the photographs of the test views.
 
         Raises:
-            InputError: there are none, or none judges.
+            InputError: there are no photographs, or no test views.
         """
         return self._by_photographs(self.judges, mode, threads)
 
     def photograph_decider(self, *, threads: int | None = None) -> Judge:
-        """What decides by photographs.
+        """Return the scorer by the photographs of the validation views.
 
         Raises:
-            InputError: there are none, or none decides.
+            InputError: there are no photographs, or no validation views.
         """
         return self._by_photographs(self.decides, "standard", threads)
 
     def pictures(self, cameras: Sequence[Camera]) -> list[Picture]:
-        """The photographs that some of the cameras took, in their order."""
+        """Return the photographs that the given cameras took, in the order of the cameras."""
         taken = {id(one.camera): one for one in self.photographs}
         return [taken[id(camera)] for camera in cameras]
 
@@ -132,7 +132,7 @@ class ViewSet:
         """Read all photographs now, so that a damaged one is found before minutes are spent on the others.
 
         Raises:
-            InputError: a file is no image, or is cut short.
+            InputError: a file is not an image, or is truncated.
         """
         for photograph in self.photographs:
             _ = photograph.pixels, photograph.mask
@@ -147,16 +147,16 @@ class ViewSet:
 
 
 def counted_views(count: int, name: str) -> str:
-    """How many views there are and where they come from: `8 virtual views`, `8 views of lego`.
+    """Describe the number of views and their source: `8 virtual views`, `8 views of lego`.
 
     Args:
-        count: how many.
-        name: of the set.
+        count: number of views.
+        name: name of the set.
     """
     return counted(count, "virtual view") if name == VIRTUAL else f"{counted(count, 'view')} of {name}"
 
 
 def pose(camera: Camera) -> bytes:
-    """What tells a view from others, whatever the size of its picture: where it stands, and what it takes in."""
+    """Return bytes that identify a view at any image size: its pose and its field of view."""
     lens = camera.K[:2] / np.array([[camera.W], [camera.H]])
     return (np.round(np.concatenate([camera.viewmat[:3].ravel(), lens.ravel()]), 9) + 0.0).tobytes()
