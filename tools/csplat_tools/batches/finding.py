@@ -89,7 +89,7 @@ def find_tasks(scenes: str, command: str, ending: str, *, match: str = "*", with
 
 
 def _names(folder: Path, command: str, match: str, without: Path | None) -> list[str]:
-    """Names of scenes within a folder, with slashes."""
+    """Return the names of the scenes within a folder, with slashes."""
     endings = tuple(suffix for one in formats() if one.open is not None for suffix in one.suffixes)
     names = []
     for one in sorted(folder.rglob("*")):

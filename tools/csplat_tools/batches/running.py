@@ -113,7 +113,7 @@ def batch(
             needs more by itself fails, or gets this limit by `--memory` if the command has that option. `None`: most
             of the free memory, and a scene that needs more is tried alone.
         dask: a cluster: the address of its scheduler, or a `dask.distributed.Client`. Its machines see the same
-            files; the cluster decides on `workers` and `memory_bytes` itself.
+            files; `workers` and `memory_bytes` are left to the cluster.
         force: outputs that no batch has written may be replaced.
         thumbnails: draw a small render of each scene if the extra `render` is installed.
         progress: called with a `Step` for each scene that ended.

@@ -38,7 +38,7 @@ def need_renderer() -> None:
 def prepare_renderer(
     *, quiet: bool, gradients: bool = False, simplify: bool = False, ssim: bool = False, lpips: bool = False
 ) -> None:
-    """Compile the renderer, or load what was compiled before; say so if it takes its time.
+    """Compile the renderer, or load what was compiled before; print a note if that takes long.
 
     Args:
         quiet: print nothing.

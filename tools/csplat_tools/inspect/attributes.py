@@ -107,7 +107,7 @@ def attribute_errors_by_disk(
     if source_index is not None:
         if not is_csplat(other.path):
             return None
-        # Of a file that declares no errors, and says that it was refitted, all errors are measured.
+        # For a file that declares no errors and was refitted, all errors are measured.
         nothing = StatedErrors(source.count, 0, source.facts.sh_degree, refitted=True, records=())
         opened = replace(open_tiles(other.path), stated_errors=nothing)
         proof = prove_by_disk(source.scene, opened, source_index, memory_bytes=source.memory_bytes, progress=progress)

@@ -86,7 +86,7 @@ class Removal:
         return len(self._session.taught) + len(views.used) * later + len(views.check)
 
     def fitted(self, left: int, allowed: float | None, seen: Seen) -> FittedSplats:
-        """Return `left` splats, refitted; more if no view saw so many that cannot be pruned. See `FittedSplats`.
+        """Return `left` splats, refitted, but at least those that are never pruned, such as unseen ones.
 
         Args:
             left: number of splats to keep.

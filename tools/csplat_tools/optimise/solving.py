@@ -22,7 +22,7 @@ _QUALITIES = (24.0, 110.0)  # range in which the PSNR of each attribute is searc
 _NEAR = Window(-0.8, 1.0, 0.1)  # dB above the goal: near enough to predict the cost of a file on it
 _CLOSE = Window(-0.35, 0.4, 0.05)  # dB above the goal: near enough to choose the best coding
 _ON = Window(0.0, 0.15, 0.06)  # dB above the goal; PSNR jumps by about as much from one precision to the next
-_ON_REFITTED = Window(0.0, 0.25, 0.1)  # the same for the error of quantisation of refitted splats, whose tries are dear
+_ON_REFITTED = Window(0.0, 0.25, 0.1)  # the same for the error of quantisation of refitted splats; each try renders
 _WITHIN = Window(-0.35, 0.0, -0.12)  # range of a size target, in the dB that the bytes are worth
 _FEW, _SOME, _MANY = 3, 4, 6  # largest numbers of tries
 _JUMP = 0.25  # dB by which a file may be worse than one of less precision by chance
@@ -34,7 +34,7 @@ _PLATEAU = 1.5  # dB below the goal: files that are lower are predicted with the
 _FORESEEN = 2.0  # dB: quantisation that is better than it has to be by more counts only as the whole file is better
 _EVEN = 0.5  # least slope from two refitted files, as a fraction of the expected: quantisation is hardly less steep
 _STALLED = (2.0, 0.25)  # dB of precision, and the gain per dB that they must bring, or no precision reaches the goal
-_GROWS = {"codebook": 0.6}  # dB of a file's PSNR per dB of its attributes' PSNR, about, for codings where it is not 1
+_GROWS = {"codebook": 0.6}  # dB of a file's PSNR per dB of its attributes' PSNR, about; 1 for other codings
 
 
 @dataclass(frozen=True)

@@ -255,5 +255,5 @@ def _parted(cameras: Sequence[Camera], places: Collection[int]) -> tuple[list[Ca
 
 
 def _without(judging: Collection[bytes], cameras: Sequence[Camera]) -> list[Camera]:
-    """Return the cameras whose pose is not among those of `judging`."""
+    """Return the cameras whose pose is not in `judging`."""
     return [one for one in cameras if pose(one) not in judging]

@@ -1,6 +1,6 @@
 """Refit kept splats to renders of the source by gradient descent, one small view after the other.
 
-Where splats were pruned, their neighbours have to cover more, and where values are quantised others may make up for it:
+Neighbours of pruned splats have to cover more, and errors of quantised values can be made up for by other values:
 colours, opacities, scales and rotations are fitted together. The step length is proportional to the error. Least
 squares over all views at once (which are linear for colours alone) overfit the training views; this does not: after
 three passes over the views it gains as much on held-out views. Centres are fixed: if they move, too, scenes with few
