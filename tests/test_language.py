@@ -1,0 +1,47 @@
+"""The language of docstrings and comments: counts of banned openings and phrases, which only fall."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+#: What is counted in the Python files of the project, how, and how often it may be there at most. Lower a number when
+#: it falls; never raise one.
+CEILINGS = {
+    "docstrings that open with What, Whether, Of, …": (
+        r'^\s*r?"""(?:What|Who|Whom|Whose|Whether|Which|Where|Of|How|Why|When)\b',
+        1,  # generated from a string in spec/generate.py
+    ),
+    "comments that begin with of, as of or those": (r"# (?:of|as of|those) ", 44),
+    "so-manieth": (r"so-manieth", 0),
+    "as of, for as in": (r"\bas of `", 19),
+}
+
+
+@pytest.fixture(scope="module")
+def texts():
+    """Return the text of each Python file that the repository has, by its path."""
+    listed = subprocess.run(
+        ["git", "ls-files", "*.py"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,  # noqa: S607 - git is on the path
+    )
+    paths = [ROOT / line for line in listed.stdout.splitlines()]
+    if not paths:
+        pytest.skip("this is no checkout of the repository")
+    return {path.relative_to(ROOT).as_posix(): path.read_text("utf-8") for path in paths if path.is_file()}
+
+
+@pytest.mark.parametrize("what", CEILINGS)
+def test_there_is_no_more_of_what_is_banned(texts, what):
+    pattern, ceiling = CEILINGS[what]
+    expression = re.compile(pattern, re.MULTILINE)
+    found = {path: len(expression.findall(text)) for path, text in texts.items() if path != "tests/test_language.py"}
+    total = sum(found.values())
+    most = sorted(((count, path) for path, count in found.items() if count), reverse=True)[:5]
+    assert total <= ceiling, most
