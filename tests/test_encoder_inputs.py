@@ -112,6 +112,7 @@ OTHER_FORMATS = [
     "log-scales",
     "logit-opacities",
     "negative-scales",
+    "other-scenes",
     "out-of-range-opacities",
     "ranks",
     "short-buffer",

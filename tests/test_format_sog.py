@@ -220,6 +220,33 @@ def test_a_zip_of_several_scenes_is_refused_with_their_names(tmp_path):
     assert 13 == len(csplat.read(folder / "lod-meta.json"))
 
 
+def test_other_scenes_in_a_zip_are_named(tmp_path):
+    files = {f"a/{name}": data for name, data in files_of(*splats()).items()}
+    report = []
+    assert 5 == len(csplat.read(zipped(tmp_path / "a.zip", {**files, "a/b/scene.PLY": b"ply"}), report=report))
+    assert [("other-scenes", "note")] == [(one.id, one.kind) for one in report]
+    assert "the zip also holds a/b/scene.PLY: not read" == report[0].text
+    with pytest.raises(InputError, match=r"it holds 2 scenes, expected one \(a/meta.json, scene.ply\)"):
+        csplat.read(zipped(tmp_path / "a.zip", {**files, "scene.ply": b"ply"}))
+
+
+def test_the_directory_of_a_zip_is_not_read_for_each_part(tmp_path, monkeypatch):
+    path = zipped_folder(tmp_path / "a.zip", levels(tmp_path))
+    opened = []
+    whole = zipfile.ZipFile
+    monkeypatch.setattr(zipfile, "ZipFile", lambda *args: opened.append(args) or whole(*args))
+    assert 13 == len(csplat.read(path))
+    assert len(opened) < 5
+
+
+def test_the_list_of_files_may_have_backslashes(tmp_path):
+    folder = levels(tmp_path, filenames=[rf"{name}\meta.json" for name in ("0_0", "0_1", "1_0")])
+    for path in (folder, zipped_folder(tmp_path / "a.zip", folder)):
+        report = []
+        assert 13 == len(csplat.read(path, report=report))
+        assert ["backslashes in filenames, read as slashes"] == [one.text for one in report]
+
+
 def test_names_in_a_zip_may_have_backslashes_and_capitals(tmp_path):
     files = files_of(*splats())
     expected = csplat.read(zipped(tmp_path / "a.sog", files))
@@ -302,6 +329,12 @@ BAD = {
     "bounds of no end": (changed(["means", "mins"], [0, 0, float("inf")]), "finite"),
     "bounds of a text": (changed(["means", "mins"], [0, 0, "0"]), "finite"),
     "places beyond float32": (changed(["means", "maxs"], [0, 0, 300]), "float32"),
+    "bounds the wrong way round": (changed(["means", "mins"], [9, 9, 9]), "means has mins 9 above maxs .*, expected"),
+    "bounds of version 1 the wrong way round": (changed(["scales", "mins"], [9, 9, 9], 1), "scales has mins 9 above"),
+    "a pointer for a picture": (
+        changed([], 0, quats=b"version https://git-lfs.github.com/spec/v1\noid"),
+        "quats.webp is a pointer of Git LFS",
+    ),
     "a list for an object": (changed(["means"], []), "means mins is missing"),
     "a short codebook": (changed(["scales", "codebook"], [1.0]), "codebook is shorter"),
     "no codebook": (changed(["sh0", "codebook"], []), "codebook has 0 numbers"),

@@ -10,7 +10,7 @@ import textwrap
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.inputs import stand_in
 
-__all__ = ["DAMAGED", "Archive", "folder_refusal", "read_archive", "zip_refusal"]
+__all__ = ["DAMAGED", "Archive", "folder_refusal", "read_archive", "scenes_of", "zip_refusal"]
 
 #: What NumPy and zipfile raise of damage: RuntimeError is for passwords and unknown ways to compress, MemoryError for
 #: sizes that no array has, OSError for places outside the file and broken bz2.
@@ -37,6 +37,11 @@ _POINTS = "input.ply"  # of INRIA's trainer: what it began with
 _NAMED = 5  # of them, that a message names
 
 
+def scenes_of(names: Iterable[str]) -> list[str]:
+    """Return the names of files that are scenes by their endings."""
+    return [name for name in names if name.lower().endswith(_SCENES)]
+
+
 def zip_refusal(path: Path) -> str:
     """Say of a zip that is no scene itself which scenes lie in it."""
     try:
@@ -48,7 +53,7 @@ def zip_refusal(path: Path) -> str:
         arrays = textwrap.shorten(", ".join(name.removesuffix(".npy") for name in names), 120)
         what = f"an archive of NumPy arrays ({arrays}), no scene"
         return f"{path.name} is {what}: csplat.from_gsplat makes one of arrays under gsplat's names"
-    scenes = [name for name in names if name.lower().endswith(_SCENES)]
+    scenes = scenes_of(names)
     if not scenes:
         return f"{path.name} is a zip that holds no scene: {textwrap.shorten(', '.join(names), 120) or 'nothing'}"
     shown = ", ".join(scenes[:_NAMED]) + (f" and {len(scenes) - _NAMED} more" if len(scenes) > _NAMED else "")

@@ -40,7 +40,8 @@ different. A *repair* changes or drops something, safely, and is reported; `stri
 | `unusual-header` | a byte order mark, blank lines or capitals in the header | note |
 | `unusual-rows` | rows of text with blank lines, decimal commas, NaN of other languages, or in other lines | note |
 | `ranks` | checkpoints of gsplat: whether the splats of one GPU or of several are read | note |
-| `zip-names` | backslashes or capitals in the names of a SOG's zip | note |
+| `zip-names` | backslashes or capitals in the names of a SOG's zip or in its list of files | note |
+| `other-scenes` | scenes beside the one that is read: of a SOG's zip, or of glTF without a default scene | note |
 | `double-means` | positions in double precision: an origin carries what float32 cannot | note |
 | `non-ascii-header` | characters outside ASCII in the header: read as question marks | note |
 | `empty` | no splats at all | note |

@@ -20,7 +20,7 @@ from csplat.errors import InputError, counted
 from csplat.files import atomic_writer
 from csplat.formats.curve import along_curve
 from csplat.formats.format import Format
-from csplat.formats.packing import all_three, smallest_three
+from csplat.formats.packing import all_three, crossed, smallest_three
 from csplat.model import F32, SplatModel
 from csplat.ply_comments import format_comments, parse_comments
 from csplat.scene import BLOCK, Scene
@@ -93,7 +93,7 @@ def _open(path: Path) -> Iterator[Scene]:
     if len(bad):
         row, kind, end, axis = bad[0]
         raise InputError(f"{path.name}: chunk {row} has no finite {names[kind * 6 + end * 3 + axis]}")
-    bad = np.argwhere(bounds[:, :, 0] > bounds[:, :, 1])
+    bad = np.argwhere(crossed(bounds[:, :, 0], bounds[:, :, 1]))
     if len(bad):
         row, kind, axis = bad[0]
         low, high = (f"{names[kind * 6 + end * 3 + axis]} {bounds[row, kind, end, axis]:.6g}" for end in (0, 1))

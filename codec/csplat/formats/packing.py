@@ -1,4 +1,4 @@
-"""Packing that several formats share: rotations as three numbers."""
+"""Packing that several formats share: rotations as three numbers, and bounds."""
 
 from __future__ import annotations
 
@@ -9,9 +9,15 @@ from numpy.typing import NDArray
 
 from csplat.model import F32, normalise_quats
 
-__all__ = ["all_three", "smallest_three"]
+__all__ = ["all_three", "crossed", "smallest_three"]
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+
+
+def crossed(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return where a lower bound is above the upper one; a step of float32 is rounding."""
+    above: NDArray[np.bool_] = low > np.nextafter(high.astype(np.float32), np.float32(np.inf))
+    return above
 
 
 def smallest_three(quats: F32) -> tuple[NDArray[np.int64], F32]:

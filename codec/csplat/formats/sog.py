@@ -12,7 +12,7 @@ import numpy as np
 from csplat.archives import folder_refusal, zip_refusal
 from csplat.errors import counted
 from csplat.formats.format import Format
-from csplat.formats.sog_files import Json, Parts, parts_at
+from csplat.formats.sog_files import Json, Parts, parts_at, with_slashes
 from csplat.formats.sog_read import COEFFICIENTS, Pictures, Unit, degree_of, unit_of
 from csplat.formats.sog_write import write_sog
 from csplat.lint import Finding
@@ -36,15 +36,19 @@ _Range = tuple[int, int, int]  # number of a file, first splat and the one behin
 @contextmanager
 def _open(path: Path, level: int = 0) -> Iterator[Scene]:
     parts, name = parts_at(path)
+    with parts.held():
+        yield _scene(path, parts, name, level)
+
+
+def _scene(path: Path, parts: Parts, name: str, level: int) -> Scene:
     meta = parts.json(name)
     if isinstance(meta.value, dict) and not any(one in meta for one in _NAMES):
         where = folder_refusal(parts.path) if parts.folder is None else zip_refusal(path)
         parts.refuse(f"{name} is not that of SOG, which has {', '.join(_NAMES[:4])}; {where}")
     if "lodLevels" in meta or "tree" in meta:
         scene = _streamed(parts, meta, level)
-        scene.findings.extend(_name_findings(parts))
-        yield scene
-        return
+        scene.findings.extend(parts.findings)
+        return scene
     if level:
         parts.refuse(f"it has no levels, and level {level} is wanted")
     unit = unit_of(parts, name)
@@ -56,7 +60,7 @@ def _open(path: Path, level: int = 0) -> Iterator[Scene]:
         for arrays in pictures.blocks(degree):
             yield replace(facts, **arrays)
 
-    yield Scene(unit.count, facts, blocks, _name_findings(parts) + _findings(pictures))
+    return Scene(unit.count, facts, blocks, [*parts.findings, *_findings(pictures)])
 
 
 def _facts(degree: int, *, antialiased: bool, flat: bool) -> SplatModel:
@@ -73,10 +77,6 @@ def _facts(degree: int, *, antialiased: bool, flat: bool) -> SplatModel:
     )
 
 
-def _name_findings(parts: Parts) -> list[Finding]:
-    return [Finding("zip-names", 1, parts.oddity, "note")] if parts.oddity else []
-
-
 def _findings(pictures: Pictures) -> list[Finding]:
     if not pictures.zeros:
         return []
@@ -90,9 +90,13 @@ def _streamed(parts: Parts, meta: Json, level: int) -> Scene:
     last = max([max(one) for one in leaves], default=0)
     if level > last:
         parts.refuse(f"level {level} is wanted, its levels are 0 to {last}")
+    findings: list[Finding] = []
+    if any("\\" in name for name in names):
+        findings.append(Finding("zip-names", 1, "backslashes in filenames, read as slashes", "note"))
+        names = [with_slashes(name) for name in names]
     ranges = _ranges(parts, names, [_at(one, level) for one in leaves])
     if "environment" in meta:
-        ranges[meta["environment"].text()] = None
+        ranges[with_slashes(meta["environment"].text())] = None
     units: list[tuple[Unit, list[tuple[int, int]]]] = []
     for name, wanted in ranges.items():
         unit = unit_of(*parts.inner(name))
@@ -106,7 +110,6 @@ def _streamed(parts: Parts, meta: Json, level: int) -> Scene:
         antialiased=bool(units) and all(unit.antialiased for unit, _ in units),
         flat=bool(units) and all(unit.flat for unit, _ in units),
     )
-    findings: list[Finding] = []
     seen: set[int] = set()
 
     def blocks() -> Iterator[SplatModel]:

@@ -6,7 +6,8 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn
@@ -14,11 +15,12 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.archives import DAMAGED
+from csplat.archives import DAMAGED, scenes_of
 from csplat.errors import InputError, missing
 from csplat.inputs import stand_in
+from csplat.lint import Finding
 
-__all__ = ["Json", "Parts", "parts_at", "picture_of"]
+__all__ = ["Json", "Parts", "parts_at", "picture_of", "with_slashes"]
 
 _LARGEST_JSON = 1 << 25
 _LARGEST_PART = 1 << 30
@@ -30,6 +32,65 @@ _EXPANSION = 4  # expansion of a part in a zip, at most: images and short texts 
 _FREE = 1 << 20  # bytes that may come out of a zip regardless of its size
 
 
+class _Zip:
+    """The directory of a zip, read once. Owns the open archive while `held`.
+
+    Args:
+        path: path of the zip.
+        title: name for messages.
+    """
+
+    def __init__(self, path: Path, title: str) -> None:
+        self._path, self._title = path, title
+        self._archive: zipfile.ZipFile | None = None
+        with self._opened() as archive:
+            self.members = archive.infolist()
+        self._named: list[dict[str, list[zipfile.ZipInfo]]] = []
+        for same in _SAME:
+            named: dict[str, list[zipfile.ZipInfo]] = {}
+            for info in self.members:
+                named.setdefault(same(info.filename), []).append(info)
+            self._named.append(named)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep the archive open as long as the context lasts; otherwise each part opens it."""
+        with self._opened() as self._archive:
+            try:
+                yield
+            finally:
+                self._archive = None
+
+    def find(self, name: str) -> list[zipfile.ZipInfo]:
+        """Find the members of a name: by it, else with the backslashes of Windows, else with capitals or without."""
+        for same, named in zip(_SAME, self._named, strict=True):
+            if same(name) in named:
+                return named[same(name)]
+        return []
+
+    def read(self, info: zipfile.ZipInfo) -> bytes:
+        """Unpack a member; one of `DAMAGED` is raised where that fails."""
+        if self._archive is not None:
+            return self._archive.read(info)
+        with zipfile.ZipFile(self._path) as archive:
+            return archive.read(info)
+
+    def _opened(self) -> zipfile.ZipFile:
+        try:
+            return zipfile.ZipFile(self._path)
+        except DAMAGED as error:
+            reason = " ".join(str(error).split())[:120] or type(error).__name__
+            raise InputError(f"{self._title}: a damaged zip: {reason}") from None
+
+
+def with_slashes(name: str) -> str:
+    """Return a name with slashes where Windows has backslashes."""
+    return name.replace("\\", "/")
+
+
+_SAME = (str, with_slashes, lambda name: with_slashes(name).casefold())  # names that are alike, the closest first
+
+
 @dataclass(frozen=True)
 class Parts:
     """The parts of one SOG, by name.
@@ -38,13 +99,24 @@ class Parts:
         path: the folder, or the zip.
         title: name for messages.
         folder: folder inside the zip; `None`: there is none.
-        oddity: anything unusual about the names in the zip; "": nothing.
+        zip: the zip; `None`: the parts are files of a folder.
+        findings: what is unusual about the names in the zip.
     """
 
     path: Path
     title: str
     folder: PurePosixPath | None = None
-    oddity: str = ""
+    zip: _Zip | None = None
+    findings: tuple[Finding, ...] = ()
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep a zip open as long as the context lasts: its directory is not read again for each part."""
+        if self.zip is None:
+            yield
+            return
+        with self.zip.held():
+            yield
 
     def inner(self, name: str) -> tuple[Parts, str]:
         """Find the parts of a SOG that is a part of this one, and the name of its JSON, as `parts_at` does.
@@ -59,7 +131,7 @@ class Parts:
         place = self._inside(name)
         if place.suffix.lower() != ".json":
             self.refuse(f"{name[:80]} is a zip inside of a zip: unpack {self.title} and name its {_LEVELS}")
-        return Parts(self.path, title, self.folder / place.parent), place.name
+        return Parts(self.path, title, self.folder / place.parent, self.zip), place.name
 
     def read(self, name: str, most: int = _LARGEST_PART) -> bytes:
         """The bytes of a part.
@@ -69,11 +141,12 @@ class Parts:
             OSError: it cannot be read.
         """
         if self.folder is not None:
-            return self._unzipped(str(self.folder / self._inside(name)), most)
-        with self.file(name).open("rb") as stream:
-            data = stream.read(most + 1)
-        if len(data) > most:
-            self.refuse(f"{name[:80]} has more than {most:,} bytes")
+            data = self._unzipped(str(self.folder / self._inside(name)), most)
+        else:
+            with self.file(name).open("rb") as stream:
+                data = stream.read(most + 1)
+            if len(data) > most:
+                self.refuse(f"{name[:80]} has more than {most:,} bytes")
         if instead := stand_in(data[:64]):
             self.refuse(f"{name[:80]} is {instead}")
         return data
@@ -92,25 +165,19 @@ class Parts:
         return place
 
     def _unzipped(self, name: str, most: int) -> bytes:
-        try:
-            with zipfile.ZipFile(self.path) as archive:
-                info = self._member(archive, name)
-                if info.file_size > min(most, _FREE + _EXPANSION * info.compress_size):
-                    self.refuse(f"{name} of {info.compress_size:,} bytes says that {info.file_size:,} come out of it")
-                return archive.read(info)
-        except DAMAGED as error:
-            self.refuse(f"{name[:80]}: {' '.join(str(error).split())[:120] or type(error).__name__}")
-
-    def _member(self, archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo:
-        """Find a part of a zip: by its name, else with the backslashes of Windows, else with capitals or without."""
-        found: list[zipfile.ZipInfo] = []
-        for same in (str, _with_slashes, lambda one: _with_slashes(one).casefold()):
-            found = found or [info for info in archive.infolist() if same(info.filename) == same(name)]
+        assert self.zip is not None, "a folder inside of a zip has the zip"
+        found = self.zip.find(name)
         if not found:
             self.refuse(f"there is no {name[:80]}")
         if len({info.filename for info in found}) > 1:
             self.refuse(f"{' and '.join(info.filename[:80] for info in found[:2])} would both be {name[:80]}")
-        return found[-1]
+        info = found[-1]
+        if info.file_size > min(most, _FREE + _EXPANSION * info.compress_size):
+            self.refuse(f"{name} of {info.compress_size:,} bytes says that {info.file_size:,} come out of it")
+        try:
+            return self.zip.read(info)
+        except DAMAGED as error:
+            self.refuse(f"{name[:80]}: {' '.join(str(error).split())[:120] or type(error).__name__}")
 
     def json(self, name: str) -> Json:
         """Parse a part that holds JSON."""
@@ -194,26 +261,34 @@ def parts_at(path: Path, title: str | None = None) -> tuple[Parts, str]:
         zipped = stream.read(2) == b"PK"
     if not zipped:
         return Parts(path.parent, title), path.name
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-    except DAMAGED as error:
-        Parts(path, title).refuse(f"a damaged zip: {' '.join(str(error).split())[:120] or type(error).__name__}")
-    found = [one for one in map(PurePosixPath, map(_with_slashes, names)) if _is_manifest(one)]
+    whole = _Zip(path, title)
+    names = [info.filename for info in whole.members]
+    found = [one for one in map(PurePosixPath, map(with_slashes, names)) if _is_manifest(one)]
     if not found:
         Parts(path, title).refuse(f"a zip without {_ONE}, no SOG")
-    only = _only_scene(Parts(path, title, PurePosixPath()), found)
+    parts = Parts(path, title, PurePosixPath(), whole)
+    only = _only_scene(parts, found)
     oddities = ["backslashes in the names of the zip, read as slashes"] if any("\\" in name for name in names) else []
     oddities += [f"{only.name} is read as {only.name.lower()}"] if only.name != only.name.lower() else []
-    return Parts(path, title, only.parent, "; ".join(oddities)), only.name
+    findings = [Finding("zip-names", 1, "; ".join(oddities), "note")] if oddities else []
+    findings += _others(parts, only, names)
+    return Parts(path, title, only.parent, whole, tuple(findings)), only.name
+
+
+def _others(parts: Parts, only: PurePosixPath, names: Sequence[str]) -> list[Finding]:
+    """Report scenes of other formats beside the SOG of a zip; outside of its folder nothing says which one is meant."""
+    places = [place for place in map(PurePosixPath, map(with_slashes, names)) if _OF_MACOS not in place.parts]
+    others = [PurePosixPath(one) for one in scenes_of(map(str, places))]
+    if not others:
+        return []
+    if not all(one.is_relative_to(only.parent) for one in others):
+        _refuse_several(parts, [only, *others])
+    text = f"the zip also holds {_listed(others)}: not read"
+    return [Finding("other-scenes", len(others), text, "note")]
 
 
 def _is_manifest(place: PurePosixPath) -> bool:
     return place.name.lower() in (_ONE, _LEVELS) and _OF_MACOS not in place.parts
-
-
-def _with_slashes(name: str) -> str:
-    return name.replace("\\", "/")
 
 
 def _only_scene(parts: Parts, found: Sequence[PurePosixPath]) -> PurePosixPath:
@@ -229,7 +304,7 @@ def _only_scene(parts: Parts, found: Sequence[PurePosixPath]) -> PurePosixPath:
             said = parts.json(str(one)).value
             named = said.get("filenames") if isinstance(said, dict) else None
             names = [*named, said.get("environment")] if isinstance(named, list) else []
-            inside |= {one.parent / name for name in names if isinstance(name, str)}
+            inside |= {one.parent / with_slashes(name) for name in names if isinstance(name, str)}
     scenes = [one for one in found if one not in inside]
     if len(scenes) != 1:
         _refuse_several(parts, scenes)
@@ -237,9 +312,12 @@ def _only_scene(parts: Parts, found: Sequence[PurePosixPath]) -> PurePosixPath:
 
 
 def _refuse_several(parts: Parts, scenes: Sequence[PurePosixPath]) -> NoReturn:
-    shown = ", ".join(str(one)[:80] for one in sorted(scenes)[:_NAMED]) + (", ..." if len(scenes) > _NAMED else "")
     remedy = "name one of these files" if parts.folder is None else "unpack it and name one of these files"
-    parts.refuse(f"it holds {len(scenes)} scenes, expected one ({shown}): {remedy}")
+    parts.refuse(f"it holds {len(scenes)} scenes, expected one ({_listed(scenes)}): {remedy}")
+
+
+def _listed(places: Sequence[PurePosixPath]) -> str:
+    return ", ".join(str(one)[:80] for one in sorted(places)[:_NAMED]) + (", ..." if len(places) > _NAMED else "")
 
 
 def picture_of(parts: Parts, name: str, data: bytes, fits: Any) -> NDArray[np.uint8]:

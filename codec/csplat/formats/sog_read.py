@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.formats.packing import all_three
+from csplat.formats.packing import all_three, crossed
 from csplat.formats.sog_files import Json, Parts, picture_of
 from csplat.model import F32
 from csplat.ply_columns import alpha_of_logits
@@ -108,14 +108,22 @@ def unit_of(parts: Parts, name: str) -> Unit:
 
 
 def _bounds(means: Json) -> NDArray[np.float64]:
-    bounds = np.stack([means[name].numbers(3, 3) for name in ("mins", "maxs")])
+    bounds = np.stack(_ends(means, 3))
     if np.abs(bounds).max() > _LARGEST_LOG:
         means.parts.refuse(f"{means.place} reaches beyond what float32 holds")
     return bounds
 
 
+def _ends(section: Json, channels: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    low, high = (section[name].numbers(channels, channels) for name in ("mins", "maxs"))
+    for channel in np.flatnonzero(crossed(low, high))[:1]:
+        said = f"mins {low[channel]:.6g} above maxs {high[channel]:.6g}, expected at most that"
+        section.parts.refuse(f"{section.place} has {said}")
+    return low, high
+
+
 def _between(section: Json, channels: int) -> F32:
-    low, high = (section[name].numbers(channels, channels)[:, None] for name in ("mins", "maxs"))
+    low, high = (ends[:, None] for ends in _ends(section, channels))
     return (low + (high - low) * (np.arange(256) / 255.0)).astype(np.float32)
 
 
