@@ -118,6 +118,7 @@ OTHER_FORMATS = [
     "short-buffer",
     "spz-axes",
     "unclear-scales",
+    "zero-rows",
     "zip-names",
 ]
 

@@ -85,8 +85,10 @@ def plausible(rows):
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "git lfs pull"),
         (b'{"message": "Not Found"}'.ljust(64), "is JSON"),
         (gzip.compress(bytes(100), mtime=0).ljust(64), "gunzip"),
-        (b"what somebody wrote down, in many words of English".ljust(96), "hardly .splat: .* at byte 0 lies at"),
-        (np.random.default_rng(0).bytes(32 * 40), "hardly .splat: 9.% of 40 rows are no splats"),
+        (b"what somebody wrote down, in many words of English".ljust(96), "hardly .splat: it is text, and begins with 'what"),
+        (b"0.1234 0.5678 0.9012 1.0 0.5 0.5\n" * 32, "hardly .splat: it is text"),
+        (np.random.default_rng(0).normal(size=320).astype("<f4").tobytes(), "are no splats; that .* has scales of"),
+        (np.random.default_rng(0).bytes(32 * 40), "hardly .splat: [89].% of 40 rows are no splats"),
         (bytes(64), "a rotation of the bytes 0, 0, 0, 0"),
     ],
 )
@@ -104,6 +106,9 @@ def test_what_is_hardly_a_splat_file_is_refused_unless_insisted(tmp_path, data, 
 def test_scenes_of_any_size_are_no_doubt(tmp_path, make_model, size, count):
     model = make_model(count, 0)
     means, scales = model.means * np.float32(size) + np.float32(size), model.scales + np.float32(np.log(size))
+    csplat.write(tmp_path / "a.splat", replace(model, means=means, scales=scales, means_double=None))
+    assert count == len(csplat.read(tmp_path / "a.splat"))
+    means[:, 1] = np.float32(size) * np.float32(1e-16)  # flat, but for rounding
     csplat.write(tmp_path / "a.splat", replace(model, means=means, scales=scales, means_double=None))
     assert count == len(csplat.read(tmp_path / "a.splat"))
     csplat.write(tmp_path / "a.splat", replace(model, means=np.zeros((count, 3), np.float32), means_double=None))
@@ -124,3 +129,17 @@ def test_forbidden_values_are_told(tmp_path):
     assert (csplat.read(path).scales == -3).all()
     path.write_bytes(plausible({"quats": 128}))
     assert [("zero-quats", 20)] == [(one.id, one.count) for one in lint(path)]
+    clipped = np.clip(np.random.default_rng(0).normal(size=(20, 4)) * 512 + 128, 0, 255)
+    path.write_bytes(plausible({"quats": clipped}))
+    assert [] == lint(path)
+
+
+def test_rows_of_zeros_and_huge_values_are_told(tmp_path):
+    path = tmp_path / "a.splat"
+    path.write_bytes(plausible({}) + bytes(32 * 6))
+    assert [("zero-rows", 6, "note")] == [(one.id, one.count, one.kind) for one in lint(path)]
+    assert 26 == len(csplat.read(path))
+    scales = np.full((20, 3), 0.1)
+    scales[4, 1] = 2e38
+    path.write_bytes(plausible({"scales": scales}))
+    assert [("huge-values", 1, "note")] == [(one.id, one.count, one.kind) for one in lint(path)]

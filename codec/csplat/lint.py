@@ -44,6 +44,7 @@ different. A *repair* changes or drops something, safely, and is reported; `stri
 | `other-scenes` | scenes beside the one that is read: of a SOG's zip, or of glTF without a default scene | note |
 | `double-means` | positions in double precision: an origin carries what float32 cannot | note |
 | `non-ascii-header` | characters outside ASCII in the header: read as question marks | note |
+| `zero-rows` | splats of .splat and .ksplat whose bytes are all 0: kept | note |
 | `empty` | no splats at all | note |
 | `log-scales` | scales that should be standard deviations, most of them negative: read as logarithms | repair |
 | `negative-scales` | others below 0: the sign is left out, but where a format forbids it | repair, error |
@@ -68,7 +69,16 @@ import numpy as np
 from csplat.errors import InputError, counted
 from csplat.model import MAX_SH_DEGREE
 
-__all__ = ["Columns", "Finding", "dropped_columns", "find_columns", "float_columns", "refuse", "too_many_bands"]
+__all__ = [
+    "Columns",
+    "Finding",
+    "dropped_columns",
+    "find_columns",
+    "float_columns",
+    "refuse",
+    "too_many_bands",
+    "trailing_bytes",
+]
 
 Kind = Literal["note", "repair", "error"]
 
@@ -356,6 +366,12 @@ def _find_rest(names: _Names, sh_degree: int | None) -> tuple[tuple[str, ...], t
         return found, rest, None
     text = f"SH degree {degree}: bands above {kept} are left out, as asked"
     return found, rest, Finding("sh-bands", count - len(rest), text, "note")
+
+
+def trailing_bytes(count: int) -> list[Finding]:
+    """Report the bytes behind the end of a file's content, if there are any: another file may be joined to it."""
+    text = f"{counted(count, 'byte')} after the last splat: ignored"
+    return [Finding("trailing-bytes", count, text, "repair")] if count > 0 else []
 
 
 def too_many_bands(degree: int) -> str:

@@ -26,6 +26,7 @@ __all__ = [
     "alpha_of_logits",
     "findings_of",
     "gather",
+    "huge_rows",
     "logits_of_alpha",
     "with_half_floats",
 ]
@@ -302,7 +303,7 @@ def _repair(part: Arrays, columns: Columns, counts: Counts, widths: F64 | None) 
     if columns.colour_range:
         part.sh0[:] = (part.sh0 / np.float32(columns.colour_range) - np.float32(0.5)) / SH_C0
     _repair_quats(part.quats, counts)
-    counts.huge += _huge_rows(part, scale_count)
+    counts.huge += huge_rows(part.scales[:, :scale_count], part.sh0, part.shN)
     return len(part.opacities)
 
 
@@ -335,9 +336,14 @@ def _fuse_filter(scales: F32, alphas: F64, widths: F64) -> None:
     scales[rows] = after
 
 
-def _huge_rows(part: Arrays, scale_count: int) -> int:
-    """Count splats with values that no picture can be meant by."""
-    looked_at = ((part.scales[:, :scale_count], _HUGE_LOG), (part.sh0, _HUGE_COLOUR), (part.shN, _HUGE_COLOUR))
+def huge_rows(scales: NDArray[Any], *colours: NDArray[Any]) -> int:
+    """Count splats with values that no picture can be meant by.
+
+    Args:
+        scales: [n, C] natural logarithms.
+        colours: [n, ...] coefficients.
+    """
+    looked_at = ((scales, _HUGE_LOG), *((one, _HUGE_COLOUR) for one in colours))
     huge = None
     for array, limit in looked_at:
         if max(float(array.max(initial=0.0)), -float(array.min(initial=0.0))) > limit:

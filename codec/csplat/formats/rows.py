@@ -8,15 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.errors import counted
 from csplat.formats.activations import Spread, read_scales_as
 from csplat.model import F32, SplatModel
-from csplat.ply_columns import SH_C0, Counts, findings_of
+from csplat.lint import Finding
+from csplat.ply_columns import SH_C0, Counts, findings_of, huge_rows
 from csplat.scene import Scene
 
 __all__ = ["SH_C0", "colours_of_bytes", "finite_scene"]
 
 Rows = NDArray[Any]
 
+_HUGE = float(np.exp(87.0))  # from here on it is worth while to look for huge values
 _SMALLEST = np.float32(1e-20)  # value that a standard deviation of 0 is replaced by
 
 
@@ -38,11 +41,16 @@ def finite_scene(
     Returns:
         The scene; if there are rows, but none is finite, its findings hold an error.
     """
-    total, kept, spread, counts = 0, 0, Spread(), Counts()
+    total, kept, empty, spread, counts = 0, 0, 0, Spread(), Counts()
     for rows, *_ in blocks():
         good = _finite(rows)
         found = rows if good.all() else rows[good]
-        spread.add(np.ascontiguousarray(found["scales"]), total)
+        scales = np.ascontiguousarray(found["scales"])
+        spread.add(scales, total)
+        colours = [found["shN"]] if "shN" in (rows.dtype.names or ()) and found["shN"].dtype.kind == "f" else []
+        huge = max(spread.most, -spread.least) > _HUGE  # so far; most files have none
+        counts.huge += huge_rows(_logs(scales.astype(np.float32)) if huge else scales[:0], *colours)
+        empty += _empty_rows(rows)
         zero = np.logical_and.reduce([found["quats"][:, part] == zero_quat for part in range(4)])
         counts.zero_quats += int(np.count_nonzero(zero))
         total += len(rows)
@@ -50,6 +58,9 @@ def finite_scene(
     counts.nonfinite = total - kept
     are_logs, findings = read_scales_as(spread, "scale", strict=False)
     findings = findings_of(counts, total) + findings
+    if empty:
+        text = f"{counted(empty, 'splat')} whose bytes are all 0, which nothing is seen of: kept"
+        findings.append(Finding("zero-rows", empty, f"{text}; a download that broke off may leave them", "note"))
 
     def models() -> Iterator[SplatModel]:
         for parts in blocks():
@@ -60,6 +71,12 @@ def finite_scene(
                 yield decoded(scales if are_logs else _logs(scales), *kept)
 
     return Scene(kept, facts, models, findings)
+
+
+def _empty_rows(rows: Rows) -> int:
+    """Count rows without a bit that is set."""
+    unseen = np.flatnonzero(rows["colours"][:, 3] == 0)
+    return int(np.count_nonzero(~rows[unseen].view(np.uint8).reshape(len(unseen), rows.dtype.itemsize).any(axis=1)))
 
 
 def _finite(rows: Rows) -> NDArray[np.bool_]:

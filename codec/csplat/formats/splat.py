@@ -27,8 +27,10 @@ _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colours", "u1", 4)
 _LARGEST_LOG = np.float32(88.0)  # float32 holds its exponential
 _QUAT_ZERO = 128  # byte of a component of 0; that of 1 would be 256
 _SAMPLE = 4096  # splats that are looked at for a doubt
-_PLACES = (1e-12, 1e12)  # coordinates other than 0, scene units; of any four bytes a third lies there
-_LONGEST_QUAT = 224  # units of 1/128; four bytes of 0 are 256 long
+_PLACES = (1e-12, 1e12)  # largest coordinate other than 0, scene units; of any 12 bytes a quarter lies there
+_LONGEST_QUAT = 250  # units of 1/128; four bytes of 0 are 256 long, and 255 in three is what clipped ones have
+_MOST_IS_TEXT = 0.95  # share of printable bytes
+_PRINTABLE = np.array([32 <= byte < 127 or byte in b"\t\n\r" for byte in range(256)])
 
 
 @contextmanager
@@ -53,15 +55,22 @@ def _doubt(path: Path) -> str:
     rows = np.frombuffer(data, _ROW)
     step = max(1, len(rows) // _SAMPLE)
     sample = rows[::step]
-    far = np.abs(sample["means"])
-    placed = ((far == 0) | ((far > _PLACES[0]) & (far < _PLACES[1]))).all(axis=1)
+    share = np.mean(_PRINTABLE[np.frombuffer(sample.tobytes(), np.uint8)])
+    if share >= _MOST_IS_TEXT:
+        return f"it is text, and begins with {ascii(bytes(data[:24]).decode('ascii', 'replace'))}"
+    far = np.abs(sample["means"]).max(axis=1)  # NaN where there is one
+    placed = (far == 0) | ((far > _PLACES[0]) & (far < _PLACES[1]))
     lengths = np.linalg.norm(np.subtract(sample["quats"], _QUAT_ZERO, dtype=np.float32), axis=1)
-    finite = np.isfinite(far).all(axis=1)  # of others a finding tells
-    good = ~finite | (placed & (lengths < _LONGEST_QUAT))
+    turned = lengths < _LONGEST_QUAT
+    of_two_signs = (sample["scales"] < 0).any(axis=1) & (sample["scales"] > 0).any(axis=1)  # neither lengths nor logs
+    finite = np.isfinite(far)  # of others a finding tells
+    good = ~finite | (placed & turned & ~of_two_signs)
     if 2 * np.count_nonzero(~good) <= np.count_nonzero(finite):
         return ""
     worst = int(np.argmin(good))
-    name, what = ("quats", "has a rotation of the bytes") if placed[worst] else ("means", "lies at")
+    name, what = ("means", "lies at")
+    if placed[worst]:
+        name, what = ("scales", "has scales of") if turned[worst] else ("quats", "has a rotation of the bytes")
     said = ", ".join(f"{value:.3g}" for value in sample[name][worst].tolist())
     share = np.count_nonzero(~good) / np.count_nonzero(finite)
     at = worst * step * _ROW.itemsize
