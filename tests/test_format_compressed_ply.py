@@ -7,7 +7,7 @@ import pytest
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import format_of, named_by, open_scene
+from csplat.formats import format_of, lint, named_by, open_scene
 from csplat.ply import read_ply
 from csplat.scene import BLOCK
 
@@ -109,6 +109,8 @@ def test_it_is_told_from_a_plain_ply_by_its_words(tmp_path):
         (SMALL.replace(b"little", b"big"), "wanted binary_little_endian"),
         (SMALL.replace(b"made by hand", b"csplat origin 1 2"), r"a\.ply: .*3 finite numbers"),
         (built([[*ROW[:4], float("nan"), *ROW[5:]]], [WORD]), "chunk 0 has no finite max_y"),
+        (SMALL.replace(struct.pack("<f", -8), b"\1\0\xa0\x7f"), "chunk 0 has no finite min_scale_x"),  # signalling
+        (built([ROW], [WORD], [range(72)], rest=72), "SH degree 4, expected at most 3: --sh-degree 3"),
         (built([[ROW[3] + 1, *ROW[1:]]], [WORD]), "chunk 0 has min_x .* above max_x"),
     ],
 )
@@ -116,6 +118,40 @@ def test_what_does_not_fit_is_refused(tmp_path, data, says):
     (tmp_path / "a.ply").write_bytes(data)
     with pytest.raises(InputError, match=says):
         csplat.read(tmp_path / "a.ply", "compressed-ply")
+
+
+def test_bounds_that_were_rounded_apart_are_read(tmp_path):
+    above = float(np.nextafter(np.float32(4), np.float32(9)))
+    (tmp_path / "a.ply").write_bytes(built([[above, *ROW[1:]]], [WORD]))
+    assert [] == lint(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_bands_above_those_asked_for_are_left_out(tmp_path, degree):
+    (tmp_path / "a.ply").write_bytes(built([ROW], [WORD], [range(100, 172)], rest=72))
+    report = []
+    model = csplat.read(tmp_path / "a.ply", sh_degree=degree, report=report)
+    coefficients = (degree + 1) ** 2 - 1
+    expected = (np.arange(100, 172).reshape(3, 24).T + 0.5) / 32 - 4
+    assert expected[:coefficients].tolist() == model.shN[0].tolist()
+    assert [("sh-bands", 72 - 3 * coefficients)] == [(one.id, one.count) for one in report]
+
+
+@pytest.mark.parametrize(
+    ("data", "found"),
+    [
+        (b"\xef\xbb\xbf" + SMALL, ["unusual-header"]),
+        (SMALL.replace(b"ply\nformat", b"PLY\nFORMAT").replace(b"end_h", b"END_H"), ["unusual-header"]),
+        (SMALL.replace(b"\n", b"\r", SMALL.partition(b"end_header\n")[0].count(b"\n") + 1), []),
+        (SMALL + SMALL, ["trailing-bytes"]),
+        (built([[*ROW[:6], 1, 1, 1, 2, 2, 2, *ROW[12:]]], [WORD] * 20), ["scales-are-linear"]),
+    ],
+)
+def test_what_is_unusual_is_read_and_told(tmp_path, data, found):
+    (tmp_path / "a.ply").write_bytes(data)
+    report = []
+    assert csplat.read(tmp_path / "a.ply", report=report).means[0].tolist() == [4, 10, -1]
+    assert found == [one.id for one in report]
 
 
 def test_damage_is_refused_or_read(tmp_path):

@@ -157,3 +157,8 @@ def test_forbidden_values_are_told(tmp_path, scale, found):
     assert {"zero-quats": 1, found: 5} == findings
     scales = csplat.read(tmp_path / "a.ksplat").scales
     np.testing.assert_allclose(-4 if found == "log-scales" else np.log(0.5), scales, rtol=1e-6)
+
+
+def test_what_follows_the_last_section_is_told(tmp_path):
+    (tmp_path / "a.ksplat").write_bytes(simple(0) + bytes(33))
+    assert [("trailing-bytes", 33)] == [(one.id, one.count) for one in lint(tmp_path / "a.ksplat")]

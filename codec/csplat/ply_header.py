@@ -66,12 +66,13 @@ class Header:
         return self.start + len(self.text)
 
 
-def read_header(path: Path, findings: list[Finding]) -> Header:
+def read_header(path: Path, findings: list[Finding], kind: str = "ply") -> Header:
     """Read the header of a PLY.
 
     Args:
         path: path of the file.
         findings: anything noticed is appended.
+        kind: name of the kind of PLY that is wanted, of `csplat.detect.KINDS`.
 
     Raises:
         InputError: not a PLY of columns, or one without an end of its header.
@@ -80,8 +81,8 @@ def read_header(path: Path, findings: list[Finding]) -> Header:
     head = head_of(path)
     if head.startswith(_WIDE_MARKS) and is_ply(head[2:].replace(b"\0", b"")):
         raise InputError(f"{path.name} is a PLY in UTF-16, expected ASCII: save it as UTF-8")
-    if by_content(path, head) is not KINDS["ply"]:
-        raise refusal(path, head, wanted="ply")
+    if by_content(path, head) not in (KINDS["ply"], KINDS[kind]):
+        raise refusal(path, head, wanted=kind)
     with path.open("rb") as stream:
         start = len(_MARK) if head.startswith(_MARK) else 0
         stream.seek(start)

@@ -6,7 +6,6 @@ stand in the comments of its header, as those of a plain PLY do.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -21,8 +20,11 @@ from csplat.files import atomic_writer
 from csplat.formats.curve import along_curve
 from csplat.formats.format import Format
 from csplat.formats.packing import all_three, crossed, smallest_three
-from csplat.model import F32, SplatModel
+from csplat.lint import Finding, too_many_bands, trailing_bytes
+from csplat.model import F32, MAX_SH_DEGREE, SplatModel
+from csplat.ply_columns import Counts, findings_of
 from csplat.ply_comments import format_comments, parse_comments
+from csplat.ply_header import read_header
 from csplat.scene import BLOCK, Scene
 
 __all__ = ["FORMAT"]
@@ -34,8 +36,7 @@ _CHUNK = 256  # splats that share bounds
 _SH_C0 = 0.28209479177387814
 _LARGEST_LOG = 20.0  # log scales beyond are no splat's, and would take all steps of their chunk
 _LARGEST_BOUND = 9e37  # of a colour; its coefficient is 3.5 times that, and float32 ends at 3.4e38
-_MAX_HEADER_SIZE = 1 << 16
-_END_OF_HEADER = re.compile(rb"\nend_header[ \t]*\r?\n")
+_BANDS = (9, 24, 45, 72)  # columns of SH, of degrees 1 to 4
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
@@ -64,8 +65,8 @@ class _Element:
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[Scene]:
-    elements, comments = _header(path)
+def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
+    elements, comments, findings = _header(path)
     chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
     if chunk is None or vertex is None:
         raise InputError(f"{path.name} has no element {'chunk' if chunk is None else 'vertex'}: no compressed PLY")
@@ -78,17 +79,26 @@ def _open(path: Path) -> Iterator[Scene]:
             f"{path.name}: {counted(chunk.count, 'chunk')} for {counted(vertex.count, 'splat')},"
             f" wanted one for each {_CHUNK}"
         )
-    rest = 0
+    kept = 0  # coefficients of a channel
     if sh is not None:
         rest = len(sh.dtype.names or ())
-        if sh.count != vertex.count or rest not in (9, 24, 45):
+        if sh.count != vertex.count or rest not in _BANDS:
             raise InputError(
                 f"{path.name}: {counted(sh.count, 'row')} of {rest} SH coefficients for"
                 f" {counted(vertex.count, 'splat')}, wanted as many, of 9, 24 or 45"
             )
         _check_columns(path, "sh", sh, [f"f_rest_{index}" for index in range(rest)], "u1")
+        degree = _BANDS.index(rest) + 1
+        if degree > MAX_SH_DEGREE and sh_degree is None:
+            raise InputError(f"{path.name} has {too_many_bands(degree)}")
+        kept = rest // 3 if sh_degree is None else min(rest // 3, (sh_degree + 1) ** 2 - 1)
+        if degree > MAX_SH_DEGREE:
+            text = f"SH degree {degree}: bands above {sh_degree} are left out, as asked"
+            findings.append(Finding("sh-bands", rest - 3 * kept, text, "note"))
     table = chunk.read(path, 0, chunk.count)
-    bounds = np.stack([table[name] for name in names], 1).astype(np.float64).reshape(chunk.count, len(names) // 6, 2, 3)
+    with np.errstate(invalid="ignore"):  # a signalling NaN is refused below
+        columns = np.stack([table[name] for name in names], 1).astype(np.float64)
+    bounds = columns.reshape(chunk.count, len(names) // 6, 2, 3)
     bad = np.argwhere(~(np.abs(bounds) < _LARGEST_BOUND))
     if len(bad):
         row, kind, end, axis = bad[0]
@@ -101,7 +111,7 @@ def _open(path: Path) -> Iterator[Scene]:
     try:
         said = parse_comments(comments)
         facts = SplatModel(
-            **_unpacked(np.zeros(0, vertex.dtype), bounds[:0], None, rest),
+            **_unpacked(np.zeros(0, vertex.dtype), bounds[:0], None, kept),
             origin=said.origin or (0.0, 0.0, 0.0),
             **said.fields(),
         )
@@ -114,19 +124,19 @@ def _open(path: Path) -> Iterator[Scene]:
             coefficients = None if sh is None else sh.read(path, start, stop)
             words = vertex.read(path, start, stop)
             own = bounds[start // _CHUNK : -(-stop // _CHUNK)]
-            yield replace(facts, **_unpacked(words, own, coefficients, rest))
+            yield replace(facts, **_unpacked(words, own, coefficients, kept))
 
-    yield Scene(vertex.count, facts, blocks, [*said.findings])
+    scales = (float(bounds[:, 1, 0].min(initial=np.inf)), float(bounds[:, 1, 1].max(initial=-np.inf)))
+    findings += [*said.findings, *findings_of(Counts(scales=scales), vertex.count)]
+    yield Scene(vertex.count, facts, blocks, findings)
 
 
-def _header(path: Path) -> tuple[dict[str, _Element], list[str]]:
-    """The elements, whose rows are all there, and the comments."""
-    with path.open("rb") as stream:
-        start = stream.read(_MAX_HEADER_SIZE)
-    end = _END_OF_HEADER.search(start)
-    if not start.startswith(b"ply") or end is None:
-        raise InputError(f"{path.name}: the PLY header has no line end_header")
-    lines = [line.strip() for line in start[: end.start()].decode("ascii", "replace").splitlines()]
+def _header(path: Path) -> tuple[dict[str, _Element], list[str], list[Finding]]:
+    """The elements, whose rows are all there; the comments; and what is unusual."""
+    findings: list[Finding] = []
+    header = read_header(path, findings, "compressed-ply")
+    findings = [one for one in findings if one.repairable]  # numbers of rows are checked below
+    lines = [line.strip() for line in header.text.decode("ascii").splitlines()[:-1]]
     found: list[tuple[str, int, list[tuple[str, str]]]] = []
     comments, form = [], ""
     for line in lines[1:]:
@@ -144,7 +154,7 @@ def _header(path: Path) -> tuple[dict[str, _Element], list[str]]:
     if form != "binary_little_endian 1.0":
         raise InputError(f"{path.name}: the format is {form[:40]!r}, wanted binary_little_endian 1.0")
     elements: dict[str, _Element] = {}
-    offset, size = end.end(), path.stat().st_size
+    offset, size = header.end, path.stat().st_size
     for name, count, columns in found:
         if len({column for column, _ in columns}) != len(columns) or name in elements:
             raise InputError(f"{path.name}: the header says something of {name} twice")
@@ -152,7 +162,7 @@ def _header(path: Path) -> tuple[dict[str, _Element], list[str]]:
         offset += count * elements[name].dtype.itemsize
     if offset > size:
         raise InputError(f"{path.name}: {size:,} bytes, its header declares {offset:,}: copy or download it again")
-    return elements, comments
+    return elements, comments, findings + trailing_bytes(size - offset)
 
 
 def _check_columns(path: Path, name: str, element: _Element, wanted: list[str], kind: str) -> None:
@@ -162,8 +172,11 @@ def _check_columns(path: Path, name: str, element: _Element, wanted: list[str], 
             raise InputError(f"{path.name}: {name} has no {np.dtype(kind).name} {column}: no compressed PLY")
 
 
-def _unpacked(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None, rest: int) -> dict[str, Any]:
-    """The arrays of a model of packed words, the bounds of their chunks [C, 2 or 3, 2, 3], and the rows of SH."""
+def _unpacked(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None, kept: int) -> dict[str, Any]:
+    """The arrays of a model of packed words, the bounds of their chunks [C, 2 or 3, 2, 3], and the rows of SH.
+
+    Of the coefficients of each channel the first `kept` are taken.
+    """
     count = len(words)
 
     def placed(parts: NDArray[np.float64], kind: int) -> NDArray[np.float64]:
@@ -176,11 +189,12 @@ def _unpacked(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None
     channels = np.stack([colour >> shift & 255 for shift in (24, 16, 8)], 1) / 255.0
     if bounds.shape[1] == 3:
         channels = placed(channels, 2)
-    shN = np.zeros((count, rest // 3, 3), np.float32)
-    if sh is not None:
-        codes = sh.view(np.uint8).reshape(count, rest)  # bytes only, none between them
+    shN = np.zeros((count, kept, 3), np.float32)
+    if sh is not None and kept:
         names = sh.dtype.names or ()
-        places = [names.index(f"f_rest_{index}") for index in range(rest)]
+        codes = sh.view(np.uint8).reshape(count, len(names))  # bytes only, none between them
+        each = len(names) // 3
+        places = [names.index(f"f_rest_{channel * each + index}") for channel in range(3) for index in range(kept)]
         shN = _sh_values()[codes[:, places].reshape(count, 3, -1).transpose(0, 2, 1)]
     return {
         "means": placed(_thirds(words["packed_position"]), 0).astype(np.float32),
@@ -273,6 +287,7 @@ def _written_header(facts: SplatModel, count: int, rest: int) -> bytes:
 FORMAT = Format(
     name="compressed-ply",
     open=_open,
+    open_bands=_open,
     splat_bytes=(16.3, 25.3, 40.3, 61.3),
     write=_write,
     carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "metadata"}),

@@ -21,6 +21,7 @@ from csplat.errors import InputError
 from csplat.formats.format import Format
 from csplat.formats.rows import colours_of_bytes, finite_scene
 from csplat.inputs import mapped
+from csplat.lint import trailing_bytes
 from csplat.model import F32, SplatModel, normalise_quats
 from csplat.scene import BLOCK, Scene
 
@@ -93,7 +94,7 @@ def _open(path: Path) -> Iterator[Scene]:
     low, high = low or -_USUAL_SH, high or _USUAL_SH
     if not (abs(low) < _LARGEST and abs(high) < _LARGEST and low <= high):
         raise InputError(f"{path.name} has SH from {low} to {high}, wanted numbers, the larger one last")
-    sections = list(_sections(path.name, data, level, most))
+    sections, end = _sections(path.name, data, level, most)
     total = sum(len(section.rows) for section in sections)
     if total != count:
         raise InputError(f"{path.name} has {total:,} splats in its sections, and its header says {count:,}")
@@ -114,9 +115,10 @@ def _open(path: Path) -> Iterator[Scene]:
         )
 
     nothing = np.empty(0, _row_type(level, 0))
-    yield finite_scene(
-        blocks, decoded, decoded(np.zeros((0, 3), np.float32), nothing, np.zeros((0, 3)), np.zeros((0, 1)))
-    )
+    facts = decoded(np.zeros((0, 3), np.float32), nothing, np.zeros((0, 3)), np.zeros((0, 1)))
+    scene = finite_scene(blocks, decoded, facts)
+    scene.findings.extend(trailing_bytes(len(data) - end))
+    yield scene
 
 
 def _row_type(level: int, degree: int) -> np.dtype[Any]:
@@ -132,7 +134,9 @@ def _row_type(level: int, degree: int) -> np.dtype[Any]:
     )
 
 
-def _sections(name: str, data: Any, level: int, most: int) -> Iterator[_Section]:
+def _sections(name: str, data: Any, level: int, most: int) -> tuple[list[_Section], int]:
+    """Return the sections, and the byte behind the last one."""
+    found: list[_Section] = []
     at = _HEADER_SIZE + most * _SECTION_SIZE
     if at > len(data):
         raise InputError(f"{name} says it has {most:,} sections, more than its {len(data):,} bytes can hold")
@@ -151,9 +155,10 @@ def _sections(name: str, data: Any, level: int, most: int) -> Iterator[_Section]
             raise InputError(f"{where}: {head.splats:,} splats in room for {head.room:,}")
         rows = np.frombuffer(data, row, head.splats, start)
         if level and head.splats:
-            yield _Section(rows, *_buckets(where, data, head, centres))
+            found.append(_Section(rows, *_buckets(where, data, head, centres)))
         else:
-            yield _Section(rows, np.array([head.splats]), np.zeros((1, 3)), 1.0)
+            found.append(_Section(rows, np.array([head.splats]), np.zeros((1, 3)), 1.0))
+    return found, at
 
 
 def _buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[NDArray[np.int64], F64, float]:

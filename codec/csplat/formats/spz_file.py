@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.files import atomic_writer
-from csplat.lint import too_many_bands
+from csplat.lint import Finding, too_many_bands, trailing_bytes
 from csplat.model import MAX_SH_DEGREE
 
 __all__ = ["ANTIALIASED", "AXES", "MOST_BITS", "Packed", "read_packed", "write_packed"]
@@ -63,6 +63,7 @@ class Packed:
         flags: `ANTIALIASED` and others.
         streams: how many version 4 says it has.
         axes: three letters, as in `SplatModel`.
+        findings: what is unusual about it.
         parts: [N, bytes] each: positions, alphas, colours, scales, rotations, SH.
     """
 
@@ -75,6 +76,7 @@ class Packed:
     streams: int = 0
     axes: str = AXES
     parts: list[U8] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -151,7 +153,7 @@ def _read_arrays(packed: Packed, _size: int, stream: BinaryIO) -> None:
     tail = stream.read(_EXTENSION_BYTES + 1)  # to the end, where gzip has its checksum
     if len(tail) > _EXTENSION_BYTES:
         raise InputError(f"{packed.name} goes on after its last splat")
-    _read_extensions(packed, tail)
+    packed.findings += trailing_bytes(len(tail) - _read_extensions(packed, tail))
 
 
 def _read_streams(packed: Packed, size: int, stream: BinaryIO) -> None:
@@ -181,8 +183,8 @@ def _read_streams(packed: Packed, size: int, stream: BinaryIO) -> None:
         packed.parts.append(data.reshape(packed.count, width))
 
 
-def _read_extensions(packed: Packed, data: bytes) -> None:
-    """Find the axes; everything else is skipped."""
+def _read_extensions(packed: Packed, data: bytes) -> int:
+    """Find the axes, skipping everything else. Return the number of bytes that extensions take."""
     at = 0
     while packed.flags & _EXTENDED and at + _RECORD.size <= len(data):
         kind, size = _RECORD.unpack_from(data, at)
@@ -193,6 +195,7 @@ def _read_extensions(packed: Packed, data: bytes) -> None:
             packed.axes = _SYSTEMS[3 * number : 3 * number + 3]
             if not packed.axes:
                 raise InputError(f"{packed.name} has axes number {number}, wanted at most {len(_SYSTEMS) // 3 - 1}")
+    return at
 
 
 def _taken(name: str, stream: BinaryIO, size: int) -> bytes:
