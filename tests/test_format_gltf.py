@@ -265,11 +265,44 @@ def test_a_mesh_that_is_shown_very_often_is_refused():
 
 
 @pytest.mark.parametrize("name", list(TWO))
-def test_values_that_are_not_finite_are_refused(name):
-    array = TWO[name].copy()
-    array[1, 0] = np.nan
-    with pytest.raises(InputError, match=r"data, splats 0 to 1: .* NaN"):
-        read(*document(TWO | {name: array}))
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_splats_that_are_not_finite_are_dropped_and_counted(tmp_path, name, value):
+    arrays = many()
+    whole = filed(glb(*document(arrays)))
+    arrays[name][3, 0] = value
+    found, model = linted(tmp_path / "a.glb", *document(arrays))
+    assert ("repair", 1) == (found["nonfinite-rows"].kind, found["nonfinite-rows"].count)
+    assert ["nonfinite-rows"] == list(found)
+    assert np.delete(whole.means, 3, 0).tolist() == model.means.tolist()
+    assert np.delete(whole.opacities, 3, 0).tolist() == model.opacities.tolist()
+    arrays[name][:, 0] = value
+    (tmp_path / "a.glb").write_bytes(glb(*document(arrays)))
+    with pytest.raises(InputError, match="40 splats with NaN or infinity: none is left"):
+        csplat.read(tmp_path / "a.glb")
+
+
+def test_infinite_logits_are_opacities_of_0_and_1(tmp_path):
+    logits = np.linspace(-6, 6, 40, dtype="<f4")[:, None]
+    logits[[4, 5], 0] = np.inf, -np.inf
+    found, model = linted(tmp_path / "a.glb", *document(many(OPACITY=logits)))
+    assert {"logit-opacities", "infinite-logits"} == set(found)
+    assert [1, 0] == model.opacities[4:6].tolist()
+
+
+def test_huge_values_bytes_behind_the_end_and_other_scenes_are_told(tmp_path):
+    arrays = many()
+    arrays[f"{PREFIX}:SH_DEGREE_0_COEF_0"][2] = 1e7
+    arrays[f"{PREFIX}:SCALE"][7] = 3e38
+    said, data = document(arrays, scenes=[{"nodes": [0]}, {"name": "roof", "nodes": []}])
+    path = tmp_path / "a.glb"
+    path.write_bytes(glb(said, data) * 2)
+    found = {one.id: one for one in lint(path)}
+    assert {"huge-values": 2, "trailing-bytes": len(glb(said, data)), "other-scenes": 1} == {
+        name: one.count for name, one in found.items()
+    }
+    assert "scene 0 is read, 1 ('roof') not" in found["other-scenes"].text
+    path.write_bytes(glb(said | {"scene": 0}, data))
+    assert ["huge-values"] == [one.id for one in lint(path)]
 
 
 def linted(path, said, data):

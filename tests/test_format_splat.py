@@ -85,7 +85,10 @@ def plausible(rows):
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "git lfs pull"),
         (b'{"message": "Not Found"}'.ljust(64), "is JSON"),
         (gzip.compress(bytes(100), mtime=0).ljust(64), "gunzip"),
-        (b"what somebody wrote down, in many words of English".ljust(96), "hardly .splat: it is text, and begins with 'what"),
+        (
+            b"what somebody wrote down, in many words of English".ljust(96),
+            "hardly .splat: it is text, and begins with 'what",
+        ),
         (b"0.1234 0.5678 0.9012 1.0 0.5 0.5\n" * 32, "hardly .splat: it is text"),
         (np.random.default_rng(0).normal(size=320).astype("<f4").tobytes(), "are no splats; that .* has scales of"),
         (np.random.default_rng(0).bytes(32 * 40), "hardly .splat: [89].% of 40 rows are no splats"),

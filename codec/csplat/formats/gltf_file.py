@@ -91,12 +91,14 @@ class GltfFile:
         path: of it; buffers in files of their own stand in its folder.
         root: the JSON.
         binary: the chunk BIN, if there is one.
+        tail: bytes behind the end that a .glb declares.
         short: of buffers that were looked at and are shorter than they say, how much.
     """
 
     path: Path
     root: dict[str, Any]
     binary: memoryview | None
+    tail: int = 0
     short: dict[int, str] = field(default_factory=dict)
     _buffers: dict[int, memoryview] = field(default_factory=dict)
 
@@ -270,6 +272,16 @@ class GltfFile:
                         raise self.wrong(spot, f"found {_shown(primitive)}, number {shown} of those that are shown")
                     yield Placed(primitive, spot, matrix, node, place)
 
+    def other_scenes(self) -> str:
+        """Name the scenes that `placed` leaves out although no default scene is set; "" if there are none."""
+        scenes = self.root.get("scenes")
+        if not isinstance(scenes, list) or len(scenes) < 2 or "scene" in self.root:
+            return ""
+        names = [one.get("name") if isinstance(one, dict) else None for one in scenes]
+        said = [f"{index}{f' ({_shown(name)})' if name else ''}" for index, name in enumerate(names)]
+        shown = ", ".join(said[1:4]) + (", ..." if len(said) > 4 else "")
+        return f"{len(scenes)} scenes and no default: scene {said[0]} is read, {shown} not"
+
     def instances(self, placed: Placed) -> NDArray[np.float64]:
         """Matrices to the world [I, 4, 4] of a primitive: one, or those of EXT_mesh_gpu_instancing."""
         said = _extension(placed.node, _INSTANCING)
@@ -332,7 +344,7 @@ def opened(path: Path) -> GltfFile:
         OSError: it cannot be read.
     """
     data = memoryview(mapped(path))
-    text, binary = _chunks(path, data) if data[:4] == MAGIC else (data, None)
+    text, binary, tail = _chunks(path, data) if data[:4] == MAGIC else (data, None, 0)
     try:
         root = json.loads(bytes(text))  # of UTF-8, with a mark or without, or UTF-16
     except (ValueError, RecursionError) as error:
@@ -342,11 +354,11 @@ def opened(path: Path) -> GltfFile:
     version = root["asset"].get("version")
     if not isinstance(version, str) or version.partition(".")[0] != str(_VERSION):
         raise InputError(f"{path.name} is glTF {_shown(version)}, wanted {_VERSION}.0")
-    return GltfFile(path, root, binary)
+    return GltfFile(path, root, binary, tail)
 
 
-def _chunks(path: Path, data: memoryview) -> tuple[memoryview, memoryview | None]:
-    """The chunks JSON and BIN of a .glb."""
+def _chunks(path: Path, data: memoryview) -> tuple[memoryview, memoryview | None, int]:
+    """The chunks JSON and BIN of a .glb, and the number of bytes behind its end."""
     if len(data) < GLB_HEAD.size:
         raise InputError(f"{path.name} is truncated: {counted(len(data), 'byte')}")
     _, version, size = GLB_HEAD.unpack_from(data)
@@ -367,7 +379,8 @@ def _chunks(path: Path, data: memoryview) -> tuple[memoryview, memoryview | None
         at += length
     if not found or found[0][0] != JSON:
         raise InputError(f"{path.name} does not begin with its JSON")
-    return found[0][1], found[1][1] if len(found) > 1 and found[1][0] == BIN else None
+    binary = found[1][1] if len(found) > 1 and found[1][0] == BIN else None
+    return found[0][1], binary, len(data) - size
 
 
 def _extension(holder: dict[str, Any], name: str) -> dict[str, Any]:

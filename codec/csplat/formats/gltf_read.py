@@ -27,9 +27,9 @@ from csplat.formats.gltf_file import Accessor, GltfFile, Place, Placed, opened
 from csplat.formats.linear_colours import srgb_error, srgb_of_linear
 from csplat.formats.spz import decoded, means_of
 from csplat.formats.spz_file import ANTIALIASED, Packed, read_packed
-from csplat.lint import Finding, too_many_bands
+from csplat.lint import Finding, too_many_bands, trailing_bytes
 from csplat.model import SplatModel, normalise_quats
-from csplat.ply_columns import Counts, alpha_of_logits, findings_of
+from csplat.ply_columns import Counts, alpha_of_logits, findings_of, huge_rows
 from csplat.ply_comments import SceneFacts, parse_comments
 from csplat.scene import BLOCK, Scene
 from csplat.turning import axes_rotation, stretched, turned
@@ -54,6 +54,7 @@ _WROTE_LOGS = re.compile(r"splat-transform v?([01]\.|2\.[0-3](\.|$))")  # its is
 #: Extensions of primitives that do not affect splats: materials, and numbers of features.
 _HARMLESS = {"KHR_materials_variants", "EXT_mesh_features", "EXT_structural_metadata", "KHR_mesh_quantization"}
 _THINNEST = np.float32(np.finfo(np.float32).tiny)  # value that a scale of 0 is read as: its logarithm is finite
+_LARGE = 1e6  # from here on it is worth while to look for huge values
 _FAR = 4096.0  # a translation as large as that stays an origin: float32 would have less than half a thousandth left
 _ALIKE = 0.1  # fraction of the extent of a scene by which equivalent bounds may differ
 _SAMPLE = 4096  # splats whose colours are measured
@@ -83,8 +84,9 @@ class _Reading:
     """State of reading a file. Owns the unpacked data and the findings to report.
 
     Attributes:
-        scales, opacities: statistics of all primitives.
-        counts: counts of rotations.
+        scales, opacities: statistics of all primitives, of the rows that are finite.
+        counts: what was noticed in rows.
+        infinite: rows whose opacity is infinite, which is a logit or nothing.
         sh_degree: the highest degree to read; `None`: all, up to three bands.
         are_logs, are_logits: whether scales are logarithms and opacities logits, once that is known.
         antialiased: the flag of each SPZ.
@@ -98,6 +100,7 @@ class _Reading:
     scales: Spread = field(default_factory=Spread)
     opacities: Spread = field(default_factory=lambda: Spread(high=1.0))
     counts: Counts = field(default_factory=Counts)
+    infinite: int = 0
     are_logs: bool = False
     are_logits: bool = False
     antialiased: list[bool] = field(default_factory=list)
@@ -125,13 +128,16 @@ class _Reading:
             holder = within if packed in within else extensions
             view = self.file.whole(self.file.get(holder, inner[:-1], packed, dict), inner, "bufferView")
             block, count = self._packed_block(placed, view, draft="kernel" not in said)
+            bad = infinite = 0
         else:
-            block, count = self._plain_block(placed)
+            block, count, (bad, infinite) = self._plain_block(placed)
         if said.get("colorSpace") == _LINEAR:
             self.light.append(partial(block, slice(0, count, max(1, count // _SAMPLE))))
             block = partial(_in_srgb, block)
         for matrix in self.file.instances(placed):
             self.count += count
+            self.counts.nonfinite += bad
+            self.infinite += infinite
             # Nodes may show one mesh many times.
             if self.count > self.file.size() + sum(one.count for one in self.packed.values()):
                 shown = f"shows {counted(self.count, 'splat')} or more, which is more than it has bytes"
@@ -165,7 +171,7 @@ class _Reading:
                 wanted = " or ".join(str(one) for one in sorted(one for one in values if one))
                 raise self.file.wrong((*place, key), f"found {found!r}, which is not understood, wanted {wanted}")
 
-    def _plain_block(self, placed: Placed) -> tuple[Callable[[slice], SplatModel], int]:
+    def _plain_block(self, placed: Placed) -> tuple[Callable[[slice], SplatModel], int, tuple[int, int]]:
         file, place = self.file, (*placed.place, "attributes")
         attributes = file.get(placed.primitive, placed.place, "attributes", dict, {})
 
@@ -187,17 +193,38 @@ class _Reading:
                 raise file.wrong(place, f"{name} has {len(accessor.rows)} rows, POSITION {count}")
         if any(f"{EXTENSION}:{name}" in attributes for name in sh_names(4)) and self.sh_degree is None:
             raise file.wrong(place, too_many_bands(4))
-        self._survey(arrays, count)
-        return partial(_block, self, arrays, degree), count
+        return partial(_block, self, arrays, degree), count, self._survey(arrays, count)
 
-    def _survey(self, arrays: dict[str, Accessor], count: int) -> None:
-        """Look at the values that the extension forbids."""
+    def _survey(self, arrays: dict[str, Accessor], count: int) -> tuple[int, int]:
+        """Look at the values that the extension forbids.
+
+        Returns:
+            Rows with a NaN or an infinity other than an opacity; of the others those with an infinite opacity.
+        """
+        bad = infinite = 0
         for start in range(0, count, BLOCK):
             rows = slice(start, start + BLOCK)
-            self.scales.add(arrays["SCALE"].values(rows), self.count + start)
-            self.opacities.add(arrays["OPACITY"].values(rows), self.count + start)
-            zero = np.logical_and.reduce([arrays["ROTATION"].rows[rows, part] == 0 for part in range(4)])
+            good, largest = _finite_rows(arrays, rows)
+            values = {name: arrays[name].values(rows) for name in ("SCALE", "OPACITY")}
+            quats = arrays["ROTATION"].rows[rows]
+            if good is not None:
+                values, quats = {name: value[good] for name, value in values.items()}, quats[good]
+                bad += len(good) - len(quats)
+                unbounded = np.isinf(values["OPACITY"])
+                infinite += int(np.count_nonzero(unbounded))
+                values["OPACITY"][unbounded] = np.nan  # not counted as a value
+            self.scales.add(values["SCALE"], self.count + start)
+            self.opacities.add(values["OPACITY"], self.count + start)
+            zero = np.logical_and.reduce([quats[:, part] == 0 for part in range(4)])
             self.counts.zero_quats += int(np.count_nonzero(zero))
+            if largest > _LARGE:
+                self.counts.huge += self._huge(arrays, rows, good)
+        return bad, infinite
+
+    def _huge(self, arrays: dict[str, Accessor], rows: slice, good: NDArray[np.bool_] | None) -> int:
+        kept = slice(None) if good is None else good
+        scales = np.log(np.maximum(np.abs(arrays["SCALE"].values(rows)[kept]), _THINNEST))
+        return huge_rows(scales, *(one.values(rows)[kept] for name, one in arrays.items() if name.startswith("SH_")))
 
     def _packed_block(self, placed: Placed, view: int, *, draft: bool) -> tuple[Callable[[slice], SplatModel], int]:
         file = self.file
@@ -276,11 +303,13 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
             for start in range(0, part.count, BLOCK):
                 rows = slice(start, min(start + BLOCK, part.count))
                 try:
-                    yield _placed(_with_bands(part.block(rows), degree), part, facts)
+                    block = part.block(rows)
+                    if len(block):
+                        yield _placed(_with_bands(block, degree), part, facts)
                 except InputError as error:
                     raise InputError(f"{path.name}, splats {rows.start} to {rows.stop - 1}: {error}") from None
 
-    yield Scene(reading.count, facts, blocks, reading.findings)
+    yield Scene(reading.count - reading.counts.nonfinite, facts, blocks, reading.findings)
 
 
 def _conclude(reading: _Reading) -> None:
@@ -296,10 +325,19 @@ def _conclude(reading: _Reading) -> None:
     for index, length in reading.file.short.items():
         text = f"buffers/{index}: {length}; all that the splats use is there"
         reading.findings.append(Finding("short-buffer", 1, text, "note"))
-    reading.findings += [*found, *more, *findings_of(reading.counts, reading.count + 1)]
+    if reading.are_logits:
+        reading.counts.infinite_logits = reading.infinite
+    else:
+        reading.counts.nonfinite += reading.infinite
+    reading.findings += [*found, *more, *findings_of(reading.counts, reading.count)]
+    reading.findings += trailing_bytes(reading.file.tail)
+    if others := reading.file.other_scenes():
+        reading.findings.append(Finding("other-scenes", len(reading.file.root["scenes"]) - 1, others, "note"))
     if reading.light and all(one.repairable for one in reading.findings):
         try:
-            error = max(srgb_error(sample()) for sample in reading.light)
+            error = max(
+                (srgb_error(model) for model in (sample() for sample in reading.light) if len(model)), default=0.0
+            )
         except InputError as wrong:
             raise InputError(f"{reading.file.path.name}: {wrong}") from None
         text = f"colours are linear ({_LINEAR}): fitted to sRGB, {error:.2f} of 255 steps off (rms)"
@@ -312,20 +350,47 @@ def sh_names(degree: int) -> list[str]:
     return [f"SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
 
 
+def _finite_rows(arrays: dict[str, Accessor], rows: slice) -> tuple[NDArray[np.bool_] | None, float]:
+    """Find the rows without NaN and infinities; an opacity may be infinite.
+
+    Returns:
+        [n] True where a row is finite; `None`: all are, opacities too. And the largest of all magnitudes but of
+        positions, NaN or infinite if not all are finite.
+    """
+    largest, odd = 0.0, []
+    for name, accessor in arrays.items():
+        values = accessor.rows[rows]
+        if values.dtype.kind == "f" and values.size:
+            with np.errstate(invalid="ignore"):
+                most = max(abs(float(values.min())), abs(float(values.max())))  # both are NaN where one value is
+            if not np.isfinite(most):
+                odd.append((name, values))
+            elif name != "POSITION":
+                largest = max(largest, most)
+    if not odd:
+        return None, largest
+    good = np.ones(len(arrays["POSITION"].rows[rows]), bool)
+    for name, values in odd:
+        good &= (~np.isnan(values) if name == "OPACITY" else np.isfinite(values)).all(axis=1)
+    return good, np.inf
+
+
 def _block(reading: _Reading, arrays: dict[str, Accessor], degree: int, rows: slice) -> SplatModel:
     """Make a model of some splats as their primitive has them."""
     values = {name: accessor.values(rows) for name, accessor in arrays.items()}
+    good, _ = _finite_rows(arrays, rows) if reading.counts.nonfinite else (None, 0.0)
+    if good is not None:
+        if not reading.are_logits:
+            good &= np.isfinite(values["OPACITY"][:, 0])
+        values = {name: value[good] for name, value in values.items()}
     quats = values["ROTATION"][:, [3, 0, 1, 2]]
-    if not np.isfinite(quats).all():
-        raise InputError("rotations hold values that are NaN or infinite")
     shN = np.zeros((len(quats), (degree + 1) ** 2 - 1, 3), np.float32)
     names = [name for band in range(1, degree + 1) for name in sh_names(band)]
     for index, name in enumerate(names):
         shN[:, index] = values[name]
     scales, opacities = values["SCALE"], values["OPACITY"][:, 0]
     if not reading.are_logs:
-        with np.errstate(invalid="ignore"):  # NaN, which a model refuses
-            scales = np.log(np.maximum(scales, _THINNEST))
+        scales = np.log(np.maximum(scales, _THINNEST))
     return SplatModel(
         means=values["POSITION"],
         quats=normalise_quats(quats),

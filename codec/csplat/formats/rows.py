@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from csplat.errors import counted
 from csplat.formats.activations import Spread, read_scales_as
-from csplat.model import F32, SplatModel
 from csplat.lint import Finding
+from csplat.model import F32, SplatModel
 from csplat.ply_columns import SH_C0, Counts, findings_of, huge_rows
 from csplat.scene import Scene
 

@@ -57,7 +57,7 @@ def _doubt(path: Path) -> str:
     sample = rows[::step]
     share = np.mean(_PRINTABLE[np.frombuffer(sample.tobytes(), np.uint8)])
     if share >= _MOST_IS_TEXT:
-        return f"it is text, and begins with {ascii(bytes(data[:24]).decode('ascii', 'replace'))}"
+        return f"it is text, and begins with {bytes(data[:24]).decode('ascii', 'replace')!a}"
     far = np.abs(sample["means"]).max(axis=1)  # NaN where there is one
     placed = (far == 0) | ((far > _PLACES[0]) & (far < _PLACES[1]))
     lengths = np.linalg.norm(np.subtract(sample["quats"], _QUAT_ZERO, dtype=np.float32), axis=1)
