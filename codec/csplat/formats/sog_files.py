@@ -6,7 +6,7 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -55,7 +55,8 @@ class _Zip:
     @contextmanager
     def held(self) -> Iterator[None]:
         """Keep the archive open as long as the context lasts; otherwise each part opens it."""
-        with self._opened() as self._archive:
+        with self._opened() as archive:
+            self._archive = archive
             try:
                 yield
             finally:
@@ -88,7 +89,11 @@ def with_slashes(name: str) -> str:
     return name.replace("\\", "/")
 
 
-_SAME = (str, with_slashes, lambda name: with_slashes(name).casefold())  # names that are alike, the closest first
+def _in_small_letters(name: str) -> str:
+    return with_slashes(name).casefold()
+
+
+_SAME: tuple[Callable[[str], str], ...] = (str, with_slashes, _in_small_letters)  # of names that are alike
 
 
 @dataclass(frozen=True)
