@@ -69,6 +69,20 @@ def test_trailing_bytes_are_ignored_and_counted(path):
         read_ply(path, strict=True)
 
 
+def test_rows_that_a_text_mode_transfer_changed_are_refused(path):
+    rows = good_rows(300)
+    rows["x"] = np.arange(300, dtype="<u4").view("<f4")
+    data = header(rows) + rows.tobytes()
+    path.write_bytes(data.replace(b"\n", b"\r\n"))
+    with pytest.raises(InputError, match=r"text-mode transfer \(git autocrlf, FTP\): copy it again as binary"):
+        read_ply(path)
+    crlf = header(rows).replace(b"\n", b"\r\n") + rows.tobytes()
+    path.write_bytes(crlf)
+    assert np.array_equal(read_ply(path, strict=True).means[:, 0], rows["x"])
+    path.write_bytes(crlf + b"\r\n")
+    assert "repair" == found(path)["trailing-bytes"].kind
+
+
 def test_trailing_lines_of_an_ascii_file_are_counted(path):
     rows = good_rows(2)
     lines = "".join(" ".join(map(str, row)) + "\n" for row in rows.tolist()).encode()

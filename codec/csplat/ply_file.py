@@ -70,7 +70,7 @@ def parse(path: Path, findings: list[Finding]) -> Content | None:
         try:
             parsed = plyfile.PlyData.read(stream)
             end = None if parsed.text else stream.tell()
-            findings += _trailing_findings(path, header.end, end, sum(element.count for element in parsed))
+            findings += _trailing_findings(path, header, end, sum(element.count for element in parsed))
         except plyfile.PlyElementParseError as error:
             parsed = _read_again(path, header, findings, error)
         except (plyfile.PlyParseError, ValueError, OverflowError, MemoryError) as error:
@@ -152,19 +152,47 @@ def _other_findings(others: list[Any]) -> list[Finding]:
     return findings
 
 
-def _trailing_findings(path: Path, header_size: int, end: int | None, row_count: int) -> list[Finding]:
+def _trailing_findings(path: Path, header: Header, end: int | None, row_count: int) -> list[Finding]:
     """Count the bytes after the last row; an ASCII file (`end` is `None`) has a line per row."""
     if end is not None:
         count = path.stat().st_size - end
+        if count and _is_changed_as_text(path, header, count):
+            text = (
+                f"{counted(count, 'byte')} after the last row, and a carriage return before each line feed of the rows:"
+                " changed by a text-mode transfer (git autocrlf, FTP): copy it again as binary"
+            )
+            return [Finding("malformed", count, text, "error")]
     else:
         with path.open("rb") as stream:
-            stream.seek(header_size)
+            stream.seek(header.end)
             lines = stream.read().splitlines(keepends=True)
         count = len(b"".join(lines[row_count:]).strip())
     if count == 0:
         return []
     text = f"{counted(count, 'byte')} after the last row: ignored"
     return [Finding("trailing-bytes", count, text, "repair")]
+
+
+def _is_changed_as_text(path: Path, header: Header, surplus: int) -> bool:
+    """Tell whether a carriage return was inserted before the line feeds of binary rows.
+
+    Args:
+        path: path of the file.
+        header: its header.
+        surplus: bytes after the last row.
+    """
+    if not header.text.endswith(b"\r\n"):
+        return False
+    feeds, last = 0, b"\n"
+    with path.open("rb") as stream:
+        stream.seek(header.end)
+        while block := stream.read(_BLOCK_SIZE):
+            found = block.count(b"\n")
+            feeds += found
+            if found != (last[-1:] + block).count(b"\r\n"):
+                return False
+            last = block
+    return surplus <= feeds
 
 
 def _scalars(data: Rows) -> tuple[Rows, list[str]]:
