@@ -551,6 +551,48 @@ def test_half_floats_in_columns_of_integers_are_read(path, order):
     assert np.array_equal(model.means[:, 0], rows["x"])
 
 
+def halves_of(rows, names):
+    kinds = [(name, "<u2" if name in names else "<f4") for name in rows.dtype.names]
+    out = np.zeros(len(rows), kinds)
+    for name in rows.dtype.names:
+        out[name] = rows[name].astype("<f2").view("<u2") if name in names else rows[name]
+    return out
+
+
+def test_half_floats_with_a_few_that_are_not_finite_are_read_as_floats_are(path):
+    rows = good_rows(60)
+    rows["f_dc_1"][7], rows["opacity"][9] = np.nan, np.inf
+    halves = halves_of(rows, NAMES)
+    path.write_bytes(header(halves) + halves.tobytes())
+    assert {"half-floats", "nonfinite-rows", "infinite-logits"} <= set(found(path))
+    assert 59 == len(read_ply(path))
+
+
+def test_positions_alone_may_be_half_floats(path):
+    rng = np.random.default_rng(1)
+    rows = good_rows(60)
+    for name in NAMES:
+        rows[name] = rng.normal(size=60)
+    halves = halves_of(rows, ["x", "y", "z"])
+    path.write_bytes(header(halves) + halves.tobytes())
+    assert 3 == found(path)["half-floats"].count
+    np.testing.assert_allclose(read_ply(path).means[:, 1], rows["y"], rtol=1e-3)
+    for values in (rng.integers(0, 30_000, 60), rng.integers(0, 1000, 60), rng.integers(64_000, 65_536, 60)):
+        halves["x"] = halves["y"] = halves["z"] = values
+        path.write_bytes(header(halves) + halves.tobytes())
+        with pytest.raises(InputError, match=r"integer-columns: x, y, z are 16-bit integers, and no half floats"):
+            read_ply(path)
+
+
+def test_quantised_values_are_no_half_floats(path):
+    rows = np.zeros(60, [(name, "<u2") for name in NAMES])
+    for index, name in enumerate(NAMES):
+        rows[name] = np.random.default_rng(index).integers(0, 30_000, 60)
+    path.write_bytes(header(rows) + rows.tobytes())
+    with pytest.raises(InputError, match="of type uint16, expected float: export the values before they are quantised"):
+        read_ply(path)
+
+
 @pytest.mark.parametrize(
     ("changed", "kind", "says"),
     [

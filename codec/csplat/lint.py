@@ -75,6 +75,7 @@ __all__ = [
     "dropped_columns",
     "find_columns",
     "float_columns",
+    "plain_name",
     "refuse",
     "too_many_bands",
     "trailing_bytes",
@@ -242,7 +243,7 @@ class _Names:
         self.all = tuple(names)
         self.plain: dict[str, list[str]] = {}
         for name in names:
-            self.plain.setdefault(_PREFIXES.sub("", name.lower(), count=1), []).append(name)
+            self.plain.setdefault(plain_name(name), []).append(name)
         self._renamed: dict[str, str] = {}
         self._second: list[str] = []
         self._ambiguous: list[str] = []
@@ -306,7 +307,7 @@ def _integers(dtype: np.dtype[Any], groups: Sequence[Sequence[str]]) -> Finding 
     if not found:
         return None
     types = " and ".join(sorted({dtype[name].name for name in found}))
-    colours = groups[0] and set(groups[0]) <= set(found)
+    colours = groups[0] and set(groups[0]) == set(found)
     remedy = (
         "call colours of 0 to 255 red, green and blue" if colours else "export the values before they are quantised"
     )
@@ -317,8 +318,12 @@ def _integers(dtype: np.dtype[Any], groups: Sequence[Sequence[str]]) -> Finding 
 def float_columns(names: Sequence[str]) -> list[str]:
     """The columns of a PLY that hold numbers of splats other than positions, however they are called."""
     wanted = {*_SH0, *_SCALES, *_QUATS, _OPACITY}
-    plain = {name: _PREFIXES.sub("", name.lower(), count=1) for name in names}
-    return [name for name, found in plain.items() if found in wanted or _REST.fullmatch(found)]
+    return [name for name in names if plain_name(name) in wanted or _REST.fullmatch(plain_name(name))]
+
+
+def plain_name(name: str) -> str:
+    """Return a column's name in small letters, without the prefix of another program."""
+    return _PREFIXES.sub("", name.lower(), count=1)
 
 
 def _absence(names: _Names, missing: Sequence[str], elements: Sequence[str]) -> str:
@@ -335,7 +340,7 @@ def _absence(names: _Names, missing: Sequence[str], elements: Sequence[str]) -> 
 
 
 def _meaning(names: Sequence[str]) -> str | None:
-    plain = [_PREFIXES.sub("", name.lower(), count=1) for name in names]
+    plain = [plain_name(name) for name in names]
     found = (meaning for known, meaning in _MEANINGS.items() if any(map(known.fullmatch, plain)))
     return next(found, None)
 

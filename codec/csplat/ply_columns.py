@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import counted
-from csplat.lint import Columns, Finding, float_columns
+from csplat.lint import Columns, Finding, float_columns, plain_name
 from csplat.model import F32, QUAT_LENGTH_TOLERANCE, normalise_quats
 
 __all__ = [
@@ -50,6 +50,10 @@ _HUGE_COLOUR = 1e6
 _USUAL_LENGTHS = (1e-3, 1e3)  # lengths of quaternions: they grow and shrink while a scene is trained
 _LARGEST_COLOUR = 16.0  # red, green and blue as floats, where 1 is white: larger values are taken as 0 to 255
 _LOOKED_AT = 4096  # rows that tell half floats from integers
+_POSITIONS = ("x", "y", "z")
+_BAD_SHARE = 0.01  # half floats that may be NaN or infinite, as in any scene
+_SANE_LENGTHS = (0.01, 100.0)  # lengths of quaternions: integers read as half floats leave them
+_MOST_RATIO = 256.0  # half floats of positions: the ratio of a large one and one in the middle
 _FEW = 16  # splats: a property of fewer may be chance
 _TINY = 1e-30  # above 0
 _BYTE_COLOUR = 4.0  # an f_dc beyond is brighter than white, 1.77, and may be a colour of 0 to 255
@@ -136,27 +140,64 @@ def gather(
 def with_half_floats(rows: Rows, findings: list[Finding]) -> Rows:
     """View rows whose numbers are declared as 16-bit integers as the half floats that they are.
 
-    PLY has no type of two bytes for floats. Rows of other types, or that would hold no finite numbers, stay as they
-    are: integers in place of floats are refused by `csplat.lint`.
+    PLY has no type of two bytes for floats. Rows of other types, or that would hold no sane numbers, stay as they
+    are: integers in place of floats are refused by `csplat.lint`, and 16-bit positions that are no half floats here.
 
     Args:
         rows: rows of the file.
-        findings: a finding is appended if they are half floats.
+        findings: a finding is appended if they are half floats, or can be neither.
     """
     dtype = rows.dtype
-    floats = float_columns(dtype.names or ())
-    halves = [name for name in dtype.names or () if dtype[name].kind in "iu" and dtype[name].itemsize == 2]
-    if not floats or not set(floats) <= set(halves):
+    floats = set(float_columns(dtype.names or ()))
+    halves = {name for name in dtype.names or () if dtype[name].kind in "iu" and dtype[name].itemsize == 2}
+    positions = {name for name in halves if name.lower() in _POSITIONS}
+    if not floats or not (floats <= halves or (positions and not floats & halves)):
         return rows
-    halves = [name for name in halves if name in floats or name.lower() in ("x", "y", "z", "nx", "ny", "nz")]
+    halves = {name for name in halves if name in floats | positions or name.lower() in ("nx", "ny", "nz")}
     kinds = {name: f"{dtype[name].str[0]}f2" if name in halves else dtype[name] for name in dtype.names or ()}
     viewed = rows.view([*kinds.items()])
-    first = viewed[:_LOOKED_AT]
-    if not all(np.isfinite(first[name].astype(np.float32)).all() for name in halves):
+    if not _are_sane(viewed[:_LOOKED_AT], halves, alone=not floats & halves):
+        if positions and not floats & halves:
+            names = [name for name in dtype.names or () if name in positions]
+            text = f"{', '.join(names)} are 16-bit integers, and no half floats, expected float: store them as float"
+            findings.append(Finding("integer-columns", len(names), text, "error"))
         return rows
     text = f"{counted(len(halves), 'column')} of 16-bit integers hold the bits of half floats: read as these"
     findings.append(Finding("half-floats", len(halves), text, "note"))
     return viewed
+
+
+def _are_sane(rows: Rows, halves: set[str], *, alone: bool) -> bool:
+    """Tell whether half floats can be meant: nearly all are finite, and they have sizes that splats have.
+
+    Args:
+        rows: some rows of the file, viewed as half floats.
+        halves: names of the columns of half floats.
+        alone: only positions are half floats, and the other columns say nothing of integers.
+    """
+    columns = {name: rows[name].astype(np.float32) for name in halves}
+    bad = sum(int((np.isnan(one) if plain_name(name) == "opacity" else ~np.isfinite(one)).sum())
+              for name, one in columns.items())  # fmt: skip
+    if bad > _BAD_SHARE * len(rows) * len(columns):
+        return False
+    named = {plain_name(name): rows[name].astype(np.float64) for name in rows.dtype.names or ()}
+    nothing = np.zeros(len(rows))  # of columns that are missing, which is refused later
+    scales = np.stack([named.get(f"scale_{axis}", nothing) for axis in range(2)])
+    if not alone:
+        quats = np.stack([named.get(f"rot_{axis}", nothing) for axis in range(4)])
+        lengths = np.sqrt((quats * quats).sum(axis=0))
+        odd = (lengths > 0.0) & ~((lengths >= _SANE_LENGTHS[0]) & (lengths <= _SANE_LENGTHS[1]))
+        large = (np.abs(scales) > _HUGE_LOG) & np.isfinite(scales)
+        return bool(odd.sum() <= 0.1 * len(rows) and large.sum() <= _BAD_SHARE * large.size)
+    positions = np.stack([named.get(axis, nothing) for axis in _POSITIONS], 1)
+    positions = np.abs(positions[np.isfinite(positions).all(axis=1)])
+    if len(positions) < _FEW:
+        return True
+    middle, most = np.quantile(positions, (0.5, 0.9), axis=0)
+    # Integers that are read as half floats are of all sizes, from tiny to large, along all axes.
+    if np.median(most / np.maximum(middle, _TINY)) > _MOST_RATIO:
+        return False
+    return math.exp(min(_HUGE_LOG, float(np.median(scales)))) <= most.max() * 2.0
 
 
 def alpha_of_logits(logits: NDArray[Any]) -> F32:
