@@ -326,9 +326,19 @@ def test_red_green_and_blue_stand_for_f_dc(path, kind, largest, names):
 def test_colours_of_another_range_are_refused(path, kind, values, says):
     rows = coloured(kind, values)
     path.write_bytes(header(rows) + rows.tobytes())
-    assert "error" == found(path)["colour-columns"].kind
+    assert ["colour-columns"] == [one.id for one in found(path).values() if one.kind == "error"]
     with pytest.raises(InputError, match=says):
         read_ply(path)
+
+
+def test_colours_of_16_bits_that_are_none_above_255_are_bytes(path):
+    rows = coloured("<u2", (0, 17, 255))
+    path.write_bytes(header(rows) + rows.tobytes())
+    assert "in steps of 1/255: they are of 16 bits, and at most 255" in found(path)["rgb-colours"].text
+    expected = (np.array([0, 17 / 255, 1]) - 0.5) / 0.28209479177387814
+    np.testing.assert_allclose(read_ply(path, strict=True).sh0, [expected] * 3, rtol=1e-6)
+    with open_scene(path) as scene:
+        assert np.array_equal(read_ply(path).sh0, scene.model().sh0)
 
 
 def test_f_dc_comes_before_red_green_and_blue(path):

@@ -72,6 +72,7 @@ from csplat.model import MAX_SH_DEGREE
 __all__ = [
     "Columns",
     "Finding",
+    "colour_finding",
     "dropped_columns",
     "find_columns",
     "float_columns",
@@ -189,13 +190,14 @@ def find_columns(
     if flat:
         scales = scales[:2]
         findings.append(Finding("flat-scales", 1, "scale_2 is absent: the splats are discs (2DGS)", "note"))
-    colour_range = 0.0
+    colour_range, coefficients = 0.0, sh0
     if not any(sh0):
         colours = next((one for one in _COLOURS if names.has(one)), None)
         if colours is not None:
             sh0 = names.find(colours)
             colour_range, finding = _colour_range(dtype, sh0)
             findings.append(finding)
+            coefficients = ()
     wanted = (*_MEANS, *_SH0, _OPACITY, *(_SCALES[:2] if flat else _SCALES), *_QUATS)
     missing = [name for name, found in zip(wanted, (*means, *sh0, *opacity, *scales, *quats), strict=True) if not found]
     if missing:
@@ -203,7 +205,7 @@ def find_columns(
     every, rest, problem = _find_rest(names, sh_degree)
     if problem is not None:
         findings.append(problem)
-    if integers := _integers(dtype, (() if colour_range else sh0, rest, opacity, scales, quats)):
+    if integers := _integers(dtype, (coefficients, rest, opacity, scales, quats)):
         findings.append(integers)
     normals = names.find(_NORMALS) if names.has(_NORMALS) else ()
     filter_3d = "" if flat else names.find((_FILTER,))[0]
@@ -290,15 +292,24 @@ def _some(words: Sequence[str]) -> str:
 
 def _colour_range(dtype: np.dtype[Any], colours: Sequence[str]) -> tuple[float, Finding]:
     """Return the value of a colour that is 1, and the finding about it."""
-    named = f"{', '.join(colours[:2])} and {colours[2]}"
     kinds = {dtype[name].str[1:] for name in colours}
     largest = _COLOUR_RANGES.get(kinds.pop(), 0.0) if len(kinds) == 1 else 0.0
     if not largest:
         shown = ", ".join(dtype[name].name for name in colours)
-        text = f"{named} are of type {shown}, expected uint8, uint16 or float: export the scene with f_dc columns"
+        text = f"{_named(colours)} are of type {shown}, expected uint8, uint16 or float: export the scene with f_dc"
         return 0.0, Finding("colour-columns", 3, text, "error")
+    return largest, colour_finding(colours, largest)
+
+
+def colour_finding(colours: Sequence[str], largest: float, why: str = "") -> Finding:
+    """Report that columns are read as colours, of which a value is 1, and why that one is."""
     steps = "" if largest == 1.0 else f", in steps of 1/{largest:.0f}"
-    return largest, Finding("rgb-colours", 3, f"{named} are read as the colours of SH degree 0{steps}", "note")
+    text = f"{_named(colours)} are read as the colours of SH degree 0{steps}{why}"
+    return Finding("rgb-colours", len(colours), text, "note")
+
+
+def _named(colours: Sequence[str]) -> str:
+    return f"{', '.join(colours[:2])} and {colours[2]}"
 
 
 def _integers(dtype: np.dtype[Any], groups: Sequence[Sequence[str]]) -> Finding | None:
@@ -369,7 +380,7 @@ def _find_rest(names: _Names, sh_degree: int | None) -> tuple[tuple[str, ...], t
     rest = tuple(found[channel * bands + band] for channel in range(3) for band in range(wanted_bands))
     if degree <= MAX_SH_DEGREE:
         return found, rest, None
-    text = f"SH degree {degree}: bands above {kept} are left out, as asked"
+    text = f"SH degree {degree}: {'all bands' if kept == 0 else f'bands above {kept}'} are left out, as asked"
     return found, rest, Finding("sh-bands", count - len(rest), text, "note")
 
 

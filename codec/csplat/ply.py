@@ -24,7 +24,7 @@ from csplat.files import local_file
 from csplat.inputs import File
 from csplat.lint import Columns, Finding, find_columns, refuse
 from csplat.model import F32, SplatModel, check_sh_degree
-from csplat.ply_columns import F64, Arrays, Counts, Rows, findings_of, gather, with_half_floats
+from csplat.ply_columns import F64, Arrays, Counts, Rows, findings_of, gather, with_colour_range, with_half_floats
 from csplat.ply_comments import SceneFacts, parse_comments
 from csplat.ply_file import blocks_of, parse
 from csplat.ply_origin import relative_to_origin
@@ -214,6 +214,7 @@ def _opened(
     if columns is None:
         return None
     refuse(findings, strict=strict)  # before the work
+    columns = with_colour_range(blocks_of(path, rows), columns, findings)
     facts = parse_comments(content.comments)
     findings += facts.findings
     return _Opened(rows, columns, facts)

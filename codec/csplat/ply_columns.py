@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import counted
-from csplat.lint import Columns, Finding, float_columns, plain_name
+from csplat.lint import Columns, Finding, colour_finding, float_columns, plain_name
 from csplat.model import F32, QUAT_LENGTH_TOLERANCE, normalise_quats
 
 __all__ = [
@@ -28,6 +28,7 @@ __all__ = [
     "gather",
     "huge_rows",
     "logits_of_alpha",
+    "with_colour_range",
     "with_half_floats",
 ]
 
@@ -50,6 +51,7 @@ _HUGE_COLOUR = 1e6
 _USUAL_LENGTHS = (1e-3, 1e3)  # lengths of quaternions: they grow and shrink while a scene is trained
 _LARGEST_COLOUR = 16.0  # red, green and blue as floats, where 1 is white: larger values are taken as 0 to 255
 _LOOKED_AT = 4096  # rows that tell half floats from integers
+_BYTE, _WORD = 255.0, 65535.0  # values of a colour of 8 and of 16 bits that are 1
 _POSITIONS = ("x", "y", "z")
 _BAD_SHARE = 0.01  # half floats that may be NaN or infinite, as in any scene
 _SANE_LENGTHS = (0.01, 100.0)  # lengths of quaternions: integers read as half floats leave them
@@ -198,6 +200,24 @@ def _are_sane(rows: Rows, halves: set[str], *, alone: bool) -> bool:
     if np.median(most / np.maximum(middle, _TINY)) > _MOST_RATIO:
         return False
     return math.exp(min(_HUGE_LOG, float(np.median(scales)))) <= most.max() * 2.0
+
+
+def with_colour_range(blocks: Iterable[Rows], columns: Columns, findings: list[Finding]) -> Columns:
+    """Take red, green and blue of 16 bits that are none above 255 for what bytes would be.
+
+    Args:
+        blocks: the rows; looked at only if the colours have 16 bits.
+        columns: meaning of the columns.
+        findings: the finding about the colours is replaced if they are of 0 to 255.
+    """
+    if columns.colour_range != _WORD:
+        return columns
+    largest = max((int(rows[name].max(initial=0)) for rows in blocks for name in columns.sh0), default=0)
+    if not 0 < largest <= _BYTE:
+        return columns
+    at = next(index for index, one in enumerate(findings) if one.id == "rgb-colours")
+    findings[at] = colour_finding(columns.sh0, _BYTE, f": they are of 16 bits, and at most {largest}")
+    return replace(columns, colour_range=_BYTE)
 
 
 def alpha_of_logits(logits: NDArray[Any]) -> F32:
