@@ -392,6 +392,10 @@ def test_extreme_filters_stay_finite(path):
     [
         ({"opacity": (0, 1)}, {"opacities-are-alphas"}),
         ({"opacity": (-0.1, 1)}, set()),
+        ({"opacity": (-1e-7, 1.0000002)}, {"opacities-are-alphas"}),
+        ({"opacity": (0, 255)}, {"opacities-are-alphas"}),
+        ({"scale_0": (0, 0.1), "scale_1": (0, 2), "scale_2": (0, 0.1)}, {"scales-are-linear"}),
+        ({"scale_0": (0.3, 2), "scale_1": (0.5, 3), "scale_2": (1.5, 4)}, set()),  # from 1.3 to 55 in 40
         ({"scale_0": (1e-3, 0.1), "scale_1": (1e-3, 2), "scale_2": (1e-3, 0.1)}, {"scales-are-linear"}),
         ({"f_dc_0": (0, 1), "f_dc_1": (0, 1), "f_dc_2": (0, 1)}, {"colours-are-rgb"}),
         ({"f_dc_0": (0, 255), "f_dc_1": (0, 255), "f_dc_2": (0, 255)}, {"colours-are-rgb"}),

@@ -32,8 +32,8 @@ different. A *repair* changes or drops something, safely, and is reported; `stri
 | `filter-3d` | the 3D filter of Mip-Splatting: fused into scales and opacities | note |
 | `sh-bands` | SH bands above those that were asked for: left out | note |
 | `vertical-axis` | a comment that names the axis that is up | note |
-| `opacities-are-alphas` | opacities that all lie in 0 to 1, as after the sigmoid; read as logits | note |
-| `scales-are-linear` | scales that are all above 0, as after the exponential; read as logarithms | note |
+| `opacities-are-alphas` | opacities that all lie in 0 to 1 or 255, as after the sigmoid; read as logits | note |
+| `scales-are-linear` | scales that fit the scene as lengths, not as logarithms; read as logarithms | note |
 | `colours-are-rgb` | f_dc that are all in 0 to 1 or in 0 to 255, as colours are; read as SH coefficients | note |
 | `half-floats` | columns of 16-bit integers whose bits are those of half floats: read as these | note |
 | `sharp-elements` | what ml-sharp writes besides the splats: dropped | note |

@@ -58,6 +58,9 @@ _SANE_LENGTHS = (0.01, 100.0)  # lengths of quaternions: integers read as half f
 _MOST_RATIO = 256.0  # half floats of positions: the ratio of a large one and one in the middle
 _FEW = 16  # splats: a property of fewer may be chance
 _TINY = 1e-30  # above 0
+_ROUNDING = 1e-3  # alphas may lie beyond 0 and 1 by that much
+_OF_A_BLOCK = 256  # splats of a block whose scales are compared with the scene's extent
+_LENGTHS_RATIO = 3.0  # of large and small scales that are lengths
 _BYTE_COLOUR = 4.0  # an f_dc beyond is brighter than white, 1.77, and may be a colour of 0 to 255
 
 
@@ -96,6 +99,7 @@ class Counts:
     scales: tuple[float, float] = _NOTHING
     colours: tuple[float, float] = _NOTHING
     colour_range: float = 0.0  # as in `Columns`
+    looked_at: list[tuple[NDArray[Any], F32]] = field(default_factory=list)  # means and scales of some splats
 
 
 def gather(
@@ -356,6 +360,9 @@ def _repair(part: Arrays, columns: Columns, counts: Counts, widths: F64 | None) 
     counts.opacities = _wider(counts.opacities, part.opacities)
     counts.scales = _wider(counts.scales, part.scales[:, :scale_count])
     counts.colours = _wider(counts.colours, part.sh0)
+    if counts.scales[0] >= 0.0:  # they may be lengths
+        step = len(part.means) // _OF_A_BLOCK + 1
+        counts.looked_at.append((part.means[::step].copy(), part.scales[::step, :scale_count].copy()))
     alphas = _alphas(part.opacities)
     if widths is not None:
         counts.filtered += int(np.count_nonzero(widths))
@@ -371,9 +378,9 @@ def _repair(part: Arrays, columns: Columns, counts: Counts, widths: F64 | None) 
 def _wider(bounds: tuple[float, float], values: F32) -> tuple[float, float]:
     """Return the least and the largest of what was seen before and of some values.
 
-    Below 0 is nothing that was activated: from there on nobody looks.
+    Below 0 is nothing that was activated, but for what rounding leaves: from there on nobody looks.
     """
-    if bounds[0] < 0.0:
+    if bounds[0] < -_ROUNDING:
         return bounds
     return min(bounds[0], float(values.min(initial=math.inf))), max(bounds[1], float(values.max(initial=-math.inf)))
 
@@ -486,11 +493,13 @@ def _suspicions(counts: Counts, kept: int) -> list[Finding]:
         found.append(Finding("colour-columns", kept, text, "error"))
     if kept < _FEW:
         return found
-    if _lie_in(counts.opacities, 0.0, 1.0):
-        text = f"all {kept} opacities lie in 0..1, as alphas do: read as logits; export them before the sigmoid"
+    alphas = _lie_in(counts.opacities, -_ROUNDING, 1.0 + _ROUNDING)
+    if alphas or (_lie_in(counts.opacities, 0.0, _BYTE) and counts.opacities[1] > _HUGE_LOG):
+        top = 1 if alphas else 255
+        text = f"all {kept} opacities lie in 0..{top}, as alphas do: read as logits; export them before the sigmoid"
         found.append(Finding("opacities-are-alphas", kept, text, "note"))
-    if _lie_in(counts.scales, _TINY, _HUGE_LOG):
-        text = f"all scales of {kept} splats are above 0, as lengths are: read as logarithms; export them before exp"
+    if _lie_in(counts.scales, 0.0, _HUGE_LOG) and _are_lengths(counts):
+        text = f"no scale of {kept} splats is below 0, as lengths are: read as logarithms; export them before exp"
         found.append(Finding("scales-are-linear", kept, text, "note"))
     if not counts.colour_range and (
         _lie_in(colours, 0.0, 1.0) or (_lie_in(colours, 0.0, 255.0) and colours[1] > _BYTE_COLOUR)
@@ -500,6 +509,16 @@ def _suspicions(counts: Counts, kept: int) -> list[Finding]:
         text += "; name the columns red, green and blue if they are colours"
         found.append(Finding("colours-are-rgb", kept, text, "note"))
     return found
+
+
+def _are_lengths(counts: Counts) -> bool:
+    """Tell whether scales above 0 fit the scene as lengths, and as logarithms do not."""
+    means, scales = (np.concatenate(arrays) for arrays in zip(*counts.looked_at, strict=True))
+    extent = float(np.subtract(*np.quantile(means, (0.95, 0.05), axis=0)).max())
+    low, middle, high = np.quantile(scales, (0.05, 0.5, 0.95)).tolist()
+    # Lengths differ by a factor; their exponentials are all about 1, which no logarithms say of a scene.
+    alike = middle < 1.0 and high > _LENGTHS_RATIO * low
+    return middle <= extent / 2.0 and (alike or math.exp(middle) > extent / 2.0)
 
 
 def _lie_in(bounds: tuple[float, float], low: float, high: float) -> bool:
