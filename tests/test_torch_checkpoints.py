@@ -220,6 +220,60 @@ def test_the_files_of_all_gpus_are_one_scene(no_torch, make_model, tmp_path):
     assert ("ranks", "note", True) == (report[-1].id, report[-1].kind, report[-1].usual)
 
 
+def read_splats(no_torch, splats):
+    no_torch(lambda *_, **__: {"splats": splats})
+    report = []
+    return csplat.read(STORED["gsplat.pt"], report=report), {one.id: one for one in report}
+
+
+def test_values_are_looked_at_as_those_of_a_ply(no_torch):
+    rng = np.random.default_rng(0)
+    numbers = {"means": 3, "quats": 4, "scales": 3, "sh0": 3}
+    splats = {name: rng.standard_normal((20, width)).astype(np.float32) for name, width in numbers.items()}
+    splats = {name: tensor(one) for name, one in splats.items()}
+    splats |= {"sh0": splats["sh0"][:, None], "opacities": tensor(np.linspace(0, 1, 20, dtype=np.float32))}
+    splats["scales"] = tensor(np.abs(splats["scales"]) * np.float32(0.1))
+    splats["quats"][3] = 0
+    model, found = read_splats(no_torch, {**splats, "filter_3D": tensor(np.ones(20))})
+    assert {"zero-quats", "opacities-are-alphas", "scales-are-linear", "filter-3d"} <= set(found)
+    assert "repair" == found["zero-quats"].kind == found["filter-3d"].kind
+    assert [1, 0, 0, 0] == model.quats[3].tolist()
+
+
+def test_two_scales_are_discs(no_torch, make_model):
+    splats = made_splats(make_model, 0)
+    model, found = read_splats(no_torch, {**splats, "scales": splats["scales"][:, :2]})
+    assert "flat-scales" in found
+    assert model.flat
+    assert np.array_equal(splats["scales"][:, :2], model.scales[:, :2])
+    np.testing.assert_allclose(model.scales[:, 2], splats["scales"][:, :2].min() - np.log(100), rtol=1e-6)
+
+
+def test_positions_in_doubles_get_an_origin(no_torch, make_model):
+    splats = made_splats(make_model, 0)
+    far = tensor(splats["means"].astype(np.float64) + 1e7 + 0.3)
+    model, found = read_splats(no_torch, {**splats, "means": far})
+    assert "double-means" in found
+    assert np.float32 == model.means.dtype
+    np.testing.assert_allclose(model.means + np.array(model.origin), far, rtol=0, atol=1e-6)
+
+
+def test_what_is_no_checkpoint_is_refused_before_torch_loads_it(no_torch, tmp_path):
+    no_torch(lambda *_, **__: pytest.fail("it was loaded"))
+    for data, says in (
+        (b"404: Not Found", "no checkpoint of torch: it begins with b'404: Not'"),
+        (b"version https://git-lfs.github.com/spec/v1\noid", "a pointer of Git LFS"),
+    ):
+        (tmp_path / "a.pt").write_bytes(data)
+        with pytest.raises(InputError, match=rf"^a\.pt is {says}[^\n]*$"):
+            csplat.read(tmp_path / "a.pt")
+        (tmp_path / "b_rank0.pt").write_bytes(STORED["gsplat.pt"].read_bytes())
+        (tmp_path / "b_rank1.pt").write_bytes(data)
+        no_torch(lambda path, **_: load_plainly(path) if path.stem == "b_rank0" else pytest.fail("it was loaded"))
+        with pytest.raises(InputError, match=rf"^b_rank1\.pt is {says}[^\n]*$"):
+            csplat.read(tmp_path / "b_rank0.pt")
+
+
 def test_what_torch_cannot_load_is_refused_in_one_line(no_torch):
     for error, says in (
         (pickle.UnpicklingError("Weights only load failed"), "holds objects of a program"),

@@ -29,7 +29,7 @@ different. A *repair* changes or drops something, safely, and is reported; `stri
 | `alias-columns` | columns that another program named in its own way: `scalar_opacity` of CloudCompare | note |
 | `second-columns` | columns that are there once more under the usual name, which is read | note |
 | `rgb-colours` | red, green and blue in place of f_dc, read as colours of SH degree 0 | note |
-| `filter-3d` | the 3D filter of Mip-Splatting: fused into scales and opacities | note |
+| `filter-3d` | the 3D filter of Mip-Splatting: fused into scales and opacities, or left out | note, repair |
 | `sh-bands` | SH bands above those that were asked for: left out | note |
 | `vertical-axis` | a comment that names the axis that is up | note |
 | `opacities-are-alphas` | opacities that all lie in 0 to 1 or 255, as after the sigmoid; read as logits | note |

@@ -28,6 +28,8 @@ __all__ = [
     "gather",
     "huge_rows",
     "logits_of_alpha",
+    "look_at",
+    "thickness_of",
     "with_colour_range",
     "with_half_floats",
 ]
@@ -99,6 +101,7 @@ class Counts:
     scales: tuple[float, float] = _NOTHING
     colours: tuple[float, float] = _NOTHING
     colour_range: float = 0.0  # as in `Columns`
+    has_columns: bool = True  # they are rows of a PLY
     looked_at: list[tuple[NDArray[Any], F32]] = field(default_factory=list)  # means and scales of some splats
 
 
@@ -139,8 +142,34 @@ def gather(
             at += _repair(part, columns, counts, widths)
     kept = _part(out, slice(0, at))
     if len(columns.scales) == 2 and at:
-        kept.scales[:, 2] = min(kept.scales[:, :2].min(), np.float32(thinnest)) - np.float32(_FLAT_SCALE_STEP)
+        kept.scales[:, 2] = thickness_of(kept.scales[:, :2], thinnest)
     return kept
+
+
+def thickness_of(scales: F32, thinnest: float = math.inf) -> np.float32:
+    """Choose the third scale of discs.
+
+    Args:
+        scales: [N, 2] natural logarithms, of one disc at least.
+        thinnest: the smallest scale of all discs, if these are not all of them.
+    """
+    return np.float32(min(scales.min(), np.float32(thinnest)) - np.float32(_FLAT_SCALE_STEP))
+
+
+def look_at(arrays: Arrays, scale_count: int, counts: Counts) -> None:
+    """Count what is noticed in splats that are not the rows of a file; they stay as they are.
+
+    Args:
+        arrays: finite; opacities are logits, and rotations may have any length.
+        scale_count: scales of a splat: 2 of discs.
+        counts: updated.
+    """
+    counts.has_columns = False
+    columns = Columns((), ("",) * scale_count, (), (), (), "", (), (), double=False)
+    for start in range(0, len(arrays.means), _LOOKED_AT):
+        part = _part(arrays, slice(start, start + _LOOKED_AT))
+        copies = (one.copy() for one in (part.means, part.quats, part.scales, part.opacities, part.sh0, part.shN))
+        _repair(Arrays(*copies), columns, counts, None)
 
 
 def with_half_floats(rows: Rows, findings: list[Finding]) -> Rows:
@@ -506,7 +535,7 @@ def _suspicions(counts: Counts, kept: int) -> list[Finding]:
     ):
         top = 1 if colours[1] <= 1.0 else 255
         text = f"all f_dc of {kept} splats lie in 0..{top}, as colours do: read as SH coefficients"
-        text += "; name the columns red, green and blue if they are colours"
+        text += "; name the columns red, green and blue if they are colours" if counts.has_columns else ""
         found.append(Finding("colours-are-rgb", kept, text, "note"))
     return found
 

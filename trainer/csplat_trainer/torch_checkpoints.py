@@ -17,19 +17,24 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from csplat.bridges import from_gsplat
+from csplat.detect import by_content, head_of
 from csplat.errors import InputError, counted, missing
 from csplat.formats import Format
 from csplat.lint import Finding, too_many_bands
 from csplat.model import MAX_SH_DEGREE, SplatModel
+from csplat.ply_columns import Arrays, Counts, findings_of, look_at, thickness_of
+from csplat.ply_comments import SceneFacts
+from csplat.ply_origin import relative_to_origin
 from csplat.scene import Scene, joined, scene_of
 
 __all__ = ["FORMAT"]
 
+_MAGICS = (b"PK\x03\x04", b"\x80")  # of a zip, and of a pickle, which torch wrote before 1.6
 _NAMED = 5  # names in a message
 _SH_C0 = 0.28209479177387814
 #: Values that INRIA's `GaussianModel.capture` returns after the SH degree in use (scene/gaussian_model.py).
@@ -37,6 +42,7 @@ _INRIA = ("means", "sh0", "shN", "scales", "quats", "opacities")
 _HOLDERS = ("pipeline", "state_dict", "model")  # keys that may hold splatfacto's tensors; else the top level does
 #: gsplat writes a file for each GPU, which has a part of the splats (simple_trainer.py).
 _RANK = re.compile(r"(?P<run>.*_rank)(?P<rank>\d{1,4})(?P<ending>\.pt)")
+_FILTER = "filter_3D"
 _NAMES = {
     "means": "means",
     "quats": "quats",
@@ -50,11 +56,38 @@ _NAMES = {
 @contextmanager
 def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
     paths, findings = _parts(path)
-    models = [_read(one, sh_degree) for one in paths]
+    parts = [_read(one, sh_degree) for one in paths]
+    models = [one.model for one in parts]
     degrees = sorted({one.sh_degree for one in models})
     if len(degrees) > 1:
         raise InputError(f"{path.name}: files of other GPUs beside it are of SH degree {degrees[0]} and {degrees[1]}")
-    yield replace(scene_of(joined(models[0], models)), findings=findings)
+    model, counts = joined(models[0], models), Counts()
+    for part in parts:
+        look_at(part.arrays, part.scale_count, counts)
+    findings += [finding for part in parts for finding in part.findings] + findings_of(counts, len(model))
+    if any(part.arrays.means.dtype == np.float64 for part in parts):
+        positions = np.concatenate([part.arrays.means.astype(np.float64) for part in parts])
+        means, origin, doubles = relative_to_origin(positions, SceneFacts())
+        model = replace(model, means=means, origin=origin, means_double=doubles)
+        text = f"positions are in doubles: {len(means)} means are float32 relative to {origin}"
+        findings.append(Finding("double-means", len(means), text, "note"))
+    yield replace(scene_of(model), findings=findings)
+
+
+class _Part(NamedTuple):
+    """The splats of one file.
+
+    Attributes:
+        model: the splats, with means in float32.
+        arrays: as the file has them: opacities are logits; means are float64 if the file's are.
+        scale_count: scales of a splat: 2 of discs.
+        findings: what was noticed.
+    """
+
+    model: SplatModel
+    arrays: Arrays
+    scale_count: int
+    findings: list[Finding]
 
 
 def _parts(path: Path) -> tuple[list[Path], list[Finding]]:
@@ -85,7 +118,12 @@ def _parts(path: Path) -> tuple[list[Path], list[Finding]]:
     return paths, [Finding("ranks", len(paths), text, "note")]
 
 
-def _read(path: Path, sh_degree: int | None) -> SplatModel:
+def _read(path: Path, sh_degree: int | None) -> _Part:
+    head = head_of(path)
+    kind = by_content(path, head)
+    if not head.startswith(_MAGICS):
+        reason = "it begins with" if kind is None else f"it is {kind.title}, and begins with"
+        raise InputError(f"{path.name} is no checkpoint of torch: {reason} {head[:8]!r}")
     try:
         import torch
     except ModuleNotFoundError as error:
@@ -117,7 +155,7 @@ def _plain_numbers(torch: Any) -> Any:
     return torch.serialization.safe_globals([make, (make, "numpy.core.multiarray.scalar"), np.dtype, *kinds])
 
 
-def _model_of(said: object, size: int, sh_degree: int | None) -> SplatModel:
+def _model_of(said: object, size: int, sh_degree: int | None) -> _Part:
     inria = _of_inria(said)
     if inria is not None:
         return _bounded(inria, size, sh_degree)
@@ -135,12 +173,12 @@ def _model_of(said: object, size: int, sh_degree: int | None) -> SplatModel:
         names = ", ".join(map(str, list(said)[:_NAMED]))
         raise InputError(f"it holds {names or 'nothing'}: neither splats of gsplat nor a pipeline of splatfacto")
     found = {name.removeprefix(models[0]): value for name, value in named.items() if name.startswith(models[0])}
-    model = _bounded({_NAMES.get(name, name): value for name, value in found.items()}, size, sh_degree)
-    if model.sh_degree or "features_rest" not in found:
-        return model
+    part = _bounded({_NAMES.get(name, name): value for name, value in found.items()}, size, sh_degree)
+    if part.model.sh_degree or "features_rest" not in found:
+        return part
     # Without SH splatfacto trains logits of colours.
-    colours = 1.0 / (1.0 + np.exp(-model.sh0.astype(np.float64)))
-    return replace(model, sh0=((colours - 0.5) / _SH_C0).astype(np.float32))
+    colours = 1.0 / (1.0 + np.exp(-part.model.sh0.astype(np.float64)))
+    return part._replace(model=replace(part.model, sh0=((colours - 0.5) / _SH_C0).astype(np.float32)))
 
 
 def _of_inria(said: object) -> dict[str, Any] | None:
@@ -165,8 +203,8 @@ def _count(means: Any) -> str:
     return counted(shape[0], "splat") if shape else "no tensor"
 
 
-def _bounded(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> SplatModel:
-    """A model of tensors, none of which has more numbers than the file has bytes: one may be said to be many."""
+def _bounded(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> _Part:
+    """The splats of tensors, none of which has more numbers than the file has bytes: one may be said to be many."""
     for name in _NAMES.values():
         numbers = getattr(splats.get(name), "numel", None)
         if name in splats and (numbers is None or numbers() > size):
@@ -178,7 +216,30 @@ def _bounded(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> Spl
             if sh_degree is None:
                 raise InputError(f"shN is of {too_many_bands(degree)}")
             splats = {**splats, "shN": shN[:, : (MAX_SH_DEGREE + 1) ** 2 - 1]}
-    return from_gsplat(splats)
+    findings = []
+    splats = {name: _array(value) if name in _NAMES.values() else value for name, value in splats.items()}
+    scales = splats.get("scales")
+    is_flat = scales is not None and scales.ndim == 2 and scales.shape[1] == 2
+    if scales is not None and is_flat:
+        third = np.full((len(scales), 1), thickness_of(scales) if len(scales) else 0.0, np.float32)
+        splats["scales"] = np.concatenate([scales, third], axis=1)
+        findings.append(Finding("flat-scales", 1, "scales are two of a splat: the splats are discs (2DGS)", "note"))
+    if _FILTER in splats:
+        text = f"{_FILTER} of Mip-Splatting is left out, and not fused: save the scene as PLY, of which it is"
+        findings.append(Finding("filter-3d", 1, text, "repair"))
+    model = replace(from_gsplat(splats), flat=is_flat)
+    arrays = Arrays(
+        splats["means"], splats["quats"], splats["scales"], splats["opacities"].reshape(-1), model.sh0, model.shN
+    )
+    return _Part(model, arrays, 2 if is_flat else 3, findings)
+
+
+def _array(value: Any) -> Any:
+    """An array of a tensor: float64 if it is, else float32."""
+    if hasattr(value, "detach"):
+        value = value.detach().cpu()
+        value = (value.double() if str(value.dtype) == "torch.float64" else value.float()).numpy()
+    return np.asarray(value, np.float64 if value.dtype == np.float64 else np.float32)
 
 
 FORMAT = Format(
