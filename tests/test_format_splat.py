@@ -99,7 +99,7 @@ def test_what_is_hardly_a_splat_file_is_refused_unless_insisted(tmp_path, data, 
     (tmp_path / "a.splat").write_bytes(data)
     with pytest.raises(InputError, match=says):
         csplat.read(tmp_path / "a.splat")
-    if len(data) % 32 == 0:
+    if len(data) % 32 == 0 and "web page" not in says:  # which is nothing but that
         with insisting("splat"), open_scene(tmp_path / "a.splat") as scene:
             assert "splat" == scene.format
 

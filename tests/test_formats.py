@@ -102,6 +102,18 @@ def test_each_format_has_a_name_of_its_own():
         ("a.json", b'{"cameras": []}', "is JSON"),
         ("a.csplat", b"<?xml version='1.0'?><Error/>", "XML, as servers"),
         ("a.ply", b"\xef\xbb\xbf<html>", "a web page"),
+        ("a.ply", b"<!-- saved from url=(0030)https://example.org/ -->\n<html>", "a web page"),
+        ("a.spz", " <!DOCTYPE html><html>".encode("utf-16"), "a web page"),
+        ("a.splat", b"<title>Sign in</title>".ljust(64), "a web page"),
+        ("a.splat", b" " * 100 + b"<html>", "a web page"),
+        ("a.spz", b"\xef\xbb\xbfversion https://git-lfs.github.com/spec/v1\noid", "Git LFS"),
+        ("a.ply", b"/annex/objects/SHA256E-s1234--abc.ply\n", "a pointer of git-annex, .* run `git annex get`"),
+        ("a.splat", b"{\\rtf1\\ansi hello}".ljust(64), "is RTF, a text"),
+        ("a.splat", b"\x93NUMPY\1\0v\0{'descr': '<f4'", "is an array of NumPy, no scene"),
+        ("a.ckpt", b'\x3c\0\0\0\0\0\0\0{"means":{', "is safetensors, which csplat does not read"),
+        ("a.xz", b"\xfd7zXZ\0\0", "is xz, unpack it first, with unxz"),
+        ("a.ply", b"BZh91AY&SY", "is bzip2, unpack it first"),
+        ("a.csplat", b"\x1f\x8b\x08\0hello", "is gzip, unpack it first, with gunzip"),
     ],
 )
 def test_other_files_are_refused_by_what_they_are(tmp_path, name, data, says):
@@ -121,6 +133,8 @@ def test_pointers_of_git_lfs_are_named_whatever_reads_them(tmp_path):
         for read in (csplat.read, read_ply, formats_lint):
             with pytest.raises(InputError, match=says):
                 read(path)
+        with insisting("splat"), pytest.raises(InputError, match=says):
+            csplat.read(path)
     (tmp_path / "meta.json").write_text('{"version": 2, "count": 1}')
     for decode in (csplat.decode, csplat.open):
         with pytest.raises(csplat.FormatError, match="git lfs pull"):

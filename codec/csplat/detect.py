@@ -29,6 +29,7 @@ _NO_SPLATS = "no scene of splats"
 _PLY_HEADER_SIZE = 1 << 16  # bytes that hold the words of a compressed PLY
 _KSPLAT_HEAD = 44  # bytes of its header that carry information; the others are 0
 _SPLAT_ROW_SIZE = 32
+_SAFETENSORS_HEAD = 100_000_000  # bytes of its header, which is JSON, at most
 _MANIFESTS = {"meta.json", "lod-meta.json"}  # names of SOG's manifests
 _PLY, _CSPLAT = "ply", "csplat"
 
@@ -203,7 +204,12 @@ def _is_tileset(path: Path, head: bytes) -> bool:
 def _is_json(_path: Path, head: bytes) -> bool:
     """Return True if the content is text that begins as JSON; a lone brace may be a byte of anything."""
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
-    return text[:1] in (b"{", b"[") and not any(byte < 32 and byte not in b"\t\n\r" for byte in text)
+    begins = text[:1] == b"[" or (text[:1] == b"{" and text[1:].lstrip()[:1] in (b'"', b"}", b""))
+    return begins and not any(byte < 32 and byte not in b"\t\n\r" for byte in text)
+
+
+def _is_safetensors(_path: Path, head: bytes) -> bool:
+    return head[8:10] == b'{"' and 0 < int.from_bytes(head[:8], "little") < _SAFETENSORS_HEAD
 
 
 def _is_usd(path: Path, head: bytes) -> bool:
@@ -238,11 +244,19 @@ KINDS: dict[str, Kind] = {
             _begins(b"b3dm", b"i3dm", b"pnts", b"cmpt"),
             "which csplat does not read: tiles of splats are .glb files",
         ),
-        Kind("gzip", "gzip", (".gz",), _is_gzip, "convert it to PLY first, with gunzip"),
+        Kind("gzip", "gzip", (".gz",), _is_gzip, "unpack it first, with gunzip"),
         Kind("zip", "zip", (".zip",), _begins(b"PK\x03\x04"), "unzip it first"),
         Kind("7z", "7z", (".7z",), _begins(b"7z\xbc\xaf\x27\x1c"), "unpack it first"),
         Kind("rar", "RAR", (".rar",), _begins(b"Rar!\x1a\x07"), "unpack it first"),
         Kind("zstd", "zstd", (".zst",), _begins(b"\x28\xb5\x2f\xfd"), "unpack it first, with unzstd"),
+        Kind("xz", "xz", (".xz",), _begins(b"\xfd7zXZ\0"), "unpack it first, with unxz"),
+        Kind(
+            "bzip2",
+            "bzip2",
+            (".bz2",),
+            lambda _path, head: head[:3] == b"BZh" and head[4:10] == b"1AY&SY",
+            "unpack it first, with bunzip2",
+        ),
         Kind("tar", "tar", (".tar",), lambda _path, head: head[257:262] == b"ustar", "unpack it first"),
         Kind("png", "a PNG", (".png",), _begins(b"\x89PNG\r\n"), f"an image, {_NO_SPLATS}"),
         Kind("jpeg", "a JPEG", (".jpg", ".jpeg"), _begins(b"\xff\xd8\xff"), f"an image, {_NO_SPLATS}"),
@@ -251,6 +265,21 @@ KINDS: dict[str, Kind] = {
         Kind("e57", "E57", (".e57",), _begins(b"ASTM-E57"), f"a point cloud, {_NO_SPLATS}"),
         Kind("obj", "OBJ", (".obj",), remedy=f"a mesh, {_NO_SPLATS}"),
         Kind("fbx", "FBX", (".fbx",), _begins(b"Kaydara FBX"), f"a mesh, {_NO_SPLATS}"),
+        Kind(
+            "safetensors",
+            "safetensors",
+            (".safetensors",),
+            _is_safetensors,
+            "which csplat does not read: csplat.from_gsplat makes a scene of tensors under gsplat's names",
+        ),
+        Kind(
+            "npy",
+            "an array of NumPy",
+            (".npy",),
+            _begins(b"\x93NUMPY"),
+            "no scene: csplat.from_gsplat makes one of arrays under gsplat's names",
+        ),
+        Kind("rtf", "RTF", (".rtf",), _begins(b"{\\rtf"), f"a text, {_NO_SPLATS}"),
         Kind("json", "JSON", (), _is_json, _NO_SPLATS),
     )
 }

@@ -11,9 +11,16 @@ from typing import Protocol
 
 __all__ = ["BinaryFile", "Buffer", "File", "LetGo", "mapped", "stand_in"]
 
-_LFS_POINTERS = (b"version https://git-lfs.github.com/spec/", b"version https://hawser.github.com/spec/")
-_HTML = (b"<!doctype", b"<html", b"<head", b"<body", b"<script")
-_XML = (b"<?xml", b"<error")
+_LFS = "Git LFS, not the file itself: run `git lfs pull`"
+#: By how they begin, files that stand for others in a repository, of what, and what helps.
+_POINTERS = {
+    b"version https://git-lfs.github.com/spec/": _LFS,
+    b"version https://hawser.github.com/spec/": _LFS,
+    b"/annex/objects/": "git-annex, not the file itself: run `git annex get`",
+}
+_HTML = (b"<!doctype", b"<!--", b"<html", b"<head", b"<title", b"<meta", b"<body", b"<script")
+_XML = (b"<?xml", b"<error", b"<svg")
+_WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")  # byte order marks of UTF-16
 
 
 class BinaryFile(Protocol):
@@ -54,9 +61,12 @@ def stand_in(head: bytes) -> str:
         >>> stand_in(b"version https://git-lfs.github.com/spec/v1")
         'a pointer of Git LFS, not the file itself: run `git lfs pull`'
     """
-    if head.startswith(_LFS_POINTERS):
-        return "a pointer of Git LFS, not the file itself: run `git lfs pull`"
-    text = head[:64].removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    text = head.decode("utf-16", "replace").encode() if head.startswith(_WIDE_MARKS) else head
+    text = text.removeprefix(b"\xef\xbb\xbf")
+    for begin, program in _POINTERS.items():
+        if text.startswith(begin):
+            return f"a pointer of {program}"
+    text = text.lstrip()[:64].lower()
     if text.startswith(_HTML):
         return "a web page (HTML), not the file itself: download it again, and look at the page where that fails"
     if text.startswith(_XML):

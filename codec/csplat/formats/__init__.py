@@ -227,12 +227,7 @@ def format_of(path: Path) -> Format:
     """
     head, insisted = head_of(path), _insisted.get()
     known = {one.name: one for one in formats()}
-    try:
-        kind = by_content(path, head)
-    except InputError:
-        if insisted is None:
-            raise
-        kind = None
+    kind = by_content(path, head)
     if kind is not None and kind.name in known:
         return known[kind.name]
     if insisted is not None:
