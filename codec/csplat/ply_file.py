@@ -242,7 +242,7 @@ class _PlyReader(io.BufferedReader):
     def __init__(self, path: Path, header: Header) -> None:
         super().__init__(io.FileIO(path))
         self.seek(header.start)
-        self._header = header.text
+        self._header, self._at = header.text, 0
 
     def read(self, size: int | None = -1, /) -> bytes:
         return self._with_header(super().read(size))
@@ -251,7 +251,8 @@ class _PlyReader(io.BufferedReader):
         return self._with_header(super().read1(size))
 
     def _with_header(self, data: bytes) -> bytes:
-        if not self._header:
+        if self._at >= len(self._header):
             return data
-        begin, self._header = self._header[: len(data)], self._header[len(data) :]
+        begin = self._header[self._at : self._at + len(data)]  # a byte at a time: the rest is not to be copied
+        self._at += len(begin)
         return begin + data[len(begin) :]
