@@ -1,5 +1,7 @@
 """Each defect on its own: its name in lint, the result of reading, and the error of strict reading."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -252,8 +254,9 @@ def renamed(rows, name_of):
         lambda name: name if len(name) < 3 else f"scalar_scal_{name}",
         lambda name: name if len(name) < 3 else f"scal_{name}",
         str.upper,
+        lambda name: re.sub(r"f_rest_(\d)$", r"f_rest_0\1", name),
     ],
-    ids=["CloudCompare", "3dgsconverter 0.1", "its columns", "capitals"],
+    ids=["CloudCompare", "3dgsconverter 0.1", "its columns", "capitals", "numbers with zeros"],
 )
 def test_columns_are_found_by_the_names_of_other_programs(path, name_of):
     plain, rows = good_rows(), renamed(good_rows(), name_of)
@@ -373,6 +376,20 @@ def test_the_filter_of_mip_splatting_is_fused(path):
     assert ({}, False) == (model.extra, model.antialiased)
     with open_scene(path) as scene:
         assert np.array_equal(model.opacities, scene.model().opacities)
+
+
+def test_the_filter_of_discs_is_not_fused(path):
+    rows = good_rows(names=[*without("scale_2"), "filter_3D"])
+    path.write_bytes(header(rows) + rows.tobytes())
+    assert "which is not defined for discs: it is not fused" in found(path)["filter-3d"].text
+    assert np.array_equal(rows["scale_1"], read_ply(path).scales[:, 1])
+
+
+def test_positions_that_are_integers_are_called_so(path):
+    rows = good_rows()
+    kinds = [(name, "<i4" if name in "xyz" else "<f4") for name in NAMES]
+    path.write_bytes(header(rows.astype(kinds)) + rows.astype(kinds).tobytes())
+    assert "positions are integers: 5 means are float32" in found(path)["double-means"].text
 
 
 def test_extreme_filters_stay_finite(path):

@@ -13,7 +13,7 @@ different. A *repair* changes or drops something, safely, and is reported; `stri
 | `integer-columns` | integers in place of the floats of a splat | error |
 | `colour-space` | colours of ml-sharp that are not sRGB | error |
 | `truncated` | fewer splats than the header declares | error |
-| `malformed` | a row that is no row | error |
+| `malformed` | a row that is no row, or binary rows that a text-mode transfer changed | error |
 | `trailing-bytes` | bytes after the last declared splat: ignored | repair |
 | `extra-columns` | columns that splats do not have: dropped, unless asked to keep them | repair |
 | `list-columns` | list properties of splats: dropped | repair |
@@ -42,7 +42,7 @@ different. A *repair* changes or drops something, safely, and is reported; `stri
 | `ranks` | checkpoints of gsplat: whether the splats of one GPU or of several are read | note |
 | `zip-names` | backslashes or capitals in the names of a SOG's zip or in its list of files | note |
 | `other-scenes` | scenes beside the one that is read: of a SOG's zip, or of glTF without a default scene | note |
-| `double-means` | positions in double precision: an origin carries what float32 cannot | note |
+| `double-means` | positions in doubles or integers: an origin carries what float32 cannot | note |
 | `non-ascii-header` | characters outside ASCII in the header: read as question marks | note |
 | `zero-rows` | splats of .splat and .ksplat whose bytes are all 0: kept | note |
 | `empty` | no splats at all | note |
@@ -92,6 +92,7 @@ _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _OPACITY = "opacity"
 _FILTER = "filter_3D"
 _REST = re.compile(r"f_rest_(0|[1-9][0-9]*)")
+_ZEROS = re.compile(r"\Af_rest_0+(?=[0-9])")
 
 #: Prefix of CloudCompare's scalar fields (PlyFilter.cpp), and the one that 3dgsconverter, which prepares files for
 #: it, before that.
@@ -208,7 +209,11 @@ def find_columns(
     if integers := _integers(dtype, (coefficients, rest, opacity, scales, quats)):
         findings.append(integers)
     normals = names.find(_NORMALS) if names.has(_NORMALS) else ()
-    filter_3d = "" if flat else names.find((_FILTER,))[0]
+    filter_3d = names.find((_FILTER,))[0]
+    if flat and filter_3d:
+        text = f"{filter_3d} is the 3D filter of Mip-Splatting, which is not defined for discs: it is not fused"
+        findings.append(Finding("filter-3d", 1, text, "note"))
+        filter_3d = ""
     findings += names.findings()
     if not all(finding.repairable for finding in findings):
         return None, findings
@@ -333,8 +338,8 @@ def float_columns(names: Sequence[str]) -> list[str]:
 
 
 def plain_name(name: str) -> str:
-    """Return a column's name in small letters, without the prefix of another program."""
-    return _PREFIXES.sub("", name.lower(), count=1)
+    """Return a column's name in small letters, without the prefix of another program and zeros before a number."""
+    return _ZEROS.sub("f_rest_", _PREFIXES.sub("", name.lower(), count=1))
 
 
 def _absence(names: _Names, missing: Sequence[str], elements: Sequence[str]) -> str:

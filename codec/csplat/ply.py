@@ -160,7 +160,7 @@ def _surveyed(path: Path, opened: _Opened, findings: list[Finding]) -> _Survey:
     if not columns.double:
         return _Survey(total, thinnest, None)
     placed = relative_to_origin(np.concatenate([np.zeros((0, 3)), *positions]), opened.facts)
-    findings.append(_doubles_finding(total, placed[1]))
+    findings.append(_doubles_finding(opened, total, placed[1]))
     return _Survey(total, thinnest, placed)
 
 
@@ -234,12 +234,13 @@ def _load(
         findings.append(_EMPTY)
     placed = relative_to_origin(arrays.means, opened.facts)
     if columns.double:
-        findings.append(_doubles_finding(len(arrays.means), placed[1]))
+        findings.append(_doubles_finding(opened, len(arrays.means), placed[1]))
     return _model(arrays, placed, opened)
 
 
-def _doubles_finding(count: int, origin: tuple[float, float, float]) -> Finding:
-    text = f"positions are in doubles: {count} means are float32 relative to {origin}"
+def _doubles_finding(opened: _Opened, count: int, origin: tuple[float, float, float]) -> Finding:
+    is_float = all(opened.rows.dtype[name].kind == "f" for name in opened.columns.means)
+    text = f"positions are {'in doubles' if is_float else 'integers'}: {count} means are float32 relative to {origin}"
     return Finding("double-means", count, text, "note")
 
 

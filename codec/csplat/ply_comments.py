@@ -20,7 +20,7 @@ __all__ = ["SceneFacts", "format_comments", "parse_comments"]
 _PREFIX = "csplat"
 _SHOWN = 80  # characters of a comment in a message
 #: ns-export of nerfstudio names the axis that points up; Brush writes the same for every scene, whatever is up in it.
-_VERTICAL_AXIS = re.compile(r"vertical axis:\s*([+-]?)([xyz])", re.IGNORECASE)
+_VERTICAL_AXIS = re.compile(r"vertical axis\s*:\s*([+-]?)([xyz])", re.IGNORECASE)
 _SAYS_NOTHING = "exported from brush"
 #: Words of Brush and splat-transform for `antialiased` (mip) and `flat` (2dgs). Postshot has the former, in lower case.
 _MODES: dict[tuple[str, ...], str] = {
