@@ -168,8 +168,9 @@ def look_at(arrays: Arrays, scale_count: int, counts: Counts) -> None:
     columns = Columns((), ("",) * scale_count, (), (), (), "", (), (), double=False)
     for start in range(0, len(arrays.means), _LOOKED_AT):
         part = _part(arrays, slice(start, start + _LOOKED_AT))
-        copies = (one.copy() for one in (part.means, part.quats, part.scales, part.opacities, part.sh0, part.shN))
-        _repair(Arrays(*copies), columns, counts, None)
+        means, quats, scales = part.means.copy(), part.quats.copy(), part.scales.copy()
+        copy = Arrays(means, quats, scales, part.opacities.copy(), part.sh0.copy(), part.shN.copy())
+        _repair(copy, columns, counts, None)
 
 
 def with_half_floats(rows: Rows, findings: list[Finding]) -> Rows:
@@ -232,7 +233,7 @@ def _are_sane(rows: Rows, halves: set[str], *, alone: bool) -> bool:
     # Integers that are read as half floats are of all sizes, from tiny to large, along all axes.
     if np.median(most / np.maximum(middle, _TINY)) > _MOST_RATIO:
         return False
-    return math.exp(min(_HUGE_LOG, float(np.median(scales)))) <= most.max() * 2.0
+    return math.exp(min(_HUGE_LOG, float(np.median(scales)))) <= 2.0 * float(most.max())
 
 
 def with_colour_range(blocks: Iterable[Rows], columns: Columns, findings: list[Finding]) -> Columns:
