@@ -144,7 +144,6 @@ def test_bands_above_those_asked_for_are_left_out(tmp_path, degree):
         (SMALL.replace(b"ply\nformat", b"PLY\nFORMAT").replace(b"end_h", b"END_H"), ["unusual-header"]),
         (SMALL.replace(b"\n", b"\r", SMALL.partition(b"end_header\n")[0].count(b"\n") + 1), []),
         (SMALL + SMALL, ["trailing-bytes"]),
-        (built([[*ROW[:6], 1, 1, 1, 2, 2, 2, *ROW[12:]]], [WORD] * 20), ["scales-are-linear"]),
     ],
 )
 def test_what_is_unusual_is_read_and_told(tmp_path, data, found):

@@ -33,8 +33,8 @@ DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeErr
 _SCENES = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf", ".csplat", ".pt", ".ckpt", ".pth")
 #: Where they lie in the folder of a trainer's outputs: INRIA's, gsplat's, nerfstudio's.
 _PLACES = ("*", "iteration_*/*", "point_cloud/iteration_*/*", "ply/*", "ckpts/*", "nerfstudio_models/*")
-_POINTS = "input.ply"  # of INRIA's trainer: what it began with
-_NAMED = 5  # of them, that a message names
+_POINTS = "input.ply"  # the points that INRIA's trainer began with
+_NAMED = 5  # scenes that a message names, at most
 
 
 def scenes_of(names: Iterable[str]) -> list[str]:
@@ -128,7 +128,7 @@ def read_archive(path: str | Path, kind: str) -> Archive:
     with Path(path).open("rb") as stream:  # opened here: np.load leaves a damaged file open
         if instead := stand_in(stream.read(64)):
             raise InputError(f"{path} is {instead}")
-        if not zipfile.is_zipfile(stream):  # of others np.load says that they might be loaded unsafely
+        if not zipfile.is_zipfile(stream):  # np.load would call others unsafe to load
             nothing.refuse("it is no .npz file")
         stream.seek(0)
         try:

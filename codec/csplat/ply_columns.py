@@ -62,7 +62,7 @@ _FEW = 16  # splats: a property of fewer may be chance
 _TINY = 1e-30  # above 0
 _ROUNDING = 1e-3  # alphas may lie beyond 0 and 1 by that much
 _OF_A_BLOCK = 256  # splats of a block whose scales are compared with the scene's extent
-_LENGTHS_RATIO = 3.0  # of large and small scales that are lengths
+_LENGTHS_RATIO = 3.0  # 95th to 5th percentile of scales that are lengths, at least
 _BYTE_COLOUR = 4.0  # an f_dc beyond is brighter than white, 1.77, and may be a colour of 0 to 255
 
 
@@ -217,7 +217,7 @@ def _are_sane(rows: Rows, halves: set[str], *, alone: bool) -> bool:
     if bad > _BAD_SHARE * len(rows) * len(columns):
         return False
     named = {plain_name(name): rows[name].astype(np.float64) for name in rows.dtype.names or ()}
-    nothing = np.zeros(len(rows))  # of columns that are missing, which is refused later
+    nothing = np.zeros(len(rows))  # for missing columns, which are refused later
     scales = np.stack([named.get(f"scale_{axis}", nothing) for axis in range(2)])
     if not alone:
         quats = np.stack([named.get(f"rot_{axis}", nothing) for axis in range(4)])

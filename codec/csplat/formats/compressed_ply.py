@@ -22,7 +22,6 @@ from csplat.formats.format import Format
 from csplat.formats.packing import all_three, crossed, smallest_three
 from csplat.lint import Finding, too_many_bands, trailing_bytes
 from csplat.model import F32, MAX_SH_DEGREE, SplatModel
-from csplat.ply_columns import Counts, findings_of
 from csplat.ply_comments import format_comments, parse_comments
 from csplat.ply_header import read_header
 from csplat.scene import BLOCK, Scene
@@ -126,9 +125,7 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
             own = bounds[start // _CHUNK : -(-stop // _CHUNK)]
             yield replace(facts, **_unpacked(words, own, coefficients, kept))
 
-    scales = (float(bounds[:, 1, 0].min(initial=np.inf)), float(bounds[:, 1, 1].max(initial=-np.inf)))
-    findings += [*said.findings, *findings_of(Counts(scales=scales), vertex.count)]
-    yield Scene(vertex.count, facts, blocks, findings)
+    yield Scene(vertex.count, facts, blocks, [*findings, *said.findings])
 
 
 def _header(path: Path) -> tuple[dict[str, _Element], list[str], list[Finding]]:

@@ -346,7 +346,7 @@ def opened(path: Path) -> GltfFile:
     data = memoryview(mapped(path))
     text, binary, tail = _chunks(path, data) if data[:4] == MAGIC else (data, None, 0)
     try:
-        root = json.loads(bytes(text))  # of UTF-8, with a mark or without, or UTF-16
+        root = json.loads(bytes(text))  # UTF-8, with or without a mark, or UTF-16
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path.name}: its JSON cannot be read: {error}") from None
     if not isinstance(root, dict) or not isinstance(root.get("asset"), dict):

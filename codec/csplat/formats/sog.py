@@ -17,7 +17,6 @@ from csplat.formats.sog_read import COEFFICIENTS, Pictures, Unit, degree_of, uni
 from csplat.formats.sog_write import write_sog
 from csplat.lint import Finding
 from csplat.model import SplatModel
-from csplat.ply_columns import Counts, findings_of
 from csplat.scene import Scene
 
 __all__ = ["FORMAT"]
@@ -61,8 +60,7 @@ def _scene(path: Path, parts: Parts, name: str, level: int) -> Scene:
         for arrays in pictures.blocks(degree):
             yield replace(facts, **arrays)
 
-    linear = findings_of(Counts(scales=(float(np.nanmin(unit.scales)), float(np.nanmax(unit.scales)))), unit.count)
-    return Scene(unit.count, facts, blocks, [*parts.findings, *linear, *_findings(pictures)])
+    return Scene(unit.count, facts, blocks, [*parts.findings, *_findings(pictures)])
 
 
 def _facts(degree: int, *, antialiased: bool, flat: bool) -> SplatModel:

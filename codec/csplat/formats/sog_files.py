@@ -93,7 +93,11 @@ def _in_small_letters(name: str) -> str:
     return with_slashes(name).casefold()
 
 
-_SAME: tuple[Callable[[str], str], ...] = (str, with_slashes, _in_small_letters)  # of names that are alike
+_SAME: tuple[Callable[[str], str], ...] = (
+    str,
+    with_slashes,
+    _in_small_letters,
+)  # keys by which names count as the same
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ def _doubt(path: Path) -> str:
     lengths = np.linalg.norm(np.subtract(sample["quats"], _QUAT_ZERO, dtype=np.float32), axis=1)
     turned = lengths < _LONGEST_QUAT
     of_two_signs = (sample["scales"] < 0).any(axis=1) & (sample["scales"] > 0).any(axis=1)  # neither lengths nor logs
-    finite = np.isfinite(far)  # of others a finding tells
+    finite = np.isfinite(far)  # a finding reports the others
     good = ~finite | (placed & turned & ~of_two_signs)
     if 2 * np.count_nonzero(~good) <= np.count_nonzero(finite):
         return ""

@@ -25,7 +25,6 @@ from csplat.formats.format import Format
 from csplat.formats.packing import all_three, smallest_three
 from csplat.formats.spz_file import ANTIALIASED, AXES, MOST_BITS, Packed, read_packed, write_packed
 from csplat.model import F32, SplatModel, normalise_quats
-from csplat.ply_columns import Counts, findings_of
 from csplat.scene import BLOCK, Scene
 from csplat.turning import in_axes
 
@@ -38,7 +37,6 @@ _PART = np.sqrt(np.float32(0.5)) / np.float32(511)  # step of a component of a r
 _LARGEST_POSITION = (1 << 23) - 1
 _USUAL_BITS = 12
 _STEPS = 32  # of positions, in the median of the standard deviations
-_HALF_A_STEP = 1 / 32  # of logarithms of scales: what is above 0 may have the code of 0
 _SH_STEP = 4  # of 256 levels
 
 
@@ -52,10 +50,7 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
         for start in range(0, packed.count, BLOCK):
             yield decoded(packed, slice(start, start + BLOCK), degree)
 
-    codes = packed.parts[3]
-    least, most = (float(code) / 16 - 10 for code in (codes.min(initial=255), codes.max(initial=0)))
-    findings = packed.findings + findings_of(Counts(scales=(least + _HALF_A_STEP, most)), packed.count)
-    yield Scene(packed.count, decoded(packed, slice(0, 0), degree), blocks, findings)
+    yield Scene(packed.count, decoded(packed, slice(0, 0), degree), blocks, packed.findings)
 
 
 def write_spz(path: Path, scene: Scene, *, version: int) -> None:
