@@ -99,6 +99,7 @@ OTHER_PROGRAMS = [
     "integer-columns",
     "opacities-are-alphas",
     "rgb-colours",
+    "scales-are-linear",
     "second-columns",
     "sh-bands",
     "sharp-elements",
