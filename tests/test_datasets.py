@@ -403,6 +403,18 @@ def test_numbers_beyond_float64_are_refused_in_a_line(ngp):
         load(ngp)
 
 
+def test_names_with_control_characters_are_refused(ngp):
+    frames = json.loads((ngp / "transforms.json").read_text())["frames"]
+    change_transforms(ngp, frames=[{**frames[0], "file_path": "a\nb.png"}])
+    with pytest.raises(InputError, match="frame 0: file_path holds control characters"):
+        load(ngp)
+    write_colmap(ngp / "model", cameras(2))
+    file = ngp / "model" / "images.bin"
+    file.write_bytes(file.read_bytes().replace(b"im 001", b"im\n001"))
+    with pytest.raises(InputError, match="the name at byte .* holds control characters"):
+        read_images(file)
+
+
 def test_a_last_row_may_be_rounded(ngp):
     frames = json.loads((ngp / "transforms.json").read_text())["frames"]
     frames[3]["transform_matrix"][3] = [0.0, -1e-17, 0.0, 1.0000001]

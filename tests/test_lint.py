@@ -794,6 +794,15 @@ def test_what_is_said_of_no_splats_is_looked_at_too(path):
         lint_ply(path)
 
 
+def test_an_integer_beyond_its_type_is_refused_in_rows_of_other_spelling(tmp_path):
+    columns = "".join(f"property uchar {name}\n" for name in ("label", "other"))
+    (tmp_path / "a.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 2\n{columns}end_header\n\n1 2\n{10**30} 2\n"
+    )
+    with pytest.raises(InputError, match=r"a\.ply"):
+        read_ply(tmp_path / "a.ply")
+
+
 def test_an_element_without_properties_is_refused(tmp_path):
     (tmp_path / "a.ply").write_text("ply\nformat ascii 1.0\nelement face 1\nend_header\n1\n")
     with pytest.raises(InputError, match="face"):

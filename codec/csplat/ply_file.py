@@ -68,11 +68,12 @@ def parse(path: Path, findings: list[Finding]) -> Content | None:
     quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
     with _open(path, header) as stream, np.errstate(over="ignore"), quiet:
         try:
-            parsed = plyfile.PlyData.read(stream)
-            end = None if parsed.text else stream.tell()
-            findings += _trailing_findings(path, header, end, sum(element.count for element in parsed))
-        except plyfile.PlyElementParseError as error:
-            parsed = _read_again(path, header, findings, error)
+            try:
+                parsed = plyfile.PlyData.read(stream)
+                end = None if parsed.text else stream.tell()
+                findings += _trailing_findings(path, header, end, sum(element.count for element in parsed))
+            except plyfile.PlyElementParseError as error:
+                parsed = _read_again(path, header, findings, error)
         except (plyfile.PlyParseError, ValueError, OverflowError, MemoryError) as error:
             raise InputError(f"{path.name}: {error or type(error).__name__}") from None
     if parsed is None:

@@ -219,6 +219,8 @@ class _Bytes:
         if end < 0:
             raise InputError(f"{self._path} ends within a name at byte {self._at}")
         name = self._data[self._at : end]
+        if any(byte < ord(" ") for byte in name):
+            raise InputError(f"{self._path}: the name at byte {self._at} holds control characters")
         self._at = end + 1
         try:
             return name.decode("utf-8")

@@ -161,6 +161,8 @@ def _frames(document: Mapping[str, Any], field: str, path: Path, report: list[st
         if not isinstance(frame, Mapping) or not isinstance(frame.get("file_path"), str):
             raise InputError(f"{path}, frame {number} has no file_path")
         name = frame["file_path"]
+        if any(character < " " for character in name):
+            raise InputError(f"{path}, frame {number}: file_path holds control characters")
         key = PurePosixPath(name).as_posix()
         if frame.get("is_bad") is True:
             bad.append(name)
