@@ -411,7 +411,7 @@ def test_names_with_control_characters_are_refused(ngp):
     write_colmap(ngp / "model", cameras(2))
     file = ngp / "model" / "images.bin"
     file.write_bytes(file.read_bytes().replace(b"im 001", b"im\n001"))
-    with pytest.raises(InputError, match="the name at byte .* holds control characters"):
+    with pytest.raises(InputError, match=r"the name at byte .* holds control characters"):
         read_images(file)
 
 
