@@ -79,7 +79,7 @@ def test_axes_there_and_back_are_the_same_bits(make_model, degree):
         assert all(getattr(model, name).tobytes() == getattr(back, name).tobytes() for name in exact)
         assert np.abs(model.shN - back.shN).max(initial=0.0) < 2e-6
         assert model.origin == back.origin
-    for matrix in (ANY, -ANY):  # of a rotation's two quaternions, the original one
+    for matrix in (ANY, -ANY):  # a rotation has two quaternions; the original one comes back
         assert np.abs(model.quats - turned(turned(model, matrix), matrix.T).quats).max() < 1e-6
 
 

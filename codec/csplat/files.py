@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import json
 import os
 import shutil
 import threading
@@ -20,7 +21,16 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.inputs import File, stand_in
 
-__all__ = ["BinaryWriter", "atomic_writer", "check_room", "local_file", "opened_for_writing", "read_array", "read_text"]
+__all__ = [
+    "BinaryWriter",
+    "atomic_writer",
+    "check_room",
+    "local_file",
+    "opened_for_writing",
+    "read_array",
+    "read_json",
+    "read_text",
+]
 
 _PART_SIZE = 1 << 20
 _MB = 1e6
@@ -74,6 +84,21 @@ def read_text(path: str | os.PathLike[str]) -> str:
             f"{os.fspath(path)} is not a text file in UTF-8 (byte {text.index(chr(0))} is 0): save it as UTF-8"
         )
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """Read a JSON file, in the encodings of `read_text`.
+
+    Args:
+        path: the file.
+
+    Raises:
+        InputError: the file cannot be read, or is not JSON.
+    """
+    try:
+        return json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{os.fspath(path)} is not a JSON file: {error}") from error
 
 
 def check_room(folder: str | os.PathLike[str], wanted_bytes: int, what: str) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
-from csplat.files import read_text
+from csplat.files import read_json
 from csplat_render.camera import DEFAULT_NEAR, Camera
 from csplat_render.camera_forms import check_intrinsics, foreign_cameras
 
@@ -62,10 +62,7 @@ def load_cameras(
         InputError: the file is absent, is not JSON, or holds something else than cameras.
     """
     path, report = Path(path), [] if report is None else report
-    try:
-        entries = json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not a JSON file: {error}") from error
+    entries = read_json(path)
     cameras = foreign_cameras(entries, str(path), report)
     if cameras is None:
         cameras = _own_cameras(entries, path)

@@ -34,7 +34,7 @@ U32 = NDArray[np.uint32]
 _CHUNK = 256  # splats that share bounds
 _SH_C0 = 0.28209479177387814
 _LARGEST_LOG = 20.0  # log scales beyond are no splat's, and would take all steps of their chunk
-_LARGEST_BOUND = 9e37  # of a colour; its coefficient is 3.5 times that, and float32 ends at 3.4e38
+_LARGEST_BOUND = 9e37  # largest colour; its coefficient is 3.5 times that, and float32 ends at 3.4e38
 _BANDS = (9, 24, 45, 72)  # columns of SH, of degrees 1 to 4
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",

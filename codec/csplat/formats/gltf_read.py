@@ -50,7 +50,7 @@ _SPZ = (
     "KHR_spz_gaussian_splats_compression",
     "KHR_spz_compression",
 )
-_WROTE_LOGS = re.compile(r"splat-transform v?([01]\.|2\.[0-3](\.|$))")  # its issue 267, pull request 268
+_WROTE_LOGS = re.compile(r"splat-transform v?([01]\.|2\.[0-3](\.|$))")  # mended in its pull request 268
 #: Extensions of primitives that do not affect splats: materials, and numbers of features.
 _HARMLESS = {"KHR_materials_variants", "EXT_mesh_features", "EXT_structural_metadata", "KHR_mesh_quantization"}
 _THINNEST = np.float32(np.finfo(np.float32).tiny)  # value that a scale of 0 is read as: its logarithm is finite

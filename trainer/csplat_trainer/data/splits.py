@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Container, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 from csplat.errors import InputError, counted
-from csplat.files import read_text
+from csplat.files import read_json, read_text
 from csplat_trainer.data.dataset import Shot
 from csplat_trainer.data.image_files import match_names, plain, shown
 
@@ -45,10 +44,7 @@ def lists_next_to(folders: Sequence[Path]) -> tuple[dict[str, list[str]], str]:
 
 
 def _json_lists(path: Path) -> dict[str, list[str]]:
-    try:
-        document = json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not a JSON file: {error}") from error
+    document = read_json(path)
     lists = {role: document.get(role) for role in ROLES} if isinstance(document, dict) else {}
     found = {role: names for role, names in lists.items() if isinstance(names, list)}
     if not found or not all(isinstance(name, str) for names in found.values() for name in names):

@@ -5,7 +5,6 @@ Both hold camera-to-world matrices with OpenGL axes: x to the right, y up, z bac
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
-from csplat.files import read_text
+from csplat.files import read_json
 from csplat_render.camera_forms import (
     PERSPECTIVES,
     finite_number,
@@ -53,15 +52,16 @@ def read_blender(folder: Path, images: str | None = None) -> Found:
         InputError: a file is not what it is called, or no image is there.
     """
     report: list[str] = []
-    train = _shots(folder / "transforms_train.json", images, report)
+    train_path = folder / "transforms_train.json"
+    train = _shots(_load(train_path), train_path, images, report)
     test_path = folder / "transforms_test.json"
     if test_path.is_file():
-        test = _shots(test_path, images, report, needed=False)
+        test = _shots(_load(test_path), test_path, images, report, needed=False)
     else:
         test = []
         report.append("there is no transforms_test.json: no test images")
     val_path = folder / "transforms_val.json"
-    val = _shots(val_path, images, report, needed=False) if val_path.is_file() else []
+    val = _shots(_load(val_path), val_path, images, report, needed=False) if val_path.is_file() else []
     _check_distinct([*train, *test, *val], folder)
     points, colours = _points_next_to(train, folder, report)
     return Found("Blender set", train, test, points, colours, report, coordinate_system=_BLENDER_AXES, val=val)
@@ -79,10 +79,10 @@ def read_transforms(path: Path, test_every: int, images: str | None = None) -> F
         InputError: the file is not what it is called, or no image is there.
     """
     document, report = _load(path), list[str]()
-    shots = _shots(path, images, report)
+    shots = _shots(document, path, images, report)
     points, colours = _points(document, shots, path, report)
     if "test_frames" in document:  # ScanNet++
-        test = _shots(path, images, report, key="test_frames", needed=False)
+        test = _shots(document, path, images, report, key="test_frames", needed=False)
         return Found("transforms.json set", shots, test, points, colours, report)
     lists = {role: names for role in ROLES if (names := _listed(document, f"{role}_filenames", path))}
     files = path.name
@@ -120,10 +120,16 @@ class _Frame:
 
 
 def _shots(
-    path: Path, images: str | None, report: list[str], *, key: str = "frames", needed: bool = True
+    document: Mapping[str, Any],
+    path: Path,
+    images: str | None,
+    report: list[str],
+    *,
+    key: str = "frames",
+    needed: bool = True,
 ) -> list[Shot]:
-    """Read the frames of one file, but for those without an image or a pose; if needed, one at least is there."""
-    document, folder = _load(path), path.parent
+    """Read the frames of a file's document, without those that lack an image or a pose; if needed, one at least."""
+    folder = path.parent
     frames = _frames(document, key, path, report, needed=needed)
     names = [frame.name for frame in frames]
     try:
@@ -281,10 +287,7 @@ def _plain(name: str, image: Path) -> str:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not a JSON file: {error}") from error
+    document = read_json(path)
     if not isinstance(document, dict):
         raise InputError(f"{path} is not a set of posed images: expected an object with frames")
     return document
