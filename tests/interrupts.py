@@ -2,8 +2,6 @@
 
 import signal
 
-__all__ = ["heed_interrupts"]
-
 
 def heed_interrupts():
     """Make a child process heed SIGINT, also when the tests run in the background of a shell, which ignores it."""

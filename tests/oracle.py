@@ -14,24 +14,6 @@ from csplat_render.arrays import Gradients, HasSplats, RenderResult, Splats
 from csplat_render.rasterise import Rasteriser
 from csplat_render.twin import Decisions, render_exact
 
-__all__ = [
-    "GROUPS",
-    "VIEW",
-    "Case",
-    "Difference",
-    "adversarial",
-    "cropped",
-    "difference",
-    "extreme_splats",
-    "facing",
-    "finite_differences",
-    "float32_errors",
-    "gradients_of",
-    "random_gradients",
-    "random_splats",
-    "relative_error",
-]
-
 Array = NDArray[Any]
 Arrays = dict[str, Array]
 

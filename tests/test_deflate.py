@@ -8,8 +8,8 @@ from tables import failures
 
 from csplat_conformance.deflate import Deflate, deflate_dynamic, deflate_fixed, deflate_stored
 from csplat_conformance.recipes.deflate_streams import broken_streams, sound_streams
-from csplat_conformance.validator.coders import CodedError, uncoded
-from csplat_conformance.validator.inflate import Inflater
+from csplat_conformance.validator.coders import uncoded
+from csplat_conformance.validator.inflate import CodedError, Inflater
 
 DEFLATE = 1
 SIZE = 2000

@@ -29,8 +29,9 @@ from csplat.decoder import read_options, read_stated_errors
 from csplat.encoder import Draft
 from csplat.errors import InputError
 from csplat_render import render
+from csplat_render.arrays import Splats
 from csplat_render.cameras import save_cameras
-from csplat_render.rasterise import Rasteriser, Splats
+from csplat_render.rasterise import Rasteriser
 from csplat_tools.cli.app import app
 from csplat_tools.cli.finetune import finetune as finetune_command
 from csplat_tools.optimise.simplify import SimplifyOptions

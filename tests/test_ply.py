@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from csplat import decode, encode
 from csplat.errors import InputError
-from csplat.ply import read_ply, write_ply
+from csplat.ply import read_ply
 from csplat.ply_columns import LOGIT_OF_0, LOGIT_OF_1, alpha_of_logits, logits_of_alpha
+from csplat.ply_write import write_ply
 from csplat.training import TrainedOn
 
 ARRAYS = ("means", "quats", "scales", "sh0", "shN")

@@ -11,7 +11,8 @@ from oracle import extreme_splats, facing
 
 from csplat.errors import LimitError
 from csplat_render import rasterise, render
-from csplat_render.rasterise import Rasteriser, Splats
+from csplat_render.arrays import Splats
+from csplat_render.rasterise import Rasteriser
 from csplat_render.warmup import warm_up
 
 pytestmark = pytest.mark.area(name="rasteriser")

@@ -16,9 +16,10 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render import Camera, render
+from csplat_render.arrays import Splats
 from csplat_render.conventions import ALPHA_CAP, DILATION
 from csplat_render.harmonics import SH_C0
-from csplat_render.rasterise import Rasteriser, Splats
+from csplat_render.rasterise import Rasteriser
 from csplat_render.twin import render_exact
 
 

@@ -24,7 +24,8 @@ from oracle import (
 
 from csplat.ply import read_ply
 from csplat_render import Camera
-from csplat_render.rasterise import Rasteriser, Splats
+from csplat_render.arrays import Splats
+from csplat_render.rasterise import Rasteriser
 from csplat_render.virtual import virtual_cameras
 
 pytestmark = pytest.mark.area(name="rasteriser")

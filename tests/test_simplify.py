@@ -15,7 +15,8 @@ from captures import views_of
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.ply import read_ply, write_ply
+from csplat.ply import read_ply
+from csplat.ply_write import write_ply
 from csplat_render.cameras import save_cameras
 from csplat_render.cloud import sample_cloud
 from csplat_render.judge import Judge, renderer

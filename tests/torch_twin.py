@@ -23,8 +23,6 @@ from csplat_render.conventions import (
 from csplat_render.harmonics import sh_basis
 from csplat_render.jit import python
 
-__all__ = ["autograd_gradients", "render_torch"]
-
 Array = NDArray[Any]
 Tensor = torch.Tensor
 

@@ -39,7 +39,8 @@ if TYPE_CHECKING:
     from csplat.merging import merge
     from csplat.model import SplatModel
     from csplat.opened import SplatFile, extract, open
-    from csplat.ply import lint_ply, read_ply, write_ply
+    from csplat.ply import lint_ply, read_ply
+    from csplat.ply_write import write_ply
     from csplat.upright import with_up
 
 __version__ = "0.1.0"
@@ -130,6 +131,6 @@ _MODULE_OF = {
     "to_gsplat": "csplat.bridges",
     "with_up": "csplat.upright",
     "write": "csplat.formats",
-    "write_ply": "csplat.ply",
+    "write_ply": "csplat.ply_write",
 }
 __getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)

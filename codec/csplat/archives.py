@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.inputs import stand_in
 
-__all__ = ["DAMAGED", "Archive", "folder_refusal", "read_archive", "scenes_of", "zip_refusal"]
-
 #: What NumPy and zipfile raise of damage: RuntimeError is for passwords and unknown ways to compress, MemoryError for
 #: sizes that no array has, OSError for places outside the file and broken bz2.
 DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError,

@@ -6,15 +6,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.decoder.header import SceneHeader, Tile
 from csplat.errors import InputError
-
-__all__ = ["tile_boxes", "touching"]
-
-F64 = NDArray[np.float64]
+from csplat.types import F64
 
 
 def tile_boxes(header: SceneHeader) -> F64:

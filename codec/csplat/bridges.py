@@ -23,13 +23,13 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, overload
 import numpy as np
 
 from csplat.errors import InputError
-from csplat.model import F32, SplatModel, check_model, normalise_quats
+from csplat.model import SplatModel, check_model, normalise_quats
 from csplat.ply_columns import alpha_of_logits, logits_of_alpha
+from csplat.types import F32
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["Form", "from_gsplat", "to_gsplat"]
 
 Form = Literal["parameters", "activated"]
 

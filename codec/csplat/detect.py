@@ -18,8 +18,6 @@ from csplat.archives import folder_refusal, zip_refusal
 from csplat.errors import InputError
 from csplat.inputs import stand_in
 
-__all__ = ["HEAD_SIZE", "KINDS", "Kind", "by_content", "by_name", "head_of", "is_ply", "refusal"]
-
 #: Bytes of the beginning of a file that are looked at.
 HEAD_SIZE = 512
 

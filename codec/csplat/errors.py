@@ -13,17 +13,6 @@ Every error has a `code`, a short constant string that programs may compare.
 
 from __future__ import annotations
 
-__all__ = [
-    "CsplatError",
-    "FormatError",
-    "InputError",
-    "LimitError",
-    "StoreError",
-    "UnsupportedError",
-    "counted",
-    "missing",
-]
-
 
 class CsplatError(Exception):
     """Base of every error that csplat raises on purpose.

@@ -21,17 +21,6 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.inputs import File, stand_in
 
-__all__ = [
-    "BinaryWriter",
-    "atomic_writer",
-    "check_room",
-    "local_file",
-    "opened_for_writing",
-    "read_array",
-    "read_json",
-    "read_text",
-]
-
 _PART_SIZE = 1 << 20
 _MB = 1e6
 

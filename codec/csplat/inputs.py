@@ -9,8 +9,6 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Protocol
 
-__all__ = ["BinaryFile", "Buffer", "File", "LetGo", "mapped", "stand_in"]
-
 _LFS = "Git LFS, not the file itself: run `git lfs pull`"
 #: By how they begin, files that stand for others in a repository, of what, and what helps.
 _POINTERS = {

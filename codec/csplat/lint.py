@@ -69,19 +69,6 @@ import numpy as np
 from csplat.errors import InputError, counted
 from csplat.model import MAX_SH_DEGREE
 
-__all__ = [
-    "Columns",
-    "Finding",
-    "colour_finding",
-    "dropped_columns",
-    "find_columns",
-    "float_columns",
-    "plain_name",
-    "refuse",
-    "too_many_bands",
-    "trailing_bytes",
-]
-
 Kind = Literal["note", "repair", "error"]
 
 _MEANS = ("x", "y", "z")

@@ -7,8 +7,6 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-__all__ = ["available_bytes", "default_bytes"]
-
 _SHARE = 0.5  # share of the free memory: other programs need some, too
 _UNKNOWN = 4 << 30  # bytes, if the system does not report it
 _LIMITS = (

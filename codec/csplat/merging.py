@@ -30,8 +30,6 @@ from csplat.parts import scene_fields
 from csplat.renumbering import Books, Spool, renumbered
 from csplat.scene import Scene
 
-__all__ = ["Merged", "merge"]
-
 #: Fields that must be equal, because they determine how all splats of a file are shown: words for each, and its name.
 _FACTS = (
     ("axes", "coordinate_system"),

@@ -16,22 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-
-__all__ = [
-    "F32",
-    "MAX_SH_DEGREE",
-    "QUAT_LENGTH_TOLERANCE",
-    "UNSPECIFIED",
-    "SplatModel",
-    "check_axes",
-    "check_model",
-    "check_sh_degree",
-    "normalise_quats",
-    "sh_degree_of",
-]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from csplat.types import F32, F64
 
 #: Highest spherical-harmonics degree of a model.
 MAX_SH_DEGREE = 3

@@ -36,8 +36,6 @@ from csplat.parts import Part, write_part
 from csplat.remote import store_of
 from csplat.stores import Store, Window
 
-__all__ = ["SplatFile", "extract", "open"]
-
 
 class SplatFile:
     """A `.csplat` file of which parts are read. `csplat.open` makes it; it is a context manager.

@@ -15,8 +15,6 @@ from csplat.encoder.container import CodebookTable, FileChunk, FileTile, Later, 
 from csplat.files import BinaryWriter, opened_for_writing
 from csplat.stores import Window
 
-__all__ = ["InTurn", "Part", "TileCopies", "chunk_payload", "scene_fields", "write_part"]
-
 #: Chunks of a whole file that are as true of a part: not what an encoder states of errors and of its work.
 _KEPT = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
 _TILE_FLAGS = sum(getattr(_spec, f"CHUNK_FLAG_{name.upper()}") for name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])

@@ -23,15 +23,13 @@ import numpy as np
 from csplat.files import local_file
 from csplat.inputs import File
 from csplat.lint import Columns, Finding, find_columns, refuse
-from csplat.model import F32, SplatModel, check_sh_degree
-from csplat.ply_columns import F64, Arrays, Counts, Rows, findings_of, gather, with_colour_range, with_half_floats
+from csplat.model import SplatModel, check_sh_degree
+from csplat.ply_columns import Arrays, Counts, Rows, findings_of, gather, with_colour_range, with_half_floats
 from csplat.ply_comments import SceneFacts, parse_comments
 from csplat.ply_file import blocks_of, parse
 from csplat.ply_origin import relative_to_origin
-from csplat.ply_write import write_ply
 from csplat.scene import BLOCK, Scene
-
-__all__ = ["lint_ply", "open_ply", "read_ply", "write_ply"]
+from csplat.types import F32, F64
 
 _EMPTY = Finding("empty", 0, "the file holds no splats", "note")
 

@@ -17,24 +17,9 @@ from numpy.typing import NDArray
 
 from csplat.errors import counted
 from csplat.lint import Columns, Finding, colour_finding, float_columns, plain_name
-from csplat.model import F32, QUAT_LENGTH_TOLERANCE, normalise_quats
+from csplat.model import QUAT_LENGTH_TOLERANCE, normalise_quats
+from csplat.types import F32, F64
 
-__all__ = [
-    "SH_C0",
-    "Arrays",
-    "Counts",
-    "alpha_of_logits",
-    "findings_of",
-    "gather",
-    "huge_rows",
-    "logits_of_alpha",
-    "look_at",
-    "thickness_of",
-    "with_colour_range",
-    "with_half_floats",
-]
-
-F64 = NDArray[np.float64]
 Rows = NDArray[Any]  # one block of the file: 1-D, structured, contiguous
 
 #: The basis function of SH degree 0.

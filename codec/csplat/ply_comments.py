@@ -15,8 +15,6 @@ from csplat.model import UNSPECIFIED, SplatModel
 from csplat.training import TRAINING, VIEW, TrainedOn
 from csplat.upright import UP, unit_up, up_of
 
-__all__ = ["SceneFacts", "format_comments", "parse_comments"]
-
 _PREFIX = "csplat"
 _SHOWN = 80  # characters of a comment in a message
 #: ns-export of nerfstudio names the axis that points up; Brush writes the same for every scene, whatever is up in it.

@@ -21,8 +21,6 @@ from csplat.ply_columns import Rows
 from csplat.ply_header import ELEMENT, Header, read_header
 from csplat.ply_text import regular_rows
 
-__all__ = ["Content", "blocks_of", "parse"]
-
 _FRAME = "delta_vertex_"  # prefix of Brush's elements: differences of later frames from the first
 #: Elements of Apple's ml-sharp (gaussians.py): the camera of its image, and data that only its programs read.
 _SHARP = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space", "version"}

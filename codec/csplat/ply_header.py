@@ -14,8 +14,6 @@ from csplat.detect import KINDS, by_content, head_of, is_ply, refusal
 from csplat.errors import InputError, counted
 from csplat.lint import Finding
 
-__all__ = ["ELEMENT", "Element", "Header", "read_header"]
-
 #: The element that holds the splats.
 ELEMENT = "vertex"
 

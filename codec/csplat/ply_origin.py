@@ -7,11 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.model import F32
-from csplat.ply_columns import F64
 from csplat.ply_comments import SceneFacts
-
-__all__ = ["relative_to_origin"]
+from csplat.types import F32, F64
 
 #: float64 positions keep origin 0 while their centre is nearer than this many spreads: float32
 #: relative to 0 then is at most four bits coarser than relative to the centre.

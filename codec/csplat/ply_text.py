@@ -14,8 +14,6 @@ from csplat.errors import counted
 from csplat.lint import Finding
 from csplat.ply_header import Element
 
-__all__ = ["Rows", "regular_rows"]
-
 Rows = list[list[str]]
 
 _LINE_END = re.compile(r"\r\n|\r|\n")

@@ -15,8 +15,6 @@ from csplat.ply_columns import logits_of_alpha
 from csplat.ply_comments import format_comments
 from csplat.scene import Scene
 
-__all__ = ["write_ply", "write_scene_ply"]
-
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are put together at a time: they stay in the cache
 
 _PLY_TYPES = {

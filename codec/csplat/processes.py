@@ -12,8 +12,6 @@ from typing import Any, TypeVar
 
 from csplat.system import CAN_FORK
 
-__all__ = ["CAN_COPY", "each_apart"]
-
 Shared = TypeVar("Shared")
 Item = TypeVar("Item")
 Result = TypeVar("Result")

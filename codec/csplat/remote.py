@@ -15,8 +15,6 @@ from csplat.errors import InputError, StoreError, missing
 from csplat.inputs import File
 from csplat.stores import Disk, Memory, Store
 
-__all__ = ["is_url", "store_of"]
-
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(://|::)")
 #: File systems of servers that may send all of a file when a part is requested.
 _WEB = {"http", "https"}

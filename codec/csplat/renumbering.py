@@ -16,8 +16,6 @@ from csplat.encoder.container import CodebookTable, FileChunk, FileTile, Later, 
 from csplat.parts import InTurn, TileCopies, chunk_payload
 from csplat.stores import Window
 
-__all__ = ["Books", "Spool", "renumbered"]
-
 _ID_SIZE, _ID_MAX = 2, (1 << 16) - 1
 _ID_END = _spec.CODEBOOK_HEAD_OFFSETS["codebook_id"] + _ID_SIZE
 

@@ -17,8 +17,6 @@ from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import SplatModel
 
-__all__ = ["BLOCK", "Scene", "joined", "scene_of", "watched", "without_bands"]
-
 #: Splats of a block, at most.
 BLOCK = 65_536
 

@@ -15,8 +15,6 @@ from csplat.errors import CsplatError, FormatError, LimitError, StoreError
 from csplat.inputs import File
 from csplat.system import Pages, read_at
 
-__all__ = ["Disk", "Memory", "RequestSizes", "Store", "Window"]
-
 
 @dataclass(frozen=True)
 class RequestSizes:

@@ -17,20 +17,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-__all__ = [
-    "CAN_FORK",
-    "NEW_GROUP_FLAGS",
-    "Pages",
-    "core_count",
-    "interrupt_main_thread",
-    "interrupt_process",
-    "kill_group",
-    "locked_folder",
-    "read_at",
-    "read_into",
-    "split_words",
-]
-
 #: Whether a process can be copied with all of its memory. macOS can, but its system libraries do not survive it.
 CAN_FORK = sys.platform == "linux" and hasattr(os, "fork")
 

@@ -12,8 +12,6 @@ from typing import Any
 
 from csplat.errors import InputError
 
-__all__ = ["TRAINING", "VIEW", "TrainedOn"]
-
 #: Keys of the metadata for the training and the first view.
 TRAINING = "training"
 VIEW = "view"

@@ -15,14 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
-from csplat.model import F32, UNSPECIFIED, SplatModel, check_axes, normalise_quats, sh_degree_of
+from csplat.model import UNSPECIFIED, SplatModel, check_axes, normalise_quats, sh_degree_of
 from csplat.scene import Scene
 from csplat.training import VIEW
+from csplat.types import F32, F64
 from csplat.upright import UP, Direction, unit_up, up_of, up_of_axes
 
-__all__ = ["USUAL", "axes_rotation", "in_axes", "moved", "scaled", "sh_bands", "sphere_lattice", "stretched", "turned"]
-
-F64 = NDArray[np.float64]
 _Rows = TypeVar("_Rows", F32, F64)
 
 _OPPOSITE = dict(zip("RLUDFB", "LRDUBF", strict=True))

@@ -14,8 +14,6 @@ from typing import Any
 from csplat.errors import InputError
 from csplat.model import UNSPECIFIED, SplatModel
 
-__all__ = ["UP", "Direction", "unit_up", "up_of", "up_of_axes", "with_up"]
-
 Direction = tuple[float, float, float]
 
 #: The key of the metadata for the up direction.

@@ -26,7 +26,6 @@ from csplat_conformance.report import Status
 if TYPE_CHECKING:
     from csplat.decoder import Limits
 
-__all__ = ["answer", "main"]
 
 _FLOATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 

@@ -23,8 +23,6 @@ from csplat_conformance.manifest import Vector
 from csplat_conformance.near import too_far
 from csplat_conformance.report import Outcome, Status
 
-__all__ = ["LEVELS", "PARTS", "Answer", "FloatsOf", "judge", "level_name", "settle", "whole_number"]
-
 #: Levels that `judge` knows, and the parts of a manifest's expectation that each looks at.
 PARTS = {1: ("header",), 2: ("integers",), 3: ("floats", "extra")}
 LEVELS = (*PARTS, 4)

@@ -18,8 +18,6 @@ from csplat_conformance.broken import patched
 from csplat_conformance.builder import Built, build
 from csplat_conformance.samples import MEANS, SH0, Recipe, attributes, morton, rich_scene, rows_of, scene, sparse, tile
 
-__all__ = ["Case", "Rule", "boundary_recipes", "cases", "held"]
-
 Rule = Range | Choice | Mask
 
 #: The field that an error names in place of the one that is wrong.

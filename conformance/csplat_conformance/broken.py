@@ -12,8 +12,6 @@ from csplat_conformance.repair import repair
 from csplat_conformance.samples import Recipe, rich_scene, scene
 from csplat_conformance.scene import Scene
 
-__all__ = ["cut", "patched", "rich", "small", "swapped", "whole"]
-
 #: CHK-6: chunks whose payload a decoder may leave unread.
 _ANCILLARY = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
 

@@ -18,8 +18,6 @@ from csplat_conformance.reference import max_scale
 from csplat_conformance.repair import CHUNK_RECORDS, repair, seal
 from csplat_conformance.scene import Block, Chunk, Codebook, Scene, Stream, Tile, transpose
 
-__all__ = ["SIZED", "Built", "build", "chunk_names"]
-
 #: Structures whose sizes the index head states, in its order, by the names that `Scene.tails` has for them.
 SIZED: Final = {
     "head": "index_head",

@@ -7,8 +7,6 @@ from collections.abc import Collection
 
 from csplat.errors import InputError
 
-__all__ = ["matching"]
-
 
 def matching(patterns: str | None, names: Collection[str], what: str) -> set[str]:
     """Return the names that one of some patterns matches; all of them for None.

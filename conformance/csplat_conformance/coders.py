@@ -10,8 +10,6 @@ from itertools import groupby
 
 from csplat import _spec
 
-__all__ = ["apply_transforms", "to_bytes"]
-
 
 def to_bytes(values: Sequence[int], width: int) -> bytes:
     """Write integers little-endian, modulo 2^(8·width): what a sequence is when no byte transform follows."""

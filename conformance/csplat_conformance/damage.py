@@ -22,8 +22,6 @@ from pathlib import Path
 from csplat_conformance.repair import chunk_records, repair
 from csplat_conformance.validator import validate
 
-__all__ = ["Found", "flip", "flips", "prefixes"]
-
 _CLAUSES_SHOWN = 6
 
 

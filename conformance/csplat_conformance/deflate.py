@@ -6,8 +6,6 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import Self
 
-__all__ = ["END_OF_BLOCK", "Deflate", "deflate_dynamic", "deflate_fixed", "deflate_stored"]
-
 #: The literal/length symbol that ends a block.
 END_OF_BLOCK = 256
 

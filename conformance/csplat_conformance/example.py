@@ -11,8 +11,6 @@ from csplat_conformance.fields import Field
 from csplat_conformance.samples import MEANS, OPACITIES, QUATS, SCALES, SH0, axis, levels, offset, signed
 from csplat_conformance.scene import Attribute, Chunk, Scene, Stream, Tile
 
-__all__ = ["annex", "example_scene"]
-
 
 def example_scene() -> Scene:
     """Return two splats of SH degree 1: one round and opaque, one turned, long and faint."""

@@ -10,8 +10,6 @@ from typing import Any
 
 from csplat import _spec
 
-__all__ = ["Field", "Writer"]
-
 
 @dataclass(frozen=True)
 class Field:

@@ -17,8 +17,6 @@ from csplat import _spec
 from csplat_conformance.reference import expected
 from csplat_conformance.samples import Recipe
 
-__all__ = ["VECTORS", "Vector", "describe", "load", "picture_name", "summarise", "to_json"]
-
 #: Folder of the vectors and of manifest.json.
 VECTORS = Path(__file__).parent / "vectors"
 

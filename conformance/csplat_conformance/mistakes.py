@@ -15,8 +15,6 @@ from csplat import decoder
 from csplat_conformance.near import EXACT
 from csplat_conformance.report import Outcome
 
-__all__ = ["Caught", "Mistake", "Wrong", "method", "nothing", "replaced", "reworded"]
-
 #: Takes the right function, then its arguments.
 Wrong = Callable[..., Any]
 

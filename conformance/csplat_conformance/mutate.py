@@ -16,8 +16,6 @@ from csplat_conformance.deflate import deflate_fixed, deflate_stored
 from csplat_conformance.fields import Field, Writer
 from csplat_conformance.repair import repair
 
-__all__ = ["mapped", "mutant", "mutant_of"]
-
 _UNREPAIRED_SHARE = 0.1
 _CRC_SIZE = 4
 _PACKED_MAX = 2000

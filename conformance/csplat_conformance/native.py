@@ -15,8 +15,6 @@ from csplat_conformance.process import Ended
 from csplat_conformance.protocol import answered
 from csplat_conformance.serving import Served
 
-__all__ = ["ADAPTER", "SOURCES", "CDecoder", "c_folder", "compile_c", "missing_c"]
-
 ADAPTER = Path("tools", "adapter.c")
 SOURCES = ("csplat.c", "inflate.c")  # sources of the decoder, which then needs no library
 _MEMORY = 3_000_000  # kibibytes of address space: an allocation without bound fails at once

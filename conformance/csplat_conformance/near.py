@@ -7,8 +7,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CLASSES", "EXACT", "RENDERER", "too_far", "ulps_between"]
-
 #: The classes of decoders.
 CLASSES: Final = (EXACT := "exact", RENDERER := "renderer")
 

@@ -15,8 +15,6 @@ from csplat_conformance.answers import Answer, whole_number
 from csplat_conformance.report import Status
 from csplat_conformance.serving import Served
 
-__all__ = ["JsDecoder", "js_folder", "missing_javascript"]
-
 _ADAPTER = Path("test", "adapter.mjs")
 _HEAP_MB = 512
 

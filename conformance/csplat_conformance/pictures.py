@@ -7,13 +7,9 @@ import struct
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError
-
-__all__ = ["PSNR_CAP", "U8", "psnr", "read_png", "write_png"]
-
-U8 = NDArray[np.uint8]
+from csplat.types import U8
 
 #: Score of equal pictures, dB.
 PSNR_CAP = 99.0

@@ -25,8 +25,6 @@ from csplat.errors import InputError
 from csplat.system import kill_group, split_words
 from csplat_conformance.report import Status
 
-__all__ = ["Ended", "run_program", "split_command"]
-
 _OUTPUT_MAX = 1 << 20  # bytes of each stream that are kept: a program may print for ever
 _KILLED = 9  # SIGKILL, which Windows has no name for
 _WINDOWS_EXCEPTION = 0xC0000000  # least exit status of a Windows program that crashed; of others it is at most 255

@@ -20,8 +20,6 @@ from csplat_conformance.answers import Answer, whole_number
 from csplat_conformance.process import Ended, run_program
 from csplat_conformance.report import Status
 
-__all__ = ["answered", "ask", "last_words"]
-
 _WORDS_MAX = 200  # characters of a program's own message
 _PARTS = ("integers", "floats", "extra")
 

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat_conformance.scene import Block, Rows, Scene, Tile, attribute_named, band_of
 
-__all__ = ["EXTRA_DTYPES", "Expected", "block_rows", "expected", "lattice_value", "max_scale"]
-
 Array = NDArray[Any]
 
 #: NumPy's names for the types of extra columns, by registry value.

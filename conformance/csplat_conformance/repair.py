@@ -9,8 +9,6 @@ from typing import Final
 
 from csplat import _spec
 
-__all__ = ["CHUNK_RECORDS", "chunk_records", "repair", "seal"]
-
 _CRC_SIZE = 4
 
 #: Structures that name a chunk, and where their `crc` lies.

@@ -29,8 +29,6 @@ from enum import StrEnum
 from html import escape
 from typing import Any
 
-__all__ = ["Outcome", "Report", "Status", "to_json", "to_junit", "to_table"]
-
 #: Characters that XML 1.0 cannot hold, not even as references.
 _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 

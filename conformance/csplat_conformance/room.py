@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["least_true", "may_be_stated", "room"]
-
 _EXCESS, _EXCESS_FLOOR = 1e-4, 1e-12  # SER-5: by how much a statement may exceed what is true
 _ROUNDING = 1e-9  # SER-7: relative, sums in binary64 in another order
 _COORDINATE = 2.0**-50  # SER-7: of the largest coordinate, which is added and subtracted in binary64

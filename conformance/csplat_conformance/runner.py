@@ -26,8 +26,6 @@ from csplat_conformance.protocol import ask
 from csplat_conformance.recipes import exact_floats
 from csplat_conformance.report import Outcome, Report
 
-__all__ = ["TIMEOUT_SECONDS", "Choice", "parse_levels", "run_builtin", "run_command"]
-
 #: Seconds that another decoder has for each vector; the largest is of 65,536 splats.
 TIMEOUT_SECONDS = 60.0
 

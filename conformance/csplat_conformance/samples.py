@@ -24,34 +24,6 @@ from csplat_conformance.scene import (
     Tile,
 )
 
-__all__ = [
-    "MEANS",
-    "OPACITIES",
-    "QUATS",
-    "SCALES",
-    "SH0",
-    "Recipe",
-    "View",
-    "attributes",
-    "axis",
-    "book",
-    "coded",
-    "integers",
-    "levels",
-    "means_rows",
-    "morton",
-    "offset",
-    "quat_rows",
-    "rich_scene",
-    "rows_of",
-    "scene",
-    "sh_attribute",
-    "signed",
-    "single",
-    "sparse",
-    "tile",
-]
-
 OPACITIES, SCALES, QUATS, MEANS, SH0 = (
     _spec.ATTRIBUTE_OPACITIES,
     _spec.ATTRIBUTE_SCALES,

@@ -11,24 +11,6 @@ from dataclasses import dataclass
 
 from csplat import _spec
 
-__all__ = [
-    "PAIRS",
-    "PLAIN",
-    "Attribute",
-    "Block",
-    "Chunk",
-    "Codebook",
-    "Extra",
-    "Rows",
-    "Scene",
-    "StatedErrors",
-    "Stream",
-    "Tile",
-    "attribute_named",
-    "band_of",
-    "transpose",
-]
-
 #: n rows of C integers.
 Rows = Sequence[Sequence[int]]
 

@@ -16,8 +16,6 @@ from typing import IO, Self
 from csplat_conformance.answers import Answer
 from csplat_conformance.report import Status
 
-__all__ = ["Served"]
-
 _READ = 1 << 16
 
 

@@ -23,13 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec, decoder
+from csplat.types import F32
 from csplat_conformance.manifest import load
 from csplat_conformance.near import ulps_between
 
-__all__ = ["GPUS", "Gpu", "lattice_values", "main", "opacities", "quats", "radicands"]
-
 Ints = NDArray[Any]
-F32 = NDArray[np.float32]
 
 _NEAREST = 0.5
 _NEIGHBOUR = 0.999

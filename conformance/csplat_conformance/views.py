@@ -23,13 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
+from csplat.types import U8
 from csplat_conformance.manifest import VECTORS, Vector
-from csplat_conformance.pictures import U8, psnr, read_png
+from csplat_conformance.pictures import psnr, read_png
 from csplat_conformance.process import run_program
 from csplat_conformance.protocol import last_words
 from csplat_conformance.report import Outcome, Status
-
-__all__ = ["can_render", "judge_command", "judge_ours", "quantised", "reference_picture", "skipped_views"]
 
 _LEVEL = "L4"
 

@@ -29,8 +29,6 @@ from csplat_conformance.wrong_python import MISTAKES as WRONG_PYTHON
 from csplat_conformance.wrong_single import MISTAKES as WRONG_SINGLE
 from csplat_conformance.wrong_words import MISTAKES as WRONG_WORDS
 
-__all__ = ["MISTAKES", "catch", "main", "table"]
-
 MISTAKES = (*WRONG_PYTHON, *WRONG_WORDS, *WRONG_SINGLE)
 
 _SHOWN_CLAUSES = 4

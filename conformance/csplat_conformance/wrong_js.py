@@ -14,8 +14,6 @@ from csplat_conformance.manifest import Vector, load
 from csplat_conformance.mistakes import Caught, Mistake
 from csplat_conformance.node import JsDecoder, js_folder
 
-__all__ = ["EDITS", "Edit", "catch_all", "catch_edit", "edited"]
-
 
 @dataclass(frozen=True)
 class Edit:

@@ -19,8 +19,6 @@ from csplat.errors import FormatError, UnsupportedError
 from csplat_conformance.mistakes import Mistake, Wrong, method, nothing, replaced
 from csplat_conformance.validator.inflate import CodedError, Inflater
 
-__all__ = ["MISTAKES", "crc_but"]
-
 # What is checked -----------------------------------------------------------------------------------
 
 

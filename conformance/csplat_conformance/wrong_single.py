@@ -16,8 +16,6 @@ from csplat_conformance.mistakes import Mistake, Wrong, nothing, replaced
 from csplat_conformance.near import RENDERER
 from csplat_conformance.single import GPUS, Gpu, lattice_values, opacities, quats
 
-__all__ = ["MISTAKES", "off_by", "single_precision"]
-
 Apply = Callable[[ExitStack], None]
 
 

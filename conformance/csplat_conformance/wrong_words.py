@@ -12,8 +12,6 @@ from csplat.errors import FormatError
 from csplat_conformance.mistakes import Mistake, Wrong, nothing, replaced, reworded
 from csplat_conformance.wrong_python import crc_but
 
-__all__ = ["MISTAKES"]
-
 
 def _columns_of_0_1(stack: ExitStack) -> None:
     stack.enter_context(mock.patch.object(_spec, "COLUMN_MAX", 2**50))

@@ -8,8 +8,6 @@ from contextlib import suppress
 
 from csplat_tools import VERSIONS
 
-__all__ = ["main"]
-
 _INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 
 

@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 import csplat
 from csplat.encoder import PresetName
+from csplat.types import U8
 from csplat_bench.common.measuring import timed
 from csplat_bench.common.peers import find_splat_transform
 from csplat_bench.common.plots import new_figure, save_svg
@@ -38,8 +38,6 @@ from csplat_render.cameras import intrinsics, look_at
 from csplat_render.judge import Judge
 from csplat_tools.files.streams import write_bytes, write_json
 from csplat_tools.views.finding import comparison_cameras
-
-U8 = NDArray[np.uint8]
 
 FOLDER = Path(__file__).resolve().parent
 SAMPLE = FOLDER.parent / "csplat_tools" / "data" / "sample.ply"

@@ -8,13 +8,10 @@ from __future__ import annotations
 import math
 
 import numba
-import numpy as np
 from garden import BALL, CAP, DISH, DISH_CENTRE, DISH_RADIUS, HEART, MOSS, PEBBLE, PETAL, SHELL, STEM, Garden
-from numpy.typing import NDArray
 
-__all__ = ["compiled", "field", "noise"]
+from csplat.types import F64
 
-F64 = NDArray[np.float64]
 Found = tuple[float, int, int]
 
 _DISH_EDGE = math.sqrt(DISH_RADIUS**2 - DISH_CENTRE**2)

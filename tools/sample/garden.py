@@ -10,14 +10,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = [
-    "BALL", "BLADE", "BODY", "BOUND", "CAP", "DISH", "DISH_CENTRE", "DISH_RADIUS", "HEART", "MOSS", "PEBBLE",
-    "PETAL", "SHELL", "STALK", "STEM", "Garden", "make_garden",
-]  # fmt: skip
-
-F64 = NDArray[np.float64]
+from csplat.types import F64
 
 DISH, MOSS, CAP, STEM, PEBBLE, BALL, BLADE, STALK, PETAL, HEART, SHELL, BODY = range(12)
 

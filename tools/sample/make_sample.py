@@ -25,11 +25,11 @@ from pathlib import Path
 
 import numpy as np
 from garden import BOUND, make_garden
-from numpy.typing import NDArray
 from photograph import photograph
 from PIL import Image
 
 from csplat import SplatModel, write_ply
+from csplat.types import F32, F64
 from csplat_render.camera import Camera
 from csplat_render.cameras import intrinsics, look_at
 from csplat_render.warmup import warm_up
@@ -38,9 +38,6 @@ from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.outputs import TrainResult
 from csplat_trainer.report import TrainingStep
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 SAMPLE = Path(__file__).resolve().parent.parent / "csplat_tools" / "data" / "sample.ply"
 COMMENTS = ("made by tools/sample/make_sample.py",)

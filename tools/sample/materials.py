@@ -7,8 +7,6 @@ import math
 from distances import compiled, noise
 from garden import BALL, BLADE, CAP, DISH, HEART, MOSS, PEBBLE, PETAL, SHELL, STALK, STEM, Garden
 
-__all__ = ["Colour", "Material", "material", "ramp"]
-
 Colour = tuple[float, float, float]
 #: Colour (linear), gloss from 0 to 1, sharpness of highlights (the exponent of their cosine).
 Material = tuple[Colour, float, float]

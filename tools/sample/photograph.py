@@ -14,14 +14,9 @@ from distances import compiled, field
 from garden import BLADE, BOUND, PETAL, Garden
 from materials import Colour, material, ramp
 from numba import prange
-from numpy.typing import NDArray
 
+from csplat.types import F64, U8
 from csplat_render.camera import Camera
-
-__all__ = ["photograph"]
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 _LAMP = (0.46, 0.76, 0.46)
 _LAMP_COLOUR = (2.7, 2.45, 2.1)

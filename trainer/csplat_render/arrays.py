@@ -7,8 +7,6 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-__all__ = ["Array", "Gradients", "HasSplats", "RenderResult", "Seen", "Splats"]
-
 Array = NDArray[Any]
 
 

@@ -13,18 +13,6 @@ import numpy as np
 
 from csplat_render.jit import inline, kernel, lane_run, parallel_kernel
 
-__all__ = [
-    "CHUNKS",
-    "TILE",
-    "TILE_BITS",
-    "arrange",
-    "count_tiles",
-    "depth_order",
-    "fill_tiles",
-    "record_offsets",
-    "tile_starts",
-]
-
 #: Width and height of a tile in pixels.
 TILE = 16
 

@@ -25,8 +25,6 @@ from csplat_render.blending_steps import (
 )
 from csplat_render.jit import ParallelKernel, parallel_kernel
 
-__all__ = ["blend", "blend_counted"]
-
 
 def _blender(counted: bool) -> ParallelKernel[...]:
     """Make `blend`, or the kernel that notes how far pixels got where `blend` adds up depth."""

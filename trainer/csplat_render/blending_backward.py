@@ -27,8 +27,6 @@ from csplat_render.blending_steps import (
 )
 from csplat_render.jit import parallel_kernel
 
-__all__ = ["RECORD", "blend_backward"]
-
 #: Numbers per record: moments of the exponent's gradient (1, x, y, xx, xy, yy, about the centre of
 #: the tile), gradients of red, green, blue and depth.
 RECORD = 10

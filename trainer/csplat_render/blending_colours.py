@@ -25,8 +25,6 @@ from csplat_render.blending_steps import (
 )
 from csplat_render.jit import parallel_kernel
 
-__all__ = ["COLOUR_SUMS", "sum_colours"]
-
 #: Numbers per record.
 COLOUR_SUMS = 4
 

@@ -15,25 +15,6 @@ import numpy as np
 from csplat_render.binning import TILE
 from csplat_render.jit import fast_exp2, inline, spliced
 
-__all__ = [
-    "CHECK",
-    "HALF",
-    "NUMBERS",
-    "aligned",
-    "alive_rows",
-    "alpha_at",
-    "begin_tile",
-    "gather",
-    "go_on",
-    "leave",
-    "middles",
-    "narrow_rows",
-    "numbers_of",
-    "passed",
-    "place",
-    "read_planes",
-]
-
 #: Splats of a batch, between two looks at which rows of a tile are finished.
 CHECK = 16
 

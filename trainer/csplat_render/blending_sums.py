@@ -29,8 +29,6 @@ from csplat_render.blending_steps import (
 )
 from csplat_render.jit import parallel_kernel
 
-__all__ = ["SUMS", "sum_removal"]
-
 #: Numbers per record.
 SUMS = 4
 

@@ -8,13 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from csplat.errors import InputError
-
-__all__ = ["DEFAULT_NEAR", "MAX_IMAGE_SIZE", "Camera", "check_last_row"]
-
-F64 = NDArray[np.float64]
+from csplat.types import F64
 
 #: Distance of the near plane in scene units, if a camera does not specify it.
 DEFAULT_NEAR = 0.2

@@ -14,23 +14,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
+from csplat.types import F64
 from csplat_render.camera import DEFAULT_NEAR, Camera, check_last_row
-
-__all__ = [
-    "PERSPECTIVES",
-    "check_intrinsics",
-    "finite_number",
-    "focal_lengths",
-    "foreign_cameras",
-    "frame_values",
-    "note_on_scales",
-    "viewmat_of_opengl",
-]
-
-F64 = NDArray[np.float64]
 
 #: Models of transforms.json that are a pinhole with OpenCV's distortion, or without; "" where none is named.
 PERSPECTIVES = ("", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")

@@ -17,24 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
 from csplat.files import read_json
+from csplat.types import F64, Mask
 from csplat_render.camera import DEFAULT_NEAR, Camera
 from csplat_render.camera_forms import check_intrinsics, foreign_cameras
-
-__all__ = [
-    "camera_outliers",
-    "central_camera",
-    "intrinsics",
-    "load_cameras",
-    "look_at",
-    "nearest_point",
-    "orbit",
-    "relative_to",
-    "resized",
-    "save_cameras",
-]
-
-B = NDArray[np.bool_]
-F64 = NDArray[np.float64]
 
 _PARALLEL = 1e-6  # the sine of an angle below which two directions count as parallel
 _FAR = 20.0  # usual distances from the middle beyond which a camera may be an outlier,
@@ -109,7 +94,7 @@ def central_camera(cameras: Sequence[Camera]) -> Camera:
     return cameras[int(np.argmin(away / max(float(away.mean()), 1e-300) + turned))]
 
 
-def camera_outliers(viewmats: F64, points: NDArray[np.floating] | None = None) -> B:
+def camera_outliers(viewmats: F64, points: NDArray[np.floating] | None = None) -> Mask:
     """Find cameras that stand far away from all others, as structure from motion leaves them where it fails.
 
     What cameras look at counts, too: of a set whose cameras stand close together, one is no outlier that is only as
@@ -140,7 +125,7 @@ def camera_outliers(viewmats: F64, points: NDArray[np.floating] | None = None) -
                 continue
             subject = nearest_point(near, axes) + middle
         if away[first] > _FAR * float(np.sqrt(np.sum((subject - middle) ** 2))):
-            outliers: B = distances >= away[first]
+            outliers: Mask = distances >= away[first]
             return outliers
     return np.zeros(len(distances), np.bool_)
 

@@ -14,24 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.model import SplatModel
+from csplat.types import F64, I64
 from csplat_render.camera import Camera
-
-__all__ = [
-    "Cloud",
-    "cover",
-    "detail",
-    "sample_cloud",
-    "share_within",
-    "surface_areas",
-    "visible_opacity",
-    "weighted_quantiles",
-]
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 #: Opacities below this never reach a picture.
 MIN_OPACITY = 1.0 / 255.0

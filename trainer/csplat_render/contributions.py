@@ -24,8 +24,6 @@ from csplat_render.jit import thread_count
 from csplat_render.projecting import BLOCK, project
 from csplat_render.rasterise import Rasteriser
 
-__all__ = ["Contributions"]
-
 # Colours are taken for no brighter: squares of their differences, summed over a tile, stay within float32.
 _BRIGHTEST = 1e15
 

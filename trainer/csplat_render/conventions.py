@@ -18,21 +18,6 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat_render.camera import Camera
 
-__all__ = [
-    "ALPHA_CAP",
-    "ALPHA_MIN",
-    "COMPENSATION_MIN",
-    "DILATION",
-    "FOV_MARGIN",
-    "LOG_SCALE_LIMIT",
-    "MODES",
-    "TRANSMITTANCE_MIN",
-    "Mode",
-    "Settings",
-    "settings_of",
-    "view_vector",
-]
-
 #: Added to both variances of the projected covariance, in square pixels.
 DILATION = 0.3
 

@@ -11,11 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.types import F32
 from csplat_render.jit import parallel_kernel, thread_count
-
-__all__ = ["convolve", "convolve_twin"]
-
-F32 = NDArray[np.float32]
 
 _PIXELS = 4  # of a row, whose sums are made together
 _TAPS = 4  # products that are added to a sum at a time

@@ -12,8 +12,6 @@ from csplat_render.harmonics import sh_basis
 from csplat_render.jit import inline, parallel_kernel
 from csplat_render.projecting import BLOCK, direction
 
-__all__ = ["DrawnView", "add_gradient", "add_removal", "basis_of_view", "set_colours"]
-
 
 @dataclass(frozen=True, eq=False)
 class DrawnView:

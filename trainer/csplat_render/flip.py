@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 
-__all__ = ["flip"]
-
 
 def flip(reference: NDArray[Any], image: NDArray[Any]) -> float:
     """Mean difference that a viewer notices who flips between two pictures, 0 (none) to 1.

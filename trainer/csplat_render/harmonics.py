@@ -6,8 +6,6 @@ from typing import Any
 
 from csplat_render.jit import inline
 
-__all__ = ["SH_C0", "sh_basis", "sh_basis_gradient"]
-
 SH_C0 = 0.28209479177387814
 _C1 = 0.4886025119029199
 _C20, _C21, _C22, _C23, _C24 = (

@@ -18,23 +18,6 @@ from numba.core import event as typed_event
 
 from csplat.errors import InputError
 
-__all__ = [
-    "LOCK",
-    "ParallelKernel",
-    "available_threads",
-    "fast_exp2",
-    "inline",
-    "is_cached",
-    "kernel",
-    "lane_run",
-    "on_compiling",
-    "parallel_kernel",
-    "python",
-    "relaxed_kernel",
-    "spliced",
-    "thread_count",
-]
-
 # The types that numba states for itself differ from version to version.
 numba: Any = typed_numba
 extending: Any = typed_extending

@@ -15,16 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.types import F32, F64
 from csplat_render import metrics
 from csplat_render.arrays import RenderResult
 from csplat_render.camera import Camera
 from csplat_render.cameras import relative_to
 from csplat_render.conventions import Mode
 
-__all__ = ["Drawable", "Judge", "Look", "OnView", "renderer"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 #: Called for each view with its number, the reference image and the render, [H, W, 3] in 0..1.
 OnView = Callable[[int, F32, F32], None]
 

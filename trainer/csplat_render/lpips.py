@@ -25,10 +25,7 @@ from numpy.typing import NDArray
 
 from csplat.archives import read_archive
 from csplat.errors import InputError
-
-__all__ = ["MIN_SIZE", "SCALE", "SHIFT", "Lpips", "load_lpips", "load_torch_lpips", "save_lpips"]
-
-F32 = NDArray[np.float32]
+from csplat.types import F32
 
 #: Smallest width and height of a picture, pixels: AlexNet has nothing left of a smaller one.
 MIN_SIZE = 31

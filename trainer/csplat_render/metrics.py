@@ -26,23 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
-
-__all__ = [
-    "COVERED_ALPHA",
-    "PSNR_CAP",
-    "Distance",
-    "Scores",
-    "ViewScore",
-    "pooled",
-    "psnr",
-    "psnr_of_mse",
-    "score_view",
-    "squared_error",
-    "ssim",
-]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from csplat.types import F32, F64
 
 #: Decibels for images without any difference.
 PSNR_CAP = 99.0

@@ -14,22 +14,17 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.training import VIEW
+from csplat.types import F64, Mask
 from csplat.upright import up_of
 from csplat_render.camera import Camera
 from csplat_render.cameras import camera_outliers, direction, intrinsics, look_at, orbit
 from csplat_render.cloud import Cloud, detail, sample_cloud
 from csplat_render.standing import standing
 from csplat_render.virtual import FIELD_OF_VIEW, HIDING, Frame, scene_frame
-
-__all__ = ["orbit_cameras"]
-
-B = NDArray[np.bool_]
-F64 = NDArray[np.float64]
 
 ELEVATION = 20.0  # degrees above the horizon, for objects
 _MARGIN = 0.08  # fraction of half an image, left free around an object
@@ -113,8 +108,8 @@ def _body(cloud: Cloud, frame: Frame) -> F64:
         places = np.floor(np.clip((cloud.points - frame.centre) / (_CELL * frame.extent), -_CELLS, _CELLS - 1))
     cells = np.ravel_multi_index(tuple(np.nan_to_num(places).astype(np.int64).T + _CELLS), (side,) * 3)
     masses = np.bincount(cells, cloud.masses, side**3)
-    left: B = np.bincount(cells, minlength=side**3) > 1
-    kept: B = np.zeros_like(left)
+    left: Mask = np.bincount(cells, minlength=side**3) > 1
+    kept: Mask = np.zeros_like(left)
     while left.any():
         part = _touching(int(np.argmax(np.where(left, masses, -1.0))), left.reshape((side,) * 3)).ravel()
         if not np.sum(masses[part]) > _PART * np.sum(masses):
@@ -125,9 +120,9 @@ def _body(cloud: Cloud, frame: Frame) -> F64:
     return cloud.points if scattered else cloud.points[kept[cells]]
 
 
-def _touching(first: int, filled: B) -> B:
+def _touching(first: int, filled: Mask) -> Mask:
     """Filled cells that are reached from one of them without a gap."""
-    found: B = np.zeros_like(filled)
+    found: Mask = np.zeros_like(filled)
     found.flat[first] = True
     while True:
         wider = found

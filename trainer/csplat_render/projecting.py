@@ -18,8 +18,6 @@ from csplat_render.conventions import COMPENSATION_MIN, DILATION, LOG_SCALE_LIMI
 from csplat_render.harmonics import sh_basis
 from csplat_render.jit import inline, parallel_kernel
 
-__all__ = ["BLOCK", "compensation", "determinants", "direction", "perspective", "project", "rotation", "rows"]
-
 #: Splats that one thread takes at a time.
 BLOCK = 512
 

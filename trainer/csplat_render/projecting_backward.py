@@ -18,8 +18,6 @@ from csplat_render.harmonics import sh_basis, sh_basis_gradient
 from csplat_render.jit import inline, parallel_kernel
 from csplat_render.projecting import BLOCK, determinants, deviation, direction, perspective, rotation, rows, unit
 
-__all__ = ["project_backward"]
-
 _HUGE = 1e37  # gradients are clamped to this: they fit float32, whatever they are added to
 
 

@@ -31,8 +31,6 @@ from csplat_render.jit import thread_count
 from csplat_render.projecting import BLOCK, project
 from csplat_render.projecting_backward import project_backward
 
-__all__ = ["MAX_INTERSECTIONS", "Gradients", "HasSplats", "Rasteriser", "RenderResult", "Seen", "Splats"]
-
 #: Most pairs of splat and tile in one picture; each takes 4 bytes, with gradients 52.
 MAX_INTERSECTIONS = 1 << 28
 

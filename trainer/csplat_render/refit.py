@@ -12,23 +12,20 @@ its product with a vector is a picture of the vector's colours taken back to the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
+from csplat.types import F32, Progress
 from csplat_render.arrays import Array, HasSplats
 from csplat_render.camera import Camera
 from csplat_render.contributions import Contributions
 from csplat_render.drawn_view import DrawnView
 
-__all__ = ["ColourOperator", "fit_colours"]
-
-F32 = NDArray[np.float32]
 Floats = NDArray[Any]
-Progress = Callable[[str, float], None]
 
 #: Memory for views that are drawn once and kept; the others are drawn anew in every step.
 CACHE_BYTES = 2 << 30

@@ -16,15 +16,12 @@ from numpy.typing import ArrayLike
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.types import Progress
 from csplat_render.arrays import Array
 from csplat_render.camera import Camera
 from csplat_render.contributions import Contributions
 from csplat_render.conventions import TRANSMITTANCE_MIN
 from csplat_render.twin import render_exact
-
-__all__ = ["Removal", "measure_removal", "removal_exact"]
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, eq=False)

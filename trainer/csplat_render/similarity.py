@@ -9,25 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from csplat.types import F64
 from csplat_render.jit import parallel_kernel, relaxed_kernel, thread_count
-
-__all__ = [
-    "C1",
-    "C2",
-    "CHANNELS",
-    "RADIUS",
-    "WINDOW",
-    "blur_across",
-    "blur_down",
-    "blur_products",
-    "blur_twin",
-    "mean_ssim",
-    "mean_ssim_twin",
-]
-
-F64 = NDArray[np.float64]
 
 C1, C2 = 0.01**2, 0.03**2
 

@@ -19,8 +19,6 @@ from csplat_render.cameras import intrinsics, look_at
 from csplat_render.cloud import detail, sample_cloud
 from csplat_render.virtual import FIELD_OF_VIEW, scene_frame
 
-__all__ = ["seeming_up", "standing"]
-
 _CERTAIN = 0.3  # a sum this long is no chance
 _NEAR_AXIS = 0.9  # cosine: programs make one of their axes up
 _POINTS, _DIRECTIONS, _SIDE = 10_000, 32, 320

@@ -29,8 +29,6 @@ from csplat_render.conventions import (
 from csplat_render.harmonics import sh_basis
 from csplat_render.jit import python
 
-__all__ = ["Decisions", "render_exact"]
-
 Array = NDArray[Any]
 
 _CHUNK = 64  # splats that are evaluated at all pixels at a time

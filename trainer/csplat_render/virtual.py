@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.types import F64
 from csplat.upright import up_of
 from csplat_render.camera import DEFAULT_NEAR, Camera
 from csplat_render.cameras import direction, intrinsics, look_at, orbit
@@ -34,17 +34,6 @@ from csplat_render.cloud import (
     weighted_quantiles,
 )
 
-__all__ = [
-    "OBJECT_DISTANCES",
-    "SURROUNDING_DISTANCES",
-    "Frame",
-    "far_apart",
-    "is_clear",
-    "scene_frame",
-    "virtual_cameras",
-]
-
-F64 = NDArray[np.float64]
 Kind = Literal["object", "surrounding"]
 
 #: Horizontal field of view, degrees.

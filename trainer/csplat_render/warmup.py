@@ -8,14 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from csplat_render.arrays import Array
+from csplat_render.arrays import Array, Splats
 from csplat_render.blending import blend
 from csplat_render.camera import Camera
 from csplat_render.jit import is_cached, on_compiling
 from csplat_render.projecting import project
-from csplat_render.rasterise import Rasteriser, Splats
-
-__all__ = ["is_compiled", "warm_up"]
+from csplat_render.rasterise import Rasteriser
 
 _SIZE = 16  # pixels on each side of what is rendered
 

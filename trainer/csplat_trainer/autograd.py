@@ -12,10 +12,9 @@ from torch import Tensor
 from torch.autograd import Function
 
 from csplat.errors import InputError
+from csplat_render.arrays import Splats
 from csplat_render.camera import Camera
-from csplat_render.rasterise import Rasteriser, Splats
-
-__all__ = ["render"]
+from csplat_render.rasterise import Rasteriser
 
 _GROUPS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 

@@ -16,8 +16,6 @@ from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat_trainer.parameters import GROUPS, Parameters, Splats
 
-__all__ = ["Checkpoint", "load_checkpoint", "save_checkpoint"]
-
 _VERSION = 1
 _FACTS = {"iteration": int, "step": int, "rng_state": dict, "queue": list, "options": dict, "log": dict}
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from csplat.errors import InputError
+from csplat.types import F32
 from csplat_render.camera import Camera
 from csplat_trainer.densify import ScreenGradients
 from csplat_trainer.exposure import Exposure
@@ -23,10 +24,6 @@ from csplat_trainer.loss import LOSS_WEIGHTS, LossValue
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.parameters import GROUPS, Parameters, Splats
 from csplat_trainer.pictures import Picture, compose
-
-__all__ = ["CudaEngine", "gsplat_rasterization"]
-
-F32 = NDArray[np.float32]
 
 _BETAS, _EPSILON = (0.9, 0.999), 1e-15
 _C1, _C2, _TAPS, _SIGMA = 0.01**2, 0.03**2, 11, 1.5

@@ -13,12 +13,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from csplat.types import F32, F64
 from csplat_trainer.parameters import GROUPS, Parameters
-
-__all__ = ["ScreenGradients", "densify", "reset_opacities"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 _LARGE = 0.01  # of the extent: larger splats are split, smaller ones cloned
 _SHRINK = 1.6  # of the two halves of a split

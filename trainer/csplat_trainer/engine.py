@@ -6,11 +6,12 @@ from typing import Protocol
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from csplat.types import F32
+from csplat_render.arrays import Splats
 from csplat_render.camera import Camera
 from csplat_render.jit import lane_run, parallel_kernel
-from csplat_render.rasterise import Rasteriser, Splats
+from csplat_render.rasterise import Rasteriser
 from csplat_trainer.densify import ScreenGradients
 from csplat_trainer.exposure import Exposure
 from csplat_trainer.loss import LOSS_WEIGHTS, LossValue, PhotometricLoss
@@ -19,10 +20,6 @@ from csplat_trainer.options import TrainOptions
 from csplat_trainer.parameters import Parameters, adam_step
 from csplat_trainer.perceptual import PerceptualLoss
 from csplat_trainer.pictures import Picture, compose
-
-__all__ = ["CpuEngine", "Engine"]
-
-F32 = NDArray[np.float32]
 
 _LARGEST_LOG = 40.0  # largest log scale whose gradient Adam can square in float32
 

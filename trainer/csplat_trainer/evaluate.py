@@ -7,17 +7,14 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from csplat.types import F32
 from csplat_render.camera import Camera
 from csplat_render.conventions import Mode
 from csplat_render.judge import Judge, Look
 from csplat_render.metrics import COVERED_ALPHA, Distance, Scores
 from csplat_trainer.pictures import Picture, compose
-
-__all__ = ["evaluate", "photograph_judge"]
-
-F32 = NDArray[np.float32]
 
 
 def photograph_judge(

@@ -11,14 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError
-
-__all__ = ["Exposure", "Exposures"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from csplat.types import F32, F64
 
 _STATE = (4, 2, 3)  # state of a photograph: values, both of Adam's means, steps
 _BETA1, _BETA2, _EPSILON = 0.9, 0.99, 1e-15

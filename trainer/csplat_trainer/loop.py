@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 from numpy.random import PCG64, Generator
-from numpy.typing import NDArray
 
 import csplat
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.training import TRAINING, VIEW
+from csplat.types import F32
 from csplat.upright import with_up
 from csplat_render.camera import Camera
 from csplat_render.cameras import central_camera
@@ -41,10 +41,6 @@ from csplat_trainer.report import TrainingStep, peak_memory, save_picture, side_
 from csplat_trainer.resume import adapt
 from csplat_trainer.starting import StartingScene, scene_of, starting_splats
 from csplat_trainer.thinning import thin
-
-__all__ = ["train"]
-
-F32 = NDArray[np.float32]
 
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 _COLOURS = {"black": _BLACK, "white": _WHITE, "random": _WHITE}  # random: what evaluations are in front of

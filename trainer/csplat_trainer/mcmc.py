@@ -11,16 +11,10 @@ import math
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from csplat.types import F32, F64, I64
 from csplat_render.jit import lane_run, parallel_kernel
 from csplat_trainer.parameters import GROUPS, Parameters
-
-__all__ = ["add_noise", "grow", "relocate", "share"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _MAX_SHARE = 51  # splats in one place at most, as the paper's code has it
 _BINOMIAL = np.array([[float(math.comb(n, k)) for k in range(_MAX_SHARE + 1)] for n in range(_MAX_SHARE + 1)])

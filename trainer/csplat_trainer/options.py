@@ -9,8 +9,6 @@ from typing import Literal, get_args
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE
 
-__all__ = ["BACKGROUNDS", "DEVICES", "INITS", "LOSSES", "STRATEGIES", "TrainOptions"]
-
 #: How splats come and go: `mcmc` grows to the cap and moves dead splats, with noise and
 #: regularisation; `fixed` starts at the cap and moves dead splats; `gradient` clones, splits and
 #: prunes; `none` keeps what it began with.

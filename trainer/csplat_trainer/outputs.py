@@ -8,8 +8,6 @@ from typing import Any
 
 from csplat.model import SplatModel
 
-__all__ = ["Outputs", "TrainResult"]
-
 
 @dataclass(frozen=True)
 class Outputs:

@@ -12,11 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel, normalise_quats
+from csplat.types import F32
 from csplat_render.jit import parallel_kernel, relaxed_kernel
 
-__all__ = ["GROUPS", "Parameters", "Splats", "adam_step", "from_model", "to_model"]
-
-F32 = NDArray[np.float32]
 Splats = dict[str, F32]
 
 #: Names of the arrays of `Splats`, in the order of everything that goes through them.

@@ -7,14 +7,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError
+from csplat.types import F32
 from csplat_render.lpips import MIN_SIZE, SCALE, SHIFT, Lpips
-
-__all__ = ["PerceptualLoss"]
-
-F32 = NDArray[np.float32]
 
 _STRIDES, _PADDINGS = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
 _POOLED = (1, 2)  # layers that a 3×3 pooling of stride 2 precedes

@@ -10,15 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
+from csplat.types import F32, F64, U8, Mask
 from csplat_render.camera import Camera
 from csplat_render.jit import parallel_kernel
-
-__all__ = ["Picture", "UnreadMask", "UnreadPixels", "compose", "halved"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,14 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.files import atomic_writer
-
-__all__ = ["TrainingStep", "moving_average", "peak_memory", "plot_loss", "save_picture", "side_by_side"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from csplat.types import F32, F64
 
 _WINDOW_SHARE = 50  # the moving average spans this part of the run
 

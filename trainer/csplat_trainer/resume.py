@@ -9,8 +9,6 @@ from csplat_trainer.mcmc import grow
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.parameters import Parameters, Splats
 
-__all__ = ["adapt"]
-
 
 def adapt(parameters: Parameters, options: TrainOptions, rng: Generator) -> Parameters:
     """Make parameters fit the options.

@@ -12,7 +12,7 @@ adds to the squared error of the renders. They are the weights of k-means, whose
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,18 +21,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.types import F32, F64, Progress
 from csplat_render.camera import Camera
 from csplat_render.conventions import view_vector
 from csplat_render.jit import thread_count
 from csplat_render.rasterise import Rasteriser
 from csplat_trainer.sensitivity_forms import FORM, covariance_forms
 from csplat_trainer.sensitivity_sums import SUMS, add_view, sum_derivatives
-
-__all__ = ["Sensitivity", "measure_sensitivity"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Progress = Callable[[str, float], None]
 
 _DIAGONAL = [0, 6, 11, 15, 18, 20]  # indices of the diagonal in a triangle of 6 by 6
 _LARGEST = 1e37  # largest value of a sum; float32 holds six of them

@@ -19,7 +19,6 @@ from csplat.model import SplatModel
 if TYPE_CHECKING:
     from csplat_trainer.sensitivity import Sensitivity
 
-__all__ = ["GROUPS", "SOURCES", "StoredSensitivity", "read_sensitivity", "scene_digest", "write_sensitivity"]
 
 #: Arrays [N] float32 of a file, as in `Sensitivity`.
 GROUPS = (

@@ -11,8 +11,6 @@ from csplat_render.conventions import COMPENSATION_MIN
 from csplat_render.jit import parallel_kernel
 from csplat_render.projecting import BLOCK, determinants, deviation, perspective, rotation, rows, unit
 
-__all__ = ["FORM", "covariance_forms"]
-
 #: Numbers per splat that determine how its exponent depends on its covariance.
 FORM = 12
 

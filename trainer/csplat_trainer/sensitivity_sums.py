@@ -33,8 +33,6 @@ from csplat_render.jit import parallel_kernel, relaxed_kernel
 from csplat_render.projecting import BLOCK, deviation, direction
 from csplat_trainer.sensitivity_forms import FORM
 
-__all__ = ["SUMS", "add_view", "sum_derivatives"]
-
 #: Numbers per record. With w the share of a pixel that is the splat's, s_c the derivative of channel c towards the
 #: exponent (that is, towards the logarithm of alpha), t the matrix of `covariance_forms`, |h|² of its first part: sums
 #: over pixels of w, w²; Σ s, Σ |s|, Σ s² over channels; Σ s · t (6 entries); Σ |s| · |t| (6); Σ s² · |h|²; Σ s² · t tᵀ

@@ -12,14 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from csplat.errors import InputError
+from csplat.types import F32, F64
 from csplat_render.camera import Camera
 from csplat_trainer.parameters import Splats
 from csplat_trainer.pictures import Picture
-
-__all__ = ["StartingScene", "scene_of", "starting_splats"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 SH_C0 = 0.28209479177387814
 

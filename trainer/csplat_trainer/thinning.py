@@ -15,8 +15,6 @@ from csplat_render.removal import measure_removal
 from csplat_trainer.parameters import Parameters, to_model
 from csplat_trainer.pictures import Picture
 
-__all__ = ["thin"]
-
 _VIEWS = 32  # at most, spread over all, that say what splats are worth
 
 

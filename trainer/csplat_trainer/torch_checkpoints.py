@@ -32,8 +32,6 @@ from csplat.ply_comments import SceneFacts
 from csplat.ply_origin import relative_to_origin
 from csplat.scene import Scene, joined, scene_of
 
-__all__ = ["FORMAT"]
-
 _MAGICS = (b"PK\x03\x04", b"\x80")  # of a zip, and of a pickle, which torch wrote before 1.6
 _NAMED = 5  # names in a message
 _SH_C0 = 0.28209479177387814

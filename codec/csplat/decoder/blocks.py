@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.decoder.streams import Ints
 
-__all__ = ["Block", "Codebook", "Coded", "Columns", "Indices", "Sparse", "runs", "work_dtype"]
-
 _RUN_ELEMENTS = 1 << 18  # integers that are worked on at a time: they stay in the second-level cache
 _RUN_SPLATS = 1 << 14
 

@@ -14,8 +14,6 @@ from csplat.decoder.stated import StatedErrors, read_serr
 if TYPE_CHECKING:
     from csplat.inputs import File
 
-__all__ = ["read_cameras", "read_metadata", "read_options", "read_stated_errors"]
-
 
 def read_metadata(data: File, *, limits: Limits | None = None) -> dict[str, Any] | None:
     """Return what the META chunk holds, `None` where there is none."""

@@ -15,15 +15,6 @@ from csplat.decoder.reconstruct import check_values, quat_rows, write_colour
 from csplat.decoder.streams import Ints, read_stream
 from csplat.errors import FormatError
 
-__all__ = [
-    "attribute_columns",
-    "check_unnamed_codebooks",
-    "layer_columns",
-    "read_codebooks",
-    "table_bytes",
-    "wanted_codebooks",
-]
-
 _ENTRY_WIDTH_MAX = 4  # STR-2: "4 for codebooks' entries"
 _ATTRIBUTE_OF = {name: attribute for attribute, name in _spec.ATTRIBUTE_NAMES.items()}
 

@@ -22,8 +22,6 @@ from csplat.decoder.lattice import (
 from csplat.decoder.streams import read_stream
 from csplat.errors import FormatError
 
-__all__ = ["TileContext", "leads", "read_coded"]
-
 _ESCAPE_CODINGS = (_spec.CODING_OFFSET, _spec.CODING_SIGNED)
 _WIDE = np.dtype(np.int64)
 

@@ -13,8 +13,6 @@ from csplat.decoder.morton import morton_axes
 from csplat.decoder.streams import Ints, read_stream
 from csplat.errors import FormatError
 
-__all__ = ["read_block", "read_raw"]
-
 
 def read_block(cursor: Cursor, context: TileContext, attribute: int) -> Block:
     """Read the block of an attribute and step over it.
@@ -81,6 +79,7 @@ def read_raw(cursor: Cursor, context: TileContext, column: int) -> Ints:
 
 
 def read_means(cursor: Cursor, context: TileContext, coding: int) -> Columns:
+    """Read the means of a tile, as lattice integers."""
     tile = context.tile
     count, width_max = tile.splat_count, _spec.CODING_WIDTH_MAX[coding]
     if coding == _spec.CODING_MORTON:

@@ -16,16 +16,6 @@ from csplat import _spec
 from csplat.errors import FormatError, InputError, UnsupportedError
 from csplat.inputs import File, mapped, stand_in
 
-__all__ = [
-    "Cursor",
-    "check_index_crc",
-    "check_length",
-    "check_reserved",
-    "open_chunk",
-    "read_file_header",
-    "view_of",
-]
-
 _CRC_SIZE = 4
 _STAND_IN_SIZE = 64  # bytes that tell what came in place of the file
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from csplat import _spec
 
-__all__ = ["ExtraColumn", "SceneHeader", "Tile"]
-
 
 @dataclass(frozen=True, slots=True)
 class ExtraColumn:

@@ -16,7 +16,6 @@ from csplat.errors import FormatError, UnsupportedError
 if TYPE_CHECKING:
     from csplat.inputs import File
 
-__all__ = ["read_header"]
 
 #: The sizes that the index head states, and the least of each: what this version reads of it.
 _RECORD_SIZES: Final = {

@@ -7,8 +7,6 @@ from csplat.decoder.container import check_reserved
 from csplat.decoder.header import ExtraColumn
 from csplat.errors import FormatError, UnsupportedError
 
-__all__ = ["check_codebook_chunks", "read_codebook_records", "read_directory", "read_extras"]
-
 _CONTROL = frozenset(chr(c) for c in (*range(0x20), 0x7F))
 _SINGLE_CHUNKS = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
 

@@ -10,8 +10,6 @@ from csplat.decoder.container import check_reserved
 from csplat.decoder.header import Tile
 from csplat.errors import FormatError, UnsupportedError
 
-__all__ = ["SINGLE_MAX", "SINGLE_MIN", "STEP_MIN", "check_coverage", "read_tiles", "scaled_step"]
-
 #: The smallest normal number of binary64; the smallest and the largest of binary32 (ATT-6, ATT-10, LAT-1).
 STEP_MIN = 2.0**-1022
 SINGLE_MIN, SINGLE_MAX = 2.0**-126, 2.0**128 - 2.0**104

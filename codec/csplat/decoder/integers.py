@@ -13,8 +13,6 @@ from csplat.decoder.header import SceneHeader
 from csplat.decoder.reconstruct import lattice_rows, quat_rows
 from csplat.decoder.tiles import TileBlocks, check_max_scale
 
-__all__ = ["empty_integers", "integer_part", "write_integers"]
-
 _INT32 = np.dtype(np.int32)
 _BAND_NAMES = {band: _spec.ATTRIBUTE_NAMES[_spec.ATTRIBUTE_SH0 + band] for band in range(1, _spec.SH_DEGREE_MAX + 1)}
 

@@ -24,7 +24,6 @@ from csplat.model import SplatModel
 if TYPE_CHECKING:
     from csplat.inputs import File
 
-__all__ = ["Job", "model_of", "prepare", "read_side_chunks", "read_texts", "thread_count"]
 
 _THREADS_MAX = 8  # more do not help: memory is the limit
 

@@ -12,8 +12,6 @@ from csplat.decoder.header import SceneHeader
 from csplat.decoder.streams import read_stream
 from csplat.errors import FormatError
 
-__all__ = ["parse_json", "read_json"]
-
 _BOM = b"\xef\xbb\xbf"
 _INT_DIGITS = 300  # longer ones are read as binary64, far beyond any integer that JavaScript keeps
 

@@ -12,16 +12,6 @@ from csplat.decoder.index_tiles import SINGLE_MAX, SINGLE_MIN, scaled_step
 from csplat.decoder.streams import read_stream
 from csplat.errors import FormatError, UnsupportedError
 
-__all__ = [
-    "check_integers",
-    "check_step",
-    "read_block_head",
-    "read_columns",
-    "read_exponent",
-    "read_offsets",
-    "read_signed",
-]
-
 
 def read_block_head(cursor: Cursor, attribute: int, legal: tuple[int, ...] | None = None) -> int:
     """Read a block head, or that of an escape block if `legal` codings are given; return the coding."""

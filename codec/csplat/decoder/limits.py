@@ -13,8 +13,6 @@ from csplat.decoder.codebooks import table_bytes
 from csplat.decoder.header import SceneHeader, Tile
 from csplat.errors import InputError, LimitError
 
-__all__ = ["Limits", "check_budget", "float_bytes", "integer_bytes"]
-
 
 @dataclass(frozen=True)
 class Limits:

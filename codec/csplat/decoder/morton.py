@@ -7,8 +7,6 @@ import numpy as np
 from csplat.decoder.blocks import runs
 from csplat.decoder.streams import Ints
 
-__all__ = ["morton_axes"]
-
 # Every third bit closes up in six steps, each of which halves the number of gaps: what is kept
 # after shifting by 2, 4, 8, 16 and 32. Good for 21 bits per axis; the format has 17.
 _FIRST = 0x1249249249249249

@@ -16,22 +16,7 @@ from csplat import _spec
 from csplat.decoder.blocks import Block, Coded, Columns, Sparse, runs, work_dtype
 from csplat.decoder.streams import Ints
 from csplat.errors import FormatError
-
-__all__ = [
-    "F32",
-    "check_values",
-    "lattice_rows",
-    "lift",
-    "opacity_table",
-    "quat_rows",
-    "write_bands",
-    "write_colour",
-    "write_lattice",
-    "write_opacities",
-    "write_quats",
-]
-
-F32 = NDArray[np.float32]
+from csplat.types import F32
 
 _SQRT_2 = float.fromhex("0x1.6A09E667F3BCDp+0")  # 7.5
 _INT32 = np.dtype(np.int32)

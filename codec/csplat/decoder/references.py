@@ -11,8 +11,6 @@ from csplat.decoder.header import SceneHeader
 from csplat.decoder.lattice import read_block_head
 from csplat.errors import FormatError
 
-__all__ = ["codebook_references"]
-
 _TILE_FLAGS = sum(flag for flag, name in _spec.CHUNK_FLAG_NAMES.items() if name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
 #: By coding: bytes of its parameters, i32 for each column, streams. CODEBOOK and RAW are handled by hand.
 _SHAPES = {

@@ -26,12 +26,6 @@ from csplat.model import SplatModel
 if TYPE_CHECKING:
     from csplat.inputs import File
 
-__all__ = [
-    "Scene",
-    "decode",
-    "decode_integers",
-    "decode_scene",
-]
 
 _T = TypeVar("_T", Arrays, dict[str, NDArray[Any]])
 

@@ -10,8 +10,6 @@ from csplat.decoder.container import check_reserved, open_chunk
 from csplat.decoder.header import SceneHeader
 from csplat.errors import FormatError
 
-__all__ = ["StatedError", "StatedErrors", "read_serr"]
-
 _COMPONENTS = {
     _spec.MEASURE_MEANS: 1,
     _spec.MEASURE_COVARIANCE: 1,

@@ -13,8 +13,6 @@ from csplat import _spec
 from csplat.decoder.container import Cursor, check_reserved
 from csplat.errors import FormatError, LimitError, UnsupportedError
 
-__all__ = ["Ints", "read_stream", "undo_transforms"]
-
 #: Integers of any width.
 Ints = NDArray[Any]
 

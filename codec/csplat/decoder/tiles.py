@@ -16,18 +16,10 @@ from csplat.decoder.coded import TileContext
 from csplat.decoder.codings import read_block, read_raw
 from csplat.decoder.container import check_reserved, open_chunk
 from csplat.decoder.header import SceneHeader, Tile
-from csplat.decoder.reconstruct import (
-    F32,
-    write_bands,
-    write_colour,
-    write_lattice,
-    write_opacities,
-    write_quats,
-)
+from csplat.decoder.reconstruct import write_bands, write_colour, write_lattice, write_opacities, write_quats
 from csplat.decoder.streams import Ints
 from csplat.errors import FormatError
-
-__all__ = ["Arrays", "TileBlocks", "check_max_scale", "read_tile", "wanted_layers", "write_tile"]
+from csplat.types import F32
 
 _TILE_FLAGS = sum(flag for flag, name in _spec.CHUNK_FLAG_NAMES.items() if name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
 

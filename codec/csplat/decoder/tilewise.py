@@ -25,8 +25,6 @@ from csplat.model import SplatModel
 if TYPE_CHECKING:
     from csplat.inputs import File
 
-__all__ = ["DecodedTile", "Opened", "iter_tiles", "open_tiles"]
-
 
 @dataclass(frozen=True)
 class DecodedTile:

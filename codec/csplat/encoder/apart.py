@@ -19,10 +19,8 @@ from csplat.encoder.plan import Plan
 from csplat.encoder.quantise import largest_exact, lattice_step
 from csplat.encoder.tiling import EVEN, Coarse, Tile, cut
 from csplat.model import SplatModel
+from csplat.types import F32
 
-__all__ = ["cut_scene"]
-
-F32 = NDArray[np.float32]
 Flags = NDArray[np.uint8]
 Rows = NDArray[np.intp]
 

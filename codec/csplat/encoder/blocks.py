@@ -9,21 +9,9 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.encoder.streams import Coding, signed_stream, smooth_stream, unsigned_stream
-
-__all__ = [
-    "axis_block",
-    "codebook_block",
-    "levels_block",
-    "morton_block",
-    "offset_block",
-    "raw_block",
-    "signed_block",
-    "signed_or_sparse_block",
-    "sparse_block",
-]
+from csplat.types import I64
 
 Integers = NDArray[Any]
-I64 = NDArray[np.int64]
 
 _MOSTLY = 0.9  # share of the splats from which on a mask is not worth the time that it takes decoders
 

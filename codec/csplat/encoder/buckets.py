@@ -16,11 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.encoder.morton import morton_codes
+from csplat.types import F32, I64
 
-__all__ = ["WHOLE", "Curve", "bucket_rows", "looked_at", "sample_rows", "slices"]
-
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
 Rows = NDArray[np.intp]
 
 #: Splats that are analysed as a whole: the most in a bucket, and the size of the sample of a larger scene.

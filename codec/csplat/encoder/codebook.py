@@ -18,19 +18,16 @@ from csplat.encoder.importance import splat_weights
 from csplat.encoder.kmeans import assign, cluster, rank_by_frequency
 from csplat.encoder.metric import Metric, refine
 from csplat.encoder.options import EncodeOptions
-from csplat.encoder.plan import Plan, Progress
+from csplat.encoder.plan import Plan
 from csplat.encoder.quantise import colour_integers, largest_exact
 from csplat.encoder.streams import signed_stream
 from csplat.model import SplatModel
+from csplat.types import F32, I16, I32, Progress
 
 if TYPE_CHECKING:
     from csplat.encoder.draft import Draft
 
-__all__ = ["Books", "Service", "books_of", "choose_sh", "largest_sh", "served", "settled"]
 
-I16 = NDArray[np.int16]
-I32 = NDArray[np.int32]
-F32 = NDArray[np.float32]
 Rows = NDArray[np.intp]
 
 _CLIP = 511  # lattice steps: splats beyond are coded directly, so that searches stay exact at full precision

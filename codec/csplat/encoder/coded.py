@@ -14,18 +14,17 @@ from numpy.typing import NDArray
 from csplat.encoder.codebook import Books
 from csplat.encoder.container import write
 from csplat.encoder.measure import ErrorSums, measured_sums
-from csplat.encoder.plan import Progress
 from csplat.encoder.scene import chosen_settings, file_chunks, file_scene, stated_errors
 from csplat.encoder.shape_tables import shape_book
 from csplat.encoder.tile import EncodedTile, encode_tile
 from csplat.encoder.tiling import Tile
 from csplat.errors import counted
 from csplat.model import SplatModel
+from csplat.types import Progress
 
 if TYPE_CHECKING:
     from csplat.encoder.draft import Draft
 
-__all__ = ["Coded", "EncodeReport", "EncodeResult", "notes_on"]
 
 _FEW_TILES, _SMALL_TILE = 16, 256  # tiles, and splats of a tile, below which the user is not warned
 

@@ -21,12 +21,9 @@ from csplat.encoder.quantise import (
     lattice_values,
 )
 from csplat.errors import InputError
-
-__all__ = ["Colour", "ShBook", "ShTables", "code_sh", "quantise_colour", "quantise_rows"]
+from csplat.types import F32, I32
 
 Integers = NDArray[Any]
-I32 = NDArray[np.int32]
-F32 = NDArray[np.float32]
 
 _SLACK = 1.0 + 2.0**-18  # differences of float32 values are taken in float32; bounds must hold all the same
 _ROWS = 2048  # splats at a time: rows of 45 floats and their columns stay in the second-level cache

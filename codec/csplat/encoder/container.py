@@ -13,20 +13,6 @@ import numpy as np
 from csplat import _spec
 from csplat.encoder.streams import Coding, unsigned_stream
 
-__all__ = [
-    "CodebookTable",
-    "FileChunk",
-    "FileTile",
-    "Later",
-    "Payload",
-    "SceneFields",
-    "chunk_crc",
-    "json_payload",
-    "parts",
-    "tile_payload",
-    "write",
-]
-
 
 @dataclass(frozen=True)
 class Later:

@@ -12,10 +12,8 @@ from csplat.encoder.plan import Plan
 from csplat.encoder.statistics import COLOUR_PER_SH0
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.types import F64
 
-__all__ = ["GRADED", "Curvatures", "step_errors"]
-
-F64 = NDArray[np.float64]
 Floats = NDArray[np.floating]
 
 #: Attributes whose steps may differ from grade to grade, and how many integers each has.

@@ -40,7 +40,7 @@ from csplat.encoder.importance import (
 )
 from csplat.encoder.measure import SCALE_MOST
 from csplat.encoder.options import EncodeOptions
-from csplat.encoder.plan import Plan, Progress, make_plan
+from csplat.encoder.plan import Plan, make_plan
 from csplat.encoder.scene import extra_columns
 from csplat.encoder.shape_codebook import choose_shapes
 from csplat.encoder.shape_tables import ShapeTables
@@ -49,11 +49,7 @@ from csplat.encoder.tile import tile_order
 from csplat.encoder.tiling import Tile
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
-
-__all__ = ["Draft", "Origin", "tried_rows", "within_binary32"]
-
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
+from csplat.types import F32, I64, Progress, null_progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +146,7 @@ class Draft:
         if options.shape_codebook_size and len(model):
             weights = shape_weights(model, importance)
             metric = shape_metric(weights, importance)
-            shapes = choose_shapes(model, weights, metric, tiles, plan, options, progress or _silent)
+            shapes = choose_shapes(model, weights, metric, tiles, plan, options, progress or null_progress)
         return cls(model, options, origin, importance, plan, tiles, extras, shapes, grades)
 
     @classmethod
@@ -228,7 +224,7 @@ class Draft:
         needs_weights = importance is not None or plan.adaptive > 0.0 or plan.sh_coding in ("auto", "codebook")
         weights = splat_weights(model, importance) if needs_weights else None
         sample = tried_rows(model, self.tiles, self.grades)
-        return choose_sh(self, weights, sh_metric(model, weights, importance), sample, progress or _silent)
+        return choose_sh(self, weights, sh_metric(model, weights, importance), sample, progress or null_progress)
 
     def _served(self, plan: Plan, books: Books) -> tuple[Plan, Books]:
         """Apply the decisions made on the sample to all splats."""
@@ -271,10 +267,6 @@ def tried_rows(model: SplatModel, tiles: Sequence[Tile], grades: Grades | None) 
     if grades is None:
         return tiles[len(tiles) // 2].rows
     return np.arange(0, len(model), math.ceil(len(model) / _spec.TILE_SPLATS_MAX))
-
-
-def _silent(stage: str, done: float) -> None:
-    """Report to nobody."""
 
 
 def within_binary32(model: SplatModel) -> SplatModel:

@@ -19,21 +19,18 @@ from csplat.encoder.coded import Coded
 from csplat.encoder.colour import ShBook, ShTables, quantise_colour, quantise_rows
 from csplat.encoder.geometry import seen_means, seen_opacities, seen_shapes
 from csplat.encoder.measure import measured_sums
-from csplat.encoder.plan import Plan, Progress
+from csplat.encoder.plan import Plan
 from csplat.encoder.quantise import colour_integers, colour_lifted, lattice_values, quat_levels, quat_values
 from csplat.encoder.shape_tables import ShapeTables
 from csplat.encoder.tile import coarseness
 from csplat.model import SplatModel
+from csplat.types import F32, I32, I64, Progress
 
 if TYPE_CHECKING:
     from csplat.encoder.draft import Draft
 
-__all__ = ["DecodedValues", "FreeValues", "Frozen"]
 
-F32 = NDArray[np.float32]
 _MANY = 50_000  # splats; with fewer, threads take longer to start than they save
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 
 @dataclass(eq=False)

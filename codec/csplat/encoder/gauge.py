@@ -10,9 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["fix_gauge"]
+from csplat.types import F32
 
-F32 = NDArray[np.float32]
 Columns = tuple[F32, F32, F32, F32]
 
 

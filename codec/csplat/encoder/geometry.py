@@ -23,11 +23,9 @@ from csplat.encoder.quantise import (
 )
 from csplat.encoder.shape_tables import ShapePart, ShapeTables
 from csplat.encoder.tiling import EVEN, Coarse, Tile
-
-__all__ = ["Shape", "quantise_shape", "seen_means", "seen_opacities", "seen_shapes"]
+from csplat.types import F32
 
 Integers = NDArray[Any]
-F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.encoder.curvature import GRADED, Curvatures, step_errors
 from csplat.encoder.importance import trusted
@@ -25,11 +24,7 @@ from csplat.encoder.options import EncodeOptions
 from csplat.encoder.plan import Plan
 from csplat.encoder.tiling import Coarse
 from csplat.model import SplatModel
-
-__all__ = ["Grades", "choose_grades", "most_grades"]
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
+from csplat.types import F64, U8
 
 _SPLATS = 2500  # splats in a class, about: each tile has Huffman codes of its own
 _MOST = 5

@@ -12,18 +12,7 @@ from csplat.encoder.curvature import Curvatures
 from csplat.encoder.metric import Metric
 from csplat.errors import InputError
 from csplat.model import SplatModel
-
-__all__ = [
-    "Importance",
-    "known_curvatures",
-    "sh_metric",
-    "shape_metric",
-    "shape_weights",
-    "splat_weights",
-    "trusted",
-]
-
-F32 = NDArray[np.float32]
+from csplat.types import F32
 
 _BLOCK = 1 << 16
 _RIDGE = 0.2  # weight of the plain norm in the metric: unmeasured views see the scene from other directions

@@ -8,8 +8,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from csplat.encoder.nearest import F32, F64, I16, I32, I64, U32, search
+from csplat.encoder.nearest import search
 from csplat.errors import InputError
+from csplat.types import F32, F64, I16, I32, I64, U32
 
 _SEED_ROUNDS = 8
 

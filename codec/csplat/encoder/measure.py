@@ -15,21 +15,9 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-
-__all__ = [
-    "SCALE_MOST",
-    "ErrorSums",
-    "covariance_entries",
-    "covariance_errors",
-    "distance_errors",
-    "measure_errors",
-    "measured_sums",
-    "true_means",
-    "value_errors",
-]
+from csplat.types import F64
 
 Floats = NDArray[Any]
-F64 = NDArray[np.float64]
 
 SCALE_MOST = 88.0  # logarithm of a standard deviation beyond which binary32 does not hold it
 _BLOCK = 8192  # splats at a time: the temporaries of a covariance stay in the second-level cache

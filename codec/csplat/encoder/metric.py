@@ -19,14 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.encoder.nearest import one_blas_thread
-
-__all__ = ["Metric", "reassign", "refine"]
+from csplat.types import F64, I32, I64
 
 Floats = NDArray[Any]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 _TRIED = 96  # entries for a point: its own and the nearest to that
 _ROUNDS = 2  # how often entries move

@@ -16,14 +16,8 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-I16 = NDArray[np.int16]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
-U32 = NDArray[np.uint32]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from csplat.types import F32, F64, I16, I32, I64, U32
 
 _Find = Callable[[F32, int], tuple[I64, F32]]  # rows [x, 1] and the number of the first
 

@@ -11,8 +11,6 @@ from typing import Any, Literal, get_args
 from csplat import _spec
 from csplat.errors import InputError
 
-__all__ = ["PRESETS", "Deflate", "EncodeOptions", "MeansCoding", "Preset", "PresetName", "ShCoding"]
-
 PresetName = Literal["fast", "balanced", "small"]
 MeansCoding = Literal["auto", "morton", "axis"]
 ShCoding = Literal["auto", "codebook", "scalar", "none"]

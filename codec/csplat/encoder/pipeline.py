@@ -13,8 +13,6 @@ from csplat.encoder.importance import Importance
 from csplat.encoder.options import EncodeOptions
 from csplat.model import SplatModel
 
-__all__ = ["encode", "encode_with_report"]
-
 
 def encode(
     model: SplatModel, options: EncodeOptions | None = None, *, progress: Callable[[str, float], None] | None = None

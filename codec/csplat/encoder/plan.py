@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.encoder.options import PRESETS, EncodeOptions
@@ -16,11 +14,7 @@ from csplat.encoder.statistics import Statistics, scene_statistics
 from csplat.encoder.streams import Coding, deflate_library
 from csplat.encoder.tiling import Lattice
 from csplat.model import SplatModel
-
-__all__ = ["Plan", "Progress", "make_plan"]
-
-F32 = NDArray[np.float32]
-Progress = Callable[[str, float], None]
+from csplat.types import F32
 
 _SAMPLE = 1 << 16  # splats from which sizes and extents are estimated
 _EDGE = 0.02  # share of splats on either side that does not count as the scene's extent

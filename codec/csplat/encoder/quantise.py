@@ -13,26 +13,8 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.errors import InputError
+from csplat.types import F32, I32, I64
 
-__all__ = [
-    "check_finite",
-    "colour_integers",
-    "colour_lifted",
-    "largest_exact",
-    "lattice_exponent",
-    "lattice_step",
-    "lattice_values",
-    "opacity_levels",
-    "opacity_values",
-    "quantise_means",
-    "quat_levels",
-    "quat_values",
-]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 Floats = NDArray[Any]
 Integers = NDArray[Any]
 

@@ -21,8 +21,6 @@ from csplat.model import UNSPECIFIED, SplatModel
 if TYPE_CHECKING:
     from csplat.encoder.draft import Draft, Origin
 
-__all__ = ["chosen_settings", "extra_columns", "file_chunks", "file_scene", "stated_errors"]
-
 
 _EXTRA_COLUMNS_MAX = 255  # TLE-2: block_count is a byte
 _COLOURS = tuple(_spec.MEASURE_NAMES[id] for id in range(_spec.MEASURE_SH0, _spec.MEASURE_SH0 + 4))

@@ -22,21 +22,15 @@ from csplat.encoder.kmeans import cluster, rank_by_frequency
 from csplat.encoder.metric import Metric, reassign
 from csplat.encoder.nearest import search
 from csplat.encoder.options import EncodeOptions
-from csplat.encoder.plan import Plan, Progress
+from csplat.encoder.plan import Plan
 from csplat.encoder.quantise import quat_levels, quat_values
 from csplat.encoder.shape_covariances import mean_axes, unit_covariances
 from csplat.encoder.shape_tables import ShapePart, ShapeTables, shape_blocks, shape_book
 from csplat.encoder.tile import tile_order
 from csplat.encoder.tiling import Tile
 from csplat.model import SplatModel
+from csplat.types import F32, F64, I16, I32, I64, Progress
 
-__all__ = ["choose_shapes"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-I16 = NDArray[np.int16]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 Rows = NDArray[np.intp]
 
 _UNIT = 2048  # lattice steps of a trace: searches are exact up to norms of about 2,300

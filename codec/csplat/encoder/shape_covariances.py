@@ -8,12 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.encoder.measure import covariance_entries
-
-__all__ = ["mean_axes", "unit_covariances"]
+from csplat.types import F32, F64
 
 Floats = NDArray[Any]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 _FLATTEST = 1e-30  # of a trace: rounding may leave an eigenvalue at 0 or below
 

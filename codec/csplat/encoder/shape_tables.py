@@ -12,11 +12,9 @@ from csplat import _spec
 from csplat.encoder import blocks
 from csplat.encoder.container import CodebookTable, FileChunk
 from csplat.encoder.streams import Coding, signed_stream
-
-__all__ = ["SHAPE_BOOK", "ShapePart", "ShapeTables", "shape_blocks", "shape_book"]
+from csplat.types import I32
 
 Integers = NDArray[Any]
-I32 = NDArray[np.int32]
 
 #: Id of the codebook: above those of the SH stage.
 SHAPE_BOOK = _spec.SH_DEGREE_MAX + 1

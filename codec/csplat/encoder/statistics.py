@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from csplat.encoder.morton import morton_codes
 from csplat.model import SplatModel
 
-__all__ = ["COLOUR_PER_SH0", "Statistics", "contrast_of", "scene_statistics"]
-
 #: A channel's colour per coefficient of degree 0.
 COLOUR_PER_SH0 = 0.28209479177387814
 

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.errors import InputError
 
-__all__ = ["Coding", "deflate_library", "signed_stream", "smooth_stream", "unsigned_stream"]
-
 Integers = NDArray[Any]
 
 _QUICK_LEVEL = 1  # DEFLATE level at which samples decide

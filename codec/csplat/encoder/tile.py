@@ -27,13 +27,11 @@ from csplat.encoder.quantise import (
 from csplat.encoder.shape_tables import SHAPE_BOOK, ShapePart, ShapeTables, shape_blocks
 from csplat.encoder.tiling import Coarse, Tile
 from csplat.model import SplatModel
-
-__all__ = ["EncodedTile", "coarseness", "encode_tile", "tile_order"]
+from csplat.types import F32
 
 _COARSEST = 6  # powers of two
 
 Integers = NDArray[Any]
-F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["EVEN", "Coarse", "Lattice", "Tile", "cut"]
+from csplat.types import F32
 
-F32 = NDArray[np.float32]
 Rows = NDArray[np.intp]
 
 _FEW = 48  # splats for which a tile of their own costs more than a coarser lattice loses

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from csplat.errors import counted
 from csplat.lint import Finding
 
-__all__ = ["Spread", "read_opacities_as", "read_scales_as"]
-
 _LOGS = (-30.0, 10.0)  # natural logarithms of lengths in scene units: from 1e-13 to 22,026
 _MOST_ARE_LOGS = 0.5  # share of negative values: splats of trained scenes are smaller than a unit, but for the sky
 _MANY_LOGITS = 0.25  # share of values outside of 0..1: of trained scenes it is two thirds and more

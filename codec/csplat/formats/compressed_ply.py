@@ -21,15 +21,11 @@ from csplat.formats.curve import along_curve
 from csplat.formats.format import Format
 from csplat.formats.packing import all_three, crossed, smallest_three
 from csplat.lint import Finding, too_many_bands, trailing_bytes
-from csplat.model import F32, MAX_SH_DEGREE, SplatModel
+from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.ply_comments import format_comments, parse_comments
 from csplat.ply_header import read_header
 from csplat.scene import BLOCK, Scene
-
-__all__ = ["FORMAT"]
-
-U8 = NDArray[np.uint8]
-U32 = NDArray[np.uint32]
+from csplat.types import F32, U8, U32
 
 _CHUNK = 256  # splats that share bounds
 _SH_C0 = 0.28209479177387814

@@ -15,13 +15,9 @@ from numpy.typing import NDArray
 from csplat.encoder.morton import morton_codes
 from csplat.errors import InputError
 from csplat.formats.format import ARRAYS
-from csplat.model import F32, SplatModel
+from csplat.model import SplatModel
 from csplat.scene import BLOCK, Scene
-
-__all__ = ["along_curve"]
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
+from csplat.types import F32, F64, I64
 
 _STEPS = 1 << 21  # steps along each axis
 _SAMPLE = 1 << 16  # splats that determine where the curve runs

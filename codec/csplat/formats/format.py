@@ -12,8 +12,6 @@ from csplat.detect import KINDS
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.scene import Scene
 
-__all__ = ["ARRAYS", "Format", "Reader", "Writer"]
-
 #: Splat attributes of every format.
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 

@@ -10,8 +10,6 @@ from csplat.formats.format import Format
 from csplat.formats.gltf_read import AXES, open_gltf
 from csplat.formats.gltf_write import write_gltf
 
-__all__ = ["FORMAT"]
-
 FORMAT = Format(
     name="gltf",
     open=open_gltf,

@@ -22,11 +22,8 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat.inputs import mapped, stand_in
-from csplat.model import F32
+from csplat.types import F32, F64
 
-__all__ = ["BIN", "GLB_HEAD", "JSON", "MAGIC", "Accessor", "GltfFile", "Placed", "opened"]
-
-F64 = NDArray[np.float64]
 Place = tuple[str | int, ...]  # of a value in the JSON: ("nodes", 3, "mesh")
 
 MAGIC = b"glTF"

@@ -33,10 +33,7 @@ from csplat.ply_columns import Counts, alpha_of_logits, findings_of, huge_rows
 from csplat.ply_comments import SceneFacts, parse_comments
 from csplat.scene import BLOCK, Scene
 from csplat.turning import axes_rotation, stretched, turned
-
-__all__ = ["AXES", "COLOURS", "EXTENSION", "open_gltf", "sh_names"]
-
-F64 = NDArray[np.float64]
+from csplat.types import F64
 
 #: Left, up, front.
 AXES = "LUF"

@@ -16,14 +16,11 @@ from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat.formats.gltf_file import BIN, GLB_HEAD, JSON, MAGIC
 from csplat.formats.gltf_read import AXES, COLOURS, EXTENSION, sh_names
-from csplat.model import F32, SplatModel
+from csplat.model import SplatModel
 from csplat.ply_comments import format_comments
 from csplat.scene import Scene
 from csplat.turning import in_axes, scaled
-
-__all__ = ["write_gltf"]
-
-F64 = NDArray[np.float64]
+from csplat.types import F32, F64
 
 _SH_C0 = 0.28209479177387814
 _FLOAT, _BYTE, _ARRAY_BUFFER = 5126, 5121, 34962

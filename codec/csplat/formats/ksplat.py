@@ -22,13 +22,11 @@ from csplat.formats.format import Format
 from csplat.formats.rows import colours_of_bytes, finite_scene
 from csplat.inputs import mapped
 from csplat.lint import trailing_bytes
-from csplat.model import F32, SplatModel, normalise_quats
+from csplat.model import SplatModel, normalise_quats
 from csplat.scene import BLOCK, Scene
-
-__all__ = ["FORMAT"]
+from csplat.types import F32, F64
 
 Rows = NDArray[Any]
-F64 = NDArray[np.float64]
 
 _HEADER = struct.Struct("<BBxxIIIIHxx12xff")
 _SECTION = struct.Struct("<IIIIfHxxIIIIH")

@@ -12,11 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from csplat.formats.rows import SH_C0
-from csplat.model import F32, SplatModel
+from csplat.model import SplatModel
+from csplat.ply_columns import SH_C0
 from csplat.turning import sh_bands, sphere_lattice
-
-__all__ = ["srgb_error", "srgb_of_linear"]
+from csplat.types import F32
 
 _DIRECTIONS = 96  # six for each coefficient of degree 3: with 1,000 the colours of a scene differ by 0.01 of 255 steps
 _ROWS = 4096  # splats whose colours are in memory at a time

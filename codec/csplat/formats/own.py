@@ -13,8 +13,6 @@ from csplat.formats.format import Format
 from csplat.large import encode_scene
 from csplat.scene import Scene
 
-__all__ = ["FORMAT"]
-
 
 @contextmanager
 def _open(path: Path) -> Iterator[Scene]:

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.model import F32, normalise_quats
-
-__all__ = ["all_three", "crossed", "smallest_three"]
+from csplat.model import normalise_quats
+from csplat.types import F32
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 

@@ -6,9 +6,6 @@ from csplat.formats.format import ARRAYS, Format
 from csplat.ply import open_ply
 from csplat.ply_write import write_scene_ply
 
-__all__ = ["FORMAT"]
-
-
 FORMAT = Format(
     name="ply",
     open=open_ply,

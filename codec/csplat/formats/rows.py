@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from csplat.errors import counted
 from csplat.formats.activations import Spread, read_scales_as
 from csplat.lint import Finding
-from csplat.model import F32, SplatModel
+from csplat.model import SplatModel
 from csplat.ply_columns import SH_C0, Counts, findings_of, huge_rows
 from csplat.scene import Scene
-
-__all__ = ["SH_C0", "colours_of_bytes", "finite_scene"]
+from csplat.types import F32
 
 Rows = NDArray[Any]
 

@@ -19,8 +19,6 @@ from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.scene import Scene
 
-__all__ = ["FORMAT"]
-
 _MOST = 1 << 40
 _NAMES = (
     "means",

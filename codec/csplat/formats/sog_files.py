@@ -20,8 +20,6 @@ from csplat.errors import InputError, missing
 from csplat.inputs import stand_in
 from csplat.lint import Finding
 
-__all__ = ["Json", "Parts", "parts_at", "picture_of", "with_slashes"]
-
 _LARGEST_JSON = 1 << 25
 _LARGEST_PART = 1 << 30
 _LONGEST_NAME = 200

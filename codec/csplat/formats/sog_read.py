@@ -15,14 +15,9 @@ from numpy.typing import NDArray
 
 from csplat.formats.packing import all_three, crossed
 from csplat.formats.sog_files import Json, Parts, picture_of
-from csplat.model import F32
 from csplat.ply_columns import alpha_of_logits
 from csplat.scene import BLOCK
-
-__all__ = ["COEFFICIENTS", "ENTRIES", "LEAST_TAG", "Pictures", "Unit", "degree_of", "unit_of"]
-
-U8 = NDArray[np.uint8]
-U16 = NDArray[np.uint16]
+from csplat.types import F32, U8, U16
 
 COEFFICIENTS = (0, 3, 8, 15)  #: number of SH coefficients, for each degree
 ENTRIES = 64  #: palette entries in a row of their picture

@@ -21,14 +21,9 @@ from csplat.files import atomic_writer
 from csplat.formats.curve import along_curve
 from csplat.formats.packing import smallest_three
 from csplat.formats.sog_read import ENTRIES, LEAST_TAG
-from csplat.model import F32, SplatModel
+from csplat.model import SplatModel
 from csplat.scene import Scene, joined
-
-__all__ = ["write_sog"]
-
-U8 = NDArray[np.uint8]
-U32 = NDArray[np.uint32]
-F64 = NDArray[np.float64]
+from csplat.types import F32, F64, U8, U32
 
 _LEAST_WEIGHT = 1e-3
 _LARGEST_SIDE = 16383  # pixels of a WebP

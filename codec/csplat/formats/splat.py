@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from csplat.errors import InputError, counted
 from csplat.files import atomic_writer
 from csplat.formats.format import Format
-from csplat.formats.rows import SH_C0, colours_of_bytes, finite_scene
+from csplat.formats.rows import colours_of_bytes, finite_scene
 from csplat.inputs import mapped
-from csplat.model import F32, SplatModel, normalise_quats
+from csplat.model import SplatModel, normalise_quats
+from csplat.ply_columns import SH_C0
 from csplat.scene import BLOCK, Scene
-
-__all__ = ["FORMAT"]
+from csplat.types import F32
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colours", "u1", 4), ("quats", "u1", 4)])
 _LARGEST_LOG = np.float32(88.0)  # float32 holds its exponential

@@ -24,13 +24,10 @@ from csplat.errors import InputError
 from csplat.formats.format import Format
 from csplat.formats.packing import all_three, smallest_three
 from csplat.formats.spz_file import ANTIALIASED, AXES, MOST_BITS, Packed, read_packed, write_packed
-from csplat.model import F32, SplatModel, normalise_quats
+from csplat.model import SplatModel, normalise_quats
 from csplat.scene import BLOCK, Scene
 from csplat.turning import in_axes
-
-__all__ = ["FORMAT", "decoded", "means_of", "write_spz"]
-
-U8 = NDArray[np.uint8]
+from csplat.types import F32, U8
 
 _COLOUR = np.float32(0.15)  # what a coefficient is multiplied by, of the 256 levels
 _PART = np.sqrt(np.float32(0.5)) / np.float32(511)  # step of a component of a rotation

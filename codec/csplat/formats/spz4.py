@@ -7,6 +7,4 @@ from functools import partial
 
 from csplat.formats import spz
 
-__all__ = ["FORMAT"]
-
 FORMAT = replace(spz.FORMAT, name="spz4", write=partial(spz.write_spz, version=4))

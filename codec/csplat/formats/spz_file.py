@@ -20,10 +20,7 @@ from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat.lint import Finding, too_many_bands, trailing_bytes
 from csplat.model import MAX_SH_DEGREE
-
-__all__ = ["ANTIALIASED", "AXES", "MOST_BITS", "Packed", "read_packed", "write_packed"]
-
-U8 = NDArray[np.uint8]
+from csplat.types import U8
 
 #: Right, up, back.
 AXES = "RUB"

@@ -20,8 +20,6 @@ from csplat.encoder.buckets import Curve
 from csplat.errors import InputError
 from csplat.model import SplatModel
 
-__all__ = ["BucketWriter", "Layout", "read_splats", "write_splats"]
-
 _FRAME = struct.Struct("<QI")  # rows, CRC-32 of the arrays
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 

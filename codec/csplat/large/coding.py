@@ -23,8 +23,6 @@ from csplat.encoder.tile import EncodedTile, encode_tile
 from csplat.files import atomic_writer
 from csplat.large.bucket_files import Layout, bucket_path, damaged, read_splats
 
-__all__ = ["Bucket", "Coding", "code_bucket", "coded_bucket"]
-
 
 @dataclass(frozen=True)
 class Bucket:

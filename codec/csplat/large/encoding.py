@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,10 +31,7 @@ from csplat.large.work import Work
 from csplat.large.workers import code_here, code_on_cluster
 from csplat.memory import default_bytes
 from csplat.scene import Scene, watched
-
-__all__ = ["Needs", "encode_scene", "needs_of"]
-
-Progress = Callable[[str, float], None]
+from csplat.types import Progress, null_progress
 
 _MB = 1_000_000
 _PROGRAM = 120 * _MB  # a process that has loaded the encoder
@@ -159,7 +156,7 @@ def encode_scene(
         "csplat": __version__,
     }
     work = Work.begun(work_folder, _layout(scene, options), key, resume=resume)
-    return _Encoding(scene, path, options, work, needs, cluster, progress or _silent).run()
+    return _Encoding(scene, path, options, work, needs, cluster, progress or null_progress).run()
 
 
 @dataclass(eq=False)
@@ -265,7 +262,3 @@ class _Encoding:
                 self.progress("writing", min(1.0, size / max(1, payloads)))
         notes = notes_on(tiles, strict=draft.plan.lattice.strict)
         return EncodeReport(settings, errors.stated(), errors.count, len(tiles), size, notes)
-
-
-def _silent(stage: str, done: float) -> None:
-    """Report to nobody."""

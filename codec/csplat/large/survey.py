@@ -12,8 +12,6 @@ from csplat.large.bucket_files import Layout
 from csplat.model import SplatModel
 from csplat.scene import Scene
 
-__all__ = ["Survey", "take_survey"]
-
 
 @dataclass(frozen=True, eq=False)
 class Survey:

@@ -19,8 +19,6 @@ from csplat.large.bucket_files import Layout, bucket_path, damaged, read_splats,
 from csplat.large.coding import Bucket
 from csplat.large.survey import Survey
 
-__all__ = ["Work"]
-
 _STATE = "state.json"
 _SAMPLE = "sample"
 

@@ -11,8 +11,6 @@ from csplat.errors import missing
 from csplat.large.coding import Bucket, Coding, code_bucket
 from csplat.processes import each_apart
 
-__all__ = ["code_here", "code_on_cluster"]
-
 
 def code_here(folder: Path, buckets: Sequence[Bucket], coding: Coding, workers: int) -> Iterator[Bucket]:
     """Code buckets on this machine, and give each when it is done.

@@ -19,8 +19,9 @@ errors (L3; what is only coarse is in `coarse` and `cut`), `picturing` at render
 
 from __future__ import annotations
 
-from csplat_conformance.encoders.inputs import Input, all_inputs
-from csplat_conformance.encoders.run import LEVELS, PSNR_MIN, EncoderChoice, run_encoder
+from csplat_conformance.encoders.inputs import PSNR_MIN, Input, all_inputs
+from csplat_conformance.encoders.levels import LEVELS
+from csplat_conformance.encoders.run import EncoderChoice, run_encoder
 from csplat_conformance.encoders.writing import write_inputs
 
 __all__ = ["LEVELS", "PSNR_MIN", "EncoderChoice", "Input", "all_inputs", "run_encoder", "write_inputs"]

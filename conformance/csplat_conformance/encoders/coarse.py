@@ -22,8 +22,6 @@ import numpy as np
 from csplat_conformance.encoders.inputs import Input
 from csplat_conformance.stated import MeasureProof, Proof, Source
 
-__all__ = ["coarse_errors", "coarse_pruning"]
-
 MEANS_OF_APART = 0.25
 COVARIANCE_MAX, COVARIANCE_RMS = 1.15, 0.65
 OPACITIES_MAX = 0.25

@@ -23,12 +23,8 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.decoder import SceneHeader
 from csplat.model import SplatModel
+from csplat.types import F64, I64
 from csplat_conformance.stated import Source
-
-__all__ = ["ONE_SIDED", "STEPS_MAX", "find_cuts"]
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 STEPS_MAX = 0.75  #: lattice steps; rounding leaves 0.5, and 0.71 next to alpha 0 if it looks for the nearest alpha
 ONE_SIDED = 0.95  #: share of the errors with one sign; 40 fair coins are this one-sided once in 10^9 throws

@@ -10,8 +10,6 @@ from csplat_conformance.mutate import mapped
 from csplat_conformance.process import Ended
 from csplat_conformance.report import Status
 
-__all__ = ["judge_end", "wrong_habits"]
-
 _TRACEBACK = b"Traceback (most recent call last)"
 _LINE_MAX = 200  # characters of a program's line that are shown
 

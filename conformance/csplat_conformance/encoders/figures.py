@@ -7,8 +7,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-__all__ = ["beside", "figures_of"]
-
 _FILE = Path(__file__).with_name("figures.json")
 _SPELT = {"spz": "SPZ"}
 

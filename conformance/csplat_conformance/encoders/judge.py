@@ -19,8 +19,6 @@ from csplat_conformance.report import Status
 from csplat_conformance.stated import Source, wrong_extras
 from csplat_conformance.validator import validate
 
-__all__ = ["judge_content", "judge_stream"]
-
 _CUT_SHORT = frozenset((_spec.ERROR_TRUNCATED,))
 _SHOWN = 3
 

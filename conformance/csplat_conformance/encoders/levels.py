@@ -16,8 +16,6 @@ from csplat_conformance.encoders.trial import Trial
 from csplat_conformance.encoders.verdict import Verdict, failed
 from csplat_conformance.report import Outcome, Status
 
-__all__ = ["LEVELS", "Asked", "judge_input"]
-
 LEVELS = ("L1", "L2", "L3", "L4")
 
 

@@ -13,8 +13,6 @@ from csplat_conformance.encoders.matching import Pairs
 from csplat_conformance.encoders.verdict import Wrong
 from csplat_conformance.stated import Source, check_source_index
 
-__all__ = ["check_index"]
-
 CLAUSE = "SRC-4"
 
 

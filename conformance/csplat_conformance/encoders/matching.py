@@ -8,10 +8,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Pairs", "pair"]
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
+from csplat.types import F64, I64
 
 _NONE = -1
 _CELL_MAX = 2.0**40  # centres more cells away from the origin than this share a cell; distance decides anyway

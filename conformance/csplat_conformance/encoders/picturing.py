@@ -15,8 +15,6 @@ from csplat_conformance.encoders.verdict import Verdict
 from csplat_conformance.report import Status
 from csplat_conformance.stated import Source
 
-__all__ = ["PictureJudge", "judge_pictures"]
-
 #: PSNR in dB of a decoded scene against its source; the source comes first.
 PictureJudge = Callable[[SplatModel, SplatModel], float]
 

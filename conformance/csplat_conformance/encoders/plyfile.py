@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from csplat_conformance.stated import Source
 
-__all__ = ["Layout", "Splats", "is_splat", "meaning", "write"]
-
 _ENDIAN = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPE_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i2": "short", "i4": "int", "u4": "uint"}
 

@@ -11,8 +11,6 @@ from csplat_conformance.encoders.verdict import Verdict, in_short
 from csplat_conformance.report import Status
 from csplat_conformance.stated import prove
 
-__all__ = ["judge_errors"]
-
 _UNKNOWN = "which splat is which is not known"
 _SILENT = "the file states no errors"
 

@@ -21,8 +21,6 @@ from csplat_conformance.encoders.trial import AGAIN_SECONDS, OPTIONAL_PLACES, PL
 from csplat_conformance.process import split_command
 from csplat_conformance.report import Outcome, Report, Status
 
-__all__ = ["LEVELS", "PSNR_MIN", "TIMEOUT_SECONDS", "EncoderChoice", "chosen_inputs", "run_encoder"]
-
 TIMEOUT_SECONDS = 60.0
 
 _NO_PICTURES = "nothing renders here"

@@ -13,8 +13,6 @@ from csplat.files import atomic_writer
 from csplat_conformance.encoders.inputs import Input
 from csplat_conformance.process import Ended, run_program
 
-__all__ = ["AGAIN_SECONDS", "OPTIONAL_PLACES", "PLACES", "Runner", "Trial", "try_once"]
-
 #: Runs a command line with some places put in, within some seconds, without a process of its own.
 Runner = Callable[[str, Mapping[str, str], float], Ended]
 

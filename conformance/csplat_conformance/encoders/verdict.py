@@ -7,8 +7,6 @@ from typing import Any
 
 from csplat_conformance.report import Status
 
-__all__ = ["Verdict", "Wrong", "failed", "in_short"]
-
 #: A defect: the broken clause, empty if there is none, and a line about it.
 Wrong = tuple[str, str]
 

@@ -10,8 +10,6 @@ from csplat.files import atomic_writer
 from csplat_conformance.encoders.inputs import PSNR_MIN, Input
 from csplat_conformance.encoders.run import chosen_inputs
 
-__all__ = ["LIST", "write_inputs"]
-
 LIST = "inputs.json"
 
 

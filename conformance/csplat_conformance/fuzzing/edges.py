@@ -8,8 +8,6 @@ from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
 
-__all__ = ["Edges"]
-
 _Trace = Callable[[FrameType, str, Any], Any]
 
 

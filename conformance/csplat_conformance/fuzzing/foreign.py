@@ -21,8 +21,6 @@ from csplat.model import SplatModel, normalise_quats
 from csplat_conformance.fuzzing.plies import FileTarget, unsound
 from csplat_conformance.fuzzing.targets import Case
 
-__all__ = ["FormatTarget", "Seed"]
-
 _OWN = ("ply", "csplat")  # formats that have targets of their own
 _COUNTS = (b"\x00\x00\x00\x00", b"\x01\x00\x00\x00", b"\xff\xff\xff\x7f", b"\xff\xff\xff\xff", b"\x00\x00\x00\x80")
 _PACKAGE = Path(csplat.__file__).parent

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 
 from csplat_conformance.samples import integers
 
-__all__ = ["Ply", "changed", "seeds"]
-
 _KINDS = ("binary_little_endian", "binary_big_endian", "ascii")
 _TYPES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double", "int8", "uint16", "float32", "float64")
 _CODES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}

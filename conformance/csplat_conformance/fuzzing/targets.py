@@ -26,8 +26,6 @@ from csplat_conformance.repair import repair
 from csplat_conformance.report import Status
 from csplat_conformance.serving import Served
 
-__all__ = ["C_LIMITS", "JS_LIMITS", "LIMITS", "Case", "DecoderTarget", "OthersTarget", "Target", "missing_others"]
-
 LIMITS = decoder.Limits(splats=100_000, bytes=32_000_000, json_bytes=1_000_000)
 
 _SMALL = decoder.Limits(splats=10_000, bytes=8_000_000, json_bytes=1_000_000)  # arrays are hashed: fewer of them

@@ -11,8 +11,6 @@ from csplat.errors import CsplatError
 from csplat_conformance import validator
 from csplat_conformance.fuzzing.targets import LIMITS, DecoderTarget
 
-__all__ = ["ValidatorTarget"]
-
 
 class ValidatorTarget(DecoderTarget):
     """A file is decoded if and only if the validator finds nothing; of refusals it names the clause, too."""

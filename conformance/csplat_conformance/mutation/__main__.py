@@ -28,8 +28,6 @@ from csplat_conformance.mutation.mutants import Decoder, Fate, Mutant, Result, s
 from csplat_conformance.mutation.native import NativeDecoder
 from csplat_conformance.mutation.python import NO_FORK, PythonDecoder
 
-__all__ = ["main"]
-
 _FILES = 2000
 _DECODERS: Final[dict[str, Callable[[Sequence[bytes]], Decoder]]] = {
     "python": PythonDecoder,

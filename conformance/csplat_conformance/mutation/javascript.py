@@ -15,8 +15,6 @@ from csplat_conformance.mutation.judging import difference, failing, verdict
 from csplat_conformance.mutation.mutants import Fate, Mutant, Result
 from csplat_conformance.node import JsDecoder, js_folder
 
-__all__ = ["JavaScriptDecoder"]
-
 _SECONDS = 5.0  # for one file: more than a hundred times what the largest takes
 _OPERATORS = Path("test", "operators.mjs")
 #: Not of the decoder of whole files, which is what vectors ask, or not in JavaScript; or tables that are generated.

@@ -13,8 +13,6 @@ from csplat_conformance.fuzzing.targets import DecoderTarget
 from csplat_conformance.manifest import Vector, load
 from csplat_conformance.report import Status
 
-__all__ = ["Ask", "difference", "failing", "fuzzed", "vectors", "verdict"]
-
 #: Decodes a file.
 Ask = Callable[[bytes], Answer]
 

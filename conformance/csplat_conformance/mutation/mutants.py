@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
 
-__all__ = ["Decoder", "Fate", "Mutant", "Result", "sample", "score", "table"]
-
 _SHOWN = 100  # characters of a piece of text
 
 

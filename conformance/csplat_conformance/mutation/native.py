@@ -13,8 +13,6 @@ from csplat_conformance.mutation.mutants import Fate, Mutant, Result
 from csplat_conformance.mutation.tokens import c_mutants
 from csplat_conformance.native import ADAPTER, SOURCES, CDecoder, c_folder, compile_c
 
-__all__ = ["NativeDecoder"]
-
 _SECONDS = 5.0  # for one file: more than a hundred times what the largest takes
 
 

@@ -9,8 +9,6 @@ from typing import Final
 
 from csplat_conformance.mutation.mutants import Mutant
 
-__all__ = ["python_mutants"]
-
 _COMPARISONS: Final = {
     ast.Lt: ("<", ("<=", ">=")),
     ast.LtE: ("<=", ("<", ">")),

@@ -26,8 +26,6 @@ from csplat_conformance.mutation.mutants import Fate, Mutant, Result
 from csplat_conformance.mutation.operators import python_mutants
 from csplat_conformance.report import Status
 
-__all__ = ["NO_FORK", "PythonDecoder"]
-
 NO_FORK = "this system cannot copy processes, in which mutants run: use Linux or macOS"
 
 _PROCESSOR_SECONDS = 30  # the right decoder takes five

@@ -9,8 +9,6 @@ from typing import Final
 
 from csplat_conformance.mutation.mutants import Mutant
 
-__all__ = ["c_mutants"]
-
 _TOKEN: Final = re.compile(
     r"""
     (?P<nothing>/\*[ ]begin[ ]generated.*?/\*[ ]end[ ]generated[ ]\*/ | /\*.*?\*/ | ^\#(?:[^\n\\]|\\.)*)

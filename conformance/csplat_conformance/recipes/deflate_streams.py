@@ -10,8 +10,6 @@ from csplat_conformance.deflate import END_OF_BLOCK, Deflate, flat_lengths
 from csplat_conformance.samples import MEANS, OPACITIES, QUATS, SCALES, SH0, Recipe, axis, levels, scene, signed, tile
 from csplat_conformance.scene import Scene, Stream
 
-__all__ = ["Case", "broken_streams", "invalid_deflate_recipes", "sound_streams", "valid_deflate_recipes"]
-
 _LENGTH_3 = 257
 _TABLE = {7: 2, 8: 2, END_OF_BLOCK: 2, _LENGTH_3: 2}  # complete
 _BOTH = {0: 1, 1: 1}

@@ -23,8 +23,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import Attribute, Block, Chunk, Codebook, Extra, Scene, Stream
 
-__all__ = ["edge_recipes"]
-
 _RUNS = (_spec.TRANSFORM_RUN_LENGTH,)
 _COLUMN = _spec.COLUMN_MAX
 

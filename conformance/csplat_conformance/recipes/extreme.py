@@ -27,8 +27,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import Attribute, Block, Chunk, Extra, Scene, StatedErrors, Stream
 
-__all__ = ["extreme_recipes"]
-
 _RUNS = (_spec.TRANSFORM_RUN_LENGTH,)
 _MAX = _spec.INTEGER_MAX
 _SINGLE_LARGEST = float(2**128 - 2**104)

@@ -29,8 +29,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import PLAIN, Attribute, Block, Chunk, Codebook, Extra, Scene, StatedErrors, Stream
 
-__all__ = ["extreme_stream_recipes"]
-
 _RUNS = (_spec.TRANSFORM_RUN_LENGTH,)
 
 

@@ -10,8 +10,6 @@ from csplat_conformance.builder import SIZED, Built, build
 from csplat_conformance.samples import Recipe, rich_scene, scene, tile
 from csplat_conformance.scene import Block, Chunk, Extra, Scene, Stream
 
-__all__ = ["invalid_growth_recipes", "valid_growth_recipes"]
-
 _LONGEST = 255
 
 

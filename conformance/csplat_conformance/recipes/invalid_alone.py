@@ -22,8 +22,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import Attribute, Chunk, Codebook, Extra, Stream
 
-__all__ = ["alone_recipes"]
-
 _RUNS = (_spec.TRANSFORM_RUN_LENGTH,)
 _META = Chunk(_spec.CHUNK_METADATA, b"{}")
 

@@ -27,8 +27,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import Attribute, Block, Codebook, Extra, Rows, Scene, Stream
 
-__all__ = ["alone_block_recipes"]
-
 _COLUMN = _spec.COLUMN_MAX
 
 

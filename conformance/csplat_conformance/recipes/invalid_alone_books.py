@@ -21,8 +21,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import Block, Codebook, Scene, Stream
 
-__all__ = ["alone_book_recipes"]
-
 _SH1, _SH2 = sh_attribute(1), sh_attribute(2)
 
 

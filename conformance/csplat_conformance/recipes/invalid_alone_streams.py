@@ -22,8 +22,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import PAIRS, Block, Chunk, Codebook, Extra, Scene, Stream
 
-__all__ = ["alone_stream_recipes"]
-
 _RUNS = (_spec.TRANSFORM_RUN_LENGTH,)
 _STREAM = "TILE.0.0/opacities.stream"
 

@@ -22,8 +22,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import Attribute, Block, Chunk, Codebook, Tile
 
-__all__ = ["alone_tile_recipes"]
-
 _RUNS = (_spec.TRANSFORM_RUN_LENGTH,)
 _META = Chunk(_spec.CHUNK_METADATA, b"{}")
 

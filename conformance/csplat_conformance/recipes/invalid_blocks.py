@@ -30,8 +30,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import Attribute, Block, Codebook, Extra, Scene, Stream
 
-__all__ = ["block_recipes"]
-
 _STREAM = "TILE.0.0/opacities.stream"
 
 

@@ -18,8 +18,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import Chunk, Scene, StatedErrors, Stream
 
-__all__ = ["chunk_recipes"]
-
 _NAN, _INF = float("nan"), float("inf")
 _LARGEST = 0.0048828125
 _RMS = math.nextafter(_LARGEST * math.sqrt(3.0) * (1.0 + 2.0**-20), 1.0)

@@ -23,8 +23,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import Attribute, Block, Codebook, Scene, Stream
 
-__all__ = ["codebook_recipes"]
-
 
 def codebook_recipes() -> list[Recipe]:
     """Return the recipes of this module."""

@@ -11,8 +11,6 @@ from csplat_conformance.samples import (
     Recipe,
 )
 
-__all__ = ["header_recipes"]
-
 
 def header_recipes() -> list[Recipe]:
     """Return the recipes of this module."""

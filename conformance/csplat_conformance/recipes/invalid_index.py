@@ -11,8 +11,6 @@ from csplat_conformance.builder import build
 from csplat_conformance.samples import SCALES, SH0, Recipe, scene, signed, tile
 from csplat_conformance.scene import Block, Stream
 
-__all__ = ["index_recipes"]
-
 _SPLAT_BYTES = 4 * (3 + 4 + 3 + 1 + 48)  # in the arrays of section 3, at SH degree 3
 _NAN, _INF = float("nan"), float("inf")
 

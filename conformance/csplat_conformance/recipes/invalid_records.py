@@ -12,8 +12,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import Extra
 
-__all__ = ["record_recipes"]
-
 
 def record_recipes() -> list[Recipe]:
     """Return the recipes of this module."""

@@ -23,8 +23,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import Attribute, Block, Scene, Stream
 
-__all__ = ["stream_recipes"]
-
 _RUNS = (_spec.TRANSFORM_RUN_LENGTH,)
 _STREAM = "TILE.0.0/opacities.stream"
 _VALUES = [7, 8]

@@ -20,8 +20,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import Chunk, Scene
 
-__all__ = ["tile_recipes"]
-
 _NAN, _INF = float("nan"), float("inf")
 _KNOWN = _spec.CHUNK_FLAG_CRITICAL
 

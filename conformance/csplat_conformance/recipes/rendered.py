@@ -30,8 +30,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import PAIRS, Attribute, Scene, Tile
 
-__all__ = ["rendered_recipes"]
-
 _SIDE = 128  # pixels
 _NEAR = 0.2  # scene units
 _PSNR = 45.0  # dB: rounding to 8 bits costs 59, a cut at three standard deviations is seen at 40

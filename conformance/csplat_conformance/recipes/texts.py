@@ -11,8 +11,6 @@ from csplat_conformance.builder import build
 from csplat_conformance.samples import Recipe, scene
 from csplat_conformance.scene import Chunk, Scene, StatedErrors
 
-__all__ = ["bad_text_recipes", "good_text_recipes"]
-
 _META, _CAMS, _OPTS = _spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS
 
 #: Texts that JSN-1 refuses, by the name of the vector: the text and its defect.

@@ -33,8 +33,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import PLAIN, Attribute, Block, Chunk, Extra, Scene, StatedErrors, Stream
 
-__all__ = ["valid_recipes"]
-
 _DELTA, _ZIGZAG, _PLANES, _RUNS = (
     _spec.TRANSFORM_DELTA,
     _spec.TRANSFORM_ZIGZAG,

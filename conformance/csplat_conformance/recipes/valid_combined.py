@@ -33,8 +33,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import Block, Chunk, Codebook, Extra, Scene, Stream, Tile
 
-__all__ = ["combined_recipes"]
-
 _EVERY = (
     _spec.TRANSFORM_DELTA,
     _spec.TRANSFORM_ZIGZAG,

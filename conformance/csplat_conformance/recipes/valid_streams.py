@@ -22,8 +22,6 @@ from csplat_conformance.samples import (
 )
 from csplat_conformance.scene import Attribute, Block, Codebook, Scene, Stream
 
-__all__ = ["valid_stream_recipes"]
-
 _DELTA, _ZIGZAG, _PLANES, _RUNS = (
     _spec.TRANSFORM_DELTA,
     _spec.TRANSFORM_ZIGZAG,

@@ -24,19 +24,15 @@ from csplat.memory import default_bytes
 from csplat.model import SplatModel
 from csplat.processes import CAN_COPY
 from csplat.scene import Scene, joined
+from csplat.types import I64, Progress
 from csplat_conformance.stated.cells import Cells
-from csplat_conformance.stated.matching import STAGE, UNMATCHED, Progress
+from csplat_conformance.stated.matching import STAGE, UNMATCHED
 from csplat_conformance.stated.pairs import check_source_index, measure_names, measure_pairs, merged, wrong_extras
 from csplat_conformance.stated.proof import Pairs, farthest, nearest, prove_by, tile_of
 from csplat_conformance.stated.searching import Search
 from csplat_conformance.stated.source import Source
 from csplat_conformance.stated.spool import Rows, Spool, opened_spool
 from csplat_conformance.stated.verdict import Proof, Worst
-
-__all__ = ["PartSizes", "fits_memory", "prove_by_disk"]
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _FOLDS = 2.2  # memory to compare two scenes, as a multiple of their arrays
 _SPLAT_BYTES = 80  # bytes per source splat in addition to its arrays: keys, order, centres in doubles

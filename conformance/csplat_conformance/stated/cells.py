@@ -10,10 +10,7 @@ from numpy.typing import NDArray
 
 from csplat.boxes import tile_boxes
 from csplat.decoder import SceneHeader
-
-__all__ = ["Cells"]
-
-F64 = NDArray[np.float64]
+from csplat.types import F64
 
 _EIGHTHS = np.array([[x, y, z] for x in (0.25, 0.75) for y in (0.25, 0.75) for z in (0.25, 0.75)])
 

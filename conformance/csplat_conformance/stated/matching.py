@@ -8,7 +8,7 @@ a splat's partner lies in its own cell or, along each axis, in the nearer neighb
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial, reduce
 from typing import Any
@@ -19,18 +19,10 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.decoder import SceneHeader, Tile
 from csplat.model import SplatModel
+from csplat.types import F64, I64, U64, Progress
 from csplat_conformance.room import room
 from csplat_conformance.stated.pairs import differences
 from csplat_conformance.stated.source import Source
-
-__all__ = ["STAGE", "UNDECIDED", "UNMATCHED", "Progress", "lattice_radii", "match", "tile_radii"]
-
-#: Called with a stage's name and its progress, 0 to 1.
-Progress = Callable[[str, float], None]
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-U64 = NDArray[np.uint64]
 
 UNMATCHED = -1  #: no source splat lies within the bounds
 UNDECIDED = -2  #: more candidates than were looked at

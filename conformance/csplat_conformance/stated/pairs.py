@@ -16,12 +16,9 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
+from csplat.types import F32, F64
 from csplat_conformance.stated.source import Source
 
-__all__ = ["Measured", "check_source_index", "differences", "measure_names", "measure_pairs", "merged", "wrong_extras"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 Rows = NDArray[Any]  # integers that name splats
 
 _NORMALS = frozenset(("nx", "ny", "nz"))

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from csplat.decoder import SceneHeader, StatedErrors
 from csplat.model import SplatModel
+from csplat.types import I64, Progress
 from csplat_conformance.room import may_be_stated, room
-from csplat_conformance.stated.matching import UNDECIDED, UNMATCHED, Progress, lattice_radii, match
+from csplat_conformance.stated.matching import UNDECIDED, UNMATCHED, lattice_radii, match
 from csplat_conformance.stated.pairs import (
     Measured,
     check_source_index,
@@ -27,10 +28,6 @@ from csplat_conformance.stated.pairs import (
 )
 from csplat_conformance.stated.source import Source
 from csplat_conformance.stated.verdict import MeasureProof, Proof, Worst
-
-__all__ = ["Pairs", "Way", "contradictions", "farthest", "nearest", "prove", "prove_by", "tile_of"]
-
-I64 = NDArray[np.int64]
 
 _LOOKED_AT, _LOOKED_AT_LEAST = 100, 10  # splats without a partner whose nearest source splats are looked for
 _PASSES = 10**8  # distances that this may take

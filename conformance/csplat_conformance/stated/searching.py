@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.boxes import tile_boxes
@@ -16,15 +15,10 @@ from csplat.decoder import Opened
 from csplat.model import SplatModel
 from csplat.processes import each_apart
 from csplat.scene import joined
+from csplat.types import F64, I8, I64
 from csplat_conformance.room import room
 from csplat_conformance.stated.matching import UNMATCHED, match, tile_radii
 from csplat_conformance.stated.spool import Spool
-
-__all__ = ["FOUND", "Search"]
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-I8 = NDArray[np.int8]
 
 FOUND = 0  #: instead of which partner it is
 

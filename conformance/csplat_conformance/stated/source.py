@@ -11,10 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import MAX_SH_DEGREE, SplatModel
-
-__all__ = ["Source"]
-
-F32 = NDArray[np.float32]
+from csplat.types import F32
 
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 

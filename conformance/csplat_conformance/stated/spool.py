@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 
 from csplat.files import check_room
 from csplat.system import read_into
+from csplat.types import I64
 from csplat_conformance.stated.source import Source
 
-__all__ = ["Rows", "Spool", "opened_spool"]
-
-I64 = NDArray[np.int64]
 Records = NDArray[Any]  # structured, a splat each
 
 _WAITING_BYTES = 1 << 25  # bytes of splats that wait to be written, so that parts of a file are large enough to read

@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["MeasureProof", "Proof", "Worst"]
-
 _NOT_WITHOUT_INDEX = "rms and counts are not proved without a source index"
 
 

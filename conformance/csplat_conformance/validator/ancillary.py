@@ -15,8 +15,6 @@ from csplat_conformance.validator.jsontext import JsonError, parse
 from csplat_conformance.validator.reading import Payload
 from csplat_conformance.validator.streams import read_stream
 
-__all__ = ["read_stated_errors", "read_text"]
-
 _COMPONENTS = {"means": 1, "covariance": 1, "opacities": 1, "sh0": 3, "sh1": 9, "sh2": 15, "sh3": 21}
 _ROOM = 1.0 + 2.0**-20  # SER-2
 _CAMERA_KEYS = ("K", "viewmat", "W", "H")

@@ -10,6 +10,7 @@ from mmap import mmap
 
 from csplat import _spec
 from csplat.inputs import LetGo
+from csplat.types import null_progress
 from csplat_conformance.validator.ancillary import read_stated_errors, read_text
 from csplat_conformance.validator.chunks import Chunk, check_coverage, check_frame, read_directory
 from csplat_conformance.validator.codebooks import Books, read_codebook
@@ -19,8 +20,6 @@ from csplat_conformance.validator.index import Index, read_records
 from csplat_conformance.validator.reading import Payload, UnreadableError, place
 from csplat_conformance.validator.tile_records import Tile, read_tiles
 from csplat_conformance.validator.tiles import TileReader
-
-__all__ = ["validate"]
 
 _CRC_SIZE = 4
 _TEXTS = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS)
@@ -60,7 +59,7 @@ def validate(
     findings = Findings()
     counts = _Counts()
     with suppress(TooManyError):  # the last remark says so
-        _check(view, findings, counts, json_bytes_max, splats_max, progress or (lambda _stage, _done: None))
+        _check(view, findings, counts, json_bytes_max, splats_max, progress or null_progress)
     return Validation(
         tuple(sorted(findings.violations, key=lambda one: one.offset)),
         tuple(findings.remarks),

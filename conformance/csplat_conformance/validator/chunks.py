@@ -12,8 +12,6 @@ from csplat_conformance.validator.findings import Findings, Placed
 from csplat_conformance.validator.index import Index
 from csplat_conformance.validator.reading import Payload, place
 
-__all__ = ["Chunk", "check_coverage", "check_frame", "chunk_record", "read_directory", "registered_flags"]
-
 _SINGLE = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
 #: The first layer that this version does not have; the order of its chunks is not checked (4.3.6).
 _LAST = max(_spec.LAYER_NAMES) + 1

@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from csplat import _spec
+from csplat.types import I64
 from csplat_conformance.validator.chunks import Chunk
 from csplat_conformance.validator.findings import Findings
 from csplat_conformance.validator.index import CodebookAt, Index
 from csplat_conformance.validator.reading import Payload
 from csplat_conformance.validator.streams import read_stream
-from csplat_conformance.validator.values import I64, Place, check_integers
-
-__all__ = ["Books", "attribute_columns", "first_attribute", "read_codebook"]
+from csplat_conformance.validator.values import Place, check_integers
 
 #: By id and layer the entries, [size, C], of chunks that could be read and are sound.
 Books = dict[tuple[int, int], I64]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from csplat import _spec
+from csplat.types import I64
 from csplat_conformance.validator.codebooks import attribute_columns, first_attribute
 from csplat_conformance.validator.findings import Placed
 from csplat_conformance.validator.index import CodebookAt
@@ -18,9 +19,7 @@ from csplat_conformance.validator.tiles import (
     read_exponent,
     read_offsets,
 )
-from csplat_conformance.validator.values import I64, check_integers
-
-__all__ = ["read_coded"]
+from csplat_conformance.validator.values import check_integers
 
 _WIDTH_MAX = _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK]
 _ESCAPES = (_spec.CODING_OFFSET, _spec.CODING_SIGNED)

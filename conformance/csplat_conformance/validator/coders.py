@@ -7,8 +7,6 @@ import zlib
 from csplat import _spec
 from csplat_conformance.validator.inflate import CodedError, Inflater
 
-__all__ = ["CodedError", "uncoded"]
-
 _RAW_DEFLATE = -15
 
 

@@ -7,8 +7,6 @@ from typing import Any, Generic, TypeVar
 
 from csplat_conformance.validator.rules import CODES
 
-__all__ = ["Findings", "Placed", "TooManyError", "Unread", "Validation", "Violation"]
-
 T = TypeVar("T")
 
 #: A file of garbage with sound sizes breaks a clause every few bytes: nobody reads more.

@@ -10,8 +10,6 @@ from csplat import _spec
 from csplat_conformance.validator.findings import Findings, Placed
 from csplat_conformance.validator.reading import place
 
-__all__ = ["Index", "read_records", "scaled"]
-
 #: Bytes of the fields that this version knows.
 _LEAST = {
     "head": _spec.INDEX_HEAD_SIZE,

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = ["CodedError", "Inflater"]
-
 _STORED, _FIXED, _DYNAMIC = 0, 1, 2
 _END_OF_BLOCK = 256
 _LITERALS_MAX, _DISTANCES_MAX = 286, 30

@@ -7,8 +7,6 @@ from typing import TypeVar
 
 from csplat_conformance.validator.findings import Findings, Placed
 
-__all__ = ["Payload", "UnreadableError", "place"]
-
 T = TypeVar("T")
 _Unpack = Callable[[memoryview, int], T]
 

@@ -10,8 +10,6 @@ from typing import Final
 
 from csplat import _spec
 
-__all__ = ["CODES"]
-
 #: Clause to error code; if the text names two, the one that this table has is the usual one.
 CODES: Final[dict[str, str]] = {
     "RES-1": _spec.ERROR_RESERVED,

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat_conformance.validator.coders import CodedError, uncoded
+from csplat_conformance.validator.coders import uncoded
 from csplat_conformance.validator.findings import Findings, Placed
+from csplat_conformance.validator.inflate import CodedError
 from csplat_conformance.validator.reading import Payload, UnreadableError
-
-__all__ = ["Elements", "Stream", "read_stream"]
 
 #: Elements of a stream: int64, or uint64 for RAW, which alone may be eight bytes wide.
 Elements = NDArray[Any]

@@ -10,8 +10,6 @@ from csplat_conformance.validator.findings import Findings, Placed
 from csplat_conformance.validator.index import Index, scaled
 from csplat_conformance.validator.reading import place
 
-__all__ = ["Tile", "read_tiles"]
-
 _SH_LAYERS = range(1, _spec.SH_DEGREE_MAX + 1)
 
 

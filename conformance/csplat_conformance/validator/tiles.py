@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from csplat import _spec
+from csplat.types import I64
 from csplat_conformance.validator.chunks import Chunk
 from csplat_conformance.validator.codebooks import Books
 from csplat_conformance.validator.findings import Findings, Placed
@@ -16,9 +17,7 @@ from csplat_conformance.validator.index import Index, scaled
 from csplat_conformance.validator.reading import Payload, UnreadableError
 from csplat_conformance.validator.streams import Elements, read_stream
 from csplat_conformance.validator.tile_records import Tile
-from csplat_conformance.validator.values import I64, check_box, check_integers, check_max_scale
-
-__all__ = ["BlockHead", "First", "TileReader", "read_block_head", "read_columns", "read_exponent", "read_offsets"]
+from csplat_conformance.validator.values import check_box, check_integers, check_max_scale
 
 BlockHead = Placed[_spec.BlockHead]
 

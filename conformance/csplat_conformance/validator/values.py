@@ -6,15 +6,11 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.types import I64
 from csplat_conformance.validator.findings import Findings
 from csplat_conformance.validator.index import Index, scaled
-
-__all__ = ["I64", "Place", "check_box", "check_integers", "check_max_scale", "is_finite", "value_bits"]
-
-I64 = NDArray[np.int64]
 
 #: Byte of the file and name of what a message is about.
 Place = tuple[int, str]

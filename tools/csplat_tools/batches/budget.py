@@ -9,8 +9,6 @@ from contextlib import contextmanager
 from csplat.errors import LimitError
 from csplat_tools.batches.looking import RENDERER_BYTES
 
-__all__ = ["Budget"]
-
 
 class Budget:
     """A gate that lets a scene begin when there is memory for it. Owns the number of bytes left.

@@ -15,8 +15,6 @@ from csplat_tools.batches.records import Record
 from csplat_tools.batches.scene import Job, do_job
 from csplat_tools.batches.workers import Worker
 
-__all__ = ["on_cluster"]
-
 _here = threading.local()  # holds the process of each thread of a Dask worker; it ends with the worker
 
 

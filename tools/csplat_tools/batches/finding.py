@@ -19,8 +19,6 @@ from csplat.remote import is_url
 from csplat.system import split_words
 from csplat_tools.files.scenes import FOLDER_NAMES
 
-__all__ = ["Task", "find_tasks", "starting_points"]
-
 _MANIFESTS = (".jsonl", ".csv", ".txt")
 _COLUMNS = ("path", "output", "options")
 _ONE_LEVEL, _LEVELS = FOLDER_NAMES

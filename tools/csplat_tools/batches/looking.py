@@ -16,8 +16,6 @@ from csplat.formats import format_of
 from csplat_tools.files.by_disk import Scale, expected
 from csplat_tools.files.scenes import FOLDER_NAMES, size_of
 
-__all__ = ["RENDERER_BYTES", "Expected", "Look", "content_hash", "expect", "look"]
-
 _FILE_SPLAT_BYTES = 16.0  # bytes per splat if a file does not state its count; .splat, SPZ and SOG have about as many
 _UNBOUNDED = 1 << 62
 #: Bytes that a process holds in addition to its command: the renderer draws the thumbnail.

@@ -15,8 +15,6 @@ from csplat_tools.files.console import format_bytes, format_seconds
 from csplat_tools.files.streams import write_bytes
 from csplat_tools.pages.parts import definitions, document, table
 
-__all__ = ["PAGE", "make_page", "write_page"]
-
 PAGE = "index.html"
 _PICTURES_MAX = 1000  # thumbnails on the page, 4 kB each
 _HEADS = ("scene", "splats", "source, kB", "output, kB", "share, %", "bytes per splat", "seconds", "memory, MB")

@@ -18,8 +18,6 @@ from csplat.errors import InputError
 from csplat.system import locked_folder
 from csplat_tools.files.streams import write_bytes
 
-__all__ = ["JOURNAL", "Journal", "Record", "open_journal", "read_journal"]
-
 JOURNAL = "batch.jsonl"
 _LOCK = ".batch.lock"  # file that is locked, on Windows only
 _BEGUN = "begun"

@@ -22,8 +22,6 @@ from csplat_tools.batches.scene import Job, Planned, do_job, plan_job
 from csplat_tools.batches.spreading import source_bytes, spread
 from csplat_tools.batches.workers import Worker, WorkerLostError
 
-__all__ = ["Batch", "CommandLineError", "Step", "batch", "plan"]
-
 _GIVEN = ("threads", "memory", "resume")  # options that the batch passes to a command that has them
 _FREE_SHARE = 0.9  # fraction of the free memory that a batch uses if `memory_bytes` is not given
 

@@ -19,8 +19,6 @@ from csplat_tools.batches.records import Record
 from csplat_tools.batches.workers import Worker, WorkerLostError, remove_left
 from csplat_tools.files.scenes import size_of
 
-__all__ = ["Job", "Planned", "do_job"]
-
 THUMBNAILS = "thumbnails"
 _PART_BYTES = 16 << 20
 

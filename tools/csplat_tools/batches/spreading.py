@@ -15,8 +15,6 @@ from csplat_tools.batches.scene import Job
 from csplat_tools.batches.workers import Worker
 from csplat_tools.files.scenes import size_of
 
-__all__ = ["source_bytes", "spread"]
-
 T = TypeVar("T")
 
 

@@ -19,8 +19,6 @@ from csplat_tools.files.extras import need_pictures, prepare_renderer
 from csplat_tools.files.pictures import to_bytes
 from csplat_tools.files.streams import write_bytes
 
-__all__ = ["THUMBNAIL_SIZE", "prepare_thumbnails", "write_thumbnail"]
-
 #: Width and height of a thumbnail, pixels.
 THUMBNAIL_SIZE = (128, 96)
 

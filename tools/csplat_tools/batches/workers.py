@@ -15,8 +15,6 @@ from typing import Any
 from csplat.errors import CsplatError
 from csplat.system import NEW_GROUP_FLAGS, interrupt_process
 
-__all__ = ["Worker", "WorkerLostError", "remove_left"]
-
 _PROGRAM = "csplat_tools.cli.serving"  # started by its name: `cli` is above this package and may not be imported here
 _PATIENCE = 10.0  # seconds that an interrupted process has to tidy up before it is killed
 

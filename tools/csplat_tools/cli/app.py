@@ -14,8 +14,6 @@ from csplat_tools import VERSIONS
 from csplat_tools.cli.console import WrongCommandLine, guarded, refuse_command_line
 from csplat_tools.files.console import say
 
-__all__ = ["app", "command_function"]
-
 #: Commands as `--help` lists them, and the modules of `csplat_tools.cli` that define them.
 _MODULES = {
     "encode": "encode",

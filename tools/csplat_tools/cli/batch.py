@@ -23,8 +23,6 @@ from csplat_tools.cli.options import command
 from csplat_tools.cli.parsing import parse_bytes
 from csplat_tools.files.console import format_about, format_bytes, format_seconds, format_table, note, step_progress
 
-__all__ = ["batch"]
-
 _SHOWN_MAX = 50  # failures listed on standard error; the page lists all
 
 

@@ -24,7 +24,6 @@ from csplat_tools.views import counted_views
 if TYPE_CHECKING:
     from csplat_tools.inspect.compare import Comparison
 
-__all__ = ["compare"]
 
 _INDEX_BYTES = 1 << 27  # largest size of a source index, which is read as a whole
 

@@ -14,6 +14,7 @@ import typer
 
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
+from csplat.types import Progress
 from csplat_conformance.encoders import PSNR_MIN, EncoderChoice, run_encoder, write_inputs
 from csplat_conformance.encoders.picturing import PictureJudge
 from csplat_conformance.encoders.run import TIMEOUT_SECONDS as ENCODER_SECONDS
@@ -23,11 +24,9 @@ from csplat_conformance.runner import TIMEOUT_SECONDS, Choice, parse_levels, run
 from csplat_tools.cli.console import FAILED
 from csplat_tools.cli.groups import Group, Output
 from csplat_tools.cli.options import chosen, command
-from csplat_tools.files.console import Progress, note, say
+from csplat_tools.files.console import note, say
 from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.streams import STANDARD_STREAM, write_bytes
-
-__all__ = ["conformance"]
 
 _OURS = "-m csplat_tools encode {ply} {out} --source-index {index} --quiet"
 #: Options of a run, which exclude --write-inputs.

@@ -16,8 +16,6 @@ import typer
 from csplat.errors import CsplatError, InputError
 from csplat_tools.files.console import note
 
-__all__ = ["FAILED", "INTERRUPTED", "WrongCommandLine", "guarded", "refuse_command_line"]
-
 FAILED = 1
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 _WRONG_USE = 2

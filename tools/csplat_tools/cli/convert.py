@@ -21,8 +21,6 @@ from csplat_tools.files.converting import convert_file, format_rows
 from csplat_tools.files.filters import Filters
 from csplat_tools.files.streams import STANDARD_STREAM
 
-__all__ = ["convert", "formats"]
-
 _CHANGES = "Changes, in this order"
 _COLUMNS = ("format", "endings", "read", "written", "SH degree", "axes", "exact", "has a place for")
 

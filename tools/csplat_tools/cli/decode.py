@@ -12,8 +12,6 @@ from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.convert import decode_file
 from csplat_tools.files.streams import check_name
 
-__all__ = ["decode"]
-
 
 @command(beside=".ply")
 def decode(

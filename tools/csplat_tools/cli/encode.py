@@ -14,6 +14,7 @@ from csplat._spec import MEASURE_NAMES
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
+from csplat.types import Progress
 from csplat_render.standing import seeming_up
 from csplat_tools.cli.encoder_options import ENCODER, Encoding, Facts
 from csplat_tools.cli.groups import Group, Output
@@ -22,7 +23,7 @@ from csplat_tools.cli.parsing import parse_bytes, parse_decibels
 from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Views, Virtual
 from csplat_tools.files.by_disk import Scale, expected
-from csplat_tools.files.console import Progress, format_about, format_bytes, format_table, note
+from csplat_tools.files.console import format_about, format_bytes, format_table, note
 from csplat_tools.files.convert import Encoded, EncodedScene, Encoder, encode_file
 from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.streams import check_name, source_path
@@ -31,7 +32,6 @@ from csplat_tools.inspect.glance import SIZE, SPLATS_MAX, glance
 if TYPE_CHECKING:
     from csplat_tools.optimise.target import Target
 
-__all__ = ["encode"]
 
 _TARGET = "Targets (one of the first four, which want the render extra)"
 _ROOM = "Large scenes"

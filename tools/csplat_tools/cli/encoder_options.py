@@ -14,8 +14,6 @@ from csplat_tools.cli.settings import Settings
 from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.facts import SceneOverrides
 
-__all__ = ["ENCODER", "Encoding", "Facts", "Preset"]
-
 _SCENE = "What the PLY may not say"
 
 #: The dataclass whose fields `--set` takes for the encoder, as `module:name`.

@@ -14,8 +14,6 @@ from csplat_tools.cli.parsing import parse_numbers
 from csplat_tools.files.console import format_bytes
 from csplat_tools.files.streams import check_name, csplat_file, whole_output
 
-__all__ = ["extract"]
-
 
 @command()
 def extract(

@@ -30,8 +30,6 @@ from csplat_tools.files.convert import read_source
 from csplat_tools.files.extras import need_trainer
 from csplat_tools.files.streams import check_name
 
-__all__ = ["finetune"]
-
 
 @command(
     reads=True,

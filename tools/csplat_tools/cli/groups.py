@@ -10,10 +10,9 @@ from typing import Annotated, Any, ClassVar
 import typer
 
 from csplat.lint import Finding
-from csplat_tools.files.console import WORTH_SAYING, Progress, format_about, note, progress_bar, say, say_json
+from csplat.types import Progress
+from csplat_tools.files.console import WORTH_SAYING, format_about, note, progress_bar, say, say_json
 from csplat_tools.files.streams import STANDARD_STREAM, check_name, check_outputs, write_json
-
-__all__ = ["Group", "Output"]
 
 _ENDINGS = {
     "--report": ".json", "--page": ".html", "-o": ".html", "--source-index": ".npy", "--checkpoint": ".npz",

@@ -20,8 +20,6 @@ from csplat_tools.inspect.foreign import describe_foreign
 from csplat_tools.inspect.info import AttributeFacts, CodebookFacts, FileFacts, LayerFacts, describe_file
 from csplat_tools.inspect.words import coding_words, headline, other_metadata, scene_words
 
-__all__ = ["info"]
-
 
 @command(reads=True, needs={"beside": ("page",)})
 def info(

@@ -17,8 +17,6 @@ from csplat_tools.files.convert import findings_as_json
 from csplat_tools.files.scenes import without_extra
 from csplat_tools.files.streams import STANDARD_STREAM, check_name, source_path, write_model
 
-__all__ = ["lint"]
-
 
 @command(reads=True)
 def lint(

@@ -15,8 +15,6 @@ from csplat_tools.cli.options import command
 from csplat_tools.files.console import format_bytes
 from csplat_tools.files.streams import STANDARD_STREAM, check_name, csplat_file, whole_output
 
-__all__ = ["merge"]
-
 
 @command()
 def merge(

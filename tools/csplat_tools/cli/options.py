@@ -29,23 +29,6 @@ from csplat_tools.cli.settings import Settings, describe_settings, read_settings
 from csplat_tools.files.console import progress_bar, say
 from csplat_tools.files.streams import STANDARD_STREAM
 
-__all__ = [
-    "EFFORT",
-    "Checkpoint",
-    "CheckpointEvery",
-    "Importance",
-    "Lpips",
-    "ModeWord",
-    "Resume",
-    "Scene",
-    "Seed",
-    "ShDegree",
-    "SourceIndex",
-    "Threads",
-    "chosen",
-    "command",
-]
-
 Scene = Annotated[
     str, typer.Argument(metavar="SCENE", help="A PLY, a .csplat file, another of `csplat formats`, or -.")
 ]

@@ -12,17 +12,6 @@ from csplat.model import check_axes
 from csplat.upright import Direction, unit_up
 from csplat_tools.files.sizes import parse_size_bytes
 
-__all__ = [
-    "parse_axes",
-    "parse_bytes",
-    "parse_colour",
-    "parse_decibels",
-    "parse_numbers",
-    "parse_size",
-    "parse_up",
-    "up_word",
-]
-
 _NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 

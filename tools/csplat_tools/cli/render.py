@@ -23,8 +23,6 @@ from csplat_tools.files.streams import STANDARD_STREAM, check_name
 from csplat_tools.present.film import DEFAULT_FPS, MAX_FPS, is_film
 from csplat_tools.present.rendering import find_cameras, render_film, render_folder
 
-__all__ = ["render"]
-
 _OTHER_FILMS = (".avi", ".m4v", ".mkv", ".mov", ".mpg", ".webm")
 
 

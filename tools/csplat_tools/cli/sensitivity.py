@@ -16,8 +16,6 @@ from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.scenes import load_model
 from csplat_tools.files.streams import check_name
 
-__all__ = ["sensitivity"]
-
 #: Cost of the measurement, in renders of all views.
 _PASSES = 4.4
 _SHOWN = {"colour": "colour (largest of the SH coefficients)", "opacity": "opacity", "shape": "shape, over its size"}

@@ -30,8 +30,6 @@ from csplat_tools.batches.thumbnails import prepare_thumbnails, write_thumbnail
 from csplat_tools.cli.app import app, command_function
 from csplat_tools.cli.console import FAILED, WrongCommandLine
 
-__all__ = ["answer", "main"]
-
 _ERROR = "error: "
 _CODE = re.compile(r"\b(E_[A-Z0-9_]+)\b|\((E[A-Z]+)\)$")
 _REMARKS_MAX = 20

@@ -14,8 +14,6 @@ import typer
 
 from csplat.errors import InputError, missing
 
-__all__ = ["Settings", "describe_settings", "read_settings"]
-
 _READERS: dict[type, tuple[Callable[[str], Any], str]] = {
     bool: ({"yes": True, "no": False}.__getitem__, "yes or no"),
     int: (int, "an integer"),

@@ -19,8 +19,6 @@ from csplat_tools.files.extras import need_renderer, prepare_renderer
 from csplat_tools.files.scenes import load_model
 from csplat_tools.files.streams import check_name, write_array, write_model
 
-__all__ = ["simplify"]
-
 _TARGET = "Target (one of them)"
 #: Cost in renders of all training views: for --keep (measured: donut 9, plane3 19), and for a target, which searches
 #: for the share to keep (20 and 45); half of the cost is fitting.

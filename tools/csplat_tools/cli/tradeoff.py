@@ -15,8 +15,6 @@ from csplat_tools.files.extras import need_pictures, need_plots, need_renderer, 
 from csplat_tools.files.streams import STANDARD_STREAM
 from csplat_tools.tradeoffs.options import FAMILIES, Wanted, parse_what
 
-__all__ = ["tradeoff"]
-
 _SLOW = {"strategies", "targets", "simplify", "finetune"}
 
 

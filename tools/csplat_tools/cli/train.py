@@ -20,8 +20,6 @@ from csplat_tools.views import DataOptions
 from csplat_trainer.options import BACKGROUNDS, DEVICES, TrainOptions
 from csplat_trainer.outputs import Outputs
 
-__all__ = ["train"]
-
 _DEFAULT = TrainOptions()
 _KEEP = 0.8  # default fraction of the trained splats that OUT.csplat keeps: some of them are hardly seen
 

@@ -15,8 +15,6 @@ from csplat_tools.cli.parsing import parse_bytes
 from csplat_tools.files.console import format_table, note
 from csplat_tools.inspect.verify import Verified, verify_file
 
-__all__ = ["verify"]
-
 
 @command(reads=True, needs={"source_index": ("source",), "memory": ("source",)})
 def verify(

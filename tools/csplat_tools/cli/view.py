@@ -22,8 +22,6 @@ from csplat_tools.present import export
 from csplat_tools.present.server import open_server
 from csplat_tools.present.viewing import ViewScene, open_scene, seeming_wishes, view_wishes
 
-__all__ = ["export_element", "export_html", "view"]
-
 _Cameras = Annotated[
     str | None, typer.Option(metavar="FILE.json", help="Look from these cameras, see `csplat render`.")
 ]

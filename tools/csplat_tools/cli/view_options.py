@@ -16,8 +16,6 @@ from csplat_tools.cli.parsing import parse_axes, parse_colour, parse_size, parse
 from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.views import VIRTUAL, DataOptions, Split, ViewSet, find_view_set
 
-__all__ = ["Near", "SplitWord", "Upright", "Views", "Virtual"]
-
 _DATA = "Photographs of --data (by default as the scene was trained)"
 _VIEWS = "Views (virtual ones by default)"
 

@@ -13,12 +13,11 @@ from csplat.large import Needs, encode_scene, needs_of
 from csplat.lint import Finding, dropped_columns, refuse
 from csplat.memory import default_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel
-from csplat_tools.files.console import Progress, note
+from csplat.types import Progress
+from csplat_tools.files.console import note
 from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.scenes import READ_ANEW, LoadedModel, size_of
 from csplat_tools.files.streams import STANDARD_STREAM
-
-__all__ = ["ByDisk", "Expected", "Scale", "encode_by_disk", "expected", "read_degree"]
 
 _FOLDS = 4  # memory of a scene as a multiple of its PLY's size; other formats have to be opened to tell
 #: By SH degree: seconds per million splats to read once, and to code; seconds for a codebook. Within a tenth of the

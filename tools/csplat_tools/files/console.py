@@ -15,27 +15,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TextIO, TypeVar
 
+from csplat.types import Progress
+
 if TYPE_CHECKING:
     from rich.progress import Progress as Bars
     from rich.progress import TaskID
 
-__all__ = [
-    "WORTH_SAYING",
-    "Display",
-    "Progress",
-    "displayed",
-    "finite",
-    "format_about",
-    "format_bytes",
-    "format_range",
-    "format_seconds",
-    "format_table",
-    "note",
-    "progress_bar",
-    "say",
-    "say_json",
-    "step_progress",
-]
 
 _PATIENCE = 2.0  # seconds for which a terminal shows nothing
 _EVERY = 10.0  # seconds from one line to the next if standard error is not a terminal
@@ -50,9 +35,6 @@ _MINUTES_FROM = 100.0  # seconds from which durations are given in minutes
 
 #: Work that takes more seconds than this is announced.
 WORTH_SAYING = 10.0
-
-#: Progress callback: called with the name of the stage, and the fraction of it that is done, 0 to 1.
-Progress = Callable[[str, float], None]
 
 
 def say(text: str) -> None:
@@ -79,10 +61,12 @@ class Step(Protocol):
     """The progress of a long run: the current iteration, and the number of all."""
 
     @property
-    def iteration(self) -> int: ...
+    def iteration(self) -> int:
+        """Return the current iteration."""
 
     @property
-    def iterations(self) -> int: ...
+    def iterations(self) -> int:
+        """Return the number of all iterations."""
 
 
 S = TypeVar("S", bound=Step)

@@ -15,22 +15,12 @@ from csplat.inputs import File
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.scene import Scene
+from csplat.types import Progress, null_progress
 from csplat_tools.files.by_disk import ByDisk, Scale, encode_by_disk, read_degree
-from csplat_tools.files.console import Progress
 from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.filters import Filters
 from csplat_tools.files.scenes import LoadedModel, size_of, watched
 from csplat_tools.files.streams import is_one_way, mapped_csplat, source_path, write_array, write_bytes, write_model
-
-__all__ = [
-    "Encoded",
-    "EncodedScene",
-    "Encoder",
-    "decode_file",
-    "encode_file",
-    "findings_as_json",
-    "read_source",
-]
 
 
 @dataclass(frozen=True)
@@ -118,7 +108,7 @@ def read_source(
         OSError: the scene cannot be read.
     """
     findings: list[Finding] = []
-    report = progress or (lambda _stage, _done: None)
+    report = progress or null_progress
     report("reading", 0.0)
     with source_path(file) as local:
         model = formats.read(local, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=findings)

@@ -10,14 +10,12 @@ from csplat.errors import InputError
 from csplat.formats import Format, formats, named, named_by, open_scene
 from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
-from csplat_tools.files.console import Progress
+from csplat.types import Progress
 from csplat_tools.files.convert import findings_as_json
 from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.filters import Filters
 from csplat_tools.files.scenes import size_of, watched
 from csplat_tools.files.streams import local_path
-
-__all__ = ["Converted", "convert_file", "format_rows"]
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,6 @@ from importlib import import_module
 from csplat.errors import missing
 from csplat_tools.files.console import note, progress_bar
 
-__all__ = [
-    "need_film",
-    "need_photographs",
-    "need_pictures",
-    "need_plots",
-    "need_renderer",
-    "need_trainer",
-    "prepare_renderer",
-]
-
 _FRUGAL_SPINS = "1000"  # see _wait_frugally
 _PHOTOGRAPHS = (
     ("numba", None),

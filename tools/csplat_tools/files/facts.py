@@ -9,8 +9,6 @@ from csplat.model import SplatModel
 from csplat.scene import Scene
 from csplat.upright import Direction, with_up
 
-__all__ = ["SceneOverrides"]
-
 
 @dataclass(frozen=True)
 class SceneOverrides:

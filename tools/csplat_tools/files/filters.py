@@ -9,14 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel
-from csplat.scene import Scene
+from csplat.scene import Scene, without_bands
 from csplat.turning import in_axes, moved, scaled, turned
-from csplat_tools.files.scenes import without_bands
-
-__all__ = ["Filters", "isolated"]
-
-B = NDArray[np.bool_]
-F64 = NDArray[np.float64]
+from csplat.types import F64, Mask
 
 _CELL = 0.01  # fraction of a scene's extent: distance within which neighbours count for any splat
 _SPREAD = 4.0  # standard deviations of a splat: distance within which neighbours count if that is farther
@@ -75,7 +70,7 @@ class Filters:
         return scene
 
 
-def isolated(points: F64, sizes: F64) -> B:
+def isolated(points: F64, sizes: F64) -> Mask:
     """Find splats with next to no others around them: within 1 % of the extent, or four times their own size.
 
     Args:
@@ -119,7 +114,7 @@ def _changed(scene: Scene, change: Callable[[SplatModel], SplatModel]) -> Scene:
     return replace(scene, facts=change(scene.facts), blocks=lambda: (change(model) for model in blocks()))
 
 
-def _kept(scene: Scene, keep: Callable[[SplatModel], B]) -> Scene:
+def _kept(scene: Scene, keep: Callable[[SplatModel], Mask]) -> Scene:
     def blocks() -> Iterator[SplatModel]:
         for model in scene.blocks():
             left = keep(model)
@@ -151,15 +146,15 @@ def _without_floaters(scene: Scene) -> Scene:
     return replace(scene, count=scene.count - int(np.count_nonzero(floats)), blocks=blocks)
 
 
-def _inside_box(model: SplatModel, corners: F64) -> B:
+def _inside_box(model: SplatModel, corners: F64) -> Mask:
     places = model.means + np.array(model.origin)
-    inside: B = ((places >= corners[0]) & (places <= corners[1])).all(axis=1)
+    inside: Mask = ((places >= corners[0]) & (places <= corners[1])).all(axis=1)
     return inside
 
 
-def _inside_sphere(model: SplatModel, sphere: F64) -> B:
+def _inside_sphere(model: SplatModel, sphere: F64) -> Mask:
     places = model.means + np.array(model.origin)
-    inside: B = np.sum((places - sphere[:3]) ** 2, axis=1) <= sphere[3] ** 2
+    inside: Mask = np.sum((places - sphere[:3]) ** 2, axis=1) <= sphere[3] ** 2
     return inside
 
 

@@ -13,11 +13,9 @@ from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, enco
 from csplat.errors import InputError
 from csplat.files import read_array
 from csplat.model import SplatModel
+from csplat.types import Progress
 from csplat_render.virtual import scene_frame
-from csplat_tools.files.console import Progress
 from csplat_trainer.sensitivity_file import StoredSensitivity, read_sensitivity
-
-__all__ = ["encode_by_importance", "read_importance", "read_weights", "weights_of"]
 
 _ZIP = b"PK"  # first bytes of a .npz file
 _ONE_GRADE = (

@@ -11,13 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
+from csplat.types import F32, U8
 from csplat_tools.files.extras import need_pictures
 from csplat_tools.files.streams import write_bytes
-
-__all__ = ["check_folder", "panels", "picture_names", "to_bytes", "write_png"]
-
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
 
 _DIGITS = 4
 _NAME_LENGTH_MAX = 200  # file systems take 255 bytes

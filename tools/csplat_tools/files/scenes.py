@@ -19,13 +19,8 @@ from csplat.lint import Finding, dropped_columns
 from csplat.memory import available_bytes, default_bytes
 from csplat.model import SplatModel
 from csplat.scene import Scene, joined, without_bands
-from csplat_tools.files.console import Progress
+from csplat.types import Progress
 from csplat_tools.files.streams import is_csplat, kept_path, local_path, mapped_csplat, naming
-
-__all__ = [
-    "FOLDER_NAMES", "READ_ANEW", "LoadedModel", "OpenedScene", "SceneLike", "load_model", "opened_scenes",
-    "ply_splat_bytes", "size_of", "watched", "without_bands", "without_extra",
-]  # fmt: skip
 
 #: Names of files that stand for the whole folder they are in: SOG as a folder, and with levels.
 FOLDER_NAMES = ("meta.json", "lod-meta.json")

@@ -6,8 +6,6 @@ import re
 
 from csplat.errors import InputError
 
-__all__ = ["NUMBER", "parse_size_bytes"]
-
 #: A regular expression for a number, which is its first group.
 NUMBER = r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
 

@@ -32,27 +32,6 @@ from csplat.ply_write import write_ply, write_scene_ply
 from csplat.remote import is_url
 from csplat.scene import Scene
 
-__all__ = [
-    "STANDARD_STREAM",
-    "check_name",
-    "check_output",
-    "check_outputs",
-    "csplat_file",
-    "is_csplat",
-    "is_one_way",
-    "kept_path",
-    "local_path",
-    "mapped_csplat",
-    "naming",
-    "open_output",
-    "source_path",
-    "whole_output",
-    "write_array",
-    "write_bytes",
-    "write_json",
-    "write_model",
-]
-
 STANDARD_STREAM = "-"
 
 _OURS = ("ply", "csplat")  # names of the formats that commands other than `convert` write

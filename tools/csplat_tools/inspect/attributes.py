@@ -13,13 +13,12 @@ from csplat import scene as scenes
 from csplat.decoder import StatedErrors, open_tiles
 from csplat.model import SplatModel
 from csplat.scene import Scene
+from csplat.types import Progress, null_progress
 from csplat_conformance.stated import Source, lattice_radii, match, measure_pairs, prove_by_disk
 from csplat_conformance.stated.pairs import merged
-from csplat_tools.files.console import Progress, finite
+from csplat_tools.files.console import finite
 from csplat_tools.files.scenes import LoadedModel, OpenedScene
 from csplat_tools.files.streams import is_csplat
-
-__all__ = ["AttributeErrors", "attribute_errors", "attribute_errors_by_disk"]
 
 Pairing = Literal["index", "order", "search"]
 
@@ -125,8 +124,8 @@ def attribute_errors_by_disk(
 
 def _beside(a: Scene, b: Scene, progress: Progress | None) -> Iterator[tuple[int, SplatModel, SplatModel]]:
     """Yield splats of two scenes of equal number, some at a time, with the number of the first of them."""
-    first = scenes.watched(a, "measuring splats", progress or (lambda _stage, _share: None)).blocks()
-    second = scenes.watched(b, "", lambda _stage, _share: None).blocks()
+    first = scenes.watched(a, "measuring splats", progress or null_progress).blocks()
+    second = scenes.watched(b, "", null_progress).blocks()
     start, ours, theirs = 0, a.facts, b.facts
     while start < a.count:
         ours, theirs = ours if len(ours) else next(first), theirs if len(theirs) else next(second)

@@ -15,8 +15,6 @@ from csplat import _spec
 from csplat.decoder import SceneHeader
 from csplat.errors import FormatError
 
-__all__ = ["AttributeUse", "attribute_use"]
-
 _STREAM_CLAUSE = "STR-6"
 
 

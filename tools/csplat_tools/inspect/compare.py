@@ -15,22 +15,18 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.files import check_room
 from csplat.model import SplatModel
+from csplat.types import F32, Progress
 from csplat_render import Mode
 from csplat_render.camera import Camera
 from csplat_render.judge import Judge, OnView
 from csplat_render.lpips import load_lpips
 from csplat_render.metrics import Distance, Scores, ViewScore
-from csplat_tools.files.console import Progress
 from csplat_tools.files.extras import need_pictures, need_renderer
 from csplat_tools.files.pictures import check_folder, panels, picture_names, write_png
 from csplat_tools.files.scenes import LoadedModel, OpenedScene, SceneLike, opened_scenes
 from csplat_tools.inspect.attributes import AttributeErrors, attribute_errors, attribute_errors_by_disk
 from csplat_tools.views import Colour, ViewSet, find_view_set
 from csplat_tools.views.sliced import Sliced
-
-__all__ = ["USUAL_WEIGHTS", "Comparison", "compare"]
-
-F32 = NDArray[np.float32]
 
 #: Given instead of a file of LPIPS weights: look for them in the usual places.
 USUAL_WEIGHTS = "auto"

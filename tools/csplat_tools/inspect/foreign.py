@@ -12,8 +12,6 @@ from csplat_tools.files.scenes import size_of
 from csplat_tools.files.streams import local_path
 from csplat_tools.inspect.words import place_words
 
-__all__ = ["describe_foreign"]
-
 
 def describe_foreign(source: str) -> tuple[dict[str, Any], str]:
     """Describe a file by what is known of it before its splats are read.

@@ -9,8 +9,6 @@ from csplat_render.cameras import resized
 from csplat_render.judge import Judge
 from csplat_tools.views import comparison_cameras
 
-__all__ = ["SIZE", "SPLATS_MAX", "glance"]
-
 #: Width and height of the renders, pixels; smaller ones average errors away: half of 640×480 gives 0.4 dB too much,
 #: this 0.2 at most.
 SIZE = (480, 360)

@@ -22,8 +22,6 @@ from csplat.upright import up_of
 from csplat_tools.files.console import finite
 from csplat_tools.inspect.blocks import AttributeUse, attribute_use
 
-__all__ = ["AttributeFacts", "CodebookFacts", "FileFacts", "LayerFacts", "Span", "byte_shares", "describe_file"]
-
 
 @dataclass(frozen=True)
 class Span:

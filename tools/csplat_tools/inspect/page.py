@@ -9,15 +9,14 @@ from mmap import mmap
 from pathlib import PurePath
 
 from csplat.decoder import StatedErrors, decode
-from csplat_tools.files.console import Progress, format_bytes
+from csplat.types import Progress
+from csplat_tools.files.console import format_bytes
 from csplat_tools.files.scenes import LoadedModel, load_model
 from csplat_tools.files.streams import STANDARD_STREAM, write_bytes
 from csplat_tools.inspect.info import FileFacts
 from csplat_tools.inspect.words import coding_words, headline, other_metadata, scene_words
 from csplat_tools.pages.bars import attribute_figure
 from csplat_tools.pages.parts import definitions, document, table
-
-__all__ = ["make_page", "write_page"]
 
 _ATTRIBUTES = {
     "opacities": "how dense each splat is",

@@ -12,13 +12,11 @@ from csplat import formats
 from csplat.decoder import decode, open_tiles
 from csplat.files import read_array
 from csplat.model import MAX_SH_DEGREE
+from csplat.types import Progress
 from csplat_conformance.stated import Proof, Source, fits_memory, prove, prove_by_disk
 from csplat_conformance.validator import Validation, validate
-from csplat_tools.files.console import Progress
 from csplat_tools.files.scenes import size_of
 from csplat_tools.files.streams import mapped_csplat, source_path
-
-__all__ = ["Verified", "verify_file"]
 
 _INDEX_BYTES = 1 << 27  # largest size of a source index, which is read as a whole
 

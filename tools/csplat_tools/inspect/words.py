@@ -12,8 +12,6 @@ from csplat.upright import UP, up_of
 from csplat_tools.files.console import format_bytes
 from csplat_tools.inspect.info import AttributeFacts, FileFacts
 
-__all__ = ["coding_words", "headline", "other_metadata", "place_words", "scene_words"]
-
 
 def headline(facts: FileFacts) -> str:
     """Return a headline: format version, profile, size, bytes per splat."""

@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from csplat.encoder import EncodeOptions, EncodeResult, Importance, encode_with_report
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat_tools.files.console import Progress
-
-__all__ = ["Bounded", "Weights", "meet_bounds"]
+from csplat.types import Progress
 
 #: Importance of the splats, as for the encoder.
 Weights = NDArray[Any] | Importance

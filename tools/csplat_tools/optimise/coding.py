@@ -9,11 +9,9 @@ import numpy as np
 
 from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
-from csplat_tools.files.scenes import without_bands
+from csplat.scene import without_bands
 from csplat_tools.optimise.solving import Solver
 from csplat_tools.optimise.trials import Coding, Part, Trial
-
-__all__ = ["Codings"]
 
 _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook: at some qualities its escapes cannot code them
 _SHARE_AT = (38.0, 1 / 64, 0.4)  # PSNR of a file in dB, usual codebook entries per splat there, octaves of them per dB

@@ -11,11 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = ["BYTES_PER_DB", "LEAST_QUANTISED", "error_at_size", "error_of_psnr", "log_bytes_at_error", "price_of_bytes"]
-
-F64 = NDArray[np.float64]
+from csplat.types import F64
 
 #: Fraction of the bytes that a decibel costs, about; measured 0.035 without SH, 0.05 with it.
 BYTES_PER_DB = 0.045

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from csplat.encoder import Coded, Draft, EncodeOptions, Importance, Origin, most_grades
 from csplat.model import SplatModel
+from csplat.types import I64, Mask, Progress
 from csplat_render.removal import Removal, measure_removal
-from csplat_tools.files.console import Progress
 from csplat_tools.optimise.exchange import error_of_psnr
 from csplat_tools.optimise.simplify.adjusting import adjust, adjust_frozen
 from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
@@ -25,11 +25,6 @@ from csplat_tools.views import evenly
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 
-__all__ = ["FittedSplats"]
-
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 Seen = Callable[[SplatModel], float]
 
 _GRADED = 4_000  # least number of splats for quantisation classes: fewer are too similar

@@ -10,8 +10,6 @@ from csplat_render.metrics import PSNR_CAP
 from csplat_tools.optimise.solving import Goal
 from csplat_tools.optimise.target import Target
 
-__all__ = ["goal_of", "loss_as_psnr"]
-
 
 def goal_of(target: Target, source: SplatModel, photographs: Judge | None) -> Goal:
     """Return the goal of the search for a target.

@@ -15,8 +15,6 @@ from csplat_tools.optimise.removal import Removal
 from csplat_tools.optimise.solving import TUNING_GAINS, Solver, bounded
 from csplat_tools.optimise.trials import Coding, Trial, Trials, Whole
 
-__all__ = ["Moves"]
-
 _LOSS = (5.0, 8.5)  # dB from the PSNR of all attributes to that of each alone, at 30 dB, without and with SH
 _LOSS_GROWS = (0.0, 0.22)  # dB that this grows with every dB above 30, without and with SH
 _USUAL = (7.0, 42.0)  # usual bytes per splat, and the PSNR of each attribute in such files

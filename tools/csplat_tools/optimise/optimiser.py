@@ -16,9 +16,9 @@ from csplat.decoder import decode
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.types import Progress
 from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame
-from csplat_tools.files.console import Progress
 from csplat_tools.optimise.bounds import Weights
 from csplat_tools.optimise.coding import Codings
 from csplat_tools.optimise.goals import goal_of
@@ -33,8 +33,6 @@ from csplat_tools.optimise.target import Target
 from csplat_tools.optimise.trials import Trial, Trials, Whole
 from csplat_tools.views import VIRTUAL, ViewSet, elsewhere, with_deciders
 from csplat_tools.views.timing import picture_seconds
-
-__all__ = ["check", "expected_pictures", "expected_seconds", "optimise"]
 
 #: Cost of a target in renders of 640x480: without pruning (measured 380 to 690 with plane3, donut, lego60k, fox120k),
 #: and with it, a fixed part and one that grows with the effort (plane3 at 40 dB, effort 1, 3 and 7: as 0.6 to 1 to 4).

@@ -20,8 +20,6 @@ from csplat_tools.views import ViewSet, find_view_set
 if TYPE_CHECKING:
     from csplat_tools.optimise.simplify import SimplifyOptions
 
-__all__ = ["encode_to"]
-
 
 def encode_to(
     scene: SceneLike,

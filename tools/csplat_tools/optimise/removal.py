@@ -7,10 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.model import SplatModel
-from csplat_tools.files.console import Progress
+from csplat.types import F64, Progress
 from csplat_tools.optimise.exchange import (
     LEAST_QUANTISED,
     error_at_size,
@@ -24,9 +23,6 @@ from csplat_tools.optimise.simplify.order import removal_order
 from csplat_tools.optimise.simplify.simplify import Session, prepare
 from csplat_tools.views import ViewSet
 
-__all__ = ["Removal"]
-
-F64 = NDArray[np.float64]
 Cost = Callable[[F64, F64], F64]
 Seen = Callable[[SplatModel], float]
 

@@ -9,8 +9,6 @@ from csplat.encoder import EncodeResult
 from csplat.errors import counted
 from csplat_tools.files.console import format_bytes
 
-__all__ = ["Optimised", "Report"]
-
 _LESS = 1.0  # dB: a PSNR from elsewhere that is lower by more is pointed out
 
 

@@ -13,8 +13,6 @@ from csplat_tools.optimise.target import Target
 from csplat_tools.optimise.trials import Trial, Trials, spread_of
 from csplat_tools.views import counted_views
 
-__all__ = ["reported"]
-
 _FAR = 0.3  # dB: a PSNR that exceeds the target by more is explained
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-__all__ = ["FLATTEST", "Window", "meet"]
-
 #: Least slope that is taken from two trials, as a fraction of the expected one: a smaller one may be noise.
 FLATTEST = 0.15
 

@@ -12,23 +12,14 @@ from numpy.typing import NDArray
 from csplat.encoder import EncodeOptions, Importance, most_grades, trusted
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.types import Progress
 from csplat_render import Camera
 from csplat_render.removal import measure_removal
-from csplat_tools.files.console import Progress
 from csplat_tools.files.streams import open_output
 from csplat_tools.views import Colour, ViewSet, evenly
 from csplat_tools.views.agreeing import find_views
 from csplat_trainer.sensitivity import Sensitivity, measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, write_sensitivity
-
-__all__ = [
-    "MeasuredSensitivity",
-    "measure_scene",
-    "measure_views",
-    "measured_for",
-    "measured_importance",
-    "measuring_views",
-]
 
 Weights = NDArray[Any] | Importance
 

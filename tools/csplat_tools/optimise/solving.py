@@ -12,8 +12,6 @@ from csplat_tools.optimise.exchange import BYTES_PER_DB, LEAST_QUANTISED, error_
 from csplat_tools.optimise.search import FLATTEST, Window, meet
 from csplat_tools.optimise.trials import Coding, Part, Trial, Trials
 
-__all__ = ["TUNING_GAINS", "Goal", "Solver", "bounded"]
-
 #: dB that a refit through the quantisers of a file gains, about: quick files count as better by this.
 TUNING_GAINS = 1.1
 

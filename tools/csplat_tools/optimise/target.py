@@ -14,8 +14,6 @@ from csplat.errors import InputError
 from csplat_render.metrics import PSNR_CAP
 from csplat_tools.files.sizes import NUMBER
 
-__all__ = ["Target", "parse_max_error"]
-
 _LENGTHS = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
 _IN_UNITS = "means"  # the one measure that is a length
 _LOSSES = (0.001, 60.0)  # allowed range of `max_loss`, dB

@@ -15,13 +15,10 @@ from numpy.typing import NDArray
 from csplat.decoder import decode
 from csplat.encoder import Coded, Draft, EncodeOptions, EncodeResult, Importance, ShCoding
 from csplat.model import SplatModel
+from csplat.types import F64, Progress, null_progress
 from csplat_render.judge import Judge
 from csplat_render.metrics import psnr_of_mse
-from csplat_tools.files.console import Progress
 
-__all__ = ["Coding", "Part", "Trial", "Trials", "Whole", "spread_of"]
-
-F64 = NDArray[np.float64]
 Weights = NDArray[Any] | Importance
 _ENTRIES = (16, 8192)  # least and largest number of entries of a codebook that is chosen here
 _QUICK_LEVEL = 10  # DEFLATE level of drafts: the highest spends half of its time on the last per cent
@@ -284,7 +281,7 @@ class Trials:
             alike = trial.part is part and trial.options == options and trial.coding.graded == coding.graded
             if alike and trial.is_careful == careful:
                 return trial
-        tell, stage = self.progress or (lambda _stage, _done: None), f"file {len(self.made) + 1}"
+        tell, stage = self.progress or null_progress, f"file {len(self.made) + 1}"
         tell(stage, 0.0)
         coded = part.coded(options, graded=coding.graded, quick=quick)
         result = coded.write(part.said(None))

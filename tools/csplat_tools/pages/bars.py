@@ -8,8 +8,6 @@ from html import escape
 
 from csplat_tools.files.console import format_bytes
 
-__all__ = ["STANDALONE", "Bar", "attribute_figure", "draw_bars"]
-
 # Colours that people tell apart whatever colours they see, on white and on black.
 _COLOURS = {
     "opacities": "#88ccee",

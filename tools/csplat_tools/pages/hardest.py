@@ -9,16 +9,10 @@ from dataclasses import dataclass
 from html import escape
 
 import numpy as np
-from numpy.typing import NDArray
 
+from csplat.types import F32, F64, U8
 from csplat_render.metrics import psnr, squared_error
 from csplat_tools.files.pictures import panels, to_bytes
-
-__all__ = ["AMPLIFICATION", "PICTURES", "HardestPlace", "Place", "picture_row", "pictures_beside"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 #: Factor by which the differences that are shown are amplified.
 AMPLIFICATION = 10.0

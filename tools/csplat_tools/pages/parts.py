@@ -7,8 +7,6 @@ import hashlib
 from collections.abc import Collection, Mapping, Sequence
 from html import escape
 
-__all__ = ["command_line", "copy_button", "definitions", "document", "table"]
-
 _STYLE = """
 :root {
   color-scheme: light dark;

@@ -14,7 +14,6 @@ from csplat_tools.pages.bars import STANDALONE
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["INK", "drawn", "hover"]
 
 #: Placeholder for the colour of text until the SVG is written: no other colour is exactly this.
 INK = "#123457"

@@ -22,8 +22,6 @@ from dataclasses import dataclass
 
 from csplat_tools.present.webroot import ELEMENT, PAGE, WORKER, web_files
 
-__all__ = ["Exported", "export_element", "export_page", "link_modules"]
-
 # Import statements: `import { a, b as c } from '…'`, `import * as a from '…'`, `import '…'`.
 _IMPORT = re.compile(
     r"""^import\s+(?:(?:\*\s+as\s+(?P<all>[\w$]+)|(?P<some>\{[^}]*\}))\s+from\s+)?(['"])(?P<name>[^'"\n]+)\3;""",

@@ -10,15 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError
+from csplat.types import U8
 from csplat_tools.files.extras import need_film, need_pictures
 from csplat_tools.files.streams import write_bytes
-
-__all__ = ["DEFAULT_FPS", "FILM_ENDINGS", "MAX_FPS", "check_film", "is_film", "write_film"]
-
-U8 = NDArray[np.uint8]
 
 _MP4 = "MP4"
 

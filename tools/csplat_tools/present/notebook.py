@@ -17,8 +17,6 @@ from csplat_render.standing import seeming_up
 from csplat_tools.present.export import export_page
 from csplat_tools.present.viewing import seeming_wishes
 
-__all__ = ["MOST_SPLATS", "most_visible", "scene_html"]
-
 #: Largest number of splats in a frame: some 9 bytes each, a third more as text, are saved with the notebook.
 MOST_SPLATS = 250_000
 

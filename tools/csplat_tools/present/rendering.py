@@ -8,25 +8,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.training import TrainedOn
+from csplat.types import F32, Progress
 from csplat_render import Camera, Mode, render
 from csplat_render.arrays import RenderResult
 from csplat_render.cameras import load_cameras, resized
 from csplat_render.paths import orbit_cameras
-from csplat_tools.files.console import Progress
 from csplat_tools.files.extras import need_pictures, need_renderer
 from csplat_tools.files.pictures import check_folder, picture_names, to_bytes, write_png
 from csplat_tools.files.streams import check_output, write_array
 from csplat_tools.present.film import check_film, write_film
 from csplat_tools.views import BLACK, Colour, DataOptions, Split, find_view_set
-
-__all__ = ["Rendered", "find_cameras", "render_film", "render_folder"]
-
-F32 = NDArray[np.float32]
 
 _DEFAULT_SIZE = (640, 480)
 

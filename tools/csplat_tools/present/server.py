@@ -24,8 +24,6 @@ from csplat.errors import InputError
 from csplat_tools.present.viewing import ViewScene
 from csplat_tools.present.webroot import PAGE, web_files
 
-__all__ = ["SceneServer", "byte_range", "open_server"]
-
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",

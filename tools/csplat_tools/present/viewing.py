@@ -14,16 +14,13 @@ from csplat.encoder import EncodeOptions, PresetName, encode_with_report
 from csplat.errors import CsplatError, FormatError
 from csplat.lint import Finding
 from csplat.model import UNSPECIFIED
+from csplat.types import Progress
 from csplat.upright import Direction
 from csplat_render.cameras import load_cameras
 from csplat_render.standing import seeming_up
-from csplat_tools.files.console import Progress
 from csplat_tools.files.convert import read_source
 from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.streams import STANDARD_STREAM, is_csplat, local_path, mapped_csplat
-
-__all__ = ["ViewScene", "open_scene", "seeming_wishes", "view_wishes"]
-
 
 _NONE = SceneOverrides()
 _SPLATS_LOOKED_AT = 2_000_000  # larger files are not decoded only to estimate the up direction

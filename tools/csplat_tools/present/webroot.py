@@ -9,8 +9,6 @@ from pathlib import Path
 
 from csplat.errors import InputError
 
-__all__ = ["ELEMENT", "PAGE", "WORKER", "web_files"]
-
 #: Paths below the root: the page, the element for other pages, and the module that both start as a worker.
 PAGE = "tools/viewer/index.html"
 ELEMENT = "tools/viewer/element.mjs"

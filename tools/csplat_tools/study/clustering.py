@@ -14,19 +14,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.encoder import cluster, fix_gauge
 from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats
-from csplat_tools.files.console import Progress
+from csplat.types import F32, F64, U32, Progress
 from csplat_tools.study.sizes import attribute_floats, index_bits, raw_bytes
 
-__all__ = ["ATTRIBUTES", "MAX_STAGES", "Book", "Clustered", "KMeans", "cluster_attributes", "parse_kmeans"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U32 = NDArray[np.uint32]
 #: Attributes that have a codebook of their own, in the order of a model's fields.
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 

@@ -11,20 +11,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.scene import without_bands
+from csplat.types import F32, Progress
 from csplat_render import Camera
 from csplat_render.judge import Judge, renderer
 from csplat_render.refit import fit_colours
-from csplat_tools.files.console import Progress
-from csplat_tools.files.scenes import without_bands
 from csplat_tools.views import ViewSet, reduced
 
-__all__ = ["Teacher"]
-
-F32 = NDArray[np.float32]
 _STEPS = 8  # largest number of conjugate gradient steps; more overfit the training views
 
 

@@ -14,13 +14,12 @@ import numpy as np
 from csplat.decoder import decode
 from csplat.encoder import Draft, EncodeOptions, EncodeResult, Origin
 from csplat.model import SplatModel
-from csplat_tools.files.console import Progress
+from csplat.types import Progress
 from csplat_tools.study.reduction import Reduction, find_teacher, reduced_by, target_degree
 
 if TYPE_CHECKING:
     from csplat_tools.views import ViewSet
 
-__all__ = ["encode_reduced"]
 
 _KEY = "reduced"
 

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.types import I64
 from csplat_render.cloud import surface_areas
-
-__all__ = ["check_threshold", "prune_opacity", "prune_share"]
-
-I64 = NDArray[np.int64]
 
 
 def prune_opacity(model: SplatModel, tau: float) -> tuple[SplatModel, I64]:

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
-from csplat_tools.files.console import Progress
-from csplat_tools.files.scenes import without_bands
+from csplat.scene import without_bands
+from csplat.types import I64, Progress
 from csplat_tools.study.clustering import Clustered, KMeans, cluster_attributes
 from csplat_tools.study.pruning import check_threshold, prune_opacity
 from csplat_tools.study.sizes import attribute_floats, raw_bytes
@@ -20,9 +19,7 @@ from csplat_tools.views import ViewSet, find_view_set
 if TYPE_CHECKING:
     from csplat_tools.study.distilling import Teacher
 
-__all__ = ["Reduced", "Reduction", "find_teacher", "reduce_model", "reduced_by", "target_degree"]
 
-I64 = NDArray[np.int64]
 _ASIDE = 8  # every Nth virtual view is held out for validation
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-__all__ = ["attribute_floats", "index_bits", "raw_bytes"]
-
 _FLOAT_BYTES = 4
 
 

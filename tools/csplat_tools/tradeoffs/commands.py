@@ -16,8 +16,6 @@ from csplat_tools.study import Reduction
 from csplat_tools.tradeoffs.options import Wanted
 from csplat_tools.tradeoffs.setting import Setting
 
-__all__ = ["encode_command", "file_name", "finetune_command", "reduction_command", "target_command"]
-
 _REDUCED = "from pathlib import Path; from csplat import EncodeOptions, read_ply; from csplat_tools.study import"
 
 

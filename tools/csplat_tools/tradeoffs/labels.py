@@ -17,7 +17,6 @@ from csplat_tools.pages.svg import INK
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["label_marks"]
 
 Point = tuple[float, float]
 

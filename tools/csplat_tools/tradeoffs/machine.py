@@ -11,8 +11,6 @@ import csplat
 from csplat._spec import VERSION_MAJOR, VERSION_MINOR
 from csplat.system import core_count
 
-__all__ = ["describe_machine", "package_version", "processor_name"]
-
 _PACKAGES = ("numpy", "numba", "scipy", "deflate", "zstandard", "matplotlib", "pillow")
 
 

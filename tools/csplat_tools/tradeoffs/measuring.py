@@ -10,26 +10,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.decoder import SceneHeader, decode, read_header
 from csplat.model import SplatModel
+from csplat.types import F32, Progress
 from csplat_render import Mode
 from csplat_render.cameras import relative_to
 from csplat_render.judge import Judge, renderer
 from csplat_render.metrics import Scores, ViewScore, psnr_of_mse, squared_error
-from csplat_tools.files.console import Progress
 from csplat_tools.inspect.info import byte_shares
 from csplat_tools.pages.hardest import HardestPlace
 from csplat_tools.tradeoffs.points import ModeTime, Partial, Point, TriedFile
 from csplat_tools.tradeoffs.setting import Setting
 from csplat_tools.tradeoffs.sweep import Candidate
 from csplat_tools.views import evenly, showing_cameras
-
-__all__ = ["DECODE_RUNS", "TIMED_VIEWS", "Measurer", "fetched_bytes"]
-
-F32 = NDArray[np.float32]
 
 #: Number of runs of decoding, which takes milliseconds: the median is reported.
 DECODE_RUNS = 3

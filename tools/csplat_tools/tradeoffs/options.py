@@ -13,8 +13,6 @@ from csplat_render import Mode
 from csplat_render.conventions import MODES
 from csplat_tools.files.sizes import parse_size_bytes
 
-__all__ = ["FAMILIES", "USUAL", "Wanted", "parse_what"]
-
 #: Groups of points, in the order in which they are measured: quick ones come first.
 FAMILIES = ("presets", "precision", "strategies", "targets", "simplify", "finetune")
 #: Groups that are measured by default: without fine-tuning, which takes minutes for each point.

@@ -17,8 +17,6 @@ from csplat_tools.tradeoffs.running import Tradeoff
 from csplat_tools.tradeoffs.tables import columns_of, mode_rows, partial_rows, views_line
 from csplat_tools.views import VIRTUAL
 
-__all__ = ["check_plots", "make_page", "write_page", "write_plots"]
-
 _MOST_SHOWN = 9  # largest number of points with images, some 60 kB each
 _FRONT = ' class="front"'
 

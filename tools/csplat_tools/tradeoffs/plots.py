@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["PLOTS", "draw_plot"]
 
 _WIDE, _HIGH = 7.0, 4.4  # width and height of a plot, inches of 100 pixels
 

@@ -11,8 +11,6 @@ import numpy as np
 from csplat_render.metrics import Scores
 from csplat_tools.pages.hardest import Place
 
-__all__ = ["Failure", "ModeTime", "Partial", "Point", "TriedFile", "pareto_front"]
-
 _QUALITY = ("psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips")
 
 

@@ -9,9 +9,10 @@ from typing import Any
 from csplat.errors import CsplatError, InputError, counted
 from csplat.inputs import File
 from csplat.model import SplatModel
+from csplat.types import Progress, null_progress
 from csplat_render.jit import thread_count
 from csplat_render.metrics import Scores
-from csplat_tools.files.console import Progress, format_about, format_bytes
+from csplat_tools.files.console import format_about, format_bytes
 from csplat_tools.files.extras import need_renderer
 from csplat_tools.tradeoffs.machine import describe_machine
 from csplat_tools.tradeoffs.measuring import DECODE_RUNS, Measurer
@@ -20,8 +21,6 @@ from csplat_tools.tradeoffs.points import Failure, ModeTime, Point, pareto_front
 from csplat_tools.tradeoffs.setting import Setting, read_setting
 from csplat_tools.tradeoffs.sweep import Candidate, candidates
 from csplat_tools.views import Colour, DataOptions
-
-__all__ = ["Tradeoff", "estimated_seconds", "tradeoff"]
 
 # Seconds by kind of point, on two cores: a fixed part (scores, and for presets those with fewer bands); per million
 # splats; and per second that eight renders of the source take. Only for the estimate that is shown to the user.
@@ -149,7 +148,7 @@ def tradeoff(
     else:
         setting = read_setting(scene, cameras=cameras, data=data, background=background, lpips=lpips)
     wanted = wanted or Wanted()
-    report: Progress = progress or (lambda _stage, _done: None)
+    report: Progress = progress or null_progress
     tell = say or (lambda _line: None)
     with thread_count(wanted.threads):
         measurer = Measurer(setting, wanted.modes, wanted.threads)

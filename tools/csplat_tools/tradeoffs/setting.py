@@ -16,8 +16,6 @@ from csplat_tools.files.convert import read_source
 from csplat_tools.files.scenes import LoadedModel, load_model
 from csplat_tools.views import Colour, DataOptions, ViewSet, find_view_set
 
-__all__ = ["Setting", "read_setting"]
-
 
 @dataclass(frozen=True, eq=False)
 class Setting:

@@ -9,7 +9,8 @@ from typing import Any
 
 from csplat.encoder import PRESETS, EncodeOptions, EncodeResult, encode_with_report
 from csplat.model import SplatModel
-from csplat_tools.files.console import Progress, format_bytes
+from csplat.types import Progress
+from csplat_tools.files.console import format_bytes
 from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.study import Reduction, encode_reduced, parse_kmeans
 from csplat_tools.tradeoffs.commands import encode_command, finetune_command, reduction_command, target_command
@@ -28,8 +29,6 @@ from csplat_tools.training.finetune import (
 from csplat_tools.views import ViewSet, find_view_set
 from csplat_tools.views.viewset import pose
 from csplat_trainer.tuning import FinetuneOptions
-
-__all__ = ["Candidate", "candidates"]
 
 _MOST_DISTILLED = 2  # number of SH degrees that are distilled, 0 and 1: each takes as long as a simplification
 

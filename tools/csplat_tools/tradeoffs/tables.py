@@ -10,8 +10,6 @@ from csplat_tools.tradeoffs.points import Partial, Point
 from csplat_tools.tradeoffs.running import Tradeoff
 from csplat_tools.views import counted_views
 
-__all__ = ["MARK", "Column", "columns_of", "format_tradeoff", "mode_rows", "partial_rows", "views_line"]
-
 #: Mark before the names of points on the Pareto front.
 MARK = "*"
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from csplat.encoder import Importance
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.types import I64, Progress
 from csplat_render import Camera
 from csplat_render.removal import measure_removal
-from csplat_tools.files.console import Progress
 from csplat_tools.files.importance import read_importance
 from csplat_tools.optimise.sensitivity import measure_views
 from csplat_tools.optimise.simplify import SimplifyOptions, simplify
@@ -22,10 +22,6 @@ from csplat_tools.views import VIEW_COUNT, ViewSet, with_deciders
 from csplat_trainer.sensitivity import Sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.tuning import View, Views, renders_of, split_views
-
-__all__ = ["Chosen", "choose_splats", "training_views"]
-
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,17 +8,15 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 import csplat_trainer
 from csplat.decoder import decode
 from csplat.encoder import PRESETS, Draft, EncodeOptions, Origin
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.types import Progress
 from csplat_render.jit import thread_count
 from csplat_render.metrics import Distance
-from csplat_tools.files.console import Progress, format_bytes, note, progress_bar, step_progress
+from csplat_tools.files.console import format_bytes, note, progress_bar, step_progress
 from csplat_tools.files.extras import prepare_renderer
 from csplat_tools.files.streams import write_array, write_bytes
 from csplat_tools.optimise.exchange import BYTES_PER_DB
@@ -29,21 +27,6 @@ from csplat_tools.training.searching import smallest_reaching
 from csplat_tools.views import ViewSet
 from csplat_trainer.outputs import Outputs
 from csplat_trainer.tuning import Clock, Finetuned, FinetuneOptions, TuningStep
-
-__all__ = [
-    "BYTE_COST",
-    "LEARNING_FACTOR",
-    "SHAPE_ENTRIES",
-    "SPLAT_BYTES",
-    "VIEWS",
-    "VIEW_SIZE",
-    "TunedChoice",
-    "choose_and_finetune",
-    "run_finetuning",
-    "usually_aside",
-]
-
-I64 = NDArray[np.int64]
 
 #: Factor of the learning rates; True: the scene's own renders are the reference instead of photographs. Those can be
 #: matched almost exactly: what long steps lose of that, short ones take long to regain.

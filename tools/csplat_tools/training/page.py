@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import counted
 from csplat.model import SplatModel
+from csplat.types import U8
 from csplat_tools.files.console import format_bytes
 from csplat_tools.files.pictures import to_bytes
 from csplat_tools.files.streams import write_bytes
@@ -26,9 +27,6 @@ from csplat_tools.views import ViewSet, evenly
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Shown", "make_page", "show_views", "write_page"]
-
-U8 = NDArray[np.uint8]
 
 _VIEWS = 3  # number of views that are shown
 _WIDE, _HIGH = 7.0, 3.4  # width and height of a plot, inches

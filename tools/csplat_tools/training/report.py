@@ -16,8 +16,6 @@ from csplat_tools.files.scenes import ply_splat_bytes
 from csplat_tools.inspect.info import byte_shares
 from csplat_tools.views import ViewSet
 
-__all__ = ["SCORES", "Judged", "as_report", "format_report", "judge_models", "score_rows"]
-
 #: Scores that are reported, with their number of digits after the decimal point.
 SCORES = {"psnr": 2, "psnr_mean": 2, "ssim": 4, "lpips": 4}
 

@@ -8,8 +8,6 @@ from typing import Protocol, TypeVar
 
 from csplat.errors import InputError
 
-__all__ = ["smallest_reaching"]
-
 _PER_DOUBLING = 1.25  # dB that twice the bytes bring, about, if there is only one file
 _SLOPES = (0.3, 12.0)  # range of this slope if it is taken from two files, dB per doubling
 _NEAR = 0.1  # dB above the target that are near enough

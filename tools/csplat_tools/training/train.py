@@ -27,8 +27,6 @@ from csplat_trainer.perceptual import PerceptualLoss
 from csplat_trainer.report import TrainingStep, plot_loss
 from csplat_trainer.tuning import FinetuneOptions
 
-__all__ = ["run_training", "run_training_to_file", "tuning_after", "tuning_checkpoint"]
-
 _TUNING = 1 / 6  # steps of the tuning that follows a training, as a fraction of the training's steps
 _BRIEF = 4_000  # training steps up to which a tuning uses full learning rates: after longer training they gain nothing
 

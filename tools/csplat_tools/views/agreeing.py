@@ -16,15 +16,11 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.types import F64, Progress
 from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.removal import Removal, measure_removal
-from csplat_tools.files.console import Progress
 from csplat_tools.views import CHECKS, VIEW_SIZE, ViewSet, reduced
-
-__all__ = ["AgreedViews", "find_views", "removal_keys"]
-
-F64 = NDArray[np.float64]
 
 _BATCH = 40  # virtual views that are added at a time
 # dB between the errors predicted for used and for held-out views, below which there are enough views. Fits overfit

@@ -12,8 +12,6 @@ from csplat_render.cloud import sample_cloud
 from csplat_render.virtual import is_clear, scene_frame, virtual_cameras
 from csplat_tools.views import placing
 
-__all__ = ["elsewhere"]
-
 _SEED = 2000  # seed of these views; validation views use 1000 and more
 _NEARER, _FARTHER = (0.6, 0.7, 0.8, 0.9), 2.0  # factors of the distance from the middle of the scene
 _POINTS = 20_000  # points that are sampled from the scene

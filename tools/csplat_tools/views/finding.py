@@ -32,7 +32,6 @@ from csplat_tools.views.viewset import BLACK, SPLITS, VIRTUAL, WHITE, Colour, Sp
 if TYPE_CHECKING:
     from csplat_trainer.pictures import Picture
 
-__all__ = ["DataOptions", "comparison_cameras", "find_view_set", "with_deciders"]
 
 _ENOUGH = 40  # number of cameras of a file from which they are split into all three roles
 _JUDGE_EVERY, _MOST_JUDGES = 4, 24  # every Nth of them is a test view, up to this number

@@ -11,27 +11,14 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.model import SplatModel
+from csplat.types import F64
 from csplat_render import Camera
 from csplat_render.cameras import direction, intrinsics, look_at
 from csplat_render.cloud import detail, sample_cloud
 from csplat_render.virtual import FIELD_OF_VIEW, HIDING, Frame, is_clear, scene_frame
 
-__all__ = [
-    "CHECKS",
-    "VIEW_COUNT",
-    "VIEW_SIZE",
-    "VIRTUAL_SIZES",
-    "VirtualSizes",
-    "camera_sequence",
-    "evenly",
-    "reduced",
-    "usual_views",
-]
-
-F64 = NDArray[np.float64]
 T = TypeVar("T")
 
 #: Default number of virtual training views, and width and height of their renders, pixels, for small scenes; for larger

@@ -19,8 +19,6 @@ from csplat_render.virtual import HIDING, far_apart, scene_frame
 from csplat_tools.views.placing import camera_sequence
 from csplat_tools.views.viewset import VIRTUAL, ViewSet
 
-__all__ = ["showing_cameras"]
-
 _COUNT, _SIZE = 6, (640, 480)  # largest number of views; their width and height, pixels
 _TRIED, _POINTS, _SEED = 64, 40_000, 0  # candidates; points sampled from the scene; seed of both
 _GOOD_DETAIL = 0.8  # least detail as a fraction of the best view's

@@ -14,21 +14,16 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.scene import BLOCK, Scene, scene_of
+from csplat.types import F32, F64, Progress
 from csplat_conformance.stated import Source
 from csplat_conformance.stated.spool import Rows, Spool, opened_spool
 from csplat_render import Camera, Mode
 from csplat_render.arrays import HasSplats, RenderResult
-from csplat_tools.files.console import Progress
-
-__all__ = ["Sliced", "slice_limits"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 STAGE = "drawing one picture by way of the disk"
 _LOOKED_AT = 1 << 19  # approximate number of splats that are sampled to cut a slice again

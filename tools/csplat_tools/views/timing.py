@@ -10,8 +10,6 @@ from csplat_render import Camera, Mode
 from csplat_render.cameras import resized
 from csplat_render.judge import Drawable, renderer
 
-__all__ = ["picture_seconds", "pictures_seconds"]
-
 _SAMPLES = 2  # largest number of cameras that are rendered
 _SMALLER = 8  # divisor of width and height in mode `exact`, in which a render takes a minute: time grows with pixels
 

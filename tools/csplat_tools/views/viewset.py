@@ -16,7 +16,6 @@ from csplat_render.judge import Drawable, Judge
 if TYPE_CHECKING:
     from csplat_trainer.pictures import Picture
 
-__all__ = ["BLACK", "SPLITS", "VIRTUAL", "WHITE", "Colour", "Split", "ViewSet", "counted_views", "pose"]
 
 Colour = tuple[float, float, float]
 

@@ -19,8 +19,6 @@ from csplat_trainer.data.image_pixels import ImageHead, image_size, mask_values,
 from csplat_trainer.data.lens import Lens, undistorted_lens
 from csplat_trainer.data.pixels import shown_size
 
-__all__ = ["check_shots", "notes_on_images", "notes_on_lenses", "notes_on_poses"]
-
 _ROUNDING = 1.0  # pixels by which each side of a scaled-down image may be rounded
 _NEARLY = 0.02  # relative, of scales across and down: beyond it an image is turned, or a mask is another image's
 _MIDDLE = (0.25, 0.75)  # fractions of the image: principal points outside this range are reported

@@ -12,20 +12,15 @@ from __future__ import annotations
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
+from csplat.types import F32, F64
 from csplat_trainer.data.colmap_files import ColmapImage, count_images, read_cameras, read_images, read_points
 from csplat_trainer.data.dataset import Found, Shot
 from csplat_trainer.data.image_files import find_images, find_masks, masks_among, missing_images
 from csplat_trainer.data.lens import Lens
 from csplat_trainer.data.point_cloud import read_point_cloud
 from csplat_trainer.data.splits import lists_next_to, split_every, split_listed
-
-__all__ = ["find_model", "read_colmap"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 #: With models in numbered folders, or one in itself; the last only if there is no other.
 _MODEL_FOLDERS = (("sparse", "colmap/sparse"), ("distorted/sparse",))

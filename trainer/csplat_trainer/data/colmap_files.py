@@ -10,19 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat.files import read_text
 from csplat.inputs import stand_in
+from csplat.types import F32, F64
 from csplat_trainer.data.image_files import shown
 from csplat_trainer.data.lens import UNDISTORTER, Lens
 from csplat_trainer.data.point_cloud import finite_points
-
-__all__ = ["ColmapImage", "count_images", "read_cameras", "read_images", "read_points"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 _UNIT_TOLERANCE = 0.01  # of a quaternion's length; text files may hold few digits
 

@@ -8,20 +8,15 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.model import UNSPECIFIED
 from csplat.training import TrainedOn
+from csplat.types import F32, F64
 from csplat.upright import Direction
 from csplat_render.camera import DEFAULT_NEAR
 from csplat_render.cameras import camera_outliers, nearest_point
 from csplat_trainer.data.lens import Lens
 from csplat_trainer.pictures import Picture
-
-__all__ = ["DataSet", "Found", "Shot", "near_plane"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 _NEAR = 0.03  # fraction of the cameras' distance from what they look at

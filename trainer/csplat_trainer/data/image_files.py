@@ -30,17 +30,6 @@ from urllib.parse import unquote
 from csplat.errors import InputError, counted
 from csplat_trainer.data.image_pixels import image_size
 
-__all__ = [
-    "FoundImages",
-    "NoImagesError",
-    "find_images",
-    "find_masks",
-    "match_names",
-    "missing_images",
-    "plain",
-    "shown",
-]
-
 _ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".avif", ".tif", ".tiff", ".bmp", ".jp2")
 _SHOWN = 5  # names in a message, at most
 

@@ -20,27 +20,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageFile, TiffImagePlugin, UnidentifiedImageError
 
 from csplat.errors import InputError
 from csplat.inputs import stand_in
-
-__all__ = [
-    "COUNTS",
-    "ImageHead",
-    "MaskValues",
-    "image_size",
-    "mask_values",
-    "opaque_images",
-    "opened_image",
-    "read_head",
-    "rgb_pixels",
-    "value_range",
-]
-
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
+from csplat.types import F64, U8
 
 #: A mask's values from which on pixels count.
 COUNTS = 128

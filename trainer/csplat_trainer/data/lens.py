@@ -14,13 +14,9 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError
-
-__all__ = ["UNDISTORTER", "Lens", "distorted", "undistorted_lens"]
-
-F64 = NDArray[np.float64]
+from csplat.types import F64
 
 _ZOOM_STEP = 0.005
 _MAX_ZOOM = 1.5

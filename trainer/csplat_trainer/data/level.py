@@ -6,13 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from csplat.types import F64
 from csplat.upright import Direction, unit_up
-
-__all__ = ["Level", "find_level"]
-
-F64 = NDArray[np.float64]
 
 _TURNED = 0.03  # least mean square, across the weakest direction but one, of the axes that point to the right
 _TILT_MAX = 20.0  # degrees; cameras that were held less level determine nothing

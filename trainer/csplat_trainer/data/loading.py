@@ -23,8 +23,6 @@ from csplat_trainer.data.pixels import picture_of
 from csplat_trainer.data.placement import centre, describe_outliers
 from csplat_trainer.data.transforms import read_blender, read_transforms
 
-__all__ = ["load"]
-
 _NAMED = 3  # folders in a message, at most
 _AGREES = math.cos(math.radians(30.0))  # of the custom of a kind of set with its cameras
 

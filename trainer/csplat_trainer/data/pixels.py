@@ -6,20 +6,15 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from scipy.ndimage import map_coordinates
 
+from csplat.types import U8, Mask
 from csplat_render.camera import Camera
 from csplat_trainer.data.dataset import Shot
 from csplat_trainer.data.image_pixels import COUNTS, ImageHead, mask_values, opened_image, rgb_pixels
 from csplat_trainer.data.lens import Lens, distorted, undistorted_lens
 from csplat_trainer.pictures import Picture, UnreadMask, UnreadPixels
-
-__all__ = ["picture_of", "shown_size"]
-
-U8 = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 # Orientations of EXIF that swap width and height, and what undoes them: quarter turns, anticlockwise, then a flip.
 _ON_ITS_SIDE = {5: (1, True), 6: (-1, False), 7: (-1, True), 8: (1, False)}

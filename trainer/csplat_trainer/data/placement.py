@@ -6,16 +6,13 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
+from csplat.types import F64
 from csplat_render.cameras import camera_outliers, nearest_point
 from csplat_trainer.data.dataset import DataSet, Found, Shot
 from csplat_trainer.data.image_files import shown
 
-__all__ = ["centre", "describe_outliers"]
-
-F64 = NDArray[np.float64]
 Origin = tuple[float, float, float]
 
 _NEAR_SIZES = 256.0  # sizes of the scene; farther from 0, a step of float32 is more than 1.5e-5 of that size

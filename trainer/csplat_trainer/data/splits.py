@@ -10,8 +10,6 @@ from csplat.files import read_json, read_text
 from csplat_trainer.data.dataset import Shot
 from csplat_trainer.data.image_files import match_names, plain, shown
 
-__all__ = ["ROLES", "lists_next_to", "split_every", "split_listed"]
-
 _SCANNET = "train_test_lists.json"  # of ScanNet++
 
 #: Names of lists, and what each is for.

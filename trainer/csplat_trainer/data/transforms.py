@@ -11,10 +11,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat.files import read_json
+from csplat.types import F32, F64
 from csplat_render.camera_forms import (
     PERSPECTIVES,
     finite_number,
@@ -29,11 +29,6 @@ from csplat_trainer.data.image_pixels import image_size, read_head
 from csplat_trainer.data.lens import UNDISTORTER, Lens
 from csplat_trainer.data.point_cloud import read_point_cloud
 from csplat_trainer.data.splits import ROLES, lists_next_to, split_every, split_listed
-
-__all__ = ["read_blender", "read_transforms"]
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 _POINT_CLOUDS = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
 _BLENDER_AXES = "RFU"  # seen from the front: x to the right, y away, z up

@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass, fields
 from typing import Any
 
-__all__ = ["Budget"]
-
 _REACHED = 0.6  # fraction of the steps after which the size should be reached: later ones hardly move a value
 _BELOW = 0.002  # fraction of the size that is left free: counts come every few steps, and files grow between them
 _GAIN, _FASTEST = 40.0, 0.5  # gain of log(cost) per relative excess of bits, and its largest change at each count

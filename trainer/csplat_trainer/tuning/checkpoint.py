@@ -17,8 +17,6 @@ from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat_trainer.parameters import GROUPS, Parameters
 
-__all__ = ["FinetuneCheckpoint", "load_finetune", "save_finetune"]
-
 _VERSION = 1
 _FACTS = {
     "frozen": str, "iteration": int, "step": int, "rng_state": dict, "queue": list, "options": dict, "log": dict,

@@ -16,6 +16,7 @@ from csplat.encoder import DecodedValues, Draft, EncodeOptions, EncodeResult, Im
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
 from csplat.training import TrainedOn
+from csplat.types import I64
 from csplat_render.cameras import relative_to
 from csplat_trainer.data import DataSet
 from csplat_trainer.outputs import Outputs
@@ -24,10 +25,6 @@ from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.tuning.loop import TuningStep, tune
 from csplat_trainer.tuning.options import FinetuneOptions
 from csplat_trainer.tuning.views import View, Views, split_views
-
-__all__ = ["Clock", "Finetuned", "finetune"]
-
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 from numpy.random import PCG64, Generator
-from numpy.typing import NDArray
 
 from csplat.encoder import DecodedValues, FreeValues, Frozen
 from csplat.errors import InputError
+from csplat.types import F32
+from csplat_render.arrays import Splats
 from csplat_render.metrics import psnr_of_mse
-from csplat_render.rasterise import Rasteriser, Splats
+from csplat_render.rasterise import Rasteriser
 from csplat_trainer.exposure import Exposure, Exposures
 from csplat_trainer.loss import LOSS_WEIGHTS, PhotometricLoss
 from csplat_trainer.report import peak_memory
@@ -26,10 +27,6 @@ from csplat_trainer.tuning.options import FinetuneOptions
 from csplat_trainer.tuning.rate import Costs
 from csplat_trainer.tuning.state import TunedScene
 from csplat_trainer.tuning.views import View, Views
-
-__all__ = ["FinetuneResult", "TuningStep", "tune"]
-
-F32 = NDArray[np.float32]
 
 _COUNT_EVERY = 50  # steps between counts of the integers
 _LEAST_GAIN = 2e-4  # smallest difference of the score that counts as a gain

@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from csplat.errors import InputError
 from csplat_trainer.options import LOSSES, Loss
 
-__all__ = ["FinetuneOptions"]
-
 
 @dataclass(frozen=True)
 class FinetuneOptions:

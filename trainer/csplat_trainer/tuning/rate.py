@@ -16,13 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.encoder import Frozen
+from csplat.types import F32, I32
 from csplat_render.jit import lane_run, parallel_kernel
 from csplat_trainer.parameters import Splats
-
-__all__ = ["Costs", "Stored", "colour_integers_of", "cost_slopes"]
-
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
 
 _REACH = 128  # integers beyond ± this cost as much as the last ones
 _ROWS = 1 << 15  # rows of SH that are counted at a time: their integers take several times the memory of the values

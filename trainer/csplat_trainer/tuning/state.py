@@ -11,15 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.encoder import DecodedValues, FreeValues, Frozen
+from csplat.types import F32, I64
 from csplat_render.arrays import Gradients
 from csplat_render.jit import parallel_kernel
 from csplat_trainer.parameters import Parameters, Splats, adam_step, sigmoid
 from csplat_trainer.tuning.rate import Costs, Stored
-
-__all__ = ["TunedScene", "sum_by_entry", "sum_by_entry_twin"]
-
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
 
 _ALPHAS = (1e-6, 1.0 - 1e-6)  # range of the opacities that logits are computed from
 

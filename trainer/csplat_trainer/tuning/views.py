@@ -12,13 +12,10 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.types import F32
 from csplat_render.camera import Camera
 from csplat_render.rasterise import Rasteriser
 from csplat_trainer.pictures import Picture, compose
-
-__all__ = ["View", "Views", "renders_of", "split_views"]
-
-F32 = NDArray[np.float32]
 
 _JUDGES = 16  # validation views at most, if they are training views too
 _BRIGHTEST = np.float32(6e4)  # largest value for float16

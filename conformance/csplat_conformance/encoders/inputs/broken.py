@@ -9,8 +9,6 @@ import numpy as np
 from csplat_conformance.encoders.inputs.making import Input, cloud
 from csplat_conformance.encoders.plyfile import Layout, write
 
-__all__ = ["broken"]
-
 
 def broken() -> list[Input]:
     """Return them, in the order of a run."""

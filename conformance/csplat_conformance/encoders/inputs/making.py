@@ -11,8 +11,6 @@ import numpy as np
 from csplat_conformance.encoders.plyfile import Layout, Splats, meaning, write
 from csplat_conformance.stated import Source
 
-__all__ = ["APART", "PITCH", "PSNR_MIN", "Input", "cloud", "made"]
-
 PSNR_MIN = 30.0  #: dB that renders must reach, unless an input sets another value
 PITCH = 0.1  #: scene units between neighbours
 _JITTER = 0.2  # fraction of the pitch, to either side

@@ -7,8 +7,6 @@ import numpy as np
 from csplat_conformance.encoders.inputs.making import Input, cloud, made
 from csplat_conformance.encoders.plyfile import Layout, Splats
 
-__all__ = ["nasty"]
-
 _FACES = (
     ("element face 3", "property list uchar int vertex_indices"),
     b"".join(bytes((count,)) + bytes(4 * count) for count in (3, 4, 0)),

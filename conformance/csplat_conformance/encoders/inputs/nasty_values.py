@@ -7,8 +7,6 @@ import numpy as np
 from csplat_conformance.encoders.inputs.making import APART, Input, cloud, made
 from csplat_conformance.encoders.plyfile import Layout, Splats
 
-__all__ = ["nasty_values"]
-
 
 def nasty_values() -> list[Input]:
     """Return them, in the order of a run."""

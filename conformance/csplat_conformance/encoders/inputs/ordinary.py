@@ -9,8 +9,6 @@ import numpy as np
 from csplat_conformance.encoders.inputs.making import PITCH, Input, cloud, made
 from csplat_conformance.encoders.plyfile import Layout, Splats
 
-__all__ = ["ordinary"]
-
 _MANY = 65_536 + 600  # more than one tile holds
 
 

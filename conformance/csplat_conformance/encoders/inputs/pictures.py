@@ -6,14 +6,11 @@ The other inputs are sparse clouds at random, in which a wrong rotation or opaci
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from csplat.types import F64
 from csplat_conformance.encoders.inputs.making import Input, made
 from csplat_conformance.encoders.plyfile import Splats
 
-__all__ = ["pictures"]
-
-F64 = NDArray[np.float64]
 Surface = tuple[F64, F64, float]  # centres, normals, about how far apart the centres are
 
 _APART = 0.04

@@ -28,9 +28,10 @@ import typer
 from csplat.formats import formats, write
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat_bench.common.command import JSON, MARKDOWN, run, tell
+from csplat_bench.common.command import JSON, MARKDOWN, run
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import find_scenes
+from csplat_tools.files.console import note
 
 #: Ends a batch that writes to a folder.
 End = Callable[[subprocess.Popen[str], Path], None]
@@ -66,11 +67,11 @@ def _measured(folder: Path, count: int, broken: int, splats: int, workers: int) 
 
     def add(name: str, words: Sequence[str], out: str, end: End | None) -> None:
         rows.append((name, *_batch(scenes, folder / out, ["--workers", str(workers), *words], end)))
-        tell(f"{name}: {rows[-1][1]} s")
+        note(f"{name}: {rows[-1][1]} s")
 
     for at_once in (1, workers):
         rows.append(_loop(scenes, folder / f"loop{at_once}", at_once))
-        tell(f"{rows[-1][0]}: {rows[-1][1]} s")
+        note(f"{rows[-1][0]}: {rows[-1][1]} s")
     add("csplat batch", [], "plain", None)
     _compare(folder / "loop1", folder / "plain")
     add("the same again", [], "plain", None)

@@ -20,12 +20,13 @@ import typer
 from csplat.formats import formats, read, write
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, listed, run, tell
+from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, listed, run
 from csplat_bench.common.measuring import timed
 from csplat_bench.common.peers import find_splat_transform, judged, transform
 from csplat_bench.common.report import optional, table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, find_scenes
 from csplat_render.judge import Judge
+from csplat_tools.files.console import note
 from csplat_tools.views import comparison_cameras
 
 _SCENES = "donut,horse,plane3,lego60k"
@@ -88,7 +89,7 @@ def main(
             rows.append(
                 Row(scene.name, f"{peer.name}, splat-transform", peer.size_bytes, psnr, seconds, None, len(source))
             )
-        tell(scene.name)
+        note(scene.name)
     header = ("scene", "format", "bytes", "a splat", "dB", "written in s", "read, M splats/s")
     print(table(header, [row.cells for row in rows], markdown=markdown))
     if json is not None:

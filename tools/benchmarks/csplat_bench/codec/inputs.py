@@ -24,8 +24,9 @@ from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, encode
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
-from csplat.ply import read_ply, write_ply
-from csplat_bench.common.command import MARKDOWN, PEERS, preset_of, run, tell
+from csplat.ply import read_ply
+from csplat.ply_write import write_ply
+from csplat_bench.common.command import MARKDOWN, PEERS, preset_of, run
 from csplat_bench.common.peers import find_splat_transform, judged, transform
 from csplat_bench.common.report import table, tell_machine
 from csplat_bench.common.scenes import NPM, ROOT, Scene
@@ -33,6 +34,7 @@ from csplat_conformance.choosing import matching
 from csplat_conformance.encoders import Input, all_inputs
 from csplat_conformance.stated import Source
 from csplat_render.judge import Judge
+from csplat_tools.files.console import note
 from csplat_tools.views import comparison_cameras
 
 FIGURES = ROOT / "conformance" / "csplat_conformance" / "encoders" / "figures.json"
@@ -74,11 +76,11 @@ def main(
     for name, one in wanted.items():
         if one.renders or write:
             measured[name] = _measure(one, command)
-            tell(name)
+            note(name)
     if write:
         lines = [f"{json.dumps(name)}: {json.dumps(figures)}" for name, figures in _figures(measured).items()]
         FIGURES.write_text("{\n" + ",\n".join(lines) + "\n}\n", "utf-8")
-        tell(f"wrote {FIGURES}")
+        note(f"wrote {FIGURES}")
         return
     columns = ("wanted", *PRESETS, "SPZ")
     rows = [(name, f"{wanted[name].psnr_min:g}", *_cells(found)) for name, found in measured.items()]

@@ -12,8 +12,6 @@ from csplat_bench.common.command import preset_of
 from csplat_bench.common.making import ARRAYS
 from csplat_bench.common.measuring import medians, peak_bytes, reset_peak, timed
 
-__all__ = ["Run", "encoded"]
-
 
 @dataclass(frozen=True)
 class Run:

@@ -37,7 +37,6 @@ from csplat_bench.common.command import (
     numbers,
     preset_of,
     run,
-    tell,
 )
 from csplat_bench.common.measuring import timed
 from csplat_bench.common.peers import find_splat_transform, judged, transform
@@ -45,6 +44,7 @@ from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, Scene, find_scenes, given_cameras, judge_of
 from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame, virtual_cameras
+from csplat_tools.files.console import note
 
 _SCENES = "fox120k,fox60k_noreg,lego60k,plane3,statue,donut,jacket,horse,angel,st-peter"
 _LIMIT = 1.0  # dB: largest difference between the cameras of the data folder and those that `psnr` chooses
@@ -96,7 +96,7 @@ def main(
             psnr = judged(command, peer, judge_of(scene.name, source))
             found.append(Quality(peer.name, peer.size_bytes / len(source), psnr))
         measured[scene] = scene_frame(source).kind, found
-        tell(f"{scene.name}: {timing.wall:.1f} s")
+        note(f"{scene.name}: {timing.wall:.1f} s")
     columns = [*listed(presets), *(["SPZ"] if command else [])]
     rows = [
         (scene.name, f"{scene.splat_count:,}, {scene.sh_degree}", *(one.cell for one in found))

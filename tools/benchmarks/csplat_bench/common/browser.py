@@ -12,8 +12,6 @@ from typing import Any
 
 from csplat.errors import InputError
 
-__all__ = ["open_page", "serve"]
-
 _PATIENCE = 600_000  # milliseconds
 
 _SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]

@@ -10,16 +10,14 @@ from pathlib import Path
 from typing import Any, TypedDict
 
 from csplat.errors import InputError
-from csplat.ply import write_ply
-from csplat_bench.common.command import tell
+from csplat.ply_write import write_ply
 from csplat_bench.common.report import write_json
 from csplat_bench.common.scenes import DATA
+from csplat_tools.files.console import note
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions
 from csplat_trainer.report import TrainingStep
-
-__all__ = ["CAPTURES", "Capture", "Training", "choose_captures", "read_training", "train_to", "trained"]
 
 _TOLD = 5  # lines of progress of a training
 
@@ -136,7 +134,7 @@ def train_to(ply: Path, data: DataSet, options: TrainOptions) -> Training:
 
     def show(now: TrainingStep) -> None:
         if now.iteration % every == 0:
-            tell(f"{ply.stem}: {now.iteration}/{now.iterations}, {now.splat_count} splats, {now.seconds:.0f} s")
+            note(f"{ply.stem}: {now.iteration}/{now.iterations}, {now.splat_count} splats, {now.seconds:.0f} s")
 
     result = train(replace(data, test=[]), options, on_step=show)
     log = result.log

@@ -17,11 +17,6 @@ from csplat.encoder import PresetName
 from csplat.errors import CsplatError
 from csplat_tools.files.console import note as tell
 
-__all__ = [
-    "AGAIN", "CACHE", "EXTRA", "JSON", "LPIPS", "MARKDOWN", "OUT", "PEERS", "PRESETS", "SCENES", "TABLES", "THREADS",
-    "VIEWS", "WrongWords", "listed", "numbers", "preset_of", "run", "tell",
-]  # fmt: skip
-
 T = TypeVar("T")
 
 SCENES = Annotated[str, typer.Option(help="names, separated by commas")]

@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-__all__ = ["Point", "Rate", "Series", "bracket", "bytes_between", "front", "psnr_at", "rate_at"]
-
 _WINDOW = 2.0  # dB on either side of a goal in which a point has to lie for a straight line to be trusted
 _BESIDE = 0.4  # dB: points are aimed this far from a goal
 _SLOPES = (0.1, 2.0)  # dB of PSNR per dB of quality that are believed

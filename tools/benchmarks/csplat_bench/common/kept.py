@@ -10,10 +10,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from csplat.errors import InputError
-from csplat_bench.common.command import tell
 from csplat_bench.common.report import write_json
-
-__all__ = ["Kept", "file_digest", "read_kept"]
+from csplat_tools.files.console import note
 
 T = TypeVar("T")
 
@@ -54,7 +52,7 @@ class Kept:
             start = time.perf_counter()
             known[key] = call()
             self.write()
-            tell(f"{self.path.stem} {kind} {key}: {time.perf_counter() - start:.0f} s")
+            note(f"{self.path.stem} {kind} {key}: {time.perf_counter() - start:.0f} s")
         return known[key]
 
     def write(self) -> None:

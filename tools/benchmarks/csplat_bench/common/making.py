@@ -8,15 +8,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.model import SplatModel, normalise_quats
+from csplat.types import F32
 from csplat_render import Camera
 from csplat_render.rasterise import Rasteriser
-
-__all__ = ["ARRAYS", "blow_up", "copies", "crowd", "split", "with_splats"]
-
-F32 = NDArray[np.float32]
 
 #: Arrays of a model.
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")

@@ -20,8 +20,6 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
-__all__ = ["Timing", "alone", "medians", "peak_bytes", "reset_peak", "run_timed", "timed"]
-
 P = ParamSpec("P")
 T = TypeVar("T")
 

@@ -12,12 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from csplat.ply import read_ply
-from csplat_bench.common.command import tell
 from csplat_bench.common.measuring import Timing, run_timed
 from csplat_bench.common.scenes import Scene
 from csplat_render.judge import Judge
-
-__all__ = ["CAP_SECONDS", "Peer", "find_splat_transform", "judged", "npm_install", "npm_pinned", "transform"]
+from csplat_tools.files.console import note
 
 #: Longest run of another program.
 CAP_SECONDS = 600
@@ -73,7 +71,7 @@ def npm_install(folder: Path, packages: Sequence[str]) -> str:
     if npm is None:
         return "npm is not installed"
     folder.mkdir(parents=True, exist_ok=True)
-    tell(f"installing into {folder}: {' '.join(packages)}")
+    note(f"installing into {folder}: {' '.join(packages)}")
     command = [npm, "install", "--prefix", str(folder), "--no-audit", "--no-fund", *packages]
     try:
         subprocess.run(command, capture_output=True, timeout=CAP_SECONDS, check=True)

@@ -11,8 +11,6 @@ from csplat.files import atomic_writer
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["new_figure", "save_svg"]
-
 
 def new_figure(width: float, height: float) -> Figure:
     """Return an empty figure, its size in inches of 100 pixels, without a window."""

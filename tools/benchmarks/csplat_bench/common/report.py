@@ -10,11 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from csplat.files import atomic_writer
-from csplat_bench.common.command import tell
-from csplat_tools.files.console import format_table
+from csplat_tools.files.console import format_table, note
 from csplat_tools.tradeoffs.machine import describe_machine
-
-__all__ = ["Machine", "Table", "describe", "laid_out", "machines", "optional", "table", "tell_machine", "write_json"]
 
 #: The machine that figures were taken on: descriptions by name.
 Machine = dict[str, str]
@@ -72,7 +69,7 @@ def tell_machine(**more: str) -> Machine:
     """Describe the machine, on standard error as well."""
     machine = {**describe(), **more}
     for name, text in machine.items():
-        tell(f"{name}: {text}")
+        note(f"{name}: {text}")
     return machine
 
 

@@ -14,27 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from csplat.model import SplatModel
-from csplat.ply import read_ply, write_ply
-from csplat_bench.common.command import tell
+from csplat.ply import read_ply
+from csplat.ply_write import write_ply
 from csplat_bench.common.making import blow_up, crowd
 from csplat_render import Camera
 from csplat_render.cameras import load_cameras
 from csplat_render.judge import Judge
+from csplat_tools.files.console import note
 from csplat_tools.views import BLACK, comparison_cameras
-
-__all__ = [
-    "DATA",
-    "MADE",
-    "NPM",
-    "OUT",
-    "ROOT",
-    "SAMPLE",
-    "Scene",
-    "cameras_of",
-    "find_scenes",
-    "given_cameras",
-    "judge_of",
-]
 
 ROOT = Path(__file__).resolve().parents[4]
 DATA = Path(os.environ.get("CSPLAT_DATA", ROOT.parent / "shared" / "data"))
@@ -109,7 +96,7 @@ def find_scenes(names: Sequence[str], cache: Path = MADE, extra: Sequence[Path] 
     paths = {name: _path(name, cache) for name in names}
     absent = [name for name, path in paths.items() if path is None]
     if absent:
-        tell(f"absent: {', '.join(absent)}")
+        note(f"absent: {', '.join(absent)}")
     found = [Scene.of(path, name) for name, path in paths.items() if path is not None]
     return [*found, *map(Scene.of, extra)]
 

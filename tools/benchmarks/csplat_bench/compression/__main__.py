@@ -38,7 +38,6 @@ from csplat_bench.common.command import (
     numbers,
     preset_of,
     run,
-    tell,
 )
 from csplat_bench.common.kept import Kept, file_digest, read_kept
 from csplat_bench.common.report import machines, tell_machine
@@ -50,6 +49,7 @@ from csplat_bench.compression.tables import tables
 from csplat_render.jit import thread_count
 from csplat_render.lpips import load_lpips
 from csplat_render.warmup import warm_up
+from csplat_tools.files.console import note
 from csplat_trainer.tuning import FinetuneOptions
 
 _SCENES = ",".join(CAPTURES)
@@ -101,13 +101,13 @@ def main(
     failed = False
     if set(parts) & set(KINDS):
         chosen = choose_captures(listed(scenes), extra)
-        warm_up(tell, simplify=True, ssim=True, lpips=lpips is not None)
+        warm_up(note, simplify=True, ssim=True, lpips=lpips is not None)
         with thread_count(threads):
             for one in chosen:
                 try:
                     _measure(one, parts, lists, encoding, tuning, lpips, out)
                 except (CsplatError, OSError) as error:  # the others are measured all the same
-                    tell(f"error: {one.name}: {error}")
+                    note(f"error: {one.name}: {error}")
                     failed = True
     if "memory" in parts:
         (scene,) = choose_captures([memory_scene])

@@ -15,8 +15,6 @@ from csplat_bench.compression.rows import Step
 from csplat_bench.compression.runs import Bench, Tuned
 from csplat_bench.compression.sizes import books_of, float_bytes, integer_bytes, integer_columns, ply_bytes
 
-__all__ = ["ablation"]
-
 
 def ablation(bench: Bench, tuned: Tuned) -> list[Step]:
     """The steps of the pipeline, one after the other, and what each of them leaves.

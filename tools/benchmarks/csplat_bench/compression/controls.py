@@ -16,8 +16,6 @@ from csplat_bench.compression.rows import Control
 from csplat_bench.compression.runs import Bench
 from csplat_trainer.tuning import tune
 
-__all__ = ["Unquantised", "control", "eight_bits"]
-
 
 class Unquantised(Frozen):
     """A frozen scene whose quantisers do nothing: tuning it is training on, with the same steps and the same views."""

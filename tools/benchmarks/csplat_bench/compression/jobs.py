@@ -16,8 +16,6 @@ from csplat_bench.compression.runs import Bench
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.tuning import FinetuneOptions, tune
 
-__all__ = ["KINDS", "Lists", "facts_of", "find_jobs", "variants", "warm"]
-
 #: Kinds of rows.
 KINDS = ("main", "control", "others", "sizes", "escapes", "positions", "curve")
 

@@ -7,8 +7,6 @@ from typing import Any, TypedDict
 from csplat_bench.common.captures import Training
 from csplat_bench.common.report import Machine
 
-__all__ = ["Control", "Facts", "Known", "Memory", "Row", "Scores", "Step"]
-
 
 class Scores(TypedDict):
     """On held-out photographs: PSNR pooled, and the mean of theirs, dB; LPIPS by AlexNet, if it was wanted."""

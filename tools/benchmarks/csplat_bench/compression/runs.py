@@ -29,8 +29,6 @@ from csplat_tools.training.report import judge_models
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.tuning import Clock, FinetuneOptions, Views, tune
 
-__all__ = ["Bench", "Tuned"]
-
 #: Splats, and the seconds that it took to choose them, by stage.
 Pick = tuple[Chosen, dict[str, float]]
 

@@ -18,8 +18,6 @@ from csplat.encoder import FreeValues, Frozen
 from csplat_tools.files.scenes import ply_splat_bytes
 from csplat_trainer.tuning.rate import colour_integers_of
 
-__all__ = ["Book", "books_of", "float_bytes", "integer_bytes", "integer_columns", "ply_bytes"]
-
 _FLOAT = 4
 _SHAPE = 7  # floats of rotation and scales
 _REST = 7  # floats of centre, opacity and base colour; normals, which are all 0, go when the PLY goes

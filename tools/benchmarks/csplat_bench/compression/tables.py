@@ -8,8 +8,6 @@ from csplat_bench.common.report import Table, laid_out, optional
 from csplat_bench.compression.rows import Facts, Known, Memory, Row, Scores
 from csplat_tools.files.scenes import ply_splat_bytes
 
-__all__ = ["tables"]
-
 Results = Mapping[str, Known]
 
 _SCORES = ("PSNR", "mean", "SSIM", "LPIPS")

@@ -25,7 +25,7 @@ import typer
 
 from csplat.encoder import PRESETS as KNOWN_PRESETS
 from csplat.errors import CsplatError, InputError
-from csplat_bench.common.command import JSON, LPIPS, MARKDOWN, OUT, PRESETS, WrongWords, listed, run, tell
+from csplat_bench.common.command import JSON, LPIPS, MARKDOWN, OUT, PRESETS, WrongWords, listed, run
 from csplat_bench.common.report import describe, write_json
 from csplat_bench.common.scenes import OUT as EVERYTHING
 from csplat_bench.datasets.folders import choose_scenes, find_scene_folders
@@ -33,6 +33,7 @@ from csplat_bench.datasets.runs import Settings, run_scene
 from csplat_bench.datasets.tables import means_table, notes, scenes_table
 from csplat_render.lpips import load_lpips
 from csplat_render.warmup import warm_up
+from csplat_tools.files.console import note
 from csplat_trainer.options import Device, TrainOptions
 
 
@@ -71,16 +72,16 @@ def main(
     chosen = choose_scenes(find_scene_folders(root), scenes)
     weights = None if lpips is None else load_lpips(None if lpips == "auto" else lpips)
     for one in chosen:
-        tell(f"found {one.title} ({one.protocol.name}, {one.kind}) in {one.path}")
-    warm_up(tell)
+        note(f"found {one.title} ({one.protocol.name}, {one.kind}) in {one.path}")
+    warm_up(note)
     records, failed = [], {}
     for number, one in enumerate(chosen):
-        tell(f"-- {number + 1} of {len(chosen)}: {one.title}")
+        note(f"-- {number + 1} of {len(chosen)}: {one.title}")
         try:
             records.append(run_scene(one, settings, out, weights))
         except (CsplatError, OSError) as error:  # the others are run all the same
             failed[one.title] = str(error)
-            tell(f"error: {one.title}: {error}")
+            note(f"error: {one.title}: {error}")
     machine, remarks = describe(), notes(records)
     if json is not None:
         write_json(json, {"machine": machine, "scenes": records, "failed": failed, "notes": remarks})

@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from csplat.errors import InputError
-from csplat_bench.common.command import listed, tell
+from csplat_bench.common.command import listed
 from csplat_bench.datasets.protocols import BLENDER, COLMAP, MAX_WIDTH, OTHER, PROTOCOLS, TRANSFORMS, Protocol
+from csplat_tools.files.console import note
 from csplat_trainer.data.colmap import find_model, read_colmap
 from csplat_trainer.data.dataset import Found
 from csplat_trainer.data.image_pixels import image_size
 from csplat_trainer.data.transforms import read_blender, read_transforms
-
-__all__ = ["TEST_EVERY", "PictureChoice", "SceneFolder", "choose_pictures", "choose_scenes", "find_scene_folders"]
 
 #: If a set does not name its test images, every Nth image is one.
 TEST_EVERY = 8
@@ -145,7 +144,7 @@ def _walk(folder: Path, depth: int) -> Iterator[SceneFolder]:
         try:
             inside = sorted(path for path in folder.iterdir() if path.is_dir() and not _is_part(path.name))
         except OSError as error:
-            tell(f"{folder} is left out: {error.strerror or error}")
+            note(f"{folder} is left out: {error.strerror or error}")
             return
         for path in inside:
             yield from _walk(path, depth - 1)
@@ -166,7 +165,7 @@ def _kind(folder: Path) -> str | None:
         return None
     if any(path.is_dir() and re.fullmatch(r"images(_\d+)?", path.name) for path in folder.iterdir()):
         return COLMAP
-    tell(f"{folder} is left out: a COLMAP model without a folder of pictures")
+    note(f"{folder} is left out: a COLMAP model without a folder of pictures")
     return None
 
 

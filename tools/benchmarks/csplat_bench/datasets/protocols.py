@@ -12,22 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from statistics import fmean
 
-__all__ = [
-    "BLENDER",
-    "C3DGS",
-    "COLMAP",
-    "MAX_WIDTH",
-    "OTHER",
-    "PAPER_STEPS",
-    "PROTOCOLS",
-    "THREE_DGS",
-    "TRANSFORMS",
-    "Protocol",
-    "Published",
-    "published_means",
-    "published_splats",
-]
-
 COLMAP, BLENDER, TRANSFORMS = "COLMAP", "Blender", "transforms.json"
 
 #: Training steps of the published figures.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any, TypedDict
 
-__all__ = ["File", "Record"]
-
 
 class File(TypedDict):
     """The PLY, or a compressed file of it; scores are those of what it decodes to, on the held-out pictures."""

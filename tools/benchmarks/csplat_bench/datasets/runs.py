@@ -13,18 +13,17 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_bench.common.captures import read_training, train_to
-from csplat_bench.common.command import preset_of, tell
+from csplat_bench.common.command import preset_of
 from csplat_bench.common.kept import file_digest
 from csplat_bench.common.measuring import timed
 from csplat_bench.common.report import write_json
 from csplat_bench.datasets.folders import TEST_EVERY, SceneFolder, choose_pictures
 from csplat_bench.datasets.records import File, Record
 from csplat_render.lpips import Lpips
+from csplat_tools.files.console import note
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.evaluate import photograph_judge
 from csplat_trainer.options import TrainOptions
-
-__all__ = ["PLY", "Settings", "run_scene"]
 
 #: Name of the trained scene among its compressed files.
 PLY = "PLY"
@@ -73,19 +72,19 @@ def run_scene(folder: SceneFolder, settings: Settings, out: Path, lpips: Lpips |
     training = read_training(ply) if there else {}
     if not there:
         for line in (*data.report, *record["remarks"]):
-            tell(line)
+            note(line)
         write_json(path, record)
         training = train_to(ply, data, settings.training)
     elif not training:
-        tell(f"{folder.title}: trained elsewhere")
+        note(f"{folder.title}: trained elsewhere")
     elif training["options"] != asdict(settings.training) or _begun(folder, settings)["size"] != record["size"]:
         options = training["options"]
-        tell(
+        note(
             f"{folder.title}: trained before with other settings ({options['iterations']} steps, at most "
             f"{options['max_splats']} splats); --force trains it again"
         )
     else:
-        tell(f"{folder.title}: trained before")
+        note(f"{folder.title}: trained before")
     scoring = {
         "ply_sha256": file_digest(ply),
         "presets": list(settings.presets),
@@ -93,7 +92,7 @@ def run_scene(folder: SceneFolder, settings: Settings, out: Path, lpips: Lpips |
         "csplat": csplat.__version__,
     }
     if record.get("scoring") == scoring and not settings.rescore:
-        tell(f"{folder.title}: scored before")
+        note(f"{folder.title}: scored before")
         return record
     if training:
         record |= {"settings": training["options"], "train_views": training["views"]}
@@ -130,7 +129,7 @@ def _scored(folder: SceneFolder, data: DataSet, settings: Settings, ply: Path, l
         encoded, timing = timed(encode, source, EncodeOptions(preset=preset_of(preset)))
         files.append(_file(preset, decode(encoded), len(encoded), timing.wall, data, lpips))
     for one in files:
-        tell(f"{folder.title}: {one['file']} {one['size_bytes'] / 1e6:.2f} MB, {one['psnr_mean']:.2f} dB")
+        note(f"{folder.title}: {one['file']} {one['size_bytes'] / 1e6:.2f} MB, {one['psnr_mean']:.2f} dB")
     camera = data.test[0].camera
     return {
         "test_views": len(data.test),

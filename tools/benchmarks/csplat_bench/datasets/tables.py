@@ -19,8 +19,6 @@ from csplat_bench.datasets.protocols import (
 )
 from csplat_bench.datasets.records import File, Record
 
-__all__ = ["HEADER", "means_table", "notes", "scenes_table"]
-
 HEADER = (
     "scene", "file", "PSNR", "SSIM", "LPIPS", "LPIPS-VGG", "MB", "splats", "SH", "pixels", "views", "steps", "train",
 )  # fmt: skip

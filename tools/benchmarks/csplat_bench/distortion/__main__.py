@@ -42,7 +42,6 @@ from csplat_bench.common.command import (
     numbers,
     preset_of,
     run,
-    tell,
 )
 from csplat_bench.common.curves import Point, bracket, rate_at
 from csplat_bench.common.kept import Kept, read_kept
@@ -56,6 +55,7 @@ from csplat_bench.distortion.plot import plot as draw
 from csplat_bench.distortion.tables import tables
 from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame
+from csplat_tools.files.console import note
 from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.optimise.sensitivity import measured_importance, measuring_views
 from csplat_tools.views import BLACK, find_view_set
@@ -163,7 +163,7 @@ def _peers(bench: _Bench, command: list[str], folder: Path) -> None:
         else:
             known[peer.name] = {"psnr": psnr, "size_bytes": peer.size_bytes, "seconds": peer.timing.wall}
     bench.kept.write()
-    tell(f"{bench.scene.name} peers: {known}")
+    note(f"{bench.scene.name} peers: {known}")
 
 
 def _plain(bench: _Bench) -> None:
@@ -207,7 +207,7 @@ def _extend(bench: _Bench, preset: str, coding: str, goal: float, most: int = 8)
         series.append(asdict(point))  # type: ignore[arg-type]  # the same fields
         bench.kept.write()
         size = point.size_bytes / len(bench.source)
-        tell(f"{bench.scene.name} {name} at {quality:g}: {size:.2f} B at {point.psnr:.2f} dB, {timing.wall:.1f} s")
+        note(f"{bench.scene.name} {name} at {quality:g}: {size:.2f} B at {point.psnr:.2f} dB, {timing.wall:.1f} s")
         return point
 
     start = goal + _LOSS[bench.source.sh_degree > 0]

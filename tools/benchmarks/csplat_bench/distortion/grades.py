@@ -18,7 +18,8 @@ from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, Importance, encode_with_report
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat_bench.common.command import MARKDOWN, SCENES, listed, run, tell
+from csplat.scene import without_bands
+from csplat_bench.common.command import MARKDOWN, SCENES, listed, run
 from csplat_bench.common.curves import Point, rate_at
 from csplat_bench.common.measuring import timed
 from csplat_bench.common.report import table, tell_machine
@@ -27,7 +28,7 @@ from csplat_render import Camera
 from csplat_render.cameras import load_cameras
 from csplat_render.judge import Judge
 from csplat_render.virtual import scene_frame
-from csplat_tools.files.scenes import without_bands
+from csplat_tools.files.console import note
 from csplat_tools.optimise.sensitivity import measured_importance, measuring_views
 from csplat_tools.views import BLACK, find_view_set
 
@@ -44,7 +45,7 @@ def main(*, scenes: SCENES = _SCENES, markdown: MARKDOWN = False) -> None:
     rows = []
     for scene in find_scenes(listed(scenes)):
         rows += _rows(scene)
-        tell(f"{scene.name}: done")
+        note(f"{scene.name}: done")
     print(table(_HEAD, rows, markdown=markdown))
 
 

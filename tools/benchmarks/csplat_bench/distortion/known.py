@@ -8,8 +8,6 @@ from typing import TypedDict
 from csplat_bench.common.curves import Point, Rate, Series, rate_at
 from csplat_bench.common.report import Machine
 
-__all__ = ["FIGURES", "GRADED", "Figure", "KeptPoint", "Measured", "Simplified", "Values", "point_of"]
-
 #: Prefix of the names of series whose splats are in quantisation classes by measured importance.
 GRADED = "graded"
 

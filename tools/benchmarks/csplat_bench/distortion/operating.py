@@ -21,6 +21,7 @@ from csplat.encoder import encode
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
+from csplat.scene import without_bands
 from csplat_bench.common.command import MARKDOWN, OUT, SCENES, TABLES, listed, run
 from csplat_bench.common.kept import Kept, read_kept
 from csplat_bench.common.measuring import timed
@@ -28,7 +29,6 @@ from csplat_bench.common.report import table, tell_machine
 from csplat_bench.common.scenes import OUT as EVERYTHING
 from csplat_bench.common.scenes import find_scenes
 from csplat_render.judge import Judge
-from csplat_tools.files.scenes import without_bands
 from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.tradeoffs.measuring import fetched_bytes
 from csplat_tools.views import BLACK, comparison_cameras

@@ -13,7 +13,6 @@ from csplat_bench.distortion.known import FIGURES, Measured
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["plot"]
 
 # Okabe and Ito's colours, told apart by all eyes.
 _OURS, _SIMPLIFIED, _SPZ, _SOG, _SPX = "#0072B2", "#009E73", "#D55E00", "#CC79A7", "#E69F00"

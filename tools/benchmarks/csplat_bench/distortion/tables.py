@@ -8,8 +8,6 @@ from csplat_bench.common.curves import Rate, Series, front, psnr_at, rate_at
 from csplat_bench.common.report import Table, laid_out, optional
 from csplat_bench.distortion.known import Measured
 
-__all__ = ["aims", "tables"]
-
 #: Share of SPZ's bytes at equal PSNR that is aimed at, without and with simplification.
 _AIMS = (0.7, 0.4)
 _AIMS_SYNTHETIC = (0.8, 0.55)

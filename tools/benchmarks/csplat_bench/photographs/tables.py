@@ -10,8 +10,6 @@ from csplat_bench.common.plots import new_figure, save_svg
 from csplat_bench.common.report import Table, laid_out, optional
 from csplat_bench.photographs.published import PUBLISHED, Published
 
-__all__ = ["plot", "tables"]
-
 # Okabe and Ito's colours, told apart by all eyes.
 _OURS = {"train": ("#0072B2", "o-"), "finetune": ("#56B4E9", "o--"), "encode": ("#0072B2", "o:")}
 _STYLES = {

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat_bench.common.command import CACHE, JSON, MARKDOWN, SCENES, listed, run, tell
+from csplat_bench.common.command import CACHE, JSON, MARKDOWN, SCENES, listed, run
 from csplat_bench.common.measuring import Timing, medians, timed
 from csplat_bench.common.report import optional, table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, cameras_of, find_scenes
@@ -33,6 +33,7 @@ from csplat_render import Camera
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.rasterise import Rasteriser
 from csplat_render.warmup import warm_up
+from csplat_tools.files.console import note
 
 _SCENES = "lego60k,fox120k,lego@90k,fox@90k,lego@500k,fox@500k"
 _HEADER = (
@@ -78,7 +79,7 @@ def main(
 ) -> None:
     """Measure the scenes that the command line names, and print a table."""
     machine = tell_machine()
-    warm_up(tell)
+    warm_up(note)
     rows, figures = [], {}
     for scene in find_scenes(listed(scenes), cache):
         model = read_ply(scene.path)
@@ -91,7 +92,7 @@ def main(
             cells = (scene.name, f"{len(model):,}", model.sh_degree, f"{one.in_view:,}", name)
             rows.append((*cells, *times, optional(one.psnr, ".1f", "–")))
             figures[f"{scene.name} {name}"] = asdict(one)
-        tell(f"{scene.name} measured")
+        note(f"{scene.name} measured")
     print(table(_HEADER, rows, markdown=markdown))
     if json is not None:
         write_json(json, {"machine": machine, "threads": threads, "results": figures})

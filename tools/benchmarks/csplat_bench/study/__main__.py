@@ -26,7 +26,7 @@ import typer
 
 from csplat.errors import CsplatError, InputError
 from csplat_bench.common.captures import Capture
-from csplat_bench.common.command import MARKDOWN, OUT, SCENES, WrongWords, listed, run, tell
+from csplat_bench.common.command import MARKDOWN, OUT, SCENES, WrongWords, listed, run
 from csplat_bench.common.kept import Kept, file_digest
 from csplat_bench.common.report import machines, tell_machine
 from csplat_bench.common.scenes import DATA, ROOT
@@ -48,6 +48,7 @@ from csplat_bench.study.scenes import BASELINES, OTHERS, OWN, RENDERED, Subject,
 from csplat_bench.study.tables import tables
 from csplat_render.lpips import load_lpips
 from csplat_render.warmup import warm_up
+from csplat_tools.files.console import note
 
 _FIRST = "study1k"
 _LAST = "study1k-lpips"
@@ -81,13 +82,13 @@ def main(
     if parts:
         distance = _lpips(lpips)
         known = baselines(iterations, splats)
-        warm_up(tell, simplify=True, ssim=True, lpips=distance is not None)
+        warm_up(note, simplify=True, ssim=True, lpips=distance is not None)
         for part, name, rows in _jobs(listed(scenes)):
             if part in parts:
                 try:
                     _subject(name, rows, known, distance, out, views)
                 except (CsplatError, OSError) as error:  # the others are measured all the same
-                    tell(f"error: {error}")
+                    note(f"error: {error}")
                     failed = True
     _show(set(what) or set(_SHOWN), out, plots, markdown=markdown)
     return int(failed)
@@ -167,7 +168,7 @@ def _show(what: set[str], out: Path, plots: Path, *, markdown: bool) -> None:
     if "plots" in what:
         plots.mkdir(parents=True, exist_ok=True)
         for path in draw(results, plots):
-            tell(f"drawn: {path}")
+            note(f"drawn: {path}")
 
 
 if __name__ == "__main__":

@@ -7,17 +7,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.model import SplatModel
+from csplat.types import F32
 from csplat_bench.study.records import Scored
 from csplat_render import Camera
 from csplat_render.judge import renderer
 from csplat_render.metrics import psnr_of_mse, squared_error, ssim
 
-__all__ = ["Distance", "Views", "renders_at"]
-
-F32 = NDArray[np.float32]
 Distance = Callable[[F32, F32], float]
 
 

@@ -13,7 +13,6 @@ from csplat_bench.study.tables import MIB, PUBLISHED
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw"]
 
 # Okabe and Ito's colours, which differ for everyone.
 _ORANGE, _SKY, _GREEN, _YELLOW, _BLUE, _RED, _PINK, _BLACK = (

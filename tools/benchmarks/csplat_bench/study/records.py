@@ -6,8 +6,6 @@ from typing import Any, NotRequired, TypedDict
 
 from csplat_bench.common.report import Machine
 
-__all__ = ["Facts", "How", "Known", "Measured", "Results", "Scored", "Survivors"]
-
 
 class Scored(TypedDict):
     """Scores on some views: PSNR pooled, then means and deviations over views; `None` if not measured."""

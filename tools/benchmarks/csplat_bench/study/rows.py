@@ -31,11 +31,6 @@ from csplat_tools.training.finetune import BYTE_COST, SHAPE_ENTRIES
 from csplat_tools.views import ViewSet, with_deciders
 from csplat_trainer.tuning import FinetuneOptions
 
-__all__ = [
-    "TAUS", "Row", "attribute_bytes", "baseline_bytes", "measure_row", "measure_taus", "rows_of_baseline",
-    "rows_of_render", "rows_of_scene",
-]  # fmt: skip
-
 #: Entries of each of six codebooks of 1,000 splats of SH 1: as large as the published row by its rule, 0.0136 MiB.
 STUDY_ENTRIES = 98
 

@@ -19,8 +19,6 @@ from csplat_render import Camera
 from csplat_tools.views import BLACK, DataOptions, ViewSet, find_view_set
 from csplat_trainer.options import TrainOptions
 
-__all__ = ["BASELINES", "OTHERS", "OWN", "RENDERED", "Subject", "baselines", "larger", "open_subject"]
-
 _LPIPS_WEIGHT = 0.1
 
 #: The published study's training and variants of it, by name: how each differs.

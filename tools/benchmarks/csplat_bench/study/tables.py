@@ -8,8 +8,6 @@ from typing import Any
 from csplat_bench.common.report import Table, laid_out, optional
 from csplat_bench.study.records import Facts, Measured, Results
 
-__all__ = ["MIB", "PUBLISHED", "Published", "tables"]
-
 MIB = 1 << 20
 
 

@@ -30,13 +30,14 @@ from csplat.decoder import decode
 from csplat.encoder import PRESETS
 from csplat.errors import InputError
 from csplat.ply import read_ply
-from csplat_bench.common.command import MARKDOWN, SCENES, TABLES, listed, run, tell
+from csplat_bench.common.command import MARKDOWN, SCENES, TABLES, listed, run
 from csplat_bench.common.kept import Kept, read_kept
 from csplat_bench.common.report import describe
 from csplat_bench.common.scenes import ROOT, Scene, find_scenes
 from csplat_bench.targets.tables import Build, File, tables
 from csplat_render.judge import Judge
 from csplat_render.virtual import virtual_cameras
+from csplat_tools.files.console import note
 from csplat_tools.views import BLACK
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg,angel,fox120k,st-peter,statue"  # the quick ones first
@@ -131,7 +132,7 @@ def _measure(scene: Scene, rows: Sequence[Row], kept: Kept, name: str, program: 
         if machine != build["machine"]:
             found["machine"] = machine  # its seconds cannot be compared with other rows
         kept.write()
-        tell(f"{scene.name} {name} {row.name}: {json.dumps(found)}")
+        note(f"{scene.name} {name} {row.name}: {json.dumps(found)}")
 
 
 def _made(program: str, scene: Scene, row: Row, judge: Judge) -> File:

@@ -10,8 +10,6 @@ from typing import TypedDict
 from csplat_bench.common.curves import Point, bytes_between
 from csplat_bench.common.report import Table, laid_out
 
-__all__ = ["Build", "File", "Known", "Ratio", "at_equal_psnr", "dominated", "kind_of", "tables"]
-
 _BUILDS = ("before", "now")
 _BYTES_PER_DB = 0.045  # share of the bytes that a decibel costs, if it cannot be taken from two files
 _SMALLER, _BETTER = 0.01, 0.1  # share of the bytes, and dB, by which one file beats another

@@ -17,11 +17,12 @@ from typing import Annotated
 
 import typer
 
-from csplat_bench.common.command import JSON, THREADS, WrongWords, listed, run, tell
+from csplat_bench.common.command import JSON, THREADS, WrongWords, listed, run
 from csplat_bench.common.measuring import alone
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import DATA
 from csplat_bench.training.stages import STAGES, Steps, measured
+from csplat_tools.files.console import note
 
 _ROWS = "1000:200x200,20000:200x200,100000:400x400,500000:640x480"
 _HEADER = (
@@ -44,7 +45,7 @@ def main(
     for row in listed(rows):
         count, width, height = _numbers(row)
         found.append(alone(measured, folder, count, (width, height), warm, steps, threads))
-        tell(f"{row} measured")
+        note(f"{row} measured")
     print(table(_HEADER, map(_cells, found)))
     if json is not None:
         write_json(json, {"machine": machine, "results": [asdict(one) for one in found]})

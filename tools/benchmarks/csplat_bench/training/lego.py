@@ -19,9 +19,10 @@ from typing import Annotated
 
 import typer
 
-from csplat_bench.common.command import LPIPS, listed, run, tell
+from csplat_bench.common.command import LPIPS, listed, run
 from csplat_bench.common.report import describe, optional, table
 from csplat_bench.common.scenes import DATA
+from csplat_tools.files.console import note
 
 _HEADER = ("splats", "SH", "PSNR mean, dB", "pooled", "covered", "SSIM", "LPIPS", "train, s", "ms/step", "peak, MB")
 
@@ -39,7 +40,7 @@ def main(
         words = ["--max-splats", count, "--sh-degree", "1" if count == "1000" else "3", "--iterations", str(iterations)]
         words += [] if lpips is None else ["--lpips-weights", lpips]
         rows.append(_row(folder, words))
-        tell("  ".join(rows[-1]))
+        note("  ".join(rows[-1]))
     print(table(_HEADER, rows))
     print(*(f"{name}: {text}" for name, text in describe().items()), sep="\n")
     print(f"load average at the end: {os.getloadavg()[0]:.1f}")

@@ -21,8 +21,6 @@ from csplat_trainer.parameters import Parameters, adam_step
 from csplat_trainer.pictures import Picture
 from csplat_trainer.starting import scene_of, starting_splats
 
-__all__ = ["STAGES", "Steps", "measured"]
-
 #: In addition to `step`, which is all of them, and `CPU`, the seconds of all threads.
 STAGES = ("forward", "loss", "backward", "Adam", "other")
 

@@ -21,11 +21,12 @@ import typer
 from csplat.encoder import EncodeOptions, encode
 from csplat.ply import read_ply
 from csplat_bench.common.browser import open_page
-from csplat_bench.common.command import CACHE, JSON, PRESETS, listed, numbers, preset_of, run, tell
+from csplat_bench.common.command import CACHE, JSON, PRESETS, listed, numbers, preset_of, run
 from csplat_bench.common.making import blow_up
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, Scene, find_scenes
 from csplat_bench.viewer.page import HEIGHT, WIDTH, Drawn, File, drawn
+from csplat_tools.files.console import note
 
 
 def main(
@@ -47,7 +48,7 @@ def main(
     with open_page(chromium, gpu=gpu) as page:
         for file in _draw_files(scenes, size, listed(presets), cache):
             draw.append(drawn(page, file, runs))
-            tell(f"{file.name} {file.preset}: done")
+            note(f"{file.name} {file.preset}: done")
     print(_draw_table(draw), flush=True)
     if json is not None:
         write_json(json, {"machine": machine, "draw": draw})

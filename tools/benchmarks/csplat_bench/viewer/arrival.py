@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.formats import named
-from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, WrongWords, listed, run, tell
+from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, WrongWords, listed, run
 from csplat_bench.common.peers import find_splat_transform
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, Scene, find_scenes
@@ -47,6 +47,7 @@ from csplat_bench.viewer.forms import FORMS, size_of
 from csplat_bench.viewer.line import SLOW, Line
 from csplat_bench.viewer.stage import HEIGHT, WIDTH, looked_at, opened_page, pinhole, placed_in
 from csplat_render.metrics import psnr
+from csplat_tools.files.console import note
 
 _GOOD = 25.0  # dB
 _SMALL = (120, 160)  # rows and columns of what is looked at, as pages/arrival.mjs has them
@@ -183,7 +184,7 @@ def main(
                     url = f"{address}{files[form].relative_to(folder)}"
                     found = _watched(page, line, viewer, url, pinhole(camera, model))
                     kept.setdefault((viewer, form), []).append(found)
-                    tell(f"{scene.name} {form} {viewer} {turn + 1}: {found if isinstance(found, str) else 'done'}")
+                    note(f"{scene.name} {form} {viewer} {turn + 1}: {found if isinstance(found, str) else 'done'}")
             for (viewer, form), each in kept.items():
                 size = size_of(folder / SLOW.strip("/") / f"{scene.name}-{form}")
                 rows.append(_arrival(scene.name, form, viewer, size, each))
@@ -218,7 +219,7 @@ def _transform(peers: Path) -> list[str]:
     command, said = find_splat_transform(peers)
     if command is None:
         raise InputError(f"splat-transform: {said}")
-    tell(said)
+    note(said)
     return command
 
 

@@ -34,8 +34,9 @@ import typer
 from csplat.decoder import decode
 from csplat.errors import InputError
 from csplat_bench.common.browser import open_page, serve
-from csplat_bench.common.command import listed, run, tell
+from csplat_bench.common.command import listed, run
 from csplat_bench.common.report import table
+from csplat_tools.files.console import note
 from csplat_tools.present.export import export_page
 from csplat_tools.present.server import open_server
 from csplat_tools.present.viewing import open_scene
@@ -75,7 +76,7 @@ def main(
                     seconds, said = _opened(url, source, runs, go, ask)
                     wrong += said != "right"
                     rows.append((engine, version, place, f"{statistics.median(seconds):.1f}", said))
-                    tell(f"{engine} {place}: {said}")
+                    note(f"{engine} {place}: {said}")
     print(table(("engine", "version", "opened", "seconds", "what came"), rows))
     return 1 if wrong else 0
 

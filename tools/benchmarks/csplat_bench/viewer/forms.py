@@ -14,8 +14,6 @@ from csplat.formats import write
 from csplat.ply import read_ply
 from csplat_bench.common.scenes import Scene
 
-__all__ = ["FORMS", "Form", "size_of"]
-
 _LEVELS = ("25%", "6%")  # shares of the splats in the levels below the finest
 
 #: Writes a scene into an empty folder, returns the file that viewers open; the words are splat-transform's command.

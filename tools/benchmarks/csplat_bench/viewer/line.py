@@ -14,8 +14,6 @@ from pathlib import Path
 
 from csplat_tools.present.server import byte_range
 
-__all__ = ["SLOW", "Line"]
-
 #: Files in this folder of a served one come over the slow line, all others at full speed.
 SLOW = "/scenes/"
 

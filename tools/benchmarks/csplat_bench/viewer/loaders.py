@@ -23,13 +23,14 @@ import typer
 
 from csplat.encoder import EncodeOptions, encode
 from csplat.formats import read, write
-from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, listed, run, tell
+from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, listed, run
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, find_scenes
 from csplat_bench.viewer.owners import still
 from csplat_bench.viewer.rules import ENGINES
 from csplat_bench.viewer.stage import looked_at, opened_page, pinhole
 from csplat_render.metrics import psnr
+from csplat_tools.files.console import note
 
 _LOADS = 20
 _HEADER = (
@@ -96,7 +97,7 @@ def main(
             for name in listed(engines):
                 trial = Trial(page, address, name, pinhole(camera, decoded))
                 rows.append(trial.loaded(scene.name))
-                tell(" ".join(rows[-1].cells))
+                note(" ".join(rows[-1].cells))
     print(table(_HEADER, [row.cells for row in rows], markdown=markdown))
     if json is not None:
         write_json(json, {"machine": machine, "rows": [asdict(row) for row in rows]})

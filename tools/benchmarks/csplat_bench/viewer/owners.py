@@ -33,13 +33,14 @@ from csplat.formats.own import FORMAT as CSPLAT
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.turning import USUAL
 from csplat.upright import up_of_axes
-from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, listed, run, tell
+from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, listed, run
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, find_scenes
 from csplat_bench.viewer.rules import DEGREE, ENGINES, Picture, drawn
 from csplat_bench.viewer.stage import HEIGHT, WIDTH, looked_at, opened_page, pinhole, placed_in
 from csplat_render import Camera
 from csplat_render.metrics import psnr
+from csplat_tools.files.console import note
 from csplat_tools.files.pictures import write_png
 
 _OURS = "ours"  # among the formats of pictures
@@ -131,7 +132,7 @@ def main(
                         like = None if twin is None else psnr(picture, twin)
                         rows.append(replace(shown, scene=scene.name, ply=like))
                         pictures[name, form.name] = picture
-                        tell(" ".join(rows[-1].cells))
+                        note(" ".join(rows[-1].cells))
             if out is not None:
                 _keep(out, scene.name, pictures)
     header = ("scene", "engine", "format", "right", "stands", "dB", "by its rules", "SH", "PLY")

@@ -16,8 +16,6 @@ from csplat_render.virtual import virtual_cameras
 from csplat_tools.present.server import open_server
 from csplat_tools.present.viewing import open_scene
 
-__all__ = ["HEIGHT", "WIDTH", "Drawn", "File", "drawn"]
-
 WIDTH, HEIGHT = 640, 480
 
 _VIEWS = 4

@@ -12,8 +12,6 @@ from csplat_render import Camera, render
 from csplat_render.harmonics import sh_basis
 from csplat_render.jit import python
 
-__all__ = ["DEGREE", "ENGINES", "Engine", "Picture", "drawn"]
-
 Picture = NDArray[np.float32]
 
 DEGREE = 3

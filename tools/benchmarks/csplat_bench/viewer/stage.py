@@ -26,8 +26,6 @@ from csplat_render import Camera
 from csplat_render.metrics import psnr
 from csplat_render.paths import orbit_cameras
 
-__all__ = ["HEIGHT", "WIDTH", "looked_at", "opened_page", "pinhole", "placed_in", "served"]
-
 WIDTH, HEIGHT = 320, 240  # SwiftShader takes its time
 
 _PLACES = 8

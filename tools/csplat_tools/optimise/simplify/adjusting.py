@@ -15,24 +15,18 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.encoder import FreeValues, Frozen
 from csplat.model import SplatModel
+from csplat.types import F32, Mask, Progress
 from csplat_render import Camera
-from csplat_render.arrays import Gradients, HasSplats
-from csplat_render.rasterise import Rasteriser, Splats
-from csplat_tools.files.console import Progress
+from csplat_render.arrays import Gradients, HasSplats, Splats
+from csplat_render.rasterise import Rasteriser
 from csplat_tools.optimise.exchange import LEAST_QUANTISED, price_of_bytes
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_trainer.parameters import Parameters, adam_step, from_model
 from csplat_trainer.tuning.rate import Costs
 from csplat_trainer.tuning.state import TunedScene
-
-__all__ = ["adjust", "adjust_frozen"]
-
-F32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 #: Learning rates of the first steps per unit of the root mean square error, which counts up to `_LARGEST_ERROR`.
 _RATES = {"logits": 1.95, "scales": 0.39, "quats": 0.023, "sh0": 0.1, "shN": 0.04}

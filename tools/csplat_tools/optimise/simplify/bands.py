@@ -5,14 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.model import SplatModel
+from csplat.types import Mask
 from csplat_render.removal import Removal
-
-__all__ = ["BAND_COST", "band_mask", "free_coefficients", "without"]
-
-Mask = NDArray[np.bool_]
 
 #: Largest errors of bands 1, 2, 3 that are not worth their bits, as fractions of the scene's error per splat. At the
 #: optimum, a bit reduces the error by the same amount wherever it is spent: a splat has some 30 quantised values, whose

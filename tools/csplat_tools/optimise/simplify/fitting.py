@@ -9,18 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel
+from csplat.types import F32, Mask, Progress
 from csplat_render import Camera
 from csplat_render.metrics import squared_error
 from csplat_render.removal import measure_removal
-from csplat_tools.files.console import Progress
 from csplat_tools.optimise.simplify.adjusting import adjust
 from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
 from csplat_tools.optimise.simplify.options import SimplifyOptions
-
-__all__ = ["BAND_STEPS", "FIT_STEPS", "Fit", "fit"]
-
-F32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 #: Steps of a fit, and of the one after bands were left out.
 FIT_STEPS, BAND_STEPS = 960, 160

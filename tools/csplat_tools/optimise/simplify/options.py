@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from csplat.errors import InputError
 from csplat_tools.views import VIEW_SIZE, usual_views
 
-__all__ = ["SimplifyOptions"]
-
 _USUAL = 3  # default effort
 
 

@@ -13,16 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel
+from csplat.types import F64, I64, Progress
 from csplat_render import Camera
 from csplat_render.removal import Removal, measure_removal
-from csplat_tools.files.console import Progress
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_tools.views.agreeing import removal_keys
-
-__all__ = ["Order", "Round", "Side", "removal_order", "seen_by"]
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _LEAST_SHARE = 0.01  # fraction of the splats that is left at the end of an order without a given target
 _ROUND_SHARE = 0.72  # fraction left after each round of such an order: splats that hid another may have been pruned

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.types import F32, I64, Progress
 from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.judge import Judge, renderer
 from csplat_render.metrics import PSNR_CAP
 from csplat_render.removal import measure_removal
-from csplat_tools.files.console import Progress
 from csplat_tools.files.extras import need_renderer
 from csplat_tools.files.scenes import SceneLike, load_model
 from csplat_tools.optimise.simplify.fitting import Fit, fit
@@ -28,10 +28,6 @@ from csplat_tools.optimise.target import Target
 from csplat_tools.views import ViewSet, camera_sequence, find_view_set
 from csplat_tools.views.agreeing import AgreedViews, find_views
 
-__all__ = ["Session", "Simplified", "find_decider", "most_gone", "prepare", "simplify"]
-
-F32 = NDArray[np.float32]
-I64 = NDArray[np.int64]
 _TRIES = 3  # largest number of fits on the way to a target PSNR
 _AGREE_ON = 0.5  # least fraction of the splats on whose removal views have to agree: fits need the views in any case
 _BANDS_WORTH = 1.0  # dB that leaving out SH bands may cost; a fit that loses more has failed

@@ -34,24 +34,14 @@ import typer
 
 from csplat import EncodeOptions, encode
 from csplat.formats import write
-from csplat.ply import read_ply, write_ply
+from csplat.ply import read_ply
+from csplat.ply_write import write_ply
 from csplat_bench.codec.decoders.started import DECODERS, Decoder, Process, Tab, built
 from csplat_bench.common.browser import open_page, serve
-from csplat_bench.common.command import (
-    CACHE,
-    EXTRA,
-    JSON,
-    MARKDOWN,
-    PEERS,
-    PRESETS,
-    SCENES,
-    listed,
-    preset_of,
-    run,
-    tell,
-)
+from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, PRESETS, SCENES, listed, preset_of, run
 from csplat_bench.common.report import optional, table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, ROOT, Scene, find_scenes
+from csplat_tools.files.console import note
 
 _SCENES = "lego60k,fox120k,fontaine,fox-1M,donut,donut-1M"
 Start = Callable[[Decoder, Path], Process | Tab]
@@ -113,7 +103,7 @@ def main(
             files = _files(scene, listed(presets), wanted, peers, folder)
             with _starting(wanted, chromium, peers, folder) as start:
                 rows += measured(scene, wanted, files, runs, start)
-        tell(f"{scene.name}: done")
+        note(f"{scene.name}: done")
     print(_table(rows, markdown=markdown))
     if json is not None:
         write_json(json, {"machine": machine, "rows": [asdict(row) for row in rows]})
@@ -125,10 +115,10 @@ def _files(
     """A scene in all forms that are wanted, by suffix."""
     model = read_ply(scene.path)
     for preset in presets:
-        tell(f"{scene.name}: {preset}")
+        note(f"{scene.name}: {preset}")
         (folder / f"scene.{preset}.csplat").write_bytes(encode(model, EncodeOptions(preset=preset_of(preset))))
     if any(one.driver in ("spz", "others.mjs") for one in wanted):
-        tell(f"{scene.name}: SPZ, SPLAT, KSPLAT")
+        note(f"{scene.name}: SPZ, SPLAT, KSPLAT")
         write_ply(folder / "scene.ply", model)
         write(folder / "scene.spz", model)
         write(folder / "scene.splat", model)
@@ -167,7 +157,7 @@ def measured(scene: Scene, wanted: Sequence[Decoder], files: dict[str, Path], ru
                         stack.enter_context(running)
                         firsts.append(running.decode())
                     except OSError as error:
-                        tell(f"left out: {one.name} of {suffix}: {error}")
+                        note(f"left out: {one.name} of {suffix}: {error}")
                         continue
                     growths.append(running.growth_bytes())
                     started.append(running)
@@ -175,7 +165,7 @@ def measured(scene: Scene, wanted: Sequence[Decoder], files: dict[str, Path], ru
         warm_up = min(10, 1 + _WARM_SPLATS // scene.splat_count)
         for turn in range(1 - warm_up, runs + 1):
             turns.append([running.decode()[0] for running in started])
-            tell(f"{scene.name}: turn {turn} of {runs}" if turn > 0 else f"{scene.name}: warming up")
+            note(f"{scene.name}: turn {turn} of {runs}" if turn > 0 else f"{scene.name}: warming up")
     columns = list(zip(*turns[warm_up:], strict=True))
     references = {
         one.place: column

@@ -25,10 +25,11 @@ import typer
 
 from csplat import EncodeOptions, decoder, encode, read_ply
 from csplat.errors import CsplatError
-from csplat_bench.common.command import JSON, PRESETS, listed, preset_of, run, tell
+from csplat_bench.common.command import JSON, PRESETS, listed, preset_of, run
 from csplat_bench.common.making import ARRAYS
 from csplat_bench.common.report import describe, table, write_json
 from csplat_bench.common.scenes import ROOT
+from csplat_tools.files.console import note
 from csplat_tools.files.streams import is_csplat
 
 _ADAPTER = ROOT / "codec" / "js" / "test" / "adapter.mjs"
@@ -86,7 +87,7 @@ def main(
                 wrong += one.differs
                 rows.append((label, _splats(data), len(data), len(one.sums), one.size_bytes, one.verdict))
                 sums[label] = one.sums
-                tell(f"{label}: {one.verdict}")
+                note(f"{label}: {one.verdict}")
         assert process.stdin is not None
         process.stdin.close()
     print(table(("file", "splats", "bytes", "arrays", "array bytes", "SHA-256 of all arrays"), rows))

@@ -13,12 +13,10 @@ from pathlib import Path
 from typing import Any, Self
 
 from csplat.errors import InputError
-from csplat_bench.common.command import tell
 from csplat_bench.common.measuring import peak_bytes, reset_peak
 from csplat_bench.common.peers import npm_pinned
 from csplat_bench.common.scenes import ROOT
-
-__all__ = ["DECODERS", "DRIVERS", "Decoder", "Process", "Tab", "built"]
+from csplat_tools.files.console import note
 
 DRIVERS = Path(__file__).with_name("drivers")
 
@@ -119,7 +117,7 @@ def built(wanted: Sequence[Decoder], peers: Path, chromium: str) -> list[Decoder
     if shutil.which(chromium) is None or find_spec("playwright") is None:
         absent["chromium"] = "Chromium or playwright is not installed"
     for driver in sorted(drivers & ways.keys()):
-        tell(f"building {driver}")
+        note(f"building {driver}")
         try:
             ways[driver](peers)
         except (OSError, InputError) as error:
@@ -130,7 +128,7 @@ def built(wanted: Sequence[Decoder], peers: Path, chromium: str) -> list[Decoder
         absent.setdefault("spz", "there are no SPZ without @adobe/spz")
     for name, reason in absent.items():
         if any(name in (one.place, one.driver) for one in wanted):
-            tell(f"left out: {name}: {reason}")
+            note(f"left out: {name}: {reason}")
     return [one for one in wanted if not {one.place, one.driver} & absent.keys()]
 
 

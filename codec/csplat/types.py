@@ -1,0 +1,28 @@
+"""Types that every layer shares: arrays by their dtype, and the callback of long work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+I8 = NDArray[np.int8]
+I16 = NDArray[np.int16]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
+U32 = NDArray[np.uint32]
+U64 = NDArray[np.uint64]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+"""One truth value per row."""
+
+Progress = Callable[[str, float], None]
+"""Called with the name of a stage and the fraction of it that is done, 0 to 1."""
+
+
+def null_progress(stage: str, done: float) -> None:
+    """Ignore progress: the default of functions that take a `Progress`."""
