@@ -100,7 +100,7 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BENCH).study
 
 wasm: ## compile the decoder in C for the JavaScript one; needs Debian 12's clang-14 lld-14 wasi-libc libclang-rt-14-dev-wasm32
-	codec/js/wasm/build.sh codec/js/wasm.mjs
+	codec/js/wasm/build.sh codec/js/wasm_binary.mjs
 
 fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, readers
 	$(BIN)/python tests/fuzz.py --target all --seconds 2400

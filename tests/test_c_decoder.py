@@ -133,10 +133,10 @@ def test_survives_callers_whose_functions_fail(sanitized, tmp_path):
 def test_the_webassembly_of_the_javascript_decoder_is_compiled_from_these_sources(tmp_path):
     if shutil.which("clang-14") is None or shutil.which("wasm-ld-14") is None:
         absent("there is no clang-14 or no lld-14")
-    made = run(["codec/js/wasm/build.sh", tmp_path / "wasm.mjs"], cwd=ROOT)
+    made = run(["codec/js/wasm/build.sh", tmp_path / "wasm_binary.mjs"], cwd=ROOT)
     assert (made.returncode, made.stderr) == (0, "")
-    committed = (ROOT / "codec" / "js" / "wasm.mjs").read_bytes()
-    assert (tmp_path / "wasm.mjs").read_bytes() == committed, "make wasm"
+    committed = (ROOT / "codec" / "js" / "wasm_binary.mjs").read_bytes()
+    assert (tmp_path / "wasm_binary.mjs").read_bytes() == committed, "make wasm"
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import * as spec from './spec.mjs';
  * @typedef {import('./decoder.d.ts').Header} Header
  * @typedef {import('./decoder.d.ts').Limits} Limits
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
- * @typedef {import('./tile.mjs').Layer} Layer
+ * @typedef {import('./tile_blocks.mjs').Layer} Layer
  * @typedef {{shDegree: number, integers: boolean, extra: boolean}} Wanted
  */
 

@@ -35,7 +35,7 @@ const ENTRY_WIDTH_MAX = 4; // STR-2
  * @typedef {import('./decoder.d.ts').CodebookRecord} CodebookRecord
  * @typedef {import('./decoder.d.ts').DirectoryRecord} DirectoryRecord
  * @typedef {import('./decoder.d.ts').PackedColumns} PackedColumns
- * @typedef {import('./tile.mjs').TileContext} TileContext
+ * @typedef {import('./tile_blocks.mjs').TileContext} TileContext
  * @typedef {import('./inflate.mjs').Inflate} Inflate
  */
 

@@ -24,7 +24,7 @@ const { ERROR_RANGE, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
  * @typedef {import('./codebooks.mjs').Table} Table
  * @typedef {import('./decoder.d.ts').AttributeRecord} AttributeRecord
  * @typedef {import('./payload.mjs').Payload} Payload
- * @typedef {import('./tile.mjs').TileContext} TileContext
+ * @typedef {import('./tile_blocks.mjs').TileContext} TileContext
  */
 
 const AT = spec.BLOCK_HEAD_OFFSETS;

@@ -8,11 +8,11 @@
 import { Assembly } from './assemble.mjs';
 import { readFileHeader } from './container.mjs';
 import { CsplatError, FormatError, InputError, LimitError, UnsupportedError, fault } from './errors.mjs';
-import { readIndex } from './index.mjs';
+import { readIndex } from './file_index.mjs';
 import { checkedDegree, checkedForm, checkedLimits, checkedTiles, toBytes } from './options.mjs';
 import { Reader } from './reader.mjs';
 import * as spec from './spec.mjs';
-import { MemorySource } from './whole.mjs';
+import { MemorySource } from './whole_sources.mjs';
 import { byWorkers } from './workers.mjs';
 
 export { CsplatError, FormatError, InputError, LimitError, UnsupportedError };
@@ -23,7 +23,7 @@ export { CsplatError, FormatError, InputError, LimitError, UnsupportedError };
  * @typedef {import('./decoder.d.ts').Limits} Limits
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./decoder.d.ts').TilesOptions} TilesOptions
- * @typedef {import('./tile.mjs').SceneContext} SceneContext
+ * @typedef {import('./tile_blocks.mjs').SceneContext} SceneContext
  */
 
 /**

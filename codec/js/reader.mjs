@@ -1,19 +1,22 @@
 // Tiles and layers of a file, one by one and in any order, over HTTP Range, from a Blob or from memory.
+//
+// Two complete decoders are behind this reader: WebAssembly (wasm_decoder.mjs) and JavaScript (tile_blocks.mjs). The second
+// serves pages whose content security policy forbids WebAssembly, asks for integers, or needs the place of an error.
 
 import { describe, emptyDescription } from './ancillary.mjs';
 import { FloatArrays, arrayBytes, bandArray } from './arrays.mjs';
 import { Assembly, checkBudget, codebooksById } from './assemble.mjs';
 import { readTable, tableBytes } from './codebooks.mjs';
-import { CompiledDecoder } from './compiled.mjs';
+import { WasmDecoder } from './wasm_decoder.mjs';
 import { checkFileSize, openChunk, readFileHeader } from './container.mjs';
 import { InputError } from './errors.mjs';
-import { readIndex } from './index.mjs';
+import { readIndex } from './file_index.mjs';
 import { platformInflate } from './inflate.mjs';
 import { checkedDegree, checkedForm, checkedLimits, checkedTile } from './options.mjs';
-import { packLayer } from './packed.mjs';
+import { packLayer } from './packed_layers.mjs';
 import { openSource } from './source.mjs';
 import * as spec from './spec.mjs';
-import { Tile } from './tile.mjs';
+import { Tile } from './tile_blocks.mjs';
 
 const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thirty million splats
 
@@ -71,7 +74,7 @@ export class Reader {
     progress.fileSize = file.fileSize;
     const index = await source.read(spec.HEADER_SIZE, file.indexSize, signal);
     const header = readIndex(index, file, limits);
-    const compiled = options.inflate ? null : await CompiledDecoder.open(file.fileSize, head, index);
+    const compiled = options.inflate ? null : await WasmDecoder.open(file.fileSize, head, index);
     const inflate = options.inflate ?? (await platformInflate());
     const reader = new this(source, header, limits, inflate, compiled);
     reader.inflates = options.inflate !== undefined;
@@ -87,7 +90,7 @@ export class Reader {
    * @param {Header} header
    * @param {Required<Limits>} limits
    * @param {Inflate} inflate
-   * @param {CompiledDecoder | null} compiled for floats and packed arrays, where WebAssembly runs
+   * @param {WasmDecoder | null} compiled for floats and packed arrays, where WebAssembly runs
    */
   constructor(source, header, limits, inflate, compiled) {
     this.source = source;
@@ -266,7 +269,7 @@ export class Reader {
    * @template T
    * @param {TileRecord} record
    * @param {Map<LayerRecord, Bytes>} chunks of the layers
-   * @param {(decoder: CompiledDecoder) => T} decode
+   * @param {(decoder: WasmDecoder) => T} decode
    * @returns {Promise<T | null>} null or false where it cannot: then it is up to the modules beside this one
    */
   async byCompiled({ tables }, chunks, decode) {

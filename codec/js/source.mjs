@@ -1,7 +1,7 @@
-// Where the bytes of a file come from when they are not in memory: HTTP with Range, or what `whole.mjs` has.
+// Where the bytes of a file come from when they are not in memory: HTTP with Range, or what `whole_sources.mjs` has.
 
 import { InputError } from './errors.mjs';
-import { BlobSource, MemorySource, WholeSource, asInputError, bodyParts, shortData } from './whole.mjs';
+import { BlobSource, MemorySource, WholeSource, asInputError, bodyParts, shortData } from './whole_sources.mjs';
 
 const GAP_BYTES = 1 << 14; // ranges this close are fetched as one
 const REQUEST_BYTES = 1 << 23; // ranges are not joined beyond this

@@ -45,7 +45,7 @@ EDITS: Final = (
         "major !== spec.VERSION_MAJOR || minor !== spec.VERSION_MINOR",
         "major !== spec.VERSION_MAJOR",
     ),
-    Edit("steps", "binary64, as the means'", "ATT-10", "index.mjs", "Math.fround(step) === step && ", ""),
+    Edit("steps", "binary64, as the means'", "ATT-10", "file_index.mjs", "Math.fround(step) === step && ", ""),
     Edit(
         "lattices",
         "step × 2^exponent may be anything",

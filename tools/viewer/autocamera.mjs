@@ -1,15 +1,15 @@
 // The first picture: from a camera of the file, or from one that finds the scene by itself.
 
-import { evened, findFrame, quantiles } from './frame.mjs';
-import { Rig, defaultLens } from './rig.mjs';
-import { ROUGH, detail, pick, thinned } from './survey.mjs';
+import { evened, findFrame, quantiles } from './bounding_frame.mjs';
+import { OrbitCamera, defaultLens } from './orbit_camera.mjs';
+import { ROUGH, detail, pick, thinned } from './rough_view.mjs';
 import { across, add, cross, dot, length, lookAlong, scale, sub, turn, unit } from './vectors.mjs';
 
 /**
- * @typedef {import('./frame.mjs').Frame} Frame
- * @typedef {import('./frame.mjs').Samples} Samples
- * @typedef {import('./rig.mjs').Lens} Lens
- * @typedef {import('./rig.mjs').Pose} Pose
+ * @typedef {import('./bounding_frame.mjs').Frame} Frame
+ * @typedef {import('./bounding_frame.mjs').Samples} Samples
+ * @typedef {import('./orbit_camera.mjs').Lens} Lens
+ * @typedef {import('./orbit_camera.mjs').Pose} Pose
  * @typedef {import('./vectors.mjs').Basis} Basis
  * @typedef {import('./vectors.mjs').Vec3} Vec3
  */
@@ -163,7 +163,7 @@ export function automaticPose(samples, splatCount, { up, front, isFrontKnown }) 
   let [best] = views;
   let most = -1;
   for (const view of views.length > 1 ? views : []) {
-    const camera = new Rig(from(view.direction, view.distance), frame.extent).camera(ROUGH.width, ROUGH.height);
+    const camera = new OrbitCamera(from(view.direction, view.distance), frame.extent).camera(ROUGH.width, ROUGH.height);
     const score = view.weight * detail(few, standsFor, camera, hiding);
     if (score > most) [best, most] = [view, score];
   }

@@ -1,10 +1,10 @@
 // Mouse, fingers and keys: what a person does on the canvas, turned into movements of the rig.
 
-import { between } from './rig.mjs';
+import { between } from './orbit_camera.mjs';
 
 /**
- * @typedef {import('./rig.mjs').Pose} Pose
- * @typedef {import('./rig.mjs').Rig} Rig
+ * @typedef {import('./orbit_camera.mjs').Pose} Pose
+ * @typedef {import('./orbit_camera.mjs').OrbitCamera} OrbitCamera
  *
  * @typedef {object} Hooks
  * @property {() => void} moved called when the rig's pose has changed
@@ -57,7 +57,7 @@ const ZOOM = /** @type {Record<string, number>} */ ({ Equal: -1, NumpadAdd: -1, 
 export class Controls {
   /**
    * @param {HTMLElement} canvas
-   * @param {Rig} rig
+   * @param {OrbitCamera} rig
    * @param {Hooks} hooks
    * @param {Reach} [reach] everything, by default
    */

@@ -6,7 +6,7 @@
 import { E_CONTEXT } from './engine_error.mjs';
 import { explain } from './messages.mjs';
 import { nameOf, readWishes } from './page.mjs';
-import { Showing } from './showing.mjs';
+import { SceneViewer } from './viewer.mjs';
 
 /**
  * @typedef {import('./types.d.ts').ErrorReport} ErrorReport
@@ -60,7 +60,7 @@ function sharedSheet() {
 export class CsplatView extends HTMLElement {
   static observedAttributes = ['src', 'alt', 'aria-label', ...WISHES];
 
-  /** @type {Showing | null} */
+  /** @type {SceneViewer | null} */
   #showing = null;
   #isNear = false;
   #isStale = false;
@@ -148,8 +148,8 @@ export class CsplatView extends HTMLElement {
     const { src } = this;
     if (!src) return;
     const canvas = this.#canvas;
-    /** @type {Showing} */
-    const showing = new Showing(
+    /** @type {SceneViewer} */
+    const showing = new SceneViewer(
       canvas,
       this.#wishes(),
       {

@@ -8,8 +8,8 @@
 
 import { NO_CAMERA, viewOf } from './camera_maths.mjs';
 import { EngineError, E_CONTEXT, E_INPUT, E_REPLACED, E_WEBGL2, E_WORKER } from './engine_error.mjs';
-import { Frames } from './frames.mjs';
-import { Opening } from './opening.mjs';
+import { FrameScheduler } from './frame_scheduler.mjs';
+import { SceneLoad } from './scene_load.mjs';
 import { createRenderer } from './renderer.mjs';
 import { emptyStats } from './statistics.mjs';
 
@@ -77,12 +77,12 @@ class SplatEngine {
     this.view = null;
     this.viewId = 0;
     this.sceneCount = 0;
-    /** @type {Opening | null} */
+    /** @type {SceneLoad | null} */
     this.opening = null;
     /** @type {(() => void)[]} those that wait for the next message of the worker */
     this.waiting = [];
     this.stats = emptyStats(renderer.capabilities);
-    this.frames = new Frames(
+    this.frames = new FrameScheduler(
       () => this.drawFrame(),
       (frameMs, fps) => this.frameDrawn(frameMs, fps),
     );
@@ -117,11 +117,11 @@ class SplatEngine {
    * Have a scene read.
    *
    * @param {string | Blob | ArrayBuffer} source
-   * @param {import('./opening.mjs').Settle} settle
+   * @param {import('./scene_load.mjs').Settle} settle
    */
   begin(source, settle) {
     this.stats = emptyStats(this.renderer.capabilities);
-    const opening = new Opening(source, ++this.sceneCount, this.stats, this.options, settle);
+    const opening = new SceneLoad(source, ++this.sceneCount, this.stats, this.options, settle);
     this.opening = opening;
     const tell = (/** @type {string | Blob | ArrayBuffer} */ readable) => {
       if (this.opening === opening) this.tell({ type: 'open', scene: opening.scene, source: readable });

@@ -4,16 +4,16 @@ import { CsplatReader } from '../../codec/js/decoder.mjs';
 import { SAMPLE_COUNT, showing } from './bounds.mjs';
 import { toCamera } from './camera_maths.mjs';
 import { reachClass } from './cull.mjs';
-import { layoutSlots, packBand, packGeometry, packRows } from './pack.mjs';
+import { layoutSlots, packBand, packGeometry, packRows } from './texels.mjs';
 
 /**
  * @typedef {import('../../codec/js/decoder.d.ts').Header} Header
  * @typedef {import('../../codec/js/decoder.d.ts').PackedGeometry} PackedGeometry
  * @typedef {import('../../codec/js/decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./cull.mjs').CullTile} CullTile
- * @typedef {import('./pack.mjs').BandTexels} BandTexels
- * @typedef {import('./pack.mjs').GeometryTexels} GeometryTexels
- * @typedef {import('./pack.mjs').Rows} Rows
+ * @typedef {import('./texels.mjs').BandTexels} BandTexels
+ * @typedef {import('./texels.mjs').GeometryTexels} GeometryTexels
+ * @typedef {import('./texels.mjs').Rows} Rows
  * @typedef {import('./types.d.ts').View} View
  *
  * What becomes of a file's parts.

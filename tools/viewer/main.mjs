@@ -3,10 +3,10 @@
 // Parameters: ?scene=URL&camera=JSON-or-its-URL&view=0&up=x,y,z&seems=x,y,z&axes=RDF&size=WxH&background=rrggbb&ui=0
 // `window.csplatViewer` lets programs drive the page; its `ready` resolves when the scene is drawn for good.
 
-import { KeepOffer, upWord } from './keep.mjs';
+import { SaveUpOffer, upWord } from './save_up.mjs';
 import { Overlay, element } from './overlay.mjs';
 import { embedded, nameOf, readWishes } from './page.mjs';
-import { Showing } from './showing.mjs';
+import { SceneViewer } from './viewer.mjs';
 
 const BACKGROUNDS = /** @type {[number, number, number][]} */ ([
   [0, 0, 0],
@@ -19,7 +19,7 @@ const address = Object.fromEntries(new URLSearchParams(location.search));
 const { wishes, complaints } = readWishes(new URLSearchParams({ ...page?.wishes, ...address }));
 const canvas = element('canvas', HTMLCanvasElement);
 const overlay = new Overlay({ open: (file) => void show(file, file.name) });
-const keep = new KeepOffer({
+const keep = new SaveUpOffer({
   file: async (up) => {
     if (!showing.engine) throw new Error('there is no scene');
     return showing.engine.fileWithUp(up);
@@ -27,7 +27,7 @@ const keep = new KeepOffer({
   say: (text) => overlay.toast(text),
 });
 const calm = matchMedia('(prefers-reduced-motion: reduce)');
-const showing = new Showing(canvas, wishes, {
+const showing = new SceneViewer(canvas, wishes, {
   calm: () => calm.matches || wishes.size !== null || !wishes.ui,
   header: () => {
     otherBackground(0);

@@ -85,7 +85,7 @@ export class Overlay {
     this.describe(name);
     this.#bar(0);
     html('progress').hidden = false;
-    html('summary').textContent = 'Opening …';
+    html('summary').textContent = 'SceneLoad …';
   }
 
   /**
@@ -105,7 +105,7 @@ export class Overlay {
     this.#bar(Math.min(1, share));
     const what = layer > 0 ? `colour detail ${layer} of 3` : `${count(splatsDone)} of ${count(splatCount)} splats`;
     html('summary').textContent =
-      phase === 'open' ? 'Opening …' : `${what} · ${megabytes(received)} of ${megabytes(fileSize)} MB`;
+      phase === 'open' ? 'SceneLoad …' : `${what} · ${megabytes(received)} of ${megabytes(fileSize)} MB`;
   }
 
   /** Everything is here. */

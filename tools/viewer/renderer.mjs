@@ -24,7 +24,7 @@ import { WebGl2Renderer } from './webgl2.mjs';
  *
  * @typedef {{attributes: number, order: number, work: number}} Bytes
  *
- * Draws splats. Slots number the splats: tile after tile, as `layoutSlots` of pack.mjs says. What has not been uploaded
+ * Draws splats. Slots number the splats: tile after tile, as `layoutSlots` of texels.mjs says. What has not been uploaded
  * must not stand in the order. All methods but `dispose` may do nothing once the context is lost.
  *
  * @typedef {object} Renderer
@@ -32,9 +32,9 @@ import { WebGl2Renderer } from './webgl2.mjs';
  * @property {Bytes} bytes
  * @property {(scene: SceneLayout) => void} allocate make room for a scene, in the place of the one before; throws a
  *   RangeError where there is too little
- * @property {(tile: number, texels: import('./pack.mjs').GeometryTexels) => void} uploadGeometry layer 0 of a tile
- * @property {(codebook: number, layer: number, rows: import('./pack.mjs').Rows) => void} uploadTable entries of a codebook
- * @property {(tile: number, layer: number, band: import('./pack.mjs').BandTexels) => void} uploadBand an SH band of a
+ * @property {(tile: number, texels: import('./texels.mjs').GeometryTexels) => void} uploadGeometry layer 0 of a tile
+ * @property {(codebook: number, layer: number, rows: import('./texels.mjs').Rows) => void} uploadTable entries of a codebook
+ * @property {(tile: number, layer: number, band: import('./texels.mjs').BandTexels) => void} uploadBand an SH band of a
  *   tile, after the table it names; a codebook's lowest band first
  * @property {() => void} complete everything has been uploaded: give back what was kept in reserve
  * @property {(order: Uint32Array, count: number) => void} setOrder slots, the farthest first

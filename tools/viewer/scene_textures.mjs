@@ -1,16 +1,16 @@
 // The textures of one scene: attributes as the tiles' integers, codebooks as tables, constants of tiles, the order.
 
 import { toCamera } from './camera_maths.mjs';
-import { BLOCK_SPLATS, layoutSlots } from './pack.mjs';
-import { UNITS } from './programs.mjs';
+import { BLOCK_SPLATS, layoutSlots } from './texels.mjs';
+import { UNITS } from './shader_programs.mjs';
 import { BAND_CODEBOOK, BAND_ROWS, TILE_TEXELS } from './shader_attributes.mjs';
-import { Records } from './targets.mjs';
+import { Records } from './framebuffers.mjs';
 import { LinearTexture, Store, formats } from './textures.mjs';
 
 /**
- * @typedef {import('./pack.mjs').BandTexels} BandTexels
- * @typedef {import('./pack.mjs').GeometryTexels} GeometryTexels
- * @typedef {import('./pack.mjs').Rows} Rows
+ * @typedef {import('./texels.mjs').BandTexels} BandTexels
+ * @typedef {import('./texels.mjs').GeometryTexels} GeometryTexels
+ * @typedef {import('./texels.mjs').Rows} Rows
  * @typedef {import('./renderer.mjs').SceneLayout} SceneLayout
  * @typedef {import('./types.d.ts').View} View
  */

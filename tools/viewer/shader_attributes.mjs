@@ -1,4 +1,4 @@
-// Where the textures keep what, and the part of the shaders that reads attributes from them. pack.mjs describes the layout.
+// Where the textures keep what, and the part of the shaders that reads attributes from them. texels.mjs describes the layout.
 
 /** Texels of a row of the textures that are addressed by one number. */
 export const ROW_TEXELS = 2048;

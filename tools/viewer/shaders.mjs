@@ -1,6 +1,6 @@
 // The shaders. A fragment pass projects the splats of the order, one to a pixel, into records; quads are drawn from those.
 
-import { BLOCK_SPLATS } from './pack.mjs';
+import { BLOCK_SPLATS } from './texels.mjs';
 import { COLOUR, READ_BANDS, READ_GEOMETRY, RECORD_COLUMNS, TILE_TEXELS } from './shader_attributes.mjs';
 
 const HEAD = `#version 300 es

@@ -55,7 +55,7 @@ export interface Stats {
   cullMs: number;
   /** Milliseconds from a frame's first command until the GPU was done with it, the last one. */
   frameMs: number;
-  /** Frames of the last second. */
+  /** FrameScheduler of the last second. */
   fps: number;
   /** Bytes of textures with attributes, tables and order; `workBytes` those of targets and projected splats. */
   gpuBytes: number;

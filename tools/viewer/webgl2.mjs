@@ -1,15 +1,15 @@
 // The WebGL 2 back end: see renderer.mjs for what its methods do.
 
 import { slopeLimits } from './camera_maths.mjs';
-import { Programs } from './programs.mjs';
+import { ShaderPrograms } from './shader_programs.mjs';
 import { SceneTextures } from './scene_textures.mjs';
 import { RECORD_COLUMNS, ROW_TEXELS } from './shader_attributes.mjs';
-import { Picture, Quads, pictureFormat } from './targets.mjs';
+import { Picture, Quads, pictureFormat } from './framebuffers.mjs';
 
 /**
- * @typedef {import('./pack.mjs').BandTexels} BandTexels
- * @typedef {import('./pack.mjs').GeometryTexels} GeometryTexels
- * @typedef {import('./pack.mjs').Rows} Rows
+ * @typedef {import('./texels.mjs').BandTexels} BandTexels
+ * @typedef {import('./texels.mjs').GeometryTexels} GeometryTexels
+ * @typedef {import('./texels.mjs').Rows} Rows
  * @typedef {import('./renderer.mjs').Capabilities} Capabilities
  * @typedef {import('./renderer.mjs').Renderer} Renderer
  * @typedef {import('./renderer.mjs').SceneLayout} SceneLayout
@@ -44,7 +44,7 @@ export class WebGl2Renderer {
   constructor(gl, format) {
     const name = deviceName(gl);
     this.gl = gl;
-    this.programs = new Programs(gl);
+    this.programs = new ShaderPrograms(gl);
     this.picture = new Picture(gl, pictureFormat(gl, SOFTWARE.test(name), format));
     this.quads = new Quads(gl);
     /** @type {Capabilities} */

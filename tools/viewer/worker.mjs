@@ -2,7 +2,7 @@
 
 import { cull } from './cull.mjs';
 import { load } from './loader.mjs';
-import { withUp } from './rewriting.mjs';
+import { withUp } from './meta_writer.mjs';
 import { DepthSorter } from './sort.mjs';
 
 /**
@@ -27,9 +27,9 @@ import { DepthSorter } from './sort.mjs';
  * @typedef {{scene: number} & (
  *   | {type: 'header', header: import('./types.d.ts').Header, description: import('./types.d.ts').Description}
  *   | {type: 'progress', progress: import('./types.d.ts').Progress, decodeMs: number}
- *   | {type: 'geometry', tile: number, texels: import('./pack.mjs').GeometryTexels, samples: import('./loader.mjs').Samples}
- *   | {type: 'table', codebook: number, layer: number, rows: import('./pack.mjs').Rows}
- *   | {type: 'band', tile: number, layer: number, band: import('./pack.mjs').BandTexels}
+ *   | {type: 'geometry', tile: number, texels: import('./texels.mjs').GeometryTexels, samples: import('./loader.mjs').Samples}
+ *   | {type: 'table', codebook: number, layer: number, rows: import('./texels.mjs').Rows}
+ *   | {type: 'band', tile: number, layer: number, band: import('./texels.mjs').BandTexels}
  *   | {type: 'order', id: number, tiles: number, order: Uint32Array<ArrayBuffer>, count: number, cullMs: number, sortMs: number}
  *   | {type: 'done'}
  *   | {type: 'error', error: ErrorReport})} Reply

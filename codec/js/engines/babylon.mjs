@@ -10,7 +10,7 @@ import { GaussianSplattingMesh } from '@babylonjs/core/Meshes/GaussianSplatting/
 import { Observable } from '@babylonjs/core/Misc/observable.js';
 
 import { openScene } from './scene.mjs';
-import { alphaOf, displayColour, eachThinnest, places, putBand, putColumns, putQuats } from './unpack.mjs';
+import { alphaOf, displayColour, eachThinnest, places, putBand, putColumns, putQuats } from './packed_values.mjs';
 
 const NAME = 'csplat';
 const ROW_BYTES = 32; // centre and scales as float32, colour, alpha and rotation as bytes

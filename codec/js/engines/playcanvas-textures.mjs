@@ -1,6 +1,6 @@
 // A file's integers as textures for PlayCanvas, as narrow as the scene allows. Without the engine, so that they can be tested.
 
-import { places, putColumns } from './unpack.mjs';
+import { places, putColumns } from './packed_values.mjs';
 
 /**
  * @typedef {import('../decoder.d.ts').AttributeRecord} AttributeRecord

@@ -5,7 +5,7 @@ import * as pc from 'playcanvas';
 
 import { bandImagesOf, imagesOf } from './playcanvas-textures.mjs';
 import { openScene } from './scene.mjs';
-import { onceSaid } from './unpack.mjs';
+import { onceSaid } from './packed_values.mjs';
 
 /**
  * @typedef {import('../decoder.d.ts').Packed} Packed

@@ -2,7 +2,7 @@
 
 import { CsplatReader } from '../decoder.mjs';
 import { mirroredBand, mirroredGeometry } from './mirror.mjs';
-import { onceSaid, uprightIn } from './unpack.mjs';
+import { onceSaid, uprightIn } from './packed_values.mjs';
 
 /**
  * @typedef {import('../decoder.d.ts').Header} Header

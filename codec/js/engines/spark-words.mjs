@@ -1,6 +1,6 @@
 // The words that Spark's splats are made of, from packed tiles. Without the engine, so that they can be tested.
 
-import { alphaOf, displayColour, eachThinnest, places, putBand, putColumns, putQuats } from './unpack.mjs';
+import { alphaOf, displayColour, eachThinnest, places, putBand, putColumns, putQuats } from './packed_values.mjs';
 
 /**
  * @typedef {import('../decoder.d.ts').Header} Header

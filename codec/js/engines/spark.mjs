@@ -4,7 +4,7 @@ import { ExtSplats, PackedSplats, SplatMesh } from '@sparkjsdev/spark';
 
 import { openScene } from './scene.mjs';
 import { ExtWords, PackedWords, halvesSuffice } from './spark-words.mjs';
-import { onceSaid } from './unpack.mjs';
+import { onceSaid } from './packed_values.mjs';
 
 /**
  * @typedef {import('./options.d.ts').SceneSource} SceneSource

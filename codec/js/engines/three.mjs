@@ -7,7 +7,7 @@
 import { BufferAttribute, BufferGeometry, Loader, Matrix4 } from 'three';
 
 import { openScene } from './scene.mjs';
-import { alphaOf, displayColour, onceSaid, places, putBand, putColumns, putCovariances } from './unpack.mjs';
+import { alphaOf, displayColour, onceSaid, places, putBand, putColumns, putCovariances } from './packed_values.mjs';
 
 /**
  * @typedef {import('../decoder.d.ts').ByteSource} ByteSource

@@ -5,7 +5,15 @@ import { test } from 'node:test';
 import { CsplatReader } from '../decoder.mjs';
 import { openScene } from '../engines/scene.mjs';
 import { mirroredBand, mirroredGeometry } from '../engines/mirror.mjs';
-import { alphaOf, places, putBand, putColumns, putCovariances, putQuats, uprightIn } from '../engines/unpack.mjs';
+import {
+  alphaOf,
+  places,
+  putBand,
+  putColumns,
+  putCovariances,
+  putQuats,
+  uprightIn,
+} from '../engines/packed_values.mjs';
 import { failures, manifest, vector } from './helpers.mjs';
 
 const same = (value) => value;

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Compile the decoder in C to WebAssembly and write it as a module that bundlers, pages and Node import alike:
 #
-#     codec/js/wasm/build.sh codec/js/wasm.mjs
+#     codec/js/wasm/build.sh codec/js/wasm_binary.mjs
 #
 # The same bytes come out wherever the packages are Debian 12's: clang-14 lld-14 wasi-libc libclang-rt-14-dev-wasm32.
 set -eu

@@ -1,4 +1,4 @@
-/* What the JavaScript decoder (../compiled.mjs) calls of the decoder in C: one file to an instance, its bytes by the
+/* What the JavaScript decoder (../wasm_decoder.mjs) calls of the decoder in C: one file to an instance, its bytes by the
  * import `read`. Messages are left out: what is refused here JavaScript decodes again, to say why.
  * SPDX-License-Identifier: Apache-2.0 */
 #include "../../c/csplat.c"
@@ -7,9 +7,9 @@
 
 __attribute__((import_module("env"), import_name("read"))) int read_part(double offset, size_t size, void *into);
 
-enum { SH_ROWS = 512 }; /* as in ../compiled.mjs */
+enum { SH_ROWS = 512 }; /* as in ../wasm_decoder.mjs */
 
-/* ../compiled.mjs reads these structures as they lie in memory. */
+/* ../wasm_decoder.mjs reads these structures as they lie in memory. */
 typedef char columns_as_expected[sizeof(csplat_columns) == 192 && offsetof(csplat_columns, offset) == 16 ? 1 : -1];
 typedef char packed_as_expected[sizeof(csplat_packed) == 208 && offsetof(csplat_packed, rows) == 192 ? 1 : -1];
 

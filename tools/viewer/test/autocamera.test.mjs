@@ -3,10 +3,10 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import { automaticPose, cameraPose, directionOf, frontFor, readCamera, upOfCameras, waysUp } from '../autocamera.mjs';
-import { evened, findFrame, quantiles } from '../frame.mjs';
-import { Rig, pivotOf } from '../rig.mjs';
-import { emptyPose } from '../sceneview.mjs';
-import { ROUGH, detail, pick } from '../survey.mjs';
+import { evened, findFrame, quantiles } from '../bounding_frame.mjs';
+import { OrbitCamera, pivotOf } from '../orbit_camera.mjs';
+import { emptyPose } from '../camera_list.mjs';
+import { ROUGH, detail, pick } from '../rough_view.mjs';
 import { dot, length, lookAlong, sub } from '../vectors.mjs';
 
 const UP = [0, -1, 0];
@@ -48,7 +48,7 @@ function room(next = numbers(7)) {
 
 /** Shares of the samples within the picture, and how far from its middle their centre falls, in half pictures. */
 function seen({ samples }, pose, extent, width = 640, height = 480) {
-  const { viewmat: m, fx, fy, cx, cy, near } = new Rig(pose, extent).camera(width, height);
+  const { viewmat: m, fx, fy, cx, cy, near } = new OrbitCamera(pose, extent).camera(width, height);
   let inside = 0;
   const sum = [0, 0];
   for (let i = 0; i < samples.length; i += 3) {
@@ -134,7 +134,7 @@ test('a wall of a few large splats hides what lies behind it', () => {
   samples.weights.fill(4, things.length);
   const from = (z) => {
     const pose = { ...emptyPose(), eye: [0, 0, z], basis: lookAlong([0, 0, -z], UP) };
-    return detail(samples, 1, new Rig(pose, 1).camera(ROUGH.width, ROUGH.height), 0);
+    return detail(samples, 1, new OrbitCamera(pose, 1).camera(ROUGH.width, ROUGH.height), 0);
   };
   assert.ok(from(3) < 0.5 * from(-3), `${from(3)} of ${from(-3)}`);
 });

@@ -4,7 +4,7 @@ import { test } from 'node:test';
 
 import * as spec from '../../../codec/js/spec.mjs';
 import { readCamera } from '../autocamera.mjs';
-import { keepCommand, upWord } from '../keep.mjs';
+import { saveUpCommand, upWord } from '../save_up.mjs';
 import { explain } from '../messages.mjs';
 import { fetchCameras, readWishes } from '../page.mjs';
 
@@ -153,10 +153,10 @@ test('a PLY is recognised by its name', () => {
 });
 
 test('the command that keeps what is up can be pasted into a shell', () => {
-  assert.equal(keepCommand('scene.csplat', [0, 0, 1]), 'csplat encode scene.ply scene.csplat --up z');
-  assert.equal(keepCommand('a.b.CSPLAT', [0, -1, -0]), 'csplat encode a.b.ply a.b.csplat --up -y');
+  assert.equal(saveUpCommand('scene.csplat', [0, 0, 1]), 'csplat encode scene.ply scene.csplat --up z');
+  assert.equal(saveUpCommand('a.b.CSPLAT', [0, -1, -0]), 'csplat encode a.b.ply a.b.csplat --up -y');
   assert.equal(
-    keepCommand("my dog's $HOME.csplat", [1, 0, 0]),
+    saveUpCommand("my dog's $HOME.csplat", [1, 0, 0]),
     "csplat encode 'my dog'\\''s $HOME.ply' 'my dog'\\''s $HOME.csplat' --up x",
   );
   assert.equal(upWord([-0.006123456, -0.8760004, 0.4822]), '-0.006123,-0.876,0.4822');

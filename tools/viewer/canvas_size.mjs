@@ -1,4 +1,4 @@
-// The size of the picture: that of the page at the screen's pixels, coarser while a slow machine is moving.
+// The size of the drawing buffer: CSS size times pixel ratio, reduced while the camera moves on a slow machine.
 
 /** @typedef {{setSize: (width: number, height: number) => void}} Sized */
 
@@ -10,7 +10,7 @@ const COARSEST = 0.4; // of the pixels per side
 const STEPS = [0.6, 1.15]; // limits of what one frame changes
 const REST_MS = 220; // without movement, until the picture is drawn at full size
 
-export class Stage {
+export class CanvasSize {
   /**
    * @param {HTMLCanvasElement} canvas
    * @param {{width: number, height: number} | null} fixed size of the drawing buffer, whatever the page's

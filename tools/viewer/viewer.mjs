@@ -1,13 +1,13 @@
-// Scenes on a canvas: an engine, a camera, a person's hands on it, a picture of the canvas's size. The page (main.mjs)
-// and the element (element.mjs) put their own things around it.
+// The viewer: an engine, a camera with its controls, and a canvas that follows the page's size. The page (main.mjs) and
+// the element (element.mjs) are built around it.
 
 import { Controls } from './controls.mjs';
 import { createEngine } from './engine.mjs';
 import { E_REPLACED, EngineError } from './engine_error.mjs';
 import { fetchCameras } from './page.mjs';
-import { Rig } from './rig.mjs';
-import { SceneView, emptyPose } from './sceneview.mjs';
-import { Stage } from './stage.mjs';
+import { OrbitCamera } from './orbit_camera.mjs';
+import { CameraList, emptyPose } from './camera_list.mjs';
+import { CanvasSize } from './canvas_size.mjs';
 
 /**
  * @typedef {import('./types.d.ts').Engine} Engine
@@ -27,7 +27,7 @@ import { Stage } from './stage.mjs';
 
 const BLACK = /** @type {[number, number, number]} */ ([0, 0, 0]);
 
-export class Showing {
+export class SceneViewer {
   /**
    * @param {HTMLCanvasElement} canvas
    * @param {import('./page.mjs').Wishes} wishes
@@ -43,8 +43,8 @@ export class Showing {
     this.turn = 0; // counts scenes, so that what is late for one is not shown for the next
     this.isOpening = false;
     this.isClosed = false;
-    this.rig = new Rig(emptyPose(), 1);
-    this.stage = new Stage(canvas, wishes.size, () => this.draw());
+    this.rig = new OrbitCamera(emptyPose(), 1);
+    this.stage = new CanvasSize(canvas, wishes.size, () => this.draw());
     /** @type {Controls} */
     this.controls = new Controls(
       canvas,
@@ -59,8 +59,8 @@ export class Showing {
       },
       reach,
     );
-    /** @type {SceneView} */
-    this.view = new SceneView(this.rig, this.controls, wishes);
+    /** @type {CameraList} */
+    this.view = new CameraList(this.rig, this.controls, wishes);
   }
 
   /** What stands behind the scene: first what is wished, else what it was trained in front of, else black. */

@@ -1,4 +1,4 @@
-// The camera that a person moves: where it stands, what it turns around, and how its lens fits the canvas. No DOM here.
+// The interactive camera: position, pivot, and the lens fitted to the canvas. No DOM here.
 
 import {
   add,
@@ -58,7 +58,7 @@ export function defaultLens() {
  */
 const fit = (lens, width, height) => Math.min(width / lens.W, height / lens.H);
 
-export class Rig {
+export class OrbitCamera {
   /**
    * @param {Pose} pose
    * @param {number} extent of the scene: what speeds and limits are multiples of

@@ -3,7 +3,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import { FloatArrays } from '../arrays.mjs';
-import { CompiledDecoder } from '../compiled.mjs';
+import { WasmDecoder } from '../wasm_decoder.mjs';
 import { CsplatReader, readHeader } from '../decoder.mjs';
 import { zlibInflate } from '../inflate.mjs';
 import { HEADER_SIZE } from '../spec.mjs';
@@ -14,11 +14,7 @@ const valid = manifest.filter(({ error }) => !error.code);
 /** All that it can decode of a file whose header and index are right, or null. */
 async function decodeAll(file, header) {
   const end = HEADER_SIZE + header.indexSize;
-  const decoder = await CompiledDecoder.open(
-    file.length,
-    file.subarray(0, HEADER_SIZE),
-    file.subarray(HEADER_SIZE, end),
-  );
+  const decoder = await WasmDecoder.open(file.length, file.subarray(0, HEADER_SIZE), file.subarray(HEADER_SIZE, end));
   if (decoder === null) return null;
   const places = [...header.directory, ...header.tiles.flatMap(({ layers }) => layers)];
   const parts = new Map(places.map(({ offset, size }) => [offset, file.subarray(offset, offset + size)]));
@@ -73,7 +69,7 @@ test('a page that forbids WebAssembly has no such decoder', async () => {
       throw new WebAssembly.CompileError('unsafe-eval');
     };
     try {
-      const { CompiledDecoder: another } = await import(`../compiled.mjs?${forbidden}`);
+      const { WasmDecoder: another } = await import(`../wasm_decoder.mjs?${forbidden}`);
       assert.equal(await another.open(file.length, file.subarray(0, HEADER_SIZE), file.subarray(HEADER_SIZE)), null);
     } finally {
       WebAssembly[forbidden] = allowed;

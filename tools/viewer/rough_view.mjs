@@ -1,8 +1,8 @@
-// Rough pictures of a scene from samples of its splats: how much a view shows, and how far away something lies.
+// Coarse renders of a scene from samples of its splats: how much a view shows, and the depth under a pixel.
 
 /**
- * @typedef {import('./frame.mjs').Samples} Samples
- * @typedef {import('./rig.mjs').EngineCamera} EngineCamera
+ * @typedef {import('./bounding_frame.mjs').Samples} Samples
+ * @typedef {import('./orbit_camera.mjs').EngineCamera} EngineCamera
  * @typedef {import('./vectors.mjs').Vec3} Vec3
  */
 

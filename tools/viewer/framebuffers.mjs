@@ -1,6 +1,6 @@
-// What is drawn to: records of projected splats, the picture; and the quads that are drawn.
+// Render targets: records of projected splats and the image, and the quads that are drawn.
 
-import { UNITS } from './programs.mjs';
+import { UNITS } from './shader_programs.mjs';
 import { RECORD_COLUMNS } from './shader_attributes.mjs';
 import { makeTexture } from './textures.mjs';
 

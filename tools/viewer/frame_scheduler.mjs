@@ -1,8 +1,8 @@
-// When frames are drawn: at the next animation frame, and not before the GPU is done with the last one.
+// Draws at the next animation frame, but not before the GPU has finished the last one.
 
 const SECOND_MS = 1000;
 
-export class Frames {
+export class FrameScheduler {
   /**
    * @param {() => Promise<void>} draw resolves when the GPU is done
    * @param {(frameMs: number, fps: number) => void} drawn

@@ -1,4 +1,4 @@
-// A scene's cameras: what its file and the address say of them, which one is shown first, which way is up.
+// A scene's cameras, from its file and the page's address: the list, the first one shown, and the up direction.
 
 import {
   DEFAULT_AXES,
@@ -10,15 +10,15 @@ import {
   upOfCameras,
   waysUp,
 } from './autocamera.mjs';
-import { findFrame } from './frame.mjs';
-import { defaultLens } from './rig.mjs';
-import { pick } from './survey.mjs';
+import { findFrame } from './bounding_frame.mjs';
+import { defaultLens } from './orbit_camera.mjs';
+import { pick } from './rough_view.mjs';
 import { dot, unitDirection } from './vectors.mjs';
 
 /**
  * @typedef {import('./controls.mjs').Controls} Controls
- * @typedef {import('./rig.mjs').Pose} Pose
- * @typedef {import('./rig.mjs').Rig} Rig
+ * @typedef {import('./orbit_camera.mjs').Pose} Pose
+ * @typedef {import('./orbit_camera.mjs').OrbitCamera} OrbitCamera
  * @typedef {import('./types.d.ts').Bounds} Bounds
  * @typedef {import('./types.d.ts').Description} Description
  * @typedef {import('./types.d.ts').Header} Header
@@ -61,9 +61,9 @@ const noFacts = () => {
   };
 };
 
-export class SceneView {
+export class CameraList {
   /**
-   * @param {Rig} rig
+   * @param {OrbitCamera} rig
    * @param {Controls} controls
    * @param {{up: Vec3 | null, axes: string | null, seems: Vec3 | null}} wanted instead of the file's; `seems`: what is
    * up in the first scene if nothing says it

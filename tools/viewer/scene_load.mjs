@@ -1,4 +1,4 @@
-// One call of the engine's `open`: takes what the worker sends of a scene, and knows what has come of it so far.
+// One call of the engine's `open`: receives a scene from the worker and tracks what has arrived.
 
 import { coarseBounds, fineBounds } from './bounds.mjs';
 import { EngineError, E_LIMIT } from './engine_error.mjs';
@@ -14,7 +14,7 @@ import { expandedBytes } from './statistics.mjs';
  * @typedef {{resolve: () => void, reject: (error: EngineError) => void}} Settle
  */
 
-export class Opening {
+export class SceneLoad {
   /**
    * @param {string | Blob | ArrayBuffer} source
    * @param {number} scene number by which the worker's messages are told from those for earlier scenes

@@ -1,4 +1,4 @@
-// The index (spec 4.3): records of the whole file. `tiles.mjs` reads the rest of it, the tiles.
+// The index (spec 4.3): records of the whole file. `tile_records.mjs` reads the rest of it, the tiles.
 
 import { CRC_SIZE } from './checksums.mjs';
 import { fault } from './errors.mjs';
@@ -7,7 +7,7 @@ import { SINGLE_MIN, STEP_MIN } from './lattice.mjs';
 import { Payload } from './payload.mjs';
 import { nameOf, registeredFlags } from './registry.mjs';
 import * as spec from './spec.mjs';
-import { checkCoverage, checkTables, readTile } from './tiles.mjs';
+import { checkCoverage, checkTables, readTile } from './tile_records.mjs';
 
 const { ERROR_INDEX, ERROR_LIMIT, ERROR_RESERVED, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
 

@@ -1,4 +1,4 @@
-// The same file, but that it says which way is up (spec 5.4): META is another, index and header follow.
+// Rewrites a file with an up direction in META (spec 5.4); index and header are updated, all else is copied.
 
 import { CRC_SIZE, crc32 } from '../../codec/js/checksums.mjs';
 import { CsplatReader } from '../../codec/js/decoder.mjs';

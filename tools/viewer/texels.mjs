@@ -1,4 +1,4 @@
-// From a tile's integers to texels of four 32-bit words, and back. shaders.mjs reads the same layout.
+// Packs a tile's integers into texels of four 32-bit words. shaders.mjs reads the same layout.
 //
 // Geometry is a string of bits per splat: means x y z, quats x y z, scales (three), opacity, sh0 r g b, each field with
 // as many bits as the tile needs; the first 128 bits are a texel, what does not fit follows in words apart. Colours of

@@ -2,7 +2,7 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
-import { SceneView } from '../sceneview.mjs';
+import { CameraList } from '../camera_list.mjs';
 
 /** A camera of a file, held so that +z is up. */
 const LEVEL = {
@@ -22,7 +22,7 @@ const LEVEL = {
 };
 
 function opened({ axes = '', metadata = null, cameras = null }, wanted = {}) {
-  const view = new SceneView(null, { touched: false }, { up: null, axes: null, seems: null, ...wanted });
+  const view = new CameraList(null, { touched: false }, { up: null, axes: null, seems: null, ...wanted });
   view.begin();
   view.read({ axes }, { metadata, cameras });
   return view;

@@ -1,4 +1,4 @@
-// The programs of the WebGL 2 back end and their uniforms.
+// Shader programs of the WebGL 2 back end and their uniforms.
 
 import { COVER_VERTEX, PROJECT_FRAGMENT, RESOLVE_FRAGMENT, SPLAT_FRAGMENT, SPLAT_VERTEX } from './shaders.mjs';
 
@@ -68,7 +68,7 @@ class Program {
 }
 
 /** All of them. */
-export class Programs {
+export class ShaderPrograms {
   /** @param {WebGL2RenderingContext} gl */
   constructor(gl) {
     this.gl = gl;

@@ -1,4 +1,4 @@
-// The offer to keep the way up that a person has found: the file that says it, and the command that writes one.
+// Offers to save the up direction that the user chose: a rewritten file, or the command that writes one.
 
 import { element } from './overlay.mjs';
 
@@ -40,7 +40,7 @@ export function upWord(up) {
  * @param {string} name of the file
  * @param {Vec3} up
  */
-export function keepCommand(name, up) {
+export function saveUpCommand(name, up) {
   const stem = name.replace(/\.csplat$/i, '') || 'scene';
   const words = [`${stem}.ply`, `${stem}.csplat`].map((word) =>
     /^[\w.+-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`,
@@ -48,7 +48,7 @@ export function keepCommand(name, up) {
   return `csplat encode ${words.join(' ')} --up ${upWord(up)}`;
 }
 
-export class KeepOffer {
+export class SaveUpOffer {
   /** @param {Hooks} hooks */
   constructor(hooks) {
     this.hooks = hooks;
@@ -68,7 +68,7 @@ export class KeepOffer {
     this.name = name;
     this.up = rounded(up);
     element('keep-title', HTMLElement).textContent = `${upWord(up).replace('-', '−')} is up.`;
-    element('keep-command', HTMLElement).textContent = keepCommand(name, up);
+    element('keep-command', HTMLElement).textContent = saveUpCommand(name, up);
     element('keep', HTMLElement).hidden = false;
   }
 

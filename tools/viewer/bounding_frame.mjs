@@ -1,5 +1,5 @@
-// Where a scene lies, how large it is and of which kind it is, from samples of its splats. No box of everything is
-// looked at: a few splats far away must not decide what the first picture shows.
+// Centre, size and kind (object or surroundings) of a scene, from samples of its splats. Not the bounding box of all
+// splats: a few distant ones must not decide the first view.
 
 /**
  * @typedef {import('./vectors.mjs').Vec3} Vec3

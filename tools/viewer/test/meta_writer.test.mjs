@@ -4,7 +4,7 @@ import { readFileSync, readdirSync } from 'node:fs';
 import { test } from 'node:test';
 
 import { decode } from '../../../codec/js/decoder.mjs';
-import { withUp } from '../rewriting.mjs';
+import { withUp } from '../meta_writer.mjs';
 
 const FOLDER = new URL('../../../conformance/csplat_conformance/vectors/valid/', import.meta.url);
 const NAMES = readdirSync(FOLDER).filter((name) => name.endsWith('.csplat'));

@@ -2,7 +2,7 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
-import { Rig, between, defaultLens, pivotOf } from '../rig.mjs';
+import { OrbitCamera, between, defaultLens, pivotOf } from '../orbit_camera.mjs';
 import { cross, dot, length, lookAlong, slerp, sub, toBasis, toQuat, turnBasis } from '../vectors.mjs';
 
 const WIDTH = 800;
@@ -19,7 +19,7 @@ function rig(changes = {}) {
     near: 0.2,
     ...changes,
   };
-  return new Rig(pose, 1);
+  return new OrbitCamera(pose, 1);
 }
 
 /** Where a point falls on the picture, in pixels, and its depth. */

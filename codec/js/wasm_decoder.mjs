@@ -1,9 +1,9 @@
-// The decoder in C as WebAssembly (wasm/, codec/c), for floats and packed arrays. Whatever it refuses the modules beside
-// this one decode once more: they say what is wrong, and where.
+// The C decoder compiled to WebAssembly (wasm/, codec/c), for floats and packed arrays. Files that it refuses are decoded
+// again by the JavaScript modules, which report what is wrong and where.
 
 import { shRows } from './arrays.mjs';
 import * as spec from './spec.mjs';
-import { WASM } from './wasm.mjs';
+import { WASM } from './wasm_binary.mjs';
 
 /**
  * @typedef {import('./arrays.mjs').FloatArrays} FloatArrays
@@ -39,7 +39,7 @@ const ARRAYS = { 1: Uint8Array, 2: Uint16Array, 4: Uint32Array };
 /** @type {Promise<WebAssembly.Module | null> | null} */
 let compiling = null;
 
-/** @type {WeakRef<CompiledDecoder> | null} one that is closed: its memory is there already */
+/** @type {WeakRef<WasmDecoder> | null} one that is closed: its memory is there already */
 let spare = null;
 
 /** The module; null where the platform, or the page's policy, has no WebAssembly of this kind. */
@@ -50,7 +50,7 @@ function compiledModule() {
       const bytes = new Uint8Array(text.length);
       for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i); // Uint8Array.from takes several times as long
       const module = await WebAssembly.compile(bytes);
-      spare = new WeakRef(new CompiledDecoder(module)); // here, not before, WebKit heeds the policy
+      spare = new WeakRef(new WasmDecoder(module)); // here, not before, WebKit heeds the policy
       return module;
     } catch {
       return null;
@@ -60,17 +60,17 @@ function compiledModule() {
 }
 
 /** Decodes tiles of one file. */
-export class CompiledDecoder {
+export class WasmDecoder {
   /**
    * @param {number} fileSize
    * @param {Bytes} head the file's first bytes
    * @param {Bytes} index
-   * @returns {Promise<CompiledDecoder | null>} null where the platform cannot, or the file is refused
+   * @returns {Promise<WasmDecoder | null>} null where the platform cannot, or the file is refused
    */
   static async open(fileSize, head, index) {
     const module = await compiledModule();
     if (module === null) return null;
-    const decoder = spare?.deref() ?? new CompiledDecoder(module);
+    const decoder = spare?.deref() ?? new WasmDecoder(module);
     spare = null;
     const parts = new Map([
       [0, head],
@@ -105,7 +105,7 @@ export class CompiledDecoder {
    * @template T
    * @param {Parts} parts what may be read
    * @param {Set<number>} checked gets the offsets of those that were read, unless something was refused
-   * @param {(decoder: CompiledDecoder) => T} decode
+   * @param {(decoder: WasmDecoder) => T} decode
    * @returns {T | null} null where it broke down
    */
   reading(parts, checked, decode) {

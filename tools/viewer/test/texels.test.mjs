@@ -5,7 +5,7 @@ import { test } from 'node:test';
 
 import { CsplatReader } from '../../../codec/js/decoder.mjs';
 import { failures } from '../../../codec/js/test/helpers.mjs';
-import { BLOCK_SPLATS, bitsFor, layoutSlots, packBand, packGeometry, packRows } from '../pack.mjs';
+import { BLOCK_SPLATS, bitsFor, layoutSlots, packBand, packGeometry, packRows } from '../texels.mjs';
 
 const VECTORS = new URL('../../../conformance/csplat_conformance/vectors/', import.meta.url);
 const { vectors } = JSON.parse(readFileSync(new URL('manifest.json', VECTORS), 'utf8'));
