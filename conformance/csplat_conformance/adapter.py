@@ -11,6 +11,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.errors import CsplatError, LimitError
 from csplat_conformance.answers import Answer
+from csplat_conformance.manifest import load, summarise
 from csplat_conformance.report import Status
 
 if TYPE_CHECKING:
@@ -50,6 +52,22 @@ def answer(data: bytes, limits: Limits | None = None, threads: int | None = None
     sums = {key: (len(raw), hashlib.sha256(raw).hexdigest()) for key, raw in arrays.items()}
     floats = {key.removeprefix("floats."): raw for key, raw in arrays.items() if key.startswith("floats.")}
     return Answer(Status.PASSED, "", header, sums, floats, seconds=time.monotonic() - began)
+
+
+@lru_cache(maxsize=8)
+def exact_floats(name: str) -> dict[str, NDArray[np.float32]]:
+    """Decode the float arrays of a valid vector, whose hashes are in the manifest.
+
+    Raises:
+        AssertionError: a hash differs: csplat's decoder is broken.
+    """
+    from csplat import decoder
+
+    vector = next(vector for vector in load() if vector.name == name)
+    model = decoder.decode(vector.data)
+    floats = {key: getattr(model, key) for key in vector.expect["floats"]}
+    assert summarise(floats) == vector.expect["floats"], f"csplat's decoder gives other floats for {name}"
+    return floats
 
 
 class _DifferError(Exception):

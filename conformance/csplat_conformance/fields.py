@@ -10,6 +10,8 @@ from typing import Any
 
 from csplat import _spec
 
+_CRC_SIZE = 4
+
 
 @dataclass(frozen=True)
 class Field:
@@ -66,6 +68,56 @@ class Writer:
         if len(packed) != entry.size:
             raise ValueError(f"{name} has {entry.size} bytes, not {len(packed)}")
         self.data[entry.offset : entry.offset + entry.size] = packed
+
+
+def read_fields(data: bytes) -> tuple[dict[str, Field], dict[str, tuple[int, int]]]:
+    """Locate the fields of header, index records and chunk frames in a valid file of any origin.
+
+    Returns:
+        Places of the fields by name; offset and size of each chunk by name, in the order of the file.
+
+    Raises:
+        ValueError: the index holds more than its records.
+    """
+    out = Writer()
+    out.structure("header", "header", _spec.unpack_header(data))
+    index_size = _spec.unpack_header(data).index_size
+    head = _spec.unpack_index_head(data, _spec.HEADER_SIZE)
+    out.structure("index", "index_head", head)
+    spans: dict[str, tuple[int, int]] = {}
+    if head.head_size > _spec.INDEX_HEAD_SIZE:
+        out.raw("index.tail", data[len(out.data) : _spec.HEADER_SIZE + head.head_size])
+
+    def record(name: str, structure: str) -> tuple[int, ...]:
+        unpack = getattr(_spec, f"unpack_{structure}")
+        values: tuple[int, ...] = unpack(data, len(out.data))
+        at = len(out.data)
+        out.structure(name, structure, values)
+        end = at + int(getattr(head, structure.replace("_record", "_size")))
+        if end > len(out.data):
+            out.raw(f"{name}.tail", data[len(out.data) : end])
+        return values
+
+    for structure, count in (("attribute", head.attribute_count), ("codebook", head.codebook_count)):
+        for i in range(count):
+            record(f"{structure}[{i}]", f"{structure}_record")
+    for i in range(head.extra_count):
+        record(f"extra[{i}]", "extra_record")
+    for i in range(head.directory_count):
+        entry = _spec.DirectoryRecord(*record(f"directory[{i}]", "directory_record"))  # type: ignore[arg-type]  # one field is bytes
+        spans[f"{i}"] = (entry.offset, entry.size)
+    for i in range(head.tile_count):
+        tile = _spec.TileRecord(*record(f"tile[{i}]", "tile_record"))  # type: ignore[arg-type]  # some fields are tuples
+        for k in range(tile.layer_count):
+            layer = _spec.LayerRecord(*record(f"tile[{i}].layer[{k}]", "layer_record"))
+            spans[f"TILE.{i}.{k}"] = (layer.offset, layer.size)
+        out.raw(f"tile[{i}].tables", data[len(out.data) : len(out.data) + 2 * tile.table_count])
+    if len(out.data) + _CRC_SIZE != _spec.HEADER_SIZE + index_size:
+        raise ValueError("the index holds more than its records")
+    for name, (offset, _) in spans.items():
+        for key, place in _spec.CHUNK_HEADER_OFFSETS.items():
+            out.fields[f"{name}/header.{key}"] = Field(offset + place, "<H" if key in ("flags", "reserved_0") else "<I")
+    return out.fields, dict(sorted(spans.items(), key=lambda item: item[1]))
 
 
 def _formats(packed: str, offsets: dict[str, int]) -> dict[str, tuple[int, str]]:

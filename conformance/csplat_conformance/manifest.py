@@ -14,8 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat_conformance.reference import expected
-from csplat_conformance.samples import Recipe
 
 #: Folder of the vectors and of manifest.json.
 VECTORS = Path(__file__).parent / "vectors"
@@ -62,46 +60,6 @@ def load(path: Path = VECTORS / "manifest.json") -> list[Vector]:
 @cache
 def _loaded(path: Path) -> tuple[Vector, ...]:
     return tuple(Vector(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))["vectors"])
-
-
-def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vector:
-    """Return a recipe's entry for the bytes that it made.
-
-    Args:
-        recipe: the recipe of the entry.
-        data: the file.
-        pictures: a PNG for each of the recipe's views.
-    """
-    expect: dict[str, Any] = {}
-    error: dict[str, Any] = {}
-    if recipe.scene is not None:
-        result = expected(recipe.scene)
-        expect = {"header": result.header}
-        for key in ("integers", "floats", "extra"):
-            expect[key] = summarise(getattr(result, key))
-    else:
-        error = {"code": recipe.code, "clause": recipe.clauses[0], "offset": recipe.offset}
-        error |= {"also": list(recipe.also), "optional": recipe.optional}
-    views = [
-        {
-            "camera": view.camera,
-            "picture": picture_name(recipe.name, number),
-            "sha256": hashlib.sha256(picture).hexdigest(),
-            "psnr": view.psnr,
-        }
-        for number, (view, picture) in enumerate(zip(recipe.views, pictures, strict=True))
-    ]
-    return Vector(
-        name=recipe.name,
-        file=f"{recipe.name}.csplat",
-        sha256=hashlib.sha256(data).hexdigest(),
-        why=recipe.why,
-        clauses=list(recipe.clauses),
-        since=f"{_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}",
-        expect=expect,
-        error=error,
-        views=views,
-    )
 
 
 def picture_name(name: str, number: int) -> str:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from csplat import _spec
 from csplat_conformance.builder import Built
 from csplat_conformance.deflate import deflate_fixed, deflate_stored
-from csplat_conformance.fields import Field, Writer
+from csplat_conformance.fields import Field, read_fields
 from csplat_conformance.repair import repair
 
 _UNREPAIRED_SHARE = 0.1
@@ -59,45 +59,7 @@ def mutant_of(rng: random.Random, base: Built, bases: Sequence[Built]) -> tuple[
 
 def mapped(data: bytes) -> Built:
     """Return a valid file of any origin with the fields of header, index records and chunk frames."""
-    out = Writer()
-    out.structure("header", "header", _spec.unpack_header(data))
-    index_size = _spec.unpack_header(data).index_size
-    head = _spec.unpack_index_head(data, _spec.HEADER_SIZE)
-    out.structure("index", "index_head", head)
-    spans = {}
-    if head.head_size > _spec.INDEX_HEAD_SIZE:
-        out.raw("index.tail", data[len(out.data) : _spec.HEADER_SIZE + head.head_size])
-
-    def record(name: str, structure: str) -> tuple[int, ...]:
-        unpack = getattr(_spec, f"unpack_{structure}")
-        values: tuple[int, ...] = unpack(data, len(out.data))
-        at = len(out.data)
-        out.structure(name, structure, values)
-        end = at + int(getattr(head, structure.replace("_record", "_size")))
-        if end > len(out.data):
-            out.raw(f"{name}.tail", data[len(out.data) : end])
-        return values
-
-    for structure, count in (("attribute", head.attribute_count), ("codebook", head.codebook_count)):
-        for i in range(count):
-            record(f"{structure}[{i}]", f"{structure}_record")
-    for i in range(head.extra_count):
-        record(f"extra[{i}]", "extra_record")
-    for i in range(head.directory_count):
-        entry = _spec.DirectoryRecord(*record(f"directory[{i}]", "directory_record"))  # type: ignore[arg-type]  # one field is bytes
-        spans[f"{i}"] = (entry.offset, entry.size)
-    for i in range(head.tile_count):
-        tile = _spec.TileRecord(*record(f"tile[{i}]", "tile_record"))  # type: ignore[arg-type]  # some fields are tuples
-        for k in range(tile.layer_count):
-            layer = _spec.LayerRecord(*record(f"tile[{i}].layer[{k}]", "layer_record"))
-            spans[f"TILE.{i}.{k}"] = (layer.offset, layer.size)
-        out.raw(f"tile[{i}].tables", data[len(out.data) : len(out.data) + 2 * tile.table_count])
-    if len(out.data) + _CRC_SIZE != _spec.HEADER_SIZE + index_size:
-        raise ValueError("the index holds more than its records")
-    for name, (offset, _) in spans.items():
-        for key, place in _spec.CHUNK_HEADER_OFFSETS.items():
-            out.fields[f"{name}/header.{key}"] = Field(offset + place, "<H" if key in ("flags", "reserved_0") else "<I")
-    return Built(data, out.fields, dict(sorted(spans.items(), key=lambda item: item[1])))
+    return Built(data, *read_fields(data))
 
 
 # In place ------------------------------------------------------------------------------------------

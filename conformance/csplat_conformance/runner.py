@@ -23,7 +23,6 @@ from csplat_conformance.manifest import VECTORS, Vector, load
 from csplat_conformance.near import CLASSES, EXACT, RENDERER
 from csplat_conformance.process import split_command
 from csplat_conformance.protocol import ask
-from csplat_conformance.recipes import exact_floats
 from csplat_conformance.report import Outcome, Report
 
 #: Seconds that another decoder has for each vector; the largest is of 65,536 splats.
@@ -68,7 +67,7 @@ class Choice:
     @property
     def near(self) -> FloatsOf | None:
         """The source of exact floats that a decoder's must be near; None if they must be equal bit for bit."""
-        return exact_floats if self.by == RENDERER else None
+        return adapter.exact_floats if self.by == RENDERER else None
 
 
 def parse_levels(text: str) -> tuple[int, ...]:

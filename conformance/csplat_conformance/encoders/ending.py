@@ -6,7 +6,7 @@ from csplat import _spec
 from csplat_conformance.encoders.inputs import Input
 from csplat_conformance.encoders.trial import Trial
 from csplat_conformance.encoders.verdict import Verdict, Wrong, failed
-from csplat_conformance.mutate import mapped
+from csplat_conformance.fields import read_fields
 from csplat_conformance.process import Ended
 from csplat_conformance.report import Status
 
@@ -98,13 +98,13 @@ def _first_difference(one: bytes, other: bytes) -> int:
 def _field_at(data: bytes, at: int) -> str:
     """Name what lies at a byte: a field, or the chunk; nothing if the file is not one."""
     try:
-        built = mapped(data)
+        fields, spans = read_fields(data)
     except Exception:  # noqa: BLE001 - a file that breaks clauses may end the walk anywhere, and is reported elsewhere
         return ""
-    for name, entry in built.fields.items():
+    for name, entry in fields.items():
         if entry.offset <= at < entry.offset + entry.size:
             return _named(data, name)
-    for name, (offset, size) in built.spans.items():
+    for name, (offset, size) in spans.items():
         if offset <= at < offset + size:
             return f"the chunk {_named(data, f'directory[{name}]') if name.isdigit() else name}"
     return ""

@@ -11,12 +11,16 @@ A picture is out of date when it differs visibly: exponentials may round differe
 from __future__ import annotations
 
 import argparse
+import hashlib
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+from csplat import _spec
 from csplat_conformance.clauses import clause_map, replaced
 from csplat_conformance.example import annex
-from csplat_conformance.manifest import VECTORS, describe, picture_name, to_json
+from csplat_conformance.manifest import VECTORS, Vector, picture_name, summarise, to_json
 from csplat_conformance.pictures import psnr, read_png, write_png
 from csplat_conformance.recipes import all_recipes
 from csplat_conformance.reference import expected
@@ -73,6 +77,46 @@ def files() -> dict[Path, bytes]:
         text = replaced(text, "clause map", clause_map(text, vectors))
         result[FORMAT] = text.encode()
     return result
+
+
+def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vector:
+    """Return a recipe's entry for the bytes that it made.
+
+    Args:
+        recipe: the recipe of the entry.
+        data: the file.
+        pictures: a PNG for each of the recipe's views.
+    """
+    expect: dict[str, Any] = {}
+    error: dict[str, Any] = {}
+    if recipe.scene is not None:
+        result = expected(recipe.scene)
+        expect = {"header": result.header}
+        for key in ("integers", "floats", "extra"):
+            expect[key] = summarise(getattr(result, key))
+    else:
+        error = {"code": recipe.code, "clause": recipe.clauses[0], "offset": recipe.offset}
+        error |= {"also": list(recipe.also), "optional": recipe.optional}
+    views = [
+        {
+            "camera": view.camera,
+            "picture": picture_name(recipe.name, number),
+            "sha256": hashlib.sha256(picture).hexdigest(),
+            "psnr": view.psnr,
+        }
+        for number, (view, picture) in enumerate(zip(recipe.views, pictures, strict=True))
+    ]
+    return Vector(
+        name=recipe.name,
+        file=f"{recipe.name}.csplat",
+        sha256=hashlib.sha256(data).hexdigest(),
+        why=recipe.why,
+        clauses=list(recipe.clauses),
+        since=f"{_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}",
+        expect=expect,
+        error=error,
+        views=views,
+    )
 
 
 def _pictures(recipe: Recipe) -> dict[Path, bytes]:
