@@ -52,8 +52,8 @@ import filelock
 import pytest
 from reach import ROOT, Importers, Map, Project, Tree, file_of, has_kernels, place_of
 
-from csplat_conformance.mutation.mutants import Mutant, Result, sample, table
-from csplat_conformance.mutation.operators import python_mutants
+from csplat_selftest.mutation.mutants import Mutant, Result, sample, table
+from csplat_selftest.mutation.operators import python_mutants
 
 #: Packages that every map covers, so that one map serves all of them.
 MAPPED = ("csplat.encoder", "csplat_tools.optimise", "csplat_trainer")

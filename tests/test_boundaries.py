@@ -7,15 +7,15 @@ from tables import failures
 
 import csplat
 from csplat import _spec
-from csplat_conformance._rules import CHOICES, RANGES
-from csplat_conformance.boundaries import cases, held
-from csplat_conformance.builder import build
+from csplat_authoring._rules import CHOICES, RANGES
+from csplat_authoring.boundaries import cases, held
+from csplat_authoring.builder import build
+from csplat_authoring.recipes import sound_recipes
 from csplat_conformance.manifest import VECTORS, load
-from csplat_conformance.mutate import mapped
 from csplat_conformance.node import JsDecoder, missing_javascript
-from csplat_conformance.recipes import sound_recipes
 from csplat_conformance.report import Status
 from csplat_conformance.validator import validate
+from csplat_selftest.mutate import mapped
 
 
 @pytest.fixture(scope="module")

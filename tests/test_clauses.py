@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from csplat_authoring.example import annex, example_scene
+from csplat_authoring.reference import expected
 from csplat_conformance.clauses import EXCUSES, clause_ids, clause_map, replaced
-from csplat_conformance.example import annex, example_scene
 from csplat_conformance.manifest import VECTORS, load
-from csplat_conformance.reference import expected
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")

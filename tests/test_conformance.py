@@ -8,13 +8,13 @@ from tables import differing, failures
 
 import csplat
 from csplat.decoder import Limits, iter_tiles
+from csplat_authoring.builder import build
+from csplat_authoring.repair import repair
+from csplat_authoring.samples import rich_scene
 from csplat_conformance import manifest, runner
-from csplat_conformance.builder import build
 from csplat_conformance.manifest import VECTORS, load, summarise
-from csplat_conformance.repair import repair
 from csplat_conformance.report import Status
 from csplat_conformance.runner import Choice
-from csplat_conformance.samples import rich_scene
 
 VECTOR_LIST = load()
 VALID = [vector for vector in VECTOR_LIST if not vector.error]

@@ -12,9 +12,9 @@ import jsonschema
 import pytest
 
 from csplat import _spec
+from csplat_authoring.recipes import sound_recipes
 from csplat_conformance.clauses import clause_ids
 from csplat_conformance.manifest import VECTORS
-from csplat_conformance.recipes import sound_recipes
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
@@ -221,6 +221,6 @@ def test_every_attribute_that_a_codebook_may_serve_has_escapes():
 
 @pytest.mark.area(name="vectors")
 def test_vectors_and_annexes_are_those_of_the_recipes():
-    words = [sys.executable, "-m", "csplat_conformance.recipes", "--check"]
+    words = [sys.executable, "-m", "csplat_authoring", "--check"]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (0, "") == (done.returncode, done.stdout + done.stderr)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from csplat.errors import InputError
+from csplat_authoring import __main__ as recipes
+from csplat_authoring.recipes.rendered import rendered_recipes
+from csplat_authoring.reference import expected
 from csplat_conformance import views
 from csplat_conformance.manifest import VECTORS, load
 from csplat_conformance.pictures import PSNR_CAP, psnr, read_png, write_png
-from csplat_conformance.recipes import __main__ as recipes
-from csplat_conformance.recipes.rendered import rendered_recipes
-from csplat_conformance.reference import expected
 from csplat_conformance.report import Status
 from csplat_conformance.runner import Choice, run_builtin, run_command
 

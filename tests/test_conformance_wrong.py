@@ -10,16 +10,17 @@ from tables import failures
 from csplat import _spec
 from csplat.decoder import job
 from csplat.decoder.container import open_chunk
-from csplat_conformance import adapter, wrong
+from csplat_conformance import adapter
 from csplat_conformance.manifest import load
-from csplat_conformance.mistakes import reworded
 from csplat_conformance.near import EXACT, RENDERER
 from csplat_conformance.node import js_folder, missing_javascript
 from csplat_conformance.report import Status
 from csplat_conformance.single import GPUS
-from csplat_conformance.wrong import MISTAKES
-from csplat_conformance.wrong_js import EDITS, catch_edit, edited
-from csplat_conformance.wrong_single import off_by, single_precision
+from csplat_selftest import wrong
+from csplat_selftest.mistakes import reworded
+from csplat_selftest.wrong import MISTAKES
+from csplat_selftest.wrong_js import EDITS, catch_edit, edited
+from csplat_selftest.wrong_single import off_by, single_precision
 
 needs_javascript = pytest.mark.skipif(bool(missing_javascript()), reason=f"skipped: {missing_javascript()}")
 

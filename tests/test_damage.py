@@ -5,10 +5,10 @@ import pytest
 import csplat
 from csplat import _spec
 from csplat.decoder import read_header
-from csplat_conformance.builder import build
+from csplat_authoring.builder import build
+from csplat_authoring.repair import chunk_records, repair
+from csplat_authoring.samples import rich_scene
 from csplat_conformance.manifest import VECTORS
-from csplat_conformance.repair import chunk_records, repair
-from csplat_conformance.samples import rich_scene
 
 SMALL = (VECTORS / "valid" / "worked_example.csplat").read_bytes()
 RICH = build(rich_scene()).data

@@ -10,9 +10,9 @@ import pytest
 from csplat import SplatModel, _spec
 from csplat.decoder import Limits, decode, decode_integers, decode_scene, iter_tiles, read_header, read_metadata
 from csplat.errors import FormatError, InputError, LimitError
-from csplat_conformance.builder import build
-from csplat_conformance.reference import expected
-from csplat_conformance.samples import (
+from csplat_authoring.builder import build
+from csplat_authoring.reference import expected
+from csplat_authoring.samples import (
     attributes,
     axis,
     book,
@@ -26,7 +26,7 @@ from csplat_conformance.samples import (
     signed,
     tile,
 )
-from csplat_conformance.scene import Chunk, Codebook, Stream
+from csplat_authoring.scene import Chunk, Codebook, Stream
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 RICH = build(rich_scene()).data

@@ -6,9 +6,9 @@ from csplat import _spec
 from csplat.decoder import decode, decode_scene, read_cameras, read_metadata, read_options, read_stated_errors
 from csplat.decoder.jsontext import parse_json
 from csplat.errors import FormatError
-from csplat_conformance.builder import build
-from csplat_conformance.samples import scene
-from csplat_conformance.scene import Chunk
+from csplat_authoring.builder import build
+from csplat_authoring.samples import scene
+from csplat_authoring.scene import Chunk
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ import zlib
 import pytest
 from tables import failures
 
-from csplat_conformance.deflate import Deflate, deflate_dynamic, deflate_fixed, deflate_stored
-from csplat_conformance.recipes.deflate_streams import broken_streams, sound_streams
+from csplat_authoring.deflate import Deflate, deflate_dynamic, deflate_fixed, deflate_stored
+from csplat_authoring.recipes.deflate_streams import broken_streams, sound_streams
 from csplat_conformance.validator.coders import uncoded
 from csplat_conformance.validator.inflate import CodedError, Inflater
 

@@ -15,20 +15,20 @@ from tables import failures
 
 from csplat import _spec, decoder
 from csplat.errors import FormatError, InputError
+from csplat_authoring.builder import build
+from csplat_authoring.repair import repair
+from csplat_authoring.samples import rich_scene
 from csplat_conformance import node, validator
 from csplat_conformance.answers import Answer
-from csplat_conformance.builder import build
-from csplat_conformance.fuzzing import plies
-from csplat_conformance.fuzzing.edges import Edges
-from csplat_conformance.fuzzing.plies import PlyTarget
-from csplat_conformance.fuzzing.ply_mutants import Ply
-from csplat_conformance.fuzzing.targets import DecoderTarget, OthersTarget, compared, missing_others
-from csplat_conformance.fuzzing.validating import ValidatorTarget
 from csplat_conformance.manifest import VECTORS
-from csplat_conformance.mutate import mapped, mutant_of
-from csplat_conformance.repair import repair
 from csplat_conformance.report import Status
-from csplat_conformance.samples import rich_scene
+from csplat_selftest.fuzzing import plies
+from csplat_selftest.fuzzing.edges import Edges
+from csplat_selftest.fuzzing.plies import PlyTarget
+from csplat_selftest.fuzzing.ply_mutants import Ply
+from csplat_selftest.fuzzing.targets import DecoderTarget, OthersTarget, compared, missing_others
+from csplat_selftest.fuzzing.validating import ValidatorTarget
+from csplat_selftest.mutate import mapped, mutant_of
 
 pytestmark = pytest.mark.slow  # together: tests of the fuzzer
 

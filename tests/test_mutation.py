@@ -8,16 +8,16 @@ from chromium import absent
 
 from csplat.errors import InputError
 from csplat_conformance.manifest import load
-from csplat_conformance.mutation import __main__ as command
-from csplat_conformance.mutation import judging
-from csplat_conformance.mutation.javascript import JavaScriptDecoder
-from csplat_conformance.mutation.mutants import Fate, Mutant, Result, sample, score, table
-from csplat_conformance.mutation.native import NativeDecoder
-from csplat_conformance.mutation.operators import python_mutants
-from csplat_conformance.mutation.python import PythonDecoder
-from csplat_conformance.mutation.tokens import c_mutants
 from csplat_conformance.native import missing_c
 from csplat_conformance.node import missing_javascript
+from csplat_selftest.mutation import __main__ as command
+from csplat_selftest.mutation import judging
+from csplat_selftest.mutation.javascript import JavaScriptDecoder
+from csplat_selftest.mutation.mutants import Fate, Mutant, Result, sample, score, table
+from csplat_selftest.mutation.native import NativeDecoder
+from csplat_selftest.mutation.operators import python_mutants
+from csplat_selftest.mutation.python import PythonDecoder
+from csplat_selftest.mutation.tokens import c_mutants
 
 pytestmark = pytest.mark.slow  # together: tests of the mutants
 

@@ -26,10 +26,10 @@ from csplat.files import atomic_writer
 from csplat.formats.sog_files import Parts
 from csplat.inputs import LetGo
 from csplat_conformance.answers import Answer
-from csplat_conformance.mutation import __main__ as mutation
 from csplat_conformance.process import run_program
 from csplat_conformance.report import Status
 from csplat_conformance.serving import Served
+from csplat_selftest.mutation import __main__ as mutation
 from csplat_tools.batches.finding import leads_out
 from csplat_tools.batches.records import JOURNAL, Record, open_journal, read_journal
 from csplat_tools.batches.workers import Worker, WorkerLostError
@@ -61,7 +61,6 @@ USERS = {
     "codec/csplat/inputs.py": "advice on pages that were read, if the system takes any",
     "codec/csplat/memory.py": "the size of the memory, if the system tells",
     "codec/csplat/system.py": "the replacements",
-    "conformance/csplat_conformance/mutation/python.py": "forks; `main` refuses systems that cannot",
     "conformance/csplat_conformance/serving.py": "waits for pipes, in a thread where it cannot",
     "trainer/csplat_trainer/report.py": "peak memory, or none",
 }

@@ -14,7 +14,7 @@ from csplat.decoder.blocks import Columns
 from csplat.decoder.morton import morton_axes
 from csplat.decoder.reconstruct import lattice_rows, opacity_table, write_colour, write_lattice, write_quats
 from csplat.decoder.streams import _undo_run_length, undo_transforms
-from csplat_conformance.deflate import Deflate
+from csplat_authoring.deflate import Deflate
 from csplat_conformance.near import too_far
 from csplat_conformance.room import may_be_stated
 

@@ -11,18 +11,18 @@ from tables import failures
 
 import csplat
 from csplat import _spec
-from csplat_conformance.builder import build
-from csplat_conformance.damage import flip, flips, prefixes
+from csplat_authoring.builder import build
+from csplat_authoring.recipes import sound_recipes
+from csplat_authoring.repair import repair
+from csplat_authoring.samples import attributes, rich_scene, scene, tile
+from csplat_authoring.scene import Attribute, Chunk, StatedErrors
 from csplat_conformance.manifest import load
-from csplat_conformance.mutate import mutant
-from csplat_conformance.recipes import sound_recipes
-from csplat_conformance.repair import repair
-from csplat_conformance.samples import attributes, rich_scene, scene, tile
-from csplat_conformance.scene import Attribute, Chunk, StatedErrors
 from csplat_conformance.validator import validate
 from csplat_conformance.validator.findings import VIOLATIONS_MAX
 from csplat_conformance.validator.jsontext import JsonError, parse
 from csplat_conformance.validator.rules import CODES
+from csplat_selftest.damage import flip, flips, prefixes
+from csplat_selftest.mutate import mutant
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
@@ -322,7 +322,7 @@ def test_every_flipped_bit_of_a_small_file_is_found():
 
 @pytest.mark.slow
 def test_flipped_bits_of_a_real_file_are_found(sample_path):
-    # `python -m csplat_conformance.damage FILE` flips 250, and takes any file.
+    # `python -m csplat_selftest.damage FILE` flips 250, and takes any file.
     data = csplat.encode(csplat.read_ply(sample_path).select(slice(0, 200)))
     plain, repaired = flips(data, 16, seed=5)
 

@@ -7,7 +7,7 @@ import zlib
 import numpy as np
 
 from csplat import _spec
-from csplat_conformance.mutate import mapped
+from csplat_selftest.mutate import mapped
 from wrong_encoders.mistake import Harm, Mistake
 
 

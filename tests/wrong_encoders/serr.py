@@ -3,7 +3,7 @@
 import dataclasses
 
 from csplat import _spec
-from csplat_conformance.mutate import mapped
+from csplat_selftest.mutate import mapped
 
 
 def serr_at(data):

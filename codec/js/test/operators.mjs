@@ -1,4 +1,4 @@
-// The mutants of JavaScript modules: operators, constants, bounds and statements, one at a time (csplat_conformance.mutation).
+// The mutants of JavaScript modules: operators, constants, bounds and statements, one at a time (csplat_selftest.mutation).
 //
 //   node operators.mjs .../typescript/lib/typescript.js a.mjs b.mjs    # a line of JSON: [[file, line, start, old, new], ...]
 

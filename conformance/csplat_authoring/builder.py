@@ -1,0 +1,351 @@
+"""Turn a declared scene into the bytes of a csplat file, field by field as the spec lists them.
+
+It shares no code with the encoder, checks nothing, and writes nonsense if the scene declares nonsense.
+Every field of the result has a name (`tile[0].extent`, `TILE.0.0/sh0.stream.count`), so that a vector can
+overwrite it afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from csplat import _spec
+from csplat_authoring import coders, deflate
+from csplat_authoring.reference import max_scale
+from csplat_authoring.repair import CHUNK_RECORDS, repair, seal
+from csplat_authoring.scene import Block, Chunk, Codebook, Scene, Stream, Tile, transpose
+from csplat_conformance.fields import Field, Writer
+
+#: Structures whose sizes the index head states, in its order, by the names that `Scene.tails` has for them.
+SIZED: Final = {
+    "head": "index_head",
+    "attribute": "attribute_record",
+    "codebook": "codebook_record",
+    "extra": "extra_record",
+    "directory": "directory_record",
+    "tile": "tile_record",
+    "layer": "layer_record",
+}
+_CODERS = {"stored": _spec.CODER_STORED, "deflate": _spec.CODER_DEFLATE}
+
+
+@dataclass(frozen=True)
+class Built:
+    """A file and the places of its fields.
+
+    Attributes:
+        data: the bytes.
+        fields: name to place.
+        spans: chunk name to (offset, size).
+    """
+
+    data: bytes
+    fields: dict[str, Field]
+    spans: dict[str, tuple[int, int]]
+
+    def patched(self, changes: dict[str, Any], repaired: bool = True) -> bytes:
+        """Return the bytes with fields overwritten and, unless told otherwise, all checksums repaired.
+
+        The CRCs that the changes name stay as they are given.
+        """
+        data = self._with(self.data, changes)
+        if not repaired:
+            return data
+        kept = {name: value for name, value in changes.items() if name.endswith("crc")}
+        data = self._with(repair(data, self.records), kept)
+        return self._with(seal(data), kept)  # the CRC of the index covers those of the chunks
+
+    def _with(self, data: bytes, changes: dict[str, Any]) -> bytes:
+        writer = Writer(bytearray(data), self.fields)
+        for name, value in changes.items():
+            writer.patch(name, value)
+        return bytes(writer.data)
+
+    @property
+    def records(self) -> list[tuple[str, int]]:
+        """Structure and place of the records that name chunks."""
+        return [
+            (entry.structure, entry.offset - CHUNK_RECORDS[entry.structure])
+            for name, entry in self.fields.items()
+            if entry.structure in CHUNK_RECORDS and name.endswith(".crc")
+        ]
+
+
+def build(scene: Scene) -> Built:
+    """Write a scene."""
+    chunks = _chunks(scene)
+    order = scene.order or tuple(chunks)
+    index_size = len(_index(scene, chunks, dict.fromkeys(chunks, 0)).data) + 4
+    at = _spec.HEADER_SIZE + index_size + len(scene.gap)
+    offsets = {}
+    for name in order:
+        offsets[name] = at
+        at += len(chunks[name].data)
+
+    file = Writer()
+    file.structure("header", "header", _header(index_size, at))
+    index = _index(scene, chunks, offsets)
+    file.append(index)
+    file.value("index.crc", "I", 0)
+    file.data += scene.gap
+    for name in order:
+        file.append(chunks[name], name + "/")
+    file.data += scene.trailing
+    spans = {name: (offsets[name], len(chunks[name].data)) for name in order}
+    unsealed = Built(bytes(file.data), file.fields, spans)
+    return replace(unsealed, data=unsealed.patched({}))
+
+
+def chunk_names(scene: Scene) -> list[str]:
+    """Return the names of the chunks in the order that the spec recommends (4.3.6)."""
+    return list(_chunks(scene))
+
+
+def _header(index_size: int, file_size: int) -> list[Any]:
+    version = (_spec.VERSION_MAJOR, _spec.VERSION_MINOR)
+    return [_spec.MAGIC, *version, _spec.PROFILE_BASE, 0, 0, index_size, file_size, 0]
+
+
+# Index ---------------------------------------------------------------------------------------------
+
+
+class _Records(Writer):
+    """The index: structures with the tails that the scene declares."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        self.tails = {SIZED[kind]: tail for kind, tail in scene.tails}
+
+    def structure(self, name: str, structure: str, values: Iterable[Any]) -> None:
+        super().structure(name, structure, values)
+        tail = self.tails.get(structure, b"")
+        if tail:
+            self.raw(f"{name}.tail", tail)
+
+    def size_of(self, structure: str) -> int:
+        return int(getattr(_spec, f"{structure.upper()}_SIZE")) + len(self.tails.get(structure, b""))
+
+
+def _index(scene: Scene, chunks: dict[str, Writer], offsets: dict[str, int]) -> Writer:
+    out = _Records(scene)
+    sizes = [out.size_of(name) for name in SIZED.values()]
+    directory = scene.directory or tuple(n for n in scene.order or chunks if not n.startswith("TILE."))
+    counts = [len(directory), len(scene.codebooks), len(scene.extras), len(scene.attributes)]
+    splats = sum(tile.splat_count for tile in scene.tiles)
+    facts: list[Any] = [scene.sh_degree, scene.scene_flags, bytes(scene.axes), scene.unit_metres, scene.origin]
+    out.structure("index", "index_head", [*sizes, 0, splats, len(scene.tiles), *counts, *facts])
+    for attribute, record in scene.attributes.items():
+        name = f"attribute[{_spec.ATTRIBUTE_NAMES.get(attribute, attribute)}]"
+        facts = [attribute, record.mapping, record.chroma_shift, 0, record.levels, record.step]
+        out.structure(name, "attribute_record", facts)
+    for book in scene.codebooks:
+        values = [book.id, book.kind, *book.bands, 0, 0, len(next(iter(book.entries.values())))]
+        out.structure(f"codebook[{book.id}]", "codebook_record", values)
+    for i, extra in enumerate(scene.extras):
+        encoded = extra.name.encode()
+        out.structure(f"extra[{i}]", "extra_record", [extra.dtype, len(encoded), encoded])
+    for name in directory:
+        out.structure(f"directory[{name}]", "directory_record", _directory(scene, name, chunks[name], offsets[name]))
+    for i, tile in enumerate(scene.tiles):
+        _tile_record(out, scene, i, tile, chunks, offsets)
+    return out
+
+
+def _directory(scene: Scene, name: str, chunk: Writer, offset: int) -> list[Any]:
+    if name.startswith("CODB."):
+        _, book_id, layer = name.split(".")
+        kind, ids = _spec.CHUNK_CODEBOOK, (int(book_id), int(layer))
+    else:
+        declared = dict(zip(_ancillary_names(scene), scene.chunks, strict=True))[name]
+        kind, ids = declared.type, (declared.id, declared.layer)
+    flags = _spec.unpack_chunk_header(chunk.data).flags
+    return [kind, flags, *ids, 0, 0, len(chunk.data), offset, 0]
+
+
+def _tile_record(
+    out: _Records, scene: Scene, i: int, tile: Tile, chunks: dict[str, Writer], offsets: dict[str, int]
+) -> None:
+    used = {b.codebook for b in tile.blocks.values() if b.coding == _spec.CODING_CODEBOOK}
+    tables = sorted(used) if tile.tables is None else tile.tables
+    columns = zip(*tile.blocks[_spec.ATTRIBUTE_MEANS].rows, strict=True)
+    extent = tuple(max(column) for column in columns)
+    head: list[Any] = [tile.splat_count, 0, len(tile.layers), len(tables), tile.exponent, 0]
+    scale = max_scale(scene, tile) if _spec.ATTRIBUTE_SCALES in tile.blocks else 0.0
+    out.structure(f"tile[{i}]", "tile_record", [*head, tile.corner, extent, scale])
+    for layer in tile.layers:
+        name = f"TILE.{i}.{layer}"
+        where = [len(chunks[name].data), offsets[name], 0]
+        out.structure(f"tile[{i}].layer[{layer}]", "layer_record", [layer, 0, 0, *where])
+    for k, table in enumerate(tables):
+        out.value(f"tile[{i}].table[{k}]", "H", table)
+
+
+# Chunks --------------------------------------------------------------------------------------------
+
+
+def _chunks(scene: Scene) -> dict[str, Writer]:
+    """Return all chunks by name, in the recommended order."""
+    out = {}
+    for name, chunk in zip(_ancillary_names(scene), scene.chunks, strict=True):
+        flags = chunk.flags if chunk.flags is not None else _flags(chunk.type)
+        out[name] = _framed(chunk.type, flags, _ancillary(chunk))
+    for layer in sorted({*_spec.LAYER_NAMES, *(layer for tile in scene.tiles for layer in tile.layers)}):
+        for book in scene.codebooks:
+            if layer in book.layers:
+                out[f"CODB.{book.id}.{layer}"] = _framed(
+                    _spec.CHUNK_CODEBOOK, _flags(_spec.CHUNK_CODEBOOK), _codebook(book, layer)
+                )
+        for i, tile in enumerate(scene.tiles):
+            if layer in tile.layers:
+                payload = _tile(scene, tile, layer) if layer in _spec.LAYER_NAMES else _unknown(tile, layer)
+                out[f"TILE.{i}.{layer}"] = _framed(_spec.CHUNK_TILE, _flags(_spec.CHUNK_TILE), payload)
+    return out
+
+
+def _ancillary_names(scene: Scene) -> list[str]:
+    names: list[str] = []
+    for chunk in scene.chunks:
+        name = chunk.type.decode("latin-1")
+        names.append(name + f"#{names.count(name)}" * (name in names))
+    return names
+
+
+def _flags(kind: bytes) -> int:
+    values = {name: bit for bit, name in _spec.CHUNK_FLAG_NAMES.items()}
+    return sum(values[name] for name in _spec.CHUNK_FLAGS.get(kind, ()))
+
+
+def _framed(kind: bytes, flags: int, payload: Writer) -> Writer:
+    out = Writer()
+    out.structure("header", "chunk_header", [kind, flags, 0, len(payload.data)])
+    out.append(payload)
+    return out
+
+
+def _ancillary(chunk: Chunk) -> Writer:
+    out = Writer()
+    if chunk.text is not None:
+        _stream(out, "stream", list(chunk.text), chunk.how)
+    elif chunk.errors is not None:
+        stated = chunk.errors
+        head = [stated.source_count, stated.pruned_count, stated.source_sh_degree, stated.flags]
+        out.structure("head", "stated_errors_head", [*head, len(stated.records)])
+        for measure, largest, rms in stated.records:
+            name = f"record[{_spec.MEASURE_NAMES[measure]}]"
+            out.structure(name, "stated_error_record", [measure, 0, 0, 0, largest, rms])
+    elif chunk.payload:
+        out.raw("payload", chunk.payload)
+    _tail(out, chunk.tail)
+    return out
+
+
+def _codebook(book: Codebook, layer: int) -> Writer:
+    out = Writer()
+    out.structure("head", "codebook_head", [book.id, layer, 0])
+    _stream(out, "entries", transpose(book.entries[layer]), book.how)
+    _tail(out, book.tail)
+    return out
+
+
+def _tile(scene: Scene, tile: Tile, layer: int) -> Writer:
+    out = Writer()
+    blocks: list[tuple[str, int, Block]] = []
+    if layer == _spec.LAYER_EXTRA:
+        blocks = [(f"extra[{k}]", _spec.ATTRIBUTE_EXTRA, block) for k, block in enumerate(tile.extras)]
+    else:
+        attributes = [a for a in tile.blocks if _spec.ATTRIBUTE_LAYER[a] == layer]
+        if layer == _spec.LAYER_GEOMETRY:
+            attributes = [a for a in tile.order if a in attributes]
+        blocks = [(_spec.ATTRIBUTE_NAMES[a], a, tile.blocks[a]) for a in attributes]
+    out.structure("head", "tile_head", [layer, len(blocks), 0])
+    for k, (name, attribute, block) in enumerate(blocks):
+        _block(out, name, scene, attribute, block, k)
+    _tail(out, dict(tile.tails).get(layer, b""))
+    return out
+
+
+def _unknown(tile: Tile, layer: int) -> Writer:
+    out = Writer()
+    out.raw("payload", dict(tile.unknown)[layer])
+    return out
+
+
+def _tail(out: Writer, tail: bytes) -> None:
+    if tail:
+        out.raw("tail", tail)
+
+
+# Blocks and streams --------------------------------------------------------------------------------
+
+
+def _block(out: Writer, name: str, scene: Scene, attribute: int, block: Block, place: int) -> None:
+    out.structure(name, "block_head", [attribute, block.coding, 0])
+    if block.coding in (_spec.CODING_OFFSET, _spec.CODING_SIGNED):
+        _lattice(out, name, block)
+    elif block.coding == _spec.CODING_SPARSE:
+        out.structure(f"{name}.params", "sparse_params", [block.exponent, 0, len(block.rows)])
+        whole = sum(bit << i for i, bit in enumerate(block.mask))
+        _stream(out, f"{name}.mask", [*whole.to_bytes(-(-len(block.mask) // 8), "little")], block.mask_how)
+        _stream(out, f"{name}.stream", transpose(block.rows), block.how)
+    elif block.coding == _spec.CODING_MORTON:
+        out.structure(f"{name}.params", "morton_params", [block.bits, 0, 0])
+        _stream(out, f"{name}.stream", [_morton(row) for row in block.rows], block.how)
+    elif block.coding == _spec.CODING_CODEBOOK:
+        _codebook_block(out, name, scene, attribute, block)
+    else:
+        if block.coding == _spec.CODING_RAW:
+            out.structure(f"{name}.params", "raw_params", [place, 0])
+        _stream(out, f"{name}.stream", transpose(block.rows), block.how)
+    if block.tail:
+        out.raw(f"{name}.tail", block.tail)
+
+
+def _lattice(out: Writer, name: str, block: Block) -> None:
+    out.structure(f"{name}.params", "lattice_params", [block.exponent, 0])
+    columns = [list(column) for column in zip(*block.rows, strict=True)]
+    if block.coding == _spec.CODING_OFFSET:
+        offsets = block.offsets or tuple(min(column) for column in columns)
+        out.value(f"{name}.offsets", f"{len(offsets)}i", offsets)
+        columns = [[v - offset for v in column] for column, offset in zip(columns, offsets, strict=True)]
+    _stream(out, f"{name}.stream", [v for column in columns for v in column], block.how)
+
+
+def _codebook_block(out: Writer, name: str, scene: Scene, attribute: int, block: Block) -> None:
+    escapes = len(block.escape.rows) if block.escape else 0
+    out.structure(f"{name}.params", "codebook_params", [block.codebook, 0, escapes])
+    if block.indices:
+        _stream(out, f"{name}.indices", block.indices, block.index_how)
+    if block.summands:
+        (offset,) = block.offsets or (min(block.summands),)
+        out.structure(f"{name}.summand", "lattice_params", [0, 0])
+        out.value(f"{name}.summand.offset", "i", offset)
+        _stream(out, f"{name}.summand.stream", [v - offset for v in block.summands], block.how)
+    if block.escape:
+        _block(out, f"{name}.escape", scene, attribute, block.escape, 0)
+
+
+def _morton(row: Sequence[int]) -> int:
+    return sum((q >> b & 1) << 3 * b + axis for axis, q in enumerate(row) for b in range(q.bit_length()))
+
+
+def _stream(out: Writer, name: str, values: Sequence[int], how: Stream) -> None:
+    packed = coders.apply_transforms(values, how.width, how.transforms) if how.packed is None else how.packed
+    coded = _coded(packed, how) if how.coded is None else how.coded
+    transforms = bytes(how.transforms).ljust(_spec.TRANSFORMS_MAX, b"\0")
+    coder = _CODERS[how.coder.split("_")[0]]
+    head = [how.width, coder, transforms, 0, len(values), len(packed), len(coded)]
+    out.structure(name, "stream_head", head)
+    out.raw(f"{name}.coded", coded)
+
+
+def _coded(packed: bytes, how: Stream) -> bytes:
+    if how.coder == "stored":
+        return packed
+    coder = {
+        "deflate_stored": deflate.deflate_stored,
+        "deflate_fixed": deflate.deflate_fixed,
+        "deflate_dynamic": deflate.deflate_dynamic,
+    }[how.coder]
+    return coder(packed)

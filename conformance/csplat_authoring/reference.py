@@ -1,0 +1,208 @@
+"""Compute what a decoder must return for a scene, straight from the formulae of the spec (sections 6.4.5, 7 and 9.2).
+
+Python integers and one IEEE operation at a time; slow on purpose, and independent of `csplat.decoder`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat_authoring.scene import Block, Rows, Scene, Tile, attribute_named, band_of
+
+Array = NDArray[Any]
+
+#: NumPy's names for the types of extra columns, by registry value.
+EXTRA_DTYPES = {value: f"<{name[0]}{_spec.EXTRA_DTYPE_BYTES[value]}" for value, name in _spec.EXTRA_DTYPE_NAMES.items()}
+
+_ROOT_2 = float.fromhex("0x1.6A09E667F3BCDp+0")
+_COLOURS = (_spec.ATTRIBUTE_SH0, _spec.ATTRIBUTE_SH1, _spec.ATTRIBUTE_SH2, _spec.ATTRIBUTE_SH3)
+
+
+@dataclass
+class Expected:
+    """Header facts and arrays."""
+
+    header: dict[str, Any]
+    integers: dict[str, Array] = field(default_factory=dict)
+    floats: dict[str, Array] = field(default_factory=dict)
+    extra: dict[str, Array] = field(default_factory=dict)
+
+
+def expected(scene: Scene) -> Expected:
+    """Compute everything that the manifest states about a valid file."""
+    result = Expected(_header(scene))
+    rows = {attribute: _all_rows(scene, attribute) for attribute in scene.attributes}
+    result.integers = _integers(scene, rows)
+    result.floats = _floats(scene, rows)
+    for i, extra in enumerate(scene.extras):
+        if extra.dtype not in EXTRA_DTYPES:
+            continue  # ANC-3
+        bits = [row[0] for tile in scene.tiles for row in tile.extras[i].rows]
+        size = _spec.EXTRA_DTYPE_BYTES[extra.dtype]
+        raw = b"".join(value.to_bytes(size, "little") for value in bits)
+        result.extra[extra.name] = np.frombuffer(raw, EXTRA_DTYPES[extra.dtype])
+    return result
+
+
+def _header(scene: Scene) -> dict[str, Any]:
+    return {
+        "profile": _spec.PROFILE_NAMES[_spec.PROFILE_BASE],
+        "splat_count": sum(tile.splat_count for tile in scene.tiles),
+        "tile_count": len(scene.tiles),
+        "sh_degree": scene.sh_degree,
+        "scene_flags": [name for bit, name in _spec.SCENE_FLAG_NAMES.items() if scene.scene_flags & bit],
+        "axes": "".join(_spec.DIRECTION_LETTER[axis] for axis in scene.axes),
+        "unit_metres": scene.unit_metres or 0.0,  # 0 of either sign is 0
+        "origin": list(scene.origin),
+    }
+
+
+def block_rows(scene: Scene, tile: Tile, attribute: int, block: Block) -> list[list[int]]:
+    """Return [n, C] integers of a block: for means q, for colours before the lifting of 7.1."""
+    if block.coding == _spec.CODING_SPARSE:
+        present, zeros = iter(block.rows), [0] * _spec.ATTRIBUTE_COLUMNS[attribute]
+        return [list(next(present)) if bit else zeros for bit in block.mask]
+    if block.coding != _spec.CODING_CODEBOOK:
+        return [list(row) for row in block.rows]
+    book = next(book for book in scene.codebooks if book.id == block.codebook)
+    first = next(b for b in tile.blocks.values() if b.codebook == book.id and b.indices)
+    layer, columns = band_of(attribute), _spec.ATTRIBUTE_COLUMNS[attribute]
+    start = 0
+    if attribute == _spec.ATTRIBUTE_QUATS:
+        start = _spec.ATTRIBUTE_COLUMNS[_spec.ATTRIBUTE_SCALES]
+    entries = book.entries[layer]
+    escaped = iter(block.escape.rows if block.escape else ())
+    result = []
+    for splat, index in enumerate(first.indices):
+        if index == len(entries):
+            result.append(list(next(escaped)))
+            continue
+        summand = block.summands[splat] if block.summands else 0
+        result.append([summand + value for value in entries[index][start : start + columns]])
+    return result
+
+
+def _all_rows(scene: Scene, attribute: int) -> list[list[list[int]]]:
+    """Return for each tile the integers of an attribute, zeros for a band left out."""
+    zero = [0] * _spec.ATTRIBUTE_COLUMNS[attribute]
+    result = []
+    for tile in scene.tiles:
+        block = tile.blocks.get(attribute)
+        rows = block_rows(scene, tile, attribute, block) if block else [zero] * tile.splat_count
+        if attribute in _COLOURS:
+            rows = _lifted(scene, attribute, rows)
+        if attribute == _spec.ATTRIBUTE_MEANS:
+            rows = [[c + q for c, q in zip(tile.corner, row, strict=True)] for row in rows]
+        result.append(rows)
+    return result
+
+
+def _lifted(scene: Scene, attribute: int, rows: Rows) -> list[list[int]]:
+    """Return the columns R, G, B of each coefficient in the order of the file's columns (spec 7.1)."""
+    record = scene.attributes[attribute]
+    if record.mapping != _spec.MAPPING_YCOCG:
+        return [list(row) for row in rows]
+    coefficients = 2 * band_of(attribute) + 1
+    result = []
+    for row in rows:
+        lifted = [0] * len(row)
+        for m in range(coefficients):
+            y, co, cg = row[m], row[coefficients + m], row[2 * coefficients + m]
+            co, cg = co * 2**record.chroma_shift, cg * 2**record.chroma_shift
+            t = y - (cg >> 1)
+            green = cg + t
+            blue = t - (co >> 1)
+            lifted[m], lifted[coefficients + m], lifted[2 * coefficients + m] = blue + co, green, blue
+        result.append(lifted)
+    return result
+
+
+def _exponent(tile: Tile, attribute: int) -> int:
+    if attribute == _spec.ATTRIBUTE_MEANS:
+        return tile.exponent
+    block = tile.blocks.get(attribute)
+    return 0 if block is None else block.exponent
+
+
+def _integers(scene: Scene, rows: dict[int, list[list[list[int]]]]) -> dict[str, Array]:
+    dtypes = {_spec.ATTRIBUTE_OPACITIES: "<u4", _spec.ATTRIBUTE_QUATS: "<i4"}
+    result: dict[str, Array] = {}
+    for attribute, tiles in rows.items():
+        flat = [row for tile in tiles for row in tile]
+        columns = _spec.ATTRIBUTE_COLUMNS[attribute]
+        array = np.array(flat, dtypes.get(attribute, "<i8")).reshape(len(flat), columns)
+        if attribute == _spec.ATTRIBUTE_OPACITIES:
+            array = array[:, 0].copy()
+        elif band_of(attribute):
+            array = np.ascontiguousarray(array.reshape(len(flat), 3, columns // 3).transpose(0, 2, 1))
+        result[_spec.ATTRIBUTE_NAMES[attribute]] = array
+    result["tile_splats"] = np.array([tile.splat_count for tile in scene.tiles], "<u4")
+    table = [[_exponent(tile, attribute) for attribute in scene.attributes] for tile in scene.tiles]
+    result["exponents"] = np.array(table, "<i4").reshape(len(scene.tiles), len(scene.attributes))
+    return result
+
+
+def lattice_value(n: int, step: float, exponent: int) -> np.float32:
+    """Return the value of a lattice integer (spec 7.2)."""
+    with np.errstate(over="ignore"):  # files to be refused overflow on purpose
+        return np.float32(float(n) * math.ldexp(step, exponent))
+
+
+def _lattice(scene: Scene, attribute: int, rows: list[list[list[int]]]) -> Array:
+    step, columns = scene.attributes[attribute].step, _spec.ATTRIBUTE_COLUMNS[attribute]
+    values = [
+        [lattice_value(n, step, _exponent(tile, attribute)) for n in row]
+        for tile, tile_rows in zip(scene.tiles, rows, strict=True)
+        for row in tile_rows
+    ]
+    return np.array(values, "<f4").reshape(len(values), columns)
+
+
+def max_scale(scene: Scene, tile: Tile) -> float:
+    """Return the largest decoded scale of a tile: the value of the largest integer."""
+    attribute = _spec.ATTRIBUTE_SCALES
+    block = tile.blocks[attribute]
+    largest = max(max(row) for row in block_rows(scene, tile, attribute, block))
+    return float(lattice_value(largest, scene.attributes[attribute].step, block.exponent))
+
+
+def _floats(scene: Scene, rows: dict[int, list[list[list[int]]]]) -> dict[str, Array]:
+    count = sum(tile.splat_count for tile in scene.tiles)
+    result = {
+        _spec.ATTRIBUTE_NAMES[attribute]: _lattice(scene, attribute, rows[attribute])
+        for attribute in (_spec.ATTRIBUTE_MEANS, _spec.ATTRIBUTE_SCALES, _spec.ATTRIBUTE_SH0)
+    }
+    result["opacities"] = _opacities(scene, rows[_spec.ATTRIBUTE_OPACITIES])
+    result["quats"] = _quats(scene, rows[_spec.ATTRIBUTE_QUATS])
+    bands = []
+    for band in range(1, scene.sh_degree + 1):
+        attribute = attribute_named(f"sh{band}")
+        values = _lattice(scene, attribute, rows[attribute])
+        bands.append(values.reshape(count, 3, 2 * band + 1).transpose(0, 2, 1))
+    result["shN"] = np.concatenate(bands, 1) if bands else np.zeros((count, 0, 3), "<f4")
+    return {name: np.ascontiguousarray(array, "<f4") for name, array in result.items()}
+
+
+def _opacities(scene: Scene, rows: list[list[list[int]]]) -> Array:
+    record = scene.attributes[_spec.ATTRIBUTE_OPACITIES]
+    m = record.levels
+    power = 2 if record.mapping == _spec.MAPPING_SQUARE else 1
+    return np.array([np.float32(float(q**power) / float(m**power)) for tile in rows for (q,) in tile], "<f4")
+
+
+def _quats(scene: Scene, rows: list[list[list[int]]]) -> Array:
+    m = scene.attributes[_spec.ATTRIBUTE_QUATS].levels
+    c = 1.0 / (float(m) * _ROOT_2)
+    values = []
+    for tile in rows:
+        for q1, q2, q3 in tile:
+            r = 2 * m * m - q1 * q1 - q2 * q2 - q3 * q3
+            w = np.float32(math.sqrt(float(r)) * c)
+            values.append([w, *(np.float32(float(q) * c) for q in (q1, q2, q3))])
+    return np.array(values, "<f4").reshape(len(values), 4)

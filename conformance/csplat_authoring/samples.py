@@ -1,0 +1,239 @@
+"""Small scenes and blocks that the recipes vary: seeded integers, no meaning."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from csplat import _spec
+from csplat_authoring.scene import (
+    PAIRS,
+    PLAIN,
+    Attribute,
+    Block,
+    Chunk,
+    Codebook,
+    Extra,
+    Rows,
+    Scene,
+    StatedErrors,
+    Stream,
+    Tile,
+)
+
+OPACITIES, SCALES, QUATS, MEANS, SH0 = (
+    _spec.ATTRIBUTE_OPACITIES,
+    _spec.ATTRIBUTE_SCALES,
+    _spec.ATTRIBUTE_QUATS,
+    _spec.ATTRIBUTE_MEANS,
+    _spec.ATTRIBUTE_SH0,
+)
+_LEVELS_OPACITIES, _LEVELS_QUATS = 255, 127
+
+
+@dataclass(frozen=True)
+class View:
+    """A rendering.
+
+    Attributes:
+        camera: K, viewmat, W, H and near, as a camera file has them.
+        psnr: PSNR that a renderer's picture must reach against the reference, dB.
+    """
+
+    camera: dict[str, Any]
+    psnr: float
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One vector.
+
+    Attributes:
+        name: group and name, `valid/morton`.
+        why: one line: what it shows, why it hurts.
+        clauses: ids that it covers; for invalid files first the one it breaks.
+        data: makes the file.
+        scene: the scene that it must decode to; None if it must be refused.
+        code: error code, if it must be refused.
+        offset: the defect's byte, if a single one is to blame.
+        also: further codes that a decoder may report.
+        optional: type of the chunk in whose payload the defect lies, `META`: decoders that leave it unread (CHK-6)
+            accept the file. Empty if every decoder refuses it.
+        views: reference views, for scenes that are rendered.
+    """
+
+    name: str
+    why: str
+    clauses: tuple[str, ...]
+    data: Callable[[], bytes]
+    scene: Scene | None = None
+    code: str = ""
+    offset: int | None = None
+    also: tuple[str, ...] = ()
+    optional: str = ""
+    views: tuple[View, ...] = ()
+
+
+def integers(seed: int, count: int, low: int, high: int) -> list[int]:
+    """Return seeded integers from low to high (a 64-bit linear congruential generator, Knuth's constants)."""
+    state, result = seed * 2 + 1, []
+    for _ in range(count):
+        state = (state * 6364136223846793005 + 1442695040888963407) % 2**64
+        result.append(low + (state >> 33) % (high - low + 1))
+    return result
+
+
+def rows_of(seed: int, n: int, columns: int, low: int, high: int) -> list[list[int]]:
+    """Return [n, columns] seeded integers."""
+    flat = integers(seed, n * columns, low, high)
+    return [flat[i * columns : (i + 1) * columns] for i in range(n)]
+
+
+def means_rows(seed: int, n: int, high: int) -> list[list[int]]:
+    """Return [n, 3] integers whose minimum is 0 on each axis."""
+    rows = rows_of(seed, n, 3, 0, high)
+    low = [min(column) for column in zip(*rows, strict=True)]
+    return [[q - least for q, least in zip(row, low, strict=True)] for row in rows]
+
+
+def quat_rows(seed: int, n: int, m: int = _LEVELS_QUATS) -> list[list[int]]:
+    """Return [n, 3] integers of rotations at M levels."""
+    return rows_of(seed, n, 3, -(m * 2 // 3), m * 2 // 3)
+
+
+def levels(values: Sequence[int], how: Stream = PLAIN) -> Block:
+    """Return a block coded LEVELS."""
+    return Block(_spec.CODING_LEVELS, [[value] for value in values], how)
+
+
+def morton(rows: Rows, bits: int, how: Stream = PAIRS) -> Block:
+    """Return a block coded MORTON."""
+    return Block(_spec.CODING_MORTON, rows, how, bits=bits)
+
+
+def axis(rows: Rows, how: Stream = PLAIN) -> Block:
+    """Return a block coded AXIS."""
+    return Block(_spec.CODING_AXIS, rows, how)
+
+
+def offset(rows: Rows, how: Stream = PLAIN, exponent: int = 0, offsets: tuple[int, ...] = ()) -> Block:
+    """Return a block coded OFFSET; the offsets are the columns' minima unless given."""
+    return Block(_spec.CODING_OFFSET, rows, how, exponent=exponent, offsets=offsets)
+
+
+def signed(rows: Rows, how: Stream = PLAIN, exponent: int = 0) -> Block:
+    """Return a block coded SIGNED."""
+    return Block(_spec.CODING_SIGNED, rows, how, exponent=exponent)
+
+
+def sparse(
+    mask: tuple[int, ...], rows: Rows, how: Stream = PLAIN, mask_how: Stream = PLAIN, exponent: int = 0
+) -> Block:
+    """Return a block coded SPARSE: a bit per splat, and the rows of those whose bit is 1."""
+    return Block(_spec.CODING_SPARSE, rows, how, exponent=exponent, mask=mask, mask_how=mask_how)
+
+
+def book(
+    codebook: int,
+    indices: tuple[int, ...] = (),
+    escape: Block | None = None,
+    how: Stream = PLAIN,
+    **rest: Any,
+) -> Block:
+    """Return a block coded CODEBOOK; without indices it is not the first of its codebook."""
+    return Block(_spec.CODING_CODEBOOK, codebook=codebook, indices=indices, index_how=how, escape=escape, **rest)
+
+
+def sh_attribute(band: int) -> int:
+    """Return the registry value of an SH band."""
+    return SH0 + band
+
+
+def single(step: float) -> float:
+    """Return the binary32 value nearest to a step."""
+    return float(np.float32(step))
+
+
+def attributes(degree: int = 0, ycocg: bool = False, chroma_shift: int = 0) -> dict[int, Attribute]:
+    """Return attribute records with steps that are not powers of two, of colours and scales in binary32."""
+    colour = _spec.MAPPING_YCOCG if ycocg else _spec.MAPPING_LATTICE
+    result = {
+        OPACITIES: Attribute(_spec.MAPPING_LINEAR, levels=_LEVELS_OPACITIES),
+        SCALES: Attribute(_spec.MAPPING_LATTICE, single(0.1)),
+        QUATS: Attribute(_spec.MAPPING_UNIT_W, levels=_LEVELS_QUATS),
+        MEANS: Attribute(_spec.MAPPING_LATTICE, 0.001),
+    }
+    for band in range(degree + 1):
+        result[SH0 + band] = Attribute(colour, single(0.03 / (band + 1)), chroma_shift=chroma_shift)
+    return result
+
+
+def tile(seed: int = 1, n: int = 2, degree: int = 0, changes: dict[int, Block] | None = None, **rest: Any) -> Tile:
+    """Return a tile of seeded integers in one-byte streams."""
+    blocks = {
+        OPACITIES: levels(integers(seed, n, 0, _LEVELS_OPACITIES)),
+        SCALES: offset(rows_of(seed + 1, n, 3, -90, 20)),
+        QUATS: signed(quat_rows(seed + 2, n)),
+        MEANS: axis(means_rows(seed + 3, n, 200)),
+        SH0: offset(rows_of(seed + 4, n, 3, -60, 60)),
+    }
+    for band in range(1, degree + 1):
+        blocks[SH0 + band] = signed(rows_of(seed + 4 + band, n, 3 * (2 * band + 1), -100, 100))
+    blocks |= changes or {}
+    values: dict[str, Any] = {"corner": (-100, 5, 1000)}
+    return Tile(blocks, **(values | rest))
+
+
+def scene(degree: int = 0, tiles: Sequence[Tile] | None = None, **rest: Any) -> Scene:
+    """Return a scene of one small tile, or of the tiles given."""
+    values: dict[str, Any] = {"attributes": attributes(degree), "sh_degree": degree}
+    values["tiles"] = (tile(degree=degree),) if tiles is None else tuple(tiles)
+    return Scene(**(values | rest))
+
+
+def coded(scene: Scene, how: Callable[[Stream], Stream]) -> Scene:
+    """Return the scene with the coding of every stream of a tile changed."""
+    tiles = []
+    for one in scene.tiles:
+        blocks = {attribute: replace(block, how=how(block.how)) for attribute, block in one.blocks.items()}
+        tiles.append(replace(one, blocks=blocks))
+    return replace(scene, tiles=tuple(tiles))
+
+
+def rich_scene() -> Scene:
+    """Return a scene of two tiles with codebooks, escapes, an absent band, extras and all known chunks."""
+    shape = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(1, 3, 6, -40, 40)})
+    colours = Codebook(
+        7,
+        _spec.CODEBOOK_KIND_SH,
+        {band: rows_of(band, 4, 3 * (2 * band + 1), -50, 50) for band in (1, 2)},
+        (1, 2),
+    )
+    escape1, escape2 = signed(rows_of(21, 1, 9, -500, 500), Stream(2)), offset(rows_of(22, 1, 15, -5, 5))
+    first = tile(
+        3,
+        3,
+        0,
+        {
+            SCALES: book(2, (0, 2, 1), summands=(-50, -40, -60)),
+            QUATS: book(2),
+            SH0 + 1: book(7, (0, 4, 3), escape1),
+            SH0 + 2: book(7, (), escape2),
+        },
+        extras=(Block(_spec.CODING_RAW, [[5], [0], [65535]], Stream(2)),),
+    )
+    second = tile(5, 2, 2, exponent=1, extras=(Block(_spec.CODING_RAW, [[1], [2]], Stream(2)),))
+    return Scene(
+        attributes(2, ycocg=True, chroma_shift=1),
+        (first, second),
+        codebooks=(shape, colours),
+        extras=(Extra("label", _spec.EXTRA_DTYPE_U16),),
+        chunks=(
+            Chunk(_spec.CHUNK_METADATA, b'{"title":"rich"}'),
+            Chunk(_spec.CHUNK_STATED_ERRORS, errors=StatedErrors(6, 1, 3, 0, ((_spec.MEASURE_MEANS, 0.5, 0.25),))),
+        ),
+        sh_degree=2,
+    )

@@ -1,1 +1,0 @@
-"""Decoders changed operator by operator: which changes do the vectors miss? `python -m csplat_conformance.mutation`."""

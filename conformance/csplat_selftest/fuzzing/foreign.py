@@ -1,0 +1,175 @@
+"""Readers of other formats under malformed files: bytes damaged, inside of what is packed, too."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import random
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Generator, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import csplat
+from csplat.errors import InputError
+from csplat.formats import formats, read, write
+from csplat.model import SplatModel, normalise_quats
+from csplat_selftest.fuzzing.plies import FileTarget, unsound
+from csplat_selftest.fuzzing.targets import Case
+
+_OWN = ("ply", "csplat")  # formats that have targets of their own
+_COUNTS = (b"\x00\x00\x00\x00", b"\x01\x00\x00\x00", b"\xff\xff\xff\x7f", b"\xff\xff\xff\xff", b"\x00\x00\x00\x80")
+_PACKAGE = Path(csplat.__file__).parent
+
+
+@dataclass(frozen=True)
+class Seed:
+    """A file.
+
+    Attributes:
+        ending: ending of its name.
+        content: content of the file.
+    """
+
+    ending: str
+    content: bytes
+
+    @property
+    def data(self) -> bytes:
+        """Both, the ending on a line of its own."""
+        return self.ending.encode() + b"\n" + self.content
+
+    @classmethod
+    def of(cls, data: bytes) -> Seed:
+        """The other way round."""
+        ending, _, content = data.partition(b"\n")
+        return cls(ending.decode("ascii", "replace").replace("/", "_").replace("\0", "_"), content)
+
+
+class FormatTarget(FileTarget):
+    """`csplat.read` of formats that are not ours: a sound model or an InputError. Cases begin with their ending."""
+
+    name = "formats"
+    suffix = ".case"
+    watched: Sequence[Path] = tuple(sorted(_PACKAGE.glob("formats/*.py")))
+
+    def seeds(self, paths: Iterable[Path]) -> list[Seed]:
+        """Return small scenes in every format that is written to one file, and the given files."""
+        folder = Path(self._folder.name)
+        found = []
+        for one in formats():
+            if one.write is None or one.open is None or one.name in _OWN:
+                continue
+            for degree in range(one.degree + 1):
+                path = folder / f"seed{(one.suffixes or ('.' + one.name,))[0]}"
+                write(path, _scene(degree), one.name)
+                found.append(Seed("".join(path.suffixes), path.read_bytes()))
+        return found + [Seed("".join(path.suffixes), path.read_bytes()) for path in paths]
+
+    def mutant(self, rng: random.Random, corpus: Sequence[Seed]) -> Case:
+        """Damage a file, or what is packed in it."""
+        seed = rng.choice(corpus)
+        change = _inside if rng.random() < 0.6 else _damaged
+        changed = Seed(seed.ending, change(rng, seed.content))
+        return Case(changed.data, lambda: changed)
+
+    def attempt(self, data: bytes) -> tuple[str, str]:
+        """Read a file."""
+        seed = Seed.of(data)
+        path = Path(self._folder.name) / f"case{seed.ending}"
+        path.write_bytes(seed.content)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                model = read(path, keep_extra=zlib.crc32(data) % 4 == 0)
+            except InputError:
+                return "refused", ""
+            wrong = unsound(model)
+        return ("finding", wrong) if wrong else ("read", "")
+
+    def smaller(self, data: bytes, corpus: Sequence[Seed]) -> Generator[bytes, bytes | None, None]:  # noqa: ARG002 - as all targets
+        """Leave out pieces."""
+        seed = Seed.of(data)
+        piece = len(seed.content)
+        while piece := piece // 2:
+            for start in reversed(range(0, len(seed.content), piece)):
+                less = Seed(seed.ending, seed.content[:start] + seed.content[start + piece :])
+                seed = seed if (yield less.data) is None else less
+
+
+def _inside(rng: random.Random, data: bytes) -> bytes:
+    """Damage what a gzip stream or a member of an archive holds; whatever checks it is right again."""
+    if data[:2] == b"\x1f\x8b":
+        try:
+            return gzip.compress(_damaged(rng, gzip.decompress(data)), 1, mtime=0)
+        except (OSError, EOFError, zlib.error):
+            return _damaged(rng, data)
+    if data[:4] == b"PK\x03\x04":
+        return _archive(rng, data)
+    return _damaged(rng, data, 64)  # heads are where structure is
+
+
+def _archive(rng: random.Random, data: bytes) -> bytes:
+    out = io.BytesIO()
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as before, zipfile.ZipFile(out, "w") as after:
+            names = before.namelist()
+            chosen = "meta.json" if "meta.json" in names and rng.random() < 0.5 else rng.choice(names)
+            for name in names:
+                content = before.read(name)
+                after.writestr(name, _damaged(rng, content) if name == chosen else content)
+    except (zipfile.BadZipFile, OSError, ValueError, IndexError, NotImplementedError, RuntimeError, zlib.error):
+        return _damaged(rng, data)
+    return out.getvalue()
+
+
+def _damaged(rng: random.Random, data: bytes, reach: int | None = None) -> bytes:
+    """A few bytes changed, left out, put in or said twice, within the first `reach`."""
+    changed = bytearray(data)
+    for _ in range(rng.choice((1, 1, 2, 5))):
+        at = rng.randrange(min(len(changed), reach or len(changed)) or 1)
+        rng.choice(_CHANGES)(rng, changed, at)
+    return bytes(changed)
+
+
+def _flip(rng: random.Random, data: bytearray, at: int) -> None:
+    data[at : at + 1] = bytes([(data[at] if at < len(data) else 0) ^ (1 << rng.randrange(8))])
+
+
+def _count(rng: random.Random, data: bytearray, at: int) -> None:
+    data[at : at + 4] = rng.choice(_COUNTS)
+
+
+def _cut(rng: random.Random, data: bytearray, at: int) -> None:
+    del data[at : at + rng.choice((1, 4, 100, len(data)))]
+
+
+def _twice(rng: random.Random, data: bytearray, at: int) -> None:
+    data[at:at] = data[at : at + rng.choice((1, 4, 30))]
+
+
+def _digit(rng: random.Random, data: bytearray, at: int) -> None:
+    """Change a number of a text, if there is one near."""
+    for place in range(at, min(at + 200, len(data))):
+        if 48 <= data[place] < 58:
+            data[place : place + 1] = rng.choice((b"0", b"-1", b"9999999999", b"1e400", b"null", b"[]", b'"x"'))
+            return
+
+
+_CHANGES: tuple[Callable[[random.Random, bytearray, int], None], ...] = (_flip, _flip, _count, _cut, _twice, _digit)
+
+
+def _scene(degree: int, count: int = 12) -> SplatModel:
+    rng = np.random.default_rng(degree)
+    return SplatModel(
+        means=rng.standard_normal((count, 3)).astype(np.float32),
+        quats=normalise_quats(rng.standard_normal((count, 4))),
+        scales=rng.uniform(-4.0, -1.0, (count, 3)).astype(np.float32),
+        opacities=rng.uniform(0.1, 0.9, count).astype(np.float32),
+        sh0=rng.uniform(-1.0, 1.0, (count, 3)).astype(np.float32),
+        shN=rng.uniform(-0.3, 0.3, (count, (degree + 1) ** 2 - 1, 3)).astype(np.float32),
+    )

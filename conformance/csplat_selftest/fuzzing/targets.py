@@ -1,0 +1,281 @@
+"""Targets of the fuzzer: the Python decoder, and the decoders in JavaScript and C compared with it."""
+
+from __future__ import annotations
+
+import json
+import random
+import struct
+import warnings
+import zlib
+from collections.abc import Callable, Generator, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import csplat
+from csplat import _spec, decoder
+from csplat.errors import CsplatError
+from csplat_authoring.builder import Built, build
+from csplat_authoring.recipes import sound_recipes
+from csplat_authoring.repair import repair
+from csplat_conformance import adapter, node
+from csplat_conformance.answers import Answer
+from csplat_conformance.manifest import VECTORS, load
+from csplat_conformance.native import CDecoder, missing_c
+from csplat_conformance.report import Status
+from csplat_conformance.serving import Served
+from csplat_selftest.mutate import mapped, mutant_of
+
+LIMITS = decoder.Limits(splats=100_000, bytes=32_000_000, json_bytes=1_000_000)
+
+_SMALL = decoder.Limits(splats=10_000, bytes=8_000_000, json_bytes=1_000_000)  # arrays are hashed: fewer of them
+#: The same by their names in JavaScript.
+JS_LIMITS = {"splats": _SMALL.splats, "bytes": _SMALL.bytes, "jsonBytes": _SMALL.json_bytes}
+C_LIMITS = (_SMALL.splats, _SMALL.bytes, _SMALL.json_bytes)
+_LARGEST_SEED = 3000  # bytes: small files make many cases a second
+_MEMORY = 700_000_000  # bytes of another process; a heap of 512 MiB, and Node
+
+
+@dataclass(frozen=True)
+class Case:
+    """A mutant.
+
+    Attributes:
+        data: the file.
+        source: makes what it can be mutated from again, of the target's own type; None if nothing can.
+        notes: names that are counted, such as `(not repaired)`.
+    """
+
+    data: bytes
+    source: Callable[[], Any]
+    notes: tuple[str, ...] = ()
+
+
+class Target(Protocol):
+    """Something that reads files.
+
+    Attributes:
+        name: on the command line.
+        suffix: suffix of its files.
+        watched: Python files, or folders of them, whose coverage guides it.
+    """
+
+    name: str
+    suffix: str
+    watched: Sequence[Path]
+
+    def seeds(self, paths: Iterable[Path]) -> list[Any]:
+        """Return what mutants start from, and the given files too."""
+        ...
+
+    def mutant(self, rng: random.Random, corpus: Sequence[Any]) -> Case:
+        """Make a case from one or more entries of the corpus."""
+        ...
+
+    def attempt(self, data: bytes) -> tuple[str, str]:
+        """Let the target read a file: (name for the tally, what is wrong or an empty string)."""
+        ...
+
+    def smaller(self, data: bytes, corpus: Sequence[Any]) -> Generator[bytes, bytes | None, None]:
+        """Yield simpler files that may show the same; each is made from the last that did, which is sent back."""
+        ...
+
+    def memory(self) -> str:
+        """Say whether another process holds too much memory; an empty string if not."""
+        ...
+
+    def coverage(self) -> str:
+        """Return what is known of the coverage of another process, or an empty string."""
+        ...
+
+    def close(self) -> None:
+        """End what was started."""
+        ...
+
+
+class DecoderTarget:
+    """The Python decoder: it decodes within small limits, or refuses with a CsplatError."""
+
+    name = "decoder"
+    suffix = ".csplat"
+    watched: Sequence[Path] = (Path(csplat.__file__).parent / "decoder",)
+
+    def seeds(self, paths: Iterable[Path]) -> list[Built]:
+        """Return the valid vectors with all their fields, and the given files."""
+        # Selected by the size of the vector's file: building all scenes to select small ones takes two seconds.
+        small = {vector.name for vector in load() if (VECTORS / vector.file).stat().st_size <= _LARGEST_SEED}
+        scenes = [recipe.scene for recipe in sound_recipes() if recipe.scene is not None and recipe.name in small]
+        return [build(scene) for scene in scenes] + [mapped(p.read_bytes()) for p in paths]
+
+    def mutant(self, rng: random.Random, corpus: Sequence[Built]) -> Case:
+        """Damage a file of the corpus."""
+        base = rng.choice(corpus)
+        data, repaired, in_place = mutant_of(rng, base, corpus)
+        again = (lambda: Built(data, base.fields, base.spans)) if in_place else (lambda: _mapped(data))
+        return Case(data, again, () if repaired else ("(not repaired)",))
+
+    def attempt(self, data: bytes) -> tuple[str, str]:
+        """Decode; now and then in the other ways too, which must find the same."""
+        chance = zlib.crc32(data)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                # One thread is three times as fast on small files; now and then all are used.
+                model = decoder.decode(data, limits=LIMITS, threads=1 if chance % 16 else None)
+                if len(model) > LIMITS.splats:
+                    return "finding", "more splats than the limits allow"
+                return _agreed(data, len(model)) if chance % 8 == 1 else ("decoded", "")
+        except CsplatError as error:
+            return error.code, ""
+
+    def smaller(self, data: bytes, corpus: Sequence[Built]) -> Generator[bytes, bytes | None, None]:
+        """Undo one changed byte after the other, if the length is that of a seed."""
+        same = [base for base in corpus if len(base.data) == len(data)]
+        if not same:
+            return
+        base = min(same, key=lambda other: sum(a != b for a, b in zip(other.data, data, strict=True)))
+        for at in [i for i in range(len(data)) if data[i] != base.data[i]]:
+            kept = yield repair(data[:at] + base.data[at : at + 1] + data[at + 1 :], base.records)
+            data = data if kept is None else kept
+
+    def memory(self) -> str:
+        """Nothing runs elsewhere."""
+        return ""
+
+    def coverage(self) -> str:
+        """Nothing runs elsewhere."""
+        return ""
+
+    def close(self) -> None:
+        """Nothing was started."""
+
+
+def missing_others() -> dict[str, str]:
+    """Return why other decoders cannot run here, by language."""
+    found = {"JavaScript": node.missing_javascript(), "C": missing_c()}
+    return {name: why for name, why in found.items() if why}
+
+
+class OthersTarget(DecoderTarget):
+    """The decoders in JavaScript and C against the Python one: same verdict, same arrays; another code is only counted.
+
+    Args:
+        scratch: folder for the coverage that Node writes.
+        languages: languages of the decoders.
+        memory_bytes: see below.
+
+    Attributes:
+        decoders: decoders that can run here, by language.
+        memory_bytes: resident memory that none of them exceeds.
+    """
+
+    name = "others"
+
+    def __init__(
+        self,
+        scratch: Path | None = None,
+        *,
+        languages: Sequence[str] = ("JavaScript", "C"),
+        memory_bytes: int = _MEMORY,
+    ) -> None:
+        self._scratch = scratch
+        self.memory_bytes = memory_bytes
+        self.decoders: dict[str, Served] = {}
+        here = set(languages) - set(missing_others())
+        if "JavaScript" in here:
+            self.decoders["JavaScript"] = node.JsDecoder(limits=JS_LIMITS, coverage=scratch)
+        if "C" in here:
+            self.decoders["C"] = CDecoder(limits=C_LIMITS)
+
+    def attempt(self, data: bytes) -> tuple[str, str]:
+        """Decode with all and compare."""
+        ours = adapter.answer(data, _SMALL, threads=1)  # one thread: so it is traced, and quicker
+        if ours.status not in (Status.PASSED, Status.REFUSED):
+            return "finding", f"Python, {ours.status}: {ours.message}"
+        became = {ours.code or "decoded"}
+        for name, other in self.decoders.items():
+            theirs = other.ask(data)
+            if theirs.status not in (Status.PASSED, Status.REFUSED):
+                return "finding", f"{name}, {theirs.status}: {theirs.message}"
+            found, what = compared(ours, theirs, name)
+            if what:
+                return found, what
+            became.add(found)
+        return next(name for name in (_spec.ERROR_LIMIT, "another code", *became) if name in became), ""
+
+    def memory(self) -> str:
+        """Look at the resident memory of the others."""
+        held = {name: one.resident_bytes() for name, one in self.decoders.items()}
+        return next((f"{name} holds {size:,} bytes" for name, size in held.items() if size > self.memory_bytes), "")
+
+    def close(self) -> None:
+        """Let them end; Node writes its coverage."""
+        for one in self.decoders.values():
+            one.close()
+
+    def coverage(self) -> str:
+        """Return the share of the JavaScript decoder's text that ran."""
+        return js_coverage(self._scratch) if self._scratch else ""
+
+
+def _mapped(data: bytes) -> Built | None:
+    """Return a mutant that was laid out anew with its fields, if its index still leads to its chunks."""
+    try:
+        found = mapped(data)
+    except (ValueError, LookupError, struct.error):
+        return None
+    inside = all(
+        offset + size <= len(data) and size >= _spec.CHUNK_HEADER_SIZE for offset, size in found.spans.values()
+    )
+    return found if inside else None
+
+
+def _agreed(data: bytes, count: int) -> tuple[str, str]:
+    """Decode a sound file in the other ways: they must find it sound too."""
+    try:
+        integers = decoder.decode_integers(data, limits=LIMITS, threads=1)
+        tiles = list(decoder.iter_tiles(data, limits=LIMITS))
+    except CsplatError as error:
+        if error.code == _spec.ERROR_LIMIT:  # a budget counts the bytes of the arrays, which are others
+            return "decoded", ""
+        return "finding", f"decode accepts what another way refuses: {error}"
+    if not len(integers["means"]) == sum(len(tile.means) for tile in tiles) == count:
+        return "finding", "ways of decoding differ in the number of splats"
+    return "decoded", ""
+
+
+def compared(ours: Answer, theirs: Answer, name: str) -> tuple[str, str]:
+    """Compare the answers of Python and of the decoder of this name."""
+    codes = (ours.code, theirs.code)
+    if _spec.ERROR_LIMIT in codes:
+        return _spec.ERROR_LIMIT, ""
+    if ours.status != theirs.status:
+        words = [f"{one.status} {one.code} {one.clause or ''}".strip() for one in (ours, theirs)]
+        return "finding", f"Python {words[0]}, {name} {words[1]}"
+    if ours.status is Status.REFUSED:
+        return (ours.code if codes[0] == codes[1] else "another code"), ""
+    if dict(ours.header) != dict(theirs.header):
+        return "finding", f"{name}: the headers differ"
+    differ = [key for key in {*ours.arrays, *theirs.arrays} if ours.arrays.get(key) != theirs.arrays.get(key)]
+    return ("finding", f"{name}: arrays differ: {', '.join(sorted(differ))}") if differ else ("decoded", "")
+
+
+def js_coverage(folder: Path) -> str:
+    """Return the share of the decoder's text that ran, from what Node left in a folder."""
+    ran: dict[str, bytearray] = {}
+    home = node.js_folder()
+    for path in folder.glob("coverage-*.json"):
+        for script in json.loads(path.read_text(encoding="utf-8"))["result"]:
+            file = Path(script["url"].removeprefix("file://"))
+            if file.parent != home or not file.exists():
+                continue
+            marks = bytearray(b"\1" * len(file.read_text(encoding="utf-8")))
+            for function in script["functions"]:
+                for part in function["ranges"]:
+                    start, end = part["startOffset"], part["endOffset"]
+                    marks[start:end] = bytes([part["count"] > 0]) * len(marks[start:end])
+            old = ran.get(file.name, bytes(len(marks)))
+            ran[file.name] = bytearray(a | b for a, b in zip(marks, old, strict=True))
+    total = sum(map(len, ran.values()))
+    covered = sum(sum(marks) for marks in ran.values())
+    return f"{100 * covered / total:.1f} % of the text of {len(ran)} modules ran" if total else ""

@@ -1,0 +1,148 @@
+"""The mutants of a Python module: its operators, constants, bounds and statements, one at a time."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from typing import Final
+
+from csplat_selftest.mutation.mutants import Mutant
+
+_COMPARISONS: Final = {
+    ast.Lt: ("<", ("<=", ">=")),
+    ast.LtE: ("<=", ("<", ">")),
+    ast.Gt: (">", (">=", "<=")),
+    ast.GtE: (">=", (">", "<")),
+    ast.Eq: ("==", ("!=",)),
+    ast.NotEq: ("!=", ("==", "<", ">")),  # one side of a mismatch alone
+    ast.In: ("in", ("not in",)),
+    ast.NotIn: (r"not\s+in", ("in",)),
+    ast.Is: ("is", ("is not",)),
+    ast.IsNot: (r"is\s+not", ("is",)),
+}
+_ARITHMETIC: Final = {
+    ast.Add: ("+", "-"),
+    ast.Sub: ("-", "+"),
+    ast.Mult: ("*", "//"),
+    ast.Div: ("/", "*"),
+    ast.FloorDiv: ("//", "*"),
+    ast.Mod: ("%", "*"),
+    ast.LShift: ("<<", ">>"),
+    ast.RShift: (">>", "<<"),
+    ast.BitAnd: ("&", "|"),
+    ast.BitOr: ("|", "&"),
+    ast.BitXor: ("^", "&"),
+}
+_NAMES: Final = {"min": "max", "max": "min", "any": "all", "all": "any"}
+#: Nodes whose text has no influence on what a decoder decodes.
+_WORDS: Final = (ast.JoinedStr, ast.arg)
+
+
+def python_mutants(file: str, text: str) -> list[Mutant]:
+    """Return every mutant of a module, in the order of the text. Some may be no program.
+
+    Args:
+        file: its name.
+        text: its source.
+    """
+    return list(_Module(file, text).mutants())
+
+
+class _Module:
+    def __init__(self, file: str, text: str) -> None:
+        self.file = file
+        self.text = text
+        lines = text.splitlines(keepends=True)
+        self.starts = [0]
+        for line in lines:
+            self.starts.append(self.starts[-1] + len(line))
+        self.lines = lines
+
+    def mutants(self) -> Iterator[Mutant]:
+        yield from self.inside(ast.parse(self.text))
+
+    def inside(self, node: ast.AST) -> Iterator[Mutant]:
+        if isinstance(node, _WORDS) or _is_for_types(node):
+            return
+        yield from self.of(node)
+        for name, value in ast.iter_fields(node):
+            if name in ("annotation", "returns", "decorator_list") or isinstance(node, ast.Raise):
+                continue  # a raise is dropped, its words are not read
+            for child in value if isinstance(value, list) else [value]:
+                if isinstance(child, ast.AST):
+                    yield from self.inside(child)
+
+    def of(self, node: ast.AST) -> Iterator[Mutant]:
+        """Yield what changes at this node itself."""
+        match node:
+            case ast.Compare():
+                operands = [node.left, *node.comparators]
+                for i, operator in enumerate(node.ops):
+                    old, news = _COMPARISONS[type(operator)]
+                    for new in news:
+                        yield self.operator(node, operands[i], operands[i + 1], old, new)
+            case ast.BoolOp():
+                old, new = ("and", "or") if isinstance(node.op, ast.And) else ("or", "and")
+                for left, right in zip(node.values, node.values[1:], strict=False):
+                    yield self.operator(node, left, right, old, new)
+            case ast.BinOp() if type(node.op) in _ARITHMETIC:
+                old, new = _ARITHMETIC[type(node.op)]
+                yield self.operator(node, node.left, node.right, re.escape(old), new)
+            case ast.AugAssign() if type(node.op) in _ARITHMETIC:
+                old, new = _ARITHMETIC[type(node.op)]
+                yield self.operator(node, node.target, node.value, re.escape(f"{old}="), f"{new}=", wrap=False)
+            case ast.UnaryOp(op=ast.Not()):
+                yield self.replaced(node, f"({self.source(node.operand)})")
+            case ast.Constant(value=bool()):
+                yield self.replaced(node, str(not node.value))
+            case ast.Constant(value=int() | float()):
+                yield self.replaced(node, f"({self.source(node)} + 1)")
+                yield self.replaced(node, f"({self.source(node)} - 1)")
+            case ast.Slice():
+                for bound in (node.lower, node.upper):
+                    if bound is not None and not isinstance(bound, ast.Constant):
+                        yield self.replaced(bound, f"({self.source(bound)}) + 1")
+                        yield self.replaced(bound, f"({self.source(bound)}) - 1")
+            case ast.Call(func=ast.Name(id=name)) if name in _NAMES:
+                yield self.replaced(node.func, _NAMES[name])
+            case ast.Call(func=ast.Attribute(attr=name) as method) if name in _NAMES:
+                yield self.replaced(method, f"{self.source(method.value)}.{_NAMES[name]}")
+            case ast.Raise():
+                yield self.replaced(node, "pass")
+            case ast.Expr(value=ast.Call()):
+                yield self.replaced(node, "pass")
+            case ast.FunctionDef():
+                # A function's last statement would give no value at all: any caller notices.
+                last = node.body[-1]
+                early = [one for one in ast.walk(node) if isinstance(one, ast.Return) and one is not last]
+                yield from (self.replaced(one, "pass") for one in early)
+
+    def operator(
+        self, node: ast.AST, left: ast.AST, right: ast.AST, old: str, new: str, *, wrap: bool = True
+    ) -> Mutant:
+        """Replace the operator between two operands; the node is put in brackets, so that its parts stay its parts."""
+        (start, end), gap_start, gap_end = self.span(node), self.span(left)[1], self.span(right)[0]
+        gap = re.sub(rf"(?<![\w]){old}(?![\w])", new, self.text[gap_start:gap_end], count=1)
+        changed = self.text[start:gap_start] + gap + self.text[gap_end:end]
+        return self.replaced(node, f"({changed})" if wrap else changed)
+
+    def replaced(self, node: ast.AST, new: str) -> Mutant:
+        start, end = self.span(node)
+        return Mutant(self.file, node.lineno, start, self.text[start:end], new)  # type: ignore[attr-defined]  # has a place
+
+    def source(self, node: ast.AST) -> str:
+        start, end = self.span(node)
+        return self.text[start:end]
+
+    def span(self, node: ast.AST) -> tuple[int, int]:
+        """Characters, where the tree counts bytes of a line in UTF-8."""
+        places = (node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset)  # type: ignore[attr-defined]  # has a place
+        start, end = (
+            self.starts[line - 1] + len(self.lines[line - 1].encode()[:column].decode()) for line, column in places
+        )
+        return start, end
+
+
+def _is_for_types(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
