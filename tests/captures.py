@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from csplat import write_ply
 from csplat.model import SplatModel, normalise_quats
 from csplat_render import render
-from csplat_render.cameras import intrinsics, look_at, resized
-from csplat_render.judge import renderer
+from csplat_render.camera import intrinsics, look_at, resized
+from csplat_render.scorer import renderer
 from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.views import BLACK, ViewSet, camera_sequence, find_view_set, with_deciders

@@ -234,11 +234,11 @@ def encoded(name: str, preset: str, quality: float | None = None) -> EncodeResul
 @cache
 def judge(name: str, size: tuple[int, int] = (640, 480)):
     """Return a judge that compares renders with those of a condition, from the cameras of `psnr`."""
-    from csplat_render.judge import Judge
-    from csplat_render.virtual import virtual_cameras
+    from csplat_render.scorer import Scorer
+    from csplat_render.virtual_cameras import virtual_cameras
 
     model = scene(name)[0]
-    return Judge.of_source(model, virtual_cameras(model, 8, *size), (0.0, 0.0, 0.0))
+    return Scorer.of_source(model, virtual_cameras(model, 8, *size), (0.0, 0.0, 0.0))
 
 
 def guide_rows() -> list[list[str]]:

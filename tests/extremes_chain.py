@@ -20,8 +20,8 @@ from csplat.model import SplatModel
 from csplat.ply import lint_ply
 from csplat_conformance.stated import Proof, Source, prove
 from csplat_render import Camera, render
-from csplat_render.arrays import RenderResult
-from csplat_render.virtual import virtual_cameras
+from csplat_render.conventions import RenderResult
+from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.optimise.simplify import SimplifyOptions, simplify
 from csplat_trainer.loop import train
 from csplat_trainer.tuning import renders_of, split_views, tune

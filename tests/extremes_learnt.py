@@ -13,9 +13,9 @@ from extremes import COPIES, COUNT, DRAWN, NAMES, judge, scene
 from csplat import EncodeOptions, SplatModel, decode
 from csplat.encoder import Draft, Frozen
 from csplat_render import Camera
-from csplat_render.judge import Judge, Look
-from csplat_render.rasterise import Rasteriser
-from csplat_render.virtual import virtual_cameras
+from csplat_render.rasteriser import Rasteriser
+from csplat_render.scorer import ReferenceImage, Scorer
+from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
 from csplat_trainer.data import DataSet
 from csplat_trainer.loop import train
@@ -40,12 +40,12 @@ def learnt_from(name: str) -> SplatModel:
 
 
 @cache
-def small_judge(name: str) -> Judge:
+def small_judge(name: str) -> Scorer:
     """Return a judge that compares renders of 160×120 with those of the scene."""
     if name in DRAWN:
         return judge(name, SMALL)
     model = learnt_from(name)
-    return Judge.of_source(model, virtual_cameras(model, 8, *SMALL), (0.0, 0.0, 0.0))
+    return Scorer.of_source(model, virtual_cameras(model, 8, *SMALL), (0.0, 0.0, 0.0))
 
 
 @cache
@@ -77,13 +77,14 @@ def trained(name: str) -> TrainResult:
 
 
 @cache
-def tuned(name: str, count: int = 52) -> tuple[Frozen, FinetuneResult, Judge]:
+def tuned(name: str, count: int = 52) -> tuple[Frozen, FinetuneResult, Scorer]:
     """Tune the scene as a file to `count` images but four; return it and a judge of those four."""
     source = learnt_from(name)
     views = split_views(renders_of(source, virtual_cameras(source, count, 48, 36), BLACK, None), BLACK, aside=4)
     frozen = Draft.of(source, COARSE).frozen()
-    aside = Judge(
-        [view.camera for view in views.validation], [Look(view.wanted.astype(np.float32)) for view in views.validation]
+    aside = Scorer(
+        [view.camera for view in views.validation],
+        [ReferenceImage(view.wanted.astype(np.float32)) for view in views.validation],
     )
     return frozen, tune(frozen, views, SHORT), aside
 

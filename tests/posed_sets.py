@@ -6,7 +6,7 @@ import struct
 import numpy as np
 from PIL import Image
 
-from csplat_render.cameras import intrinsics, look_at, relative_to
+from csplat_render.camera import intrinsics, look_at, relative_to
 
 W, H = 48, 32
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])

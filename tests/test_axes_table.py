@@ -23,7 +23,7 @@ pytest.importorskip("PIL", reason="pictures need pillow: pip install 'csplat[ren
 from posed_sets import write_blender, write_colmap_set, write_transforms
 
 from csplat_render import render
-from csplat_render.paths import orbit_cameras
+from csplat_render.camera_paths import orbit_cameras
 from csplat_trainer.data import load
 from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions

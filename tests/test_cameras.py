@@ -8,18 +8,17 @@ import pytest
 from tables import failures
 
 from csplat.errors import InputError
-from csplat_render.camera import Camera
-from csplat_render.cameras import (
+from csplat_render.camera import (
+    Camera,
     camera_outliers,
     central_camera,
-    direction,
+    direction_at,
     intrinsics,
-    load_cameras,
     look_at,
     orbit,
     relative_to,
-    save_cameras,
 )
+from csplat_render.camera_files import load_cameras, save_cameras
 
 K = intrinsics(640, 480, 60.0)
 UP = np.array([0.0, 0.0, 1.0])
@@ -102,7 +101,7 @@ def test_the_field_of_view_spans_the_width():
 @pytest.mark.parametrize("up", [[0, 0, 1], [0, -1, 0], [1, 0, 0], [0.6, 0.0, 0.8]])
 def test_directions_are_unit_and_keep_their_elevation(up):
     for azimuth in (0.0, 77.0, 200.0):
-        d = direction(up, azimuth, 25.0)
+        d = direction_at(up, azimuth, 25.0)
         assert np.isclose(np.linalg.norm(d), 1.0)
         assert np.isclose(np.degrees(np.arcsin(d @ np.array(up, float))), 25.0)
 

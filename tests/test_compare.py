@@ -34,7 +34,7 @@ def scene(make_model):
 @pytest.fixture
 def cameras(renderer):  # noqa: ARG001 -- a fixture cannot ask for another one by a mark
     """Two small views of the cloud, and one of the empty space behind it."""
-    from csplat_render.cameras import intrinsics, look_at
+    from csplat_render.camera import intrinsics, look_at
 
     K = intrinsics(64, 48, 60.0)
     up = (0.0, -1.0, 0.0)
@@ -53,9 +53,9 @@ def camera_file(cameras, tmp_path):
 
 
 def compare_models(source, other, cameras, **words):
-    from csplat_render.judge import Judge
+    from csplat_render.scorer import Scorer
 
-    return Judge.of_source(source, cameras).scores(other, **words)
+    return Scorer.of_source(source, cameras).scores(other, **words)
 
 
 def loaded(model):
@@ -173,9 +173,9 @@ def test_an_error_scores_lower_on_the_covered_pixels(scene, cameras):
 
 
 def test_a_judge_serves_for_many_and_says_of_some_views_what_all_say_of_them(scene, cameras):
-    from csplat_render.judge import Judge
+    from csplat_render.scorer import Scorer
 
-    judge, other = Judge.of_source(scene, cameras), decode(encode(scene, EncodeOptions(preset="small")))
+    judge, other = Scorer.of_source(scene, cameras), decode(encode(scene, EncodeOptions(preset="small")))
     errors, scores = judge.errors(other), judge.scores(other)
     assert [one.mse for one in scores.each] == pytest.approx(errors.tolist(), rel=1e-12)
     assert judge.psnr(other) == pytest.approx(scores.psnr, rel=1e-12)
@@ -184,12 +184,12 @@ def test_a_judge_serves_for_many_and_says_of_some_views_what_all_say_of_them(sce
 
 
 def test_pictures_that_do_not_fit_into_memory_are_made_when_their_turn_comes(scene, cameras):
-    from csplat_render import judge
+    from csplat_render import scorer
 
     other = replace(scene, sh0=scene.sh0 + np.float32(0.3))
-    kept = judge.Judge.of_source(scene, cameras).scores(other)
-    again = judge.Judge.of_source(scene, cameras, kept_bytes=0)
-    assert not any(isinstance(look, judge.Look) for look in again.looks)
+    kept = scorer.Scorer.of_source(scene, cameras).scores(other)
+    again = scorer.Scorer.of_source(scene, cameras, kept_bytes=0)
+    assert not any(isinstance(look, scorer.ReferenceImage) for look in again.looks)
     assert kept == again.scores(other)
 
 

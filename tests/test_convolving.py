@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("numba", reason="the kernel wants the extra [render]")
 
-from csplat_render.convolving import convolve, convolve_twin
+from csplat_render.metric_kernels import convolve, convolve_twin
 
 pytestmark = pytest.mark.area(name="rasteriser")
 
@@ -58,7 +58,7 @@ def test_the_twin_is_the_sum_written_out(stride, padding):
 
 
 def test_the_number_of_threads_changes_nothing():
-    from csplat_render.jit import thread_count
+    from csplat_render.kernels import thread_count
 
     x, weights, bias = case((33, 20, 8), (3, 3, 8, 24))
     found = []

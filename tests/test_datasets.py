@@ -33,7 +33,7 @@ from posed_sets import (  # noqa: E402
     write_transforms,
 )
 
-from csplat_render.cameras import relative_to  # noqa: E402
+from csplat_render.camera import relative_to  # noqa: E402
 from csplat_trainer.data import load  # noqa: E402
 from csplat_trainer.data.colmap_files import read_images, read_points  # noqa: E402
 from csplat_trainer.starting import scene_of  # noqa: E402

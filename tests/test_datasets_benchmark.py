@@ -19,7 +19,7 @@ from csplat_bench.datasets import __main__ as datasets
 from csplat_bench.datasets import folders as dataset_folders
 from csplat_bench.datasets import protocols as dataset_protocols
 from csplat_bench.datasets import tables as dataset_tables
-from csplat_render.cameras import intrinsics, look_at
+from csplat_render.camera import intrinsics, look_at
 
 pytestmark = pytest.mark.area(name="benchmarks")
 

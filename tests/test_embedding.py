@@ -181,11 +181,11 @@ def check_covariances(found, scene):
 
 def check_colours(found, scene):
     pytest.importorskip("numba", reason="the renderer wants the extra [render]")
-    from csplat_render import harmonics, jit
+    from csplat_render import kernels, projection
 
     ways = directions(len(found))
     basis = np.zeros((16, len(ways)))
-    jit.python(harmonics.sh_basis)(3, *ways.T, basis)
+    kernels.python_function(projection.sh_basis)(3, *ways.T, basis)
     count = len(ways)
     coefficients = np.concatenate([scene.sh0[:count, None], scene.shN[:count]], axis=1).astype(np.float64)
     wanted = np.maximum(0.0, 0.5 + np.einsum("kn,nkc->nc", basis, coefficients))

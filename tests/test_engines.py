@@ -21,8 +21,8 @@ from csplat_bench.viewer.loaders import Trial
 from csplat_bench.viewer.owners import stands, still
 from csplat_bench.viewer.rules import ENGINES
 from csplat_bench.viewer.stage import pinhole, served
+from csplat_render.camera_paths import orbit_cameras
 from csplat_render.metrics import psnr
-from csplat_render.paths import orbit_cameras
 
 pytestmark = [*IN_CHROMIUM, pytest.mark.area(name="engines")]
 

@@ -33,8 +33,8 @@ from csplat.encoder.measure import measure_errors
 from csplat.errors import LimitError
 from csplat_conformance.stated import Source, prove
 from csplat_render import render
-from csplat_render.cameras import intrinsics, look_at
-from csplat_render.virtual import virtual_cameras
+from csplat_render.camera import intrinsics, look_at
+from csplat_render.virtual_cameras import virtual_cameras
 
 pytestmark = [pytest.mark.extremes, pytest.mark.slow]
 

@@ -35,7 +35,7 @@ from csplat.decoder import read_header, read_stated_errors
 from csplat.encoder import Draft, encode_with_report
 from csplat.errors import InputError
 from csplat_conformance.stated import Source, prove
-from csplat_render.virtual import virtual_cameras
+from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.optimise.simplify import simplify
 from csplat_tools.views import find_view_set

@@ -29,9 +29,9 @@ from csplat.decoder import read_options, read_stated_errors
 from csplat.encoder import Draft
 from csplat.errors import InputError
 from csplat_render import render
-from csplat_render.arrays import Splats
-from csplat_render.cameras import save_cameras
-from csplat_render.rasterise import Rasteriser
+from csplat_render.camera_files import save_cameras
+from csplat_render.conventions import SplatArrays
+from csplat_render.rasteriser import Rasteriser
 from csplat_tools.cli.app import app
 from csplat_tools.cli.finetune import finetune as finetune_command
 from csplat_tools.optimise.simplify import SimplifyOptions
@@ -156,7 +156,7 @@ def test_the_decoded_file_scores_what_was_scored_while_tuning(coarse, views):
     seen = frozen.seen(tuned.held)
     for name in ("means", "shN"):
         assert np.array_equal(getattr(decoded, name)[order], getattr(seen, name)[rows])
-    splats = Splats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
+    splats = SplatArrays(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
     for view in views.validation:
         picture = rasteriser.forward(splats, view.camera, background=BLACK).rgb
         error.append(np.square(np.clip(picture, 0, 1) - np.clip(view.wanted, 0, 1)).mean(dtype=np.float64))
@@ -213,7 +213,7 @@ def test_gradients_of_entries_are_those_of_all_their_users(source, views):
     wanted = np.zeros((H, W, 3), np.float32)
 
     def rendered(shN):
-        splats = Splats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, shN)
+        splats = SplatArrays(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, shN)
         return rasteriser.forward(splats, view.camera, background=np.ones(3)).rgb
 
     picture = rendered(seen.shN)
@@ -248,7 +248,7 @@ def test_a_step_moves_values_through_their_quantisers(coarse, views):
     before = {name: values.copy() for name, values in scene.parameters.values.items()}
     rasteriser, view = Rasteriser(), views.train[0]
     seen, alphas = scene.seen()
-    splats = Splats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
+    splats = SplatArrays(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
     wanted = view.picture(BLACK, np.empty((H, W, 3), np.float32))
     _, slope = PhotometricLoss(H, W)(rasteriser.forward(splats, view.camera, background=BLACK).rgb, wanted)
     rates = {"means": 0.0, "quats": 1e-4, "scales": 1e-4, "sizes": 0.0, "logits": 1e-4, "sh0": 1e-4, "shN": 1e-4}

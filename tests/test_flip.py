@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from csplat.errors import InputError
-from csplat_render.flip import flip
+from csplat_render.metrics import flip
 
 
 def test_flip_is_zero_for_equal_pictures_and_grows():

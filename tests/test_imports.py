@@ -48,5 +48,8 @@ def test_an_unknown_name_is_an_attribute_error():
 def test_the_renderer_needs_no_torch():
     """That cameras need no numba is tested in test_interface.py."""
     pytest.importorskip("numba", reason="the renderer wants the extra [render]")
-    loaded = {name.split(".")[0] for name in modules_after("import csplat_render.rasterise, csplat_render.twin")}
+    loaded = {
+        name.split(".")[0]
+        for name in modules_after("import csplat_render.rasteriser, csplat_render.reference_rasteriser")
+    }
     assert not loaded & {"torch", "csplat_trainer", "csplat_tools", "plyfile"}  # numba itself may load scipy

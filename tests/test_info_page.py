@@ -18,8 +18,7 @@ pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'cspl
 from captures import cameras, shell
 
 from csplat import EncodeOptions, encode, read_ply, write_ply
-from csplat_render.cloud import detail, sample_cloud
-from csplat_render.virtual import scene_frame
+from csplat_render.virtual_cameras import detail, sample_cloud, scene_frame
 from csplat_tools.cli.app import app
 from csplat_tools.inspect.info import describe_file
 from csplat_tools.pages.bars import Bar, draw_bars

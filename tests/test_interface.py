@@ -177,7 +177,7 @@ assert not loaded, loaded
 sys.modules["numba"] = None
 import csplat, csplat_render, csplat_tools, csplat_trainer
 from csplat_render import Camera, render
-from csplat_render.virtual import virtual_cameras
+from csplat_render.virtual_cameras import virtual_cameras
 assert not {{"scipy", "torch"}} & set(sys.modules)
 path = {str(files[1])!r}
 model = csplat.read_ply(path)

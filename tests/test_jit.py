@@ -13,13 +13,13 @@ from csplat.errors import InputError
 
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
-from csplat_render import jit
-from csplat_render.jit import ParallelKernel, available_threads, kernel, lane_run, parallel_kernel, thread_count
+from csplat_render import kernels
+from csplat_render.kernels import ParallelKernel, available_threads, kernel, lane_range, parallel_kernel, thread_count
 
 
 @parallel_kernel()
 def note(lane, lanes, seen):
-    first, end = lane_run(lane, lanes, len(seen))
+    first, end = lane_range(lane, lanes, len(seen))
     for i in range(first, end):
         seen[i] += lane + 1
 
@@ -32,7 +32,7 @@ def fail_at(lane, lanes, which):
 
 @kernel
 def run_of(lane, lanes, count):
-    return lane_run(lane, lanes, count)
+    return lane_range(lane, lanes, count)
 
 
 def test_the_runs_of_all_lanes_make_up_the_whole():
@@ -106,7 +106,7 @@ def test_a_forked_child_has_threads_of_its_own_and_waits_for_no_lock_that_nobody
     script = """
 import os, signal, threading, time
 import numpy as np
-from csplat_render.jit import thread_count
+from csplat_render.kernels import thread_count
 from test_jit import note
 def noted():
     seen = np.zeros(9, np.int64)
@@ -143,12 +143,12 @@ os._exit(0)
 
 def test_compiling_is_told_once_and_running_what_is_compiled_is_not():
     told = []
-    plain = jit.numba.njit(lambda x: x + 1)
-    with jit.on_compiling(lambda: told.append(1)):
+    plain = kernels.numba.njit(lambda x: x + 1)
+    with kernels.on_compiling(lambda: told.append(1)):
         assert (2, 2.5) == (plain(1), plain(1.5))  # two types, two compilations
     assert [1] == told
-    with jit.on_compiling(lambda: told.append(2)):
+    with kernels.on_compiling(lambda: told.append(2)):
         plain(3)
     assert [1] == told
-    assert jit.is_cached(plain)
-    assert not jit.is_cached(jit.numba.njit(lambda x: x + 2))
+    assert kernels.is_cached(plain)
+    assert not kernels.is_cached(kernels.numba.njit(lambda x: x + 2))

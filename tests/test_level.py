@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from csplat_render.cameras import intrinsics, look_at
+from csplat_render.camera import intrinsics, look_at
 from csplat_trainer.data.level import find_level
 
 K = intrinsics(64, 48, 60.0)

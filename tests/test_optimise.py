@@ -23,10 +23,10 @@ from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_conformance.stated import Source, prove
-from csplat_render.cameras import intrinsics, look_at, resized
-from csplat_render.judge import Judge
+from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.metrics import psnr_of_mse
-from csplat_render.virtual import scene_frame
+from csplat_render.scorer import Scorer
+from csplat_render.virtual_cameras import scene_frame
 from csplat_tools.optimise.exchange import error_of_psnr
 from csplat_tools.optimise.optimiser import expected_pictures
 from csplat_tools.optimise.removal import Removal
@@ -289,7 +289,7 @@ def test_shapes_are_clustered_by_what_the_views_say_of_them(kept):
 
 @pytest.mark.slow
 def test_what_is_left_is_fitted_to_what_the_source_looks_like(kept, alike):
-    bare = Judge.of_source(alike, judged_by(cameras(40)).judges, BLACK).psnr(alike.select(kept.result.source_index))
+    bare = Scorer.of_source(alike, judged_by(cameras(40)).judges, BLACK).psnr(alike.select(kept.result.source_index))
     assert kept.report.psnr > bare + 3.0
 
 
@@ -411,7 +411,7 @@ def measured(unequal):
 
 @pytest.mark.slow
 def test_what_was_measured_grades_splats_and_makes_files_smaller_at_the_same_psnr(unequal, measured):
-    judge, files = Judge.of_source(unequal, cameras(6), BLACK), {}
+    judge, files = Scorer.of_source(unequal, cameras(6), BLACK), {}
     for graded in (True, False):
         options = EncodeOptions(attribute_psnr=48.0 if graded else 47.0)
         whole = Whole(unequal, None, measured, None)

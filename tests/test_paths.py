@@ -5,9 +5,9 @@ import pytest
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat_render.cameras import intrinsics, look_at, orbit
-from csplat_render.paths import orbit_cameras
-from csplat_render.virtual import scene_frame
+from csplat_render.camera import intrinsics, look_at, orbit
+from csplat_render.camera_paths import orbit_cameras
+from csplat_render.virtual_cameras import scene_frame
 
 pytestmark = pytest.mark.slow  # two CPU seconds together
 

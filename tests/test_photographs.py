@@ -19,7 +19,7 @@ Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip insta
 
 # Importing them needs what is looked for above.
 from csplat_render import render  # noqa: E402
-from csplat_render.cameras import intrinsics, look_at, relative_to  # noqa: E402
+from csplat_render.camera import intrinsics, look_at, relative_to  # noqa: E402
 from csplat_tools.inspect.compare import compare  # noqa: E402
 from csplat_tools.views import DataOptions, find_view_set  # noqa: E402
 from csplat_trainer.evaluate import photograph_judge  # noqa: E402

@@ -13,12 +13,13 @@ from csplat.errors import InputError
 from csplat.model import SplatModel, sh_degree_of
 from csplat.ply import read_ply
 from csplat_render import render
-from csplat_render.arrays import Splats
-from csplat_render.cameras import intrinsics, load_cameras, look_at
+from csplat_render.camera import intrinsics, look_at
+from csplat_render.camera_files import load_cameras
 from csplat_render.contributions import Contributions
+from csplat_render.conventions import SplatArrays
+from csplat_render.pruning_error import measure_pruning_error, pruning_error_exact
 from csplat_render.refit import ColourOperator, fit_colours
-from csplat_render.removal import measure_removal, removal_exact
-from csplat_render.virtual import virtual_cameras
+from csplat_render.virtual_cameras import virtual_cameras
 
 
 def views(count=3, width=40, height=30, distance=4.0):
@@ -53,10 +54,10 @@ def relative(found, expected):
 def test_the_pass_agrees_with_taking_splats_away_one_by_one(antialiased):
     model = replace(scene(30), antialiased=antialiased)
     behind = (0.2, 0.5, 0.9)
-    expected = removal_exact(model, views(2), np.arange(30), background=behind, transmittance_min=0.0)
-    wide = measure_removal(model, views(2), background=behind, dtype=np.float64, transmittance_min=0.0)
+    expected = pruning_error_exact(model, views(2), np.arange(30), background=behind, transmittance_min=0.0)
+    wide = measure_pruning_error(model, views(2), background=behind, dtype=np.float64, transmittance_min=0.0)
     assert relative(wide.error, expected).max() < 1e-9
-    narrow = measure_removal(model, views(2), background=behind, transmittance_min=0.0)
+    narrow = measure_pruning_error(model, views(2), background=behind, transmittance_min=0.0)
     assert relative(narrow.error, expected)[expected > 1e-6].max() < 1e-4
     assert expected.max() > 1.0
 
@@ -78,9 +79,9 @@ def test_the_pass_agrees_on_the_sample(sample_path):
 
 def assert_the_pass_agrees(source, camera):
     model = source.select(slice(0, None, max(1, len(source) // 500)))
-    found = measure_removal(model, [camera], transmittance_min=0.0)
+    found = measure_pruning_error(model, [camera], transmittance_min=0.0)
     rows = np.argsort(-found.error)[:120:40]
-    expected = removal_exact(model, [camera], rows, transmittance_min=0.0)
+    expected = pruning_error_exact(model, [camera], rows, transmittance_min=0.0)
     off = relative(found.error[rows], expected).max()
     print(f"{off:.1e} off taking splats away one by one")
     assert off < 1e-4
@@ -90,15 +91,17 @@ def assert_the_pass_agrees(source, camera):
 def test_finished_pixels_are_all_that_it_leaves_out():
     model = scene(count=60)
     model = replace(model, opacities=np.full(60, 0.97, np.float32), scales=model.scales + np.float32(1.0))
-    exact = removal_exact(model, views(1), np.arange(60))
-    found = measure_removal(model, views(1)).error
+    exact = pruning_error_exact(model, views(1), np.arange(60))
+    found = measure_pruning_error(model, views(1)).error
     assert abs(found.sum() / exact.sum() - 1.0) < 2e-2
     assert np.corrcoef(found, exact)[0, 1] > 0.999
 
 
 def test_the_picture_is_that_of_the_renderer():
     model, seen = scene(count=200), []
-    measure_removal(model, views(2), background=(0.1, 0.2, 0.3), on_picture=lambda _n, picture: seen.append(picture))
+    measure_pruning_error(
+        model, views(2), background=(0.1, 0.2, 0.3), on_picture=lambda _n, picture: seen.append(picture)
+    )
     for camera, picture in zip(views(2), seen, strict=True):
         np.testing.assert_allclose(picture, render(model, camera, background=(0.1, 0.2, 0.3)).rgb, atol=2e-5)
 
@@ -107,7 +110,7 @@ def test_the_picture_is_that_of_the_renderer():
 def test_error_and_product_are_what_removal_adds_to_a_wrong_picture():
     model = scene(count=30)
     wanted = [render(scene(count=30, seed=1), camera, mode="exact").rgb for camera in views(2)]
-    found = measure_removal(model, views(2), references=wanted, dtype=np.float64)
+    found = measure_pruning_error(model, views(2), references=wanted, dtype=np.float64)
 
     def error(rows):
         pictures = [render(model.select(rows), camera, mode="exact").rgb for camera in views(2)]
@@ -123,7 +126,7 @@ def test_error_and_product_are_what_removal_adds_to_a_wrong_picture():
 def test_bands_and_weights_are_those_of_a_single_splat():
     model = scene(count=1)
     camera = views(1)[0]
-    found = measure_removal(model, [camera], dtype=np.float64)
+    found = measure_pruning_error(model, [camera], dtype=np.float64)
     alpha = render(model, camera, mode="exact").alpha
     assert found.squared_weight[0] == pytest.approx((alpha**2).sum(), rel=1e-6)
     shN = model.shN.copy()
@@ -137,7 +140,7 @@ def test_a_hidden_splat_and_one_out_of_view_are_unseen():
     model = scene(count=3)
     far = model.means.copy()
     far[2] = 100.0
-    found = measure_removal(replace(model, means=far), views(1))
+    found = measure_pruning_error(replace(model, means=far), views(1))
     assert not found.seen[2]
     assert found.error[2] == 0.0
     assert found.seen[:2].all()
@@ -146,7 +149,7 @@ def test_a_hidden_splat_and_one_out_of_view_are_unseen():
 @pytest.mark.parametrize("threads", [1, 2])
 def test_threads_change_nothing(threads):
     model = scene(count=300)
-    found, other = measure_removal(model, views(2), threads=threads), measure_removal(model, views(2))
+    found, other = measure_pruning_error(model, views(2), threads=threads), measure_pruning_error(model, views(2))
     for name in ("error", "squared_weight", "bands"):
         np.testing.assert_array_equal(getattr(found, name), getattr(other, name))
 
@@ -157,8 +160,8 @@ def test_splats_at_a_slant_lose_no_row(antialiased):
     model = scene(count=30, seed=4)
     scales = np.tile(np.float32([-0.5, -6.0, -6.0]), (30, 1))  # needles: most rows of their boxes are empty
     model = replace(model, scales=scales, antialiased=antialiased)
-    expected = removal_exact(model, views(1), np.arange(30), transmittance_min=0.0)
-    found = measure_removal(model, views(1), dtype=np.float64, transmittance_min=0.0)
+    expected = pruning_error_exact(model, views(1), np.arange(30), transmittance_min=0.0)
+    found = measure_pruning_error(model, views(1), dtype=np.float64, transmittance_min=0.0)
     assert relative(found.error, expected)[expected > 0.0].max() < 1e-9
     assert np.count_nonzero(expected) > 20
 
@@ -198,7 +201,7 @@ def test_rows_that_hold_nan_are_unseen_and_change_nothing(field, bad):
 def measured(arrays, view, *, antialiased=False):
     """Measure what a `SplatModel` would refuse."""
     degree = sh_degree_of(arrays["shN"].shape[1])
-    return measure_removal(Loose(**arrays, sh_degree=degree, antialiased=antialiased), [view])
+    return measure_pruning_error(Loose(**arrays, sh_degree=degree, antialiased=antialiased), [view])
 
 
 def assert_finite(arrays, view, *, antialiased=False):
@@ -208,8 +211,8 @@ def assert_finite(arrays, view, *, antialiased=False):
 
 
 @dataclass(frozen=True)
-class Loose(Splats):
-    """The fields of a model that `measure_removal` reads, without validation."""
+class Loose(SplatArrays):
+    """The fields of a model that `measure_pruning_error` reads, without validation."""
 
     sh_degree: int
     antialiased: bool
@@ -220,8 +223,8 @@ class Loose(Splats):
 
 def test_parts_add_up():
     model, cameras = scene(count=50), views(3)
-    whole = measure_removal(model, cameras)
-    parts = measure_removal(model, cameras[:1]) + measure_removal(model, cameras[1:])
+    whole = measure_pruning_error(model, cameras)
+    parts = measure_pruning_error(model, cameras[:1]) + measure_pruning_error(model, cameras[1:])
     np.testing.assert_allclose(whole.error, parts.error, rtol=1e-12)
     assert whole.value_count == parts.value_count
     np.testing.assert_array_equal(whole.seen, parts.seen)
@@ -229,9 +232,9 @@ def test_parts_add_up():
 
 def test_no_camera_and_too_few_references_are_refused():
     with pytest.raises(InputError, match="camera"):
-        measure_removal(scene(), [])
+        measure_pruning_error(scene(), [])
     with pytest.raises(InputError, match="1 reference pictures for 2"):
-        measure_removal(scene(), views(2), references=[np.zeros((30, 40, 3))])
+        measure_pruning_error(scene(), views(2), references=[np.zeros((30, 40, 3))])
 
 
 # colours

@@ -17,7 +17,7 @@ from csplat.ply import read_ply
 from csplat_bench.common.making import crowd, split
 from csplat_bench.viewer.rules import Engine
 from csplat_render import render
-from csplat_render.virtual import virtual_cameras
+from csplat_render.virtual_cameras import virtual_cameras
 
 pytestmark = pytest.mark.area(name="benchmarks")
 

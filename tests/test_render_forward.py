@@ -16,11 +16,10 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render import Camera, render
-from csplat_render.arrays import Splats
-from csplat_render.conventions import ALPHA_CAP, DILATION
-from csplat_render.harmonics import SH_C0
-from csplat_render.rasterise import Rasteriser
-from csplat_render.twin import render_exact
+from csplat_render.conventions import ALPHA_CAP, DILATION, SplatArrays
+from csplat_render.projection import SH_C0
+from csplat_render.rasteriser import Rasteriser
+from csplat_render.reference_rasteriser import render_exact
 
 
 def camera(width=64, height=48, focal=60.0, distance=4.0, **fields):
@@ -246,11 +245,11 @@ def test_results_belong_to_the_caller():
 
 def test_rejects_arrays_that_do_not_fit():
     model = scene(count=5)
-    bad = Splats(model.means, model.quats[:4], model.scales, model.opacities, model.sh0, model.shN)
+    bad = SplatArrays(model.means, model.quats[:4], model.scales, model.opacities, model.sh0, model.shN)
     with pytest.raises(InputError, match="quats has shape"):
         Rasteriser().forward(bad, camera())
     with pytest.raises(InputError, match="coefficients"):
-        Rasteriser().forward(Splats(**{**vars(bad), "quats": model.quats, "shN": model.shN[:, :4]}), camera())
+        Rasteriser().forward(SplatArrays(**{**vars(bad), "quats": model.quats, "shN": model.shN[:, :4]}), camera())
     with pytest.raises(InputError, match="mode"):
         render(model, camera(), mode="slow")
     with pytest.raises(InputError, match="dtype"):

@@ -8,7 +8,7 @@ import pytest
 
 from csplat import read_ply
 from csplat_render import render
-from csplat_render.cameras import intrinsics, look_at
+from csplat_render.camera import intrinsics, look_at
 from csplat_render.metrics import psnr
 from csplat_trainer.data import load
 from csplat_trainer.options import TrainOptions

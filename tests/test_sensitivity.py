@@ -14,9 +14,9 @@ from csplat.ply_write import write_ply
 
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
-from csplat_render.cameras import intrinsics, look_at
-from csplat_render.twin import Decisions, render_exact
-from csplat_render.virtual import scene_frame
+from csplat_render.camera import intrinsics, look_at
+from csplat_render.reference_rasteriser import Decisions, render_exact
+from csplat_render.virtual_cameras import scene_frame
 from csplat_tools.cli.app import app
 from csplat_tools.files.importance import weights_of
 from csplat_trainer.sensitivity import measure_sensitivity

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("numba", reason="the kernels want the extra [render]")
 
-from csplat_render.similarity import RADIUS, WINDOW, blur_across, blur_down, blur_twin, mean_ssim, mean_ssim_twin
+from csplat_render.metric_kernels import RADIUS, WINDOW, blur_across, blur_down, blur_twin, mean_ssim, mean_ssim_twin
 
 
 def pictures(height, width, dtype=np.float64):
@@ -43,7 +43,7 @@ def test_both_passes_make_the_window(dtype):
 
 
 def test_the_number_of_threads_changes_nothing():
-    from csplat_render.jit import thread_count
+    from csplat_render.kernels import thread_count
 
     x, y = pictures(61, 80)
     found = []

@@ -17,11 +17,10 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat.ply_write import write_ply
-from csplat_render.cameras import save_cameras
-from csplat_render.cloud import sample_cloud
-from csplat_render.judge import Judge, renderer
-from csplat_render.removal import Removal, measure_removal
-from csplat_render.virtual import is_clear, scene_frame
+from csplat_render.camera_files import save_cameras
+from csplat_render.pruning_error import PruningError, measure_pruning_error
+from csplat_render.scorer import Scorer, renderer
+from csplat_render.virtual_cameras import is_clear, sample_cloud, scene_frame
 from csplat_tools.cli.app import app
 from csplat_tools.cli.parsing import parse_decibels
 from csplat_tools.optimise.simplify import SimplifyOptions, simplify
@@ -133,13 +132,13 @@ def test_what_is_invisible_goes_first_and_what_is_unseen_stays(source):
 def test_rounds_ask_one_side_after_the_other(source):
     """Each round measures one side again; the other side keeps its last errors until its turn."""
     parts = [camera_sequence(source, 4, (48, 36), seed=seed) for seed in (1, 2)]
-    sides = [Side(cameras, measure_removal(source, cameras, bands=False)) for cameras in parts]
+    sides = [Side(cameras, measure_pruning_error(source, cameras, bands=False)) for cameras in parts]
     order = removal_order(source, sides, replace(SMALL, rounds=2), len(source) // 2)
     first = order.rounds[0].removed
     rows = order.kept(len(source), first)
     keys = removal_keys(source.opacities, seen_by(sides))
     np.testing.assert_array_equal(order.errors[:first], np.sort(np.maximum(keys, 0.0))[:first])
-    again = measure_removal(source.select(rows), parts[0]).error + sides[1].removal.error[rows]
+    again = measure_pruning_error(source.select(rows), parts[0]).error + sides[1].removal.error[rows]
     places = np.searchsorted(rows, order.rows[first:])
     np.testing.assert_allclose(order.errors[first:], again[places], rtol=1e-9)
 
@@ -147,7 +146,7 @@ def test_rounds_ask_one_side_after_the_other(source):
 @pytest.mark.slow
 def test_exact_errors_choose_better_than_opacity(source):
     check = camera_sequence(source, 6, (64, 48), seed=9)
-    judge = Judge.of_source(source, check, (0, 0, 0))
+    judge = Scorer.of_source(source, check, (0, 0, 0))
     scores = {}
     views = views_of(camera_sequence(source, 32, (48, 36), seed=3))
     for rounds in (1, SMALL.rounds):
@@ -196,7 +195,7 @@ def test_what_no_view_shows_is_not_adjusted(source):
     cameras = camera_sequence(source, 4, (48, 36))[:1]
     wanted = [picture + np.float32(0.1) for picture in render_pictures(source, cameras)]
     adjusted = adjust(source, cameras, wanted, SMALL, steps=8)
-    seen = measure_removal(source, cameras).seen
+    seen = measure_pruning_error(source, cameras).seen
     assert 0 < np.count_nonzero(seen) < len(source)
     np.testing.assert_array_equal(source.means, adjusted.means)
     for name in ("opacities", "quats", "scales", "sh0", "shN"):
@@ -280,7 +279,7 @@ def test_the_result_does_not_depend_on_threads(source, given):
 def test_bands_that_are_worth_less_than_their_bits_go():
     bands = np.array([[0.3, 0.3, 0.3], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
     zeros = np.zeros(3)
-    removal = Removal(zeros, zeros, np.array([True, False, True]), bands, 1)
+    removal = PruningError(zeros, zeros, np.array([True, False, True]), bands, 1)
     stays = band_mask(removal, 1.0)
     np.testing.assert_array_equal([[True, False, False], [True, True, True], [True, True, True]], stays)
     free = free_coefficients(stays)

@@ -16,9 +16,9 @@ from csplat import EncodeOptions, files, write_ply
 from csplat.encoder import encode_with_report
 from csplat.errors import InputError
 from csplat.scene import scene_of
-from csplat_render.cameras import intrinsics, look_at
-from csplat_render.judge import renderer
-from csplat_render.rasterise import Rasteriser
+from csplat_render.camera import intrinsics, look_at
+from csplat_render.rasteriser import Rasteriser
+from csplat_render.scorer import renderer
 from csplat_tools.cli.app import app
 from csplat_tools.files.scenes import LoadedModel, OpenedScene, opened_scenes
 from csplat_tools.views import comparison_cameras

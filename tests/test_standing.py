@@ -5,8 +5,8 @@ import pytest
 
 from csplat import decode, encode, read_ply
 from csplat.model import SplatModel
-from csplat_render.paths import orbit_cameras
-from csplat_render.standing import seeming_up, standing
+from csplat_render.camera_paths import orbit_cameras
+from csplat_render.virtual_cameras import estimate_up, with_estimated_up
 from csplat_tools.cli.parsing import parse_up, up_word
 from csplat_tools.views import find_view_set, showing_cameras
 
@@ -33,21 +33,21 @@ def photographed_from(up, seed=0, **fields):
 
 @pytest.mark.parametrize("up", AXES)
 def test_up_is_from_where_an_object_was_seen(up):
-    assert list(up) == standing(photographed_from(up)).metadata["up"]  # what `seeming_up` returns
+    assert list(up) == with_estimated_up(photographed_from(up)).metadata["up"]  # what `estimate_up` returns
     assert up == parse_up(up_word(up))
 
 
 def test_nothing_is_guessed_where_nothing_tells_it():
-    assert seeming_up(photographed_from((0, 0, 0))) is None  # seen from all sides
-    assert seeming_up(photographed_from((0.6, 0.6, 0.6))) is None  # between the axes
-    assert seeming_up(photographed_from((0, 0, 1)).select(np.arange(0))) is None
+    assert estimate_up(photographed_from((0, 0, 0))) is None  # seen from all sides
+    assert estimate_up(photographed_from((0.6, 0.6, 0.6))) is None  # between the axes
+    assert estimate_up(photographed_from((0, 0, 1)).select(np.arange(0))) is None
 
 
 @pytest.mark.parametrize("said", [{"metadata": {"up": [1, 0, 0]}}, {"coordinate_system": "RDF"}])
 def test_what_a_scene_says_is_not_doubted(said):
     model = photographed_from((0, 0, 1), **said)
-    assert seeming_up(model) is None
-    assert standing(model) is model
+    assert estimate_up(model) is None
+    assert with_estimated_up(model) is model
 
 
 @pytest.mark.slow
@@ -69,4 +69,4 @@ def test_a_file_says_no_more_than_its_source():
     ("name", "up"), [("lego60k", (0, 0, 1)), ("donut", (0, 0, 1)), ("horse", None), ("jacket", None)]
 )
 def test_real_objects_seem_to_stand_as_they_do(data_dir, name, up):
-    assert up == seeming_up(read_ply(data_dir / "ply" / f"{name}.ply"))
+    assert up == estimate_up(read_ply(data_dir / "ply" / f"{name}.ply"))

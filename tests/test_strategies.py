@@ -275,7 +275,7 @@ def test_a_file_is_the_same_each_time(source):
 def test_a_distilled_degree_looks_more_like_the_source(shell):
     from captures import cameras, views_of
 
-    from csplat_render.judge import Judge
+    from csplat_render.scorer import Scorer
 
     truncated = encode_reduced(shell, Reduction(sh_degree=0), EncodeOptions(attribute_psnr=60.0))
     reduction = Reduction(sh_degree=0, distil=True)
@@ -286,7 +286,7 @@ def test_a_distilled_degree_looks_more_like_the_source(shell):
     assert scene.stated_errors.refitted
     said = scene.options["reduced"]
     assert ("distilled", 21) == (said["sh"], said["views"])
-    judge = Judge.of_source(shell, views.decides, (0.0, 0.0, 0.0))
+    judge = Scorer.of_source(shell, views.decides, (0.0, 0.0, 0.0))
     before, after = (judge.psnr(decode(one.data)) for one in (truncated, distilled))
     assert said["check_psnr"] == pytest.approx(after, abs=0.5)
     assert after > before + 1.0

@@ -22,7 +22,8 @@ pytest.importorskip("numba", reason="targets of size and PSNR want the extra [re
 # Importing it needs what is looked for above.
 from captures import cameras, photograph, shell
 
-from csplat_render.cameras import intrinsics, look_at, save_cameras
+from csplat_render.camera import intrinsics, look_at
+from csplat_render.camera_files import save_cameras
 from csplat_tools.cli.groups import Output
 
 pytestmark = pytest.mark.usefixtures("small_views")

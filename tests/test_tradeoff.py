@@ -28,7 +28,7 @@ from csplat._spec import CHUNK_CODEBOOK
 from csplat.decoder import read_header
 from csplat.errors import InputError
 from csplat.scene import without_bands
-from csplat_render.cameras import save_cameras
+from csplat_render.camera_files import save_cameras
 from csplat_tools.cli.app import app
 from csplat_tools.study import Reduction
 from csplat_tools.tradeoffs.commands import reduction_command, target_command

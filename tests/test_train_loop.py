@@ -11,9 +11,8 @@ from typer.testing import CliRunner
 from csplat import decode, read_ply, write_ply
 from csplat.errors import InputError
 from csplat.training import TrainedOn
-from csplat_render.camera import Camera
-from csplat_render.cameras import intrinsics, orbit, relative_to
-from csplat_render.rasterise import Rasteriser
+from csplat_render.camera import Camera, intrinsics, orbit, relative_to
+from csplat_render.rasteriser import Rasteriser
 from csplat_tools.cli.app import app
 from csplat_tools.training.train import tuning_after
 from csplat_trainer.data import DataSet

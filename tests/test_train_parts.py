@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from csplat.errors import InputError
-from csplat_render.camera import Camera
-from csplat_render.cameras import intrinsics, orbit
+from csplat_render.camera import Camera, intrinsics, orbit
 from csplat_trainer.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from csplat_trainer.densify import ScreenGradients, densify, reset_opacities
 from csplat_trainer.mcmc import add_noise, grow, relocate, share

@@ -16,8 +16,9 @@ from csplat.model import SplatModel, normalise_quats
 pytest.importorskip("numba", reason="pictures need the rasteriser: pip install 'csplat[render]'")
 
 from csplat_render import render
-from csplat_render.cameras import intrinsics, load_cameras, look_at
-from csplat_render.virtual import virtual_cameras
+from csplat_render.camera import intrinsics, look_at
+from csplat_render.camera_files import load_cameras
+from csplat_render.virtual_cameras import virtual_cameras
 
 pytestmark = [*IN_CHROMIUM, pytest.mark.area(name="chromium")]
 

@@ -19,8 +19,9 @@ from PIL import Image
 from csplat.errors import InputError
 from csplat.ply import read_ply
 from csplat.training import TRAINING, TrainedOn
-from csplat_render.cameras import relative_to, resized, save_cameras
-from csplat_render.judge import renderer
+from csplat_render.camera import relative_to, resized
+from csplat_render.camera_files import save_cameras
+from csplat_render.scorer import renderer
 from csplat_tools.cli.app import app
 from csplat_tools.views import BLACK, WHITE, DataOptions, ViewSet, find_view_set
 from csplat_tools.views.viewset import pose

@@ -10,10 +10,17 @@ import pytest
 from csplat import read_ply
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat_render.cameras import load_cameras
-from csplat_render.cloud import cover, sample_cloud, weighted_quantiles
-from csplat_render.paths import orbit_cameras
-from csplat_render.virtual import OBJECT_DISTANCES, SURROUNDING_DISTANCES, scene_frame, virtual_cameras
+from csplat_render.camera_files import load_cameras
+from csplat_render.camera_paths import orbit_cameras
+from csplat_render.virtual_cameras import (
+    OBJECT_DISTANCES,
+    SURROUNDING_DISTANCES,
+    covered_fraction,
+    sample_cloud,
+    scene_frame,
+    virtual_cameras,
+    weighted_quantiles,
+)
 
 
 def model_of(means, size=0.03, **fields):
@@ -77,7 +84,7 @@ def test_an_object_covers_half_of_each_picture(count, seed):
     frame = scene_frame(model)
     for camera in cameras:
         assert (640, 480) == (camera.W, camera.H)
-        assert cover(cloud, camera) >= 0.5
+        assert covered_fraction(cloud, camera) >= 0.5
         distance = np.linalg.norm(camera.position - frame.centre) / frame.extent
         assert np.isclose(distance, OBJECT_DISTANCES).any()
         assert camera.near == min(0.2, 0.05 * frame.extent)
@@ -87,7 +94,7 @@ def test_a_tower_is_covered_too():
     rng = np.random.default_rng(0)
     model = model_of(rng.random((5000, 3)) * [0.3, 3.0, 0.3], 0.02)
     cloud = sample_cloud(model, 50_000, rng)
-    assert all(cover(cloud, camera) >= 0.5 for camera in virtual_cameras(model, 3))
+    assert all(covered_fraction(cloud, camera) >= 0.5 for camera in virtual_cameras(model, 3))
 
 
 def test_cameras_stand_all_around_an_object():
@@ -139,7 +146,7 @@ THREADS = """
 import json
 import numpy as np
 from csplat.model import SplatModel, normalise_quats
-from csplat_render.virtual import virtual_cameras
+from csplat_render.virtual_cameras import virtual_cameras
 
 rng = np.random.default_rng(0)
 f = lambda *shape: rng.standard_normal((20000, *shape)).astype(np.float32)

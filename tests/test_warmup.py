@@ -18,7 +18,7 @@ pytestmark = [
 _USE = """
 import json, os, sys
 import numpy as np
-import csplat_tools.optimise.simplify, csplat_render.judge, csplat_render.lpips, csplat_render.similarity
+import csplat_tools.optimise.simplify, csplat_render.scorer, csplat_render.lpips, csplat_render.metric_kernels
 from csplat.model import SplatModel
 from csplat_render.warmup import warm_up
 
@@ -49,16 +49,16 @@ simplify(model, keep=0.5, options=SimplifyOptions(views=2, view_size=(32, 24), r
 _COMPARE = """
 plain = None
 warm_up(gradients=False, ssim=True, lpips=True)
-from csplat_render.convolving import convolve
+from csplat_render.metric_kernels import convolve
 from csplat_render.lpips import SCALE
-from csplat_render.judge import Judge
-from csplat_render.cameras import intrinsics, look_at
+from csplat_render.scorer import Scorer
+from csplat_render.camera import intrinsics, look_at
 before = compiled()
 def lpips(a, b):
     kernel = np.full((11, 11, 3, 64), 0.1, np.float32)
     return float(convolve((a - b) / SCALE, kernel, np.zeros(64, np.float32), 4, 2).mean())
 camera = look_at((4.0, 4.0, 4.0), (0.5, 0.5, 0.5), (0.0, 0.0, 1.0), intrinsics(64, 48, 60.0), 64, 48)
-judge = Judge.of_source(model, [camera], (0.0, 0.0, 0.0))
+judge = Scorer.of_source(model, [camera], (0.0, 0.0, 0.0))
 judge.scores(model.select(np.arange(30)), lpips=lpips)
 """
 _TELL = "print(json.dumps([plain, before, compiled()]), flush=True)"
@@ -88,7 +88,7 @@ def assert_nothing_was_compiled(before, after):
 def test_nothing_is_left_to_compile_after_warming_up_for_simplify_and_a_plain_renderer_needs_less(versions):
     plain, before, after = versions[0]
     assert_nothing_was_compiled(before, after)
-    assert "csplat_render.blending_sums.sum_removal" in {name for name in after if after[name] > plain.get(name, 0)}
+    assert "csplat_render.contributions.sum_pruning" in {name for name in after if after[name] > plain.get(name, 0)}
 
 
 def test_nothing_is_left_to_compile_after_warming_up_for_compare(versions):

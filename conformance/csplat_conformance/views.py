@@ -1,7 +1,7 @@
 """L4: renderings. A scene, a camera, a reference picture, and how near to it a renderer has to come.
 
-The picture is what the equations give in binary64 (`csplat_render.twin`), over black, clipped to 0..1, times 255 and
-rounded; IMPLEMENTERS.md lists the conventions. A renderer is a command
+The picture is what the equations give in binary64 (`csplat_render.reference_rasteriser`), over black, clipped to 0..1,
+times 255 and rounded; IMPLEMENTERS.md lists the conventions. A renderer is a command
 
     my-renderer INPUT CAMERA OUT
 
@@ -47,7 +47,7 @@ def quantised(rgb: NDArray[Any]) -> U8:
 def reference_picture(floats: Mapping[str, NDArray[Any]], camera: Mapping[str, Any], antialiased: bool) -> U8:
     """Render the expected arrays of a scene from the equations, in binary64. Needs the extra `render`."""
     from csplat_render.camera import Camera  # in the extra `render`, which the suite can do without
-    from csplat_render.twin import render_exact
+    from csplat_render.reference_rasteriser import render_exact
 
     splats: Any = SimpleNamespace(**floats)
     return quantised(render_exact(splats, Camera.from_json(camera), antialiased=antialiased).rgb)

@@ -99,10 +99,10 @@ def psnr(source, decoded):
     )
     judge = _judges().get(key)
     if judge is None:
-        from csplat_render.judge import Judge
-        from csplat_render.virtual import virtual_cameras
+        from csplat_render.scorer import Scorer
+        from csplat_render.virtual_cameras import virtual_cameras
 
-        judge = _judges()[key] = Judge.of_source(source, virtual_cameras(source, *VIEWS, seed=0))
+        judge = _judges()[key] = Scorer.of_source(source, virtual_cameras(source, *VIEWS, seed=0))
     return judge.psnr(decoded)
 
 

@@ -34,8 +34,8 @@ from csplat_bench.common.peers import find_splat_transform
 from csplat_bench.common.plots import new_figure, save_svg
 from csplat_bench.common.report import describe
 from csplat_render import Camera, render
-from csplat_render.cameras import intrinsics, look_at
-from csplat_render.judge import Judge
+from csplat_render.camera import intrinsics, look_at
+from csplat_render.scorer import Scorer
 from csplat_tools.files.streams import write_bytes, write_json
 from csplat_tools.views.finding import comparison_cameras
 
@@ -86,7 +86,7 @@ def measure(peers: Path) -> dict[str, Any]:
         What `measured.json` holds: bytes, dB and least seconds by name, and what took them.
     """
     source = csplat.read_ply(SAMPLE)
-    judge = Judge.of_source(source, comparison_cameras(source))
+    judge = Scorer.of_source(source, comparison_cameras(source))
     presets = {}
     for name in _PRESETS:
         options = csplat.EncodeOptions(preset=name)
@@ -192,7 +192,7 @@ def _row(names: Sequence[Path]) -> Image.Image:
     return row
 
 
-def _target(judge: Judge, folder: Path, psnr: int, *more: str) -> dict[str, Any]:
+def _target(judge: Scorer, folder: Path, psnr: int, *more: str) -> dict[str, Any]:
     """A file that reaches a PSNR, by the command itself."""
     path = folder / "target.csplat"
     words = ["encode", str(SAMPLE), str(path), "--target-psnr", str(psnr), "--force", "--quiet", *more]
@@ -200,7 +200,7 @@ def _target(judge: Judge, folder: Path, psnr: int, *more: str) -> dict[str, Any]
     return {**_scored(judge, path.read_bytes()), "wanted": psnr, "seconds": round(timing.wall, 1)}
 
 
-def _peer(judge: Judge, command: list[str], path: Path) -> dict[str, Any]:
+def _peer(judge: Scorer, command: list[str], path: Path) -> dict[str, Any]:
     """A file of another format, with that program's defaults, and what the program reads from it."""
     back = path.with_name(path.name + ".ply")
     for given, made in ((SAMPLE, path), (path, back)):
@@ -208,7 +208,7 @@ def _peer(judge: Judge, command: list[str], path: Path) -> dict[str, Any]:
     return {"bytes": path.stat().st_size, "psnr": round(judge.psnr(csplat.read_ply(back)), 2)}
 
 
-def _scored(judge: Judge, data: bytes) -> dict[str, Any]:
+def _scored(judge: Scorer, data: bytes) -> dict[str, Any]:
     return {"bytes": len(data), "psnr": round(judge.psnr(csplat.decode(data)), 2)}
 
 

@@ -30,8 +30,7 @@ from PIL import Image
 
 from csplat import SplatModel, write_ply
 from csplat.types import F32, F64
-from csplat_render.camera import Camera
-from csplat_render.cameras import intrinsics, look_at
+from csplat_render.camera import Camera, intrinsics, look_at
 from csplat_render.warmup import warm_up
 from csplat_trainer.data import load
 from csplat_trainer.loop import train

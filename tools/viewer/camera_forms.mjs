@@ -1,5 +1,5 @@
 // Camera files of other programs, as entries of our own: cameras.json of INRIA, camera paths of nerfstudio,
-// transforms.json. `csplat_render/camera_forms.py` describes them, and reads them in the same way.
+// transforms.json. `csplat_render/camera_files.py` describes them, and reads them in the same way.
 
 const NEAR = 0.01; // scene units, of nerfstudio's renderer
 

@@ -144,7 +144,7 @@ bool openBand(uint tile, uint local, uint band) {
 }
 `;
 
-/** Spherical harmonics in the order and with the signs of csplat_render/harmonics.py. */
+/** Spherical harmonics in the order and with the signs of csplat_render/projection.py. */
 export const COLOUR = `
 uniform int uDegree;
 

@@ -16,7 +16,7 @@ void main() {
   gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0);
 }`;
 
-/** One splat to a record; follows csplat_render/projecting.py, in single precision. */
+/** One splat to a record; follows csplat_render/projection.py, in single precision. */
 export const PROJECT_FRAGMENT = `${HEAD}
 ${READ_GEOMETRY}
 ${READ_BANDS}

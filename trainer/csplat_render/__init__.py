@@ -13,7 +13,7 @@ from csplat_render.conventions import Mode
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from csplat_render.arrays import HasSplats, RenderResult
+    from csplat_render.conventions import HasSplats, RenderResult
 
 __all__ = ["Camera", "Mode", "render"]
 
@@ -28,7 +28,7 @@ def render(
     sh_degree: int | None = None,
     threads: int | None = None,
 ) -> RenderResult:
-    """Render one picture. For many of one scene, or gradients, keep a `csplat_render.rasterise.Rasteriser`.
+    """Render one picture. For many of one scene, or gradients, keep a `csplat_render.rasteriser.Rasteriser`.
 
     Args:
         model: a `SplatModel`, or anything with its six arrays. Its origin is not added: cameras
@@ -46,7 +46,7 @@ def render(
 
     Examples:
         >>> import csplat, csplat_render
-        >>> from csplat_render.paths import orbit_cameras
+        >>> from csplat_render.camera_paths import orbit_cameras
         >>> model = csplat.read_ply("scene.ply")
         >>> camera = orbit_cameras(model, 1, 64, 48)[0]
         >>> csplat_render.render(model, camera, mode="exact").rgb.shape
@@ -58,8 +58,8 @@ def render(
     """
     # numba takes a second to import: those who want cameras alone do not wait for it.
     try:
-        from csplat_render.rasterise import Rasteriser
-        from csplat_render.twin import render_exact
+        from csplat_render.rasteriser import Rasteriser
+        from csplat_render.reference_rasteriser import render_exact
     except ModuleNotFoundError as error:
         raise missing(error) from None
 

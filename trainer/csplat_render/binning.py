@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from csplat_render.jit import inline, kernel, lane_run, parallel_kernel
+from csplat_render.kernels import device_function, kernel, lane_range, parallel_kernel
 
 #: Width and height of a tile in pixels.
 TILE = 16
@@ -22,7 +22,7 @@ TILE_BITS = 4
 #: Runs of the depth order that are sorted into tiles independently.
 CHUNKS = 8
 
-_FEW = 6  # tiles of a box that is taken as it is, without asking for the ellipse in it
+_SMALL_BOX = 6  # tiles of a box that is taken as it is, without asking for the ellipse in it
 _DIGIT = 11  # bits per pass of the radix sort; three passes cover a float32
 
 
@@ -66,7 +66,7 @@ def depth_order(depth: Any, keys: Any, order: Any, keys2: Any, order2: Any) -> i
     return n
 
 
-@inline
+@device_function
 def _scatter(n: int, shift: Any, mask: Any, counts: Any, keys: Any, order: Any, keys2: Any, order2: Any) -> None:
     for j in range(n):
         key = keys[j]
@@ -77,17 +77,17 @@ def _scatter(n: int, shift: Any, mask: Any, counts: Any, keys: Any, order: Any, 
         order2[to] = order[j]
 
 
-@inline
-def _tiles(j: int, box: Any) -> tuple[int, int, int, int, bool]:
+@device_function
+def _tile_box(j: int, box: Any) -> tuple[int, int, int, int, bool]:
     """Columns and rows of the tiles of a box, and whether it is taken as it is: roots cost more than they save."""
     first, last = box[j, 0] >> TILE_BITS, ((box[j, 1] - 1) >> TILE_BITS) + 1
     top, bottom = box[j, 2] >> TILE_BITS, ((box[j, 3] - 1) >> TILE_BITS) + 1
     width, height = last - first, bottom - top
-    return first, last, top, bottom, width < 2 or height < 2 or width * height <= _FEW
+    return first, last, top, bottom, width < 2 or height < 2 or width * height <= _SMALL_BOX
 
 
-@inline
-def _span(tile_y: int, j: int, extent: Any, box: Any, first: int, last: int) -> tuple[int, int]:
+@device_function
+def _row_span(tile_y: int, j: int, extent: Any, box: Any, first: int, last: int) -> tuple[int, int]:
     """First and last + 1 tile of one row of tiles that the ellipse of a splat touches."""
     py = extent[j, 5]
     low = max(tile_y * TILE, box[j, 2]) + 0.5 - py
@@ -111,7 +111,9 @@ def _span(tile_y: int, j: int, extent: Any, box: Any, first: int, last: int) -> 
 
 
 @parallel_kernel()
-def arrange(lane: int, lanes: int, order: Any, extent: Any, box: Any, sorted_extent: Any, sorted_box: Any) -> None:
+def gather_by_depth(
+    lane: int, lanes: int, order: Any, extent: Any, box: Any, sorted_extent: Any, sorted_box: Any
+) -> None:
     """Copy what the sort into tiles reads to the order in which it reads: no waiting for memory there.
 
     Args:
@@ -121,7 +123,7 @@ def arrange(lane: int, lanes: int, order: Any, extent: Any, box: Any, sorted_ext
         sorted_extent: [V, 6], written.
         sorted_box: [V, 4], written.
     """
-    for j in range(*lane_run(lane, lanes, len(order))):
+    for j in range(*lane_range(lane, lanes, len(order))):
         i = order[j]
         for k in range(6):
             sorted_extent[j, k] = extent[i, k]
@@ -137,8 +139,8 @@ def count_tiles(
 
     Args:
         order: [V] int32, splats that are drawn, nearest first.
-        extent: [V, 6], see `arrange`.
-        box: [V, 4], see `arrange`.
+        extent: [V, 6], see `gather_by_depth`.
+        box: [V, 4], see `gather_by_depth`.
         tiles_x: tiles side by side.
         counts: [CHUNKS, tiles] int32, written: splats of each chunk in each tile.
         touched: [N] int32, written for splats that are drawn: tiles of each; empty without gradients.
@@ -149,7 +151,7 @@ def count_tiles(
         row = counts[chunk]
         row[:] = 0
         for j in range(n * chunk // chunks, n * (chunk + 1) // chunks):
-            first, last, top, bottom, few = _tiles(j, box)
+            first, last, top, bottom, few = _tile_box(j, box)
             tiles = (last - first) * (bottom - top) if few else 0
             if few:
                 for ty in range(top, bottom):
@@ -157,7 +159,7 @@ def count_tiles(
                         row[t] += 1
             else:
                 for ty in range(top, bottom):
-                    x0, x1 = _span(ty, j, extent, box, first, last)
+                    x0, x1 = _row_span(ty, j, extent, box, first, last)
                     tiles += max(x1 - x0, 0)
                     for t in range(ty * tiles_x + x0, ty * tiles_x + x1):
                         row[t] += 1
@@ -208,8 +210,8 @@ def fill_tiles(
 
     Args:
         order: see `count_tiles`, as the next three.
-        extent: [V, 6], see `arrange`.
-        box: [V, 4], see `arrange`.
+        extent: [V, 6], see `gather_by_depth`.
+        box: [V, 4], see `gather_by_depth`.
         tiles_x: tiles side by side.
         counts: [CHUNKS, tiles] int32, from `tile_starts`; used up.
         starts: [tiles + 1] int64.
@@ -226,11 +228,11 @@ def fill_tiles(
         for j in range(n * chunk // chunks, n * (chunk + 1) // chunks):
             i = order[j]
             slot = offsets[i] if with_slots else 0
-            first, last, top, bottom, few = _tiles(j, box)
+            first, last, top, bottom, few = _tile_box(j, box)
             for ty in range(top, bottom):
                 x0, x1 = first, last
                 if not few:
-                    x0, x1 = _span(ty, j, extent, box, first, last)
+                    x0, x1 = _row_span(ty, j, extent, box, first, last)
                 for t in range(ty * tiles_x + x0, ty * tiles_x + x1):
                     to = starts[t] + row[t]
                     row[t] += 1

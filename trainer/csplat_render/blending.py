@@ -1,32 +1,268 @@
-"""The loop over pixels, forward: tile by tile, splats front to back, a row of 16 pixels at a time."""
+"""Blending of the splats of each tile, front to back, 16 pixels of a row at a time; and its gradient.
+
+A splat's exponent is rewritten for each tile, in float64, as one polynomial of x for each row, so that float32 is
+enough for the pixels however far away the centre of the splat lies. This is done for a batch of splats at a time,
+because their numbers lie anywhere in memory: the processor fetches many at once.
+
+Forward, at a pixel, with transmittance T = 1 before the first splat:
+
+    alpha = min(opacity · exp(E), ALPHA_CAP), 0 below ALPHA_MIN;  w = T alpha;  colour += w c;  T ← T (1 − alpha)
+
+Backward, the splats are blended once more, front to back. With L the loss, a pixel keeps the product of its gradient
+with all colour, depth and alpha that lies behind, `behind`; each splat subtracts its share `own` = w (g_colour·c +
+g_alpha + g_depth z). Then slope = ∂L/∂E = own − behind · alpha / (1 − alpha), 0 if alpha is capped. Each splat and
+tile has one record of gradients, so that threads share nothing.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from csplat_render.binning import TILE
-from csplat_render.blending_steps import (
-    CHECK,
-    NUMBERS,
-    aligned,
-    alive_rows,
-    alpha_at,
-    begin_tile,
-    gather,
-    go_on,
-    leave,
-    middles,
-    narrow_rows,
-    numbers_of,
-    passed,
-    place,
-)
-from csplat_render.jit import ParallelKernel, parallel_kernel
+from csplat_render.kernels import ParallelKernel, device_function, fast_exp2, inlined, parallel_kernel
+
+#: Splats of a batch, between two looks at which rows of a tile are finished.
+BATCH = 16
+
+# Numbers of a splat in a batch: for each row of the tile the constant and the linear coefficient of
+# the exponent of 2, then the quadratic one, opacity, red, green, blue, depth.
+ROW0, ROW1, TAIL = 0, TILE, 2 * TILE
+BATCH_COLUMNS = TAIL + 6
+
+#: From the corner of a tile to its middle.
+HALF_TILE = 0.5 * TILE
+
+_LOG2E = math.log2(math.e)
+_CACHE_LINE = 64  # bytes
+
+# If a splat has alpha >= 1/255, the gradient of its exponent is at most √(2 ln 255 / 0.3) ≈ 6 per
+# pixel, and changes by at most 1/0.3 per pixel: a tile whose centre has more than this shows nothing.
+_MAX_SLOPE = 1e3
+_MIN_EXPONENT = -1e4
 
 
-def _blender(counted: bool) -> ParallelKernel[...]:
+@device_function
+def aligned_zeros(size: int, like: Any) -> Any:
+    """Zeros that begin at a cache line, so that 16 float32 never lie in two; `like` has their dtype."""
+    store = np.zeros(size + _CACHE_LINE // like.itemsize, like.dtype)
+    skip = -store.ctypes.data % _CACHE_LINE // like.itemsize
+    return store[skip : skip + size]
+
+
+@device_function
+def pixel_centres() -> Any:
+    """Positions of the 16 pixels of a row, or of the rows, about the middle of a tile; float64."""
+    ys = np.empty(TILE, np.float64)
+    for y in range(TILE):
+        ys[y] = y + (0.5 - HALF_TILE)
+    return ys
+
+
+@device_function
+def tile_extent(tile: int, tiles_x: int, width: int, height: int) -> tuple[int, int, int, int]:
+    """First column and row of a tile, and how many of either lie on the picture."""
+    X0, Y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
+    return X0, Y0, min(TILE, width - X0), min(TILE, height - Y0)
+
+
+@device_function
+def begin_tile(T: Any, columns: int, one: Any) -> None:
+    """Let all light through; columns that are not on the picture are finished from the start.
+
+    Args:
+        T: [TILE, TILE or more], transmittances, written; a pixel that is finished has a negative one.
+        columns: number of columns on the image.
+        one: 1, of the dtype of the pixels.
+    """
+    for y in range(TILE):
+        for x in range(TILE):
+            T[y, x] = one if x < columns else -one
+
+
+@device_function
+def load_state(state: Any, X0: int, Y0: int, columns: int, high: int, planes: Any) -> None:
+    """Begin a tile where nearer splats left it.
+
+    Args:
+        state: [H, W, 5]: transmittance, negative if a pixel is finished, red, green, blue, and the fifth plane.
+        X0, Y0: first column and row of the tile.
+        columns, high: number of columns and rows on the image.
+        planes: [TILE, 5 * TILE or more], written on the picture.
+    """
+    for y in range(high):
+        for x in range(columns):
+            for k in range(5):
+                planes[y, k * TILE + x] = state[Y0 + y, X0 + x, k]
+
+
+@device_function
+def store_state(state: Any, X0: int, Y0: int, columns: int, high: int, planes: Any) -> None:
+    """Keep a tile for farther splats: the opposite of `load_state`."""
+    for y in range(high):
+        for x in range(columns):
+            for k in range(5):
+                state[Y0 + y, X0 + x, k] = planes[y, k * TILE + x]
+
+
+@device_function
+def read_planes(picture: Any, X0: int, Y0: int, columns: int, high: int, planes: Any, at: int) -> None:
+    """Copy a tile of a picture, [H, W, 3], into three planes of 16 × 16 that lie one after the other from `at` on."""
+    for y in range(high):
+        row = planes[at + y * TILE :]
+        for x in range(columns):
+            row[x] = picture[Y0 + y, X0 + x, 0]
+            row[TILE * TILE + x] = picture[Y0 + y, X0 + x, 1]
+            row[2 * TILE * TILE + x] = picture[Y0 + y, X0 + x, 2]
+
+
+@device_function
+def tile_polynomial(shape: Any, i: int, x: float, y: float) -> tuple[float, float, float, float, float, float, bool]:
+    """Exponent of a splat around the point (x, y): c0 + cx·dx + cy·dy + cxx·dx² + cxy·dx·dy + cyy·dy².
+
+    Returns:
+        c0, cx, cy, cxx, cxy, cyy, and whether anything of the splat can be seen in the tile there.
+    """
+    dx, dy = x - shape[i, 0], y - shape[i, 1]
+    a, b, c = shape[i, 2], shape[i, 3], shape[i, 4]
+    cx, cy = -(a * dx + b * dy), -(b * dx + c * dy)
+    c0 = 0.5 * (dx * cx + dy * cy)
+    seen = abs(cx) + abs(cy) < _MAX_SLOPE and c0 > _MIN_EXPONENT
+    return c0, cx, cy, -0.5 * a, -b, -0.5 * c, seen
+
+
+@device_function
+def unfinished_rows(T: Any, low: int, high: int) -> tuple[int, int]:
+    """Narrow a range of rows to the rows in which some pixel is not finished."""
+    while low < high:
+        best = T[low, 0]
+        for x in range(1, TILE):
+            best = max(best, T[low, x])
+        if best > 0.0:
+            break
+        low += 1
+    while low < high:
+        best = T[high - 1, 0]
+        for x in range(1, TILE):
+            best = max(best, T[high - 1, x])
+        if best > 0.0:
+            break
+        high -= 1
+    return low, high
+
+
+@device_function
+def gather_batch(
+    ids: Any,
+    begin: int,
+    end: int,
+    shape: Any,
+    box: Any,
+    X0: int,
+    Y0: int,
+    low: int,
+    high: int,
+    ys: Any,
+    batch: Any,
+    rows: Any,
+) -> None:
+    """Write the numbers of some splats in a tile that the loop over pixels needs.
+
+    Args:
+        ids: see `blend`, as shape and box.
+        begin: first of `ids`.
+        end: last of `ids`, plus 1; at most CHECK of them.
+        shape: see `blend`.
+        box: see `blend`.
+        X0: first column of the tile.
+        Y0: first row of the tile.
+        low: first of the tile's rows that is not finished.
+        high: last of them, plus 1.
+        ys: [TILE] float64, see `pixel_centres`.
+        batch: [CHECK, NUMBERS], written.
+        rows: [CHECK, 2] int64, written: first row of the tile that each splat may touch, and last plus 1.
+    """
+    for k in range(begin, end):
+        i = ids[k]
+        c0, cx, cy, cxx, cxy, cyy, seen = tile_polynomial(shape, i, X0 + HALF_TILE, Y0 + HALF_TILE)
+        rows[k - begin, 0] = max(box[i, 2] - Y0, low) if seen else 0
+        rows[k - begin, 1] = min(box[i, 3] - Y0, high) if seen else 0
+        c0, cx, cy, cxx, cxy, cyy = c0 * _LOG2E, cx * _LOG2E, cy * _LOG2E, cxx * _LOG2E, cxy * _LOG2E, cyy * _LOG2E
+        one = batch[k - begin]
+        for y in range(len(ys)):
+            one[ROW0 + y] = c0 + ys[y] * (cy + ys[y] * cyy)
+            one[ROW1 + y] = cx + ys[y] * cxy
+        one[TAIL] = cxx
+        for n in range(5):
+            one[TAIL + 1 + n] = shape[i, 5 + n]
+
+
+@device_function
+def narrow_rows(count: int, batch: Any, rows: Any) -> None:
+    """Narrow the rows of a tile that each splat may touch: its box is generous, at a slant above all.
+
+    Args:
+        count: splats of the batch.
+        batch: [CHECK, NUMBERS], see `gather_batch`; in place of a depth the exponent of 2 below which nothing is drawn.
+        rows: [CHECK, 2] int64, changed.
+    """
+    edge = np.float32(HALF_TILE - 0.5)
+    for j in range(count):
+        one = batch[j]
+        a, least = one[TAIL], one[TAIL + 5]
+        middle = np.float32(-0.5) / a
+        first, end = np.int32(TILE), np.int32(0)
+        for y in range(TILE):
+            at = min(max(one[ROW1 + y] * middle, -edge), edge)
+            peak = (a * at + one[ROW1 + y]) * at + one[ROW0 + y]
+            faint = peak < least  # NaN, of a splat without end, is not
+            first = min(first, np.int32(TILE) if faint else np.int32(y))
+            end = max(end, np.int32(0) if faint else np.int32(y + 1))
+        rows[j, 0] = max(rows[j, 0], first)
+        rows[j, 1] = min(rows[j, 1], end)
+
+
+@inlined
+def batch_entry(batch: Any, j: int, first: int) -> tuple[Any, ...]:
+    """Return a splat's columns of a batch: both coefficients by row, from row `first` on; then the scalars."""
+    splat = batch[j]
+    row0, row1 = splat[ROW0 + first :], splat[ROW1 + first :]
+    return row0, row1, splat[TAIL], splat[TAIL + 1], splat[TAIL + 2], splat[TAIL + 3], splat[TAIL + 4], splat[TAIL + 5]
+
+
+@inlined
+def alpha_at(x: Any, c0: Any, c1: Any, a: Any, o: Any, alpha_min: Any, alpha_cap: Any, zero: Any) -> tuple[Any, Any]:
+    """Alpha of a splat at a pixel, without cap and floor, and with both.
+
+    Args:
+        x: position in the row.
+        c0: constant coefficient of the exponent of 2 in this row.
+        c1: linear coefficient.
+        a: quadratic coefficient.
+        o: opacity.
+        alpha_min: smaller values become 0.
+        alpha_cap: larger values become this.
+        zero: 0, of the dtype of the pixels.
+    """
+    full = o * fast_exp2(min((a * x + c1) * x + c0, zero))
+    alpha = min(full, alpha_cap)
+    return full, alpha if alpha >= alpha_min else zero
+
+
+@inlined
+def transmit(before: Any, alpha: Any, stop: Any, zero: Any, one: Any) -> tuple[Any, Any, Any]:
+    """Go on behind a splat: whether the pixel does, the splat's share of it, and what is to be kept as transmittance.
+
+    A pixel whose transmittance would fall below `stop` is finished: it keeps what it had, negative from then on.
+    """
+    after = before * (one - alpha)
+    going = after >= stop
+    return going, alpha * before if going else zero, after if going else -abs(before)
+
+
+def _make_blend(counted: bool) -> ParallelKernel[...]:
     """Make `blend`, or the kernel that notes how far pixels got where `blend` adds up depth."""
 
     @parallel_kernel(relaxed=True)
@@ -53,7 +289,7 @@ def _blender(counted: bool) -> ParallelKernel[...]:
             lanes: how many share the tiles; the result does not depend on it.
             starts: [tiles + 1] int64, where the splats of each tile begin in `ids`.
             ids: [intersections] int32, splats, tile by tile, nearest first.
-            shape: [N, 10] float64, see `project`; where counted see `narrow_rows`.
+            shape: [N, 10] float64, see `project`; if `counted`, see `narrow_rows`.
             box: [N, 4] int32, see `project`.
             tiles_x: tiles side by side.
             limits: [3], smallest alpha, largest alpha, smallest transmittance; its dtype, float32 or
@@ -63,51 +299,51 @@ def _blender(counted: bool) -> ParallelKernel[...]:
             transmittance: [H, W], written: what the background shines through with.
             fifth: [H, W], written: the sum of weight · depth; where counted the place, from its tile's start, of the
                 last splat of those whose rows the pixel lies in that came before it was finished, −1 if there is none.
-            used: [tiles] int64, written: the end of what was looked at of each tile.
-            state: [H, W, 5], changed: what nearer splats left of each pixel, see `go_on`; where it is empty there are
-                none, and nothing is kept for farther ones.
+            used: [tiles] int64, written: the end of the splats that were blended, per tile.
+            state: [H, W, 5], changed: the pixels after nearer splats, see `load_state`; empty if there are none, and
+                then nothing is stored for farther ones.
         """
         height, width = transmittance.shape
         # One row of memory per row of pixels, so that the compiler sees that nothing overlaps:
         # 16 transmittances, then 16 each of red, green, blue, the fifth; and the positions in a row.
-        planes = aligned(TILE * 6 * TILE, limits).reshape((TILE, 6 * TILE))
-        ys = middles()
+        planes = aligned_zeros(TILE * 6 * TILE, limits).reshape((TILE, 6 * TILE))
+        ys = pixel_centres()
         for y in range(TILE):
             for x in range(TILE):
                 planes[y, 5 * TILE + x] = ys[x]
-        batch, rows = np.empty((CHECK, NUMBERS), limits.dtype), np.empty((CHECK, 2), np.int64)
+        batch, rows = np.empty((BATCH, BATCH_COLUMNS), limits.dtype), np.empty((BATCH, 2), np.int64)
         alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
         zero, one = alpha_min - alpha_min, alpha_min / alpha_min
         nothing = -one if counted else zero
         for tile in range(lane, len(used), lanes):
-            X0, Y0, columns, on_picture = place(tile, tiles_x, width, height)
+            X0, Y0, columns, on_picture = tile_extent(tile, tiles_x, width, height)
             low, high = 0, on_picture
             begin_tile(planes, columns, one)
             planes[:, TILE : 4 * TILE] = zero
             planes[:, 4 * TILE : 5 * TILE] = nothing
             if len(state):
-                go_on(state, X0, Y0, columns, on_picture, planes)
+                load_state(state, X0, Y0, columns, on_picture, planes)
             end = starts[tile + 1]
-            for begin in range(starts[tile], end, CHECK):
-                low, high = alive_rows(planes, low, high)
+            for begin in range(starts[tile], end, BATCH):
+                low, high = unfinished_rows(planes, low, high)
                 if low >= high:
                     end = begin
                     break
-                count = min(CHECK, end - begin)
-                gather(ids, begin, begin + count, shape, box, X0, Y0, low, high, ys, batch, rows)
+                count = min(BATCH, end - begin)
+                gather_batch(ids, begin, begin + count, shape, box, X0, Y0, low, high, ys, batch, rows)
                 if counted:
                     narrow_rows(count, batch, rows)
                 for j in range(count):
                     first = rows[j, 0]
                     body = planes[first : rows[j, 1]]
-                    row0, row1, a, o, r, g, b, d = numbers_of(batch, j, first)
+                    row0, row1, a, o, r, g, b, d = batch_entry(batch, j, first)
                     if counted:
                         d = planes.dtype.type(begin + j - starts[tile])
                     for y in range(len(body)):
                         row, c0, c1 = body[y], row0[y], row1[y]
                         for x in range(TILE):
                             _, alpha = alpha_at(row[5 * TILE + x], c0, c1, a, o, alpha_min, alpha_cap, zero)
-                            going, weight, row[x] = passed(row[x], alpha, stop, zero, one)
+                            going, weight, row[x] = transmit(row[x], alpha, stop, zero, one)
                             row[TILE + x] += weight * r
                             row[2 * TILE + x] += weight * g
                             row[3 * TILE + x] += weight * b
@@ -117,7 +353,7 @@ def _blender(counted: bool) -> ParallelKernel[...]:
                                 row[4 * TILE + x] += weight * d
             used[tile] = end
             if len(state):
-                leave(state, X0, Y0, columns, on_picture, planes)
+                store_state(state, X0, Y0, columns, on_picture, planes)
             for y in range(on_picture):
                 for x in range(columns):
                     left = abs(planes[y, x])
@@ -131,7 +367,135 @@ def _blender(counted: bool) -> ParallelKernel[...]:
 
 
 #: A picture, with its depth.
-blend = _blender(counted=False)
+blend = _make_blend(counted=False)
 
 #: A picture, and how far each pixel got.
-blend_counted = _blender(counted=True)
+blend_counted = _make_blend(counted=True)
+
+
+#: Numbers per record: moments of the exponent's gradient (1, x, y, xx, xy, yy, about the centre of
+#: the tile), gradients of red, green, blue and depth.
+RECORD = 10
+
+_AREA = TILE * TILE
+
+# Where the planes of a tile begin: transmittance, the gradient's product with what lies behind,
+# gradients, shares of the current splat, positions about the centre of the tile.
+_BEHIND, _RED, _GREEN, _BLUE, _ALPHA, _DEPTH, _SLOPE, _WEIGHT, _X, _Y = (_AREA * k for k in range(1, 11))
+_PLANES = 11
+
+
+@parallel_kernel(relaxed=True)
+def blend_backward(
+    lane: int,
+    lanes: int,
+    starts: Any,
+    used: Any,
+    ids: Any,
+    slots: Any,
+    shape: Any,
+    box: Any,
+    tiles_x: int,
+    limits: Any,
+    rgb: Any,
+    transmittance: Any,
+    depth: Any,
+    grad_rgb: Any,
+    grad_alpha: Any,
+    grad_depth: Any,
+    records: Any,
+) -> None:
+    """Gradients of every splat in every tile; parallel over tiles, vectorised over the 16 pixels of a row.
+
+    Args:
+        lane: which of the threads this is.
+        lanes: how many share the tiles; the result does not depend on it.
+        starts: see `blend`.
+        used: [tiles] int64, as `blend` wrote it.
+        ids: see `blend`.
+        slots: [intersections] int32, the record of each of `ids`.
+        shape: see `blend`, as the next three.
+        box: see `blend`.
+        tiles_x: see `blend`.
+        limits: see `blend`.
+        rgb: [H, W, 3], as `blend` wrote it, as the next two.
+        transmittance: [H, W].
+        depth: [H, W].
+        grad_rgb: [H, W, 3], gradient of the loss.
+        grad_alpha: [H, W], the same for alpha = 1 − transmittance.
+        grad_depth: [H, W], the same for depth.
+        records: [intersections, RECORD], written.
+    """
+    height, width = transmittance.shape
+    # Planes of 16 × 16, one after the other, in one array: so the compiler sees what overlaps.
+    planes = aligned_zeros(_PLANES * _AREA, limits)
+    T = planes[:_AREA].reshape((TILE, TILE))
+    ys = pixel_centres()
+    for e in range(_AREA):
+        planes[_X + e] = ys[e % TILE]
+        planes[_Y + e] = ys[e // TILE]
+    batch, rows = np.empty((BATCH, BATCH_COLUMNS), limits.dtype), np.empty((BATCH, 2), np.int64)
+    alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
+    zero, one = alpha_min - alpha_min, alpha_min / alpha_min
+    for tile in range(lane, len(used), lanes):
+        X0, Y0, columns, high = tile_extent(tile, tiles_x, width, height)
+        low = 0
+        planes[:_X] = zero
+        begin_tile(T, columns, one)
+        read_planes(grad_rgb, X0, Y0, columns, high, planes, _RED)
+        for y in range(high):
+            row = planes[y * TILE :]
+            for x in range(columns):
+                ga, gd = grad_alpha[Y0 + y, X0 + x], grad_depth[Y0 + y, X0 + x]
+                row[_ALPHA + x], row[_DEPTH + x] = ga, gd
+                row[_BEHIND + x] = (
+                    row[_RED + x] * rgb[Y0 + y, X0 + x, 0]
+                    + row[_GREEN + x] * rgb[Y0 + y, X0 + x, 1]
+                    + row[_BLUE + x] * rgb[Y0 + y, X0 + x, 2]
+                    + ga * (one - transmittance[Y0 + y, X0 + x])
+                    + gd * depth[Y0 + y, X0 + x]
+                )
+        for begin in range(starts[tile], used[tile], BATCH):
+            low, high = unfinished_rows(T, low, high)
+            count = min(BATCH, used[tile] - begin)
+            gather_batch(ids, begin, begin + count, shape, box, X0, Y0, low, high, ys, batch, rows)
+            for j in range(count):
+                record = records[slots[begin + j]]
+                first, last = rows[j, 0], rows[j, 1]
+                if first >= last:
+                    record[:] = zero
+                    continue
+                body = planes[first * TILE :]
+                row0, row1, a, o, r, g, b, d = batch_entry(batch, j, first)
+                for y in range(last - first):
+                    row, c0, c1 = body[y * TILE :], row0[y], row1[y]
+                    for x in range(TILE):
+                        full, alpha = alpha_at(row[_X + x], c0, c1, a, o, alpha_min, alpha_cap, zero)
+                        going, weight, row[x] = transmit(row[x], alpha, stop, zero, one)
+                        colour = row[_RED + x] * r + row[_GREEN + x] * g + row[_BLUE + x] * b
+                        own = weight * (colour + row[_ALPHA + x] + row[_DEPTH + x] * d)
+                        behind = row[_BEHIND + x] - own
+                        row[_BEHIND + x] = behind
+                        # Colour of this splat against the colour behind; nothing where alpha is capped.
+                        slope = own - behind * alpha / (one - alpha)
+                        slope = slope if going else zero
+                        row[_SLOPE + x] = slope if full < alpha_cap else zero
+                        row[_WEIGHT + x] = weight
+                m0, m1, m2, m3, m4, m5, m6, m7, m8, m9 = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+                for e in range((last - first) * TILE):
+                    slope, weight = body[_SLOPE + e], body[_WEIGHT + e]
+                    sx, sy = slope * body[_X + e], slope * body[_Y + e]
+                    m0 += slope
+                    m1 += sx
+                    m2 += sy
+                    m3 += sx * body[_X + e]
+                    m4 += sx * body[_Y + e]
+                    m5 += sy * body[_Y + e]
+                    m6 += weight * body[_RED + e]
+                    m7 += weight * body[_GREEN + e]
+                    m8 += weight * body[_BLUE + e]
+                    m9 += weight * body[_DEPTH + e]
+                record[0], record[1], record[2], record[3], record[4] = m0, m1, m2, m3, m4
+                record[5], record[6], record[7], record[8], record[9] = m5, m6, m7, m8, m9
+        for k in range(used[tile], starts[tile + 1]):
+            records[slots[k]] = zero

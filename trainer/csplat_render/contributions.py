@@ -1,34 +1,430 @@
 """Contribution of each splat to the renders of a scene: sums over pixels per splat, without building any matrix.
 
-A `DrawnView` is one view of fixed splats, projected and sorted into tiles, with nothing kept but the splats that it
-shows. It answers two questions: what the removal of each splat would change, and what renders follow from other
-colours, with the way back from pixels to colours.
+A `ProjectedView` is one view of fixed splats, projected and sorted into tiles, reduced to the splats that it shows.
+It answers two questions: how much pruning each splat would change the image (`Contributions.measure_pruning`), and
+which image other colours give, with the way back from pixels to colours (`Contributions.backproject`).
+
+Pruning. At a pixel a splat of alpha a with transmittance T in front of it has the weight w = T·a. Let C be its colour
+and B the colour that is seen where it ends, background included, not multiplied by any transmittance. Without the
+splat the pixel changes by d = w·(B − C): nothing else in the sum changes but the light that reaches what lies behind.
+So after an ordinary render, in which each pixel stores how far it got, the splats of a tile are processed once more,
+back to front: B follows from B ← B + a·(C − B), T from T ← T / (1 − a). Nothing is subtracted from a finished sum:
+what lies deep behind is as exact as what lies in front.
+
+Colours. Taking an image back to the colours is the transpose of rendering them. It needs the weights w alone: front to
+back, as for a render.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from csplat.model import sh_degree_of
-from csplat_render.arrays import Array, HasSplats, Splats
 from csplat_render.binning import TILE
-from csplat_render.blending import blend, blend_counted
-from csplat_render.blending_colours import COLOUR_SUMS, sum_colours
-from csplat_render.blending_sums import SUMS, sum_removal
+from csplat_render.blending import (
+    BATCH,
+    BATCH_COLUMNS,
+    aligned_zeros,
+    alpha_at,
+    batch_entry,
+    begin_tile,
+    blend,
+    blend_counted,
+    gather_batch,
+    narrow_rows,
+    pixel_centres,
+    read_planes,
+    tile_extent,
+    transmit,
+)
 from csplat_render.camera import Camera
-from csplat_render.conventions import TRANSMITTANCE_MIN, view_vector
-from csplat_render.drawn_view import DrawnView, add_gradient, add_removal, basis_of_view, set_colours
-from csplat_render.jit import thread_count
-from csplat_render.projecting import BLOCK, project
-from csplat_render.rasterise import Rasteriser
+from csplat_render.conventions import TRANSMITTANCE_MIN, Array, HasSplats, SplatArrays, view_vector
+from csplat_render.kernels import device_function, parallel_kernel, thread_count
+from csplat_render.projection import BLOCK, project, sh_basis, view_direction
+from csplat_render.rasteriser import Rasteriser
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectedView:
+    """One view of fixed geometry: V splats that may be seen in it, in the order of the scene.
+
+    Attributes:
+        rows: [V] int32, which splats of the scene they are.
+        shape: [V, 10] float64, see `project`, but for the last column: the exponent of 2 below which nothing is drawn.
+            Columns 6 to 8 are colours and may be replaced.
+        box: [V, 4] int32, see `project`.
+        basis: [V, B] float32, spherical harmonics in the direction of the splat, B = (degree + 1)²; [V, 0] where
+            nothing asks for them.
+        starts: [tiles + 1] int64, where the splats of each tile begin in `ids`.
+        ids: [intersections] int32, places in `rows`, tile by tile, nearest first.
+        slots: [intersections] int32, the record of each of `ids`.
+        first: [V + 1] int64, where the records of each splat begin.
+        width, height: of the picture, pixels.
+    """
+
+    rows: Array
+    shape: Array
+    box: Array
+    basis: Array
+    starts: Array
+    ids: Array
+    slots: Array
+    first: Array
+    width: int
+    height: int
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory that the arrays take."""
+        arrays = (self.rows, self.shape, self.box, self.basis, self.starts, self.ids, self.slots, self.first)
+        return sum(array.nbytes for array in arrays)
+
+    def with_records(self, needed: Array) -> tuple[ProjectedView, Array]:
+        """Leave out pairs of splat and tile, and splats that have none.
+
+        Args:
+            needed: [intersections] bool, which records stay.
+
+        Returns:
+            The view, and which of the V splats are left.
+        """
+        before = np.zeros(len(needed) + 1, np.int64)
+        np.cumsum(needed, out=before[1:])
+        stays = np.take(needed, self.slots)
+        starts = np.zeros(len(stays) + 1, np.int64)
+        np.cumsum(stays, out=starts[1:])
+        first = before[self.first]
+        left = np.flatnonzero(first[1:] > first[:-1])
+        place = np.empty(len(self.rows), np.int32)
+        place[left] = np.arange(len(left), dtype=np.int32)
+        view = ProjectedView(
+            rows=self.rows[left],
+            shape=np.take(self.shape, left, axis=0),
+            box=np.take(self.box, left, axis=0),
+            basis=np.take(self.basis, left, axis=0),
+            starts=starts[self.starts],
+            ids=place[self.ids[stays]],
+            slots=before[self.slots[stays]].astype(np.int32),
+            first=np.append(first[left], first[-1]),
+            width=self.width,
+            height=self.height,
+        )
+        return view, left
+
+
+@parallel_kernel()
+def evaluate_basis(lane: int, lanes: int, means: Any, rows: Any, view: Any, degree: int, basis: Any) -> None:
+    """Spherical harmonics in the direction of each splat that is drawn; parallel over blocks of them."""
+    values = np.empty(16, np.float64)
+    for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
+        for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
+            x, y, z, _ = view_direction(view, means[rows[j]])
+            sh_basis(degree, x, y, z, values)
+            for k in range(basis.shape[1]):
+                basis[j, k] = values[k]
+
+
+@parallel_kernel()
+def set_colours(
+    lane: int, lanes: int, rows: Any, basis: Any, coefficients: Any, active: Any, offset: float, shape: Any
+) -> None:
+    """Write offset + Y · coefficients into the shapes, 0 where not active; parallel over blocks of splats."""
+    for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
+        for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
+            i = rows[j]
+            r, g, b = _colour_at(basis[j], coefficients[i])
+            shape[j, 6] = offset + r if active[j, 0] else 0.0
+            shape[j, 7] = offset + g if active[j, 1] else 0.0
+            shape[j, 8] = offset + b if active[j, 2] else 0.0
+
+
+@device_function
+def _colour_at(basis: Any, coefficients: Any) -> tuple[float, float, float]:
+    """Red, green, blue of some coefficients, [B, 3], in the direction of a basis, [B]; float64."""
+    r, g, b = 0.0, 0.0, 0.0
+    for k in range(basis.shape[0]):
+        y = np.float64(basis[k])
+        r += y * coefficients[k, 0]
+        g += y * coefficients[k, 1]
+        b += y * coefficients[k, 2]
+    return r, g, b
+
+
+@parallel_kernel()
+def add_pruning_sums(
+    lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, shN: Any, totals: Any, bands: Any
+) -> None:
+    """Add the records of one view up, splat by splat, see `Contributions.removal`; parallel over blocks of splats."""
+    for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
+        for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
+            i = rows[j]
+            error, product, weight, squares = 0.0, 0.0, 0.0, 0.0
+            for n in range(first[j], first[j + 1]):
+                error += records[n, 0]
+                product += records[n, 1]
+                weight += records[n, 2]
+                squares += records[n, 3]
+            if weight <= 0.0:
+                continue
+            totals[i, 0] += error
+            totals[i, 1] += product
+            totals[i, 2] += weight
+            totals[i, 3] += squares
+            totals[i, 4] += 1.0
+            for band in range(1, bands.shape[1] + 1):
+                begin, end = band * band, (band + 1) * (band + 1)
+                r, g, b = _colour_at(basis[j, begin:end], shN[i, begin - 1 : end - 1])
+                bands[i, band - 1] += squares * (r * r + g * g + b * b)
+
+
+@parallel_kernel()
+def add_gradient(
+    lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, active: Any, gradient: Any, diagonal: Any
+) -> None:
+    """Take the records of one view to the coefficients, see `Contributions.colours`; parallel over blocks of splats."""
+    with_diagonal = diagonal.shape[0] > 0
+    for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
+        for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
+            r, g, b, squares = 0.0, 0.0, 0.0, 0.0
+            for n in range(first[j], first[j + 1]):
+                r += records[n, 0]
+                g += records[n, 1]
+                b += records[n, 2]
+                squares += records[n, 3]
+            if squares <= 0.0:
+                continue
+            r, g, b = r if active[j, 0] else 0.0, g if active[j, 1] else 0.0, b if active[j, 2] else 0.0
+            r32, g32, b32 = np.float32(r), np.float32(g), np.float32(b)
+            own, to = basis[j], gradient[rows[j]]
+            for k in range(basis.shape[1]):
+                to[k, 0] += own[k] * r32
+                to[k, 1] += own[k] * g32
+                to[k, 2] += own[k] * b32
+            if with_diagonal:
+                for k in range(basis.shape[1]):
+                    diagonal[rows[j], k] += squares * own[k] * own[k]
+
+
+#: Numbers per record.
+PRUNING_SUMS = 4
+
+_AREA = TILE * TILE
+
+# Where the planes of a tile begin, after transmittance: three colours of what lies behind, how far each pixel got,
+# three differences from the picture that is wanted, what the current splat adds to two sums, its weight, positions.
+_RED, _GREEN, _BLUE, _LAST, _ERR_R, _ERR_G, _ERR_B, _CHANGE, _PRODUCT, _WEIGHT, _X = (_AREA * k for k in range(1, 12))
+_PLANES = 12
+
+
+@parallel_kernel(relaxed=True)
+def sum_pruning(
+    lane: int,
+    lanes: int,
+    starts: Any,
+    ids: Any,
+    slots: Any,
+    shape: Any,
+    box: Any,
+    tiles_x: int,
+    limits: Any,
+    background: Any,
+    error: Any,
+    transmittance: Any,
+    last: Any,
+    records: Any,
+) -> None:
+    """Sum over the pixels of every splat in every tile; parallel over tiles, vectorised over the 16 pixels of a row.
+
+    Args:
+        lane: which of the threads this is.
+        lanes: how many share the tiles; the result does not depend on it.
+        starts: see `blend`, as the next.
+        ids: [intersections] int32.
+        slots: [intersections] int32, the record of each of `ids`.
+        shape: [N, 10] float64, as for `blend_counted`, as the next four.
+        box: [N, 4] int32.
+        tiles_x: tiles side by side.
+        limits: [3].
+        background: [3].
+        error: [H, W, 3], the picture less the one that is wanted; [0, 0, 3] where it is the one.
+        transmittance: [H, W], as `blend_counted` wrote it, as the next.
+        last: [H, W].
+        records: [intersections, SUMS], written: sums of |d|², d · error, w and w², d being the change of the pixel if
+            the splat were not there.
+    """
+    height, width = transmittance.shape
+    # Planes of 16 × 16, one after the other, in one array: so the compiler sees what overlaps.
+    planes, deepest = aligned_zeros(_PLANES * _AREA, limits), np.zeros(TILE, np.int64)
+    ys = pixel_centres()
+    for e in range(_AREA):
+        planes[_X + e] = ys[e % TILE]
+    batch, rows = np.empty((BATCH, BATCH_COLUMNS), limits.dtype), np.empty((BATCH, 2), np.int64)
+    alpha_min, alpha_cap = limits[0], limits[1]
+    zero, one = alpha_min - alpha_min, alpha_min / alpha_min
+    is_wrong = error.shape[0] > 0
+    for tile in range(lane, len(starts) - 1, lanes):
+        X0, Y0, columns, high = tile_extent(tile, tiles_x, width, height)
+        planes[:_LAST] = zero
+        planes[_LAST:_ERR_R] = -one  # pixels beyond the picture got nowhere
+        planes[_ERR_R:_X] = zero
+        if is_wrong:
+            read_planes(error, X0, Y0, columns, high, planes, _ERR_R)
+        start, end = starts[tile], starts[tile]
+        for y in range(high):
+            row = planes[y * TILE :]
+            deepest[y] = -1
+            for x in range(columns):
+                row[x] = transmittance[Y0 + y, X0 + x]
+                row[_LAST + x] = last[Y0 + y, X0 + x]
+                row[_RED + x], row[_GREEN + x], row[_BLUE + x] = background[0], background[1], background[2]
+                deepest[y] = max(deepest[y], np.int64(row[_LAST + x]))
+            end = max(end, start + deepest[y] + 1)
+        for k in range(end, starts[tile + 1]):
+            records[slots[k]] = zero
+        while end > start:
+            begin = max(start, end - BATCH)
+            gather_batch(ids, begin, end, shape, box, X0, Y0, 0, high, ys, batch, rows)
+            narrow_rows(end - begin, batch, rows)
+            for j in range(end - begin - 1, -1, -1):
+                record, k = records[slots[begin + j]], begin + j - start
+                first, after_last = rows[j, 0], rows[j, 1]
+                while first < after_last and deepest[first] < k:
+                    first += 1
+                while first < after_last and deepest[after_last - 1] < k:
+                    after_last -= 1
+                if first >= after_last:
+                    record[:] = zero
+                    continue
+                body = planes[first * TILE :]
+                row0, row1, a, o, r, g, b, _ = batch_entry(batch, j, first)
+                depth = planes.dtype.type(k)
+                for y in range(after_last - first):
+                    row, c0, c1 = body[y * TILE :], row0[y], row1[y]
+                    for x in range(TILE):
+                        _, alpha = alpha_at(row[_X + x], c0, c1, a, o, alpha_min, alpha_cap, zero)
+                        alpha = alpha if depth <= row[_LAST + x] else zero
+                        before = row[x] / (one - alpha)
+                        row[x] = before
+                        weight = alpha * before
+                        dr, dg, db = row[_RED + x] - r, row[_GREEN + x] - g, row[_BLUE + x] - b
+                        row[_RED + x] -= alpha * dr
+                        row[_GREEN + x] -= alpha * dg
+                        row[_BLUE + x] -= alpha * db
+                        row[_WEIGHT + x] = weight
+                        row[_CHANGE + x] = weight * weight * (dr * dr + dg * dg + db * db)
+                        if is_wrong:
+                            row[_PRODUCT + x] = weight * (
+                                dr * row[_ERR_R + x] + dg * row[_ERR_G + x] + db * row[_ERR_B + x]
+                            )
+                m0, m1, m2, m3 = zero, zero, zero, zero
+                for e in range((after_last - first) * TILE):
+                    weight = body[_WEIGHT + e]
+                    m0 += body[_CHANGE + e]
+                    if is_wrong:
+                        m1 += body[_PRODUCT + e]
+                    m2 += weight
+                    m3 += weight * weight
+                record[0], record[1], record[2], record[3] = m0, m1, m2, m3
+            end = begin
+
+
+#: Numbers per record.
+COLOUR_SUMS = 4
+
+
+# Where the planes of a tile begin, after transmittance: the picture, the current splat's weight, positions.
+_COLOUR_RED, _COLOUR_GREEN, _COLOUR_BLUE, _COLOUR_WEIGHT, _COLOUR_X = (_AREA * k for k in range(1, 6))
+_COLOUR_PLANES = 6
+
+# What a splat that finishes a pixel seems to weigh there: nothing beside the smallest weight, 4e-7, but not 0.
+_FINISHING_WEIGHT = 1e-12
+
+
+@parallel_kernel(relaxed=True)
+def sum_colours(
+    lane: int,
+    lanes: int,
+    starts: Any,
+    used: Any,
+    ids: Any,
+    slots: Any,
+    shape: Any,
+    box: Any,
+    tiles_x: int,
+    limits: Any,
+    error: Any,
+    records: Any,
+) -> None:
+    """Take a picture back to the splats of every tile; parallel over tiles, vectorised over the 16 pixels of a row.
+
+    Args:
+        lane: which of the threads this is.
+        lanes: how many share the tiles; the result does not depend on it.
+        starts: see `blend`.
+        used: [tiles] int64, as `blend` wrote it.
+        ids: see `blend`.
+        slots: [intersections] int32, the record of each of `ids`.
+        shape: see `blend`, as the next three; colours are not read.
+        box: [N, 4] int32.
+        tiles_x: tiles side by side.
+        limits: [3].
+        error: [H, W, 3], what is taken back.
+        records: [intersections, COLOUR_SUMS], written: sums of w · error for red, green, blue, and of w²; the last is
+            0 for what could as well be absent: it neither shows nor finishes a pixel.
+    """
+    height, width = error.shape[:2]
+    planes = aligned_zeros(_COLOUR_PLANES * _AREA, limits)
+    T, ys = planes[:_AREA].reshape((TILE, TILE)), pixel_centres()
+    for e in range(_AREA):
+        planes[_COLOUR_X + e] = ys[e % TILE]
+    batch, rows = np.empty((BATCH, BATCH_COLUMNS), limits.dtype), np.empty((BATCH, 2), np.int64)
+    alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
+    zero, one = alpha_min - alpha_min, alpha_min / alpha_min
+    trace = planes.dtype.type(_FINISHING_WEIGHT)
+    for tile in range(lane, len(used), lanes):
+        X0, Y0, columns, high = tile_extent(tile, tiles_x, width, height)
+        begin_tile(T, columns, one)
+        planes[_COLOUR_RED:_COLOUR_WEIGHT] = zero
+        read_planes(error, X0, Y0, columns, high, planes, _COLOUR_RED)
+        # Rows that are finished are gone through: so a sum is added up in one order, whatever lies in front.
+        for begin in range(starts[tile], used[tile], BATCH):
+            count = min(BATCH, used[tile] - begin)
+            gather_batch(ids, begin, begin + count, shape, box, X0, Y0, 0, high, ys, batch, rows)
+            for j in range(count):
+                record = records[slots[begin + j]]
+                first, last = rows[j, 0], rows[j, 1]
+                if first >= last:
+                    record[:] = zero
+                    continue
+                body = planes[first * TILE :]
+                row0, row1, a, o, _, _, _, _ = batch_entry(batch, j, first)
+                for y in range(last - first):
+                    row, c0, c1 = body[y * TILE :], row0[y], row1[y]
+                    for x in range(TILE):
+                        _, alpha = alpha_at(row[_COLOUR_X + x], c0, c1, a, o, alpha_min, alpha_cap, zero)
+                        before = row[x]
+                        going, weight, row[x] = transmit(before, alpha, stop, zero, one)
+                        row[_COLOUR_WEIGHT + x] = weight if going else max(before, zero) * trace
+                m0, m1, m2, m3 = zero, zero, zero, zero
+                for e in range((last - first) * TILE):
+                    weight = body[_COLOUR_WEIGHT + e]
+                    m0 += weight * body[_COLOUR_RED + e]
+                    m1 += weight * body[_COLOUR_GREEN + e]
+                    m2 += weight * body[_COLOUR_BLUE + e]
+                    m3 += weight * weight
+                record[0], record[1], record[2], record[3] = m0, m1, m2, m3
+        for k in range(used[tile], starts[tile + 1]):
+            records[slots[k]] = zero
+
 
 # Colours are taken for no brighter: squares of their differences, summed over a tile, stay within float32.
-_BRIGHTEST = 1e15
+_MAX_COLOUR = 1e15
 
 # Allowance for rounding of an exponent: far from a splat's centre it is a small difference of large numbers, up to 1e4.
-_MARGIN = 0.05
+_EXPONENT_MARGIN = 0.05
 
 
 class Contributions(Rasteriser):
@@ -48,7 +444,9 @@ class Contributions(Rasteriser):
         super().__init__("standard", dtype, gradients=True, threads=threads)
         self._limits[2] = transmittance_min
 
-    def draw(self, splats: HasSplats, camera: Camera, *, antialiased: bool = False, basis: bool = True) -> DrawnView:
+    def draw(
+        self, splats: HasSplats, camera: Camera, *, antialiased: bool = False, basis: bool = True
+    ) -> ProjectedView:
         """Project splats, sort them into the tiles of a picture, and forget what it does not show.
 
         Args:
@@ -60,7 +458,7 @@ class Contributions(Rasteriser):
         Raises:
             LimitError: there are too many pairs of splat and tile.
         """
-        arrays = Splats(
+        arrays = SplatArrays(
             *(
                 np.ascontiguousarray(getattr(splats, name), self.dtype)
                 for name in ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -83,13 +481,13 @@ class Contributions(Rasteriser):
             # In the order of the scene, not of depth: what is read and written per splat then lies in a row.
             rows = np.flatnonzero(near > 0.0).astype(np.int32)
             harmonics = np.empty((len(rows), (degree + 1) ** 2 if basis else 0), np.float32)
-            basis_of_view(arrays.means, rows, view, degree, harmonics)
+            evaluate_basis(arrays.means, rows, view, degree, harmonics)
         offsets, place = self._buffers["offsets"], self._buffer("place", (n,), np.int32)
         place[rows] = np.arange(len(rows), dtype=np.int32)
         drawn = np.take(shape, rows, axis=0)
-        np.minimum(drawn[:, 6:9], _BRIGHTEST, out=drawn[:, 6:9])
-        drawn[:, 9] = np.log2(self.settings.alpha_min / drawn[:, 5]) - _MARGIN
-        return DrawnView(
+        np.minimum(drawn[:, 6:9], _MAX_COLOUR, out=drawn[:, 6:9])
+        drawn[:, 9] = np.log2(self.settings.alpha_min / drawn[:, 5]) - _EXPONENT_MARGIN
+        return ProjectedView(
             rows=rows,
             shape=drawn,
             box=np.take(box, rows, axis=0),
@@ -104,7 +502,7 @@ class Contributions(Rasteriser):
 
     def removal(
         self,
-        drawn: DrawnView,
+        drawn: ProjectedView,
         shN: Array,
         totals: Array,
         bands: Array,
@@ -129,12 +527,12 @@ class Contributions(Rasteriser):
         """
         rgb, records = self._removal(drawn, background, reference)
         with thread_count(self.threads):
-            add_removal(drawn.rows, drawn.first, records, drawn.basis, shN, totals, bands)
+            add_pruning_sums(drawn.rows, drawn.first, records, drawn.basis, shN, totals, bands)
         return rgb
 
     def colours(
         self,
-        drawn: DrawnView,
+        drawn: ProjectedView,
         coefficients: Array,
         active: Array,
         gradient: Array,
@@ -168,7 +566,7 @@ class Contributions(Rasteriser):
             add_gradient(drawn.rows, drawn.first, records, drawn.basis, active, gradient, diagonal)
         return rgb
 
-    def trimmed(self, drawn: DrawnView) -> tuple[DrawnView, Array]:
+    def trimmed(self, drawn: ProjectedView) -> tuple[ProjectedView, Array]:
         """Leave out what the last `colours`, of this view, found without any weight: pictures stay the same to the bit.
 
         Returns:
@@ -176,10 +574,10 @@ class Contributions(Rasteriser):
         """
         return drawn.with_records(self._buffer("sums", (len(drawn.ids), COLOUR_SUMS), self.dtype)[:, 3] > 0.0)
 
-    def _removal(self, drawn: DrawnView, background: Array, reference: Array | None) -> tuple[Array, Array]:
+    def _removal(self, drawn: ProjectedView, background: Array, reference: Array | None) -> tuple[Array, Array]:
         """Run the loops over pixels, front to back and again back to front: the picture, and the records."""
         size, tiles_x = (drawn.height, drawn.width), -(-drawn.width // TILE)
-        records = self._buffer("sums", (len(drawn.ids), SUMS), self.dtype)
+        records = self._buffer("sums", (len(drawn.ids), PRUNING_SUMS), self.dtype)
         transmittance, last = self._buffer("through", size, self.dtype), self._buffer("last", size, self.dtype)
         rgb = np.empty((*size, 3), self.dtype)
         behind = np.ascontiguousarray(background, self.dtype)
@@ -190,13 +588,13 @@ class Contributions(Rasteriser):
                 np.empty((0, 0, 5), self.dtype),
             )  # fmt: skip
             error = np.empty((0, 0, 3), self.dtype) if reference is None else rgb - reference
-            sum_removal(
+            sum_pruning(
                 drawn.starts, drawn.ids, drawn.slots, drawn.shape, drawn.box, tiles_x, self._limits, behind,
                 error.astype(self.dtype, copy=False), transmittance, last, records,
             )  # fmt: skip
         return rgb, records
 
-    def _colours(self, drawn: DrawnView, background: Array, reference: Array | None) -> tuple[Array, Array]:
+    def _colours(self, drawn: ProjectedView, background: Array, reference: Array | None) -> tuple[Array, Array]:
         """Run the loops over pixels, front to back twice: the picture, and the records."""
         size, tiles_x = (drawn.height, drawn.width), -(-drawn.width // TILE)
         records = self._buffer("sums", (len(drawn.ids), COLOUR_SUMS), self.dtype)

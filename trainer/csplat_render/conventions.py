@@ -1,16 +1,15 @@
-"""The numbers that rasteriser and exact twin share, and the three modes.
+"""Definitions that the rasteriser and its exact reference share: constants, modes, splats, and results.
 
-They are those of the first published implementation of Gaussian splatting: alpha = opacity ·
-exp(−½ dᵀ Σ⁻¹ d) with Σ the projected covariance plus `DILATION`, capped at `ALPHA_CAP`, left out
-below `ALPHA_MIN`; splats blended front to back in the order of float32 depth, then of index, until
-the next one would bring the transmittance below `TRANSMITTANCE_MIN`; colour = spherical harmonics
-+ ½, at least 0.
+The constants are those of the first published implementation of Gaussian splatting: alpha = opacity ·
+exp(−½ dᵀ Σ⁻¹ d) with Σ the projected covariance plus `DILATION`, capped at `ALPHA_CAP`, left out below `ALPHA_MIN`;
+splats are blended front to back in the order of float32 depth, then of index, until the next one would bring the
+transmittance below `TRANSMITTANCE_MIN`; colour = spherical harmonics + ½, at least 0.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,29 +43,29 @@ MODES: tuple[Mode, ...] = ("exact", "standard", "fast")
 
 
 @dataclass(frozen=True)
-class Settings:
+class Thresholds:
     """Thresholds of a mode: the smallest alpha that is drawn, and the transmittance at which a pixel is finished."""
 
     alpha_min: float
     transmittance_min: float
 
 
-_SETTINGS = {
-    "standard": Settings(ALPHA_MIN, TRANSMITTANCE_MIN),
+_THRESHOLDS = {
+    "standard": Thresholds(ALPHA_MIN, TRANSMITTANCE_MIN),
     # A larger smallest alpha shrinks every splat; what shines through with less than 1/255 is left out.
-    "fast": Settings(1.5 * ALPHA_MIN, ALPHA_MIN),
+    "fast": Thresholds(1.5 * ALPHA_MIN, ALPHA_MIN),
 }
 
 
-def settings_of(mode: str) -> Settings:
+def thresholds_of(mode: str) -> Thresholds:
     """Settings of a mode of the rasteriser.
 
     Raises:
         InputError: there is no such mode, or it is the twin's.
     """
-    if mode not in _SETTINGS:
-        raise InputError(f"the rasteriser's mode is {mode!r}, wanted one of {', '.join(_SETTINGS)}")
-    return _SETTINGS[mode]
+    if mode not in _THRESHOLDS:
+        raise InputError(f"the rasteriser's mode is {mode!r}, wanted one of {', '.join(_THRESHOLDS)}")
+    return _THRESHOLDS[mode]
 
 
 def view_vector(camera: Camera) -> NDArray[np.float64]:
@@ -86,3 +85,108 @@ def view_vector(camera: Camera) -> NDArray[np.float64]:
     ]
     R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     return np.array([*R.ravel(), *t, fx, fy, cx, cy, camera.near, *limits, *camera.position], np.float64)
+
+
+Array = NDArray[Any]
+
+
+class HasSplats(Protocol):
+    """Anything that can be rendered: a `SplatModel`, a `SplatArrays`, or any object with these arrays."""
+
+    @property
+    def means(self) -> Array: ...  # noqa: D102 - as in Splats
+    @property
+    def quats(self) -> Array: ...  # noqa: D102 - as in Splats
+    @property
+    def scales(self) -> Array: ...  # noqa: D102 - as in Splats
+    @property
+    def opacities(self) -> Array: ...  # noqa: D102 - as in Splats
+    @property
+    def sh0(self) -> Array: ...  # noqa: D102 - as in Splats
+    @property
+    def shN(self) -> Array: ...  # noqa: D102, N802 - as in Splats
+
+
+@dataclass(frozen=True, eq=False)
+class SplatArrays:
+    """The arrays of N splats, unchecked but for their shapes: rows that hold NaN are left out of pictures.
+
+    Attributes:
+        means: [N, 3], centres.
+        quats: [N, 4], rotations w x y z, of any length.
+        scales: [N, 3], natural logarithms of the standard deviations.
+        opacities: [N], alpha.
+        sh0: [N, 3].
+        shN: [N, K, 3], K = 0, 3, 8 or 15.
+    """
+
+    means: Array
+    quats: Array
+    scales: Array
+    opacities: Array
+    sh0: Array
+    shN: Array
+
+
+@dataclass(frozen=True, eq=False)
+class RenderResult:
+    """A picture of splats.
+
+    Attributes:
+        rgb: [H, W, 3], not clipped: colours may exceed 1.
+        alpha: [H, W], 1 − transmittance.
+        depth: [H, W], sum of weight · depth, not divided by alpha.
+        radii: [N] float32, 3 standard deviations of each splat along its longest axis, in pixels;
+            0 for what is not drawn.
+        drawn: number of splats in view.
+        intersections: pairs of splat and tile; what the time depends on.
+        ignored: number of splats that hold NaN or infinity.
+    """
+
+    rgb: Array
+    alpha: Array
+    depth: Array
+    radii: Array
+    drawn: int
+    intersections: int
+    ignored: int
+
+
+@dataclass(frozen=True, eq=False)
+class VisibleSplats:
+    """Splats that a render shows.
+
+    Attributes:
+        near: [N] float32, depths, by which splats are sorted; 0 for splats that are not drawn.
+        tiles: [N] integers, number of the render's tiles that each may touch; 0 likewise.
+        ignored: number of splats that hold NaN or infinity.
+    """
+
+    near: Array
+    tiles: Array
+    ignored: int
+
+
+@dataclass(frozen=True, eq=False)
+class Gradients:
+    """Gradients of a loss; the arrays are the rasteriser's and hold until its next `backward`.
+
+    Attributes:
+        means: [N, 3].
+        quats: [N, 4], through the normalisation.
+        scales: [N, 3], towards the logarithms.
+        opacities: [N], towards alpha.
+        sh0: [N, 3].
+        shN: [N, K, 3]; 0 beyond the degree that was rendered.
+        means2d: [N], length of the gradient towards the centre on the picture, per pixel.
+        radii: [N] float32, see `RenderResult`.
+    """
+
+    means: Array
+    quats: Array
+    scales: Array
+    opacities: Array
+    sh0: Array
+    shN: Array
+    means2d: Array
+    radii: Array

@@ -199,7 +199,7 @@ def _heads_path() -> Path | None:
 
 def _features(picture: NDArray[Any], weights: Lpips) -> list[F32]:
     """Return the features after each of AlexNet's five convolutions, [h, w, channels] each."""
-    from csplat_render.convolving import convolve  # numba takes a second to import
+    from csplat_render.metric_kernels import convolve  # numba takes a second to import
 
     x: F32 = (np.clip(picture.astype(np.float32), 0.0, 1.0) * np.float32(2.0) - np.float32(1.0) - SHIFT) / SCALE
     features = []

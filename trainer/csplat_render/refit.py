@@ -20,10 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
 from csplat.types import F32, Progress
-from csplat_render.arrays import Array, HasSplats
 from csplat_render.camera import Camera
-from csplat_render.contributions import Contributions
-from csplat_render.drawn_view import DrawnView
+from csplat_render.contributions import Contributions, ProjectedView
+from csplat_render.conventions import Array, HasSplats
 
 Floats = NDArray[Any]
 
@@ -62,7 +61,7 @@ class ColourOperator:
         self._background = np.asarray(background, np.float32)
         self._black = np.zeros(3, np.float32)
         self._cache_left = cache_bytes
-        self._kept: dict[int, tuple[DrawnView, Array]] = {}
+        self._kept: dict[int, tuple[ProjectedView, Array]] = {}
         self._splats = splats
 
     def error(
@@ -104,14 +103,14 @@ class ColourOperator:
             total += float(np.sum(np.square(rgb, dtype=np.float64)))
         return total
 
-    def _view(self, number: int) -> tuple[DrawnView, Array]:
+    def _view(self, number: int) -> tuple[ProjectedView, Array]:
         kept = self._kept.get(number)
         if kept is None:
             drawn = self._drawing.draw(self._splats, self.cameras[number], antialiased=self.antialiased)
             kept = (drawn, drawn.shape[:, 6:9] > 0.0)
         return kept
 
-    def _keep(self, number: int, drawn: DrawnView, active: Array) -> None:
+    def _keep(self, number: int, drawn: ProjectedView, active: Array) -> None:
         """Keep a view whose weights have just been summed, if there is room: what has none is not looked at again."""
         if number in self._kept or drawn.size_bytes > self._cache_left:
             return

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from csplat_render.arrays import Array, Splats
 from csplat_render.blending import blend
 from csplat_render.camera import Camera
-from csplat_render.jit import is_cached, on_compiling
-from csplat_render.projecting import project
-from csplat_render.rasterise import Rasteriser
+from csplat_render.conventions import Array, SplatArrays
+from csplat_render.kernels import is_cached, on_compiling
+from csplat_render.projection import project
+from csplat_render.rasteriser import Rasteriser
 
-_SIZE = 16  # pixels on each side of what is rendered
+_IMAGE_SIZE = 16  # pixels on each side of what is rendered
 
 
 def warm_up(
@@ -33,7 +33,7 @@ def warm_up(
     Args:
         announce: called with one line if anything has to be compiled, and with another at its end.
         gradients: compile the renderer's backward pass too.
-        simplify: compile the kernels of `measure_removal`.
+        simplify: compile the kernels of `measure_pruning_error`.
         ssim: compile the kernels of `metrics.ssim`.
         lpips: compile the kernels of `lpips.Lpips`.
         others: functions to call; each compiles kernels that are not the renderer's.
@@ -55,7 +55,9 @@ def warm_up(
     with on_compiling(say):
         viewmat = np.eye(4)
         viewmat[2, 3] = 5.0
-        camera = Camera(np.array([[8.0, 0.0, 8.0], [0.0, 8.0, 8.0], [0.0, 0.0, 1.0]]), viewmat, _SIZE, _SIZE)
+        camera = Camera(
+            np.array([[8.0, 0.0, 8.0], [0.0, 8.0, 8.0], [0.0, 0.0, 1.0]]), viewmat, _IMAGE_SIZE, _IMAGE_SIZE
+        )
         rasteriser = Rasteriser(dtype=dtype, gradients=gradients)
         picture = rasteriser.forward(_one_splat(dtype), camera)
         if gradients:
@@ -79,9 +81,9 @@ def is_compiled() -> bool:
 
 def _warm_up_simplifying(camera: Camera) -> None:
     from csplat.model import SplatModel
-    from csplat_render.removal import measure_removal
+    from csplat_render.pruning_error import measure_pruning_error
 
-    measure_removal(SplatModel(**vars(_one_splat(np.float32))), [camera])
+    measure_pruning_error(SplatModel(**vars(_one_splat(np.float32))), [camera])
 
 
 def _warm_up_metrics(picture: Array, *, ssim: bool, lpips: bool) -> None:
@@ -90,13 +92,13 @@ def _warm_up_metrics(picture: Array, *, ssim: bool, lpips: bool) -> None:
 
         metrics.ssim(picture, picture)
     if lpips:
-        from csplat_render.convolving import convolve
+        from csplat_render.metric_kernels import convolve
 
         kernel = np.ones((3, 3, 3, 4), np.float32)
         convolve(picture.astype(np.float32), kernel, np.zeros(4, np.float32), 1, 1)
 
 
-def _one_splat(dtype: Any) -> Splats:
+def _one_splat(dtype: Any) -> SplatArrays:
     quat, shN = np.array([[1.0, 0.0, 0.0, 0.0]], dtype), np.zeros((1, 0, 3), dtype)
     zeros = np.zeros((1, 3), dtype)
-    return Splats(zeros, quat, zeros, np.ones(1, dtype), np.ones((1, 3), dtype), shN)
+    return SplatArrays(zeros, quat, zeros, np.ones(1, dtype), np.ones((1, 3), dtype), shN)

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.random import Generator
 
 from csplat.types import F32
-from csplat_render.arrays import Splats
 from csplat_render.camera import Camera
-from csplat_render.jit import lane_run, parallel_kernel
-from csplat_render.rasterise import Rasteriser
+from csplat_render.conventions import SplatArrays
+from csplat_render.kernels import lane_range, parallel_kernel
+from csplat_render.rasteriser import Rasteriser
 from csplat_trainer.densify import ScreenGradients
 from csplat_trainer.exposure import Exposure
 from csplat_trainer.loss import LOSS_WEIGHTS, LossValue, PhotometricLoss
@@ -150,7 +150,7 @@ class CpuEngine:
         if len(self._alphas) != len(v["logits"]):
             self._alphas, self._logit_gradient = np.empty_like(v["logits"]), np.empty_like(v["logits"])
         _activate(v["logits"], self._alphas)
-        splats = Splats(v["means"], v["quats"], v["scales"], self._alphas, v["sh0"], v["shN"])
+        splats = SplatArrays(v["means"], v["quats"], v["scales"], self._alphas, v["sh0"], v["shN"])
         result = self._rasteriser.forward(
             splats, camera, background=background, antialiased=self._options.antialiased, sh_degree=degree
         )
@@ -174,7 +174,7 @@ def _half_pictures(norms: F32, camera: Camera) -> F32:
 def _activate(lane: int, lanes: int, logits: F32, alphas: F32) -> None:
     """Opacities of logits; vectorises over splats."""
     one = np.float32(1.0)
-    first, end = lane_run(lane, lanes, len(logits))
+    first, end = lane_range(lane, lanes, len(logits))
     x, y = logits[first:end], alphas[first:end]
     for i in range(len(x)):
         y[i] = one / (one + np.exp(-x[i]))
@@ -203,7 +203,7 @@ def _chain(
         scale_weight: weight of the sum of standard deviations.
         by_logit: [N], written.
     """
-    first, end = lane_run(lane, lanes, len(alphas))
+    first, end = lane_range(lane, lanes, len(alphas))
     alphas, by_alpha, by_logit = alphas[first:end], by_alpha[first:end], by_logit[first:end]
     scales, by_scale = scales[first:end], by_scale[first:end]
     for i in range(end - first):

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from csplat.types import F32
 from csplat_render.camera import Camera
 from csplat_render.conventions import Mode
-from csplat_render.judge import Judge, Look
 from csplat_render.metrics import COVERED_ALPHA, Distance, Scores
+from csplat_render.scorer import ReferenceImage, Scorer
 from csplat_trainer.pictures import Picture, compose
 
 
@@ -24,19 +24,19 @@ def photograph_judge(
     mode: Mode = "standard",
     threads: int | None = None,
     origin: Sequence[float] | None = None,
-) -> Judge:
+) -> Scorer:
     """Return a judge by photographs; each is composed when its turn comes.
 
     Args:
         pictures: at least one.
         background: red, green, blue, behind renders and behind photographs that have an alpha channel.
-        mode, threads, origin: as in `Judge`.
+        mode, threads, origin: as in `Scorer`.
     """
     colour = np.asarray(background, np.float32)
     cameras = [picture.camera for picture in pictures]
     looks = [partial(_look, one, colour) for one in pictures]
     masked = any(one.masked is not None for one in pictures)
-    return Judge(cameras, looks, colour, mode, threads, origin, [_count(one) for one in pictures] if masked else None)
+    return Scorer(cameras, looks, colour, mode, threads, origin, [_count(one) for one in pictures] if masked else None)
 
 
 def evaluate(
@@ -61,10 +61,10 @@ def evaluate(
     return Scores.of(each).as_json()
 
 
-def _look(picture: Picture, background: F32) -> Look:
+def _look(picture: Picture, background: F32) -> ReferenceImage:
     shown = compose(picture, background, np.empty((picture.camera.H, picture.camera.W, 3), np.float32))
     covered = picture.pixels[..., 3] >= COVERED_ALPHA * 255.0 if picture.has_alpha else None
-    return Look(shown, covered, counts=picture.mask)
+    return ReferenceImage(shown, covered, counts=picture.mask)
 
 
 def _count(picture: Picture) -> int:

@@ -20,11 +20,10 @@ from csplat.model import SplatModel
 from csplat.training import TRAINING, VIEW
 from csplat.types import F32
 from csplat.upright import with_up
-from csplat_render.camera import Camera
-from csplat_render.cameras import central_camera
+from csplat_render.camera import Camera, central_camera
 from csplat_render.lpips import Lpips, load_lpips
 from csplat_render.metrics import psnr_of_mse
-from csplat_render.virtual import scene_frame
+from csplat_render.virtual_cameras import scene_frame
 from csplat_trainer.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.densify import ScreenGradients, densify, reset_opacities

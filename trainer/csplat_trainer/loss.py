@@ -15,8 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.types import F32, F64
-from csplat_render.jit import parallel_kernel
-from csplat_render.similarity import C1, C2, CHANNELS, RADIUS, WINDOW, blur_across, blur_down, blur_products, blur_twin
+from csplat_render.kernels import parallel_kernel
+from csplat_render.metric_kernels import (
+    C1,
+    C2,
+    CHANNELS,
+    RADIUS,
+    WINDOW,
+    blur_across,
+    blur_down,
+    blur_products,
+    blur_twin,
+)
 
 #: Weights of L1 and of 1 − SSIM, by the name of the option.
 LOSS_WEIGHTS = {"inria": (0.8, 0.2), "study": (1.0, 0.2), "l1": (1.0, 0.0)}

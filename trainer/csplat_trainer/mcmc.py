@@ -13,7 +13,7 @@ import numpy as np
 from numpy.random import Generator
 
 from csplat.types import F32, F64, I64
-from csplat_render.jit import lane_run, parallel_kernel
+from csplat_render.kernels import lane_range, parallel_kernel
 from csplat_trainer.parameters import GROUPS, Parameters
 
 _MAX_SHARE = 51  # splats in one place at most, as the paper's code has it
@@ -127,7 +127,7 @@ def _noise(
 ) -> None:
     """Add the noise to each mean; a thread takes a run of splats."""
     highest = math.log(_GATE_OFF / (1.0 - _GATE_OFF))
-    for i in range(*lane_run(lane, lanes, means.shape[0])):
+    for i in range(*lane_range(lane, lanes, means.shape[0])):
         if logits[i] > highest:
             continue
         alpha = 1.0 / (1.0 + math.exp(-logits[i]))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from csplat.model import SplatModel, normalise_quats
 from csplat.types import F32
-from csplat_render.jit import parallel_kernel, relaxed_kernel
+from csplat_render.kernels import parallel_kernel, relaxed_kernel
 
 Splats = dict[str, F32]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.types import F32, F64, U8, Mask
 from csplat_render.camera import Camera
-from csplat_render.jit import parallel_kernel
+from csplat_render.kernels import parallel_kernel
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,8 @@ from csplat.model import SplatModel
 from csplat.types import F32, F64, Progress
 from csplat_render.camera import Camera
 from csplat_render.conventions import view_vector
-from csplat_render.jit import thread_count
-from csplat_render.rasterise import Rasteriser
+from csplat_render.kernels import thread_count
+from csplat_render.rasteriser import Rasteriser
 from csplat_trainer.sensitivity_forms import FORM, covariance_forms
 from csplat_trainer.sensitivity_sums import SUMS, add_view, sum_derivatives
 

@@ -8,8 +8,16 @@ from typing import Any
 import numpy as np
 
 from csplat_render.conventions import COMPENSATION_MIN
-from csplat_render.jit import parallel_kernel
-from csplat_render.projecting import BLOCK, determinants, deviation, perspective, rotation, rows, unit
+from csplat_render.kernels import parallel_kernel
+from csplat_render.projection import (
+    BLOCK,
+    determinants,
+    jacobian_rows,
+    perspective_jacobian,
+    rotation_matrix,
+    standard_deviation,
+    unit_quaternion,
+)
 
 #: Numbers per splat that determine how its exponent depends on its covariance.
 FORM = 12
@@ -44,9 +52,13 @@ def covariance_forms(lane: int, lanes: int, means: Any, quats: Any, scales: Any,
             x = view[0] * X + view[1] * Y + view[2] * Z + view[9]
             y = view[3] * X + view[4] * Y + view[5] * Z + view[10]
             z = view[6] * X + view[7] * Y + view[8] * Z + view[11]
-            j0, j02, j1, j12, _, _ = perspective(view, x, y, z)
-            pq = rows(view, j0, j02, j1, j12)
-            s0, s1, s2 = deviation(scales[i, 0]), deviation(scales[i, 1]), deviation(scales[i, 2])
+            j0, j02, j1, j12, _, _ = perspective_jacobian(view, x, y, z)
+            pq = jacobian_rows(view, j0, j02, j1, j12)
+            s0, s1, s2 = (
+                standard_deviation(scales[i, 0]),
+                standard_deviation(scales[i, 1]),
+                standard_deviation(scales[i, 2]),
+            )
             half = 0.5 * (s0 * s0 + s1 * s1 + s2 * s2)
             a, b, c = shape[i, 2], shape[i, 3], shape[i, 4]
             size = math.sqrt(half)
@@ -55,8 +67,8 @@ def covariance_forms(lane: int, lanes: int, means: Any, quats: Any, scales: Any,
                 forms[i, 2 * k], forms[i, 2 * k + 1] = size * (p * a + q * b), size * (p * b + q * c)
             forms[i, 6:] = 0.0
             if antialiased:
-                qw, qx, qy, qz, _ = unit(quats[i])
-                r = rotation(qw, qx, qy, qz)
+                qw, qx, qy, qz, _ = unit_quaternion(quats[i])
+                r = rotation_matrix(qw, qx, qy, qz)
                 A, B, C = 0.0, 0.0, 0.0
                 for k, s in enumerate((s0, s1, s2)):
                     u = s * (r[k] * pq[0] + r[3 + k] * pq[1] + r[6 + k] * pq[2])

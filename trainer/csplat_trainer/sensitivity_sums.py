@@ -13,24 +13,23 @@ from typing import Any
 import numpy as np
 
 from csplat_render.binning import TILE
-from csplat_render.blending_steps import (
-    CHECK,
-    HALF,
-    NUMBERS,
-    aligned,
-    alive_rows,
+from csplat_render.blending import (
+    BATCH,
+    BATCH_COLUMNS,
+    HALF_TILE,
+    aligned_zeros,
     alpha_at,
+    batch_entry,
     begin_tile,
-    gather,
-    middles,
-    numbers_of,
-    passed,
-    place,
+    gather_batch,
+    pixel_centres,
     read_planes,
+    tile_extent,
+    transmit,
+    unfinished_rows,
 )
-from csplat_render.harmonics import sh_basis
-from csplat_render.jit import parallel_kernel, relaxed_kernel
-from csplat_render.projecting import BLOCK, deviation, direction
+from csplat_render.kernels import parallel_kernel, relaxed_kernel
+from csplat_render.projection import BLOCK, sh_basis, standard_deviation, view_direction
 from csplat_trainer.sensitivity_forms import FORM
 
 #: Numbers per record. With w the share of a pixel that is the splat's, s_c the derivative of channel c towards the
@@ -68,26 +67,26 @@ def sum_derivatives(lane: int, lanes: int, starts: Any, used: Any, ids: Any, slo
         records: [intersections, SUMS], written.
     """
     height, width = rgb.shape[:2]
-    planes = aligned(_PLANES * _AREA, limits)
+    planes = aligned_zeros(_PLANES * _AREA, limits)
     T = planes[:_AREA].reshape((TILE, TILE))
-    ys = middles()
+    ys = pixel_centres()
     for e in range(_AREA):
         planes[_X + e] = ys[e % TILE]
         planes[_Y + e] = ys[e // TILE]
-    batch, rows_ = np.empty((CHECK, NUMBERS), limits.dtype), np.empty((CHECK, 2), np.int64)
+    batch, rows_ = np.empty((BATCH, BATCH_COLUMNS), limits.dtype), np.empty((BATCH, 2), np.int64)
     form, sums = np.empty(FORM + 3, limits.dtype), np.empty(SUMS, limits.dtype)
     alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
     zero, one = alpha_min - alpha_min, alpha_min / alpha_min
     for tile in range(lane, len(used), lanes):
-        X0, Y0, columns, high = place(tile, tiles_x, width, height)
+        X0, Y0, columns, high = tile_extent(tile, tiles_x, width, height)
         low = 0
         planes[:_X] = zero
         begin_tile(T, columns, one)
         read_planes(rgb, X0, Y0, columns, high, planes, _RED)
-        for begin in range(starts[tile], used[tile], CHECK):
-            low, high = alive_rows(T, low, high)
-            count = min(CHECK, used[tile] - begin)
-            gather(ids, begin, begin + count, shape, box, X0, Y0, low, high, ys, batch, rows_)
+        for begin in range(starts[tile], used[tile], BATCH):
+            low, high = unfinished_rows(T, low, high)
+            count = min(BATCH, used[tile] - begin)
+            gather_batch(ids, begin, begin + count, shape, box, X0, Y0, low, high, ys, batch, rows_)
             for j in range(count):
                 record = records[slots[begin + j]]
                 first, last = rows_[j, 0], rows_[j, 1]
@@ -95,12 +94,12 @@ def sum_derivatives(lane: int, lanes: int, starts: Any, used: Any, ids: Any, slo
                     record[:] = zero
                     continue
                 body = planes[first * TILE :]
-                row0, row1, a, o, r, g, b, _ = numbers_of(batch, j, first)
+                row0, row1, a, o, r, g, b, _ = batch_entry(batch, j, first)
                 for y in range(last - first):
                     row, c0, c1 = body[y * TILE :], row0[y], row1[y]
                     for x in range(TILE):
                         full, alpha = alpha_at(row[_X + x], c0, c1, a, o, alpha_min, alpha_cap, zero)
-                        going, weight, row[x] = passed(row[x], alpha, stop, zero, one)
+                        going, weight, row[x] = transmit(row[x], alpha, stop, zero, one)
                         red, green, blue = weight * r, weight * g, weight * b
                         row[_RED + x] -= red
                         row[_GREEN + x] -= green
@@ -115,7 +114,7 @@ def sum_derivatives(lane: int, lanes: int, starts: Any, used: Any, ids: Any, slo
                         row[_SIZE + x] = free * (abs(red) + abs(green) + abs(blue))
                         row[_SQUARE + x] = free * (red * red + green * green + blue * blue)
                 i = ids[begin + j]
-                dx, dy = X0 + HALF - shape[i, 0], Y0 + HALF - shape[i, 1]
+                dx, dy = X0 + HALF_TILE - shape[i, 0], Y0 + HALF_TILE - shape[i, 1]
                 for e in range(FORM):
                     form[e] = forms[i, e]
                 for k in range(3):
@@ -245,7 +244,7 @@ def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, vie
             if not sums[0] > 0.0:
                 continue
             views[i] += 1
-            x, y, z, _ = direction(view, means[i])
+            x, y, z, _ = view_direction(view, means[i])
             sh_basis(degree, x, y, z, basis)
             for c in range(3 if with_magnitudes else 0):
                 if shape[i, 6 + c] > 0.0:
@@ -265,7 +264,11 @@ def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, vie
                 twice = 1.0 if e < 3 else 2.0  # an entry off the diagonal occurs twice in the covariance
                 net[i, 1 + e] += twice * abs(sums[5 + e])
                 sizes[i, 1 + e] += twice * sums[11 + e]
-            s0, s1, s2 = deviation(scales[i, 0]), deviation(scales[i, 1]), deviation(scales[i, 2])
+            s0, s1, s2 = (
+                standard_deviation(scales[i, 0]),
+                standard_deviation(scales[i, 1]),
+                standard_deviation(scales[i, 2]),
+            )
             squares[i, 0] += sums[1]
             squares[i, 1] += sums[4] / (alpha * alpha)
             squares[i, 2] += 2.0 * sums[17] / (s0 * s0 + s1 * s1 + s2 * s2)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat_render.removal import measure_removal
+from csplat_render.pruning_error import measure_pruning_error
 from csplat_trainer.parameters import Parameters, to_model
 from csplat_trainer.pictures import Picture
 
@@ -37,5 +37,5 @@ def thin(
     """
     views = pictures[:: -(-len(pictures) // _VIEWS)]
     model = to_model(parameters.values, antialiased=antialiased)
-    found = measure_removal(model, [one.camera for one in views], background=background, bands=False)
+    found = measure_pruning_error(model, [one.camera for one in views], background=background, bands=False)
     parameters.keep(np.sort(np.argsort(-found.error, kind="stable")[:count]))

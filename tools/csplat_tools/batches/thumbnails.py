@@ -64,7 +64,7 @@ def _jpeg(model: SplatModel) -> bytes:
     from PIL import Image
 
     from csplat_render import render
-    from csplat_render.paths import orbit_cameras
+    from csplat_render.camera_paths import orbit_cameras
 
     width, height = THUMBNAIL_SIZE
     camera = orbit_cameras(model, 1, _FINER * width, _FINER * height)[0]

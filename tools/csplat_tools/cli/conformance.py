@@ -251,9 +251,9 @@ def _picture_judge(levels: Sequence[str], *, quiet: bool) -> tuple[PictureJudge 
 
     def psnr(source: SplatModel, decoded: SplatModel) -> float:
         ready()
-        from csplat_render.judge import Judge
+        from csplat_render.scorer import Scorer
         from csplat_tools.views import comparison_cameras
 
-        return Judge.of_source(source, comparison_cameras(source)).psnr(decoded)
+        return Scorer.of_source(source, comparison_cameras(source)).psnr(decoded)
 
     return psnr, ""

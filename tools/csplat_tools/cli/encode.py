@@ -15,7 +15,7 @@ from csplat.encoder import EncodeOptions
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat.types import Progress
-from csplat_render.standing import seeming_up
+from csplat_render.virtual_cameras import estimate_up
 from csplat_tools.cli.encoder_options import ENCODER, Encoding, Facts
 from csplat_tools.cli.groups import Group, Output
 from csplat_tools.cli.options import EFFORT, Importance, SourceIndex, command
@@ -261,7 +261,7 @@ def encode(
         psnr = None if out.quiet else _psnr(encoded, encoding.threads)
     about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(SIZE)}
     if not out.quiet and encoded.made is not None and len(encoded.source) <= SPLATS_MAX:
-        facts.seeming(seeming_up(encoded.source), out, shown=False)
+        facts.seeming(estimate_up(encoded.source), out, shown=False)
     out.remark(_summary(encoded, psnr, source, output))
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
 

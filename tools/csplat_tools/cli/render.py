@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar
 import typer
 
 from csplat.errors import counted
-from csplat_render.standing import seeming_up
+from csplat_render.virtual_cameras import estimate_up
 from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import ModeWord, Scene, ShDegree, command
 from csplat_tools.cli.parsing import parse_size
@@ -112,7 +112,7 @@ def render(
     cameras = find_cameras(model, views.cameras, orbit, shots, pixels, split=split, report=report)
     out.remark(*report)
     if orbit is not None:
-        upright.seeming(seeming_up(model), out)
+        upright.seeming(estimate_up(model), out)
     write = partial(render_film, fps=fps) if film else partial(render_folder, depth=depth, alpha=alpha)
     with out.bar() as progress:
         rendered = write(

@@ -10,7 +10,7 @@ import typer
 
 from csplat.model import SplatModel
 from csplat.upright import Direction
-from csplat_render.standing import seeming_up
+from csplat_render.virtual_cameras import estimate_up
 from csplat_tools.cli.groups import Group, Output
 from csplat_tools.cli.parsing import parse_axes, parse_colour, parse_size, parse_up, up_word
 from csplat_tools.files.facts import SceneOverrides
@@ -47,7 +47,7 @@ class Upright(Group):
         """Return the estimated up direction, with a remark, if neither the user nor the scene specifies one.
 
         Args:
-            axis: the estimate of `seeming_up`; `None`: there is none.
+            axis: the estimate of `estimate_up`; `None`: there is none.
             output: prints remarks.
             shown: True if the command's result shows the scene with this direction up.
         """
@@ -145,7 +145,7 @@ class Views(Group):
         data = self.photographs(near)
         found = find_view_set(model, cameras=self.cameras, data=data, background=self.colour, every=every, **how)
         output.remark(*found.notes)
-        axis = None if output.quiet or found.name != VIRTUAL else seeming_up(model, every)
+        axis = None if output.quiet or found.name != VIRTUAL else estimate_up(model, every)
         if axis is not None:
             word = up_word(axis)
             output.remark(

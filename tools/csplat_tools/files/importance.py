@@ -14,7 +14,7 @@ from csplat.errors import InputError
 from csplat.files import read_array
 from csplat.model import SplatModel
 from csplat.types import Progress
-from csplat_render.virtual import scene_frame
+from csplat_render.virtual_cameras import scene_frame
 from csplat_trainer.sensitivity_file import StoredSensitivity, read_sensitivity
 
 _ZIP = b"PK"  # first bytes of a .npz file

@@ -18,9 +18,9 @@ from csplat.model import SplatModel
 from csplat.types import F32, Progress
 from csplat_render import Mode
 from csplat_render.camera import Camera
-from csplat_render.judge import Judge, OnView
 from csplat_render.lpips import load_lpips
 from csplat_render.metrics import Distance, Scores, ViewScore
+from csplat_render.scorer import OnView, Scorer
 from csplat_tools.files.extras import need_pictures, need_renderer
 from csplat_tools.files.pictures import check_folder, panels, picture_names, write_png
 from csplat_tools.files.scenes import LoadedModel, OpenedScene, SceneLike, opened_scenes
@@ -204,7 +204,7 @@ def _measured(
 class _Both:
     """Scorer of A's and B's renders against the photographs."""
 
-    def __init__(self, judge: Judge, distance: Distance | None) -> None:
+    def __init__(self, judge: Scorer, distance: Distance | None) -> None:
         self._judge, self._distance = judge, distance
         self._each: dict[str, list[ViewScore]] = {"a": [], "b": []}
 
@@ -220,7 +220,7 @@ class _Sheets:
     """Writer of one PNG per view, named after its photograph."""
 
     def __init__(
-        self, folder: str, names: Sequence[str], photographs: Judge | None, amplification: float, *, force: bool
+        self, folder: str, names: Sequence[str], photographs: Scorer | None, amplification: float, *, force: bool
     ) -> None:
         self._files = [f"{name}.png" for name in names]
         self._target = check_folder(folder, self._files, force=force)

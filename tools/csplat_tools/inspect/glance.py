@@ -5,8 +5,8 @@ from __future__ import annotations
 from csplat.decoder import decode
 from csplat.errors import CsplatError
 from csplat.model import SplatModel
-from csplat_render.cameras import resized
-from csplat_render.judge import Judge
+from csplat_render.camera import resized
+from csplat_render.scorer import Scorer
 from csplat_tools.views import comparison_cameras
 
 #: Width and height of the renders, pixels; smaller ones average errors away: half of 640×480 gives 0.4 dB too much,
@@ -39,6 +39,6 @@ def glance(
         return None
     try:
         cameras = [resized(camera, *SIZE) for camera in comparison_cameras(source)]
-        return Judge.of_source(source, cameras, threads=threads).psnr(decode(data, threads=threads))
+        return Scorer.of_source(source, cameras, threads=threads).psnr(decode(data, threads=threads))
     except (CsplatError, MemoryError):  # the file is written: this is a remark on it
         return None

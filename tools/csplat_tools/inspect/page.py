@@ -109,7 +109,7 @@ def make_page(title: str, facts: FileFacts, beside: _Beside | None = None) -> st
 
 def _compared(data: bytes | mmap, source: str, progress: Progress | None) -> _Beside:
     """Render file and source: from the views of `psnr` for the scores, and from others to show the hardest place."""
-    from csplat_render.judge import Judge
+    from csplat_render.scorer import Scorer
     from csplat_tools.pages.hardest import PICTURES, HardestPlace, picture_row
     from csplat_tools.views import find_view_set, showing_cameras
 
@@ -117,7 +117,7 @@ def _compared(data: bytes | mmap, source: str, progress: Progress | None) -> _Be
     views = find_view_set(loaded.model, count=0)
     hardest, shown = HardestPlace(), showing_cameras(loaded.model, views)
     scores = views.judge(loaded.model).scores(model, progress=progress)
-    showing = Judge.of_source(loaded.model, shown, views.judging_background)
+    showing = Scorer.of_source(loaded.model, shown, views.judging_background)
     showing.scores(model, ssim=False, on_view=hardest.look)
     place = hardest.found()
     assert place is not None

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from csplat.encoder import Coded, Draft, EncodeOptions, Importance, Origin, most_grades
 from csplat.model import SplatModel
 from csplat.types import I64, Mask, Progress
-from csplat_render.removal import Removal, measure_removal
+from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_tools.optimise.exchange import error_of_psnr
 from csplat_tools.optimise.simplify.adjusting import adjust, adjust_frozen
 from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
@@ -183,10 +183,10 @@ class FittedSplats:
         return replace(self._measured, curvatures=None) if options.shape_codebook_size else weights
 
     @cached_property
-    def _removal(self) -> Removal:
+    def _removal(self) -> PruningError:
         """The error of removing each splat and each of its SH bands, and the weights of their colours."""
         session = self.session
-        return measure_removal(
+        return measure_pruning_error(
             self.model, session.views.used, background=session.options.background, threads=session.options.threads,
             progress=self.progress,
         )  # fmt: skip

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 from csplat.model import SplatModel
-from csplat_render.judge import Judge
 from csplat_render.metrics import PSNR_CAP
+from csplat_render.scorer import Scorer
 from csplat_tools.optimise.solving import Goal
 from csplat_tools.optimise.target import Target
 
 
-def goal_of(target: Target, source: SplatModel, photographs: Judge | None) -> Goal:
+def goal_of(target: Target, source: SplatModel, photographs: Scorer | None) -> Goal:
     """Return the goal of the search for a target.
 
     Args:

@@ -17,8 +17,8 @@ from csplat.encoder import EncodeOptions
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import Progress
-from csplat_render.judge import Judge
-from csplat_render.virtual import scene_frame
+from csplat_render.scorer import Scorer
+from csplat_render.virtual_cameras import scene_frame
 from csplat_tools.optimise.bounds import Weights
 from csplat_tools.optimise.coding import Codings
 from csplat_tools.optimise.goals import goal_of
@@ -152,7 +152,7 @@ def check(source: SplatModel, target: Target, encoding: EncodeOptions, *, keep_a
         raise InputError("a share of the splats is to stay, and all of them: give one of the two")
 
 
-def _is_empty(judge: Judge) -> bool:
+def _is_empty(judge: Scorer) -> bool:
     """Return True if every test image has a single colour."""
     pictures = (judge.look(number).picture for number in range(len(judge.cameras)))
     return all(np.ptp(picture, axis=(0, 1)).max() == 0.0 for picture in pictures)
@@ -162,7 +162,7 @@ def _seen_elsewhere(source: SplatModel, found: Trial, views: ViewSet, threads: i
     """Return the PSNR from views that had no part in the search, by kind."""
     model, judged = decode(found.result.data), elsewhere(source).items()
     return {
-        kind: round(Judge.of_source(source, cameras, views.background, threads=threads).psnr(model), 3)
+        kind: round(Scorer.of_source(source, cameras, views.background, threads=threads).psnr(model), 3)
         for kind, cameras in judged
     }
 

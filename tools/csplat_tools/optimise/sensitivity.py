@@ -14,7 +14,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import Progress
 from csplat_render import Camera
-from csplat_render.removal import measure_removal
+from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.files.streams import open_output
 from csplat_tools.views import Colour, ViewSet, evenly
 from csplat_tools.views.agreeing import find_views
@@ -101,7 +101,7 @@ def measure_scene(
     measured = measure_views(model, cameras, views.background, matrices=matrices, threads=threads, progress=progress)
     missed = float("nan")
     if check:
-        elsewhere = measure_removal(model, check, background=views.background, bands=False, threads=threads).seen
+        elsewhere = measure_pruning_error(model, check, background=views.background, bands=False, threads=threads).seen
         missed = float(np.mean(elsewhere & ~measured.seen))
     return MeasuredSensitivity(model, measured, source, missed)
 

@@ -16,8 +16,8 @@ from csplat.decoder import decode
 from csplat.encoder import Coded, Draft, EncodeOptions, EncodeResult, Importance, ShCoding
 from csplat.model import SplatModel
 from csplat.types import F64, Progress, null_progress
-from csplat_render.judge import Judge
 from csplat_render.metrics import psnr_of_mse
+from csplat_render.scorer import Scorer
 
 Weights = NDArray[Any] | Importance
 _ENTRIES = (16, 8192)  # least and largest number of entries of a codebook that is chosen here
@@ -156,7 +156,7 @@ class Trial:
     options: EncodeOptions
     is_careful: bool
     result: EncodeResult = field(repr=False)
-    judge: Judge = field(repr=False)
+    judge: Scorer = field(repr=False)
     decided_psnr: float
     photo_psnr: float
     decode: Callable[[bytes], SplatModel] = field(default=decode, repr=False)
@@ -239,9 +239,9 @@ class Trials:
     """
 
     encoding: EncodeOptions
-    judge: Judge
-    decider: Judge
-    photographs: Judge | None = None
+    judge: Scorer
+    decider: Scorer
+    photographs: Scorer | None = None
     made: list[Trial] = field(default_factory=list)
     progress: Progress | None = None
     decode: Callable[[bytes], SplatModel] = decode

@@ -14,9 +14,10 @@ from csplat.model import SplatModel
 from csplat.training import TrainedOn
 from csplat.types import F32, Progress
 from csplat_render import Camera, Mode, render
-from csplat_render.arrays import RenderResult
-from csplat_render.cameras import load_cameras, resized
-from csplat_render.paths import orbit_cameras
+from csplat_render.camera import resized
+from csplat_render.camera_files import load_cameras
+from csplat_render.camera_paths import orbit_cameras
+from csplat_render.conventions import RenderResult
 from csplat_tools.files.extras import need_pictures, need_renderer
 from csplat_tools.files.pictures import check_folder, picture_names, to_bytes, write_png
 from csplat_tools.files.streams import check_output, write_array

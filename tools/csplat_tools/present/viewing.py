@@ -16,8 +16,8 @@ from csplat.lint import Finding
 from csplat.model import UNSPECIFIED
 from csplat.types import Progress
 from csplat.upright import Direction
-from csplat_render.cameras import load_cameras
-from csplat_render.standing import seeming_up
+from csplat_render.camera_files import load_cameras
+from csplat_render.virtual_cameras import estimate_up
 from csplat_tools.files.convert import read_source
 from csplat_tools.files.facts import SceneOverrides
 from csplat_tools.files.streams import STANDARD_STREAM, is_csplat, local_path, mapped_csplat
@@ -131,7 +131,7 @@ def _seems_up(path: Path, header: SceneHeader) -> Direction | None:
     if header.splat_count > _SPLATS_LOOKED_AT or header.coordinate_system != UNSPECIFIED:
         return None
     try:
-        return seeming_up(decode(path, sh_degree=0))
+        return estimate_up(decode(path, sh_degree=0))
     except CsplatError:
         return None  # the page shows the intact part, and reports the error
 
@@ -139,5 +139,5 @@ def _seems_up(path: Path, header: SceneHeader) -> Direction | None:
 def _encoded(path: Path, stem: str, preset: PresetName, progress: Progress | None) -> ViewScene:
     source = read_source(str(path), progress=progress)
     data = encode_with_report(source.model, EncodeOptions(preset=preset), progress=progress).data
-    header, up = read_header(data), seeming_up(source.model)
+    header, up = read_header(data), estimate_up(source.model)
     return ViewScene(f"{stem}.csplat", data, len(data), header, up, source.findings, source.size_bytes)

@@ -17,8 +17,8 @@ from csplat.model import SplatModel
 from csplat.scene import without_bands
 from csplat.types import F32, Progress
 from csplat_render import Camera
-from csplat_render.judge import Judge, renderer
 from csplat_render.refit import fit_colours
+from csplat_render.scorer import Scorer, renderer
 from csplat_tools.views import ViewSet, reduced
 
 _STEPS = 8  # largest number of conjugate gradient steps; more overfit the training views
@@ -38,7 +38,7 @@ class Teacher:
 
     cameras: Sequence[Camera]
     wanted: Sequence[F32]
-    check: Judge
+    check: Scorer
     background: tuple[float, float, float]
     threads: int | None
 
@@ -65,7 +65,7 @@ class Teacher:
         used, aside = reduced(views.teaches), reduced(views.decides)
         draw = renderer(source, views.background, threads=threads)
         wanted = [draw(camera).rgb for camera in used]
-        check = Judge.of_source(source, aside, views.background, threads=threads)
+        check = Scorer.of_source(source, aside, views.background, threads=threads)
         return cls(used, wanted, check, views.background, threads)
 
     def taught(self, model: SplatModel, sh_degree: int, progress: Progress | None = None) -> SplatModel:

@@ -7,7 +7,7 @@ import numpy as np
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import I64
-from csplat_render.cloud import surface_areas
+from csplat_render.virtual_cameras import surface_areas
 
 
 def prune_opacity(model: SplatModel, tau: float) -> tuple[SplatModel, I64]:

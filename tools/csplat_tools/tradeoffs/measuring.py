@@ -16,9 +16,9 @@ from csplat.decoder import SceneHeader, decode, read_header
 from csplat.model import SplatModel
 from csplat.types import F32, Progress
 from csplat_render import Mode
-from csplat_render.cameras import relative_to
-from csplat_render.judge import Judge, renderer
+from csplat_render.camera import relative_to
 from csplat_render.metrics import Scores, ViewScore, psnr_of_mse, squared_error
+from csplat_render.scorer import Scorer, renderer
 from csplat_tools.inspect.info import byte_shares
 from csplat_tools.pages.hardest import HardestPlace
 from csplat_tools.tradeoffs.points import ModeTime, Partial, Point, TriedFile
@@ -83,7 +83,7 @@ class Measurer:
         self._showing = (
             None
             if shown is views.judges
-            else Judge.of_source(setting.source, shown, views.judging_background, threads=threads)
+            else Scorer.of_source(setting.source, shown, views.judging_background, threads=threads)
         )
         self._photographs = views.photograph_judge(threads=threads) if views.photographs else None
         places = evenly(range(len(views.judges)), TIMED_VIEWS)

@@ -10,7 +10,7 @@ from csplat.errors import CsplatError, InputError, counted
 from csplat.inputs import File
 from csplat.model import SplatModel
 from csplat.types import Progress, null_progress
-from csplat_render.jit import thread_count
+from csplat_render.kernels import thread_count
 from csplat_render.metrics import Scores
 from csplat_tools.files.console import format_about, format_bytes
 from csplat_tools.files.extras import need_renderer

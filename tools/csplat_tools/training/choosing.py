@@ -14,7 +14,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import I64, Progress
 from csplat_render import Camera
-from csplat_render.removal import measure_removal
+from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.files.importance import read_importance
 from csplat_tools.optimise.sensitivity import measure_views
 from csplat_tools.optimise.simplify import SimplifyOptions, simplify
@@ -96,7 +96,7 @@ def choose_splats(
     if found is not None and not (prune and len(measuring) < len(looking)):
         seen = found.seen
     else:
-        seen = measure_removal(
+        seen = measure_pruning_error(
             source, looking, background=views.background, bands=False, threads=threads, progress=progress
         ).seen
     if not seen.any():

@@ -14,7 +14,7 @@ from csplat.encoder import PRESETS, Draft, EncodeOptions, Origin
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import Progress
-from csplat_render.jit import thread_count
+from csplat_render.kernels import thread_count
 from csplat_render.metrics import Distance
 from csplat_tools.files.console import format_bytes, note, progress_bar, step_progress
 from csplat_tools.files.extras import prepare_renderer

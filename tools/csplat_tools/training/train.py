@@ -10,7 +10,7 @@ import csplat_trainer
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError, counted
 from csplat.training import TrainedOn
-from csplat_render.jit import thread_count
+from csplat_render.kernels import thread_count
 from csplat_render.lpips import load_lpips
 from csplat_tools.files.console import note, step_progress
 from csplat_tools.files.extras import prepare_renderer

@@ -19,7 +19,7 @@ from csplat.model import SplatModel
 from csplat.types import F64, Progress
 from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
-from csplat_render.removal import Removal, measure_removal
+from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_tools.views import CHECKS, VIEW_SIZE, ViewSet, reduced
 
 _BATCH = 40  # virtual views that are added at a time
@@ -42,7 +42,7 @@ class AgreedViews:
 
     used: list[Camera]
     check: list[Camera]
-    removal: Removal
+    removal: PruningError
     gap: float
 
 
@@ -71,8 +71,8 @@ def find_views(
         InputError: there are no training or no validation views.
     """
 
-    def measured(cameras: Sequence[Camera]) -> Removal:
-        return measure_removal(
+    def measured(cameras: Sequence[Camera]) -> PruningError:
+        return measure_pruning_error(
             model, cameras, background=views.background, bands=False, threads=threads, progress=progress
         )
 
@@ -105,7 +105,7 @@ def _parted(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
     return [one for i, one in enumerate(cameras) if i not in aside], [cameras[i] for i in sorted(aside)]
 
 
-def removal_keys(opacities: NDArray[np.float32], removal: Removal, *, keep_unseen: bool = True) -> F64:
+def removal_keys(opacities: NDArray[np.float32], removal: PruningError, *, keep_unseen: bool = True) -> F64:
     """Return the keys by which splats are pruned, the smallest first.
 
     Args:
@@ -122,7 +122,7 @@ def removal_keys(opacities: NDArray[np.float32], removal: Removal, *, keep_unsee
     return keys
 
 
-def _gap(model: SplatModel, used: Removal, check: Removal, gone: float) -> float:
+def _gap(model: SplatModel, used: PruningError, check: PruningError, gone: float) -> float:
     """Return by how many dB the predicted error of the splats to be pruned is larger in held-out views."""
     keys = removal_keys(model.opacities, used)
     order = np.argsort(keys, kind="stable")[: int(gone * len(model))]

@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 
 from csplat.model import SplatModel
 from csplat_render import Camera
-from csplat_render.cameras import relative_to
-from csplat_render.cloud import sample_cloud
-from csplat_render.virtual import is_clear, scene_frame, virtual_cameras
+from csplat_render.camera import relative_to
+from csplat_render.virtual_cameras import is_clear, sample_cloud, scene_frame, virtual_cameras
 from csplat_tools.views import placing
 
 _SEED = 2000  # seed of these views; validation views use 1000 and more

@@ -22,8 +22,9 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.training import TrainedOn
 from csplat_render import Camera
-from csplat_render.cameras import load_cameras, relative_to
-from csplat_render.virtual import virtual_cameras
+from csplat_render.camera import relative_to
+from csplat_render.camera_files import load_cameras
+from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.files.extras import need_photographs
 from csplat_tools.views import placing
 from csplat_tools.views.placing import CHECKS, camera_sequence, evenly, usual_views
@@ -82,7 +83,7 @@ def find_view_set(
 
     Args:
         source: the scene.
-        cameras: a camera file, see `csplat_render.cameras.load_cameras`.
+        cameras: a camera file, see `csplat_render.camera_files.load_cameras`.
         data: a data set, instead of a camera file.
         background: background colour; `None`: that of the scene's training if known, else black.
         count: number of virtual training views, to which 16 are added that pruning holds out to check its choice; 0: no

@@ -15,9 +15,8 @@ import numpy as np
 from csplat.model import SplatModel
 from csplat.types import F64
 from csplat_render import Camera
-from csplat_render.cameras import direction, intrinsics, look_at
-from csplat_render.cloud import detail, sample_cloud
-from csplat_render.virtual import FIELD_OF_VIEW, HIDING, Frame, is_clear, scene_frame
+from csplat_render.camera import direction_at, intrinsics, look_at
+from csplat_render.virtual_cameras import FIELD_OF_VIEW, HIDING, SceneFrame, detail, is_clear, sample_cloud, scene_frame
 
 T = TypeVar("T")
 
@@ -132,16 +131,16 @@ def _between(bounds: tuple[float, float], at: float) -> float:
     return bounds[0] + (bounds[1] - bounds[0]) * at
 
 
-def _around_object(frame: Frame, point: F64, K: F64, size: tuple[int, int]) -> Camera:
+def _around_object(frame: SceneFrame, point: F64, K: F64, size: tuple[int, int]) -> Camera:
     height = _between(_OBJECT_HEIGHT, point[1])
-    along = direction(frame.up, 360.0 * point[0], math.degrees(math.asin(height)))
+    along = direction_at(frame.up, 360.0 * point[0], math.degrees(math.asin(height)))
     eye = frame.centre + frame.extent * _between(_OBJECT_DISTANCE, point[2]) * along
     target = frame.centre + frame.extent * _OBJECT_OFFSET * (2.0 * point[3:] - 1.0)
     return look_at(eye, target, frame.up, K, *size, frame.near)
 
 
-def _in_surroundings(frame: Frame, number: int, point: F64, K: F64, size: tuple[int, int]) -> Camera:
-    along = direction(frame.up, 360.0 * point[0], math.degrees(math.asin(_between(_AROUND_HEIGHT, point[1]))))
+def _in_surroundings(frame: SceneFrame, number: int, point: F64, K: F64, size: tuple[int, int]) -> Camera:
+    along = direction_at(frame.up, 360.0 * point[0], math.degrees(math.asin(_between(_AROUND_HEIGHT, point[1]))))
     offset = _AROUND_OFFSET * (2.0 * point[3:] - 1.0)
     if number % _OUTWARDS == 0:
         eye = frame.centre + frame.extent * offset

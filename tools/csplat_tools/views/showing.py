@@ -13,9 +13,7 @@ import numpy as np
 
 from csplat.model import SplatModel
 from csplat_render import Camera
-from csplat_render.cloud import detail, sample_cloud
-from csplat_render.standing import standing
-from csplat_render.virtual import HIDING, far_apart, scene_frame
+from csplat_render.virtual_cameras import HIDING, detail, farthest_points, sample_cloud, scene_frame, with_estimated_up
 from csplat_tools.views.placing import camera_sequence
 from csplat_tools.views.viewset import VIRTUAL, ViewSet
 
@@ -37,12 +35,12 @@ def showing_cameras(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
     """
     if views.name != VIRTUAL or not len(source):
         return views.judges
-    told = standing(source)
+    told = with_estimated_up(source)
     own = views.judges if told is source else ()  # else they would show it lying on its side
     cameras = [*own, *camera_sequence(told, _TRIED, _SIZE, seed=_SEED)]
     cloud, nearest = sample_cloud(source, _POINTS, np.random.default_rng(_SEED)), HIDING * scene_frame(source).extent
     details = np.array([detail(cloud, camera, nearest) for camera in cameras])
     good = np.flatnonzero(details >= _GOOD_DETAIL * details.max())
     positions = np.stack([cameras[i].position for i in good])
-    chosen = far_apart(positions, int(np.argmax(details[good])), min(_COUNT, len(good)))
+    chosen = farthest_points(positions, int(np.argmax(details[good])), min(_COUNT, len(good)))
     return [cameras[good[i]] for i in chosen]

@@ -23,7 +23,7 @@ from csplat.types import F32, F64, Progress
 from csplat_conformance.stated import Source
 from csplat_conformance.stated.spool import Rows, Spool, opened_spool
 from csplat_render import Camera, Mode
-from csplat_render.arrays import HasSplats, RenderResult
+from csplat_render.conventions import HasSplats, RenderResult
 
 STAGE = "drawing one picture by way of the disk"
 _LOOKED_AT = 1 << 19  # approximate number of splats that are sampled to cut a slice again
@@ -95,7 +95,7 @@ class Sliced:
     def renderer(
         self, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
     ) -> Callable[[Camera], RenderResult]:
-        """Return a function that draws the scene from a camera, like `csplat_render.judge.renderer`, without `radii`.
+        """Return a function that draws the scene from a camera, like `csplat_render.scorer.renderer`, without `radii`.
 
         Raises:
             InputError: the mode is `exact`; while drawing: the disk has no room, or the scene is not whole.
@@ -109,7 +109,7 @@ class _Picture:
     """A render in progress. Owns the state of its pixels."""
 
     def __init__(self, scene: Sliced, camera: Camera, background: ArrayLike, mode: Mode, threads: int | None) -> None:
-        from csplat_render.rasterise import Rasteriser  # numba takes a second to import
+        from csplat_render.rasteriser import Rasteriser  # numba takes a second to import
 
         self._scene, self._camera, self._background = scene, camera, background
         self._rasteriser = Rasteriser(mode, gradients=False, threads=threads)

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 
 from csplat.model import SplatModel
 from csplat_render import Camera, Mode
-from csplat_render.cameras import resized
-from csplat_render.judge import Drawable, renderer
+from csplat_render.camera import resized
+from csplat_render.scorer import Renderable, renderer
 
 _SAMPLES = 2  # largest number of cameras that are rendered
 _SMALLER = 8  # divisor of width and height in mode `exact`, in which a render takes a minute: time grows with pixels
@@ -20,7 +20,7 @@ def pictures_seconds(source: SplatModel, cameras: Sequence[Camera], *, mode: Mod
 
 
 def picture_seconds(
-    source: SplatModel | Drawable,
+    source: SplatModel | Renderable,
     cameras: Sequence[Camera],
     *,
     mode: Mode = "standard",

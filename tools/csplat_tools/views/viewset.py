@@ -11,7 +11,7 @@ import numpy as np
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat_render import Camera, Mode
-from csplat_render.judge import Drawable, Judge
+from csplat_render.scorer import Renderable, Scorer
 
 if TYPE_CHECKING:
     from csplat_trainer.pictures import Picture
@@ -77,13 +77,13 @@ class ViewSet:
 
     def judge(
         self,
-        source: SplatModel | Drawable,
+        source: SplatModel | Renderable,
         *,
         background: Colour | None = None,
         mode: Mode = "standard",
         threads: int | None = None,
         progress: Callable[[str, float], None] | None = None,
-    ) -> Judge:
+    ) -> Scorer:
         """Return the scorer by the source's renders in the test views.
 
         Args:
@@ -96,17 +96,17 @@ class ViewSet:
             InputError: there are no test views.
         """
         colour = background or self.judging_background
-        return Judge.of_source(source, self.judges, colour, mode=mode, threads=threads, progress=progress)
+        return Scorer.of_source(source, self.judges, colour, mode=mode, threads=threads, progress=progress)
 
-    def decider(self, source: SplatModel, *, threads: int | None = None) -> Judge:
+    def decider(self, source: SplatModel, *, threads: int | None = None) -> Scorer:
         """Return the scorer by the source's renders in the validation views.
 
         Raises:
             InputError: there are no validation views.
         """
-        return Judge.of_source(source, self.decides, self.background, threads=threads)
+        return Scorer.of_source(source, self.decides, self.background, threads=threads)
 
-    def photograph_judge(self, *, mode: Mode = "standard", threads: int | None = None) -> Judge:
+    def photograph_judge(self, *, mode: Mode = "standard", threads: int | None = None) -> Scorer:
         """Return the scorer by the photographs of the test views.
 
         Raises:
@@ -114,7 +114,7 @@ class ViewSet:
         """
         return self._by_photographs(self.judges, mode, threads)
 
-    def photograph_decider(self, *, threads: int | None = None) -> Judge:
+    def photograph_decider(self, *, threads: int | None = None) -> Scorer:
         """Return the scorer by the photographs of the validation views.
 
         Raises:
@@ -136,7 +136,7 @@ class ViewSet:
         for photograph in self.photographs:
             _ = photograph.pixels, photograph.mask
 
-    def _by_photographs(self, cameras: Sequence[Camera], mode: Mode, threads: int | None) -> Judge:
+    def _by_photographs(self, cameras: Sequence[Camera], mode: Mode, threads: int | None) -> Scorer:
         from csplat_trainer.evaluate import photograph_judge
 
         if not self.photographs:

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
-from csplat_render.camera_forms import check_intrinsics
-from csplat_render.cameras import camera_outliers, gaze, nearest_point
+from csplat_render.camera import camera_outliers, convergence, nearest_point
+from csplat_render.camera_files import check_intrinsics
 from csplat_trainer.data.dataset import Shot
 from csplat_trainer.data.image_pixels import ImageHead, image_size, mask_values, opened_image, value_range
 from csplat_trainer.data.lens import Lens, undistorted_lens
@@ -25,7 +25,7 @@ _MIDDLE = (0.25, 0.75)  # fractions of the image: principal points outside this 
 _SMALL_RANGE = 1.0 / 8.0  # fraction of the 16-bit range: images of 12 bits are as dark as that
 _SAME = 1e-9  # relative difference of positions; coordinates of maps are a million times the distance of cameras
 _FEW = 4  # cameras; fewer need not look anywhere in common
-_AIMED = 0.98  # median cosine, see `gaze`
+_AIMED = 0.98  # median cosine, see `convergence`
 _PARALLEL = 0.05  # least mean square of what is across to lines of sight that are not parallel
 _MEETING = 0.1  # of their distance: lines of sight that pass a point so near meet there
 _SHOTS, _POINTS = 64, 4096  # shots and points of a set, at most, that are checked for belonging together
@@ -167,7 +167,7 @@ def _is_panorama(viewmats: NDArray[np.float64]) -> bool:
     towards = nearest_point(positions, axes) - positions
     missed = np.linalg.norm(np.einsum("nij,nj->ni", across, towards), axis=1)
     distance = float(np.median(np.linalg.norm(towards, axis=1)))
-    return gaze(positions, axes) < -_AIMED and float(np.median(missed)) < _MEETING * distance
+    return convergence(positions, axes) < -_AIMED and float(np.median(missed)) < _MEETING * distance
 
 
 def _sees_any(shot: Shot, points: NDArray[np.floating[Any]]) -> bool:

@@ -13,8 +13,7 @@ from csplat.model import UNSPECIFIED
 from csplat.training import TrainedOn
 from csplat.types import F32, F64
 from csplat.upright import Direction
-from csplat_render.camera import DEFAULT_NEAR
-from csplat_render.cameras import camera_outliers, nearest_point
+from csplat_render.camera import DEFAULT_NEAR, camera_outliers, nearest_point
 from csplat_trainer.data.lens import Lens
 from csplat_trainer.pictures import Picture
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from csplat.errors import InputError, counted
 from csplat.types import F64
-from csplat_render.cameras import camera_outliers, nearest_point
+from csplat_render.camera import camera_outliers, nearest_point
 from csplat_trainer.data.dataset import DataSet, Found, Shot
 from csplat_trainer.data.image_files import shown
 

@@ -15,12 +15,12 @@ import numpy as np
 from csplat.errors import InputError, counted
 from csplat.files import read_json
 from csplat.types import F32, F64
-from csplat_render.camera_forms import (
+from csplat_render.camera_files import (
     PERSPECTIVES,
+    describe_scales,
     finite_number,
     focal_lengths,
     frame_values,
-    note_on_scales,
     viewmat_of_opengl,
 )
 from csplat_trainer.data.dataset import Found, Shot
@@ -145,7 +145,7 @@ def _shots(
             lens = _lens(frame_values(document, frame.values), image, where)
             viewmat = viewmat_of_opengl(frame.values.get("transform_matrix"), "transform_matrix", where)
             shots.append(Shot(_plain(frame.name, image), image, lens, viewmat, masks.get(frame.name)))
-    report += note_on_scales(
+    report += describe_scales(
         [frame.values["transform_matrix"] for frame in frames if frame.name in found.files], path.name
     )
     return shots

@@ -17,7 +17,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
 from csplat.training import TrainedOn
 from csplat.types import I64
-from csplat_render.cameras import relative_to
+from csplat_render.camera import relative_to
 from csplat_trainer.data import DataSet
 from csplat_trainer.outputs import Outputs
 from csplat_trainer.sensitivity import measure_sensitivity

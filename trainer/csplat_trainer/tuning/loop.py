@@ -15,9 +15,9 @@ from numpy.random import PCG64, Generator
 from csplat.encoder import DecodedValues, FreeValues, Frozen
 from csplat.errors import InputError
 from csplat.types import F32
-from csplat_render.arrays import Splats
+from csplat_render.conventions import SplatArrays
 from csplat_render.metrics import psnr_of_mse
-from csplat_render.rasterise import Rasteriser
+from csplat_render.rasteriser import Rasteriser
 from csplat_trainer.exposure import Exposure, Exposures
 from csplat_trainer.loss import LOSS_WEIGHTS, PhotometricLoss
 from csplat_trainer.report import peak_memory
@@ -254,7 +254,7 @@ class _Run:
         }
 
     def _render(self, seen: DecodedValues, view: View) -> F32:
-        splats = Splats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
+        splats = SplatArrays(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
         return self._rasteriser.forward(
             splats, view.camera, background=self._views.background, antialiased=self._antialiased
         ).rgb

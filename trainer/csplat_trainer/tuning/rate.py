@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from csplat.encoder import Frozen
 from csplat.types import F32, I32
-from csplat_render.jit import lane_run, parallel_kernel
+from csplat_render.kernels import lane_range, parallel_kernel
 from csplat_trainer.parameters import Splats
 
 _REACH = 128  # integers beyond ± this cost as much as the last ones
@@ -205,7 +205,7 @@ def _add_plain(
     """Add the slopes of plain columns, [n, C] from column `first` on; a thread takes a run of rows."""
     reach = tables.shape[1] // 2
     over = np.float32(1.0 / step)
-    begin, end = lane_run(lane, lanes, seen.shape[0])
+    begin, end = lane_range(lane, lanes, seen.shape[0])
     seen, out = seen[begin:end], out[begin:end]
     for i in range(end - begin):
         for c in range(first, seen.shape[1]):
@@ -221,7 +221,7 @@ def _add_colour(
     reach = tables.shape[1] // 2
     over = np.float32(1.0 / step)
     chroma = np.float32(0.5**shift)
-    begin, end = lane_run(lane, lanes, seen.shape[0])
+    begin, end = lane_range(lane, lanes, seen.shape[0])
     seen, out = seen[begin:end], out[begin:end]
     for i in range(end - begin):
         for k in range(seen.shape[1]):

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from csplat.encoder import DecodedValues, FreeValues, Frozen
 from csplat.types import F32, I64
-from csplat_render.arrays import Gradients
-from csplat_render.jit import parallel_kernel
+from csplat_render.conventions import Gradients
+from csplat_render.kernels import parallel_kernel
 from csplat_trainer.parameters import Parameters, Splats, adam_step, sigmoid
 from csplat_trainer.tuning.rate import Costs, Stored
 

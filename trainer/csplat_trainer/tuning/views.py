@@ -14,7 +14,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F32
 from csplat_render.camera import Camera
-from csplat_render.rasterise import Rasteriser
+from csplat_render.rasteriser import Rasteriser
 from csplat_trainer.pictures import Picture, compose
 
 _JUDGES = 16  # validation views at most, if they are training views too

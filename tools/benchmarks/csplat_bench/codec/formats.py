@@ -25,7 +25,7 @@ from csplat_bench.common.measuring import timed
 from csplat_bench.common.peers import find_splat_transform, judged, transform
 from csplat_bench.common.report import optional, table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, find_scenes
-from csplat_render.judge import Judge
+from csplat_render.scorer import Scorer
 from csplat_tools.files.console import note
 from csplat_tools.views import comparison_cameras
 
@@ -81,7 +81,7 @@ def main(
     rows: list[Row] = []
     for scene in find_scenes(listed(scenes), cache, extra):
         source = read_ply(scene.path)
-        judge = Judge.of_source(source, comparison_cameras(source))
+        judge = Scorer.of_source(source, comparison_cameras(source))
         rows += _ours(scene.name, source, judge)
         for peer in transform(command, scene, cache) if command is not None else ():
             seconds = None if peer.timing is None else peer.timing.wall
@@ -96,7 +96,7 @@ def main(
         write_json(json, {"machine": machine, "rows": [asdict(row) for row in rows]})
 
 
-def _ours(name: str, source: SplatModel, judge: Judge) -> list[Row]:
+def _ours(name: str, source: SplatModel, judge: Scorer) -> list[Row]:
     found = []
     with tempfile.TemporaryDirectory(prefix="csplat-formats-") as folder:
         for one in formats():

@@ -33,7 +33,7 @@ from csplat_bench.common.scenes import NPM, ROOT, Scene
 from csplat_conformance.choosing import matching
 from csplat_conformance.encoders import Input, all_inputs
 from csplat_conformance.stated import Source
-from csplat_render.judge import Judge
+from csplat_render.scorer import Scorer
 from csplat_tools.files.console import note
 from csplat_tools.views import comparison_cameras
 
@@ -121,8 +121,8 @@ def _spz(one: Input, source: Source, path: Path, command: list[str]) -> Figures 
     return None if isinstance(psnr, str) else {"bytes": peer.size_bytes, "psnr": psnr}
 
 
-def _judge(source: SplatModel) -> Judge:
-    return Judge.of_source(source, comparison_cameras(source))
+def _judge(source: SplatModel) -> Scorer:
+    return Scorer.of_source(source, comparison_cameras(source))
 
 
 def _origin(source: Source) -> tuple[float, float, float]:

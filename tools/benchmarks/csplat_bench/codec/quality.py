@@ -42,8 +42,8 @@ from csplat_bench.common.measuring import timed
 from csplat_bench.common.peers import find_splat_transform, judged, transform
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, Scene, find_scenes, given_cameras, judge_of
-from csplat_render.judge import Judge
-from csplat_render.virtual import scene_frame, virtual_cameras
+from csplat_render.scorer import Scorer
+from csplat_render.virtual_cameras import scene_frame, virtual_cameras
 from csplat_tools.files.console import note
 
 _SCENES = "fox120k,fox60k_noreg,lego60k,plane3,statue,donut,jacket,horse,angel,st-peter"
@@ -114,7 +114,7 @@ def _files(scene: Scene, source: SplatModel, presets: Sequence[str], seeds: Sequ
     """A file of each preset, judged."""
     judge = judge_of(scene.name, source)
     compared = seeds if given_cameras(scene.name) else ()
-    others = [Judge.of_source(source, virtual_cameras(source, seed=seed)) for seed in compared]
+    others = [Scorer.of_source(source, virtual_cameras(source, seed=seed)) for seed in compared]
     found = []
     for preset in presets:
         data = encode(source, EncodeOptions(preset=preset_of(preset)))

@@ -12,7 +12,7 @@ import numpy as np
 from csplat.model import SplatModel, normalise_quats
 from csplat.types import F32
 from csplat_render import Camera
-from csplat_render.rasterise import Rasteriser
+from csplat_render.rasteriser import Rasteriser
 
 #: Arrays of a model.
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")

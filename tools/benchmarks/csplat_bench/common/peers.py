@@ -14,7 +14,7 @@ from pathlib import Path
 from csplat.ply import read_ply
 from csplat_bench.common.measuring import Timing, run_timed
 from csplat_bench.common.scenes import Scene
-from csplat_render.judge import Judge
+from csplat_render.scorer import Scorer
 from csplat_tools.files.console import note
 
 #: Longest run of another program.
@@ -115,7 +115,7 @@ def transform(command: Sequence[str], scene: Scene, folder: Path, runs: int = 1)
     return peers
 
 
-def judged(command: Sequence[str], peer: Peer, judge: Judge) -> float | str:
+def judged(command: Sequence[str], peer: Peer, judge: Scorer) -> float | str:
     """PSNR of what splat-transform reads from a peer's file, dB; or why there is none."""
     if peer.timing is None:
         return peer.remark

@@ -18,8 +18,8 @@ from csplat.ply import read_ply
 from csplat.ply_write import write_ply
 from csplat_bench.common.making import blow_up, crowd
 from csplat_render import Camera
-from csplat_render.cameras import load_cameras
-from csplat_render.judge import Judge
+from csplat_render.camera_files import load_cameras
+from csplat_render.scorer import Scorer
 from csplat_tools.files.console import note
 from csplat_tools.views import BLACK, comparison_cameras
 
@@ -136,6 +136,6 @@ def cameras_of(name: str, model: SplatModel) -> Sequence[Camera]:
     return given_cameras(name) or comparison_cameras(model)
 
 
-def judge_of(name: str, source: SplatModel) -> Judge:
+def judge_of(name: str, source: SplatModel) -> Scorer:
     """Whoever judges by these cameras, in front of black: eight views of 640 by 480, pooled."""
-    return Judge.of_source(source, cameras_of(name, source), BLACK)
+    return Scorer.of_source(source, cameras_of(name, source), BLACK)

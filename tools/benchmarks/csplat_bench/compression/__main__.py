@@ -46,7 +46,7 @@ from csplat_bench.compression.jobs import KINDS, Lists, facts_of, find_jobs, var
 from csplat_bench.compression.memory import measure_memory
 from csplat_bench.compression.runs import Bench
 from csplat_bench.compression.tables import tables
-from csplat_render.jit import thread_count
+from csplat_render.kernels import thread_count
 from csplat_render.lpips import load_lpips
 from csplat_render.warmup import warm_up
 from csplat_tools.files.console import note

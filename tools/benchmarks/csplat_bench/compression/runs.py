@@ -22,7 +22,7 @@ from csplat_bench.common.making import ARRAYS
 from csplat_bench.compression.rows import Row, Scores
 from csplat_bench.compression.sizes import books_of
 from csplat_render.lpips import Lpips
-from csplat_render.removal import measure_removal
+from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.inspect.info import byte_shares
 from csplat_tools.training.choosing import Chosen, choose_splats, training_views
 from csplat_tools.training.report import judge_models
@@ -111,7 +111,7 @@ class Bench:
             return chosen, clock.seconds
         clock = Clock()  # it would not have measured what it is not told
         with clock.stage("choosing"):
-            removal = measure_removal(
+            removal = measure_pruning_error(
                 chosen.model, self.looks.teaches, background=self.looks.background, threads=self.threads
             )
         return replace(chosen, importance=removal.squared_weight), clock.seconds

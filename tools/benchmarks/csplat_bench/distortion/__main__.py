@@ -53,8 +53,8 @@ from csplat_bench.common.scenes import OUT as EVERYTHING
 from csplat_bench.distortion.known import GRADED, KeptPoint, Measured, Simplified
 from csplat_bench.distortion.plot import plot as draw
 from csplat_bench.distortion.tables import tables
-from csplat_render.judge import Judge
-from csplat_render.virtual import scene_frame
+from csplat_render.scorer import Scorer
+from csplat_render.virtual_cameras import scene_frame
 from csplat_tools.files.console import note
 from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.optimise.sensitivity import measured_importance, measuring_views
@@ -126,7 +126,7 @@ class _Bench:
 
     scene: Scene
     source: SplatModel
-    judge: Judge
+    judge: Scorer
     kept: Kept
 
     @cached_property

@@ -25,9 +25,9 @@ from csplat_bench.common.measuring import timed
 from csplat_bench.common.report import table, tell_machine
 from csplat_bench.common.scenes import Scene, cameras_of, find_scenes
 from csplat_render import Camera
-from csplat_render.cameras import load_cameras
-from csplat_render.judge import Judge
-from csplat_render.virtual import scene_frame
+from csplat_render.camera_files import load_cameras
+from csplat_render.scorer import Scorer
+from csplat_render.virtual_cameras import scene_frame
 from csplat_tools.files.console import note
 from csplat_tools.optimise.sensitivity import measured_importance, measuring_views
 from csplat_tools.views import BLACK, find_view_set
@@ -80,7 +80,7 @@ def _shares(
     source: SplatModel, views: Sequence[Camera], even: Sequence[bytes], graded: dict[str, tuple[str, list[bytes]]]
 ) -> dict[str, tuple[str, list[str]]]:
     """Return the size of graded files relative to even ones at the same PSNR, judged by these views."""
-    judge = Judge.of_source(source, views, BLACK)
+    judge = Scorer.of_source(source, views, BLACK)
 
     def point(data: bytes) -> Point:
         return Point(judge.psnr(decode(data)), len(data))

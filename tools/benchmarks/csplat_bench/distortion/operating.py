@@ -28,7 +28,7 @@ from csplat_bench.common.measuring import timed
 from csplat_bench.common.report import table, tell_machine
 from csplat_bench.common.scenes import OUT as EVERYTHING
 from csplat_bench.common.scenes import find_scenes
-from csplat_render.judge import Judge
+from csplat_render.scorer import Scorer
 from csplat_tools.optimise.reaching import encode_to
 from csplat_tools.tradeoffs.measuring import fetched_bytes
 from csplat_tools.views import BLACK, comparison_cameras
@@ -84,7 +84,7 @@ def _reached(source: SplatModel, ply_bytes: int, name: str) -> Reached:
         data, timing = timed(_encoded, source, psnr, whole=whole)
     except InputError as error:
         return {"error": str(error)}
-    judge = Judge.of_source(source, comparison_cameras(source), BLACK)
+    judge = Scorer.of_source(source, comparison_cameras(source), BLACK)
     model = decode(data)
     return {
         "ply_bytes": ply_bytes,

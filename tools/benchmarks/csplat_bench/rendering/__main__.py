@@ -31,7 +31,7 @@ from csplat_bench.common.report import optional, table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, cameras_of, find_scenes
 from csplat_render import Camera
 from csplat_render.metrics import psnr_of_mse
-from csplat_render.rasterise import Rasteriser
+from csplat_render.rasteriser import Rasteriser
 from csplat_render.warmup import warm_up
 from csplat_tools.files.console import note
 

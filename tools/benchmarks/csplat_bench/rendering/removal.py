@@ -29,9 +29,9 @@ from csplat_bench.common.measuring import timed
 from csplat_bench.common.report import table, tell_machine
 from csplat_bench.common.scenes import OUT as EVERYTHING
 from csplat_bench.common.scenes import find_scenes, judge_of
-from csplat_render.judge import Judge, Look, renderer
-from csplat_render.rasterise import Rasteriser
-from csplat_render.removal import measure_removal
+from csplat_render.pruning_error import measure_pruning_error
+from csplat_render.rasteriser import Rasteriser
+from csplat_render.scorer import ReferenceImage, Scorer, renderer
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.optimise.simplify.adjusting import adjust
 from csplat_tools.optimise.simplify.fitting import fit
@@ -103,7 +103,7 @@ def main(
 class _Bench:
     """Simplifies one scene over and over. Owns its views, found once."""
 
-    def __init__(self, source: SplatModel, judge: Judge, options: SimplifyOptions) -> None:
+    def __init__(self, source: SplatModel, judge: Scorer, options: SimplifyOptions) -> None:
         self._source, self._judge, self._options = source, judge, options
         self._views = find_views(source, find_view_set(source, count=options.views), 0.5)
 
@@ -113,8 +113,8 @@ class _Bench:
         return [draw(camera).rgb for camera in self._views.used]
 
     @cached_property
-    def _checked(self) -> Judge:
-        return Judge.of_source(self._source, self._views.check, BLACK)
+    def _checked(self) -> Scorer:
+        return Scorer.of_source(self._source, self._views.check, BLACK)
 
     def left(self, percent: int, method: str) -> Left:
         """Remove a share by a method; by the last one without and with a fit."""
@@ -129,7 +129,7 @@ class _Bench:
         result: Left = {"psnr": self._judge.psnr(model), "seconds": timing.wall, "views": len(views.used)}
         if method == "rounds":
             fitted, timing = timed(fit, model, views.used, self._wanted, options)
-            own = Judge(views.used, [Look(picture) for picture in self._wanted])
+            own = Scorer(views.used, [ReferenceImage(picture) for picture in self._wanted])
             result |= {"fit_psnr": self._judge.psnr(fitted.model), "fit_seconds": timing.wall}
             result |= {"fit_used": own.psnr(fitted.model), "fit_check": self._checked.psnr(fitted.model)}
         return result
@@ -146,7 +146,7 @@ def _pass_milliseconds(source: SplatModel) -> dict[str, float]:
 
     calls = {
         "render": render,
-        "pass": lambda: measure_removal(source, cameras),
+        "pass": lambda: measure_pruning_error(source, cameras),
         "step": lambda: adjust(source, cameras, wanted, options, steps=len(cameras)),
     }
     turns = [{name: timed(call)[1].wall for name, call in calls.items()} for _ in range(3)]

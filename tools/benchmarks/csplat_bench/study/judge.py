@@ -12,8 +12,8 @@ from csplat.model import SplatModel
 from csplat.types import F32
 from csplat_bench.study.records import Scored
 from csplat_render import Camera
-from csplat_render.judge import renderer
 from csplat_render.metrics import psnr_of_mse, squared_error, ssim
+from csplat_render.scorer import renderer
 
 Distance = Callable[[F32, F32], float]
 

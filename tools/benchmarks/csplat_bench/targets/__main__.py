@@ -35,8 +35,8 @@ from csplat_bench.common.kept import Kept, read_kept
 from csplat_bench.common.report import describe
 from csplat_bench.common.scenes import ROOT, Scene, find_scenes
 from csplat_bench.targets.tables import Build, File, tables
-from csplat_render.judge import Judge
-from csplat_render.virtual import virtual_cameras
+from csplat_render.scorer import Scorer
+from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.files.console import note
 from csplat_tools.views import BLACK
 
@@ -126,7 +126,7 @@ def _measure(scene: Scene, rows: Sequence[Row], kept: Kept, name: str, program: 
     source = read_ply(scene.path)
     # Cameras that no search knows.
     cameras = [camera for seed in _SEEDS for camera in virtual_cameras(source, 8, 640, 480, seed=seed)]
-    judge = Judge.of_source(source, cameras, BLACK)
+    judge = Scorer.of_source(source, cameras, BLACK)
     for row in missing:
         build["rows"][row.name] = found = _made(program, scene, row, judge)
         if machine != build["machine"]:
@@ -135,7 +135,7 @@ def _measure(scene: Scene, rows: Sequence[Row], kept: Kept, name: str, program: 
         note(f"{scene.name} {name} {row.name}: {json.dumps(found)}")
 
 
-def _made(program: str, scene: Scene, row: Row, judge: Judge) -> File:
+def _made(program: str, scene: Scene, row: Row, judge: Scorer) -> File:
     """Make a file in a process of its own, and judge it; or say why there is none."""
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "file.csplat"

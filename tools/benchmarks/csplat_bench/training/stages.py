@@ -13,7 +13,7 @@ from unittest.mock import patch
 import numpy as np
 
 from csplat_bench.common.measuring import peak_bytes, reset_peak
-from csplat_render.jit import thread_count
+from csplat_render.kernels import thread_count
 from csplat_trainer.data import load
 from csplat_trainer.engine import CpuEngine
 from csplat_trainer.options import TrainOptions

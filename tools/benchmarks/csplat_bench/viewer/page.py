@@ -12,7 +12,7 @@ from typing import Any, TypedDict
 
 from csplat.decoder import decode
 from csplat_render.camera import Camera
-from csplat_render.virtual import virtual_cameras
+from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.present.server import open_server
 from csplat_tools.present.viewing import open_scene
 

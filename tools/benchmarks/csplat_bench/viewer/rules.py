@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from csplat.model import SplatModel
 from csplat_render import Camera, render
-from csplat_render.harmonics import sh_basis
-from csplat_render.jit import python
+from csplat_render.kernels import python_function
+from csplat_render.projection import sh_basis
 
 Picture = NDArray[np.float32]
 
@@ -69,7 +69,7 @@ def _coloured(model: SplatModel, camera: Camera, degree: int) -> SplatModel:
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     basis = np.empty(((degree + 1) ** 2, len(model)))
     x, y, z = directions.T
-    python(sh_basis)(degree, x, y, z, basis)
+    python_function(sh_basis)(degree, x, y, z, basis)
     colours = np.clip(0.5 + basis[0, 0] * model.sh0, 0.0, 1.0)
     colours += np.einsum("kn,nkc->nc", basis[1:], model.shN[:, : len(basis) - 1])
     sh0 = (np.clip(colours, 0.0, 1.0) - 0.5) / basis[0, 0]

@@ -23,8 +23,8 @@ from csplat_bench.common.peers import npm_pinned
 from csplat_bench.common.scenes import ROOT, Scene
 from csplat_bench.viewer.rules import ENGINES, drawn
 from csplat_render import Camera
+from csplat_render.camera_paths import orbit_cameras
 from csplat_render.metrics import psnr
-from csplat_render.paths import orbit_cameras
 
 WIDTH, HEIGHT = 320, 240  # SwiftShader takes its time
 

@@ -20,8 +20,8 @@ from csplat.encoder import FreeValues, Frozen
 from csplat.model import SplatModel
 from csplat.types import F32, Mask, Progress
 from csplat_render import Camera
-from csplat_render.arrays import Gradients, HasSplats, Splats
-from csplat_render.rasterise import Rasteriser
+from csplat_render.conventions import Gradients, HasSplats, SplatArrays
+from csplat_render.rasteriser import Rasteriser
 from csplat_tools.optimise.exchange import LEAST_QUANTISED, price_of_bytes
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_trainer.parameters import Parameters, adam_step, from_model
@@ -104,7 +104,7 @@ def adjust_frozen(
 class _Scene(Protocol):
     """The values that are fitted, and the splats that are rendered from them."""
 
-    def seen(self) -> Splats: ...
+    def seen(self) -> SplatArrays: ...
 
     def step(self, gradients: Gradients, rates: dict[str, float]) -> None: ...
 
@@ -166,9 +166,9 @@ class _Floats:
         parameters.beta2 = _BETA2
         return cls(model.means, parameters, free)
 
-    def seen(self) -> Splats:
+    def seen(self) -> SplatArrays:
         v = self.parameters.values
-        return Splats(self.means, v["quats"], v["scales"], self.parameters.alphas, v["sh0"], v["shN"])
+        return SplatArrays(self.means, v["quats"], v["scales"], self.parameters.alphas, v["sh0"], v["shN"])
 
     def step(self, gradients: Gradients, rates: dict[str, float]) -> None:
         alphas = self.parameters.alphas
@@ -218,11 +218,11 @@ class _Quantised:
     _seen: Any = None
     _costs: Costs | None = None
 
-    def seen(self) -> Splats:
+    def seen(self) -> SplatArrays:
         self._seen = None  # as large as the scene
         self._seen, self._alphas = self.tuned.seen()
         s = self._seen
-        return Splats(s.means, s.quats, s.scales, s.opacities, s.sh0, s.shN)
+        return SplatArrays(s.means, s.quats, s.scales, s.opacities, s.sh0, s.shN)
 
     def step(self, gradients: Gradients, rates: dict[str, float]) -> None:
         assert self._alphas is not None

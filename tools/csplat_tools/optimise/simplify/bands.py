@@ -8,7 +8,7 @@ import numpy as np
 
 from csplat.model import SplatModel
 from csplat.types import Mask
-from csplat_render.removal import Removal
+from csplat_render.pruning_error import PruningError
 
 #: Largest errors of bands 1, 2, 3 that are not worth their bits, as fractions of the scene's error per splat. At the
 #: optimum, a bit reduces the error by the same amount wherever it is spent: a splat has some 30 quantised values, whose
@@ -17,7 +17,7 @@ from csplat_render.removal import Removal
 BAND_COST = (0.25, 0.4, 0.55)
 
 
-def band_mask(removal: Removal, error: float) -> Mask:
+def band_mask(removal: PruningError, error: float) -> Mask:
     """Return a mask of the bands to keep, [N, d].
 
     Args:

@@ -12,7 +12,7 @@ from csplat.model import SplatModel
 from csplat.types import F32, Mask, Progress
 from csplat_render import Camera
 from csplat_render.metrics import squared_error
-from csplat_render.removal import measure_removal
+from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.optimise.simplify.adjusting import adjust
 from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
 from csplat_tools.optimise.simplify.options import SimplifyOptions
@@ -63,7 +63,7 @@ def fit(
         nonlocal error
         error += float(np.sum(squared_error(wanted[number], picture)))
 
-    removal = measure_removal(
+    removal = measure_pruning_error(
         model,
         cameras[:deciding],
         background=options.background,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from csplat.model import SplatModel
 from csplat.types import F64, I64, Progress
 from csplat_render import Camera
-from csplat_render.removal import Removal, measure_removal
+from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_tools.views.agreeing import removal_keys
 
@@ -69,7 +69,7 @@ class Side:
     """
 
     cameras: Sequence[Camera]
-    removal: Removal
+    removal: PruningError
 
     def of_rows(self, rows: NDArray[Any]) -> Side:
         """Return the views with the errors of some of the splats."""
@@ -108,7 +108,7 @@ def removal_order(
     for target in _targets(count, options, left, len(rows)):
         if gone:
             turn = (len(rounds) - 1) % len(sides)
-            removal = measure_removal(
+            removal = measure_pruning_error(
                 model.select(rows), sides[turn].cameras, background=options.background, bands=False,
                 threads=options.threads, progress=progress,
             )  # fmt: skip
@@ -131,7 +131,7 @@ def removal_order(
     return Order(np.concatenate(gone), np.concatenate(errors), tuple(rounds))
 
 
-def seen_by(sides: Sequence[Side]) -> Removal:
+def seen_by(sides: Sequence[Side]) -> PruningError:
     """Return the sum of the removal errors over all sides."""
     return functools.reduce(operator.add, [side.removal for side in sides])
 

@@ -16,9 +16,9 @@ from csplat.model import SplatModel
 from csplat.types import F32, I64, Progress
 from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
-from csplat_render.judge import Judge, renderer
 from csplat_render.metrics import PSNR_CAP
-from csplat_render.removal import measure_removal
+from csplat_render.pruning_error import measure_pruning_error
+from csplat_render.scorer import Scorer, renderer
 from csplat_tools.files.extras import need_renderer
 from csplat_tools.files.scenes import SceneLike, load_model
 from csplat_tools.optimise.simplify.fitting import Fit, fit
@@ -78,7 +78,7 @@ class Session:
     sides: list[Side]
     wanted: list[F32]
     order: Order
-    checked: Judge
+    checked: Scorer
     seconds: dict[str, float]
 
     @property
@@ -130,13 +130,13 @@ def prepare(
     if around.virtual:
         more = round(len(found.used) * max(1.0, options.work))
         cameras = camera_sequence(source, more, size, seed=options.seed + 1)
-        removal = measure_removal(
+        removal = measure_pruning_error(
             source, cameras, background=around.background, bands=False, threads=options.threads, progress=progress
         )
         sides.append(Side(cameras, removal))
     taught = [camera for side in sides for camera in side.cameras]
     wanted = _pictures(source, taught, options)
-    checked = Judge.of_source(source, found.check, around.background, threads=options.threads)
+    checked = Scorer.of_source(source, found.check, around.background, threads=options.threads)
     seconds["views"] = time.perf_counter() - start
     start = time.perf_counter()
     values = sum(side.removal.value_count for side in sides)
@@ -210,7 +210,7 @@ def simplify(
     return replace(result, report={**_report(session, result, target), **_judged(session, result.model)})
 
 
-def find_decider(session: Session, target: Target) -> tuple[Judge, float]:
+def find_decider(session: Session, target: Target) -> tuple[Scorer, float]:
     """Return the validation scorer and the PSNR that is to be reached, dB; 99 if the target has none.
 
     Args:
@@ -239,7 +239,7 @@ def _judged(session: Session, model: SplatModel) -> dict[str, Any]:
     return said
 
 
-def _finished(session: Session, gone: int, judge: Judge | None, progress: Progress | None) -> Simplified:
+def _finished(session: Session, gone: int, judge: Scorer | None, progress: Progress | None) -> Simplified:
     """Prune and refit, and measure the result."""
     rows, threshold = session.pruned(gone), session.threshold(gone)
     pruned = session.source.select(rows)
@@ -259,7 +259,7 @@ def _finished(session: Session, gone: int, judge: Judge | None, progress: Progre
     return Simplified(model, rows, threshold, stays, report)
 
 
-def _search(session: Session, judge: Judge, goal: float, progress: Progress | None) -> Simplified:
+def _search(session: Session, judge: Scorer, goal: float, progress: Progress | None) -> Simplified:
     """Find the fewest splats that reach a PSNR: bisect along the order without a fit, then allow for the fit's gain."""
     if judge.psnr(session.source) < goal:
         raise InputError(f"even the source is below the target of {goal:.2f} dB: its renders are not its pictures")
@@ -281,7 +281,7 @@ def _search(session: Session, judge: Judge, goal: float, progress: Progress | No
     return _unchanged(session, judge)
 
 
-def most_gone(session: Session, judge: Judge, goal: float, lowest: int = 0) -> int:
+def most_gone(session: Session, judge: Scorer, goal: float, lowest: int = 0) -> int:
     """Return the number of splats that may be pruned before the PSNR, without a fit, falls below a goal.
 
     Args:
@@ -300,7 +300,7 @@ def most_gone(session: Session, judge: Judge, goal: float, lowest: int = 0) -> i
     return low
 
 
-def _unchanged(session: Session, judge: Judge) -> Simplified:
+def _unchanged(session: Session, judge: Scorer) -> Simplified:
     source = session.source
     score = session.checked.psnr(source)
     report = {"gone": 0, "check_psnr_pruned": score, "check_psnr": score}

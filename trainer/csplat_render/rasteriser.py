@@ -12,37 +12,46 @@ from numpy.typing import ArrayLike
 
 from csplat.errors import InputError, LimitError
 from csplat.model import sh_degree_of
-from csplat_render.arrays import Array, Gradients, HasSplats, RenderResult, Seen, Splats
 from csplat_render.binning import (
     CHUNKS,
     TILE,
-    arrange,
     count_tiles,
     depth_order,
     fill_tiles,
+    gather_by_depth,
     record_offsets,
     tile_starts,
 )
-from csplat_render.blending import blend
-from csplat_render.blending_backward import RECORD, blend_backward
+from csplat_render.blending import RECORD, blend, blend_backward
 from csplat_render.camera import Camera
-from csplat_render.conventions import ALPHA_CAP, Mode, Settings, settings_of, view_vector
-from csplat_render.jit import thread_count
-from csplat_render.projecting import BLOCK, project
-from csplat_render.projecting_backward import project_backward
+from csplat_render.conventions import (
+    ALPHA_CAP,
+    Array,
+    Gradients,
+    HasSplats,
+    Mode,
+    RenderResult,
+    SplatArrays,
+    Thresholds,
+    VisibleSplats,
+    thresholds_of,
+    view_vector,
+)
+from csplat_render.kernels import thread_count
+from csplat_render.projection import BLOCK, project, project_backward
 
 #: Most pairs of splat and tile in one picture; each takes 4 bytes, with gradients 52.
 MAX_INTERSECTIONS = 1 << 28
 
-_CHUNKS_OF_A_LARGE_PICTURE = 2
-_LARGE = 1 << 16  # tiles
+_CHUNKS_OF_MANY_TILES = 2
+_MANY_TILES = 1 << 16  # tiles
 
 
 @dataclass(frozen=True, eq=False)
-class _Drawn:
+class _ForwardState:
     """State of the last `forward` that `backward` needs."""
 
-    splats: Splats
+    splats: SplatArrays
     view: Array
     degree: int
     antialiased: bool
@@ -78,7 +87,7 @@ class Rasteriser:
         gradients: bool = True,
         threads: int | None = None,
     ) -> None:
-        self.settings: Settings = settings_of(mode)
+        self.settings: Thresholds = thresholds_of(mode)
         self.dtype = np.dtype(dtype)
         if self.dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
             raise InputError(f"the rasteriser's dtype is {self.dtype}, wanted float32 or float64")
@@ -86,7 +95,7 @@ class Rasteriser:
         self.threads = threads
         self._limits = np.array([self.settings.alpha_min, ALPHA_CAP, self.settings.transmittance_min], self.dtype)
         self._buffers: dict[str, Array] = {}
-        self._last: _Drawn | None = None
+        self._last: _ForwardState | None = None
 
     def forward(
         self,
@@ -141,7 +150,7 @@ class Rasteriser:
             )  # fmt: skip
         result = RenderResult(rgb, 1 - transmittance, depth, radii, len(order), intersections, ignored)
         if self.gradients:
-            self._last = _Drawn(
+            self._last = _ForwardState(
                 arrays, view, degree, antialiased, tiles_x, tile_count, intersections, rgb.copy(), transmittance,
                 depth.copy(), radii,
             )  # fmt: skip
@@ -153,7 +162,7 @@ class Rasteriser:
         state[..., 0] = 1
         return state
 
-    def seen(self, splats: HasSplats, camera: Camera, *, antialiased: bool = False) -> Seen:
+    def seen(self, splats: HasSplats, camera: Camera, *, antialiased: bool = False) -> VisibleSplats:
         """Return the splats that a render would show, and their depths; the arguments are those of `forward`."""
         arrays = _checked(splats, self.dtype)
         degree = _checked_degree(None, arrays.shN.shape[1])
@@ -161,7 +170,7 @@ class Rasteriser:
             *_, ignored = self._project(arrays, camera, degree, antialiased=antialiased)
         near, box = self._buffers["near"].copy(), self._buffers["box"]
         tiles = np.where(near > 0, ((box[:, 1::2] - 1) // TILE - box[:, ::2] // TILE + 1).prod(axis=1), 0)
-        return Seen(near, tiles, ignored)
+        return VisibleSplats(near, tiles, ignored)
 
     def backward(
         self, grad_rgb: ArrayLike, grad_alpha: ArrayLike | None = None, grad_depth: ArrayLike | None = None
@@ -212,7 +221,9 @@ class Rasteriser:
             )  # fmt: skip
         return result
 
-    def _project(self, splats: Splats, camera: Camera, degree: int, *, antialiased: bool) -> tuple[Array, Array, int]:
+    def _project(
+        self, splats: SplatArrays, camera: Camera, degree: int, *, antialiased: bool
+    ) -> tuple[Array, Array, int]:
         """Fill the buffers shape, extent, box and near; return view, radii and how many splats were ignored."""
         n, view = len(splats.means), view_vector(camera)
         ignored, radii = self._buffer("ignored", (-(-n // BLOCK),), np.int64), np.empty(n, np.float32)
@@ -240,13 +251,13 @@ class Rasteriser:
         self, order: Array, near: Array, extent: Array, box: Array, tiles_x: int, tile_count: int
     ) -> tuple[Array, int]:
         n = len(near)
-        chunks = CHUNKS if tile_count < _LARGE else _CHUNKS_OF_A_LARGE_PICTURE
+        chunks = CHUNKS if tile_count < _MANY_TILES else _CHUNKS_OF_MANY_TILES
         counts = self._buffer("counts", (chunks, tile_count), np.int32)
         starts = self._buffer("starts", (tile_count + 1,), np.int64)
         touched = self._buffer("touched", (n if self.gradients else 0,), np.int32)
         sorted_extent = self._buffer("sorted_extent", (len(order), 6), np.float64)
         sorted_box = self._buffer("sorted_box", (len(order), 4), np.int32)
-        arrange(order, extent, box, sorted_extent, sorted_box)
+        gather_by_depth(order, extent, box, sorted_extent, sorted_box)
         count_tiles(order, sorted_extent, sorted_box, tiles_x, counts, touched)
         total = tile_starts(counts, starts)
         if total > MAX_INTERSECTIONS:
@@ -275,7 +286,7 @@ class Rasteriser:
         return view
 
 
-def _checked(splats: HasSplats, dtype: Any) -> Splats:
+def _checked(splats: HasSplats, dtype: Any) -> SplatArrays:
     means = np.ascontiguousarray(splats.means, dtype)
     n = len(means) if means.ndim else 0
     wanted: dict[str, tuple[int, ...]] = {
@@ -289,7 +300,7 @@ def _checked(splats: HasSplats, dtype: Any) -> Splats:
     if shN.ndim != 3 or shN.shape[::2] != (n, 3):
         raise InputError(f"shN has shape {list(shN.shape)}, wanted [{n}, K, 3]")
     sh_degree_of(shN.shape[1])
-    return Splats(**arrays)
+    return SplatArrays(**arrays)
 
 
 def _checked_degree(sh_degree: int | None, coefficient_count: int) -> int:

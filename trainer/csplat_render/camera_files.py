@@ -1,39 +1,85 @@
-"""Camera files of other programs: cameras.json of INRIA, camera paths of nerfstudio, transforms.json.
+"""Camera files: ours, and those of other programs.
 
-INRIA's: a list of {id, img_name, width, height, position, rotation, fx, fy}; `rotation` is camera to world by rows,
-axes as OpenCV's. The principal point is the middle. nerfstudio's path: {render_width, render_height, camera_path:
-[{camera_to_world, fov, aspect}]}; 16 numbers by rows, axes as OpenGL's: x to the right, y up, z backwards; `fov` is
-down the image, in degrees. transforms.json of instant-ngp and nerfstudio: {w, h, fl_x or camera_angle_x, frames:
-[{file_path, transform_matrix}]}, the same axes.
+* Ours: a JSON list of {K, viewmat, W, H, near, image}: world to camera, OpenCV axes, pixel centres at +0.5; `near` and
+  `image` are optional.
+* cameras.json of INRIA: a list of {id, img_name, width, height, position, rotation, fx, fy}; `rotation` is camera to
+  world by rows, OpenCV axes; the principal point is the middle.
+* Camera paths of nerfstudio: {render_width, render_height, camera_path: [{camera_to_world, fov, aspect}]}; 16 numbers
+  by rows, OpenGL axes: x right, y up, z backwards; `fov` is vertical, in degrees.
+* transforms.json of instant-ngp and nerfstudio: {w, h, fl_x or camera_angle_x, frames: [{file_path,
+  transform_matrix}]}, OpenGL axes.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from csplat.errors import InputError, counted
+from csplat.files import read_json
 from csplat.types import F64
-from csplat_render.camera import DEFAULT_NEAR, Camera, check_last_row
+from csplat_render.camera import DEFAULT_NEAR, Camera, check_last_row, relative_to
 
 #: Models of transforms.json that are a pinhole with OpenCV's distortion, or without; "" where none is named.
 PERSPECTIVES = ("", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
+_ORIGIN_FAR = 100.0  # times the distance of cameras from an origin, at least, that the origin is from 0
 _FOCAL_RANGE = (0.05, 500.0)  # focal lengths relative to the image's side: 169 to 0.1 degrees of view (satellites)
 _MOST_UNEQUAL = 3.0  # of focal lengths across and down
 _OFF_CENTRE = 10.0  # sides of the image, up to which the principal point may be away
 _SWAPPED = 0.02  # relative, of a principal point to half of the other side
-_NEAR = 0.01  # scene units, of nerfstudio's renderer
+_NERFSTUDIO_NEAR = 0.01  # scene units, of nerfstudio's renderer
 _SCALE_TOLERANCE = 1e-3
 _ANGLES_AGREE = 0.01  # relative, of a focal length with one stated beside it; files hold few digits
 _LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")  # distortion_params
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
-def foreign_cameras(document: object, where: str, report: list[str]) -> list[Camera] | None:
+def load_cameras(
+    path: str | Path, report: list[str] | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
+) -> list[Camera]:
+    """Read a camera file.
+
+    Args:
+        path: a JSON file, see above. Its cameras are relative to the scene's origin. Where that is a hundred times as
+            far from 0 as from the middle of the cameras, they are in coordinates of a map, and it is taken off.
+        report: takes lines on how the file was understood.
+        origin: [3], of the scene.
+
+    Returns:
+        Its cameras, at least one, relative to the origin.
+
+    Raises:
+        InputError: the file is absent, is not JSON, or holds something else than cameras.
+    """
+    path, report = Path(path), [] if report is None else report
+    entries = read_json(path)
+    cameras = parse_foreign_cameras(entries, str(path), report)
+    if cameras is None:
+        cameras = _own_cameras(entries, path)
+    for number, camera in enumerate(cameras):
+        K = camera.K
+        focals, middle = (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2]))
+        check_intrinsics(focals, middle, (camera.W, camera.H), f"{path}, camera {number}")
+    away = np.median([camera.position for camera in cameras], axis=0) - origin
+    if _ORIGIN_FAR * float(np.linalg.norm(away)) < float(np.linalg.norm(origin)):
+        report.append(f"{path}: the cameras stand around the scene's origin, which is taken off their coordinates")
+        cameras = [relative_to(origin, camera) for camera in cameras]
+    return cameras
+
+
+def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:
+    """Write a camera file that `load_cameras` reads back without loss."""
+    text = ",\n".join(json.dumps(camera.to_json(), allow_nan=False) for camera in cameras)
+    Path(path).write_text(f"[\n{text}\n]\n", "utf-8")
+
+
+def parse_foreign_cameras(document: object, where: str, report: list[str]) -> list[Camera] | None:
     """Read cameras in the words of another program.
 
     Args:
@@ -48,20 +94,22 @@ def foreign_cameras(document: object, where: str, report: list[str]) -> list[Cam
         InputError: a field is missing or no number, or a pose is none.
     """
     if isinstance(document, list) and document and isinstance(document[0], Mapping) and "rotation" in document[0]:
-        cameras = _each(document, where, "camera", _inria)
+        cameras = _parse_each(document, where, "camera", _parse_inria)
         many = counted(len(cameras), "camera")
         report.append(f"{where} is a cameras.json of INRIA: {many}, principal points in the middle")
         return cameras
     if not isinstance(document, Mapping):
         return None
     if isinstance(document.get("camera_path"), list):
-        cameras = _each(document["camera_path"], where, "camera_path", lambda e, at: _nerfstudio(document, e, at))
+        cameras = _parse_each(
+            document["camera_path"], where, "camera_path", lambda e, at: _parse_nerfstudio(document, e, at)
+        )
         report.append(f"{where} is a camera path of nerfstudio: {counted(len(cameras), 'camera')}")
         return cameras
     if isinstance(document.get("frames"), list):
-        cameras = _each(document["frames"], where, "frame", lambda e, at: _frame(document, e, at))
+        cameras = _parse_each(document["frames"], where, "frame", lambda e, at: _parse_frame(document, e, at))
         report.append(f"{where} is a transforms.json: {counted(len(cameras), 'camera')}")
-        report += note_on_scales([frame["transform_matrix"] for frame in document["frames"]], where)
+        report += describe_scales([frame["transform_matrix"] for frame in document["frames"]], where)
         if any(one.get(key) for key in _DISTORTION for one in (document, *document["frames"])):
             report.append(f"{where}: the distortion of its lens is left out, renders are straight")
         return cameras
@@ -218,7 +266,7 @@ def viewmat_of_opengl(matrix: Any, name: str, where: str) -> F64:
     return viewmat
 
 
-def note_on_scales(matrices: Sequence[Any], where: str) -> list[str]:
+def describe_scales(matrices: Sequence[Any], where: str) -> list[str]:
     """Report poses that hold the scale of the world in their axes, which `viewmat_of_opengl` takes off.
 
     Args:
@@ -234,7 +282,24 @@ def note_on_scales(matrices: Sequence[Any], where: str) -> list[str]:
     ]
 
 
-def _each(entries: list[Any], where: str, kind: str, read: Callable[[Mapping[str, Any], str], Camera]) -> list[Camera]:
+def _own_cameras(entries: object, path: Path) -> list[Camera]:
+    if not isinstance(entries, list) or not entries:
+        raise InputError(
+            f"{path} is not a camera file, expected a list of {{K, viewmat, W, H}}, cameras.json of INRIA, a camera "
+            "path of nerfstudio, or transforms.json"
+        )
+    cameras = []
+    for number, entry in enumerate(entries):
+        try:
+            cameras.append(Camera.from_json(entry))
+        except InputError as error:
+            raise InputError(f"{path}, camera {number}: {error}") from error
+    return cameras
+
+
+def _parse_each(
+    entries: list[Any], where: str, kind: str, read: Callable[[Mapping[str, Any], str], Camera]
+) -> list[Camera]:
     """Read the entries of a list; a fault names its file and its number."""
     if not entries:
         raise InputError(f"{where} lists no cameras")
@@ -247,7 +312,7 @@ def _each(entries: list[Any], where: str, kind: str, read: Callable[[Mapping[str
     return cameras
 
 
-def _camera(
+def _make_camera(
     at: str,
     focals: tuple[float, float],
     middle: tuple[float, float],
@@ -268,7 +333,7 @@ def _middle(width: float, height: float) -> tuple[float, float]:
     return width / 2.0, height / 2.0
 
 
-def _inria(entry: Mapping[str, Any], at: str) -> Camera:
+def _parse_inria(entry: Mapping[str, Any], at: str) -> Camera:
     width, height = finite_number(entry, "width", at), finite_number(entry, "height", at)
     focals = finite_number(entry, "fx", at), finite_number(entry, "fy", at)
     try:
@@ -280,10 +345,12 @@ def _inria(entry: Mapping[str, Any], at: str) -> Camera:
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation.T
     viewmat[:3, 3] = -rotation.T @ position
-    return _camera(at, focals, _middle(width, height), viewmat, (width, height), DEFAULT_NEAR, entry.get("img_name"))
+    return _make_camera(
+        at, focals, _middle(width, height), viewmat, (width, height), DEFAULT_NEAR, entry.get("img_name")
+    )
 
 
-def _nerfstudio(document: Mapping[str, Any], entry: Mapping[str, Any], at: str) -> Camera:
+def _parse_nerfstudio(document: Mapping[str, Any], entry: Mapping[str, Any], at: str) -> Camera:
     kind = str(document.get("camera_type") or "perspective")
     if kind.lower() != "perspective":
         raise InputError(f"{at}: camera_type is {kind}, expected perspective")
@@ -296,10 +363,10 @@ def _nerfstudio(document: Mapping[str, Any], entry: Mapping[str, Any], at: str) 
         matrix = [matrix[row : row + 4] for row in range(0, 16, 4)]
     viewmat = viewmat_of_opengl(matrix, "camera_to_world", at)
     focal = 0.5 * height / math.tan(math.radians(angle) / 2.0)
-    return _camera(at, (focal, focal), _middle(width, height), viewmat, (width, height), _NEAR, None)
+    return _make_camera(at, (focal, focal), _middle(width, height), viewmat, (width, height), _NERFSTUDIO_NEAR, None)
 
 
-def _frame(document: Mapping[str, Any], frame: Mapping[str, Any], at: str) -> Camera:
+def _parse_frame(document: Mapping[str, Any], frame: Mapping[str, Any], at: str) -> Camera:
     values = frame_values(document, frame)
     if values.get("w") is None or values.get("h") is None:
         raise InputError(f"{at}: w and h are missing, expected the size of the images: --data reads it from them")
@@ -310,7 +377,7 @@ def _frame(document: Mapping[str, Any], frame: Mapping[str, Any], at: str) -> Ca
     fx, fy = focal_lengths(values, width, height, at)
     cx, cy = finite_number(values, "cx", at, width / 2.0), finite_number(values, "cy", at, height / 2.0)
     viewmat = viewmat_of_opengl(values.get("transform_matrix"), "transform_matrix", at)
-    return _camera(at, (fx, fy), (cx, cy), viewmat, (width, height), _NEAR, values.get("file_path"))
+    return _make_camera(at, (fx, fy), (cx, cy), viewmat, (width, height), _NERFSTUDIO_NEAR, values.get("file_path"))
 
 
 def _focal(values: Mapping[str, Any], axis: str, size: float, where: str, *, fisheye: bool) -> float | None:

@@ -1,6 +1,6 @@
-"""`Judge`: the only scorer of renders, against a source's renders or against photographs.
+"""`Scorer`: the only scorer of renders, against a source's renders or against photographs.
 
-A `Judge` holds views and the reference image of each. The definition of PSNR is in `metrics`.
+A `Scorer` holds views and the reference image of each. The definition of PSNR is in `metrics`.
 """
 
 from __future__ import annotations
@@ -17,16 +17,14 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F32, F64
 from csplat_render import metrics
-from csplat_render.arrays import RenderResult
-from csplat_render.camera import Camera
-from csplat_render.cameras import relative_to
-from csplat_render.conventions import Mode
+from csplat_render.camera import Camera, relative_to
+from csplat_render.conventions import Mode, RenderResult
 
 #: Called for each view with its number, the reference image and the render, [H, W, 3] in 0..1.
 OnView = Callable[[int, F32, F32], None]
 
 
-class Drawable(Protocol):
+class Renderable(Protocol):
     """A scene that draws itself, because it is not in memory."""
 
     @property
@@ -42,7 +40,7 @@ class Drawable(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class ReferenceImage:
     """The reference image of a view.
 
     Attributes:
@@ -59,7 +57,7 @@ class Look:
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
+class Scorer:
     """Views and their reference images.
 
     Attributes:
@@ -76,7 +74,7 @@ class Judge:
     """
 
     cameras: Sequence[Camera]
-    looks: Sequence[Look | Callable[[], Look]]
+    looks: Sequence[ReferenceImage | Callable[[], ReferenceImage]]
     background: ArrayLike = (0.0, 0.0, 0.0)
     mode: Mode = "standard"
     threads: int | None = None
@@ -92,7 +90,7 @@ class Judge:
     @classmethod
     def of_source(
         cls,
-        source: SplatModel | Drawable,
+        source: SplatModel | Renderable,
         cameras: Sequence[Camera],
         background: ArrayLike = (0.0, 0.0, 0.0),
         *,
@@ -100,7 +98,7 @@ class Judge:
         threads: int | None = None,
         kept_bytes: int = 1 << 30,
         progress: Callable[[str, float], None] | None = None,
-    ) -> Judge:
+    ) -> Scorer:
         """Score against renders of the source.
 
         Args:
@@ -111,7 +109,9 @@ class Judge:
             progress: called with the fraction that is drawn.
         """
         draw = renderer(source, background, mode=mode, threads=threads)
-        looks: list[Look | Callable[[], Look]] = [partial(_rendered, draw, camera) for camera in cameras]
+        looks: list[ReferenceImage | Callable[[], ReferenceImage]] = [
+            partial(_rendered, draw, camera) for camera in cameras
+        ]
         if sum(12 * camera.W * camera.H for camera in cameras) <= kept_bytes:
             looks = []
             for camera in cameras:
@@ -122,10 +122,10 @@ class Judge:
                 progress("drawing the source", 1.0)
         return cls(cameras, looks, background, mode, threads, source.origin)
 
-    def look(self, number: int) -> Look:
+    def look(self, number: int) -> ReferenceImage:
         """Return the reference image of a view."""
         look = self.looks[number]
-        return look if isinstance(look, Look) else look()
+        return look if isinstance(look, ReferenceImage) else look()
 
     def errors(self, model: SplatModel) -> F64:
         """[V] mean squared error by view."""
@@ -144,7 +144,7 @@ class Judge:
         """PSNR of the error pooled over views, pixels and channels, dB."""
         return metrics.psnr_of_mse(self.pooled(self.errors(model)))
 
-    def some(self, places: Sequence[int]) -> Judge:
+    def some(self, places: Sequence[int]) -> Scorer:
         """Return a judge for some of the views."""
         pixels = None if self.pixels is None else [self.pixels[i] for i in places]
         cameras, looks = [self.cameras[i] for i in places], [self.looks[i] for i in places]
@@ -162,7 +162,7 @@ class Judge:
 
     def scores(
         self,
-        model: SplatModel | Drawable,
+        model: SplatModel | Renderable,
         *,
         ssim: bool = True,
         lpips: metrics.Distance | None = None,
@@ -194,7 +194,7 @@ class Judge:
             progress("comparing", 1.0)
         return metrics.Scores.of(each, ignored)
 
-    def _renderer(self, model: SplatModel | Drawable) -> Callable[[Camera], RenderResult]:
+    def _renderer(self, model: SplatModel | Renderable) -> Callable[[Camera], RenderResult]:
         draw = renderer(model, self.background, mode=self.mode, threads=self.threads)
         if self.origin is None:
             return draw
@@ -203,7 +203,7 @@ class Judge:
 
 
 def renderer(
-    model: SplatModel | Drawable, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
+    model: SplatModel | Renderable, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
 ) -> Callable[[Camera], RenderResult]:
     """Return a function that draws a scene from camera after camera, and keeps its memory in between.
 
@@ -216,8 +216,8 @@ def renderer(
     if not isinstance(model, SplatModel):
         return model.renderer(background, mode=mode, threads=threads)
     # numba takes a second to import: code that needs only the classes does not wait for it.
-    from csplat_render.rasterise import Rasteriser
-    from csplat_render.twin import render_exact
+    from csplat_render.rasteriser import Rasteriser
+    from csplat_render.reference_rasteriser import render_exact
 
     if mode == "exact":
         return lambda camera: render_exact(model, camera, background=background, antialiased=model.antialiased)
@@ -225,6 +225,6 @@ def renderer(
     return lambda camera: rasteriser.forward(model, camera, background=background, antialiased=model.antialiased)
 
 
-def _rendered(draw: Callable[[Camera], RenderResult], camera: Camera) -> Look:
+def _rendered(draw: Callable[[Camera], RenderResult], camera: Camera) -> ReferenceImage:
     result = draw(camera)
-    return Look(result.rgb, result.alpha >= metrics.COVERED_ALPHA, result.ignored)
+    return ReferenceImage(result.rgb, result.alpha >= metrics.COVERED_ALPHA, result.ignored)

@@ -1,11 +1,11 @@
-"""Paths of a camera for a film, closed, so that a film that repeats does not jump.
+"""Closed camera paths for films: a film that repeats does not jump.
 
-An *object* is circled about the direction that is up, or seems to be (`standing`), from as far away as shows all of it.
-Inside *surroundings* a circle would lead through walls. If cameras are known, a path leads along them and looks as
-they do; if the scene specifies its first view, the path sways around that; else it is the longest arc, of several
+An *object* is circled about its up axis, estimated if necessary (`with_estimated_up`), from a distance that shows all
+of it. Inside *surroundings* a circle would lead through walls. If cameras are known, the path follows them and looks
+where they look; if the scene specifies its first view, the path sways around it; else it is the longest arc, of several
 distances and heights, from which fine splats are visible, there and back.
 
-These cameras are not used for scoring: `virtual.virtual_cameras` are those of `psnr`.
+These cameras are not used for scoring; those of `psnr` are `virtual_cameras.virtual_cameras`.
 """
 
 from __future__ import annotations
@@ -20,11 +20,17 @@ from csplat.model import SplatModel
 from csplat.training import VIEW
 from csplat.types import F64, Mask
 from csplat.upright import up_of
-from csplat_render.camera import Camera
-from csplat_render.cameras import camera_outliers, direction, intrinsics, look_at, orbit
-from csplat_render.cloud import Cloud, detail, sample_cloud
-from csplat_render.standing import standing
-from csplat_render.virtual import FIELD_OF_VIEW, HIDING, Frame, scene_frame
+from csplat_render.camera import Camera, camera_outliers, direction_at, intrinsics, look_at, orbit
+from csplat_render.virtual_cameras import (
+    FIELD_OF_VIEW,
+    HIDING,
+    Cloud,
+    SceneFrame,
+    detail,
+    sample_cloud,
+    scene_frame,
+    with_estimated_up,
+)
 
 ELEVATION = 20.0  # degrees above the horizon, for objects
 _MARGIN = 0.08  # fraction of half an image, left free around an object
@@ -76,29 +82,29 @@ def orbit_cameras(
     """
     if count < 1:
         raise InputError(f"an orbit of {count} cameras, wanted at least 1")
-    frame, K = scene_frame(standing(model)), intrinsics(width, height, FIELD_OF_VIEW)
+    frame, K = scene_frame(with_estimated_up(model)), intrinsics(width, height, FIELD_OF_VIEW)
     if not along and frame.kind == "surrounding":
         along = [Camera.from_json(one) for one in model.cameras or ()]
     if along:
-        eyes, ahead, up = _beside(along, count, up_of(model.metadata, model.coordinate_system))
+        eyes, ahead, up = _path_along(along, count, up_of(model.metadata, model.coordinate_system))
         near = min(frame.near, *(camera.near for camera in along))
         return [look_at(eye, eye + way, up, K, width, height, near) for eye, way in zip(eyes, ahead, strict=True)]
     if len(model) == 0:
         return orbit(frame.centre, 1.0, frame.up, count, K, width, height, elevation=elevation, near=frame.near)
     rng = np.random.default_rng(0)
     if frame.kind == "object":
-        body = _body(sample_cloud(model, _POINTS, rng), frame)
-        centre, distance = _whole(body, frame, elevation, K, width, height)
+        body = _main_parts(sample_cloud(model, _POINTS, rng), frame)
+        centre, distance = _framing(body, frame, elevation, K, width, height)
         return orbit(centre, distance, frame.up, count, K, width, height, elevation=elevation, near=frame.near)
     cloud = sample_cloud(model, _ARC_POINTS, rng)
     first = _first_view(model)
     if first is not None:
         return _sway(cloud, first, frame, count, K, width, height)
     angles, elevation, distance = _arc(cloud, frame, count)
-    return [_towards(frame, float(angle), elevation, distance, K, width, height) for angle in angles]
+    return [_camera_towards(frame, float(angle), elevation, distance, K, width, height) for angle in angles]
 
 
-def _body(cloud: Cloud, frame: Frame) -> F64:
+def _main_parts(cloud: Cloud, frame: SceneFrame) -> F64:
     """[M, 3] points of an object without what floats around it: those of its parts that have any size.
 
     Parts are cells of a grid that touch. Splats that lie scattered are all of the object.
@@ -134,10 +140,10 @@ def _touching(first: int, filled: Mask) -> Mask:
         found = wider
 
 
-def _whole(body: F64, frame: Frame, elevation: float, K: F64, width: int, height: int) -> tuple[F64, float]:
+def _framing(body: F64, frame: SceneFrame, elevation: float, K: F64, width: int, height: int) -> tuple[F64, float]:
     """Return a point to look at and a distance, so that an object is inside all images around it."""
     up = frame.up
-    first, second = direction(up, 0.0, 0.0), direction(up, 90.0, 0.0)
+    first, second = direction_at(up, 0.0, 0.0), direction_at(up, 90.0, 0.0)
     sides = np.stack([_along(body - frame.centre, axis) for axis in (first, second, up)])
     low, high = np.quantile(sides, [1.0 - _SHOWN, _SHOWN], axis=1)
     middle, tall = (low + high) / 2.0, float(high[2] - low[2])
@@ -169,7 +175,7 @@ def _first_view(model: SplatModel) -> Camera | None:
         return None
 
 
-def _sway(cloud: Cloud, first: Camera, frame: Frame, count: int, K: F64, width: int, height: int) -> list[Camera]:
+def _sway(cloud: Cloud, first: Camera, frame: SceneFrame, count: int, K: F64, width: int, height: int) -> list[Camera]:
     """Cameras on an ellipse around a known one, as wide as they see what it sees: the middle of the scene stays put."""
     ahead, eye = first.viewmat[2, :3], first.position
     depth = max(float(np.sum((frame.centre - eye) * ahead)), frame.extent * _NEAREST_MIDDLE)
@@ -191,14 +197,14 @@ def _sway(cloud: Cloud, first: Camera, frame: Frame, count: int, K: F64, width: 
     return [at(swing, float(turn)) for turn in turns]
 
 
-def _arc(cloud: Cloud, frame: Frame, count: int) -> tuple[F64, float, float]:
+def _arc(cloud: Cloud, frame: SceneFrame, count: int) -> tuple[F64, float, float]:
     """The longest good arc about the middle of surroundings: azimuths, there and back; elevation, distance."""
     K = intrinsics(640, 480, FIELD_OF_VIEW)
     azimuths = np.arange(_TURNS) * 360.0 / _TURNS
     circles = [(elevation, distance) for distance in _ARC_DISTANCES for elevation in _ARC_ELEVATIONS]
     details = np.array(
         [
-            [detail(cloud, _towards(frame, a, *circle, K, 640, 480), HIDING * frame.extent) for a in azimuths]
+            [detail(cloud, _camera_towards(frame, a, *circle, K, 640, 480), HIDING * frame.extent) for a in azimuths]
             for circle in circles
         ]
     )
@@ -220,15 +226,15 @@ def _arc(cloud: Cloud, frame: Frame, count: int) -> tuple[F64, float, float]:
     return (start + 0.5 * (length - 1)) * step + half * np.sin(2.0 * np.pi * turns), *circles[number]
 
 
-def _towards(
-    frame: Frame, azimuth: float, elevation: float, distance: float, K: F64, width: int, height: int
+def _camera_towards(
+    frame: SceneFrame, azimuth: float, elevation: float, distance: float, K: F64, width: int, height: int
 ) -> Camera:
     """A camera that looks at the middle of a scene: angles in degrees, the distance in extents."""
-    eye = frame.centre + distance * frame.extent * direction(frame.up, azimuth, elevation)
+    eye = frame.centre + distance * frame.extent * direction_at(frame.up, azimuth, elevation)
     return look_at(eye, frame.centre, frame.up, K, width, height, frame.near)
 
 
-def _beside(cameras: Sequence[Camera], count: int, up: Sequence[float] | None) -> tuple[F64, F64, F64]:
+def _path_along(cameras: Sequence[Camera], count: int, up: Sequence[float] | None) -> tuple[F64, F64, F64]:
     """Return a path next to the given cameras.
 
     Its plan is the ellipse that lies as the cameras do. Each of its places moves to the mean of the cameras around it,

@@ -31,7 +31,7 @@ R = TypeVar("R")
 LOCK = threading.RLock()
 
 # Bytes of arrays below which waking threads (80 µs) takes longer than what one of them does alone.
-_LITTLE = 1 << 17
+_SERIAL_BYTES = 1 << 17
 
 # Without nnan and ninf: the kernels test for NaN and infinity, and may meet them.
 _LN2 = math.log(2.0)
@@ -44,13 +44,13 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     return compiled
 
 
-def inline(function: Callable[P, R]) -> Callable[P, R]:
+def device_function(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a small function that kernels call; it takes on their arithmetic."""
     compiled: Callable[P, R] = numba.njit(function, inline="never", cache=True, nogil=True, error_model="numpy")
     return compiled
 
 
-def spliced(function: Callable[P, R]) -> Callable[P, R]:
+def inlined(function: Callable[P, R]) -> Callable[P, R]:
     """Copy a few lines into the kernels that call them, before anything is compiled: loops vectorise all the same."""
     copied: Callable[P, R] = numba.njit(function, inline="always", nogil=True, error_model="numpy")
     return copied
@@ -88,7 +88,7 @@ class ParallelKernel(Generic[P]):
             _threads.run(self.compiled, arguments)
 
 
-class _Disjoint(compiler.Compiler):  # type: ignore[misc]  # numba's types are those of each version
+class _NoAliasCompiler(compiler.Compiler):  # type: ignore[misc]  # numba's types are those of each version
     """Compiles kernels whose arrays do not overlap: without that many a loop is not vectorised."""
 
     def define_pipelines(self) -> Any:
@@ -111,13 +111,15 @@ def parallel_kernel(
 
     def decorate(function: Callable[Concatenate[int, int, P], None]) -> ParallelKernel[P]:
         return ParallelKernel(
-            numba.njit(function, cache=True, nogil=True, error_model="numpy", pipeline_class=_Disjoint, **options)
+            numba.njit(
+                function, cache=True, nogil=True, error_model="numpy", pipeline_class=_NoAliasCompiler, **options
+            )
         )
 
     return decorate
 
 
-class _First(event.Listener):  # type: ignore[misc]  # numba's types are those of each version
+class _FirstCompilation(event.Listener):  # type: ignore[misc]  # numba's types are those of each version
     """Calls something when the first kernel is compiled. Owns whether that was."""
 
     def __init__(self, call: Callable[[], object]) -> None:
@@ -135,7 +137,7 @@ class _First(event.Listener):  # type: ignore[misc]  # numba's types are those o
 @contextmanager
 def on_compiling(call: Callable[[], object]) -> Iterator[None]:
     """Call something once if a kernel is compiled meanwhile: not if all of them come from numba's cache."""
-    with event.install_listener("numba:compile", _First(call)):
+    with event.install_listener("numba:compile", _FirstCompilation(call)):
         yield
 
 
@@ -180,13 +182,13 @@ def _fast_exp2(x: Any) -> Callable[[Any], Any]:
 extending.overload(fast_exp2, jit_options={"fastmath": _RELAXED}, inline="always")(_fast_exp2)
 
 
-@inline
-def lane_run(lane: int, lanes: int, count: int) -> tuple[int, int]:
+@device_function
+def lane_range(lane: int, lanes: int, count: int) -> tuple[int, int]:
     """First and last + 1 of a thread's run of `count` things."""
     return count * lane // lanes, count * (lane + 1) // lanes
 
 
-def python(compiled: Callable[P, R]) -> Callable[P, R]:
+def python_function(compiled: Callable[P, R]) -> Callable[P, R]:
     """Return the Python function that was compiled; it accepts arrays in place of a kernel's numbers."""
     function: Callable[P, R] = getattr(compiled, "py_func", compiled)
     return function
@@ -224,7 +226,7 @@ def thread_count(threads: int | None) -> Iterator[int]:
             _threads.wanted = before
 
 
-class _Helper:
+class _HelperThread:
     """A thread that sleeps until it is given something to call. Owns two locks that take turns.
 
     Locks wake a thread in half the time that a queue or a future takes.
@@ -263,19 +265,19 @@ class _Helper:
             self._ended.release()
 
 
-class _Threads:
+class _ThreadPool:
     """The threads that run kernels, in addition to the calling one. Owns them and the number of threads to use."""
 
     def __init__(self) -> None:
         self.wanted: int | None = None
-        self._helpers: list[_Helper] = []
+        self._helpers: list[_HelperThread] = []
 
     def run(self, function: Any, arguments: tuple[Any, ...]) -> None:
         """Call `function(lane, lanes, *arguments)` for every lane."""
-        lanes = self.wanted or (1 if _bytes_of(arguments) < _LITTLE else available_threads())
+        lanes = self.wanted or (1 if _bytes_of(arguments) < _SERIAL_BYTES else available_threads())
         while len(self._helpers) < lanes - 1:
-            self._helpers.append(_Helper())
-        waiting: list[_Helper] = []
+            self._helpers.append(_HelperThread())
+        waiting: list[_HelperThread] = []
         try:
             for lane, helper in enumerate(self._helpers[: lanes - 1]):
                 helper.start(function, (lane + 1, lanes, *arguments))
@@ -291,7 +293,7 @@ class _Threads:
             self.forget()  # an interrupt may have come between a start and its note: new threads the next time
             raise
 
-    def _quit(self, waiting: list[_Helper]) -> None:
+    def _quit(self, waiting: list[_HelperThread]) -> None:
         """Wait for lanes that still write into the buffers; what they raise is not the first mistake."""
         try:
             while waiting:
@@ -319,6 +321,6 @@ def _after_fork() -> None:
     _threads.forget()
 
 
-_threads = _Threads()
+_threads = _ThreadPool()
 if hasattr(os, "register_at_fork"):  # work at import, because nobody else would tell a child that it has no threads
     os.register_at_fork(after_in_child=_after_fork)

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from csplat.model import sh_degree_of
-from csplat_render.arrays import HasSplats, RenderResult
 from csplat_render.camera import Camera
 from csplat_render.conventions import (
     ALPHA_CAP,
@@ -25,9 +24,11 @@ from csplat_render.conventions import (
     FOV_MARGIN,
     LOG_SCALE_LIMIT,
     TRANSMITTANCE_MIN,
+    HasSplats,
+    RenderResult,
 )
-from csplat_render.harmonics import sh_basis
-from csplat_render.jit import python
+from csplat_render.kernels import python_function
+from csplat_render.projection import sh_basis
 
 Array = NDArray[Any]
 
@@ -141,7 +142,7 @@ def _project(
     direction = means - camera.position
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     basis = np.empty(((degree + 1) ** 2, len(z)))
-    python(sh_basis)(degree, direction[:, 0], direction[:, 1], direction[:, 2], basis)
+    python_function(sh_basis)(degree, direction[:, 0], direction[:, 1], direction[:, 2], basis)
     colour = np.einsum("kn,nkc->nc", basis, coefficients) + 0.5
     colour = np.where(decisions.ask(colour > 0.0), colour, 0.0)
     drawn = {

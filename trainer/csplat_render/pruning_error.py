@@ -17,15 +17,14 @@ from numpy.typing import ArrayLike
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import Progress
-from csplat_render.arrays import Array
 from csplat_render.camera import Camera
 from csplat_render.contributions import Contributions
-from csplat_render.conventions import TRANSMITTANCE_MIN
-from csplat_render.twin import render_exact
+from csplat_render.conventions import TRANSMITTANCE_MIN, Array
+from csplat_render.reference_rasteriser import render_exact
 
 
 @dataclass(frozen=True, eq=False)
-class Removal:
+class PruningError:
     """Sums over the pixels, channels and views of a pass; they add up from pass to pass.
 
     Attributes:
@@ -46,15 +45,15 @@ class Removal:
     value_count: int
     product: Array | None = None
 
-    def of_rows(self, rows: Array) -> Removal:
+    def of_rows(self, rows: Array) -> PruningError:
         """The same of some of the splats."""
         return replace(
             self, error=self.error[rows], squared_weight=self.squared_weight[rows], seen=self.seen[rows],
             bands=self.bands[rows], product=None if self.product is None else self.product[rows],
         )  # fmt: skip
 
-    def __add__(self, other: Removal) -> Removal:
-        return Removal(
+    def __add__(self, other: PruningError) -> PruningError:
+        return PruningError(
             self.error + other.error,
             self.squared_weight + other.squared_weight,
             self.seen | other.seen,
@@ -64,7 +63,7 @@ class Removal:
         )
 
 
-def measure_removal(
+def measure_pruning_error(
     model: SplatModel,
     cameras: Sequence[Camera],
     *,
@@ -76,7 +75,7 @@ def measure_removal(
     transmittance_min: float = TRANSMITTANCE_MIN,
     threads: int | None = None,
     progress: Progress | None = None,
-) -> Removal:
+) -> PruningError:
     """Measure what the removal of each splat, alone, would change in pictures of a scene.
 
     Args:
@@ -112,10 +111,10 @@ def measure_removal(
             progress("measuring splats", (number + 1) / len(cameras))
     error, product, squares = (totals[:, k].copy() for k in (0, 1, 3))
     count = sum(3 * camera.W * camera.H for camera in cameras)
-    return Removal(error, squares, totals[:, 4] > 0.0, by_band, count, None if references is None else product)
+    return PruningError(error, squares, totals[:, 4] > 0.0, by_band, count, None if references is None else product)
 
 
-def removal_exact(
+def pruning_error_exact(
     model: SplatModel,
     cameras: Sequence[Camera],
     rows: ArrayLike,
@@ -123,7 +122,7 @@ def removal_exact(
     background: ArrayLike = (0.0, 0.0, 0.0),
     transmittance_min: float = TRANSMITTANCE_MIN,
 ) -> Array:
-    """The slow twin of `measure_removal`: take one splat away, render in float64, compare; and so on.
+    """The slow twin of `measure_pruning_error`: take one splat away, render in float64, compare; and so on.
 
     Args:
         model: the scene.
