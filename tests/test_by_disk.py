@@ -18,7 +18,7 @@ from csplat.decoder import decode, open_tiles
 from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.errors import InputError
 from csplat.files import read_array
-from csplat.ply_write import write_ply
+from csplat.ply import write_ply
 from csplat.processes import CAN_COPY
 from csplat.scene import scene_of
 from csplat_conformance.stated import PartSizes, Source, check_source_index, prove, prove_by_disk

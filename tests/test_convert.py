@@ -14,8 +14,7 @@ from csplat import formats
 from csplat.encoder import EncodeOptions
 from csplat.formats import spz, spz_file
 from csplat.model import SplatModel, normalise_quats
-from csplat.ply import read_ply
-from csplat.ply_write import write_ply
+from csplat.ply import read_ply, write_ply
 from csplat.scene import scene_of
 from csplat.turning import in_axes
 from csplat_tools.cli.app import app, command_function

@@ -10,8 +10,7 @@ import pytest
 pytest.importorskip("numba", reason="the benchmark renders: pip install 'csplat[render]'")
 pytest.importorskip("matplotlib", reason="the benchmark plots: pip install 'csplat[render]'")
 
-from csplat.ply import read_ply
-from csplat.ply_write import write_ply
+from csplat.ply import read_ply, write_ply
 from csplat_bench.common import scenes
 from csplat_bench.common.command import run as command
 from csplat_bench.common.curves import Point, Rate, bracket, front, psnr_at, rate_at

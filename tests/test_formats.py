@@ -10,8 +10,7 @@ import csplat
 from csplat.errors import InputError
 from csplat.formats import formats, insisting, open_scene, write_scene
 from csplat.formats import lint as formats_lint
-from csplat.ply import read_ply
-from csplat.ply_write import write_ply
+from csplat.ply import read_ply, write_ply
 from csplat.scene import BLOCK, Scene, scene_of
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")

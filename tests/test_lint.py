@@ -9,7 +9,7 @@ import csplat
 from csplat.errors import InputError
 from csplat.formats import open_scene
 from csplat.ply import lint_ply, read_ply
-from csplat.ply_columns import alpha_of_logits
+from csplat.ply.columns import alpha_of_logits
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 

@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 
 from csplat import decode, encode
 from csplat.errors import InputError
-from csplat.ply import read_ply
-from csplat.ply_columns import LOGIT_OF_0, LOGIT_OF_1, alpha_of_logits, logits_of_alpha
-from csplat.ply_write import write_ply
-from csplat.training import TrainedOn
+from csplat.ply import read_ply, write_ply
+from csplat.ply.columns import LOGIT_OF_0, LOGIT_OF_1, alpha_of_logits, logits_of_alpha
+from csplat.training_record import TrainingRecord
 
 ARRAYS = ("means", "quats", "scales", "sh0", "shN")
 
@@ -332,12 +331,12 @@ def test_splats_in_one_point_far_away_are_exact(tmp_path):
 
 
 def test_what_a_scene_was_trained_on_goes_through_files(tmp_path, make_model):
-    trained = TrainedOn((1.0, 1.0, 1.0), 5, (238, 134), 0.003, "bilder  für alle")
+    trained = TrainingRecord((1.0, 1.0, 1.0), 5, (238, 134), 0.003, "bilder  für alle")
     write_ply(tmp_path / "a.ply", make_model(metadata={"training": trained.as_json()}))
     model = read_ply(tmp_path / "a.ply")
     assert {"training": trained.as_json()} == model.metadata
     write_ply(tmp_path / "b.ply", decode(encode(model)))
-    assert trained == TrainedOn.of(read_ply(tmp_path / "b.ply").metadata)
+    assert trained == TrainingRecord.of(read_ply(tmp_path / "b.ply").metadata)
     line = header_of(tmp_path / "b.ply")[-1]
     assert line.startswith('comment csplat training {"background": [1.0, 1.0, 1.0], "test_every": 5')
 

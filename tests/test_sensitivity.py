@@ -9,8 +9,7 @@ from typer.testing import CliRunner
 
 from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats
-from csplat.ply import read_ply
-from csplat.ply_write import write_ply
+from csplat.ply import read_ply, write_ply
 
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 

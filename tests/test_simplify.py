@@ -15,8 +15,7 @@ from captures import views_of
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.ply import read_ply
-from csplat.ply_write import write_ply
+from csplat.ply import read_ply, write_ply
 from csplat_render.camera_files import save_cameras
 from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_render.scorer import Scorer, renderer

@@ -13,7 +13,7 @@ import csplat
 from csplat import formats, inputs
 from csplat.decoder import Limits, decode, open_tiles, read_header, tilewise
 from csplat.errors import CsplatError, LimitError
-from csplat.ply_write import write_ply
+from csplat.ply import write_ply
 from csplat_conformance.manifest import load
 from csplat_tools.cli.app import app
 from csplat_tools.files import scenes

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from csplat import decode, read_ply, write_ply
 from csplat.errors import InputError
-from csplat.training import TrainedOn
+from csplat.training_record import TrainingRecord
 from csplat_render.camera import Camera, intrinsics, orbit, relative_to
 from csplat_render.rasteriser import Rasteriser
 from csplat_tools.cli.app import app
@@ -232,7 +232,7 @@ def test_photographs_without_alpha_start_in_a_box(make_data, make_model):
     data = make_data(make_model, alpha=False)
     result = train(data, TrainOptions(**QUICK))
     assert np.isfinite(result.model.means).all()
-    assert (0.0, 0.0, 0.0) == TrainedOn.of(result.model.metadata).background
+    assert (0.0, 0.0, 0.0) == TrainingRecord.of(result.model.metadata).background
     with pytest.raises(InputError, match="no alpha channel"):
         train(data, TrainOptions(**QUICK, init="hull"))
     with pytest.raises(InputError, match="no points"):
@@ -323,7 +323,7 @@ def test_other_commands_judge_as_training_did(make_data, make_model, tmp_path, a
     reading = ["--test-every", every, *(() if size is None else ("--size", size))]
     ply, log = tmp_path / "a.ply", tmp_path / "log.json"
     told = call("train", folder, "-o", ply, "--background", background, "--report", log, *reading, *FEW_WORDS)
-    said = TrainedOn.of(read_ply(ply).metadata)
+    said = TrainingRecord.of(read_ply(ply).metadata)
     assert (every, size) == (said.test_every, None if said.size is None else "{}x{}".format(*said.size))
     assert said.background == ((1.0, 1.0, 1.0) if alpha or background == "white" else (0.0, 0.0, 0.0))
     assert str(said) in told.stderr
@@ -336,13 +336,15 @@ def test_other_commands_judge_as_training_did(make_data, make_model, tmp_path, a
         assert judged[name] == pytest.approx(metrics[name], abs=0.01)
 
 
-@pytest.mark.parametrize("said", [TrainedOn((1.0, 1.0, 1.0), 5), TrainedOn((0.0, 0.0, 0.0), 10, (24, 20), 0.05)])
+@pytest.mark.parametrize(
+    "said", [TrainingRecord((1.0, 1.0, 1.0), 5), TrainingRecord((0.0, 0.0, 0.0), 10, (24, 20), 0.05)]
+)
 def test_a_file_and_its_ply_hand_on_what_a_scene_was_trained_on(make_model, tmp_path, said):
     ply, file, back = (tmp_path / name for name in ("a.ply", "a.csplat", "b.ply"))
     write_ply(ply, make_model(10, 0, metadata={"training": said.as_json()}))
     call("encode", ply, file, "-q")
     call("decode", file, back, "-q")
-    assert said == TrainedOn.of(read_ply(back).metadata)
+    assert said == TrainingRecord.of(read_ply(back).metadata)
     assert str(said) in call("info", file).stdout
     assert said.as_json() == json.loads(call("info", file, "--json").stdout)["metadata"]["training"]
 
@@ -355,7 +357,7 @@ def test_the_command_trains_to_a_file(file_runs):
     assert (len(model), len(data)) == (said["file"]["splats"], said["file"]["size_bytes"])
     assert {"source", "before tuning", "file"} == set(said["file"]["scores"])
     assert "held-out photographs" in file_runs.messages
-    assert (1.0, 1.0, 1.0) == TrainedOn.of(model.metadata).background
+    assert (1.0, 1.0, 1.0) == TrainingRecord.of(model.metadata).background
     assert (file_runs.folder / "run.tuning.npz").exists()
 
 

@@ -13,7 +13,7 @@ pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'cspl
 from captures import as_colmap, photograph, photograph_object, shell
 
 from csplat import read_ply
-from csplat.training import TrainedOn
+from csplat.training_record import TrainingRecord
 from csplat_tools.cli.app import app
 
 SIZE = (24, 20)
@@ -47,7 +47,7 @@ def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, 
     quick = ("--max-splats", 60, "--sh-degree", 0, "--iterations", 10, "--set", "init=box")
     size = "x".join(map(str, SIZE))
     call("train", data, "-o", ply, *quick, "--size", size, "--test-every", every, "--report", log, "-q")
-    said = TrainedOn.of(read_ply(ply).metadata)
+    said = TrainingRecord.of(read_ply(ply).metadata)
     assert ((1.0, 1.0, 1.0) if kind == "blender" else (0.0, 0.0, 0.0), SIZE) == (said.background, said.size)
     trained = json.loads(log.read_text())["metrics"]
     found = {name: SCORES[name](ply, data, tmp_path) for name in commands}

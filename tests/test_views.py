@@ -18,7 +18,7 @@ from PIL import Image
 
 from csplat.errors import InputError
 from csplat.ply import read_ply
-from csplat.training import TRAINING, TrainedOn
+from csplat.training_record import TRAINING, TrainingRecord
 from csplat_render.camera import relative_to, resized
 from csplat_render.camera_files import save_cameras
 from csplat_render.scorer import renderer
@@ -138,7 +138,7 @@ def test_a_view_of_two_roles_is_refused_in_any_size(scene):
 
 
 def test_the_scene_says_how_its_photographs_are_taken(sets, scene):
-    said = TrainedOn((0.0, 1.0, 0.0), 5, (24, 20), 0.05)
+    said = TrainingRecord((0.0, 1.0, 0.0), 5, (24, 20), 0.05)
     trained = replace(scene, metadata={**scene.metadata, TRAINING: said.as_json()})
     views = find_view_set(trained, data=DataOptions(str(sets["rgba"])))
     assert [0, 5, 10, 15] == numbers(views.judges)

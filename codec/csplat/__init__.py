@@ -39,8 +39,7 @@ if TYPE_CHECKING:
     from csplat.merging import merge
     from csplat.model import SplatModel
     from csplat.opened import SplatFile, extract, open
-    from csplat.ply import lint_ply, read_ply
-    from csplat.ply_write import write_ply
+    from csplat.ply import lint_ply, read_ply, write_ply
     from csplat.upright import with_up
 
 __version__ = "0.1.0"
@@ -131,6 +130,6 @@ _MODULE_OF = {
     "to_gsplat": "csplat.bridges",
     "with_up": "csplat.upright",
     "write": "csplat.formats",
-    "write_ply": "csplat.ply_write",
+    "write_ply": "csplat.ply.ply_writer",
 }
 __getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)

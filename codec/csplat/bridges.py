@@ -24,7 +24,7 @@ import numpy as np
 
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model, normalise_quats
-from csplat.ply_columns import alpha_of_logits, logits_of_alpha
+from csplat.ply.columns import alpha_of_logits, logits_of_alpha
 from csplat.types import F32
 
 if TYPE_CHECKING:

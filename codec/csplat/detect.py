@@ -33,7 +33,7 @@ _PLY, _CSPLAT = "ply", "csplat"
 
 
 @dataclass(frozen=True)
-class Kind:
+class FileKind:
     """A kind of file.
 
     Attributes:
@@ -56,7 +56,7 @@ class Kind:
         return not self.remedy or self.remedy.startswith(_NOT_READ)
 
 
-def by_content(path: Path, head: bytes) -> Kind | None:
+def by_content(path: Path, head: bytes) -> FileKind | None:
     """Find what a file or folder is by its content; `None`: nothing that is known.
 
     Args:
@@ -72,7 +72,7 @@ def by_content(path: Path, head: bytes) -> Kind | None:
     return next((kind for kind in KINDS.values() if kind.matches(path, head)), None)
 
 
-def by_name(path: Path) -> Kind | None:
+def by_name(path: Path) -> FileKind | None:
     """Find what a file of that name would be; `None`: nothing that is known."""
     name = path.name.lower()
     found = [(len(suffix), kind) for kind in KINDS.values() for suffix in kind.suffixes if name.endswith(suffix)]
@@ -215,69 +215,71 @@ def _is_usd(path: Path, head: bytes) -> bool:
 
 
 #: All kinds by name. Of several that match a content the first one counts.
-KINDS: dict[str, Kind] = {
+KINDS: dict[str, FileKind] = {
     kind.name: kind
     for kind in (
-        Kind("compressed-ply", "compressed PLY", (".compressed.ply",), _is_compressed_ply),
-        Kind(_PLY, "PLY", (".ply",), lambda _path, head: is_ply(head)),
-        Kind(_CSPLAT, "csplat", (".csplat",), _begins(MAGIC)),
-        Kind("spz", "SPZ", (".spz",), _is_spz),
-        Kind("spz4", "SPZ 4", (".v4.spz",)),
-        Kind("splat", ".splat", (".splat",)),
-        Kind("ksplat", ".ksplat", (".ksplat",), _is_ksplat),
-        Kind("sog", "SOG", (".sog", "meta.json"), _is_sog),
-        Kind(
+        FileKind("compressed-ply", "compressed PLY", (".compressed.ply",), _is_compressed_ply),
+        FileKind(_PLY, "PLY", (".ply",), lambda _path, head: is_ply(head)),
+        FileKind(_CSPLAT, "csplat", (".csplat",), _begins(MAGIC)),
+        FileKind("spz", "SPZ", (".spz",), _is_spz),
+        FileKind("spz4", "SPZ 4", (".v4.spz",)),
+        FileKind("splat", ".splat", (".splat",)),
+        FileKind("ksplat", ".ksplat", (".ksplat",), _is_ksplat),
+        FileKind("sog", "SOG", (".sog", "meta.json"), _is_sog),
+        FileKind(
             "tileset", "a tileset of 3D Tiles", (), _is_tileset, "which csplat does not read: its tiles are .glb files"
         ),
-        Kind("gltf", "glTF", (".glb", ".gltf"), _is_gltf),
-        Kind("checkpoint", "a checkpoint of gsplat, splatfacto or INRIA", (".pt", ".ckpt"), _holds("/data.pkl")),
-        Kind("spx", ".spx", (".spx",), _begins(b"spx\1", b"spx\2", b"spx\3"), f"{_NOT_READ} gsbox"),
-        Kind("lcc", "LCC", (".lcc",), remedy=f"{_NOT_READ} {_SPLAT_TRANSFORM}"),
-        Kind("rad", "RAD of Spark", (".rad",), _begins(b"RAD0"), f"{_NOT_READ} Spark, or take the file it was made of"),
-        Kind("usd", "USD", (".usdz", ".usdc", ".usda", ".usd"), _is_usd, f"{_NOT_READ} the program that wrote it"),
-        Kind(
+        FileKind("gltf", "glTF", (".glb", ".gltf"), _is_gltf),
+        FileKind("checkpoint", "a checkpoint of gsplat, splatfacto or INRIA", (".pt", ".ckpt"), _holds("/data.pkl")),
+        FileKind("spx", ".spx", (".spx",), _begins(b"spx\1", b"spx\2", b"spx\3"), f"{_NOT_READ} gsbox"),
+        FileKind("lcc", "LCC", (".lcc",), remedy=f"{_NOT_READ} {_SPLAT_TRANSFORM}"),
+        FileKind(
+            "rad", "RAD of Spark", (".rad",), _begins(b"RAD0"), f"{_NOT_READ} Spark, or take the file it was made of"
+        ),
+        FileKind("usd", "USD", (".usdz", ".usdc", ".usda", ".usd"), _is_usd, f"{_NOT_READ} the program that wrote it"),
+        FileKind(
             "3d-tiles",
             "a tile of 3D Tiles",
             (".b3dm", ".i3dm", ".pnts", ".cmpt"),
             _begins(b"b3dm", b"i3dm", b"pnts", b"cmpt"),
             "which csplat does not read: tiles of splats are .glb files",
         ),
-        Kind("gzip", "gzip", (".gz",), _is_gzip, "unpack it first, with gunzip"),
-        Kind("zip", "zip", (".zip",), _begins(b"PK\x03\x04"), "unzip it first"),
-        Kind("7z", "7z", (".7z",), _begins(b"7z\xbc\xaf\x27\x1c"), "unpack it first"),
-        Kind("rar", "RAR", (".rar",), _begins(b"Rar!\x1a\x07"), "unpack it first"),
-        Kind("zstd", "zstd", (".zst",), _begins(b"\x28\xb5\x2f\xfd"), "unpack it first, with unzstd"),
-        Kind("xz", "xz", (".xz",), _begins(b"\xfd7zXZ\0"), "unpack it first, with unxz"),
-        Kind(
+        FileKind("gzip", "gzip", (".gz",), _is_gzip, "unpack it first, with gunzip"),
+        FileKind("zip", "zip", (".zip",), _begins(b"PK\x03\x04"), "unzip it first"),
+        FileKind("7z", "7z", (".7z",), _begins(b"7z\xbc\xaf\x27\x1c"), "unpack it first"),
+        FileKind("rar", "RAR", (".rar",), _begins(b"Rar!\x1a\x07"), "unpack it first"),
+        FileKind("zstd", "zstd", (".zst",), _begins(b"\x28\xb5\x2f\xfd"), "unpack it first, with unzstd"),
+        FileKind("xz", "xz", (".xz",), _begins(b"\xfd7zXZ\0"), "unpack it first, with unxz"),
+        FileKind(
             "bzip2",
             "bzip2",
             (".bz2",),
             lambda _path, head: head[:3] == b"BZh" and head[4:10] == b"1AY&SY",
             "unpack it first, with bunzip2",
         ),
-        Kind("tar", "tar", (".tar",), lambda _path, head: head[257:262] == b"ustar", "unpack it first"),
-        Kind("png", "a PNG", (".png",), _begins(b"\x89PNG\r\n"), f"an image, {_NO_SPLATS}"),
-        Kind("jpeg", "a JPEG", (".jpg", ".jpeg"), _begins(b"\xff\xd8\xff"), f"an image, {_NO_SPLATS}"),
-        Kind("pdf", "a PDF", (".pdf",), _begins(b"%PDF-"), _NO_SPLATS),
-        Kind("las", "LAS", (".las", ".laz"), _begins(b"LASF"), f"a point cloud, {_NO_SPLATS}"),
-        Kind("e57", "E57", (".e57",), _begins(b"ASTM-E57"), f"a point cloud, {_NO_SPLATS}"),
-        Kind("obj", "OBJ", (".obj",), remedy=f"a mesh, {_NO_SPLATS}"),
-        Kind("fbx", "FBX", (".fbx",), _begins(b"Kaydara FBX"), f"a mesh, {_NO_SPLATS}"),
-        Kind(
+        FileKind("tar", "tar", (".tar",), lambda _path, head: head[257:262] == b"ustar", "unpack it first"),
+        FileKind("png", "a PNG", (".png",), _begins(b"\x89PNG\r\n"), f"an image, {_NO_SPLATS}"),
+        FileKind("jpeg", "a JPEG", (".jpg", ".jpeg"), _begins(b"\xff\xd8\xff"), f"an image, {_NO_SPLATS}"),
+        FileKind("pdf", "a PDF", (".pdf",), _begins(b"%PDF-"), _NO_SPLATS),
+        FileKind("las", "LAS", (".las", ".laz"), _begins(b"LASF"), f"a point cloud, {_NO_SPLATS}"),
+        FileKind("e57", "E57", (".e57",), _begins(b"ASTM-E57"), f"a point cloud, {_NO_SPLATS}"),
+        FileKind("obj", "OBJ", (".obj",), remedy=f"a mesh, {_NO_SPLATS}"),
+        FileKind("fbx", "FBX", (".fbx",), _begins(b"Kaydara FBX"), f"a mesh, {_NO_SPLATS}"),
+        FileKind(
             "safetensors",
             "safetensors",
             (".safetensors",),
             _is_safetensors,
             "which csplat does not read: csplat.from_gsplat makes a scene of tensors under gsplat's names",
         ),
-        Kind(
+        FileKind(
             "npy",
             "an array of NumPy",
             (".npy",),
             _begins(b"\x93NUMPY"),
             "no scene: csplat.from_gsplat makes one of arrays under gsplat's names",
         ),
-        Kind("rtf", "RTF", (".rtf",), _begins(b"{\\rtf"), f"a text, {_NO_SPLATS}"),
-        Kind("json", "JSON", (), _is_json, _NO_SPLATS),
+        FileKind("rtf", "RTF", (".rtf",), _begins(b"{\\rtf"), f"a text, {_NO_SPLATS}"),
+        FileKind("json", "JSON", (), _is_json, _NO_SPLATS),
     )
 }

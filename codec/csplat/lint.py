@@ -69,7 +69,7 @@ import numpy as np
 from csplat.errors import InputError, counted
 from csplat.model import MAX_SH_DEGREE
 
-Kind = Literal["note", "repair", "error"]
+FindingKind = Literal["note", "repair", "error"]
 
 _MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
@@ -116,7 +116,7 @@ class Finding:
     id: str
     count: int
     text: str
-    kind: Kind
+    kind: FindingKind
     usual: bool = False
 
     @property
@@ -129,7 +129,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Columns:
+class ColumnMap:
     """Meaning of the columns of a PLY. Names are given in the order of the model's last axis.
 
     Attributes:
@@ -158,7 +158,7 @@ class Columns:
 
 def find_columns(
     dtype: np.dtype[Any], *, keep_extra: bool = False, sh_degree: int | None = None, elements: Sequence[str] = ()
-) -> tuple[Columns | None, list[Finding]]:
+) -> tuple[ColumnMap | None, list[Finding]]:
     """Tell the columns of a PLY apart, whatever their order, by their usual names or those of other programs.
 
     Args:
@@ -216,7 +216,7 @@ def find_columns(
         text = f"{counted(moved, 'column')} in another place than usual: read by name"
         findings.append(Finding("shuffled-columns", moved, text, "note"))
     double = any(dtype[name].kind != "f" or dtype[name].itemsize > 4 for name in means)
-    columns = Columns(
+    columns = ColumnMap(
         means, scales, quats, sh0, rest, opacity[0], normals, extra, double, colour_range, filter_3d
     )  # fmt: skip
     return columns, findings

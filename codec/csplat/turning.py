@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from csplat.errors import InputError
 from csplat.model import UNSPECIFIED, SplatModel, check_axes, normalise_quats, sh_degree_of
 from csplat.scene import Scene
-from csplat.training import VIEW
+from csplat.training_record import VIEW
 from csplat.types import F32, F64
 from csplat.upright import UP, Direction, unit_up, up_of, up_of_axes
 

@@ -4,8 +4,9 @@ import io
 
 import numpy as np
 
-from csplat import ply, ply_columns
+from csplat import ply
 from csplat.model import normalise_quats
+from csplat.ply import columns as ply_columns
 from wrong_encoders import plyrows
 from wrong_encoders.mistake import DENSE, Harm, Mistake, changed, floats, replaced
 from wrong_encoders.truth import as_read

@@ -17,7 +17,7 @@ import numpy as np
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.training import VIEW
+from csplat.training_record import VIEW
 from csplat.types import F64, Mask
 from csplat.upright import up_of
 from csplat_render.camera import Camera, camera_outliers, direction_at, intrinsics, look_at, orbit

@@ -17,7 +17,7 @@ from numpy.random import PCG64, Generator
 import csplat
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.training import TRAINING, VIEW
+from csplat.training_record import TRAINING, VIEW
 from csplat.types import F32
 from csplat.upright import with_up
 from csplat_render.camera import Camera, central_camera

@@ -27,9 +27,8 @@ from csplat.errors import InputError, counted, missing
 from csplat.formats import Format
 from csplat.lint import Finding, too_many_bands
 from csplat.model import MAX_SH_DEGREE, SplatModel
-from csplat.ply_columns import Arrays, Counts, findings_of, look_at, thickness_of
-from csplat.ply_comments import SceneFacts
-from csplat.ply_origin import relative_to_origin
+from csplat.ply.columns import RowStatistics, SplatArrays, choose_thickness, list_findings, survey_arrays
+from csplat.ply.comments import CommentMetadata, split_origin
 from csplat.scene import Scene, joined, scene_of
 
 _MAGICS = (b"PK\x03\x04", b"\x80")  # of a zip, and of a pickle, which torch wrote before 1.6
@@ -59,13 +58,13 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
     degrees = sorted({one.sh_degree for one in models})
     if len(degrees) > 1:
         raise InputError(f"{path.name}: files of other GPUs beside it are of SH degree {degrees[0]} and {degrees[1]}")
-    model, counts = joined(models[0], models), Counts()
+    model, counts = joined(models[0], models), RowStatistics()
     for part in parts:
-        look_at(part.arrays, part.scale_count, counts)
-    findings += [finding for part in parts for finding in part.findings] + findings_of(counts, len(model))
+        survey_arrays(part.arrays, part.scale_count, counts)
+    findings += [finding for part in parts for finding in part.findings] + list_findings(counts, len(model))
     if any(part.arrays.means.dtype == np.float64 for part in parts):
         positions = np.concatenate([part.arrays.means.astype(np.float64) for part in parts])
-        means, origin, doubles = relative_to_origin(positions, SceneFacts())
+        means, origin, doubles = split_origin(positions, CommentMetadata())
         model = replace(model, means=means, origin=origin, means_double=doubles)
         text = f"positions are in doubles: {len(means)} means are float32 relative to {origin}"
         findings.append(Finding("double-means", len(means), text, "note"))
@@ -83,7 +82,7 @@ class _Part(NamedTuple):
     """
 
     model: SplatModel
-    arrays: Arrays
+    arrays: SplatArrays
     scale_count: int
     findings: list[Finding]
 
@@ -219,14 +218,14 @@ def _bounded(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> _Pa
     scales = splats.get("scales")
     is_flat = scales is not None and scales.ndim == 2 and scales.shape[1] == 2
     if scales is not None and is_flat:
-        third = np.full((len(scales), 1), thickness_of(scales) if len(scales) else 0.0, np.float32)
+        third = np.full((len(scales), 1), choose_thickness(scales) if len(scales) else 0.0, np.float32)
         splats["scales"] = np.concatenate([scales, third], axis=1)
         findings.append(Finding("flat-scales", 1, "scales are two of a splat: the splats are discs (2DGS)", "note"))
     if _FILTER in splats:
         text = f"{_FILTER} of Mip-Splatting is left out, and not fused: save the scene as PLY, of which it is"
         findings.append(Finding("filter-3d", 1, text, "repair"))
     model = replace(from_gsplat(splats), flat=is_flat)
-    arrays = Arrays(
+    arrays = SplatArrays(
         splats["means"], splats["quats"], splats["scales"], splats["opacities"].reshape(-1), model.sh0, model.shN
     )
     return _Part(model, arrays, 2 if is_flat else 3, findings)

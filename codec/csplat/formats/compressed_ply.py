@@ -22,8 +22,8 @@ from csplat.formats.format import Format
 from csplat.formats.packing import all_three, crossed, smallest_three
 from csplat.lint import Finding, too_many_bands, trailing_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel
-from csplat.ply_comments import format_comments, parse_comments
-from csplat.ply_header import read_header
+from csplat.ply.comments import format_comments, parse_comments
+from csplat.ply.ply_header import read_ply_header
 from csplat.scene import BLOCK, Scene
 from csplat.types import F32, U8, U32
 
@@ -127,7 +127,7 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
 def _header(path: Path) -> tuple[dict[str, _Element], list[str], list[Finding]]:
     """The elements, whose rows are all there; the comments; and what is unusual."""
     findings: list[Finding] = []
-    header = read_header(path, findings, "compressed-ply")
+    header = read_ply_header(path, findings, "compressed-ply")
     findings = [one for one in findings if one.repairable]  # numbers of rows are checked below
     lines = [line.strip() for line in header.text.decode("ascii").splitlines()[:-1]]
     found: list[tuple[str, int, list[tuple[str, str]]]] = []

@@ -29,8 +29,8 @@ from csplat.formats.spz import decoded, means_of
 from csplat.formats.spz_file import ANTIALIASED, Packed, read_packed
 from csplat.lint import Finding, too_many_bands, trailing_bytes
 from csplat.model import SplatModel, normalise_quats
-from csplat.ply_columns import Counts, alpha_of_logits, findings_of, huge_rows
-from csplat.ply_comments import SceneFacts, parse_comments
+from csplat.ply.columns import RowStatistics, alpha_of_logits, count_huge_rows, list_findings
+from csplat.ply.comments import CommentMetadata, parse_comments
 from csplat.scene import BLOCK, Scene
 from csplat.turning import axes_rotation, stretched, turned
 from csplat.types import F64
@@ -96,7 +96,7 @@ class _Reading:
     findings: list[Finding] = field(default_factory=list)
     scales: Spread = field(default_factory=Spread)
     opacities: Spread = field(default_factory=lambda: Spread(high=1.0))
-    counts: Counts = field(default_factory=Counts)
+    counts: RowStatistics = field(default_factory=RowStatistics)
     infinite: int = 0
     are_logs: bool = False
     are_logits: bool = False
@@ -221,7 +221,9 @@ class _Reading:
     def _huge(self, arrays: dict[str, Accessor], rows: slice, good: NDArray[np.bool_] | None) -> int:
         kept = slice(None) if good is None else good
         scales = np.log(np.maximum(np.abs(arrays["SCALE"].values(rows)[kept]), _THINNEST))
-        return huge_rows(scales, *(one.values(rows)[kept] for name, one in arrays.items() if name.startswith("SH_")))
+        return count_huge_rows(
+            scales, *(one.values(rows)[kept] for name, one in arrays.items() if name.startswith("SH_"))
+        )
 
     def _packed_block(self, placed: Placed, view: int, *, draft: bool) -> tuple[Callable[[slice], SplatModel], int]:
         file = self.file
@@ -326,7 +328,7 @@ def _conclude(reading: _Reading) -> None:
         reading.counts.infinite_logits = reading.infinite
     else:
         reading.counts.nonfinite += reading.infinite
-    reading.findings += [*found, *more, *findings_of(reading.counts, reading.count)]
+    reading.findings += [*found, *more, *list_findings(reading.counts, reading.count)]
     reading.findings += trailing_bytes(reading.file.tail)
     if others := reading.file.other_scenes():
         reading.findings.append(Finding("other-scenes", len(reading.file.root["scenes"]) - 1, others, "note"))
@@ -420,7 +422,7 @@ def _placed(block: SplatModel, part: _Part, facts: SplatModel) -> SplatModel:
     return replace(block, **{name: getattr(facts, name) for name in fields})
 
 
-def _said(file: GltfFile) -> SceneFacts:
+def _said(file: GltfFile) -> CommentMetadata:
     """Read the file's metadata about the scene beyond its splats."""
     extras = file.root["asset"].get("extras")
     lines = extras.get("csplat", []) if isinstance(extras, dict) else []

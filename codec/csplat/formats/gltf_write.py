@@ -17,7 +17,7 @@ from csplat.files import atomic_writer
 from csplat.formats.gltf_file import BIN, GLB_HEAD, JSON, MAGIC
 from csplat.formats.gltf_read import AXES, COLOURS, EXTENSION, sh_names
 from csplat.model import SplatModel
-from csplat.ply_comments import format_comments
+from csplat.ply.comments import format_comments
 from csplat.scene import Scene
 from csplat.turning import in_axes, scaled
 from csplat.types import F32, F64

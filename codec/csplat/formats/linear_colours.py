@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from csplat.model import SplatModel
-from csplat.ply_columns import SH_C0
+from csplat.ply.columns import SH_C0
 from csplat.turning import sh_bands, sphere_lattice
 from csplat.types import F32
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from csplat.formats.format import ARRAYS, Format
-from csplat.ply import open_ply
-from csplat.ply_write import write_scene_ply
+from csplat.ply import open_ply, write_scene_ply
 
 FORMAT = Format(
     name="ply",

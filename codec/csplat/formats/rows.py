@@ -12,7 +12,7 @@ from csplat.errors import counted
 from csplat.formats.activations import Spread, read_scales_as
 from csplat.lint import Finding
 from csplat.model import SplatModel
-from csplat.ply_columns import SH_C0, Counts, findings_of, huge_rows
+from csplat.ply.columns import SH_C0, RowStatistics, count_huge_rows, list_findings
 from csplat.scene import Scene
 from csplat.types import F32
 
@@ -40,7 +40,7 @@ def finite_scene(
     Returns:
         The scene; if there are rows, but none is finite, its findings hold an error.
     """
-    total, kept, empty, spread, counts = 0, 0, 0, Spread(), Counts()
+    total, kept, empty, spread, counts = 0, 0, 0, Spread(), RowStatistics()
     for rows, *_ in blocks():
         good = _finite(rows)
         found = rows if good.all() else rows[good]
@@ -48,7 +48,7 @@ def finite_scene(
         spread.add(scales, total)
         colours = [found["shN"]] if "shN" in (rows.dtype.names or ()) and found["shN"].dtype.kind == "f" else []
         huge = max(spread.most, -spread.least) > _HUGE  # so far; most files have none
-        counts.huge += huge_rows(_logs(scales.astype(np.float32)) if huge else scales[:0], *colours)
+        counts.huge += count_huge_rows(_logs(scales.astype(np.float32)) if huge else scales[:0], *colours)
         empty += _empty_rows(rows)
         zero = np.logical_and.reduce([found["quats"][:, part] == zero_quat for part in range(4)])
         counts.zero_quats += int(np.count_nonzero(zero))
@@ -56,7 +56,7 @@ def finite_scene(
         kept += len(found)
     counts.nonfinite = total - kept
     are_logs, findings = read_scales_as(spread, "scale", strict=False)
-    findings = findings_of(counts, total) + findings
+    findings = list_findings(counts, total) + findings
     if empty:
         text = f"{counted(empty, 'splat')} whose bytes are all 0, which nothing is seen of: kept"
         findings.append(Finding("zero-rows", empty, f"{text}; a download that broke off may leave them", "note"))

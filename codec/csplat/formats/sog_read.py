@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from csplat.formats.packing import all_three, crossed
 from csplat.formats.sog_files import Json, Parts, picture_of
-from csplat.ply_columns import alpha_of_logits
+from csplat.ply.columns import alpha_of_logits
 from csplat.scene import BLOCK
 from csplat.types import F32, U8, U16
 

@@ -19,7 +19,7 @@ from csplat.formats.format import Format
 from csplat.formats.rows import colours_of_bytes, finite_scene
 from csplat.inputs import mapped
 from csplat.model import SplatModel, normalise_quats
-from csplat.ply_columns import SH_C0
+from csplat.ply.columns import SH_C0
 from csplat.scene import BLOCK, Scene
 from csplat.types import F32
 

@@ -15,8 +15,7 @@ import numpy as np
 import csplat
 from csplat.errors import InputError
 from csplat.model import QUAT_LENGTH_TOLERANCE, SplatModel
-from csplat.ply import lint_ply, read_ply
-from csplat.ply_write import write_ply
+from csplat.ply import lint_ply, read_ply, write_ply
 from csplat_selftest.fuzzing import ply_mutants
 from csplat_selftest.fuzzing.ply_mutants import Ply, changed
 from csplat_selftest.fuzzing.targets import Case

@@ -14,7 +14,7 @@ from csplat.errors import CsplatError
 from csplat.formats import format_of, open_scene
 from csplat.model import SplatModel
 from csplat.scene import joined
-from csplat.training import TrainedOn
+from csplat.training_record import TrainingRecord
 from csplat_tools.files.extras import need_pictures, prepare_renderer
 from csplat_tools.files.pictures import to_bytes
 from csplat_tools.files.streams import write_bytes
@@ -68,7 +68,7 @@ def _jpeg(model: SplatModel) -> bytes:
 
     width, height = THUMBNAIL_SIZE
     camera = orbit_cameras(model, 1, _FINER * width, _FINER * height)[0]
-    said = TrainedOn.of(model.metadata)
+    said = TrainingRecord.of(model.metadata)
     picture = to_bytes(render(model, camera, background=said.background if said else (0.0, 0.0, 0.0), mode="fast").rgb)
     buffer = io.BytesIO()
     Image.fromarray(picture).resize(THUMBNAIL_SIZE, Image.Resampling.BOX).save(

@@ -28,7 +28,7 @@ from csplat.files import atomic_writer, local_file
 from csplat.formats import formats
 from csplat.inputs import File, mapped
 from csplat.model import SplatModel
-from csplat.ply_write import write_ply, write_scene_ply
+from csplat.ply import write_ply, write_scene_ply
 from csplat.remote import is_url
 from csplat.scene import Scene
 

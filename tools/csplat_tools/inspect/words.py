@@ -7,7 +7,7 @@ from typing import Any
 
 from csplat.decoder import SceneHeader
 from csplat.model import SplatModel
-from csplat.training import TRAINING, VIEW, TrainedOn
+from csplat.training_record import TRAINING, VIEW, TrainingRecord
 from csplat.upright import UP, up_of
 from csplat_tools.files.console import format_bytes
 from csplat_tools.inspect.info import AttributeFacts, FileFacts
@@ -31,7 +31,7 @@ def scene_words(facts: FileFacts) -> dict[str, str]:
         words["extra"] = extras
     if facts.cameras is not None:
         words["cameras"] = str(facts.cameras)
-    trained = TrainedOn.of(facts.metadata or {})
+    trained = TrainingRecord.of(facts.metadata or {})
     if trained is not None:
         words["trained on"] = str(trained)
     view = (facts.metadata or {}).get(VIEW)
@@ -63,7 +63,7 @@ def place_words(said: SceneHeader | SplatModel, count: int, metadata: Mapping[st
 def other_metadata(facts: FileFacts) -> dict[str, object]:
     """Return the metadata that `scene_words` does not describe."""
     metadata = dict(facts.metadata or {})
-    if TrainedOn.of(metadata) is not None:
+    if TrainingRecord.of(metadata) is not None:
         del metadata[TRAINING]
     if up_of(metadata) is not None:
         del metadata[UP]

@@ -11,7 +11,7 @@ import numpy as np
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.training import TrainedOn
+from csplat.training_record import TrainingRecord
 from csplat.types import F32, Progress
 from csplat_render import Camera, Mode, render
 from csplat_render.camera import resized
@@ -185,7 +185,7 @@ def _pictures(
     """Render camera after camera; see `render_folder`."""
     if prepare is not None:
         prepare()
-    said = TrainedOn.of(model.metadata)
+    said = TrainingRecord.of(model.metadata)
     behind = background or (said.background if said else BLACK)
     for number, camera in enumerate(cameras):
         if progress is not None:

@@ -9,7 +9,7 @@ from typing import Any
 import csplat_trainer
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError, counted
-from csplat.training import TrainedOn
+from csplat.training_record import TrainingRecord
 from csplat_render.kernels import thread_count
 from csplat_render.lpips import load_lpips
 from csplat_tools.files.console import note, step_progress
@@ -70,7 +70,7 @@ def run_training(
         views = find_view_set(model, data=data, aside=0)
         write_page(page, output, result.log, None, show_views(model, {"trained scene": model}, views, threads))
     if not quiet:
-        note(f"{output} says how to compare it with its photographs: {TrainedOn.of(result.model.metadata)}")
+        note(f"{output} says how to compare it with its photographs: {TrainingRecord.of(result.model.metadata)}")
     return result.log
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from csplat.model import UNSPECIFIED
-from csplat.training import TrainedOn
+from csplat.training_record import TrainingRecord
 from csplat.types import F32, F64
 from csplat.upright import Direction
 from csplat_render.camera import DEFAULT_NEAR, camera_outliers, nearest_point
@@ -62,13 +62,13 @@ class DataSet:
         images = (*self.train, *self.test)
         return _WHITE if 2 * sum(image.has_alpha for image in images) >= len(images) else _BLACK
 
-    def trained_on(self, background: tuple[float, float, float]) -> TrainedOn:
+    def trained_on(self, background: tuple[float, float, float]) -> TrainingRecord:
         """Return the record for a scene that was trained on this set.
 
         Args:
             background: red, green, blue behind the splats when the scene was scored.
         """
-        return TrainedOn(background, self.test_every, self.size, self.train[0].camera.near, self.images)
+        return TrainingRecord(background, self.test_every, self.size, self.train[0].camera.near, self.images)
 
     @cached_property
     def outliers(self) -> list[Picture]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from csplat.errors import InputError
 from csplat.lint import Finding
-from csplat.ply_file import parse
+from csplat.ply.ply_reader import parse_ply
 from csplat.types import F32, F64
 
 _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -43,7 +43,7 @@ def read_point_cloud(path: Path) -> tuple[F64, F32]:
     """
     findings: list[Finding] = []
     try:
-        content = parse(path, findings)
+        content = parse_ply(path, findings)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from error
     if content is None:

@@ -15,7 +15,7 @@ from csplat.decoder import decode
 from csplat.encoder import DecodedValues, Draft, EncodeOptions, EncodeResult, Importance, Origin
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
-from csplat.training import TrainedOn
+from csplat.training_record import TrainingRecord
 from csplat.types import I64
 from csplat_render.camera import relative_to
 from csplat_trainer.data import DataSet
@@ -153,7 +153,7 @@ def finetune(
 
 def _views_of(data: DataSet, model: SplatModel) -> Views:
     """Return the training photographs of a data set, in front of the background that the scene records."""
-    trained = TrainedOn.of(model.metadata)
+    trained = TrainingRecord.of(model.metadata)
     behind = data.background if trained is None else trained.background
     shift = np.subtract(model.origin, data.origin)
     looks = [View(relative_to(shift, one.camera), one) for one in data.train]

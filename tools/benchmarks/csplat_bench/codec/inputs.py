@@ -24,8 +24,7 @@ from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, encode
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
-from csplat.ply import read_ply
-from csplat.ply_write import write_ply
+from csplat.ply import read_ply, write_ply
 from csplat_bench.common.command import MARKDOWN, PEERS, preset_of, run
 from csplat_bench.common.peers import find_splat_transform, judged, transform
 from csplat_bench.common.report import table, tell_machine

@@ -26,7 +26,7 @@ import numpy as np
 import typer
 
 from csplat import read_ply
-from csplat.ply_write import write_scene_ply
+from csplat.ply import write_scene_ply
 from csplat.scene import Scene as Blocks
 from csplat_bench.common.command import CACHE, JSON, listed, run
 from csplat_bench.common.making import copies

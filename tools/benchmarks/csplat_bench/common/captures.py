@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypedDict
 
 from csplat.errors import InputError
-from csplat.ply_write import write_ply
+from csplat.ply import write_ply
 from csplat_bench.common.report import write_json
 from csplat_bench.common.scenes import DATA
 from csplat_tools.files.console import note

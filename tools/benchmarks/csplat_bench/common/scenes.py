@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from csplat.model import SplatModel
-from csplat.ply import read_ply
-from csplat.ply_write import write_ply
+from csplat.ply import read_ply, write_ply
 from csplat_bench.common.making import blow_up, crowd
 from csplat_render import Camera
 from csplat_render.camera_files import load_cameras

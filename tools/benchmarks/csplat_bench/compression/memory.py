@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from csplat.ply import read_ply
-from csplat.ply_write import write_ply
+from csplat.ply import read_ply, write_ply
 from csplat_bench.common.making import with_splats
 from csplat_bench.common.measuring import alone, peak_bytes, reset_peak
 from csplat_bench.compression.rows import Memory

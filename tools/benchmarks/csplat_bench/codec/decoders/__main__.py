@@ -34,8 +34,7 @@ import typer
 
 from csplat import EncodeOptions, encode
 from csplat.formats import write
-from csplat.ply import read_ply
-from csplat.ply_write import write_ply
+from csplat.ply import read_ply, write_ply
 from csplat_bench.codec.decoders.started import DECODERS, Decoder, Process, Tab, built
 from csplat_bench.common.browser import open_page, serve
 from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, PRESETS, SCENES, listed, preset_of, run

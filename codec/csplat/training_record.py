@@ -21,7 +21,7 @@ _COLOURS = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
 
 
 @dataclass(frozen=True)
-class TrainedOn:
+class TrainingRecord:
     """Settings of the training that a comparison of the scene with its photographs has to repeat.
 
     Attributes:
@@ -39,7 +39,7 @@ class TrainedOn:
     images: str | None = None
 
     @classmethod
-    def of(cls, metadata: Mapping[str, Any]) -> TrainedOn | None:
+    def of(cls, metadata: Mapping[str, Any]) -> TrainingRecord | None:
         """Return the record in a scene's metadata; `None` if it has none, or none that can be understood."""
         try:
             return cls.from_json(metadata[TRAINING]) if TRAINING in metadata else None
@@ -47,7 +47,7 @@ class TrainedOn:
             return None
 
     @classmethod
-    def from_json(cls, said: object) -> TrainedOn:
+    def from_json(cls, said: object) -> TrainingRecord:
         """The inverse of `as_json`; members of other names are passed over.
 
         Raises:

@@ -1,4 +1,14 @@
-"""Scene metadata beyond the columns, as comment lines of a PLY header."""
+"""Read and write the metadata of a scene as comment lines of a PLY header, and split positions from their origin.
+
+| comment | meaning |
+|---|---|
+| `csplat origin X Y Z` | x, y, z are relative to it |
+| `csplat absolute_origin X Y Z` | x, y, z are absolute, in doubles |
+| `csplat coordinate_system RDF` | directions of the axes |
+| `csplat up X Y Z`, `csplat unit_metres U`, `csplat licence TEXT` | as in `SplatModel` |
+| `csplat training {JSON}`, `csplat view {JSON}` | the training (`csplat.training_record`) and the first view |
+| `SplatRenderMode: mip`, `SplatRenderMode: 2dgs` | antialiased, flat: the words of other programs |
+"""
 
 from __future__ import annotations
 
@@ -9,10 +19,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import UNSPECIFIED, SplatModel
-from csplat.training import TRAINING, VIEW, TrainedOn
+from csplat.training_record import TRAINING, VIEW, TrainingRecord
+from csplat.types import F32, F64
 from csplat.upright import UP, unit_up, up_of
 
 _PREFIX = "csplat"
@@ -31,7 +45,7 @@ _MODES: dict[tuple[str, ...], str] = {
 
 
 @dataclass
-class SceneFacts:
+class CommentMetadata:
     """Scene metadata from comments; defaults for what they leave out.
 
     Attributes:
@@ -57,14 +71,14 @@ class SceneFacts:
         return {name: getattr(self, name) for name in names}
 
 
-def parse_comments(comments: Sequence[str]) -> SceneFacts:
+def parse_comments(comments: Sequence[str]) -> CommentMetadata:
     """Read the comment lines of a header, without the word `comment`.
 
     Raises:
         InputError: a line begins as ours but its value cannot be understood. To skip an origin
             would put the scene elsewhere, to skip its background would judge it wrongly.
     """
-    facts = SceneFacts()
+    facts = CommentMetadata()
     others: list[str] = []
     vertical: list[str] = []
     by_brush = any(comment.strip().lower() == _SAYS_NOTHING for comment in comments)
@@ -88,7 +102,7 @@ def parse_comments(comments: Sequence[str]) -> SceneFacts:
     return facts
 
 
-def _set_vertical_axis(facts: SceneFacts, comments: Sequence[str]) -> Sequence[str]:
+def _set_vertical_axis(facts: CommentMetadata, comments: Sequence[str]) -> Sequence[str]:
     """Take the up axis from a comment if nothing else names it; return the comments that carry other information."""
     if not comments:
         return ()
@@ -142,13 +156,13 @@ def format_comments(model: SplatModel, *, absolute: bool) -> list[str]:
     view = model.metadata.get(VIEW)
     if isinstance(view, dict) and _is_json(view):
         lines.append(f"{_PREFIX} {VIEW} {json.dumps(view)}")
-    trained = TrainedOn.of(model.metadata)
+    trained = TrainingRecord.of(model.metadata)
     if trained is not None:
         lines.append(f"{_PREFIX} {TRAINING} {json.dumps(trained.as_json())}")  # ASCII, whatever names hold
     return [line.encode("ascii", "replace").decode("ascii") for line in lines]
 
 
-def _parse_fact(facts: SceneFacts, key: str, values: Sequence[str]) -> bool:
+def _parse_fact(facts: CommentMetadata, key: str, values: Sequence[str]) -> bool:
     """Take over one field; return `False` if the key is none of ours."""
     if key in ("origin", "absolute_origin"):
         x, y, z = _numbers(key, values, 3)
@@ -178,10 +192,10 @@ def _up(values: Sequence[str]) -> list[float]:
         raise InputError(f"the header comment {' '.join((_PREFIX, UP, *values))!r}: {error}") from None
 
 
-def _training(comment: str) -> TrainedOn:
+def _training(comment: str) -> TrainingRecord:
     said = _json(comment)
     try:
-        return TrainedOn.from_json(said)
+        return TrainingRecord.from_json(said)
     except InputError as error:
         raise _misunderstood(comment, str(error)) from None
 
@@ -229,3 +243,53 @@ def _numbers(key: str, values: Sequence[str], count: int) -> list[float]:
 
 def _strings(value: object) -> list[str]:
     return [one for one in value if isinstance(one, str)] if isinstance(value, list) else []
+
+
+#: float64 positions keep origin 0 while their centre is nearer than this many spreads: float32
+#: relative to 0 then is at most four bits coarser than relative to the centre.
+_NEAR_SPREADS = 16.0
+
+
+def split_origin(means: NDArray[Any], facts: CommentMetadata) -> tuple[F32, tuple[float, float, float], F64 | None]:
+    """Split the positions of a PLY into float32 means and the origin they are relative to.
+
+    Args:
+        means: [N, 3] x, y, z as the file has them, float32 or float64.
+        facts: metadata from the comments of the file, with their origin.
+
+    Returns:
+        [N, 3] float32 and three float64, in scene units; and the positions in doubles, where float32 does not hold
+        what is left of them.
+    """
+    with np.errstate(over="ignore"):  # the model refuses what leaves float32
+        if means.dtype == np.float32:
+            origin = None if facts.origin_is_added else facts.origin
+            return means, origin or (0.0, 0.0, 0.0), None
+        positions = means
+        origin = facts.origin
+        if origin is None:
+            origin = _origin_for(means)
+        elif not facts.origin_is_added:
+            positions = means + np.array(origin)
+        rounded = (positions - np.array(origin)).astype(np.float32)
+        exact = np.array_equal(rounded + np.array(origin), positions)
+        return rounded, origin, None if exact else positions
+
+
+def _origin_for(positions: F64) -> tuple[float, float, float]:
+    """Choose an origin for float64 positions so that float32 loses nothing that shows.
+
+    Zero, where float32 is exact or the scene lies around zero; else its centre (the median, which
+    outliers do not move), rounded to a power of two near the scene's spread.
+    """
+    if len(positions) == 0 or np.array_equal(positions, positions.astype(np.float32)):
+        return (0.0, 0.0, 0.0)
+    centre = np.median(positions, axis=0)
+    spread = float(np.median(np.abs(positions - centre), axis=0).max())
+    if np.abs(centre).max() <= _NEAR_SPREADS * spread:
+        return (0.0, 0.0, 0.0)
+    if spread > 0.0:
+        step = 2.0 ** np.floor(np.log2(spread))
+        centre = np.round(centre / step) * step
+    x, y, z = centre.tolist()
+    return x, y, z

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import counted
-from csplat.lint import Columns, Finding, colour_finding, float_columns, plain_name
+from csplat.lint import ColumnMap, Finding, colour_finding, float_columns, plain_name
 from csplat.model import QUAT_LENGTH_TOLERANCE, normalise_quats
 from csplat.types import F32, F64
 
@@ -52,7 +52,7 @@ _BYTE_COLOUR = 4.0  # an f_dc beyond is brighter than white, 1.77, and may be a 
 
 
 @dataclass(eq=False)
-class Arrays:
+class SplatArrays:
     """The arrays of a `SplatModel`, by the same names, filled row by row.
 
     `means` is float64 if the file's positions are double.
@@ -71,7 +71,7 @@ _NOTHING = (math.inf, -math.inf)
 
 
 @dataclass
-class Counts:
+class RowStatistics:
     """Counts and ranges of what was noticed in rows, updated block by block."""
 
     nonfinite: int = 0
@@ -85,21 +85,21 @@ class Counts:
     opacities: tuple[float, float] = _NOTHING  # as the file has them: least and largest
     scales: tuple[float, float] = _NOTHING
     colours: tuple[float, float] = _NOTHING
-    colour_range: float = 0.0  # as in `Columns`
+    colour_range: float = 0.0  # as in `ColumnMap`
     has_columns: bool = True  # they are rows of a PLY
     looked_at: list[tuple[NDArray[Any], F32]] = field(default_factory=list)  # means and scales of some splats
 
 
-def gather(
+def gather_arrays(
     blocks: Iterable[Rows],
     count: int,
     dtype: np.dtype[Any],
-    columns: Columns,
+    columns: ColumnMap,
     *,
     keep_extra: bool = False,
-    counts: Counts | None = None,
+    counts: RowStatistics | None = None,
     thinnest: float = math.inf,
-) -> Arrays:
+) -> SplatArrays:
     """Copy columns into arrays, dropping rows that are not finite and repairing rotations.
 
     Args:
@@ -115,7 +115,7 @@ def gather(
         Arrays of the splats that were kept.
     """
     out = _allocate(count, dtype, columns, keep_extra=keep_extra)
-    counts = Counts() if counts is None else counts
+    counts = RowStatistics() if counts is None else counts
     counts.colour_range = columns.colour_range
     at = 0
     with np.errstate(over="ignore", invalid="ignore"):  # overflow of float32 is found below
@@ -127,11 +127,11 @@ def gather(
             at += _repair(part, columns, counts, widths)
     kept = _part(out, slice(0, at))
     if len(columns.scales) == 2 and at:
-        kept.scales[:, 2] = thickness_of(kept.scales[:, :2], thinnest)
+        kept.scales[:, 2] = choose_thickness(kept.scales[:, :2], thinnest)
     return kept
 
 
-def thickness_of(scales: F32, thinnest: float = math.inf) -> np.float32:
+def choose_thickness(scales: F32, thinnest: float = math.inf) -> np.float32:
     """Choose the third scale of discs.
 
     Args:
@@ -141,7 +141,7 @@ def thickness_of(scales: F32, thinnest: float = math.inf) -> np.float32:
     return np.float32(min(scales.min(), np.float32(thinnest)) - np.float32(_FLAT_SCALE_STEP))
 
 
-def look_at(arrays: Arrays, scale_count: int, counts: Counts) -> None:
+def survey_arrays(arrays: SplatArrays, scale_count: int, counts: RowStatistics) -> None:
     """Count what is noticed in splats that are not the rows of a file; they stay as they are.
 
     Args:
@@ -150,11 +150,11 @@ def look_at(arrays: Arrays, scale_count: int, counts: Counts) -> None:
         counts: updated.
     """
     counts.has_columns = False
-    columns = Columns((), ("",) * scale_count, (), (), (), "", (), (), double=False)
+    columns = ColumnMap((), ("",) * scale_count, (), (), (), "", (), (), double=False)
     for start in range(0, len(arrays.means), _LOOKED_AT):
         part = _part(arrays, slice(start, start + _LOOKED_AT))
         means, quats, scales = part.means.copy(), part.quats.copy(), part.scales.copy()
-        copy = Arrays(means, quats, scales, part.opacities.copy(), part.sh0.copy(), part.shN.copy())
+        copy = SplatArrays(means, quats, scales, part.opacities.copy(), part.sh0.copy(), part.shN.copy())
         _repair(copy, columns, counts, None)
 
 
@@ -221,7 +221,7 @@ def _are_sane(rows: Rows, halves: set[str], *, alone: bool) -> bool:
     return math.exp(min(_HUGE_LOG, float(np.median(scales)))) <= 2.0 * float(most.max())
 
 
-def with_colour_range(blocks: Iterable[Rows], columns: Columns, findings: list[Finding]) -> Columns:
+def with_colour_range(blocks: Iterable[Rows], columns: ColumnMap, findings: list[Finding]) -> ColumnMap:
     """Take red, green and blue of 16 bits that are none above 255 for what bytes would be.
 
     Args:
@@ -275,9 +275,9 @@ def logits_of_alpha(alpha: F32) -> F32:
     return logits.astype(np.float32)
 
 
-def _allocate(count: int, dtype: np.dtype[Any], columns: Columns, *, keep_extra: bool) -> Arrays:
+def _allocate(count: int, dtype: np.dtype[Any], columns: ColumnMap, *, keep_extra: bool) -> SplatArrays:
     extra = columns.extra if keep_extra else ()
-    return Arrays(
+    return SplatArrays(
         means=np.empty((count, 3), np.float64 if columns.double else np.float32),
         quats=np.empty((count, 4), np.float32),
         scales=np.empty((count, 3), np.float32),
@@ -288,8 +288,8 @@ def _allocate(count: int, dtype: np.dtype[Any], columns: Columns, *, keep_extra:
     )
 
 
-def _part(arrays: Arrays, rows: slice) -> Arrays:
-    return Arrays(
+def _part(arrays: SplatArrays, rows: slice) -> SplatArrays:
+    return SplatArrays(
         arrays.means[rows],
         arrays.quats[rows],
         arrays.scales[rows],
@@ -300,7 +300,7 @@ def _part(arrays: Arrays, rows: slice) -> Arrays:
     )
 
 
-def _copy(rows: Rows, columns: Columns, part: Arrays) -> None:
+def _copy(rows: Rows, columns: ColumnMap, part: SplatArrays) -> None:
     """Copy every column group of a block; opacities stay logits, rotations stay as they are."""
     _copy_group(rows, columns.means, part.means)
     _copy_group(rows, columns.quats, part.quats)
@@ -346,7 +346,7 @@ def _nonzero_rows(rows: Rows, names: Sequence[str]) -> int:
     return int(np.count_nonzero(nonzero))
 
 
-def _repair(part: Arrays, columns: Columns, counts: Counts, widths: F64 | None) -> int:
+def _repair(part: SplatArrays, columns: ColumnMap, counts: RowStatistics, widths: F64 | None) -> int:
     """Repair a block in place, moving the rows that are kept to the front. Return how many are kept.
 
     Args:
@@ -386,7 +386,7 @@ def _repair(part: Arrays, columns: Columns, counts: Counts, widths: F64 | None) 
     if columns.colour_range:
         part.sh0[:] = (part.sh0 / np.float32(columns.colour_range) - np.float32(0.5)) / SH_C0
     _repair_quats(part.quats, counts)
-    counts.huge += huge_rows(part.scales[:, :scale_count], part.sh0, part.shN)
+    counts.huge += count_huge_rows(part.scales[:, :scale_count], part.sh0, part.shN)
     return len(part.opacities)
 
 
@@ -419,7 +419,7 @@ def _fuse_filter(scales: F32, alphas: F64, widths: F64) -> None:
     scales[rows] = after
 
 
-def huge_rows(scales: NDArray[Any], *colours: NDArray[Any]) -> int:
+def count_huge_rows(scales: NDArray[Any], *colours: NDArray[Any]) -> int:
     """Count splats with values that no picture can be meant by.
 
     Args:
@@ -435,7 +435,7 @@ def huge_rows(scales: NDArray[Any], *colours: NDArray[Any]) -> int:
     return 0 if huge is None else int(np.count_nonzero(huge))
 
 
-def _repair_quats(quats: F32, counts: Counts) -> None:
+def _repair_quats(quats: F32, counts: RowStatistics) -> None:
     wide = quats.astype(np.float64)
     squared = np.einsum("ij,ij->i", wide, wide)
     zero = int(np.count_nonzero(squared == 0.0))
@@ -449,7 +449,7 @@ def _repair_quats(quats: F32, counts: Counts) -> None:
     quats[:] = normalise_quats(quats)
 
 
-def findings_of(counts: Counts, count: int) -> list[Finding]:
+def list_findings(counts: RowStatistics, count: int) -> list[Finding]:
     """Return the findings about what was noticed in `count` rows."""
     nonfinite = f"{counted(counts.nonfinite, 'splat')} with NaN or infinity"
     findings = [
@@ -499,7 +499,7 @@ def findings_of(counts: Counts, count: int) -> list[Finding]:
     return [finding for finding in findings if finding.count] + _suspicions(counts, count - counts.nonfinite)
 
 
-def _suspicions(counts: Counts, kept: int) -> list[Finding]:
+def _suspicions(counts: RowStatistics, kept: int) -> list[Finding]:
     """Report properties that all splats share but no trained scene has: values after their activation."""
     found = []
     colours = counts.colours
@@ -526,7 +526,7 @@ def _suspicions(counts: Counts, kept: int) -> list[Finding]:
     return found
 
 
-def _are_lengths(counts: Counts) -> bool:
+def _are_lengths(counts: RowStatistics) -> bool:
     """Tell whether scales above 0 fit the scene as lengths, and as logarithms do not."""
     means, scales = (np.concatenate(arrays) for arrays in zip(*counts.looked_at, strict=True))
     extent = float(np.subtract(*np.quantile(means, (0.95, 0.05), axis=0)).max())

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.files import BinaryWriter, opened_for_writing
 from csplat.model import SplatModel, check_model
-from csplat.ply_columns import logits_of_alpha
-from csplat.ply_comments import format_comments
+from csplat.ply.columns import logits_of_alpha
+from csplat.ply.comments import format_comments
 from csplat.scene import Scene
 
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are put together at a time: they stay in the cache

@@ -1,13 +1,16 @@
-"""The header of a PLY file, whichever way a program spells it.
+"""Rewrite headers and text rows that plyfile does not accept but whose meaning is clear.
 
-plyfile takes headers as the format describes them. What others write and what means the same is rewritten for it:
-byte order marks, blank lines, keywords in capitals, spaces behind `end_header`.
+Headers: byte order marks, blank lines, keywords in capitals, spaces after `end_header`. Text rows: several on one line
+or one over several lines, decimal commas, the NaN and infinity of other languages. Ambiguous text is an error naming
+the number or the row.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 
 from csplat.detect import KINDS, by_content, head_of, is_ply, refusal
@@ -15,7 +18,7 @@ from csplat.errors import InputError, counted
 from csplat.lint import Finding
 
 #: The element that holds the splats.
-ELEMENT = "vertex"
+SPLAT_ELEMENT = "vertex"
 
 _END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", re.IGNORECASE)
 _MAX_SIZE = 1 << 20
@@ -26,7 +29,7 @@ _FREE_TEXT = (b"comment", b"obj_info")  # keywords that are followed by free tex
 
 
 @dataclass
-class Element:
+class PlyElement:
     """An element as a header declares it.
 
     Attributes:
@@ -43,7 +46,7 @@ class Element:
 
 
 @dataclass(frozen=True)
-class Header:
+class PlyHeader:
     """A header that plyfile can parse.
 
     Attributes:
@@ -56,7 +59,7 @@ class Header:
     start: int
     text: bytes
     is_text: bool
-    elements: list[Element]
+    elements: list[PlyElement]
 
     @property
     def end(self) -> int:
@@ -64,7 +67,7 @@ class Header:
         return self.start + len(self.text)
 
 
-def read_header(path: Path, findings: list[Finding], kind: str = "ply") -> Header:
+def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> PlyHeader:
     """Read the header of a PLY.
 
     Args:
@@ -103,7 +106,7 @@ def read_header(path: Path, findings: list[Finding], kind: str = "ply") -> Heade
     text = bytes(byte if byte < 128 else ord("?") for byte in text)
     lines = [line.split() for line in text.splitlines()]
     findings += _count_findings(lines, path.stat().st_size)
-    return Header(start, text, any(words[:2] == [b"format", b"ascii"] for words in lines), _elements(lines))
+    return PlyHeader(start, text, any(words[:2] == [b"format", b"ascii"] for words in lines), _elements(lines))
 
 
 def _as_plyfile_takes_it(raw: bytes) -> tuple[bytes, list[str]]:
@@ -146,18 +149,18 @@ def _spelled(line: bytes) -> bytes:
     elif keyword == b"property":
         spelled = [*(word.lower() for word in words[:-1]), words[-1]]
     elif keyword == b"element":
-        named = [word.lower() if word.lower() == ELEMENT.encode() else word for word in words[1:]]
+        named = [word.lower() if word.lower() == SPLAT_ELEMENT.encode() else word for word in words[1:]]
         spelled = [keyword, *named]
     else:
         return line
     return line if words == spelled and keyword not in (b"ply", b"end_header") else b" ".join(spelled)
 
 
-def _elements(lines: list[list[bytes]]) -> list[Element]:
-    found: list[Element] = []
+def _elements(lines: list[list[bytes]]) -> list[PlyElement]:
+    found: list[PlyElement] = []
     for words in lines:
         if words[:1] == [b"element"] and len(words) == 3:
-            found.append(Element(words[1].decode(), int(words[2]) if words[2].isdigit() else 0))
+            found.append(PlyElement(words[1].decode(), int(words[2]) if words[2].isdigit() else 0))
         elif words[:1] == [b"property"] and len(words) > 2 and found:
             found[-1].properties.append(words[-1].decode())
             found[-1].has_lists |= words[1] == b"list"
@@ -178,3 +181,117 @@ def _count_findings(lines: list[list[bytes]], size: int) -> list[Finding]:
                 text = f"{count} rows are declared, the file has {size} bytes"
                 findings.append(Finding("truncated", count, text, "error"))
     return findings
+
+
+Rows = list[list[str]]
+
+_TEXT_LINE_END = re.compile(r"\r\n|\r|\n")
+_NAN = re.compile(r"(?<!\S)[+-]?(?:nan\([a-z]*\)|1\.#(?:ind|[qs]nan)0*)(?!\S)", re.IGNORECASE)
+_INFINITY = re.compile(r"(?<!\S)([+-]?)1\.#inf0*(?!\S)", re.IGNORECASE)
+_EXPONENT = re.compile(r"(?<!\S)([+-]?(?:\d+\.?\d*|\.\d+))d([+-]?\d+)(?!\S)", re.IGNORECASE)
+#: By what they are for messages, numbers that other languages write, and how Python does.
+_SPELLINGS = {
+    "NaN as Microsoft's C writes it": (_NAN, "nan"),
+    "infinity as Microsoft's C writes it": (_INFINITY, r"\1inf"),
+    "an exponent as Fortran writes it": (_EXPONENT, r"\1e\2"),
+}
+_DECIMAL_COMMA = re.compile(r"(?<=\d),(?=\d)")
+_NO_THOUSANDS = re.compile(r"\d,(?!\d{3}(?!\d))\d")  # not followed by three digits exactly
+
+
+class _RowError(ValueError):
+    """Rows that are none, for the reason that a finding names."""
+
+    def __init__(self, finding: Finding) -> None:
+        super().__init__(finding.text)
+        self.finding = finding
+
+
+def parse_text_rows(body: bytes, elements: Sequence[PlyElement]) -> tuple[Rows | None, list[Finding]]:
+    """Take the rows of all elements apart, however they are laid out.
+
+    Args:
+        body: the file behind its header.
+        elements: what the header declares.
+
+    Returns:
+        The words of each row, `None` where there are fewer rows than declared or one has more or fewer values; and
+        what was unusual.
+    """
+    text = body.decode("ascii", "replace")
+    said = []
+    for what, (pattern, written) in _SPELLINGS.items():
+        text, count = pattern.subn(written, text)
+        said += [f"{what} ({counted(count, 'number')})"] if count else []
+    first: _RowError | None = None
+    for separated, what in _separations(text):
+        lines = [line.split() for line in _TEXT_LINE_END.split(separated)]
+        try:
+            rows, laid_out, rest = _laid_out(lines, elements)
+        except _RowError as error:
+            first = first or error
+            continue
+        said += [what] * bool(what) + laid_out
+        findings = [Finding("unusual-rows", len(said), f"the rows have {', '.join(said)}", "note")] if said else []
+        size = len(" ".join(rest))
+        if size:
+            findings.append(Finding("trailing-bytes", size, f"{size} bytes after the last row: ignored", "repair"))
+        return rows, findings
+    assert first is not None, "there is one way at least"
+    return None, [first.finding]
+
+
+def _separations(text: str) -> list[tuple[str, str]]:
+    """The text with nothing but spaces between numbers, in each way that its commas can be meant; and that way."""
+    if "," not in text and ";" not in text:
+        return [(text, "")]
+    found = []
+    if "." not in text and _NO_THOUSANDS.search(text):
+        found.append((_DECIMAL_COMMA.sub(".", text.replace(";", " ")), "decimal commas"))
+    return [*found, (re.sub("[,;]", " ", text), "commas or semicolons between numbers"), (text, "")]
+
+
+def _laid_out(lines: Rows, elements: Sequence[PlyElement]) -> tuple[Rows, list[str], list[str]]:
+    """Give each row the values of one; what is unusual of the lines; and the words behind the last row.
+
+    Rows may share lines, or go on in the next one, as long as each line or each row ends with one of the other: a value
+    that is missing does not shift those behind it.
+    """
+    blank = next((at for at in range(len(lines) - 1, -1, -1) if lines[at]), -1) + 1 - sum(map(bool, lines))
+    said = ["blank lines"] if blank else []
+    lines = [line for line in lines if line]
+    rows: Rows = []
+    at = 0
+    for element in elements:
+        width = len(element.properties)
+        if not width:
+            raise _RowError(Finding("malformed", 1, f"the element {element.name} has no properties", "error"))
+        if element.has_lists or all(len(line) == width for line in lines[at : at + element.count]):
+            taken = lines[at : at + element.count]
+            if len(taken) < element.count:
+                raise _RowError(_truncated(element, len(taken)))
+            rows += taken
+            at += element.count
+            continue
+        ends = list(accumulate(map(len, lines[at:])))
+        count = next((number for number, end in enumerate(ends, 1) if end >= width * element.count), len(ends))
+        ends = ends[:count]
+        wanted = set(range(width, width * element.count + 1, width))
+        if not ends or ends[-1] != width * element.count or not (wanted <= set(ends) or set(ends) <= wanted):
+            row, line = next((pair for pair in enumerate(lines[at:]) if len(pair[1]) != width), (0, []))
+            text = f"row {row} of {element.name} has {len(line)} values, expected {width}"
+            raise _RowError(Finding("malformed", 1, text, "error"))
+        words = [word for line in lines[at : at + count] for word in line]
+        rows += [words[first : first + width] for first in range(0, len(words), width)]
+        said.append(f"{element.count} of {element.name} in {count} lines" if count > 1 else "all values in one line")
+        at += count
+    rest = [word for line in lines[at:] for word in line]
+    if rest and len(rows) != at:
+        text = f"there are {counted(len(rest), 'value')} behind rows that are not in lines of their own"
+        raise _RowError(Finding("malformed", len(rest), text, "error"))
+    return rows, said, rest
+
+
+def _truncated(element: PlyElement, present: int) -> Finding:
+    text = f"{element.count} rows of {element.name} are declared, {present} are there: copy or download it again"
+    return Finding("truncated", element.count - present, text, "error")

@@ -1,0 +1,502 @@
+"""Read PLY files of 3D Gaussian splats.
+
+The only module that imports plyfile, which is GPL-3.0-or-later: programs that embed the decoder and never read a PLY
+do not load it.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+import plyfile
+
+from csplat.errors import InputError, counted
+from csplat.files import local_file
+from csplat.inputs import File
+from csplat.lint import ColumnMap, Finding, find_columns, refuse
+from csplat.model import SplatModel, check_sh_degree
+from csplat.ply.columns import (
+    Rows,
+    RowStatistics,
+    SplatArrays,
+    gather_arrays,
+    list_findings,
+    with_colour_range,
+    with_half_floats,
+)
+from csplat.ply.comments import CommentMetadata, parse_comments, split_origin
+from csplat.ply.ply_header import SPLAT_ELEMENT, PlyHeader, parse_text_rows, read_ply_header
+from csplat.scene import BLOCK, Scene
+from csplat.types import F32, F64
+
+_EMPTY = Finding("empty", 0, "the file holds no splats", "note")
+
+
+def read_ply(
+    file: File,
+    *,
+    strict: bool = False,
+    keep_extra: bool = False,
+    sh_degree: int | None = None,
+    report: list[Finding] | None = None,
+) -> SplatModel:
+    """Read a PLY of splats: binary of either byte order or ASCII, SH degree 0 to 3.
+
+    Columns that another program names in its own way are found by a table (`csplat.lint`): those of CloudCompare,
+    red, green and blue in place of f_dc, and the filter of Mip-Splatting, which is fused. Each is reported.
+
+    Opacities go through the sigmoid in float64, rounded once; above a logit of 16 float32 alpha
+    is too close to 1 to keep neighbours apart. Rotations become unit length. Positions in doubles
+    get an `origin`, named by a comment of the file or chosen so that float32 loses nothing.
+    Header comments are kept in `metadata["comments"]`.
+
+    Args:
+        file: its path; an open binary file, or the bytes, of which a temporary copy is made.
+        strict: refuse what would be repaired (`csplat.lint` lists it).
+        keep_extra: keep columns that splats do not have in `SplatModel.extra`.
+        sh_degree: leave out the SH bands above, also of a file of a higher degree than 3; `None`: keep all.
+        report: findings are appended to this list, repairs among them.
+
+    Examples:
+        >>> import csplat
+        >>> model = csplat.read_ply("scene.ply")
+        >>> model
+        SplatModel(1000 splats, sh_degree=3)
+        >>> model.scales.shape, model.scales.dtype  # natural logarithms
+        ((1000, 3), dtype('float32'))
+
+    Raises:
+        InputError: not a PLY of splats (other splat formats are named, with a converter), or one
+            that cannot be repaired, or under `strict` one that would have to be.
+        OSError: the file cannot be read.
+    """
+    findings: list[Finding] = []
+    try:
+        with local_file(file) as path:
+            model = _load(path, findings, keep_extra=keep_extra, strict=strict, sh_degree=sh_degree)
+    finally:
+        if report is not None:
+            report.extend(findings)
+    refuse(findings, strict=strict)
+    assert model is not None, "without an error there is a model"
+    return model
+
+
+def lint_ply(file: File, *, sh_degree: int | None = None) -> list[Finding]:
+    """Find out what is wrong with a PLY of splats, without refusing it.
+
+    Args:
+        file: as in `read_ply`.
+        sh_degree: as in `read_ply`.
+
+    Returns:
+        Findings in the order of reading; the last one is an error where `read_ply` would refuse.
+
+    Raises:
+        InputError: not a PLY at all, or its header cannot be parsed.
+        OSError: the file cannot be read.
+    """
+    findings: list[Finding] = []
+    with local_file(file) as path:
+        opened = _opened(path, findings, keep_extra=False, strict=False, sh_degree=sh_degree)
+        if opened is not None:
+            survey = _surveyed(path, opened, findings)
+            if len(opened.rows) == 0:
+                findings.append(_EMPTY)
+            _without_splats(opened, survey)  # a model refuses what no finding is about
+            for _ in _models(path, opened, survey, keep_extra=False):
+                pass
+    return findings
+
+
+@contextmanager
+def open_ply(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
+    """Open a PLY as `csplat.formats` does; the rest as `read_ply`.
+
+    What belongs to all splats (how many are kept, an origin for doubles, the thickness of discs) is found first, in a
+    pass of its own.
+    """
+    findings: list[Finding] = []
+    opened = _opened(path, findings, keep_extra=True, strict=False, sh_degree=sh_degree)
+    refuse(findings, strict=False)
+    assert opened is not None, "without an error there are rows"
+    survey = _surveyed(path, opened, findings)
+    refuse(findings, strict=False)
+    facts = _without_splats(opened, survey)
+    yield Scene(survey.kept, facts, partial(_models, path, opened, survey, keep_extra=True), findings)
+
+
+_Placed = tuple[F32, tuple[float, float, float], F64 | None]  # means, origin, means in doubles
+
+
+class _Survey(NamedTuple):
+    """Facts about all splats of a file together.
+
+    Attributes:
+        kept: splats without those that are dropped.
+        thinnest: the smallest scale.
+        placed: for positions in doubles, all of them, in their places.
+    """
+
+    kept: int
+    thinnest: float
+    placed: _Placed | None
+
+
+def _surveyed(path: Path, opened: _Opened, findings: list[Finding]) -> _Survey:
+    """Go through all rows, appending what is noticed to `findings`."""
+    counts, total, positions, thinnest, columns = RowStatistics(), 0, [], math.inf, opened.columns
+    for block in row_blocks(path, opened.rows, BLOCK):
+        arrays = gather_arrays([block], len(block), opened.rows.dtype, columns, counts=counts)
+        total += len(arrays.means)
+        thinnest = min(thinnest, float(arrays.scales[:, : len(columns.scales)].min(initial=math.inf)))
+        if columns.double:
+            positions.append(arrays.means)
+    findings += list_findings(counts, len(opened.rows))
+    if not columns.double:
+        return _Survey(total, thinnest, None)
+    placed = split_origin(np.concatenate([np.zeros((0, 3)), *positions]), opened.facts)
+    findings.append(_doubles_finding(opened, total, placed[1]))
+    return _Survey(total, thinnest, placed)
+
+
+def _without_splats(opened: _Opened, survey: _Survey) -> SplatModel:
+    """Everything that is said of the scene."""
+    empty = gather_arrays([], 0, opened.rows.dtype, opened.columns, keep_extra=True)
+    placed = split_origin(empty.means, opened.facts)
+    return _model(empty, placed if survey.placed is None else (placed[0], survey.placed[1], None), opened)
+
+
+def _models(path: Path, opened: _Opened, survey: _Survey, *, keep_extra: bool) -> Iterator[SplatModel]:
+    """The splats that are kept, some at a time."""
+    at = 0
+    for block in row_blocks(path, opened.rows, BLOCK):
+        arrays = gather_arrays(
+            [block], len(block), opened.rows.dtype, opened.columns, keep_extra=keep_extra, thinnest=survey.thinnest
+        )
+        part = slice(at, at + len(arrays.means))
+        if survey.placed is None:
+            placed = split_origin(arrays.means, opened.facts)
+        else:
+            means, origin, doubles = survey.placed
+            placed = means[part], origin, None if doubles is None else doubles[part]
+        at = part.stop
+        if len(arrays.means):
+            yield _model(arrays, placed, opened)
+
+
+@dataclass(frozen=True, eq=False)
+class _Opened:
+    rows: Rows
+    columns: ColumnMap
+    facts: CommentMetadata
+
+
+def _opened(
+    path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool, sh_degree: int | None
+) -> _Opened | None:
+    """Look at all but the rows, appending what is noticed to `findings`; `None` if that holds an error."""
+    check_sh_degree(sh_degree)
+    content = parse_ply(path, findings)
+    if content is None:
+        return None
+    rows = with_half_floats(content.rows, findings)
+    if any(not one.repairable for one in findings):
+        return None
+    columns, more = find_columns(
+        rows.dtype, keep_extra=keep_extra, sh_degree=sh_degree, elements=content.elements
+    )  # fmt: skip
+    findings += more
+    if columns is None:
+        return None
+    refuse(findings, strict=strict)  # before the work
+    columns = with_colour_range(row_blocks(path, rows), columns, findings)
+    facts = parse_comments(content.comments)
+    findings += facts.findings
+    return _Opened(rows, columns, facts)
+
+
+def _load(
+    path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool, sh_degree: int | None
+) -> SplatModel | None:
+    """Read a file, appending what is noticed to `findings`; `None` if that holds an error."""
+    opened = _opened(path, findings, keep_extra=keep_extra, strict=strict, sh_degree=sh_degree)
+    if opened is None:
+        return None
+    rows, columns, counts = opened.rows, opened.columns, RowStatistics()
+    arrays = gather_arrays(row_blocks(path, rows), len(rows), rows.dtype, columns, keep_extra=keep_extra, counts=counts)
+    findings += list_findings(counts, len(rows))
+    if len(rows) == 0:
+        findings.append(_EMPTY)
+    placed = split_origin(arrays.means, opened.facts)
+    if columns.double:
+        findings.append(_doubles_finding(opened, len(arrays.means), placed[1]))
+    return _model(arrays, placed, opened)
+
+
+def _doubles_finding(opened: _Opened, count: int, origin: tuple[float, float, float]) -> Finding:
+    is_float = all(opened.rows.dtype[name].kind == "f" for name in opened.columns.means)
+    text = f"positions are {'in doubles' if is_float else 'integers'}: {count} means are float32 relative to {origin}"
+    return Finding("double-means", count, text, "note")
+
+
+def _model(arrays: SplatArrays, placed: _Placed, opened: _Opened) -> SplatModel:
+    means, origin, doubles = placed
+    facts = opened.facts
+    return SplatModel(
+        means=means,
+        quats=arrays.quats,
+        scales=arrays.scales,
+        opacities=arrays.opacities,
+        sh0=arrays.sh0,
+        shN=arrays.shN,
+        origin=origin,
+        **{**facts.fields(), "flat": facts.flat or len(opened.columns.scales) == 2},
+        extra=arrays.extra,
+        means_double=doubles,
+    )
+
+
+_FRAME = "delta_vertex_"  # prefix of Brush's elements: differences of later frames from the first
+#: Elements of Apple's ml-sharp (gaussians.py): the camera of its image, and data that only its programs read.
+_SHARP = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space", "version"}
+_COLOUR_SPACE, _SRGB = "color_space", 0
+_BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time: they stay in the cache
+_EARLY_END = "early end-of-file"  # message of plyfile
+_SHOWN = 40  # characters of a word in a message
+
+
+class PlyContent(NamedTuple):
+    """Contents of a PLY of splats.
+
+    Attributes:
+        rows: scalar columns of the splats.
+        comments: lines of the header.
+        elements: names of the other elements, which are all dropped.
+    """
+
+    rows: Rows
+    comments: list[str]
+    elements: list[str]
+
+
+def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
+    """Let plyfile parse a file.
+
+    Args:
+        path: path of the file.
+        findings: anything noticed is appended.
+
+    Returns:
+        Its content; `None` if the findings hold an error.
+
+    Raises:
+        InputError: not a PLY of splats, or its header cannot be parsed.
+        OSError: it cannot be read.
+    """
+    header = read_ply_header(path, findings)
+    if any(not one.repairable for one in findings):
+        return None
+    # Numbers of text beyond their type become infinite, which is found later. NumPy warns of that, and of an empty
+    # table, which plyfile then refuses.
+    quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
+    with _open(path, header) as stream, np.errstate(over="ignore"), quiet:
+        try:
+            try:
+                parsed = plyfile.PlyData.read(stream)
+                end = None if parsed.text else stream.tell()
+                findings += _trailing_findings(path, header, end, sum(element.count for element in parsed))
+            except plyfile.PlyElementParseError as error:
+                parsed = _read_again(path, header, findings, error)
+        except (plyfile.PlyParseError, ValueError, OverflowError, MemoryError) as error:
+            raise InputError(f"{path.name}: {error or type(error).__name__}") from None
+    if parsed is None:
+        return None
+    if SPLAT_ELEMENT not in parsed:
+        raise InputError(f"{path.name} has no element {SPLAT_ELEMENT!r}: not a PLY of splats")
+    others = [element for element in parsed if element.name != SPLAT_ELEMENT]
+    findings += _other_findings(others)
+    rows, lists = _scalars(parsed[SPLAT_ELEMENT].data)
+    if lists:
+        text = f"list properties {', '.join(lists)}: dropped"
+        findings.append(Finding("list-columns", len(lists), text, "repair"))
+    comments = [*parsed.comments, *parsed.obj_info]
+    for element in parsed:
+        comments += element.comments
+    return PlyContent(rows, comments, [element.name for element in others])
+
+
+def _read_again(path: Path, header: PlyHeader, findings: list[Finding], error: Any) -> Any:
+    """Read a file that plyfile could not read as it is; `None`: it is refused, and the findings give the reason.
+
+    Args:
+        path: path of the file.
+        header: its header.
+        findings: anything noticed is appended.
+        error: the error that plyfile raised.
+    """
+    if not header.is_text or error.message == _EARLY_END:
+        present, declared = error.row or 0, error.element.count
+        text = f"{declared} rows of {error.element.name} are declared, {present} are there: copy or download it again"
+        findings.append(Finding("truncated", declared - present, text, "error"))
+        return None
+    with path.open("rb") as stream:
+        stream.seek(header.end)
+        rows, more = parse_text_rows(stream.read(), header.elements)
+    findings += more
+    if rows is None:
+        return None
+    text = "\n".join([*header.text.decode("ascii").splitlines(), *map(" ".join, rows), ""])
+    try:
+        return plyfile.PlyData.read(io.StringIO(text))
+    except plyfile.PlyElementParseError as second:
+        findings.append(_row_finding(second, rows, header))
+        return None
+
+
+def _row_finding(error: Any, rows: list[list[str]], header: PlyHeader) -> Finding:
+    """Report which value of a row of text is wrong."""
+    name, row, said = error.element.name, error.row or 0, error.message
+    at = [element.name for element in header.elements].index(name)
+    element, before = header.elements[at], sum(one.count for one in header.elements[:at])
+    if error.prop is not None and not element.has_lists:
+        word = rows[before + row][element.properties.index(error.prop.name)]
+        kind = np.dtype(error.prop.val_dtype)
+        wanted = "a number" if kind.kind == "f" else f"an integer of type {kind.name}"
+        said = f"{error.prop.name} is {word[:_SHOWN]!r}, expected {wanted}"
+    return Finding("malformed", 1, f"row {row} of {name}: {said}", "error")
+
+
+def _other_findings(others: list[Any]) -> list[Finding]:
+    """Report what becomes of elements that are no splats."""
+    if not others:
+        return []
+    names = [element.name for element in others]
+    text = f"elements besides {SPLAT_ELEMENT}: {', '.join(names)}: dropped"
+    if not set(names) <= _SHARP:
+        if any(name.startswith(_FRAME) for name in names):
+            text += "; they move the splats, of which the first moment is kept"
+        return [Finding("other-elements", len(others), text, "repair")]
+    findings = [Finding("sharp-elements", len(others), f"{text}; they are the camera of ml-sharp", "note")]
+    for element in others:
+        values = element.data[_COLOUR_SPACE] if element.name == _COLOUR_SPACE == element.properties[0].name else ()
+        said = [value for value in values if value != _SRGB]
+        if said:
+            text = f"{_COLOUR_SPACE} is {said[0]} (linear RGB), expected {_SRGB} (sRGB): export the scene in sRGB"
+            findings.append(Finding("colour-space", 1, text, "error"))
+    return findings
+
+
+def _trailing_findings(path: Path, header: PlyHeader, end: int | None, row_count: int) -> list[Finding]:
+    """Count the bytes after the last row; an ASCII file (`end` is `None`) has a line per row."""
+    if end is not None:
+        count = path.stat().st_size - end
+        if count and _is_changed_as_text(path, header, count):
+            text = (
+                f"{counted(count, 'byte')} after the last row, and a carriage return before each line feed of the rows:"
+                " changed by a text-mode transfer (git autocrlf, FTP): copy it again as binary"
+            )
+            return [Finding("malformed", count, text, "error")]
+    else:
+        with path.open("rb") as stream:
+            stream.seek(header.end)
+            lines = stream.read().splitlines(keepends=True)
+        count = len(b"".join(lines[row_count:]).strip())
+    if count == 0:
+        return []
+    text = f"{counted(count, 'byte')} after the last row: ignored"
+    return [Finding("trailing-bytes", count, text, "repair")]
+
+
+def _is_changed_as_text(path: Path, header: PlyHeader, surplus: int) -> bool:
+    """Tell whether a carriage return was inserted before the line feeds of binary rows.
+
+    Args:
+        path: path of the file.
+        header: its header.
+        surplus: bytes after the last row.
+    """
+    if not header.text.endswith(b"\r\n"):
+        return False
+    feeds, last = 0, b"\n"
+    with path.open("rb") as stream:
+        stream.seek(header.end)
+        while block := stream.read(_BLOCK_SIZE):
+            found = block.count(b"\n")
+            feeds += found
+            if found != (last[-1:] + block).count(b"\r\n"):
+                return False
+            last = block
+    return surplus <= feeds
+
+
+def _scalars(data: Rows) -> tuple[Rows, list[str]]:
+    """Take list properties out of rows. Returns contiguous rows and the names taken out."""
+    names = data.dtype.names or ()
+    lists = [name for name in names if data.dtype[name].hasobject]
+    if not lists:
+        return data, []
+    kept = [(name, data.dtype[name]) for name in names if name not in lists]
+    rows = np.empty(len(data), kept)
+    for name, _ in kept:
+        rows[name] = data[name]
+    return rows, lists
+
+
+def row_blocks(path: Path, rows: Rows, most: int | None = None) -> Iterator[Rows]:
+    """Rows in blocks. Those of a memory map are read instead: aligned, and not resident twice.
+
+    Args:
+        path: path of the file.
+        rows: as `parse_ply` gives them.
+        most: rows of a block; `None`: the number that stays in the cache.
+    """
+    step = most or max(1, _BLOCK_SIZE // max(1, rows.dtype.itemsize))
+    if not isinstance(rows, np.memmap):
+        yield from (rows[start : start + step] for start in range(0, len(rows), step))
+        return
+    with path.open("rb") as stream:
+        stream.seek(rows.offset)
+        for start in range(0, len(rows), step):
+            want = min(step, len(rows) - start)
+            block = np.fromfile(stream, rows.dtype, want)
+            if len(block) != want:
+                raise InputError(f"{path.name} became shorter while it was read")
+            yield block
+
+
+def _open(path: Path, header: PlyHeader) -> IO[Any]:
+    """Open a PLY for plyfile, behind a byte order mark: as text if it is text, with the header that it takes."""
+    stream = _PlyReader(path, header)
+    return io.TextIOWrapper(stream, encoding="ascii", errors="replace") if header.is_text else stream
+
+
+class _PlyReader(io.BufferedReader):
+    """A file with another header."""
+
+    def __init__(self, path: Path, header: PlyHeader) -> None:
+        super().__init__(io.FileIO(path))
+        self.seek(header.start)
+        self._header, self._at = header.text, 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return self._with_header(super().read(size))
+
+    def read1(self, size: int = -1, /) -> bytes:
+        return self._with_header(super().read1(size))
+
+    def _with_header(self, data: bytes) -> bytes:
+        if self._at >= len(self._header):
+            return data
+        begin = self._header[self._at : self._at + len(data)]  # a byte at a time: the rest is not to be copied
+        self._at += len(begin)
+        return begin + data[len(begin) :]
