@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.decoder.header import Tile
 from csplat.decoder.streams import Ints
 
 _RUN_ELEMENTS = 1 << 18  # integers that are worked on at a time: they stay in the second-level cache
@@ -174,6 +175,21 @@ class Sparse:
 
 
 Block = Columns | Coded | Sparse
+
+
+@dataclass(frozen=True)
+class TileBlocks:
+    """The integers of a tile.
+
+    Attributes:
+        tile: its record.
+        blocks: by attribute id, those the tile has.
+        extra: the bits of the extra columns of known types, in the order of their records.
+    """
+
+    tile: Tile
+    blocks: dict[int, Block] = field(default_factory=dict)
+    extra: list[Ints] = field(default_factory=list)
 
 
 def work_dtype(bound: int) -> np.dtype[np.signedinteger]:

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.decoder.blocks import Columns, runs
+from csplat.decoder.blocks import Columns, TileBlocks, runs
 from csplat.decoder.header import SceneHeader
-from csplat.decoder.reconstruct import lattice_rows, quat_rows
-from csplat.decoder.tiles import TileBlocks, check_max_scale
+from csplat.decoder.reconstruct import check_max_scale, lattice_rows, quat_rows
 
 _INT32 = np.dtype(np.int32)
 _BAND_NAMES = {band: _spec.ATTRIBUTE_NAMES[_spec.ATTRIBUTE_SH0 + band] for band in range(1, _spec.SH_DEGREE_MAX + 1)}

@@ -16,8 +16,8 @@ from csplat.decoder.header import SceneHeader, Tile
 from csplat.decoder.index import read_header
 from csplat.decoder.jsontext import read_json
 from csplat.decoder.limits import Limits
+from csplat.decoder.reconstruct import Arrays
 from csplat.decoder.stated import StatedErrors, read_serr
-from csplat.decoder.tiles import Arrays
 from csplat.errors import InputError
 from csplat.model import SplatModel
 

@@ -7,19 +7,115 @@ checked integers, colours as red, green and blue; `integers.py` hands out the sa
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.decoder.blocks import Block, Coded, Columns, Sparse, runs, work_dtype
+from csplat.decoder.blocks import Block, Coded, Columns, Sparse, TileBlocks, runs, work_dtype
+from csplat.decoder.header import SceneHeader
 from csplat.decoder.streams import Ints
 from csplat.errors import FormatError
 from csplat.types import F32
 
 _SQRT_2 = float.fromhex("0x1.6A09E667F3BCDp+0")  # 7.5
 _INT32 = np.dtype(np.int32)
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """The arrays of section 3, for a scene or a tile of it.
+
+    Attributes:
+        means: [N, 3].
+        quats: [N, 4], w, x, y, z.
+        scales: [N, 3], natural logarithms.
+        opacities: [N].
+        sh0: [N, 3].
+        shN: [N, K, 3].
+        extra: [N] each, by name.
+    """
+
+    means: F32
+    quats: F32
+    scales: F32
+    opacities: F32
+    sh0: F32
+    shN: F32
+    extra: dict[str, NDArray[Any]]
+
+    @classmethod
+    def empty(cls, count: int, sh_degree: int, header: SceneHeader) -> Arrays:
+        """Allocate arrays for `count` splats, not filled."""
+        return cls(
+            means=np.empty((count, 3), np.float32),
+            quats=np.empty((count, 4), np.float32),
+            scales=np.empty((count, 3), np.float32),
+            opacities=np.empty(count, np.float32),
+            sh0=np.empty((count, 3), np.float32),
+            shN=np.empty((count, (sh_degree + 1) ** 2 - 1, 3), np.float32),
+            extra={column.name: np.empty(count, column.dtype) for column in header.extras if column.dtype},
+        )
+
+    def part(self, start: int, stop: int) -> Arrays:
+        """Return views of some splats."""
+        return Arrays(
+            means=self.means[start:stop],
+            quats=self.quats[start:stop],
+            scales=self.scales[start:stop],
+            opacities=self.opacities[start:stop],
+            sh0=self.sh0[start:stop],
+            shN=self.shN[start:stop],
+            extra={name: column[start:stop] for name, column in self.extra.items()},
+        )
+
+
+def write_tile(source: TileBlocks, header: SceneHeader, degree: int, opacities: F32, out: Arrays) -> None:
+    """Reconstruct a tile's values.
+
+    Args:
+        source: the tile's integers.
+        header: the scene.
+        degree: highest SH band wanted.
+        opacities: alpha of each level, `opacity_table`.
+        out: the tile's part of the arrays.
+    """
+    blocks = source.blocks
+    write_opacities(blocks[_spec.ATTRIBUTE_OPACITIES], opacities, out.opacities)
+    scales = header.attribute(_spec.ATTRIBUTE_SCALES)
+    largest = write_lattice(blocks[_spec.ATTRIBUTE_SCALES], scales, out.scales)
+    check_max_scale(source, scales, largest)
+    write_quats(blocks[_spec.ATTRIBUTE_QUATS], header.attribute(_spec.ATTRIBUTE_QUATS), out.quats)
+    write_lattice(blocks[_spec.ATTRIBUTE_MEANS], header.attribute(_spec.ATTRIBUTE_MEANS), out.means)
+    write_colour(blocks[_spec.ATTRIBUTE_SH0], header.attribute(_spec.ATTRIBUTE_SH0), out.sh0[:, None])
+    bands = {band: _spec.ATTRIBUTE_SH0 + band for band in range(1, degree + 1)}
+    write_bands(
+        {band: blocks[attribute] for band, attribute in bands.items() if attribute in blocks},
+        {band: header.attribute(attribute) for band, attribute in bands.items()},
+        out.shN,
+    )
+    for bits, column in zip(source.extra, out.extra.values(), strict=True):
+        column.view(bits.dtype)[:] = bits
+
+
+def check_max_scale(source: TileBlocks, record: _spec.AttributeRecord, largest: int) -> None:
+    """TIL-11; values grow with their integers, so the largest integer's value is the largest."""
+    step = np.ldexp(record.step, source.blocks[_spec.ATTRIBUTE_SCALES].exponent)
+    value = np.float32(np.float64(largest) * step)
+    # Bit for bit: NaN differs from everything, and +0 from −0.
+    if struct.pack("<f", source.tile.max_scale) != value.tobytes():
+        raise FormatError(
+            _spec.ERROR_BOX,
+            source.tile.offset + _spec.TILE_RECORD_OFFSETS["max_scale"],
+            "TIL-11",
+            "max_scale",
+            found=source.tile.max_scale,
+            wanted=float(value),
+        )
 
 
 # Lattices: means, scales, colours (7.1, 7.2, 7.4) --------------------------------------------------

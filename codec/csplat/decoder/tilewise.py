@@ -16,9 +16,9 @@ from csplat.decoder.codebooks import read_codebooks
 from csplat.decoder.header import SceneHeader, Tile
 from csplat.decoder.job import Job, model_of, prepare, read_side_chunks, read_texts, thread_count
 from csplat.decoder.limits import Limits, check_budget, float_bytes
-from csplat.decoder.reconstruct import opacity_table
+from csplat.decoder.reconstruct import Arrays, opacity_table, write_tile
 from csplat.decoder.stated import StatedErrors
-from csplat.decoder.tiles import Arrays, read_tile, write_tile
+from csplat.decoder.tiles import read_tile
 from csplat.inputs import LetGo
 from csplat.model import SplatModel
 
