@@ -12,7 +12,7 @@ from extremes import COUNT, write_small_scene
 from extremes_learnt import BLACK, COARSE, QUICK, SHORT, photographs_of
 
 from csplat import decode, read_ply
-from csplat.decoder import read_header, read_stated_errors
+from csplat.decoder import read_declared_bounds, read_header
 from csplat.encoder import Draft, EncodeResult, encode_with_report
 from csplat.errors import InputError
 from csplat.lint import Finding
@@ -88,7 +88,7 @@ def chain_of(name: str) -> Chain:
     result = encode_with_report(source)
     decoded = decode(result.data)
     proof = prove(
-        Source.of(source), decoded, read_header(result.data), read_stated_errors(result.data), result.source_index
+        Source.of(source), decoded, read_header(result.data), read_declared_bounds(result.data), result.source_index
     )
     (camera,) = virtual_cameras(source, 1, 24, 18)
     pictures = [render(model, camera, mode=mode) for model in (source, decoded) for mode in ("fast", "exact")]

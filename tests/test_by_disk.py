@@ -34,8 +34,8 @@ PARTS = PartSizes(least=200, most=200)  # small scenes have several
 def both(source, data, stated=None, index=None):
     """Return the proofs made in memory and by way of the disk as JSON, with numbers rounded to nine digits."""
     opened = open_tiles(data)
-    opened = replace(opened, stated_errors=stated or opened.stated_errors)
-    at_once = prove(Source.of(source), decode(data), opened.header, opened.stated_errors, index)
+    opened = replace(opened, declared_bounds=stated or opened.declared_bounds)
+    at_once = prove(Source.of(source), decode(data), opened.header, opened.declared_bounds, index)
     in_parts = prove_by_disk(scene_of(source), opened, index, memory_bytes=1, sizes=PARTS)
     assert at_once.failures == in_parts.failures
     assert at_once.clauses == in_parts.clauses
@@ -95,7 +95,7 @@ def test_a_partner_beyond_the_lattice_is_looked_for_as_far_as_is_stated(make_mod
     source = make_model(500, 0)
     result = encode_with_report(source, OPTIONS)
     moved = replace(source, means=source.means + np.float32(0.04))
-    stated = open_tiles(result.data).stated_errors
+    stated = open_tiles(result.data).declared_bounds
     for most in (0.2, 0.06):
         at_once, in_parts = both(moved, result.data, states(stated, means={"max": most}))
         assert at_once == in_parts
@@ -108,7 +108,7 @@ def test_processes_find_what_one_finds(make_model, monkeypatch):
     opened = open_tiles(encode_with_report(source, OPTIONS).data)
     far = np.where(np.arange(600) % 50, np.float32(0.04), np.float32(0.5))
     moved = replace(source, means=source.means + far[:, None])
-    opened = replace(opened, stated_errors=states(opened.stated_errors, means={"max": 0.07}))
+    opened = replace(opened, declared_bounds=states(opened.declared_bounds, means={"max": 0.07}))
     alone = prove_by_disk(scene_of(moved), opened, memory_bytes=1, sizes=PARTS)
     assert alone.failures
     monkeypatch.setattr(os, "cpu_count", lambda: 3)

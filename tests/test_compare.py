@@ -134,7 +134,7 @@ def test_both_kinds_of_file_are_read(scene, tmp_path):
     a, b = load_model(str(tmp_path / "scene")), load_model(str(tmp_path / "other"))
     assert len(a.model) == len(b.model) == len(scene)
     assert a.header is None
-    assert b.stated_errors is not None
+    assert b.declared_bounds is not None
     assert a.size_bytes == (tmp_path / "scene").stat().st_size
 
 

@@ -8,7 +8,7 @@ import pytest
 from tables import failures
 
 from csplat import _spec
-from csplat.decoder import job
+from csplat.decoder import decode_api
 from csplat.decoder.container import open_chunk
 from csplat_conformance import adapter
 from csplat_conformance.manifest import load
@@ -111,7 +111,7 @@ def test_a_decoder_that_leaves_ancillary_payloads_unread_passes_every_vector_on_
 
     def apply(stack):
         for name in ("read_json", "read_serr"):
-            stack.enter_context(mock.patch.object(job, name, frames))
+            stack.enter_context(mock.patch.object(decode_api, name, frames))
 
     about_chunks = [one for one in VECTOR_LIST if {"CHK", "JSN", "SER"} & {name[:3] for name in one.clauses}]
 

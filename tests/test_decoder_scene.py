@@ -194,7 +194,7 @@ def test_threads_change_nothing(threads):
 def test_a_whole_decode_says_which_checks_it_made():
     assert "all_chunk_crcs" in decode_scene(RICH).checks
     assert "all_chunk_crcs" not in decode_scene(RICH, tiles=[0]).checks
-    assert 0.25 == decode_scene(RICH).stated_errors.records[0].rms
+    assert 0.25 == decode_scene(RICH).declared_bounds.records[0].rms
 
 
 def test_a_damaged_layer_spares_those_who_do_not_read_it():

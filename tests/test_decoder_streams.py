@@ -7,7 +7,7 @@ import pytest
 
 from csplat import _spec
 from csplat.decoder.container import Cursor
-from csplat.decoder.streams import read_stream
+from csplat.decoder.entropy import read_stream
 from csplat.errors import FormatError, LimitError, UnsupportedError
 
 STORED, DEFLATE = _spec.CODER_STORED, _spec.CODER_DEFLATE

@@ -3,8 +3,8 @@
 import pytest
 
 from csplat import _spec
-from csplat.decoder import decode, decode_scene, read_cameras, read_metadata, read_options, read_stated_errors
-from csplat.decoder.jsontext import parse_json
+from csplat.decoder import decode, decode_scene, read_cameras, read_declared_bounds, read_metadata, read_options
+from csplat.decoder.metadata import parse_json
 from csplat.errors import FormatError
 from csplat_authoring.builder import build
 from csplat_authoring.samples import scene
@@ -66,7 +66,7 @@ def test_the_three_texts_reach_their_places():
     assert ({"licence": "CC0"}, [{"W": 2}]) == (model.metadata, model.cameras)
     assert ({"licence": "CC0"}, [{"W": 2}]) == (read_metadata(data), read_cameras(data))
     assert {"preset": "small"} == read_options(data) == decode_scene(data).options
-    assert read_stated_errors(data) is None
+    assert read_declared_bounds(data) is None
 
 
 def stated(source_count=2, pruned_count=0, flags=0, records=()):
@@ -80,8 +80,8 @@ def stated(source_count=2, pruned_count=0, flags=0, records=()):
 
 def test_stated_errors():
     data = stated(source_count=5, pruned_count=3, flags=1, records=((1, 0.5, 0.25), (4, 1.0, 1.7)))
-    errors = read_stated_errors(data)
-    assert errors == decode_scene(data).stated_errors
+    errors = read_declared_bounds(data)
+    assert errors == decode_scene(data).declared_bounds
     assert (5, 3, True) == (errors.source_count, errors.pruned_count, errors.refitted)
     assert [("means", 0.5, 0.25), ("sh0", 1.0, 1.7)] == [(e.measure, e.max, e.rms) for e in errors.records]
 

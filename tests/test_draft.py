@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from csplat import EncodeOptions, decode, encode
-from csplat.decoder import decode_scene, read_options, read_stated_errors
+from csplat.decoder import decode_scene, read_declared_bounds, read_options
 from csplat.encoder import Draft, Origin, encode_with_report
 from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
@@ -54,8 +54,8 @@ def test_other_colours_change_colours_alone(make_model):
         assert np.array_equal(getattr(before.model, name), getattr(after.model, name)), name
     np.testing.assert_allclose(before.model.sh0 + 1, after.model.sh0, atol=0.02)
     assert not after.model.shN.any()
-    assert (False, True) == (before.stated_errors.refitted, after.stated_errors.refitted)
-    assert ["means", "covariance", "opacities"] == [record.measure for record in after.stated_errors.records]
+    assert (False, True) == (before.declared_bounds.refitted, after.declared_bounds.refitted)
+    assert ["means", "covariance", "opacities"] == [record.measure for record in after.declared_bounds.records]
     assert model.sh0 is draft.model.sh0  # the draft is as it was
 
 
@@ -90,7 +90,7 @@ def test_what_is_said_stands_in_the_options(make_model):
 def test_a_file_says_what_it_stands_for(make_model):
     model, rows = make_model(300, 1), np.arange(100, 250)
     result = Draft.of(model.select(rows), origin=Origin(300, rows)).coded().write()
-    stated = read_stated_errors(result.data)
+    stated = read_declared_bounds(result.data)
     assert (300, 150, False) == (stated.source_count, stated.pruned_count, stated.refitted)
     assert set(rows) == set(result.source_index)
     assert {"means", "covariance", "opacities", "sh0", "sh1"} == set(result.report.errors)
@@ -106,15 +106,15 @@ def test_the_geometry_of_a_refitted_file_is_proved(make_model):
     draft = Draft.of(source.select(rows), origin=Origin(len(source), rows))
     result = draft.with_colours(draft.scene.sh0 + 1, draft.scene.shN).coded().write()
     scene = decode_scene(result.data)
-    whole = prove(Source.of(source), scene.model, scene.header, scene.stated_errors, result.source_index)
+    whole = prove(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index)
     assert whole.holds
     assert whole.rms_proved
     assert ["means", "covariance", "opacities"] == [one.name for one in whole.measures if one.holds]
     assert ("sh0", "sh1", "sh2", "sh3") == whole.unproved
-    assert prove(Source.of(source), scene.model, scene.header, scene.stated_errors).holds
+    assert prove(Source.of(source), scene.model, scene.header, scene.declared_bounds).holds
     moved = replace(source, means=source.means + np.float32(0.1))
-    assert not prove(Source.of(moved), scene.model, scene.header, scene.stated_errors, result.source_index).holds
-    other = prove(Source.of(source.select(slice(0, 399))), scene.model, scene.header, scene.stated_errors)
+    assert not prove(Source.of(moved), scene.model, scene.header, scene.declared_bounds, result.source_index).holds
+    other = prove(Source.of(source.select(slice(0, 399))), scene.model, scene.header, scene.declared_bounds)
     assert "source of 400 splats" in other.failures[0]
 
 
@@ -123,11 +123,11 @@ def test_a_file_of_adjusted_shapes_states_its_means_alone(make_model):
     adjusted = replace(source, scales=source.scales + np.float32(0.1)).select(rows)
     result = encode_with_report(adjusted, origin=Origin(len(source), rows, refitted=True, adjusted=True))
     scene = decode_scene(result.data)
-    assert ["means"] == [record.measure for record in scene.stated_errors.records]
-    assert prove(Source.of(source), scene.model, scene.header, scene.stated_errors, result.source_index).holds
-    assert prove(Source.of(source), scene.model, scene.header, scene.stated_errors).holds
+    assert ["means"] == [record.measure for record in scene.declared_bounds.records]
+    assert prove(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index).holds
+    assert prove(Source.of(source), scene.model, scene.header, scene.declared_bounds).holds
     moved = replace(source, means=source.means + np.float32(0.1))
-    assert not prove(Source.of(moved), scene.model, scene.header, scene.stated_errors).holds
+    assert not prove(Source.of(moved), scene.model, scene.header, scene.declared_bounds).holds
 
 
 def test_errors_are_stated_against_a_scene_that_was_not_drafted(make_model):

@@ -55,8 +55,8 @@ def stating(**changes):
     """Return a change of what a scene states."""
     return lambda scene: dataclasses.replace(
         scene,
-        stated_errors=dataclasses.replace(
-            scene.stated_errors, **{key: make(scene.stated_errors) for key, make in changes.items()}
+        declared_bounds=dataclasses.replace(
+            scene.declared_bounds, **{key: make(scene.declared_bounds) for key, make in changes.items()}
         ),
     )
 
@@ -66,7 +66,7 @@ def without(*names):
 
 
 def silent(scene):
-    return dataclasses.replace(scene, stated_errors=None)
+    return dataclasses.replace(scene, declared_bounds=None)
 
 
 REFITTED = stating(refitted=lambda _: True, records=without("sh0", "sh1"))

@@ -28,7 +28,7 @@ pytest.importorskip("scipy", reason="training needs scipy: pip install 'csplat[r
 from extremes_chain import LEARNT, assert_finite, chain_of
 
 from csplat import decode, read_ply, write_ply
-from csplat.decoder import read_header, read_stated_errors
+from csplat.decoder import read_declared_bounds, read_header
 from csplat.encoder.measure import measure_errors
 from csplat.errors import LimitError
 from csplat_conformance.stated import Source, prove
@@ -65,7 +65,7 @@ def assert_each(chains, check):
 def assert_proved(name, result):
     """The stated errors hold, rms and counts too."""
     source, decoded = scene(name)[0], decode(result.data)
-    stated = read_stated_errors(result.data)
+    stated = read_declared_bounds(result.data)
     proof = prove(Source.of(source), decoded, read_header(result.data), stated, result.source_index)
     assert ((), True) == (proof.failures, proof.rms_proved)
     return decoded
@@ -107,7 +107,7 @@ def test_the_stated_maxima_are_proved_without_an_index_too(chains):
         if name in DRAWN:
             assert (
                 ()
-                == prove(Source.of(chain.source), chain.decoded, read_header(data), read_stated_errors(data)).failures
+                == prove(Source.of(chain.source), chain.decoded, read_header(data), read_declared_bounds(data)).failures
             )
 
     assert_each(chains, check)

@@ -31,7 +31,7 @@ from extremes_learnt import (
 )
 
 from csplat import EncodeOptions, decode, encode
-from csplat.decoder import read_header, read_stated_errors
+from csplat.decoder import read_declared_bounds, read_header
 from csplat.encoder import Draft, encode_with_report
 from csplat.errors import InputError
 from csplat_conformance.stated import Source, prove
@@ -89,7 +89,7 @@ def test_a_simplified_file_states_what_holds(name):
     decoded = decode(result.data)
     assert max(1, len(source) // 2) == len(decoded)
     proof = prove(
-        Source.of(source), decoded, read_header(result.data), read_stated_errors(result.data), result.source_index
+        Source.of(source), decoded, read_header(result.data), read_declared_bounds(result.data), result.source_index
     )
     assert () == proof.failures
     assert_finite(decoded)

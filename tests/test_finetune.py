@@ -25,7 +25,7 @@ from captures import H, W, cameras, photograph, shell
 import csplat
 import csplat_trainer
 from csplat import EncodeOptions, decode, encode, write_ply
-from csplat.decoder import read_options, read_stated_errors
+from csplat.decoder import read_declared_bounds, read_options
 from csplat.encoder import Draft
 from csplat.errors import InputError
 from csplat_render import render
@@ -598,7 +598,7 @@ def test_splats_that_no_view_shows_are_left_out_and_counted(capture, tmp_path):
     told = call("finetune", capture / "scene.ply", "--data", capture, "-o", out, *BRIEF, "--json")
     facts = json.loads(told.stdout)
     assert (301, 300, 1) == (facts["source_splats"], facts["splats"], facts["unseen"])
-    stated = read_stated_errors(out.read_bytes())
+    stated = read_declared_bounds(out.read_bytes())
     assert (301, 1) == (stated.source_count, stated.pruned_count)
     assert 1 == read_options(out.read_bytes())["finetuned"]["unseen"]
 
@@ -677,7 +677,7 @@ def test_splats_that_pictures_need_least_can_be_left_out(capture, tmp_path):
     )  # fmt: skip
     facts = json.loads(result.stdout)
     assert (301, 150, 1) == (facts["source_splats"], facts["splats"], facts["unseen"])
-    stated = read_stated_errors(out.read_bytes())
+    stated = read_declared_bounds(out.read_bytes())
     assert (301, 151) == (stated.source_count, stated.pruned_count)
     call("verify", out, "--source", capture / "scene.ply")
     again = call("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "t.csplat", *BRIEF)

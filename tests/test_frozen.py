@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from csplat import EncodeOptions, decode, encode, read_ply
-from csplat.decoder import decode_scene, read_options, read_stated_errors
+from csplat.decoder import decode_scene, read_declared_bounds, read_options
 from csplat.encoder import Draft, Origin, encode_with_report
 from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
@@ -126,7 +126,7 @@ def test_errors_are_stated_against_the_source(make_model):
     held = moved(frozen, share=0.05)
     result = frozen.coded(held).write({"finetuned": {"steps": 7}})
     assert_seen_is_decoded(frozen, held, result)
-    stated = read_stated_errors(result.data)
+    stated = read_declared_bounds(result.data)
     assert (300, 200, True) == (stated.source_count, stated.pruned_count, stated.refitted)
     truth = measure_errors(source, decode(result.data), result.source_index)
     assert {"means", "covariance", "opacities"} == {record.measure for record in stated.records}

@@ -60,7 +60,7 @@ def test_the_page_says_what_the_text_says(files, page):
     assert "a & b" not in page.read_text()  # names are no markup
     for name, one in facts.attributes.items():
         assert re.search(rf"<td[^>]*>{name}</td><td[^>]*>[^<]+</td><td[^>]*>{one.size_bytes:,}</td>", text)
-    for record in facts.stated_errors.records:
+    for record in facts.declared_bounds.records:
         assert re.search(
             rf"{record.measure}</td><td[^>]*>[^<]+</td><td>{record.max:.4g}</td><td>{record.rms:.4g}<", text
         )

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 import csplat
 import csplat_conformance
 from csplat import CsplatError, EncodeOptions, FormatError, InputError, decode, encode, read_header, read_ply
-from csplat.decoder import read_metadata, read_options, read_stated_errors
-from csplat.decoder.references import codebook_references
+from csplat.decoder import read_declared_bounds, read_metadata, read_options
+from csplat.decoder.tiles import codebook_references
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 
@@ -77,8 +77,8 @@ def test_files_of_the_same_steps_are_copied_with_the_codebooks_of_each(halves):
 
 def test_what_nobody_has_proved_of_the_whole_is_left_out(halves):
     _, data = merge(*halves)
-    assert read_stated_errors(halves[0]) is not None
-    assert read_stated_errors(data) is None
+    assert read_declared_bounds(halves[0]) is not None
+    assert read_declared_bounds(data) is None
     assert read_options(data) is None
 
 

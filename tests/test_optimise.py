@@ -154,7 +154,7 @@ def test_a_psnr_is_reached_by_fewer_splats_and_the_file_says_what_it_is(many, se
     assert found.report.chosen["decided_psnr"] == pytest.approx(views.decider(many).psnr(decoded.model), abs=1e-3)
     assert (len(found.data), len(decoded.model)) == (found.report.size_bytes, found.report.splats)
     assert found.report.splats < 600
-    assert 900 == found.result.report.options["simplified"]["splats"] == decoded.stated_errors.source_count
+    assert 900 == found.result.report.options["simplified"]["splats"] == decoded.declared_bounds.source_count
     assert len(np.unique(found.result.source_index)) == len(decoded.model)
 
 
@@ -278,8 +278,8 @@ def test_a_share_of_the_splats_proves_what_it_states(kept, alike):
     assert 180 == kept.report.splats == len(decoded.model) == len(np.unique(index))
     distances = np.linalg.norm(decoded.model.means.astype(np.float64) - alike.means[index], axis=1)
     assert distances.max() <= kept.result.report.errors["means"][0]
-    assert prove(Source.of(alike), decoded.model, decoded.header, decoded.stated_errors, index).holds
-    assert decoded.stated_errors.refitted
+    assert prove(Source.of(alike), decoded.model, decoded.header, decoded.declared_bounds, index).holds
+    assert decoded.declared_bounds.refitted
 
 
 @pytest.mark.slow

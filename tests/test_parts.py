@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import csplat
 import csplat_conformance
 from csplat import EncodeOptions, FormatError, InputError, decode, encode, read_header, read_ply
-from csplat.decoder import read_metadata, read_options, read_stated_errors
+from csplat.decoder import read_declared_bounds, read_metadata, read_options
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 
@@ -60,8 +60,8 @@ def test_a_part_says_of_the_scene_what_the_file_says_and_nothing_of_its_errors(d
     part = extract(data, ALL)[1]
     assert read_metadata(data) == read_metadata(part)
     assert decode(data).cameras == decode(part).cameras
-    assert read_stated_errors(data) is not None
-    assert read_stated_errors(part) is None
+    assert read_declared_bounds(data) is not None
+    assert read_declared_bounds(part) is None
     assert read_options(part) is None
     before, after = read_header(data), read_header(part)
     for name in ("origin", "coordinate_system", "antialiased", "flat", "unit_metres", "sh_degree", "codebooks"):

@@ -214,10 +214,10 @@ def test_what_the_encoder_states_is_proved(make_model, preset):
     source = make_model(3000, 3)
     result = encode_with_report(source, EncodeOptions(preset=preset, tile_splats=700))
     scene = decode_scene(result.data)
-    proof = prove(Source.of(source), scene.model, scene.header, scene.stated_errors, result.source_index)
+    proof = prove(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index)
     assert proof.failures == ()
     assert proof.rms_proved
-    proof = prove(Source.of(source), scene.model, scene.header, scene.stated_errors)
+    proof = prove(Source.of(source), scene.model, scene.header, scene.declared_bounds)
     assert proof.failures == ()
     assert not proof.rms_proved
 
@@ -227,11 +227,11 @@ def test_a_statement_that_says_too_little_or_too_much_is_not_proved(make_model):
     source = make_model(500, 1)
     result = encode_with_report(source)
     scene = decode_scene(result.data)
-    assert scene.stated_errors is not None
-    for number, record in enumerate(scene.stated_errors.records):
-        records = list(scene.stated_errors.records)
+    assert scene.declared_bounds is not None
+    for number, record in enumerate(scene.declared_bounds.records):
+        records = list(scene.declared_bounds.records)
         records[number] = replace(record, max=record.max * 0.99)
-        stated = replace(scene.stated_errors, records=tuple(records))
+        stated = replace(scene.declared_bounds, records=tuple(records))
         assert not prove(Source.of(source), scene.model, scene.header, stated, result.source_index).holds
         assert not prove(Source.of(source), scene.model, scene.header, stated).holds
         for wrong in (
@@ -240,7 +240,7 @@ def test_a_statement_that_says_too_little_or_too_much_is_not_proved(make_model):
             replace(record, max=record.max * 1.001),
         ):
             records[number] = wrong
-            stated = replace(scene.stated_errors, records=tuple(records))
+            stated = replace(scene.declared_bounds, records=tuple(records))
             assert not prove(Source.of(source), scene.model, scene.header, stated, result.source_index).holds
 
 
@@ -248,8 +248,8 @@ def test_what_is_fitted_anew_or_not_stated_is_not_proved(make_model):
     # SER-6
     source = make_model(50, 0)
     scene = decode_scene(encode(source))
-    assert scene.stated_errors is not None
-    fewer = replace(scene.stated_errors, records=scene.stated_errors.records[:2])
+    assert scene.declared_bounds is not None
+    fewer = replace(scene.declared_bounds, records=scene.declared_bounds.records[:2])
     refitted = prove(Source.of(source), scene.model, scene.header, replace(fewer, refitted=True))
     assert refitted.holds
     assert refitted.unproved == ("opacities", "sh0")
@@ -265,8 +265,8 @@ def test_what_a_refitted_file_states_has_to_hold(make_model):
     source = make_model(50, 0)
     result = encode_with_report(source)
     scene = decode_scene(result.data)
-    halved = tuple(replace(one, max=one.max / 2, rms=one.rms / 2) for one in scene.stated_errors.records)
-    stated = replace(scene.stated_errors, refitted=True, records=halved)
+    halved = tuple(replace(one, max=one.max / 2, rms=one.rms / 2) for one in scene.declared_bounds.records)
+    stated = replace(scene.declared_bounds, refitted=True, records=halved)
     assert not prove(Source.of(source), scene.model, scene.header, stated).holds
     assert not prove(Source.of(source), scene.model, scene.header, stated, result.source_index).holds
 
@@ -280,7 +280,7 @@ def test_a_failure_names_splat_tile_source_and_amount(make_model, indexed):
     sh0[700] += np.float32(5.0)
     index = result.source_index if indexed else None
     decoded = replace(scene.model, sh0=sh0)
-    proof = prove(Source.of(source), decoded, scene.header, scene.stated_errors, index)
+    proof = prove(Source.of(source), decoded, scene.header, scene.declared_bounds, index)
     wrong = [one for one in proof.measures if one.holds is False]
 
     assert ["sh0"] == [one.name for one in wrong]
@@ -298,8 +298,8 @@ def test_a_failure_names_splat_tile_source_and_amount(make_model, indexed):
 def test_a_statement_of_any_size_is_judged(make_model):
     source = make_model(50, 0)
     scene = decode_scene(encode(source))
-    vast = tuple(replace(one, max=1e200, rms=1e200) for one in scene.stated_errors.records)
-    stated = replace(scene.stated_errors, records=vast)
+    vast = tuple(replace(one, max=1e200, rms=1e200) for one in scene.declared_bounds.records)
+    stated = replace(scene.declared_bounds, records=vast)
     assert prove(Source.of(source), scene.model, scene.header, stated).holds  # nobody knows which splat is which
     assert not prove(Source.of(source), scene.model, scene.header, stated, np.arange(50)).holds
 
@@ -314,16 +314,16 @@ def test_normals_are_nobodys_business(make_model):
     kept = replace(source, extra={"nx": np.zeros(50, np.float32)})
     result = encode_with_report(kept, EncodeOptions(keep_extra=True))
     scene = decode_scene(result.data)
-    assert prove(Source.of(source), scene.model, scene.header, scene.stated_errors, result.source_index).holds
+    assert prove(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index).holds
 
 
 def test_extra_columns_are_part_of_the_proof(make_model):
     source = make_model(50, 0, extra={"label": np.arange(50, dtype=np.int16)})
     result = encode_with_report(source, EncodeOptions(keep_extra=True))
     scene = decode_scene(result.data)
-    assert prove(Source.of(source), scene.model, scene.header, scene.stated_errors, result.source_index).holds
+    assert prove(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index).holds
     other = replace(source, extra={"label": np.zeros(50, np.int16)})
-    proof = prove(Source.of(other), scene.model, scene.header, scene.stated_errors, result.source_index)
+    proof = prove(Source.of(other), scene.model, scene.header, scene.declared_bounds, result.source_index)
     assert proof.failures == ("the extra column 'label' does not hold what the source's does",)
     assert proof.clauses == ("SRC-3",)
 

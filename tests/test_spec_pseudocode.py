@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from csplat import _spec
-from csplat.decoder.blocks import Columns
-from csplat.decoder.morton import morton_axes
+from csplat.decoder.blocks import ColumnBlock, morton_axes
+from csplat.decoder.entropy import _undo_run_length, undo_transforms
 from csplat.decoder.reconstruct import lattice_rows, opacity_table, write_colour, write_lattice, write_quats
-from csplat.decoder.streams import _undo_run_length, undo_transforms
 from csplat_authoring.deflate import Deflate
 from csplat_conformance.near import too_far
 from csplat_conformance.room import may_be_stated
@@ -101,9 +100,9 @@ def record(attribute: int, mapping: int, **fields: float) -> _spec.AttributeReco
     return _spec.AttributeRecord(attribute, mapping, values["chroma_shift"], 0, values["levels"], values["step"])
 
 
-def columns(rows: list[list[int]], exponent: int = 0) -> Columns:
+def columns(rows: list[list[int]], exponent: int = 0) -> ColumnBlock:
     """[n][C] integers as a block; wide ones, as an offset and elements make them."""
-    return Columns(np.array(rows, np.int64).T, (0,) * len(rows[0]), exponent, 0)
+    return ColumnBlock(np.array(rows, np.int64).T, (0,) * len(rows[0]), exponent, 0)
 
 
 @pytest.mark.parametrize("shift", [0, 1, 5, 15, 16])

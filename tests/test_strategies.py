@@ -43,10 +43,13 @@ def shell():
 def stored(source, result):
     """Prove what a file states against the source; return what it decodes to."""
     scene = decode_scene(result.data)
-    proof = prove(Source.of(source), scene.model, scene.header, scene.stated_errors, result.source_index)
+    proof = prove(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index)
     assert () == proof.failures
     assert proof.rms_proved
-    assert (len(source), source.sh_degree) == (scene.stated_errors.source_count, scene.stated_errors.source_sh_degree)
+    assert (len(source), source.sh_degree) == (
+        scene.declared_bounds.source_count,
+        scene.declared_bounds.source_sh_degree,
+    )
     return scene
 
 
@@ -234,10 +237,10 @@ def test_a_pruned_file_proves_its_errors_and_says_what_is_gone(source):
     scene = stored(source, result)
     assert {"splats": 150, "prune_opacity": 0.5, "sh_degree": 1, "sh": "truncated"} == scene.options["reduced"]
     assert (int(np.sum(source.opacities <= 0.5)), False) == (
-        scene.stated_errors.pruned_count, scene.stated_errors.refitted,
+        scene.declared_bounds.pruned_count, scene.declared_bounds.refitted,
     )  # fmt: skip
     assert (source.opacities[result.source_index] > 0.5).all()
-    measures = [record.measure for record in scene.stated_errors.records]
+    measures = [record.measure for record in scene.declared_bounds.records]
     assert ["means", "covariance", "opacities", "sh0", "sh1", "sh2"] == measures
     assert 1 == scene.model.sh_degree
 
@@ -254,11 +257,11 @@ def test_a_clustered_file_states_its_errors_against_the_source(source, text):
     reduction = Reduction(prune_opacity=0.2, sh_degree=1, kmeans=kmeans)
     result = encode_reduced(source, reduction, EncodeOptions(attribute_psnr=60.0))
     scene = stored(source, result)
-    assert 6 == len(scene.stated_errors.records)
+    assert 6 == len(scene.declared_bounds.records)
     clustered = reduce_model(source, reduction).model
     by_coding = measure_errors(clustered, scene.model, np.searchsorted(
         np.flatnonzero(source.opacities > 0.2), result.source_index))  # fmt: skip
-    rms = {record.measure: record.rms for record in scene.stated_errors.records}
+    rms = {record.measure: record.rms for record in scene.declared_bounds.records}
     assert rms["sh0"] > 5 * by_coding["sh0"][1]  # most of it comes from clustering
     said = scene.options["reduced"]["kmeans"]
     assert set(ATTRIBUTES) == set(said)
@@ -282,8 +285,8 @@ def test_a_distilled_degree_looks_more_like_the_source(shell):
     views = views_of(cameras(24))
     distilled = encode_reduced(shell, reduction, EncodeOptions(attribute_psnr=60.0), views=views)
     scene = stored(shell, distilled)
-    assert ["means", "covariance", "opacities"] == [record.measure for record in scene.stated_errors.records]
-    assert scene.stated_errors.refitted
+    assert ["means", "covariance", "opacities"] == [record.measure for record in scene.declared_bounds.records]
+    assert scene.declared_bounds.refitted
     said = scene.options["reduced"]
     assert ("distilled", 21) == (said["sh"], said["views"])
     judge = Scorer.of_source(shell, views.decides, (0.0, 0.0, 0.0))
@@ -297,7 +300,7 @@ def test_distilled_and_clustered_colours_state_no_error(shell):
 
     reduction = Reduction(prune_opacity=0.15, sh_degree=1, distil=True, kmeans=parse_kmeans("64"))
     scene = stored(shell, encode_reduced(shell, reduction, views=views_of(cameras(9))))
-    assert ["means", "covariance", "opacities"] == [record.measure for record in scene.stated_errors.records]
+    assert ["means", "covariance", "opacities"] == [record.measure for record in scene.declared_bounds.records]
     assert {"kmeans", "check_psnr", "views", "prune_opacity"} <= set(scene.options["reduced"])
     assert 64 >= len(np.unique(np.round(scene.model.opacities, 5)))
 

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import csplat
 from csplat import formats, inputs
-from csplat.decoder import Limits, decode, open_tiles, read_header, tilewise
+from csplat.decoder import Limits, decode, decode_api, open_tiles, read_header
 from csplat.errors import CsplatError, LimitError
 from csplat.ply import write_ply
 from csplat_conformance.manifest import load
@@ -110,7 +110,7 @@ def test_what_a_decode_refuses_is_refused_in_the_same_words_and_leaves_no_ply(tm
 
 @pytest.mark.parametrize("threads", [1, 2, 7])
 def test_threads_and_letting_go_of_the_file_change_nothing(many_tiles, threads, monkeypatch):
-    monkeypatch.setattr(tilewise, "LetGo", partial(inputs.LetGo, step_bytes=1))
+    monkeypatch.setattr(decode_api, "LetGo", partial(inputs.LetGo, step_bytes=1))
     expected = decode(many_tiles)
     opened = open_tiles(many_tiles, threads=threads)
     for _ in range(2):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from csplat import _spec
-from csplat.decoder.header import SceneHeader, Tile
+from csplat.decoder.container import SceneHeader, Tile
 from csplat.errors import InputError
 from csplat.types import F64
 

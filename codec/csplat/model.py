@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from importlib import import_module
 from typing import Any
 
@@ -152,6 +152,22 @@ class SplatModel:
             extra={name: column[index] for name, column in self.extra.items()},
             means_double=None if self.means_double is None else self.means_double[index],
         )
+
+
+def trusted_model(**values: Any) -> SplatModel:
+    """Make a model without the constructor's checks, for a caller that has just checked more than they do.
+
+    The constructor passes over every value, an eighth of the time of a decode; the decoder's clauses are stricter.
+
+    Args:
+        values: fields by name; those with a default may be left out.
+    """
+    required = {one.name for one in fields(SplatModel) if one.default is MISSING}
+    assert required <= values.keys() <= {one.name for one in fields(SplatModel)}
+    model: SplatModel = object.__new__(SplatModel)
+    for name, value in values.items():
+        object.__setattr__(model, name, value)
+    return model
 
 
 def check_model(caller: str, model: object) -> None:

@@ -25,7 +25,7 @@ from csplat.decoder import (
 )
 from csplat.decoder.codebooks import wanted_codebooks
 from csplat.decoder.container import check_length, read_file_header
-from csplat.decoder.job import Job, prepare
+from csplat.decoder.decode_api import DecodeRequest, prepare_decode
 from csplat.decoder.limits import check_budget, float_bytes
 from csplat.decoder.tiles import wanted_layers
 from csplat.errors import InputError
@@ -141,7 +141,7 @@ class SplatFile:
         chosen = None if box is None else [tile.index for tile in touching(self.header, box)]
         with self._store.telling():
             window = self.window()
-            job = prepare(window.view, self._limits, chosen, sh_degree)
+            job = prepare_decode(window.view, self._limits, chosen, sh_degree)
             decoded = iter_tiles(window.view, limits=self._limits, tiles=chosen, sh_degree=sh_degree)
         return self._iterate(window, job, decoded)
 
@@ -177,7 +177,7 @@ class SplatFile:
             tiles = [tile.index for tile in touching(self.header, box)]
         with self._store.telling():
             window = self.window()
-            job = prepare(window.view, self._limits, tiles, sh_degree)
+            job = prepare_decode(window.view, self._limits, tiles, sh_degree)
             splat_bytes = float_bytes(self.header, job.degree)
             check_budget(self.header, job.tiles, job.degree, splat_bytes, self._limits, whole=job.whole)
             texts = self._chunks(_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
@@ -195,7 +195,7 @@ class SplatFile:
             raise InputError(f"{self.name} is closed")
         return Window(self._store, self._head)
 
-    def _iterate(self, window: Window, job: Job, decoded: Iterator[DecodedTile]) -> Iterator[DecodedTile]:
+    def _iterate(self, window: Window, job: DecodeRequest, decoded: Iterator[DecodedTile]) -> Iterator[DecodedTile]:
         side = _side(job)
         for batch in _batches(job.tiles, job.degree, self._store.sizes.batch):
             if not self._open:
@@ -292,7 +292,7 @@ def _read_head(store: Store, window: Window) -> bytes:
     return bytes(window.view[: max(first, end)])
 
 
-def _side(job: Job) -> list[tuple[int, int]]:
+def _side(job: DecodeRequest) -> list[tuple[int, int]]:
     """Return the ranges to read besides tiles: their codebooks; or, for a whole file, everything, to check it."""
     records = job.header.directory if job.whole else wanted_codebooks(job.header, job.tiles, job.degree)
     return [(record.offset, record.size) for record in records]

@@ -9,8 +9,7 @@ from functools import cached_property, partial
 from itertools import accumulate
 
 from csplat import _spec
-from csplat.decoder.container import open_chunk
-from csplat.decoder.header import SceneHeader, Tile
+from csplat.decoder.container import SceneHeader, Tile, open_chunk
 from csplat.encoder.container import CodebookTable, FileChunk, FileTile, Later, Payload, SceneFields, parts
 from csplat.files import BinaryWriter, opened_for_writing
 from csplat.stores import Window

@@ -10,8 +10,8 @@ from functools import partial
 from typing import IO
 
 from csplat import _spec
-from csplat.decoder.header import SceneHeader, Tile
-from csplat.decoder.references import codebook_references
+from csplat.decoder.container import SceneHeader, Tile
+from csplat.decoder.tiles import codebook_references
 from csplat.encoder.container import CodebookTable, FileChunk, FileTile, Later, chunk_crc
 from csplat.parts import InTurn, TileCopies, chunk_payload
 from csplat.stores import Window

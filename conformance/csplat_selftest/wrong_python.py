@@ -14,7 +14,7 @@ from unittest import mock
 import numpy as np
 
 from csplat import _spec
-from csplat.decoder import blocks, container, reconstruct, streams
+from csplat.decoder import blocks, container, entropy, reconstruct
 from csplat.errors import FormatError, UnsupportedError
 from csplat_conformance.validator.inflate import CodedError, Inflater
 from csplat_selftest.mistakes import Mistake, Wrong, method, nothing, replaced
@@ -118,7 +118,7 @@ def _no_limits(stack: ExitStack) -> None:
 
 def _zigzag(right: Wrong, elements: Any, width: int) -> Any:
     result = right(elements, width)
-    return streams._wrap(np.where(elements & 1, result + elements.dtype.type(1), result), width)  # noqa: SLF001 - to break it
+    return entropy._wrap(np.where(elements & 1, result + elements.dtype.type(1), result), width)  # noqa: SLF001 - to break it
 
 
 def _no_wrap(_right: Wrong, elements: Any, _width: int) -> Any:
@@ -132,12 +132,12 @@ def _as_unsigned(_right: Wrong, elements: Any, _width: int) -> Any:
 # Codebooks -----------------------------------------------------------------------------------------
 
 
-def _no_escapes(right: Wrong, block: blocks.Coded, *args: Any) -> Any:
+def _no_escapes(right: Wrong, block: blocks.CodebookBlock, *args: Any) -> Any:
     object.__setattr__(block, "escapes", None)
     return right(block, *args)
 
 
-def _no_summand(right: Wrong, block: blocks.Coded, *args: Any) -> Any:
+def _no_summand(right: Wrong, block: blocks.CodebookBlock, *args: Any) -> Any:
     object.__setattr__(block, "summand", None)
     return right(block, *args)
 
@@ -262,9 +262,13 @@ MISTAKES: Final = (
     Mistake("modulus", "DELTA and ZIGZAG not modulo 2^(8w)", "STR-2", replaced("_wrap", _no_wrap)),
     Mistake("sign", "elements of SIGNED read as unsigned", "LAT-4", replaced("_as_signed", _as_unsigned)),
     Mistake("order", "Morton codes taken for sorted", "ORD-1", replaced("morton_axes", _sorted_codes)),
-    Mistake("escapes", "escaped splats take the last entry", "CBK-3", method(blocks.Coded, "rows", _no_escapes)),
+    Mistake(
+        "escapes", "escaped splats take the last entry", "CBK-3", method(blocks.CodebookBlock, "rows", _no_escapes)
+    ),
     Mistake("unused entries", "entries of a codebook are believed", "CBK-7", replaced("_check_entries", nothing)),
-    Mistake("summand", "the common summand of SHAPE is dropped", "CBK-1", method(blocks.Coded, "rows", _no_summand)),
+    Mistake(
+        "summand", "the common summand of SHAPE is dropped", "CBK-1", method(blocks.CodebookBlock, "rows", _no_summand)
+    ),
     Mistake("mask", "bits from the highest on", "SPA-2", replaced("read_sparse", _mask_from_the_top)),
     Mistake("rounding", "products in binary32", "NUM-1", replaced("_scale", _binary32_product)),
     Mistake("quats, order of operations", "q / M / √2", "NUM-1", replaced("write_quats", _loose_quats)),

@@ -34,7 +34,7 @@ _BITS = {"len(present) != params.present_count": "False"}
 _OF_THE_KIND = """context.first.get(params.codebook_id) or next(
         (one for one in context.first.values() if one.book.record.kind == book.record.kind), None
     )"""
-_CHECKED = """block = Columns(elements.reshape(1, count), offsets, 0, at)
+_CHECKED = """block = ColumnBlock(elements.reshape(1, count), offsets, 0, at)
     check_integers(block.lows, block.highs, context.header.attribute(attribute), at)
     return block"""
 _NFC = "__import__('unicodedata').normalize('NFC', {})"
@@ -101,7 +101,7 @@ MISTAKES: Final = (
         "summands",
         "LAT-4 holds for them, too",
         "LAT-4",
-        reworded("_read_summand", {"return Columns(elements.reshape(1, count), offsets, 0, at)": _CHECKED}),
+        reworded("_read_summand", {"return ColumnBlock(elements.reshape(1, count), offsets, 0, at)": _CHECKED}),
     ),
     Mistake("JSON", "as the library reads it", "JSN-1", replaced("parse_json", _library_json)),
 )

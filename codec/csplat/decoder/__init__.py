@@ -1,45 +1,63 @@
-"""The decoder: a `.csplat` file, checked to the last clause, into arrays.
+"""Decode `.csplat` files into arrays, with every clause of the specification checked.
 
-Written from `spec/format.md` alone; it shares with the encoder nothing but the registry's
-constants, the errors and `SplatModel`.
+Written from `spec/format.md` alone; it shares with the encoder only the registry's constants, the errors and
+`SplatModel`.
 
-| function | gives |
+| function | returns |
 |---|---|
 | `decode` | a `SplatModel`, of the whole file or of chosen tiles and SH bands |
-| `decode_scene` | the same, with the header, the options, the stated errors and the checks made |
-| `iter_tiles` | tile by tile, in bounded memory |
-| `open_tiles` | what is known before the first tile, and the tiles as models, as often as wanted |
-| `read_header` | what header and index say; a file's beginning suffices |
+| `decode_scene` | the same, with header, options, declared error bounds and the checks made |
+| `iter_tiles` | the splats tile by tile, in bounded memory |
+| `open_tiles` | metadata, and the tiles as models, any number of times |
+| `read_header` | header and index; the beginning of a file suffices |
 | `decode_integers` | the integer arrays of spec 9.2, for conformance |
-| `read_metadata`, `read_cameras`, `read_options`, `read_stated_errors` | one chunk |
+| `read_metadata`, `read_cameras`, `read_options`, `read_declared_bounds` | one chunk |
+
+Modules, each built on those before it: `container` (file header, frames of chunks), `index`, `entropy` (streams),
+`blocks` (integers of one attribute), `reconstruct` (integers to values), `codebooks`, `tiles`, `limits`, `metadata`,
+`decode_api`.
 """
 
-from csplat.decoder.chunks import read_cameras, read_metadata, read_options, read_stated_errors
-from csplat.decoder.header import ExtraColumn, SceneHeader, Tile
+from csplat.decoder.container import ExtraColumn, SceneHeader, Tile
+from csplat.decoder.decode_api import (
+    DecodedScene,
+    DecodedTile,
+    TileReader,
+    decode,
+    decode_integers,
+    decode_scene,
+    iter_tiles,
+    open_tiles,
+)
 from csplat.decoder.index import read_header
 from csplat.decoder.limits import Limits
-from csplat.decoder.scene import Scene, decode, decode_integers, decode_scene
-from csplat.decoder.stated import StatedError, StatedErrors
-from csplat.decoder.tilewise import DecodedTile, Opened, iter_tiles, open_tiles
+from csplat.decoder.metadata import (
+    DeclaredBound,
+    DeclaredBounds,
+    read_cameras,
+    read_declared_bounds,
+    read_metadata,
+    read_options,
+)
 
 __all__ = [
+    "DeclaredBound",
+    "DeclaredBounds",
+    "DecodedScene",
     "DecodedTile",
     "ExtraColumn",
     "Limits",
-    "Opened",
-    "Scene",
     "SceneHeader",
-    "StatedError",
-    "StatedErrors",
     "Tile",
+    "TileReader",
     "decode",
     "decode_integers",
     "decode_scene",
     "iter_tiles",
     "open_tiles",
     "read_cameras",
+    "read_declared_bounds",
     "read_header",
     "read_metadata",
     "read_options",
-    "read_stated_errors",
 ]

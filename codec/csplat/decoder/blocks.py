@@ -1,7 +1,7 @@
-"""Blocks of a tile once their streams are read: integers, not yet values.
+"""Hold blocks of integers, and read the codings of one stream: LEVELS, MORTON, AXIS, OFFSET, SIGNED (spec 6.4).
 
-Two kinds of block, one interface: `rows(start, stop, dtype)` gives the lattice integers or
-levels of a run of splats, `bound` the largest magnitude that can occur on the way to them.
+Every kind of block has `rows(start, stop, dtype)`, the lattice integers or levels of a run of splats, and `bound`, the
+largest magnitude that can occur on the way to them.
 """
 
 from __future__ import annotations
@@ -13,19 +13,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.decoder.header import Tile
-from csplat.decoder.streams import Ints
+from csplat.decoder.container import Cursor, SceneHeader, Tile, check_reserved
+from csplat.decoder.entropy import Ints, read_stream
+from csplat.decoder.index import SINGLE_MAX, SINGLE_MIN, scaled_step
+from csplat.errors import FormatError, UnsupportedError
 
-_RUN_ELEMENTS = 1 << 18  # integers that are worked on at a time: they stay in the second-level cache
-_RUN_SPLATS = 1 << 14
+_RUN_ELEMENTS = 1 << 18  # integers that are processed together: they fit the second-level cache
+_RUN_SPLATS = 1 << 14  # splats that are processed together
+
+#: Every third bit is compacted in five steps, each of which halves the number of gaps: shift, and mask of the bits to
+#: keep. Enough for 21 bits per axis; the format has 17.
+_EVERY_THIRD_BIT = 0x1249249249249249
+_MORTON_STEPS = (
+    (2, 0x10C30C30C30C30C3),
+    (4, 0x100F00F00F00F00F),
+    (8, 0x001F0000FF0000FF),
+    (16, 0x001F00000000FFFF),
+    (32, 0x00000000001FFFFF),
+)
 
 
 @dataclass(frozen=True)
-class Columns:
+class ColumnBlock:
     """A block whose integers are in the stream: offset plus element.
 
     Attributes:
-        elements: [C, n], as narrow as they came.
+        elements: [C, n], in the type of the stream.
         offsets: C summands, one per column.
         exponent: the block's lattice is coarser by 2^exponent.
         at: offset in the file where the stream begins.
@@ -67,7 +80,7 @@ class Columns:
 
 @dataclass
 class Codebook:
-    """One codebook, as far as it was asked for.
+    """A codebook: its layers that were read.
 
     Attributes:
         record: its record in the index.
@@ -89,7 +102,7 @@ class Indices:
         book: the codebook.
         attribute: attribute id of the first block.
         places: [n], the entry of each splat; the size of the codebook if it is escaped.
-        escaped: places of the splats that no entry serves, ascending.
+        escaped: places of the splats without an entry, ascending.
     """
 
     book: Codebook
@@ -99,7 +112,7 @@ class Indices:
 
 
 @dataclass(frozen=True)
-class Coded:
+class CodebookBlock:
     """A block coded CODEBOOK: the integers are entries, in scales plus a summand (spec 6.4.5).
 
     Attributes:
@@ -114,8 +127,8 @@ class Coded:
 
     indices: Indices
     entries: Ints
-    escapes: Columns | None
-    summand: Columns | None
+    escapes: ColumnBlock | None
+    summand: ColumnBlock | None
     at: int
     exponent: int = 0
     bound: int = field(init=False)
@@ -126,7 +139,7 @@ class Coded:
         object.__setattr__(self, "bound", max(total, self.escapes.bound if self.escapes else 0))
 
     def rows(self, start: int, stop: int, dtype: np.dtype[np.signedinteger]) -> Ints:
-        """Return the integers of splats `start` to `stop`, as `Columns.rows` does."""
+        """Return the integers of splats `start` to `stop`, as `ColumnBlock.rows` does."""
         # An escaped splat's index is the codebook's size: `clip` gives it the last entry for now.
         rows = np.take(self.entries, self.indices.places[start:stop], axis=0, mode="clip")
         out = np.ascontiguousarray(rows.T, dtype)
@@ -140,7 +153,7 @@ class Coded:
 
 
 @dataclass(frozen=True)
-class Sparse:
+class SparseBlock:
     """A block coded SPARSE: the integers of some splats, those of the others are 0 (spec 6.4.7).
 
     Attributes:
@@ -148,7 +161,7 @@ class Sparse:
         places: indices of these splats, ascending.
     """
 
-    values: Columns
+    values: ColumnBlock
     places: NDArray[np.intp]
 
     @property
@@ -167,14 +180,14 @@ class Sparse:
         return self.values.bound
 
     def rows(self, start: int, stop: int, dtype: np.dtype[np.signedinteger]) -> Ints:
-        """Return the integers of splats `start` to `stop`, as `Columns.rows` does."""
+        """Return the integers of splats `start` to `stop`, as `ColumnBlock.rows` does."""
         out = np.zeros((len(self.values.elements), stop - start), dtype)
         first, last = np.searchsorted(self.places, (start, stop))
         out[:, self.places[first:last] - start] = self.values.rows(int(first), int(last), dtype)
         return out
 
 
-Block = Columns | Coded | Sparse
+Block = ColumnBlock | CodebookBlock | SparseBlock
 
 
 @dataclass(frozen=True)
@@ -204,3 +217,177 @@ def runs(count: int, columns: int) -> Iterator[tuple[int, int]]:
     step = min(_RUN_SPLATS, max(1, _RUN_ELEMENTS // columns))
     for start in range(0, count, step):
         yield start, min(count, start + step)
+
+
+def read_block_head(cursor: Cursor, attribute: int, legal: tuple[int, ...] | None = None) -> int:
+    """Read a block head, or that of an escape block if `legal` codings are given; return the coding."""
+    at = cursor.take(_spec.BLOCK_HEAD_SIZE)
+    head = _spec.unpack_block_head(cursor.view, at)
+    check_reserved(head, at, _spec.BLOCK_HEAD_OFFSETS)
+    place = at + _spec.BLOCK_HEAD_OFFSETS["coding"]
+    if head.attribute != attribute:
+        raise FormatError(
+            _spec.ERROR_STREAM,
+            at,
+            "CBK-5" if legal else "TLE-2",
+            "attribute",
+            found=head.attribute,
+            wanted=attribute,
+        )
+    if head.coding not in _spec.CODING_NAMES:
+        raise UnsupportedError(f"attribute coding {head.coding}", offset=place, clause="BLK-1")
+    if legal is not None and head.coding not in legal:
+        raise FormatError(
+            _spec.ERROR_STREAM, place, "CBK-5", "coding of an escape block", found=head.coding, wanted=legal
+        )
+    if _spec.CODING_NAMES[head.coding] not in _spec.ATTRIBUTE_CODINGS[attribute]:
+        raise FormatError(
+            _spec.ERROR_VALUE,
+            place,
+            "BLK-1",
+            f"coding of {_spec.ATTRIBUTE_NAMES[attribute]}",
+            found=_spec.CODING_NAMES[head.coding],
+            wanted=" or ".join(_spec.ATTRIBUTE_CODINGS[attribute]),
+        )
+    return head.coding
+
+
+def read_columns(
+    cursor: Cursor, header: SceneHeader, attribute: int, coding: int, count: int, escape: bool = False
+) -> ColumnBlock:
+    """Read the rest of a block after its head, parameters and stream; ranges checked.
+
+    Args:
+        cursor: behind the block head.
+        header: the scene.
+        attribute: attribute id of the block.
+        coding: LEVELS, OFFSET or SIGNED.
+        count: splats of the block.
+        escape: it is an escape block.
+    """
+    columns = _spec.ATTRIBUTE_COLUMNS[attribute]
+    record = header.attribute(attribute)
+    exponent, offsets = 0, (0,) * columns
+    if coding != _spec.CODING_LEVELS:
+        exponent = read_exponent(cursor, record, fixed=escape or attribute == _spec.ATTRIBUTE_QUATS)
+    if coding == _spec.CODING_OFFSET:
+        offsets = read_offsets(cursor, columns)
+    if coding == _spec.CODING_SIGNED:
+        return read_signed(cursor, record, exponent, count)
+    at = cursor.at
+    elements = read_stream(cursor, columns * count, _spec.CODING_WIDTH_MAX[coding])
+    block = ColumnBlock(elements.reshape(columns, count), offsets, exponent, at)
+    check_integers(block.lows, block.highs, record, at)
+    return block
+
+
+def read_exponent(cursor: Cursor, record: _spec.AttributeRecord, *, fixed: bool) -> int:
+    """Read lattice parameters: LAT-1, or LAT-2 if the exponent is fixed at 0."""
+    at = cursor.take(_spec.LATTICE_PARAMS_SIZE)
+    params = _spec.unpack_lattice_params(cursor.view, at)
+    check_reserved(params, at, _spec.LATTICE_PARAMS_OFFSETS)
+    if fixed and params.exponent != 0:
+        raise FormatError(_spec.ERROR_VALUE, at, "LAT-2", "exponent", found=params.exponent, wanted=0)
+    if not fixed:
+        check_step(record, params.exponent, at)
+    return params.exponent
+
+
+def check_step(record: _spec.AttributeRecord, exponent: int, at: int) -> None:
+    """LAT-1: step × 2^exponent is normal and finite in binary32; levels have no step."""
+    scaled = scaled_step(record.step, exponent, SINGLE_MIN)
+    if record.step and (scaled is None or scaled > SINGLE_MAX):
+        raise FormatError(
+            _spec.ERROR_VALUE,
+            at,
+            "LAT-1",
+            f"{record.step} x 2^{exponent} is not finite in binary32 and at least 2^-126",
+        )
+
+
+def read_signed(cursor: Cursor, record: _spec.AttributeRecord, exponent: int, count: int) -> ColumnBlock:
+    """Read a stream of signed integers in columns, [C, count] (LAT-4)."""
+    at, columns = cursor.at, _spec.ATTRIBUTE_COLUMNS[record.attribute]
+    elements = read_stream(cursor, columns * count, _spec.CODING_WIDTH_MAX[_spec.CODING_SIGNED], signed=True)
+    block = ColumnBlock(elements.reshape(columns, count), (0,) * columns, exponent, at)
+    check_integers(block.lows, block.highs, record, at)
+    return block
+
+
+def read_offsets(cursor: Cursor, columns: int) -> tuple[int, ...]:
+    """Read i32[columns], the offsets (LAT-3)."""
+    at = cursor.take(4 * columns)
+    offsets = tuple(int(value) for value in np.frombuffer(cursor.view, "<i4", columns, at))
+    for i, offset in enumerate(offsets):
+        if abs(offset) > _spec.COLUMN_MAX:
+            raise FormatError(
+                _spec.ERROR_VALUE,
+                at + 4 * i,
+                "LAT-3",
+                "offset",
+                found=offset,
+                wanted=f"{_spec.COLUMN_MAX} in magnitude at most",
+            )
+    return offsets
+
+
+def check_integers(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.AttributeRecord, at: int) -> None:
+    """Check the extremes of columns by LEV-1, QUA-1 or LAT-4, whichever applies to the attribute.
+
+    Args:
+        lows: smallest integer of each column.
+        highs: largest integer of each column.
+        record: the attribute.
+        at: offset in the file for the error.
+
+    Raises:
+        FormatError: E_RANGE.
+    """
+    if record.attribute == _spec.ATTRIBUTE_OPACITIES:
+        _check_level(highs[0], 0, record.levels, at, "LEV-1")
+    elif record.attribute == _spec.ATTRIBUTE_QUATS:
+        for found in (min(lows), max(highs)):
+            _check_level(found, -record.levels, record.levels, at, "QUA-1")
+    else:
+        _check_columns(lows, highs, record, at)
+
+
+def _check_level(found: int, low: int, high: int, at: int, clause: str) -> None:
+    if not low <= found <= high:
+        raise FormatError(_spec.ERROR_RANGE, at, clause, "level", found=found, wanted=f"{low} to {high}")
+
+
+def _check_columns(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.AttributeRecord, at: int) -> None:
+    """LAT-4: each integer, after its chroma shift, is at most COLUMN_MAX in magnitude."""
+    for column, (low, high) in enumerate(zip(lows, highs, strict=True)):
+        shift = record.chroma_shift if 3 * column >= len(lows) else 0
+        found = max(-low, high) << shift
+        if found > _spec.COLUMN_MAX:
+            raise FormatError(
+                _spec.ERROR_RANGE,
+                at,
+                "LAT-4",
+                f"integer of column {column}",
+                found=found,
+                wanted=f"{_spec.COLUMN_MAX} in magnitude at most",
+            )
+
+
+def morton_axes(codes: Ints) -> Ints:
+    """Return [3, n] uint32: "Bit 3·b + a of a code is bit b of the integer q of axis a".
+
+    Args:
+        codes: [n], unsigned.
+    """
+    out = np.empty((3, len(codes)), np.uint32)
+    for start, stop in runs(len(codes), 3):
+        wide = codes[start:stop].astype(np.uint64)
+        shifted = np.empty_like(wide)
+        for axis in range(3):
+            bits = (wide >> np.uint64(axis)) & np.uint64(_EVERY_THIRD_BIT)
+            for shift, mask in _MORTON_STEPS:
+                np.right_shift(bits, np.uint64(shift), out=shifted)
+                bits |= shifted
+                bits &= np.uint64(mask)
+            out[axis, start:stop] = bits
+    return out

@@ -1,4 +1,4 @@
-"""Codebooks: tables of integer vectors that tiles refer to (spec 5.3)."""
+"""Read codebooks, the tables of integer vectors that tiles refer to (spec 5.3)."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from collections.abc import Iterable
 import numpy as np
 
 from csplat import _spec
-from csplat.decoder.blocks import Codebook, Columns
-from csplat.decoder.container import check_reserved, open_chunk
-from csplat.decoder.header import SceneHeader, Tile
-from csplat.decoder.lattice import check_integers
+from csplat.decoder.blocks import Codebook, ColumnBlock, check_integers
+from csplat.decoder.container import SceneHeader, Tile, check_reserved, open_chunk
+from csplat.decoder.entropy import Ints, read_stream
 from csplat.decoder.reconstruct import check_values, quat_rows, write_colour
-from csplat.decoder.streams import Ints, read_stream
 from csplat.errors import FormatError
 
 _ENTRY_WIDTH_MAX = 4  # STR-2: "4 for codebooks' entries"
@@ -28,7 +26,7 @@ def layer_columns(record: _spec.CodebookRecord, layer: int) -> int:
 
 
 def attribute_columns(record: _spec.CodebookRecord, attribute: int) -> slice | None:
-    """Return the columns of an attribute in its layer's entries, `None` where CBK-1 refuses it."""
+    """Return the columns of an attribute in its layer's entries, `None` if CBK-1 refuses it."""
     if record.kind == _spec.CODEBOOK_KIND_SH:
         band = attribute - _spec.ATTRIBUTE_SH0
         legal = 1 <= band <= _spec.SH_DEGREE_MAX and record.band_first <= band <= record.band_last
@@ -43,13 +41,13 @@ def attribute_columns(record: _spec.CodebookRecord, attribute: int) -> slice | N
 
 
 def table_bytes(header: SceneHeader, tiles: Iterable[Tile], degree: int, *, whole: bool) -> int:
-    """Return what LIM-1 counts of codebooks, four bytes for each entry and column, from the index alone.
+    """Return the bytes that LIM-1 counts for codebooks, four for each entry and column, from the index alone.
 
     Args:
         header: the scene.
-        tiles: what is to be decoded.
-        degree: highest SH band wanted.
-        whole: count the codebooks that no tile names, too: a whole decode reads and checks them.
+        tiles: the tiles to decode.
+        degree: highest SH band to decode.
+        whole: include the codebooks that no tile names: a whole decode checks them.
     """
     books = {book.codebook_id: book for book in header.codebooks}
     elements = 0
@@ -73,7 +71,7 @@ def read_codebooks(view: memoryview, header: SceneHeader, tiles: Iterable[Tile],
 
 
 def check_unnamed_codebooks(view: memoryview, header: SceneHeader) -> None:
-    """Read the codebooks that no tile names, one after the other, and forget them."""
+    """Read the codebooks that no tile names, to check them."""
     records = {book.codebook_id: book for book in header.codebooks}
     named = {table for tile in header.tiles for table in tile.tables}
     for record in _codebook_chunks(header):
@@ -116,7 +114,7 @@ def _read_chunk(
     elements = read_stream(cursor, book.size * columns, _ENTRY_WIDTH_MAX, signed=True).reshape(columns, book.size)
     _check_entries(elements, header, book, record.layer, stream_at)
     cursor.finish()
-    # Rows of one entry: a gather then copies whole rows. A copy, which needs the file's bytes no longer.
+    # One row per entry, so that a gather copies whole rows; a copy, which does not refer to the file.
     return np.array(elements.T, order="C")
 
 
@@ -127,16 +125,16 @@ def _check_entries(entries: Ints, header: SceneHeader, book: _spec.CodebookRecor
         entries: [C, size].
         header: the scene.
         book: the codebook's record.
-        layer: of the chunk.
-        at: where the stream begins in the file.
+        layer: layer of the chunk.
+        at: offset of the stream in the file.
     """
     for attribute, record in enumerate(header.attributes, _spec.ATTRIBUTE_OPACITIES):
         columns = attribute_columns(book, attribute)
         if columns is None or _spec.ATTRIBUTE_LAYER[attribute] != layer:
             continue
         if attribute == _spec.ATTRIBUTE_SCALES:
-            continue  # a summand comes to them: their sums are bound, by CBK-6
-        block = Columns(entries[columns], (0,) * _spec.ATTRIBUTE_COLUMNS[attribute], 0, at)
+            continue  # CBK-6 bounds their sums with the summand instead
+        block = ColumnBlock(entries[columns], (0,) * _spec.ATTRIBUTE_COLUMNS[attribute], 0, at)
         check_integers(block.lows, block.highs, record, at)
         if attribute == _spec.ATTRIBUTE_QUATS:
             for _ in quat_rows(block, record, entries.shape[1]):
@@ -151,7 +149,7 @@ def _fill_values(book: Codebook, header: SceneHeader) -> None:
     book.values = np.empty((book.record.size, count, 3), np.float32)
     row = 0
     for band in sorted(book.entries):
-        columns = Columns(book.entries[band].T, (0,) * (3 * (2 * band + 1)), 0, 0)
+        columns = ColumnBlock(book.entries[band].T, (0,) * (3 * (2 * band + 1)), 0, 0)
         record = header.attribute(_spec.ATTRIBUTE_SH0 + band)
         write_colour(columns, record, book.values[:, row : row + 2 * band + 1])
         row += 2 * band + 1

@@ -1,15 +1,17 @@
-"""The outermost layer: the file's header, its chunks' frames, their CRCs (spec 4.2, 5.1).
+"""Read the file header and the frames of chunks, and check their CRCs (spec 4.2, 5.1).
 
-Everything below reads from one `memoryview` of the whole file, so that every offset in an error
-is an offset in the file.
+All modules of the decoder read from one `memoryview` of the whole file, so that offsets in errors are offsets in the
+file.
 """
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from csplat import _spec
@@ -17,7 +19,111 @@ from csplat.errors import FormatError, InputError, UnsupportedError
 from csplat.inputs import File, mapped, stand_in
 
 _CRC_SIZE = 4
-_STAND_IN_SIZE = 64  # bytes that tell what came in place of the file
+_STAND_IN_SIZE = 64  # bytes from which content of another kind is recognised
+
+
+@dataclass(frozen=True, slots=True)
+class ExtraColumn:
+    """One further column per splat.
+
+    Attributes:
+        name: as in `SplatModel.extra`.
+        dtype: NumPy name of its type, `<u2`; `None` if this version does not know it: then it is not returned.
+    """
+
+    name: str
+    dtype: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """A tile record with its layer records and table ids (spec 4.3.5).
+
+    Attributes:
+        index: place of the record in the index.
+        offset: byte of the file where the record begins.
+        start: place of the tile's first splat in a whole decode.
+        splat_count: its splats.
+        exponent: its lattice of means has step × 2^exponent.
+        corner: lattice integers of the box's smallest corner.
+        extent: largest minus smallest lattice integer.
+        max_scale: largest of its scales (natural logarithm).
+        layers: layer records by layer id, including those of unknown layers.
+        tables: ids of the codebooks it may use.
+    """
+
+    index: int
+    offset: int
+    start: int
+    splat_count: int
+    exponent: int
+    corner: tuple[int, int, int]
+    extent: tuple[int, int, int]
+    max_scale: float
+    layers: dict[int, _spec.LayerRecord]
+    tables: tuple[int, ...]
+
+    def corners(self, step: float) -> tuple[list[float], list[float]]:
+        """Return the corners of the box around its centres (spec 4.3.5), scene units.
+
+        Args:
+            step: step of the means' attribute record.
+        """
+        scaled = math.ldexp(step, self.exponent)
+        low = [corner * scaled for corner in self.corner]
+        return low, [(corner + extent) * scaled for corner, extent in zip(self.corner, self.extent, strict=True)]
+
+
+@dataclass(frozen=True)
+class SceneHeader:
+    """A file's header and index, all of their clauses checked.
+
+    Attributes:
+        version: (major, minor).
+        profile: name in the registry of profiles, `base`.
+        file_size: bytes of the file.
+        index_size: bytes of the index.
+        splat_count: N.
+        sh_degree: 0 to 3.
+        antialiased: trained with the mip-splatting low-pass filter.
+        flat: splats are discs; the smallest scale has no meaning.
+        coordinate_system: as in `SplatModel`.
+        unit_metres: metres per scene unit, `None` if unknown.
+        origin: the point that the means are relative to.
+        attributes: attribute records in the order of their ids.
+        codebooks: codebook records in the order of their ids.
+        extras: extra columns.
+        directory: records of all chunks that are not tiles.
+        tiles: tiles in the order of their splats.
+    """
+
+    version: tuple[int, int]
+    profile: str
+    file_size: int
+    index_size: int
+    splat_count: int
+    sh_degree: int
+    antialiased: bool
+    flat: bool
+    coordinate_system: str
+    unit_metres: float | None
+    origin: tuple[float, float, float]
+    attributes: tuple[_spec.AttributeRecord, ...]
+    codebooks: tuple[_spec.CodebookRecord, ...]
+    extras: tuple[ExtraColumn, ...]
+    directory: tuple[_spec.DirectoryRecord, ...]
+    tiles: tuple[Tile, ...]
+
+    def attribute(self, attribute: int) -> _spec.AttributeRecord:
+        """Return an attribute's record; `KeyError` for a band above the scene's degree."""
+        # ATT-1: the records are opacities, scales, quats, means, sh0 and the bands, ids from 1 on.
+        if not 1 <= attribute <= len(self.attributes):
+            raise KeyError(attribute)
+        return self.attributes[attribute - 1]
+
+    def chunk(self, kind: bytes) -> _spec.DirectoryRecord | None:
+        """Return the directory record of META, CAMS, OPTS or SERR, `None` if there is none."""
+        return next((record for record in self.directory if record.type == kind), None)
 
 
 class Cursor:
@@ -27,7 +133,7 @@ class Cursor:
         view: the whole file.
         at: offset of the next byte.
         end: offset behind the payload; the caller has checked that the file is that long.
-        clause: the clause that wants the payload to end with its last structure.
+        clause: the clause that requires the payload to end with its last structure.
     """
 
     def __init__(self, view: memoryview, at: int, end: int, clause: str) -> None:
@@ -37,7 +143,7 @@ class Cursor:
         self.clause = clause
 
     def take(self, size: int) -> int:
-        """Step over `size` bytes and return where they begin; E_STREAM where fewer are left."""
+        """Step over `size` bytes and return their offset; E_STREAM if fewer are left."""
         at = self.at
         if size > self.end - at:
             raise FormatError(
@@ -76,7 +182,7 @@ def view_of(data: File) -> memoryview:
     if isinstance(data, (str, os.PathLike)):
         return memoryview(mapped(data))
     try:
-        # An mmap is a buffer and a file; of others that are read, what comes has to be bytes.
+        # An mmap is a buffer and a file; other files must return bytes.
         read = None if isinstance(data, mmap.mmap) else getattr(data, "read", None)
         return memoryview(data if read is None else read()).cast("B")  # type: ignore[arg-type]  # the except says so
     except (TypeError, ValueError) as error:
@@ -90,7 +196,7 @@ def check_reserved(record: Any, at: int, offsets: Mapping[str, int]) -> None:
 
     Args:
         record: a structure of `_spec`.
-        at: where it begins in the file.
+        at: its offset in the file.
         offsets: its `..._OFFSETS`.
     """
     for name, place in offsets.items():
@@ -145,7 +251,7 @@ def read_file_header(view: memoryview) -> _spec.Header:
 
 
 def check_length(view: memoryview, file_size: int) -> None:
-    """The data is the file, whole and nothing else (HDR-5, HDR-6)."""
+    """Refuse data that is not the file, complete and nothing else (HDR-5, HDR-6)."""
     if len(view) < file_size:
         raise FormatError(
             _spec.ERROR_TRUNCATED,
@@ -167,7 +273,7 @@ def check_length(view: memoryview, file_size: int) -> None:
 
 
 def check_index_crc(view: memoryview, start: int, size: int) -> None:
-    """IDX-1; the caller has checked that the data holds the index."""
+    """Check IDX-1; the caller has checked that the data holds the index."""
     end = start + size - _CRC_SIZE
     _check_crc(view[start:end], int.from_bytes(view[end : end + _CRC_SIZE], "little"), end, "IDX-1")
 
@@ -175,14 +281,14 @@ def check_index_crc(view: memoryview, start: int, size: int) -> None:
 def open_chunk(
     view: memoryview, record: _spec.DirectoryRecord | _spec.LayerRecord, kind: bytes, flags: int, clause: str
 ) -> Cursor:
-    """Check CRC and header of a chunk (CHK-1, CHK-3) and stand at the beginning of its payload.
+    """Check CRC and header of a chunk (CHK-1, CHK-3) and return a cursor at the beginning of its payload.
 
     Args:
         view: the whole file; COV-1 has shown that the chunk lies within.
         record: the one that names the chunk; its size is at least that of a chunk header.
         kind: type of the record, or TILE.
         flags: flags of the record, or those registered for TILE.
-        clause: what the cursor names when the payload is too long or too short.
+        clause: the cursor's clause, for a payload that is too long or too short.
     """
     offset, end = record.offset, record.offset + record.size
     _check_crc(view[offset:end], record.crc, offset, "CHK-1")

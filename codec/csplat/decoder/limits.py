@@ -1,4 +1,4 @@
-"""Limits that a caller sets on a file (LIM-1), checked against the index before anything is allocated."""
+"""Check a caller's limits (LIM-1) against the index, before anything is allocated."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 
 from csplat import _spec
 from csplat.decoder.codebooks import table_bytes
-from csplat.decoder.header import SceneHeader, Tile
+from csplat.decoder.container import SceneHeader, Tile
 from csplat.errors import InputError, LimitError
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Budgets of one decode; the defaults of `bytes` and `json_bytes` are the registry's.
+    """Limits of one decode; the defaults of `bytes` and `json_bytes` are the registry's.
 
     Attributes:
-        splats: splats of a decode of the whole scene, or of the chosen tiles; any number if left out.
-        bytes: memory of the arrays that are returned and of the codebooks they need.
+        splats: splats of a decode of the whole scene, or of the chosen tiles; by default any number.
+        bytes: memory of the returned arrays and of the codebooks.
         json_bytes: length of one JSON text.
     """
 
@@ -56,7 +56,7 @@ def check_budget(
     whole: bool,
     at_once: bool = True,
 ) -> None:
-    """Refuse what exceeds the limits, from the index alone.
+    """Refuse a decode that exceeds the limits, from the index alone.
 
     Args:
         header: the scene.
@@ -64,7 +64,7 @@ def check_budget(
         degree: highest SH band to decode.
         splat_bytes: bytes that one splat takes in the result.
         limits: limits set by the caller.
-        whole: True if all of the file is decoded, and so every codebook read.
+        whole: True if the whole file is decoded, and so every codebook is read.
         at_once: all tiles lie in memory together; otherwise one at a time.
 
     Raises:

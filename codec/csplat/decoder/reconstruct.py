@@ -1,7 +1,7 @@
-"""Integers into float32 (spec 7): one product in binary64, rounded once.
+"""Reconstruct float32 values from integers (spec 7): one product in binary64, rounded once.
 
-Each `write_...` fills an output array for one tile. `lattice_rows` and `quat_rows` give the
-checked integers, colours as red, green and blue; `integers.py` hands out the same ones.
+Each `write_…` fills an output array for one tile. `lattice_rows` and `quat_rows` yield the checked integers, colours
+as red, green and blue; `write_integers` copies the same ones (spec 9.2).
 """
 
 from __future__ import annotations
@@ -16,18 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.decoder.blocks import Block, Coded, Columns, Sparse, TileBlocks, runs, work_dtype
-from csplat.decoder.header import SceneHeader
-from csplat.decoder.streams import Ints
+from csplat.decoder.blocks import Block, CodebookBlock, ColumnBlock, SparseBlock, TileBlocks, runs, work_dtype
+from csplat.decoder.container import SceneHeader
+from csplat.decoder.entropy import Ints
 from csplat.errors import FormatError
 from csplat.types import F32
 
 _SQRT_2 = float.fromhex("0x1.6A09E667F3BCDp+0")  # 7.5
 _INT32 = np.dtype(np.int32)
 
+_BAND_NAMES = {band: _spec.ATTRIBUTE_NAMES[_spec.ATTRIBUTE_SH0 + band] for band in range(1, _spec.SH_DEGREE_MAX + 1)}
+
 
 @dataclass(frozen=True)
-class Arrays:
+class SplatArrays:
     """The arrays of section 3, for a scene or a tile of it.
 
     Attributes:
@@ -49,7 +51,7 @@ class Arrays:
     extra: dict[str, NDArray[Any]]
 
     @classmethod
-    def empty(cls, count: int, sh_degree: int, header: SceneHeader) -> Arrays:
+    def empty(cls, count: int, sh_degree: int, header: SceneHeader) -> SplatArrays:
         """Allocate arrays for `count` splats, not filled."""
         return cls(
             means=np.empty((count, 3), np.float32),
@@ -61,9 +63,9 @@ class Arrays:
             extra={column.name: np.empty(count, column.dtype) for column in header.extras if column.dtype},
         )
 
-    def part(self, start: int, stop: int) -> Arrays:
+    def part(self, start: int, stop: int) -> SplatArrays:
         """Return views of some splats."""
-        return Arrays(
+        return SplatArrays(
             means=self.means[start:stop],
             quats=self.quats[start:stop],
             scales=self.scales[start:stop],
@@ -74,13 +76,13 @@ class Arrays:
         )
 
 
-def write_tile(source: TileBlocks, header: SceneHeader, degree: int, opacities: F32, out: Arrays) -> None:
+def write_tile(source: TileBlocks, header: SceneHeader, degree: int, opacities: F32, out: SplatArrays) -> None:
     """Reconstruct a tile's values.
 
     Args:
         source: the tile's integers.
         header: the scene.
-        degree: highest SH band wanted.
+        degree: highest SH band to decode.
         opacities: alpha of each level, `opacity_table`.
         out: the tile's part of the arrays.
     """
@@ -102,8 +104,65 @@ def write_tile(source: TileBlocks, header: SceneHeader, degree: int, opacities: 
         column.view(bits.dtype)[:] = bits
 
 
+def empty_integers(count: int, tile_count: int, degree: int) -> dict[str, NDArray[Any]]:
+    """Allocate the arrays of 9.2; bands and exponents without a block stay 0."""
+    arrays: dict[str, NDArray[Any]] = {
+        "opacities": np.empty(count, np.uint32),
+        "scales": np.empty((count, 3), np.int64),
+        "quats": np.empty((count, 3), np.int32),
+        "means": np.empty((count, 3), np.int64),
+        "sh0": np.empty((count, 3), np.int64),
+    }
+    for band in range(1, degree + 1):
+        arrays[_BAND_NAMES[band]] = np.zeros((count, 2 * band + 1, 3), np.int64)
+    arrays["tile_splats"] = np.empty(tile_count, np.uint32)
+    arrays["exponents"] = np.zeros((tile_count, _spec.ATTRIBUTE_SH0 + degree), np.int32)
+    return arrays
+
+
+def integer_part(arrays: dict[str, NDArray[Any]], start: int, stop: int) -> dict[str, NDArray[Any]]:
+    """Return views of some splats, without the arrays that have a row per tile."""
+    return {name: a[start:stop] for name, a in arrays.items() if name not in ("tile_splats", "exponents")}
+
+
+def write_integers(
+    source: TileBlocks, header: SceneHeader, out: dict[str, NDArray[Any]], exponents: NDArray[Any]
+) -> None:
+    """Write a tile's integers; the clauses checked are those of `write_tile`.
+
+    Args:
+        source: the tile's blocks.
+        header: the scene.
+        out: the tile's part of the arrays.
+        exponents: the tile's row, zeros.
+    """
+    count = source.tile.splat_count
+    for attribute, block in source.blocks.items():
+        record = header.attribute(attribute)
+        name = _spec.ATTRIBUTE_NAMES[attribute]
+        array = out[name]
+        exponents[attribute - 1] = block.exponent
+        if attribute == _spec.ATTRIBUTE_OPACITIES:
+            for start, stop in runs(count, 1):
+                array[start:stop] = block.rows(start, stop, _INT32)[0]
+        elif attribute == _spec.ATTRIBUTE_QUATS:
+            for start, stop, q, _r in quat_rows(block, record, count):
+                array[start:stop] = q.T
+        else:
+            by_channel = array.reshape(count, -1, 3)
+            largest = []
+            for start, stop, parts in lattice_rows(block, record, count):
+                for i, part in enumerate(parts):
+                    by_channel[start:stop, :, i] = part.T
+                if not isinstance(block, ColumnBlock):
+                    largest.append(max(int(part.max()) for part in parts))
+            if attribute == _spec.ATTRIBUTE_SCALES:
+                top = max(block.highs) if isinstance(block, ColumnBlock) else max(largest)
+                check_max_scale(source, record, top)
+
+
 def check_max_scale(source: TileBlocks, record: _spec.AttributeRecord, largest: int) -> None:
-    """TIL-11; values grow with their integers, so the largest integer's value is the largest."""
+    """Check TIL-11: values grow with their integers, so the largest integer has the largest value."""
     step = np.ldexp(record.step, source.blocks[_spec.ATTRIBUTE_SCALES].exponent)
     value = np.float32(np.float64(largest) * step)
     # Bit for bit: NaN differs from everything, and +0 from −0.
@@ -129,8 +188,8 @@ def lattice_rows(
     The three are x, y, z of means and scales, red, green, blue of colours.
 
     Args:
-        block: of means, scales, sh0 or an SH band.
-        record: its attribute.
+        block: a block of means, scales, sh0 or an SH band.
+        record: its attribute record.
         count: splats of the block.
 
     Raises:
@@ -154,14 +213,14 @@ def lattice_rows(
 
 
 def check_values(block: Block, record: _spec.AttributeRecord, count: int) -> None:
-    """Raise what `lattice_rows` raises, and do nothing where a look at the bound is enough."""
+    """Raise what `lattice_rows` raises, without reading the integers if their bound is small enough."""
     if not _is_finite(_bound(block, record), math.ldexp(record.step, block.exponent)):
         for _ in lattice_rows(block, record, count):
             pass
 
 
 def _bound(block: Block, record: _spec.AttributeRecord) -> int:
-    """Largest magnitude of a lattice integer of the block, and of all on the way to it."""
+    """Return the largest magnitude of a lattice integer of the block and of its intermediate values."""
     bound = max(1, block.bound)
     if record.mapping == _spec.MAPPING_YCOCG:  # |Y| + 2 (|Co| + |Cg|), shifted, covers R, G, B
         bound += bound << (record.chroma_shift + 2)
@@ -201,9 +260,9 @@ def write_lattice(block: Block, record: _spec.AttributeRecord, out: F32) -> int:
     for start, stop, parts in lattice_rows(block, record, len(out)):
         for axis, part in enumerate(parts):
             _scale(part[0], step, out[start:stop, axis], wide=record.attribute == _spec.ATTRIBUTE_MEANS)
-        if not isinstance(block, Columns):
+        if not isinstance(block, ColumnBlock):
             largest.append(max(int(part.max()) for part in parts))
-    return max(block.highs) if isinstance(block, Columns) else max(largest)
+    return max(block.highs) if isinstance(block, ColumnBlock) else max(largest)
 
 
 def write_colour(block: Block, record: _spec.AttributeRecord, out: F32) -> None:
@@ -220,7 +279,7 @@ def write_bands(blocks: dict[int, Block], records: dict[int, _spec.AttributeReco
 
     Args:
         blocks: by band, those the tile has.
-        records: by band, all that are wanted.
+        records: by band, all bands to write.
         out: the tile's part of shN.
     """
     copied = _copy_entries(blocks, records, out)
@@ -229,38 +288,38 @@ def write_bands(blocks: dict[int, Block], records: dict[int, _spec.AttributeReco
         block = blocks.get(band)
         if block is None:
             part[:] = 0.0
-        elif isinstance(block, Sparse):
+        elif isinstance(block, SparseBlock):
             part[:] = 0.0
             _write_some(block.places, block.values, record, part)
         elif not copied:
             write_colour(block, record, part)
-        elif isinstance(block, Coded) and block.escapes:
+        elif isinstance(block, CodebookBlock) and block.escapes:
             _write_some(block.indices.escaped, block.escapes, record, part)
 
 
 def _copy_entries(blocks: dict[int, Block], records: dict[int, _spec.AttributeRecord], out: F32) -> bool:
-    """Copy rows of float32 where one codebook serves all bands; False where not."""
+    """Copy rows of float32 if all bands have the same codebook and indices; otherwise return False."""
     first = blocks.get(1)
-    if not isinstance(first, Coded) or len(blocks) != len(records):
+    if not isinstance(first, CodebookBlock) or len(blocks) != len(records):
         return False
     indices = first.indices
     values = indices.book.values
     if values is None or values.shape[1:] != out.shape[1:]:
         return False
-    if not all(isinstance(block, Coded) and block.indices is indices for block in blocks.values()):
+    if not all(isinstance(block, CodebookBlock) and block.indices is indices for block in blocks.values()):
         return False
     np.take(values, indices.places, axis=0, out=out, mode="clip")
     return True
 
 
-def _write_some(places: NDArray[np.intp], columns: Columns, record: _spec.AttributeRecord, out: F32) -> None:
+def _write_some(places: NDArray[np.intp], columns: ColumnBlock, record: _spec.AttributeRecord, out: F32) -> None:
     values = np.empty((len(places), *out.shape[1:]), np.float32)
     write_colour(columns, record, values)
     out[places] = values
 
 
 def _scale(integers: Ints, step: float, out: F32, *, wide: bool = False) -> None:
-    """float32(float64(n) × s), rounded once: of all but means the same as one product in binary32 (7.2)."""
+    """Compute float32(float64(n) × s), rounded once; except for means, one product in binary32 is the same (7.2)."""
     if wide:
         np.multiply(integers, step, out=out, dtype=np.float64, casting="same_kind")
     else:
@@ -269,7 +328,7 @@ def _scale(integers: Ints, step: float, out: F32, *, wide: bool = False) -> None
 
 def _check_finite(parts: tuple[Ints, Ints, Ints], step: float, record: _spec.AttributeRecord, at: int) -> None:
     largest = max(max(-int(part.min()), int(part.max())) for part in parts)
-    # Values grow with their integers: the largest decides.
+    # Values grow with their integers, so the largest integer has the largest value.
     if not np.isfinite(np.float32(float(largest) * step)):
         raise FormatError(
             _spec.ERROR_RANGE,

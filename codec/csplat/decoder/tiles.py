@@ -1,29 +1,79 @@
-"""A tile's chunks into blocks, and blocks into arrays (spec 5.2)."""
+"""Read the blocks of tiles: every attribute coding (spec 5.2, 6.4), ranges checked."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from csplat import _spec
-from csplat.decoder.blocks import Codebook, TileBlocks
-from csplat.decoder.coded import TileContext
-from csplat.decoder.codings import read_block, read_raw
-from csplat.decoder.container import check_reserved, open_chunk
-from csplat.decoder.header import SceneHeader, Tile
+from csplat.decoder.blocks import (
+    Block,
+    Codebook,
+    CodebookBlock,
+    ColumnBlock,
+    Indices,
+    SparseBlock,
+    TileBlocks,
+    check_integers,
+    check_step,
+    morton_axes,
+    read_block_head,
+    read_columns,
+    read_exponent,
+    read_offsets,
+    read_signed,
+    runs,
+)
+from csplat.decoder.codebooks import attribute_columns
+from csplat.decoder.container import Cursor, SceneHeader, Tile, check_reserved, open_chunk
+from csplat.decoder.entropy import Ints, read_stream
 from csplat.errors import FormatError
 
 _TILE_FLAGS = sum(flag for flag, name in _spec.CHUNK_FLAG_NAMES.items() if name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
 
+_ESCAPE_CODINGS = (_spec.CODING_OFFSET, _spec.CODING_SIGNED)
+
+_WIDE = np.dtype(np.int64)
+
+#: By coding except CODEBOOK and RAW: size of its parameters, one i32 per column or none, number of streams.
+_SHAPES = {
+    _spec.CODING_LEVELS: (0, False, 1),
+    _spec.CODING_MORTON: (_spec.MORTON_PARAMS_SIZE, False, 1),
+    _spec.CODING_AXIS: (0, False, 1),
+    _spec.CODING_OFFSET: (_spec.LATTICE_PARAMS_SIZE, True, 1),
+    _spec.CODING_SIGNED: (_spec.LATTICE_PARAMS_SIZE, False, 1),
+    _spec.CODING_SPARSE: (_spec.SPARSE_PARAMS_SIZE, False, 2),
+}
+
+
+@dataclass
+class TileContext:
+    """The data that the blocks of one tile may refer to.
+
+    Attributes:
+        header: the scene.
+        tile: the tile.
+        books: the codebooks that were read.
+        first: indices of the tile's first block of each codebook, by codebook id.
+    """
+
+    header: SceneHeader
+    tile: Tile
+    books: Mapping[int, Codebook]
+    first: dict[int, Indices] = field(default_factory=dict)
+
 
 def wanted_layers(tile: Tile, degree: int) -> list[_spec.LayerRecord]:
-    """Return what is read of a tile: all of its layers but the SH bands above `degree`."""
+    """Return the layers of a tile that are read: all but the SH bands above `degree`."""
     return [layer for layer in tile.layers.values() if not degree < layer.layer <= _spec.SH_DEGREE_MAX]
 
 
 def read_tile(
     view: memoryview, header: SceneHeader, tile: Tile, degree: int, books: Mapping[int, Codebook]
 ) -> TileBlocks:
-    """Read layer 0, the SH layers up to `degree` and the extra layer of a tile; of others only the frame."""
+    """Read layer 0, the SH layers up to `degree` and the extra layer of a tile; only the frame of others."""
     context = TileContext(header, tile, books)
     result = TileBlocks(tile)
     for layer in wanted_layers(tile, degree):
@@ -50,6 +100,33 @@ def read_tile(
     return result
 
 
+def codebook_references(view: memoryview, header: SceneHeader, layer: _spec.LayerRecord) -> Iterator[tuple[int, int]]:
+    """Find the u16 that name codebooks in a tile's chunk of layer 0 or of an SH band.
+
+    Args:
+        view: the file, at least up to the end of the chunk.
+        header: the scene.
+        layer: the chunk's record.
+
+    Yields:
+        Offset in the file, and the id stored there.
+
+    Raises:
+        FormatError: the chunk's frame or a structure breaks a clause; streams are not decoded.
+    """
+    cursor = open_chunk(view, layer, _spec.CHUNK_TILE, _TILE_FLAGS, "TLE-3")
+    cursor.take(_spec.TILE_HEAD_SIZE)
+    for attribute in (record.attribute for record in header.attributes):
+        if _spec.ATTRIBUTE_LAYER[attribute] != layer.layer:
+            continue
+        coding = read_block_head(cursor, attribute)
+        if coding == _spec.CODING_CODEBOOK:
+            yield _step_over_coded(cursor, header, attribute)
+        else:
+            _step_over(cursor, attribute, coding)
+    cursor.finish()
+
+
 def _read_tile_head(view: memoryview, at: int, layer: int, block_count: int) -> None:
     head = _spec.unpack_tile_head(view, at)
     places = _spec.TILE_HEAD_OFFSETS
@@ -61,3 +138,245 @@ def _read_tile_head(view: memoryview, at: int, layer: int, block_count: int) -> 
     ):
         if found != wanted:
             raise FormatError(code, at + places[name], clause, name, found=found, wanted=wanted)
+
+
+def read_block(cursor: Cursor, context: TileContext, attribute: int) -> Block:
+    """Read the block of an attribute and step over it.
+
+    Args:
+        cursor: at the block head.
+        context: the tile.
+        attribute: the block that TLE-2 requires here.
+    """
+    at = cursor.at
+    coding = read_block_head(cursor, attribute)
+    count = context.tile.splat_count
+    if coding == _spec.CODING_CODEBOOK:
+        return read_codebook_block(cursor, context, attribute, at)
+    if coding in (_spec.CODING_MORTON, _spec.CODING_AXIS):
+        return read_means(cursor, context, coding)
+    if coding == _spec.CODING_SPARSE:
+        return read_sparse(cursor, context, attribute)
+    return read_columns(cursor, context.header, attribute, coding, count)
+
+
+def read_sparse(cursor: Cursor, context: TileContext, attribute: int) -> SparseBlock:
+    """Read mask and values: SPA-1 to SPA-3, LAT-1, LAT-4."""
+    at, places = cursor.take(_spec.SPARSE_PARAMS_SIZE), _spec.SPARSE_PARAMS_OFFSETS
+    params = _spec.unpack_sparse_params(cursor.view, at)
+    check_reserved(params, at, places)
+    record, count = context.header.attribute(attribute), context.tile.splat_count
+    check_step(record, params.exponent, at + places["exponent"])
+    if not 1 <= params.present_count <= count:
+        raise FormatError(
+            _spec.ERROR_VALUE,
+            at + places["present_count"],
+            "SPA-1",
+            "present_count",
+            found=params.present_count,
+            wanted=f"1 to {count}",
+        )
+    mask_at = cursor.at
+    bits = np.unpackbits(read_stream(cursor, (count + 7) >> 3, 1), bitorder="little")
+    if bits[count:].any():
+        raise FormatError(_spec.ERROR_RANGE, mask_at, "SPA-3", "bits of the mask beyond the last splat", wanted=0)
+    present = np.flatnonzero(bits)
+    if len(present) != params.present_count:
+        raise FormatError(
+            _spec.ERROR_RANGE, mask_at, "SPA-2", "bits of the mask", found=len(present), wanted=params.present_count
+        )
+    return SparseBlock(read_signed(cursor, record, params.exponent, len(present)), present)
+
+
+def read_raw(cursor: Cursor, context: TileContext, column: int) -> Ints:
+    """Read the block of an extra column: [n] unsigned integers, the bits of its values."""
+    coding = read_block_head(cursor, _spec.ATTRIBUTE_EXTRA)
+    at = cursor.take(_spec.RAW_PARAMS_SIZE)
+    params = _spec.unpack_raw_params(cursor.view, at)
+    check_reserved(params, at, _spec.RAW_PARAMS_OFFSETS)
+    if params.column != column:
+        raise FormatError(_spec.ERROR_STREAM, at, "RAW-1", "column", found=params.column, wanted=column)
+    width_at = cursor.at
+    elements = read_stream(cursor, context.tile.splat_count, _spec.CODING_WIDTH_MAX[coding])
+    width, dtype = cursor.view[width_at], context.header.extras[column].dtype
+    if dtype and width != (wanted := np.dtype(dtype).itemsize):
+        raise FormatError(_spec.ERROR_STREAM, width_at, "RAW-2", "width", found=width, wanted=wanted)
+    return elements
+
+
+def read_means(cursor: Cursor, context: TileContext, coding: int) -> ColumnBlock:
+    """Read the means of a tile, as lattice integers."""
+    tile = context.tile
+    count, width_max = tile.splat_count, _spec.CODING_WIDTH_MAX[coding]
+    if coding == _spec.CODING_MORTON:
+        params_at = cursor.take(_spec.MORTON_PARAMS_SIZE)
+        params = _spec.unpack_morton_params(cursor.view, params_at)
+        check_reserved(params, params_at, _spec.MORTON_PARAMS_OFFSETS)
+        if not 1 <= params.bits <= _spec.MORTON_BITS_MAX:
+            raise FormatError(
+                _spec.ERROR_VALUE, params_at, "MOR-1", "bits", found=params.bits, wanted=f"1 to {_spec.MORTON_BITS_MAX}"
+            )
+        at = cursor.at
+        codes = read_stream(cursor, count, width_max)
+        _check_bits(codes, 3 * params.bits, at, "MOR-2")
+        q = morton_axes(codes)
+    else:
+        at = cursor.at
+        q = read_stream(cursor, 3 * count, width_max).reshape(3, count)
+        _check_bits(q, _spec.AXIS_BITS_MAX, at, "AXI-1")
+    block = ColumnBlock(q, tile.corner, tile.exponent, at)
+    far = tuple(corner + extent for corner, extent in zip(tile.corner, tile.extent, strict=True))
+    if block.lows != tile.corner or block.highs != far:
+        raise FormatError(
+            _spec.ERROR_BOX,
+            tile.offset + _spec.TILE_RECORD_OFFSETS["corner"],
+            "TIL-10",
+            "the tile's box",
+            found=f"{tile.corner} to {far}",
+            wanted=f"{block.lows} to {block.highs}, the box of its splats",
+        )
+    return block
+
+
+def _check_bits(elements: Ints, bits: int, at: int, clause: str) -> None:
+    largest = int(elements.max())
+    if largest >> bits:
+        raise FormatError(_spec.ERROR_RANGE, at, clause, "integer", found=largest, wanted=f"below 2^{bits}")
+
+
+def read_codebook_block(cursor: Cursor, context: TileContext, attribute: int, at: int) -> CodebookBlock:
+    """Read the rest of the block whose head is at `at`: indices, summand, escape block; CBK-1 to CBK-6."""
+    params_at = cursor.take(_spec.CODEBOOK_PARAMS_SIZE)
+    params = _spec.unpack_codebook_params(cursor.view, params_at)
+    check_reserved(params, params_at, _spec.CODEBOOK_PARAMS_OFFSETS)
+    book = context.books.get(params.codebook_id)
+    columns = attribute_columns(book.record, attribute) if book else None
+    if book is None or columns is None or params.codebook_id not in context.tile.tables:
+        raise FormatError(
+            _spec.ERROR_CODEBOOK,
+            params_at,
+            "CBK-1",
+            f"codebook {params.codebook_id} is not of the tile or not for {_spec.ATTRIBUTE_NAMES[attribute]}",
+        )
+    indices = _indices(cursor, context, attribute, book, params, params_at)
+    summand = None
+    if attribute == _spec.ATTRIBUTE_SCALES:
+        summand = _read_summand(cursor, context, attribute)
+    escapes = None
+    if params.escape_count:
+        legal = (_spec.CODING_SIGNED,) if attribute == _spec.ATTRIBUTE_QUATS else _ESCAPE_CODINGS
+        coding = read_block_head(cursor, attribute, legal)
+        escapes = read_columns(cursor, context.header, attribute, coding, params.escape_count, escape=True)
+    layer = _spec.ATTRIBUTE_LAYER[attribute]
+    block = CodebookBlock(indices, book.entries[layer][:, columns], escapes, summand, at)
+    if summand is not None:
+        _check_sums(block, context)  # in other blocks, CBK-7 has already checked the entries
+    return block
+
+
+def holds_indices(book: _spec.CodebookRecord, attribute: int) -> bool:
+    """Return True if the block of that attribute holds the indices of a codebook, which its other blocks use."""
+    if book.kind == _spec.CODEBOOK_KIND_SH:
+        return attribute == _spec.ATTRIBUTE_SH0 + book.band_first
+    return _spec.ATTRIBUTE_NAMES[attribute] == _spec.CODEBOOK_KIND_ATTRIBUTES[book.kind][0]
+
+
+def _indices(
+    cursor: Cursor,
+    context: TileContext,
+    attribute: int,
+    book: Codebook,
+    params: _spec.CodebookParams,
+    at: int,
+) -> Indices:
+    """Read the indices, or find those of the tile's first block of the codebook (CBK-4)."""
+    name = _spec.ATTRIBUTE_NAMES[attribute]
+    if holds_indices(book.record, attribute):
+        indices = _read_indices(cursor, context, attribute, book, params.escape_count, at)
+        context.first[params.codebook_id] = indices
+        return indices
+    known = context.first.get(params.codebook_id)
+    if known is None or len(known.escaped) != params.escape_count:
+        raise FormatError(
+            _spec.ERROR_CODEBOOK,
+            at,
+            "CBK-4",
+            f"{name} follows no block of the codebook's first attribute with as many escapes",
+            found=params.escape_count,
+            wanted=None if known is None else len(known.escaped),
+        )
+    return known
+
+
+def _read_indices(
+    cursor: Cursor, context: TileContext, attribute: int, book: Codebook, escape_count: int, at: int
+) -> Indices:
+    count = context.tile.splat_count
+    size, stream_at = book.record.size, cursor.at
+    places = read_stream(cursor, count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK])
+    largest = int(places.max())
+    if largest > size:
+        raise FormatError(
+            _spec.ERROR_CODEBOOK, stream_at, "CBK-2", "index of an entry", found=largest, wanted=f"at most {size}"
+        )
+    escaped = np.flatnonzero(places == size)
+    if len(escaped) != escape_count:
+        raise FormatError(
+            _spec.ERROR_CODEBOOK,
+            at + _spec.CODEBOOK_PARAMS_OFFSETS["escape_count"],
+            "CBK-3",
+            "escape_count",
+            found=escape_count,
+            wanted=len(escaped),
+        )
+    return Indices(book, attribute, places, escaped)
+
+
+def _read_summand(cursor: Cursor, context: TileContext, attribute: int) -> ColumnBlock:
+    """Read the common summand of scales, which is on the file's lattice as their entries are."""
+    read_exponent(cursor, context.header.attribute(attribute), fixed=True)
+    offsets = read_offsets(cursor, 1)
+    at = cursor.at
+    count, width_max = context.tile.splat_count, _spec.CODING_WIDTH_MAX[_spec.CODING_OFFSET]
+    elements = read_stream(cursor, count, width_max)
+    return ColumnBlock(elements.reshape(1, count), offsets, 0, at)
+
+
+def _check_sums(block: CodebookBlock, context: TileContext) -> None:
+    """Check CBK-6: LAT-4 holds for the sums of scales as for integers in a stream."""
+    if block.bound <= _spec.COLUMN_MAX:
+        return
+    record = context.header.attribute(_spec.ATTRIBUTE_SCALES)
+    for start, stop in runs(context.tile.splat_count, 3):
+        rows = block.rows(start, stop, _WIDE)
+        lows = tuple(int(value) for value in rows.min(axis=1))
+        highs = tuple(int(value) for value in rows.max(axis=1))
+        check_integers(lows, highs, record, block.at)
+
+
+def _step_over_coded(cursor: Cursor, header: SceneHeader, attribute: int) -> tuple[int, int]:
+    at = cursor.take(_spec.CODEBOOK_PARAMS_SIZE)
+    params = _spec.unpack_codebook_params(cursor.view, at)
+    book = next((one for one in header.codebooks if one.codebook_id == params.codebook_id), None)
+    if book is None:
+        raise FormatError(_spec.ERROR_CODEBOOK, at, "CBK-1", f"there is no codebook {params.codebook_id}")
+    if holds_indices(book, attribute):
+        _step_over_stream(cursor)
+    if attribute == _spec.ATTRIBUTE_SCALES:  # the summand: lattice parameters, one offset
+        cursor.take(_spec.LATTICE_PARAMS_SIZE + 4)
+        _step_over_stream(cursor)
+    if params.escape_count:
+        _step_over(cursor, attribute, read_block_head(cursor, attribute, (_spec.CODING_OFFSET, _spec.CODING_SIGNED)))
+    return at + _spec.CODEBOOK_PARAMS_OFFSETS["codebook_id"], params.codebook_id
+
+
+def _step_over(cursor: Cursor, attribute: int, coding: int) -> None:
+    size, offsets, streams = _SHAPES[coding]
+    cursor.take(size + 4 * offsets * _spec.ATTRIBUTE_COLUMNS[attribute])
+    for _ in range(streams):
+        _step_over_stream(cursor)
+
+
+def _step_over_stream(cursor: Cursor) -> None:
+    at = cursor.take(_spec.STREAM_HEAD_SIZE)
+    cursor.take(_spec.unpack_stream_head(cursor.view, at).coded_size)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from csplat import _spec
-from csplat.decoder import Scene, decode_scene
+from csplat.decoder import DecodedScene, decode_scene
 from csplat.errors import CsplatError
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat_conformance.encoders.coarse import coarse_pruning
@@ -23,7 +23,7 @@ _CUT_SHORT = frozenset((_spec.ERROR_TRUNCATED,))
 _SHOWN = 3
 
 
-def judge_stream(data: bytes) -> tuple[Verdict, Scene | None]:
+def judge_stream(data: bytes) -> tuple[Verdict, DecodedScene | None]:
     """L1: no clause is broken (CNF-1, CNF-5); and the scene, if so."""
     if not data:
         return Verdict(Status.PARTIAL_OUTPUT, "an empty file"), None
@@ -45,7 +45,7 @@ def judge_stream(data: bytes) -> tuple[Verdict, Scene | None]:
     return Verdict(Status.PASSED, "; ".join(validation.remarks), details={"bytes": len(data)}), scene
 
 
-def judge_content(one: Input, source: Source, scene: Scene, index: Path | None) -> tuple[Verdict, Pairs]:
+def judge_content(one: Input, source: Source, scene: DecodedScene, index: Path | None) -> tuple[Verdict, Pairs]:
     """L2: each splat of the source once, or counted as pruned; facts that the source does not know are not stated.
 
     Args:
@@ -92,8 +92,8 @@ def _many(count: int, first: int) -> str:
     )
 
 
-def _wrong_counts(source: Source, scene: Scene, pairs: Pairs) -> list[Wrong]:
-    stated = scene.stated_errors
+def _wrong_counts(source: Source, scene: DecodedScene, pairs: Pairs) -> list[Wrong]:
+    stated = scene.declared_bounds
     if stated is None:
         text = f"{pairs.missing} splats of the source are missing, and nothing says so"
         return [("SER-5", text)] if pairs.missing else []

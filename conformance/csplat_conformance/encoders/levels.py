@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from csplat.decoder import Scene
+from csplat.decoder import DecodedScene
 from csplat_conformance.encoders.ending import judge_end, wrong_habits
 from csplat_conformance.encoders.inputs import Input
 from csplat_conformance.encoders.judge import judge_content, judge_stream
@@ -80,7 +80,9 @@ def _verdicts(one: Input, first: Trial, again: Trial | None, asked: Asked) -> It
     yield "L4", _judge_pictures(one, scene, pairs, len(data), alone if "L3" in asked.levels else "", asked)
 
 
-def _judge_pictures(one: Input, scene: Scene, pairs: Pairs, size_bytes: int, alone: str, asked: Asked) -> Verdict:
+def _judge_pictures(
+    one: Input, scene: DecodedScene, pairs: Pairs, size_bytes: int, alone: str, asked: Asked
+) -> Verdict:
     """Judge L4.
 
     Args:

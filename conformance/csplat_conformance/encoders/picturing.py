@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from csplat.decoder import Scene
+from csplat.decoder import DecodedScene
 from csplat.model import SplatModel
 from csplat_conformance.encoders.figures import beside, figures_of
 from csplat_conformance.encoders.inputs import Input
@@ -22,7 +22,7 @@ PictureJudge = Callable[[SplatModel, SplatModel], float]
 def judge_pictures(
     one: Input,
     source: Source,
-    scene: Scene,
+    scene: DecodedScene,
     pairs: Pairs,
     size_bytes: int,
     pictures: PictureJudge,

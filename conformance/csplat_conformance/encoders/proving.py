@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from csplat.decoder import Scene
+from csplat.decoder import DecodedScene
 from csplat_conformance.encoders.coarse import coarse_errors
 from csplat_conformance.encoders.cut import find_cuts
 from csplat_conformance.encoders.inputs import Input
@@ -15,7 +15,7 @@ _UNKNOWN = "which splat is which is not known"
 _SILENT = "the file states no errors"
 
 
-def judge_errors(one: Input, scene: Scene, pairs: Pairs) -> tuple[Verdict, str]:
+def judge_errors(one: Input, scene: DecodedScene, pairs: Pairs) -> tuple[Verdict, str]:
     """Judge L3: what is stated holds (SER-5); what is not stated is not proved.
 
     Args:
@@ -29,7 +29,7 @@ def judge_errors(one: Input, scene: Scene, pairs: Pairs) -> tuple[Verdict, str]:
     source = one.source() if one.source is not None else None
     if source is None or pairs.strays or pairs.surplus:
         return Verdict(Status.SKIPPED, _UNKNOWN), ""
-    stated = scene.stated_errors
+    stated = scene.declared_bounds
     if stated is None:
         # An empty scene has no errors.
         return (Verdict(Status.NOT_PROVED, _SILENT), _SILENT) if len(scene.model) else (Verdict(Status.PASSED), "")

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.decoder import Opened
+from csplat.decoder import TileReader
 from csplat.inputs import LetGo
 from csplat.memory import default_bytes
 from csplat.model import SplatModel
@@ -57,7 +57,7 @@ class PartSizes:
     worth_a_process: int = 1 << 18
 
 
-def fits_memory(opened: Opened, source_count: int, source_bytes: int, memory_bytes: int | None) -> bool:
+def fits_memory(opened: TileReader, source_count: int, source_bytes: int, memory_bytes: int | None) -> bool:
     """Return True if a file and its source can be compared in memory.
 
     Args:
@@ -72,14 +72,14 @@ def fits_memory(opened: Opened, source_count: int, source_bytes: int, memory_byt
     return wanted <= (default_bytes() if memory_bytes is None else memory_bytes)
 
 
-def _splat_bytes(opened: Opened) -> int:
+def _splat_bytes(opened: TileReader) -> int:
     facts = opened.facts
     return 4 * (11 + 3 * (facts.sh_degree + 1) ** 2) + sum(column.itemsize for column in facts.extra.values())
 
 
 def prove_by_disk(
     scene: Scene,
-    opened: Opened,
+    opened: TileReader,
     source_index: NDArray[Any] | None = None,
     *,
     memory_bytes: int | None = None,
@@ -104,7 +104,7 @@ def prove_by_disk(
         OSError: the disk cannot be written or read.
     """
     with closing(_ByDisk(scene, opened, memory_bytes, sizes or PartSizes(), progress)) as way:
-        return prove_by(way, opened.header, opened.stated_errors, source_index)
+        return prove_by(way, opened.header, opened.declared_bounds, source_index)
 
 
 @dataclass(eq=False)
@@ -112,7 +112,7 @@ class _ByDisk:
     """A `Way`: both scenes a part at a time. Owns the file on the disk."""
 
     scene: Scene
-    opened: Opened
+    opened: TileReader
     memory_bytes: int | None
     sizes: PartSizes
     progress: Progress | None

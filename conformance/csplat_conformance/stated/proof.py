@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.decoder import SceneHeader, StatedErrors
+from csplat.decoder import DeclaredBounds, SceneHeader
 from csplat.model import SplatModel
 from csplat.types import I64, Progress
 from csplat_conformance.room import may_be_stated, room
@@ -38,7 +38,7 @@ def prove(
     source: Source,
     decoded: SplatModel,
     header: SceneHeader,
-    stated: StatedErrors | None,
+    stated: DeclaredBounds | None,
     source_index: NDArray[Any] | None = None,
     *,
     progress: Progress | None = None,
@@ -109,7 +109,7 @@ class Way(Protocol):
 
 
 def prove_by(
-    way: Way, header: SceneHeader, stated: StatedErrors | None, source_index: NDArray[Any] | None = None
+    way: Way, header: SceneHeader, stated: DeclaredBounds | None, source_index: NDArray[Any] | None = None
 ) -> Proof:
     """Compare a file's stated errors with its source; as `prove`, wherever the splats are."""
     if stated is None:
@@ -132,7 +132,7 @@ def prove_by(
     return Proof(tuple(measures), tuple(line for _, line in wrong), clauses, silent, rms_proved=proved)
 
 
-def _different_scenes(way: Way, stated: StatedErrors) -> Iterator[str]:
+def _different_scenes(way: Way, stated: DeclaredBounds) -> Iterator[str]:
     """Yield differences that rule out a comparison: number of splats, SH degree."""
     if way.source_count != stated.source_count:
         yield f"the file stands for a source of {stated.source_count} splats, this one has {way.source_count}"

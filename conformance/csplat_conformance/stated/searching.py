@@ -11,7 +11,7 @@ import numpy as np
 
 from csplat import _spec
 from csplat.boxes import tile_boxes
-from csplat.decoder import Opened
+from csplat.decoder import TileReader
 from csplat.model import SplatModel
 from csplat.processes import each_apart
 from csplat.scene import joined
@@ -36,7 +36,7 @@ class Search:
         workers: processes.
     """
 
-    opened: Opened
+    opened: TileReader
     spool: Spool
     bounds: Mapping[str, float]
     reach: float

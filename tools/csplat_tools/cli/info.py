@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from csplat.decoder import StatedErrors
+from csplat.decoder import DeclaredBounds
 from csplat.errors import InputError, counted
 from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import command
@@ -76,8 +76,8 @@ def _format(facts: FileFacts) -> str:
     ]
     if facts.codebooks:
         parts.append("\n".join(_codebook(one) for one in facts.codebooks))
-    if facts.stated_errors is not None:
-        parts.append(_stated_errors(facts.stated_errors))
+    if facts.declared_bounds is not None:
+        parts.append(_stated_errors(facts.declared_bounds))
     parts += [
         f"{title}  {json.dumps(value, sort_keys=True)}"
         for title, value in (("options ", facts.options), ("metadata", other_metadata(facts)))
@@ -112,7 +112,7 @@ def _codebook(codebook: CodebookFacts) -> str:
     return f"codebook {codebook.id}: {codebook.kind}{bands}, {size}"
 
 
-def _stated_errors(stated: StatedErrors) -> str:
+def _stated_errors(stated: DeclaredBounds) -> str:
     source = f"{counted(stated.source_count, 'splat')}, SH degree {stated.source_sh_degree}"
     lines = [f"stands for a source of {source}; {stated.pruned_count} pruned"]
     if stated.refitted:

@@ -12,7 +12,7 @@ import numpy as np
 
 from csplat import formats
 from csplat import scene as scenes
-from csplat.decoder import Limits, SceneHeader, StatedErrors, decode_scene
+from csplat.decoder import DeclaredBounds, Limits, SceneHeader, decode_scene
 from csplat.errors import LimitError
 from csplat.inputs import File
 from csplat.lint import Finding, dropped_columns
@@ -40,7 +40,7 @@ class LoadedModel:
         model: the splats.
         size_bytes: size of the file; for a model without a file, of its plain PLY.
         header: header of a .csplat file; `None` for other formats.
-        stated_errors: declared errors of a .csplat file; `None` if it has none.
+        declared_bounds: declared errors of a .csplat file; `None` if it has none.
         name: name of the file.
         findings: findings while it was read.
     """
@@ -48,7 +48,7 @@ class LoadedModel:
     model: SplatModel
     size_bytes: int
     header: SceneHeader | None = None
-    stated_errors: StatedErrors | None = None
+    declared_bounds: DeclaredBounds | None = None
     name: str = "scene"
     findings: tuple[Finding, ...] = ()
 
@@ -186,7 +186,7 @@ def _loaded(local: Path, sh_degree: int | None = None) -> LoadedModel:
         return LoadedModel(model, size_bytes, name=name, findings=tuple(findings))
     with mapped_csplat(str(local)) as data:
         decoded = decode_scene(data, limits=Limits(bytes=min(Limits().bytes, free)), sh_degree=sh_degree)
-    return LoadedModel(decoded.model, size_bytes, decoded.header, decoded.stated_errors, name)
+    return LoadedModel(decoded.model, size_bytes, decoded.header, decoded.declared_bounds, name)
 
 
 @contextmanager

@@ -10,13 +10,13 @@ from typing import Any
 
 from csplat import _spec
 from csplat.decoder import (
+    DeclaredBounds,
     SceneHeader,
-    StatedErrors,
     read_cameras,
+    read_declared_bounds,
     read_header,
     read_metadata,
     read_options,
-    read_stated_errors,
 )
 from csplat.upright import up_of
 from csplat_tools.files.console import finite
@@ -89,7 +89,7 @@ class FileFacts:
             chunks.
         cameras: number of cameras; `None` without the chunk, as for all that follows.
         options, metadata: the file's JSON.
-        stated_errors: the source of which the file is an encoding, and the declared error bounds.
+        declared_bounds: the source of which the file is an encoding, and the declared error bounds.
     """
 
     header: SceneHeader
@@ -100,7 +100,7 @@ class FileFacts:
     cameras: int | None
     options: Mapping[str, Any] | None
     metadata: Mapping[str, Any] | None
-    stated_errors: StatedErrors | None
+    declared_bounds: DeclaredBounds | None
 
     @property
     def bytes_per_splat(self) -> float | None:
@@ -153,7 +153,7 @@ class FileFacts:
             "cameras": self.cameras,
             "options": self.options,
             "metadata": self.metadata,
-            "stated_errors": None if self.stated_errors is None else _stated(self.stated_errors),
+            "stated_errors": None if self.declared_bounds is None else _stated(self.declared_bounds),
         }
 
 
@@ -183,7 +183,7 @@ def describe_file(data: bytes | mmap) -> FileFacts:
         None if cameras is None else len(cameras),
         read_options(data),
         read_metadata(data),
-        read_stated_errors(data),
+        read_declared_bounds(data),
     )
 
 
@@ -257,7 +257,7 @@ def _codebook(header: SceneHeader, record: _spec.CodebookRecord) -> CodebookFact
     )
 
 
-def _stated(stated: StatedErrors) -> dict[str, Any]:
+def _stated(stated: DeclaredBounds) -> dict[str, Any]:
     return {
         "source_splats": stated.source_count,
         "pruned_splats": stated.pruned_count,

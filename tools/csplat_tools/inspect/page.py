@@ -8,7 +8,7 @@ from html import escape
 from mmap import mmap
 from pathlib import PurePath
 
-from csplat.decoder import StatedErrors, decode
+from csplat.decoder import DeclaredBounds, decode
 from csplat.types import Progress
 from csplat_tools.files.console import format_bytes
 from csplat_tools.files.scenes import LoadedModel, load_model
@@ -101,7 +101,7 @@ def make_page(title: str, facts: FileFacts, beside: _Beside | None = None) -> st
             _source(beside),
             _bytes(facts),
             _layers(facts),
-            "" if facts.stated_errors is None else _stated(facts.stated_errors),
+            "" if facts.declared_bounds is None else _stated(facts.declared_bounds),
             _scene(facts),
         ],
     )
@@ -165,7 +165,7 @@ def _layers(facts: FileFacts) -> str:
     return f"<h2>In which order it arrives</h2>\n{table(head, rows, words=(1,))}" if rows else ""
 
 
-def _stated(stated: StatedErrors) -> str:
+def _stated(stated: DeclaredBounds) -> str:
     text = (
         f"The file stands for a source of {stated.source_count:,} splats of SH degree {stated.source_sh_degree};"
         f" {stated.pruned_count:,} of them it leaves out. Of the others it states how far they are from the source's:"

@@ -93,7 +93,7 @@ def _proved(
     data: bytes | mmap, source: str, rows: NDArray[Any] | None, memory_bytes: int | None, progress: Progress | None
 ) -> Proof:
     opened = open_tiles(data)
-    header, stated = opened.header, opened.stated_errors
+    header, stated = opened.header, opened.declared_bounds
     degree = MAX_SH_DEGREE  # bands above cannot be encoded, and declared errors do not include them
     with source_path(source) as local:
         if fits_memory(opened, stated.source_count if stated else 0, size_of(local), memory_bytes):

@@ -1,4 +1,4 @@
-"""Streams: a head, one coder, up to four transforms (spec 6.1 to 6.3)."""
+"""Read streams: a head, one coder, up to four transforms (spec 6.1 to 6.3)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from csplat.errors import FormatError, LimitError, UnsupportedError
 Ints = NDArray[Any]
 
 _PLACES = _spec.STREAM_HEAD_OFFSETS
-#: What zlib says of a stream that it refuses, by its last word, where that is not COD-2.
+#: Clauses by the last word of zlib's message; COD-2 if it is none of these.
 _ZLIB_CLAUSES = {
     "symbols": "COD-5",  # too many length or distance symbols
     "set": "COD-6",  # invalid code lengths set, invalid literal/lengths set, invalid distances set
@@ -39,11 +39,11 @@ def read_stream(
     """Read one stream and step over it.
 
     Args:
-        cursor: stands at the stream's head.
-        count: how many elements the place wants; `None`: as many as the stream says (JSON).
-        width_max: bytes of an element at most.
+        cursor: at the stream's head.
+        count: required number of elements; `None`: the stream specifies it (JSON).
+        width_max: maximum width of an element in bytes.
         signed: read the elements as two's complement of `width` bytes.
-        count_max: the caller's budget where `count` is `None`.
+        count_max: the caller's limit if `count` is `None`.
 
     Returns:
         [count] little-endian integers of 1, 2, 4 or 8 bytes, the narrowest that hold `width`
@@ -114,8 +114,7 @@ def _undo_coder(head: _spec.StreamHead, coded: memoryview, at: int) -> bytes | m
 def _inflate(coded: memoryview, size: int, at: int) -> bytes:
     inflater = zlib.decompressobj(-zlib.MAX_WBITS)
     try:
-        # COD-4: one byte more than wanted shows a stream that gives too much, and lets inflate
-        # see the end of one that does not.
+        # COD-4: one byte more than `size` reveals a stream that is too long, and lets inflate reach the end of others.
         packed = inflater.decompress(coded, size + 1)
     except zlib.error as error:
         clause = _ZLIB_CLAUSES.get(str(error).split()[-1], "COD-2")
@@ -152,7 +151,7 @@ def undo_transforms(packed: bytes | memoryview | Ints, transforms: bytes, count:
 
     Args:
         packed: `count` × `width` bytes.
-        transforms: ids; RUN_LENGTH, already undone, and NONE are passed over.
+        transforms: ids; RUN_LENGTH, already undone, and NONE are ignored.
         count: elements.
         width: bytes of an element, 1 to 8.
     """

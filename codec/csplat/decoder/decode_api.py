@@ -1,0 +1,447 @@
+"""Decode whole scenes, chosen tiles and SH bands, at once or tile by tile."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.decoder.codebooks import check_unnamed_codebooks, read_codebooks
+from csplat.decoder.container import SceneHeader, Tile, open_chunk, view_of
+from csplat.decoder.index import parse_header
+from csplat.decoder.limits import Limits, check_budget, float_bytes, integer_bytes
+from csplat.decoder.metadata import DeclaredBounds, read_json, read_serr
+from csplat.decoder.reconstruct import (
+    SplatArrays,
+    empty_integers,
+    integer_part,
+    opacity_table,
+    write_integers,
+    write_tile,
+)
+from csplat.decoder.tiles import read_tile
+from csplat.errors import InputError, LimitError
+from csplat.inputs import LetGo
+from csplat.model import SplatModel, trusted_model
+from csplat.types import F32
+
+if TYPE_CHECKING:
+    from csplat.decoder.blocks import TileBlocks
+    from csplat.inputs import File
+
+_THREADS_MAX = 8  # default maximum; memory bandwidth is the limit beyond that
+
+_Texts = tuple[Mapping[str, Any], Sequence[Mapping[str, Any]] | None]  # metadata, cameras
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class DecodedScene:
+    """A decoded file.
+
+    Attributes:
+        header: header and index.
+        model: the splats, or those of the chosen tiles.
+        options: the encoder's record of its options (`None`: there is none, or a part was decoded).
+        declared_bounds: the file's declared error bounds (`None`: likewise).
+        checks: the checks made: `header_crc`, `index_crc`, `chunk_crc` (of every chunk read), `all_chunk_crcs`.
+    """
+
+    header: SceneHeader
+    model: SplatModel
+    options: dict[str, Any] | None
+    declared_bounds: DeclaredBounds | None
+    checks: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class DecodedTile:
+    """The splats of one tile, in arrays of its own.
+
+    Attributes:
+        tile: its record.
+        means: [n, 3] float32.
+        quats: [n, 4] float32, w, x, y, z.
+        scales: [n, 3] float32, natural logarithms.
+        opacities: [n] float32.
+        sh0: [n, 3] float32.
+        shN: [n, K, 3] float32.
+        extra: [n] each, by name.
+    """
+
+    tile: Tile
+    means: F32
+    quats: F32
+    scales: F32
+    opacities: F32
+    sh0: F32
+    shN: F32
+    extra: dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class DecodeRequest:
+    """A file and the part of it to decode.
+
+    Attributes:
+        view: the whole file.
+        header: header and index, checked.
+        tiles: tiles to decode, in the order requested.
+        degree: highest SH band to decode.
+        limits: limits on what decoding may take.
+        whole: True if all tiles and bands are decoded.
+    """
+
+    view: memoryview
+    header: SceneHeader
+    tiles: Sequence[Tile]
+    degree: int
+    limits: Limits
+    whole: bool
+
+
+@dataclass(frozen=True)
+class TileReader:
+    """An open file whose tiles are decoded on demand; all other chunks are checked already.
+
+    Attributes:
+        facts: the scene without its splats.
+        options: the encoder's record of its options (`None`: there is none).
+        declared_bounds: the file's declared error bounds (`None`: there are none).
+        request: the file.
+        threads: as in `decode`.
+    """
+
+    facts: SplatModel
+    options: dict[str, Any] | None
+    declared_bounds: DeclaredBounds | None
+    request: DecodeRequest
+    threads: int | None
+
+    @property
+    def header(self) -> SceneHeader:
+        """Header and index."""
+        return self.request.header
+
+    def models(self, tiles: Sequence[int] | None = None) -> Iterator[SplatModel]:
+        """Decode tiles one after the other into models with the metadata of `facts`.
+
+        Args:
+            tiles: indices of the tiles to decode, in the order requested; by default all.
+        """
+        header = self.header
+        chosen = header.tiles if tiles is None else [header.tiles[index] for index in tiles]
+        texts = self.facts.metadata, self.facts.cameras
+        for _, arrays in _iterate(replace(self.request, tiles=chosen), self.threads):
+            yield _model_of(header, arrays, texts)
+
+
+def decode(
+    data: File,
+    *,
+    limits: Limits | None = None,
+    tiles: Sequence[int] | None = None,
+    sh_degree: int | None = None,
+    threads: int | None = None,
+) -> SplatModel:
+    """Decode a file, or chosen tiles and SH bands of it.
+
+    Args:
+        data: the whole file: its path, which is mapped into memory; an open binary file; or its bytes.
+        limits: limits on size and memory; by default the registry's.
+        tiles: indices of the tiles to decode, in the order requested; by default all.
+        sh_degree: highest SH band to decode; by default all of the file's.
+        threads: number of threads; by default one per processor, up to 8.
+
+    Returns:
+        The splats. A part equals the same part of a whole decode, bit for bit.
+
+    Examples:
+        >>> import csplat
+        >>> model = csplat.decode("scene.csplat")
+        >>> model
+        SplatModel(1000 splats, sh_degree=3)
+        >>> csplat.decode("scene.csplat", sh_degree=1).shN.shape
+        (1000, 3, 3)
+
+    Raises:
+        FormatError: the file breaks a clause. A whole decode checks all of them, including the CRC of every chunk;
+            a part checks what it reads.
+        UnsupportedError: the file needs a feature that this version does not have.
+        LimitError: the file exceeds `limits`.
+        InputError: an argument is invalid.
+        OSError: the file cannot be read.
+    """
+    return decode_scene(data, limits=limits, tiles=tiles, sh_degree=sh_degree, threads=threads).model
+
+
+def decode_scene(
+    data: File,
+    *,
+    limits: Limits | None = None,
+    tiles: Sequence[int] | None = None,
+    sh_degree: int | None = None,
+    threads: int | None = None,
+) -> DecodedScene:
+    """Decode as `decode` does; return the other content of the file and the checks made as well."""
+    request = prepare_decode(data, limits, tiles, sh_degree)
+    header, degree = request.header, request.degree
+    check_budget(header, request.tiles, degree, float_bytes(header, degree), request.limits, whole=request.whole)
+    count = sum(tile.splat_count for tile in request.tiles)
+    arrays = _allocate(count, lambda: SplatArrays.empty(count, degree, header), request)
+    table = opacity_table(header.attribute(_spec.ATTRIBUTE_OPACITIES))
+
+    def write(_place: int, start: int, source: TileBlocks) -> None:
+        part = arrays.part(start, start + source.tile.splat_count)
+        write_tile(source, header, degree, table, part)
+
+    options, bounds = read_side_chunks(request)
+    texts = _read_texts(request)
+    _write_all(request, write, threads)
+    model = _model_of(header, arrays, texts)
+    checks = ("header_crc", "index_crc", "chunk_crc")
+    return DecodedScene(header, model, options, bounds, (*checks, "all_chunk_crcs") if request.whole else checks)
+
+
+def decode_integers(
+    data: File,
+    *,
+    limits: Limits | None = None,
+    tiles: Sequence[int] | None = None,
+    sh_degree: int | None = None,
+    threads: int | None = None,
+) -> dict[str, NDArray[Any]]:
+    """Decode the integer arrays of spec 9.2; arguments and errors as in `decode`."""
+    request = prepare_decode(data, limits, tiles, sh_degree)
+    header, degree = request.header, request.degree
+    check_budget(header, request.tiles, degree, integer_bytes(degree), request.limits, whole=request.whole)
+    count = sum(tile.splat_count for tile in request.tiles)
+    out = _allocate(count, lambda: empty_integers(count, len(request.tiles), degree), request)
+    out["tile_splats"][:] = [tile.splat_count for tile in request.tiles]
+
+    def write(place: int, start: int, source: TileBlocks) -> None:
+        part = integer_part(out, start, start + source.tile.splat_count)
+        write_integers(source, header, part, out["exponents"][place])
+
+    read_side_chunks(request)
+    _read_texts(request)
+    _write_all(request, write, threads)
+    return out
+
+
+def iter_tiles(
+    data: File,
+    *,
+    limits: Limits | None = None,
+    tiles: Sequence[int] | None = None,
+    sh_degree: int | None = None,
+    threads: int = 1,
+) -> Iterator[DecodedTile]:
+    """Decode tile by tile, in memory for one tile per thread and the codebooks.
+
+    An iteration over all tiles checks every other chunk before the first tile; a damaged tile raises at its turn.
+    `limits.bytes` applies to one tile at a time.
+
+    Args:
+        data: as in `decode`; a path or an `mmap` may be larger than memory.
+        limits: as in `decode`.
+        tiles: as in `decode`.
+        sh_degree: as in `decode`.
+        threads: number of tiles that are decoded at the same time.
+    """
+    request = _prepare_tiles(data, limits, tiles, sh_degree)
+
+    def iterate() -> Iterator[DecodedTile]:
+        read_side_chunks(request)
+        if request.whole:
+            _read_texts(request)
+        for tile, arrays in _iterate(request, threads):
+            yield DecodedTile(tile, **vars(arrays))
+
+    return iterate()
+
+
+def open_tiles(data: File, *, limits: Limits | None = None, threads: int | None = None) -> TileReader:
+    """Open a file whose tiles are decoded one after the other, on demand.
+
+    Args:
+        data: as in `iter_tiles`.
+        limits: as in `iter_tiles`.
+        threads: as in `decode`. Tiles come in their order for any number of threads.
+
+    Raises:
+        CsplatError: as in `decode`; a damaged tile raises at its turn.
+    """
+    request = _prepare_tiles(data, limits, None, None)
+    header = request.header
+    options, bounds = read_side_chunks(request)
+    empty = _model_of(header, SplatArrays.empty(0, request.degree, header), _read_texts(request))
+    return TileReader(empty, options, bounds, request, threads)
+
+
+def prepare_decode(
+    data: File, limits: Limits | None, tiles: Sequence[int] | None, sh_degree: int | None
+) -> DecodeRequest:
+    """Check header and index; arguments and errors as in `decode`."""
+    view = view_of(data)
+    header = parse_header(view, whole=True)
+    degree = header.sh_degree
+    if sh_degree is not None:
+        if not 0 <= sh_degree <= _spec.SH_DEGREE_MAX:
+            raise InputError(f"sh_degree is {sh_degree}, wanted 0 to {_spec.SH_DEGREE_MAX}")
+        degree = min(degree, sh_degree)
+    chosen: Sequence[Tile] = header.tiles
+    if tiles is not None:
+        for index in tiles:
+            if not 0 <= index < len(header.tiles):
+                raise InputError(f"tile {index} is wanted of a file that has {len(header.tiles)}")
+        chosen = [header.tiles[index] for index in tiles]
+    whole = tiles is None and degree == header.sh_degree
+    return DecodeRequest(view, header, chosen, degree, limits or Limits(), whole)
+
+
+def _prepare_tiles(
+    data: File, limits: Limits | None, tiles: Sequence[int] | None, sh_degree: int | None
+) -> DecodeRequest:
+    """Prepare a decode that has one tile in memory at a time."""
+    request = prepare_decode(data, limits, tiles, sh_degree)
+    header, degree = request.header, request.degree
+    splat_bytes = float_bytes(header, degree)
+    check_budget(header, request.tiles, degree, splat_bytes, request.limits, whole=request.whole, at_once=False)
+    return request
+
+
+def _allocate(count: int, make: Callable[[], _T], request: DecodeRequest) -> _T:
+    try:
+        return make()
+    except MemoryError:
+        wanted = count * float_bytes(request.header, request.degree)
+        at = _spec.HEADER_SIZE + _spec.INDEX_HEAD_OFFSETS["splat_count"]
+        raise LimitError("memory of this machine", wanted, offset=at, clause="LIM-1") from None
+
+
+def read_side_chunks(request: DecodeRequest) -> tuple[dict[str, Any] | None, DeclaredBounds | None]:
+    """Read and check the chunks that no tile refers to (CHK-2), for a whole decode."""
+    if not request.whole:
+        return None, None
+    view, header = request.view, request.header
+    for record in header.directory:
+        if record.type not in _spec.CHUNK_NAMES:
+            open_chunk(view, record, record.type, record.flags, "CHK-2")
+    with np.errstate(all="ignore"):
+        check_unnamed_codebooks(view, header)
+    options = read_json(view, header, _spec.CHUNK_OPTIONS, request.limits.json_bytes)
+    return options, read_serr(view, header)
+
+
+def _read_texts(request: DecodeRequest) -> _Texts:
+    view, header, json_bytes = request.view, request.header, request.limits.json_bytes
+    metadata = read_json(view, header, _spec.CHUNK_METADATA, json_bytes)
+    return metadata or {}, read_json(view, header, _spec.CHUNK_CAMERAS, json_bytes)
+
+
+def _write_all(request: DecodeRequest, write: Callable[[int, int, TileBlocks], None], threads: int | None) -> None:
+    """Decode all tiles into arrays that exist already.
+
+    Args:
+        request: the tiles.
+        write: writes one tile: its place in `request.tiles`, its first splat, its blocks.
+        threads: as in `decode`.
+    """
+    starts = [0]
+    for tile in request.tiles:
+        starts.append(starts[-1] + tile.splat_count)
+
+    def convert(place: int, source: TileBlocks) -> None:
+        write(place, starts[place], source)
+
+    for _ in _each_tile(request, convert, threads, ahead=len(request.tiles)):
+        pass
+
+
+def _iterate(request: DecodeRequest, threads: int | None) -> Iterator[tuple[Tile, SplatArrays]]:
+    """Decode tiles in their order, each into arrays of its own."""
+    header = request.header
+    table = opacity_table(header.attribute(_spec.ATTRIBUTE_OPACITIES))
+    let_go = LetGo(request.view)
+
+    def convert(_place: int, source: TileBlocks) -> tuple[Tile, SplatArrays]:
+        arrays = SplatArrays.empty(source.tile.splat_count, request.degree, header)
+        write_tile(source, header, request.degree, table, arrays)
+        return source.tile, arrays
+
+    # One more tile than there are threads: no thread waits for the caller.
+    for done in _each_tile(request, convert, threads, ahead=1):
+        let_go.after(sum(layer.size for layer in done[0].layers.values()))
+        yield done
+
+
+def _each_tile(
+    request: DecodeRequest, convert: Callable[[int, TileBlocks], _T], threads: int | None, *, ahead: int
+) -> Iterator[_T]:
+    """Read and convert tiles in threads: NumPy and zlib release the GIL on large data.
+
+    Results come in the order of the tiles, and the error of the first damaged tile is raised, for any number of
+    threads.
+
+    Args:
+        request: the tiles.
+        convert: makes the result from a tile's place in `request.tiles` and its blocks.
+        threads: as in `decode`.
+        ahead: tiles that may be finished or waiting in addition to those being decoded.
+    """
+    view, header, degree, tiles = request.view, request.header, request.degree, request.tiles
+    with np.errstate(all="ignore"):
+        books = read_codebooks(view, header, tiles, degree)
+
+    def decode_tile(place: int) -> _T:
+        # The reconstruction checks for overflow where it can occur; NumPy need not warn of it.
+        with np.errstate(all="ignore"):
+            return convert(place, read_tile(view, header, tiles[place], degree, books))
+
+    places = range(len(tiles))
+    count = _thread_count(threads, len(tiles))
+    if count == 1:
+        yield from map(decode_tile, places)
+        return
+    waiting: deque[Future[_T]] = deque()
+    with ThreadPoolExecutor(count, "csplat") as pool:
+        try:
+            for place in places:
+                waiting.append(pool.submit(decode_tile, place))
+                if len(waiting) >= count + ahead:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _thread_count(threads: int | None, task_count: int) -> int:
+    if threads is None:
+        threads = min(os.cpu_count() or 1, _THREADS_MAX)
+    if threads < 1:
+        raise InputError(f"threads is {threads}, wanted 1 or more")
+    return max(1, min(threads, task_count))
+
+
+def _model_of(header: SceneHeader, arrays: SplatArrays, texts: _Texts) -> SplatModel:
+    """Make the model; the clauses of spec 7, just checked, are stricter than its constructor."""
+    metadata, cameras = texts
+    return trusted_model(
+        **vars(arrays),
+        origin=header.origin,
+        coordinate_system=header.coordinate_system,
+        unit_metres=header.unit_metres,
+        antialiased=header.antialiased,
+        flat=header.flat,
+        cameras=cameras,
+        metadata=metadata,
+    )

@@ -1,0 +1,251 @@
+"""Read the chunks that are not about splats: JSON texts (spec 5.4) and declared error bounds (spec 5.5)."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from csplat import _spec
+from csplat.decoder.container import SceneHeader, check_reserved, open_chunk, view_of
+from csplat.decoder.entropy import read_stream
+from csplat.decoder.index import parse_header
+from csplat.decoder.limits import Limits
+from csplat.errors import FormatError
+
+if TYPE_CHECKING:
+    from csplat.inputs import File
+
+
+_BOM = b"\xef\xbb\xbf"
+_INT_DIGITS = 300  # digits; longer integers are read as binary64
+
+
+_BOUND_COMPONENTS = {
+    _spec.MEASURE_MEANS: 1,
+    _spec.MEASURE_COVARIANCE: 1,
+    _spec.MEASURE_OPACITIES: 1,
+    _spec.MEASURE_SH0: _spec.ATTRIBUTE_COLUMNS[_spec.ATTRIBUTE_SH0],
+    _spec.MEASURE_SH1: _spec.ATTRIBUTE_COLUMNS[_spec.ATTRIBUTE_SH1],
+    _spec.MEASURE_SH2: _spec.ATTRIBUTE_COLUMNS[_spec.ATTRIBUTE_SH2],
+    _spec.MEASURE_SH3: _spec.ATTRIBUTE_COLUMNS[_spec.ATTRIBUTE_SH3],
+}
+_SLACK = 1.0 + 2.0**-20  # SER-2: tolerance for the rounding of both numbers
+
+
+@dataclass(frozen=True)
+class DeclaredBound:
+    """A declared error bound of a file, for one measure.
+
+    Attributes:
+        measure: name in the registry, `means`.
+        max: largest error over the splats kept.
+        rms: root of the mean square over the splats kept.
+    """
+
+    measure: str
+    max: float
+    rms: float
+
+
+@dataclass(frozen=True)
+class DeclaredBounds:
+    """The declared error bounds of a file, against the model that was encoded.
+
+    Attributes:
+        source_count: splats of the source.
+        pruned_count: splats of the source that the file does not hold.
+        source_sh_degree: SH degree of the source.
+        refitted: attributes were refitted; those without a record can only be verified by renders.
+        records: declared errors by measure.
+    """
+
+    source_count: int
+    pruned_count: int
+    source_sh_degree: int
+    refitted: bool
+    records: tuple[DeclaredBound, ...]
+
+
+def read_metadata(data: File, *, limits: Limits | None = None) -> dict[str, Any] | None:
+    """Return the content of the META chunk, `None` if there is none."""
+    value: dict[str, Any] | None = _read_text(data, _spec.CHUNK_METADATA, limits)
+    return value
+
+
+def read_cameras(data: File, *, limits: Limits | None = None) -> list[dict[str, Any]] | None:
+    """Return the content of the CAMS chunk, `None` if there is none."""
+    value: list[dict[str, Any]] | None = _read_text(data, _spec.CHUNK_CAMERAS, limits)
+    return value
+
+
+def read_options(data: File, *, limits: Limits | None = None) -> dict[str, Any] | None:
+    """Return the content of the OPTS chunk, `None` if there is none."""
+    value: dict[str, Any] | None = _read_text(data, _spec.CHUNK_OPTIONS, limits)
+    return value
+
+
+def read_declared_bounds(data: File) -> DeclaredBounds | None:
+    """Return the content of the SERR chunk, `None` if there is none."""
+    view = view_of(data)
+    return read_serr(view, parse_header(view, whole=True))
+
+
+def read_json(view: memoryview, header: SceneHeader, kind: bytes, json_bytes: int) -> Any:
+    """Return the value of the META, CAMS or OPTS chunk, `None` if the file has none.
+
+    Args:
+        view: the whole file.
+        header: its header.
+        kind: type of the chunk.
+        json_bytes: budget for the text.
+
+    Raises:
+        FormatError: E_JSON, or its stream breaks a clause.
+        LimitError: the text is longer than `json_bytes`.
+    """
+    record = header.chunk(kind)
+    if record is None:
+        return None
+    cursor = open_chunk(view, record, record.type, record.flags, "JSN-2")
+    at = cursor.at
+    text = read_stream(cursor, None, 1, count_max=json_bytes).tobytes()
+    cursor.finish()
+    return parse_json(text, list if kind == _spec.CHUNK_CAMERAS else dict, at)
+
+
+def parse_json(text: bytes, kind: type[dict[str, Any] | list[Any]], at: int) -> Any:
+    """Parse a text by JSN-1.
+
+    Args:
+        text: UTF-8.
+        kind: `dict`, or `list` for an array of objects.
+        at: offset in the file where its stream begins, for errors.
+    """
+    try:
+        if text.startswith(_BOM):
+            raise _RefusedError("byte order mark")
+        value = json.loads(
+            text.decode("utf-8"),
+            object_pairs_hook=_object,
+            parse_constant=_constant,
+            parse_float=_number,
+            parse_int=_integer,
+        )
+        _check_tree(value)
+    except (ValueError, RecursionError) as error:
+        reason = str(error) or type(error).__name__
+        raise FormatError(_spec.ERROR_JSON, at, "JSN-1", reason) from None
+    if not isinstance(value, kind) or (kind is list and not all(isinstance(item, dict) for item in value)):
+        wanted = "an array of objects" if kind is list else "an object"
+        raise FormatError(_spec.ERROR_JSON, at, "JSN-1", "top level", found=type(value).__name__, wanted=wanted)
+    return value
+
+
+def read_serr(view: memoryview, header: SceneHeader) -> DeclaredBounds | None:
+    """Return the content of the SERR chunk, `None` if the file has none."""
+    record = header.chunk(_spec.CHUNK_STATED_ERRORS)
+    if record is None:
+        return None
+    cursor = open_chunk(view, record, record.type, record.flags, "SER-3")
+    at = cursor.take(_spec.STATED_ERRORS_HEAD_SIZE)
+    head = _spec.unpack_stated_errors_head(view, at)
+    if head.error_flags & ~sum(_spec.ERROR_FLAG_NAMES):
+        place = at + _spec.STATED_ERRORS_HEAD_OFFSETS["error_flags"]
+        raise FormatError(_spec.ERROR_RESERVED, place, "RES-1", "error_flags", found=head.error_flags)
+    if head.source_count - head.pruned_count != header.splat_count:
+        raise FormatError(
+            _spec.ERROR_VALUE,
+            at,
+            "SER-4",
+            "source_count - pruned_count",
+            found=head.source_count - head.pruned_count,
+            wanted=header.splat_count,
+        )
+    records: list[DeclaredBound] = []
+    last = 0
+    for _ in range(head.record_count):
+        at = cursor.take(_spec.STATED_ERROR_RECORD_SIZE)
+        item = _spec.unpack_stated_error_record(view, at)
+        last = _check_bound_record(item, at, last)
+        records.append(DeclaredBound(_spec.MEASURE_NAMES[item.measure], item.max, item.rms))
+    cursor.finish()
+    return DeclaredBounds(
+        head.source_count,
+        head.pruned_count,
+        head.source_sh_degree,
+        bool(head.error_flags & _spec.ERROR_FLAG_REFITTED),
+        tuple(records),
+    )
+
+
+def _read_text(data: File, kind: bytes, limits: Limits | None) -> Any:
+    view = view_of(data)
+    return read_json(view, parse_header(view, whole=True), kind, (limits or Limits()).json_bytes)
+
+
+class _RefusedError(ValueError):
+    """JSON that the `json` module accepts and JSN-1 forbids."""
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) != len(pairs):
+        raise _RefusedError("a name occurs twice in an object")
+    return result
+
+
+def _constant(name: str) -> None:
+    raise _RefusedError(f"{name} is not JSON")
+
+
+def _number(digits: str) -> float:
+    value = float(digits)
+    if not math.isfinite(value):
+        raise _RefusedError("a number is not finite in binary64")
+    return value
+
+
+def _integer(digits: str) -> int | float:
+    return int(digits) if len(digits) <= _INT_DIGITS else _number(digits)
+
+
+def _check_tree(value: Any) -> None:
+    """Refuse deep nesting and strings that are not Unicode text, without recursion."""
+    level: list[Any] = [value]
+    depth = 0
+    while level:
+        nested: list[Any] = []
+        for item in level:
+            if isinstance(item, dict):
+                nested.extend(item.keys())
+                nested.extend(item.values())
+            elif isinstance(item, list):
+                nested.extend(item)
+            elif isinstance(item, str):
+                item.encode("utf-8")  # an unpaired surrogate (\ud800) raises ValueError
+        depth += any(isinstance(item, dict | list) for item in level)
+        if depth > _spec.JSON_DEPTH_MAX:
+            raise _RefusedError(f"nested more than {_spec.JSON_DEPTH_MAX} deep")
+        level = nested
+
+
+def _check_bound_record(record: _spec.StatedErrorRecord, at: int, last: int) -> int:
+    """SER-1, SER-2; return the measure."""
+    places = _spec.STATED_ERROR_RECORD_OFFSETS
+    check_reserved(record, at, places)
+    if record.measure not in _spec.MEASURE_NAMES or record.measure <= last:
+        raise FormatError(
+            _spec.ERROR_VALUE, at, "SER-1", "measure", found=record.measure, wanted="registered, ascending"
+        )
+    bound = record.max * math.sqrt(_BOUND_COMPONENTS[record.measure]) * _SLACK
+    if not (0.0 <= record.max < math.inf and 0.0 <= record.rms < math.inf and record.rms <= bound):
+        raise FormatError(
+            _spec.ERROR_VALUE,
+            at + places["max"],
+            "SER-2",
+            f"max and rms of {_spec.MEASURE_NAMES[record.measure]}",
+            found=(record.max, record.rms),
+        )
+    return record.measure
