@@ -10,17 +10,14 @@ import numpy as np
 from analytic_model import AnalyticFile, AnalyticScene, Contents, Views, psnr_of
 
 from csplat import EncodeOptions
-from csplat_tools.optimise.coding import Codings
-from csplat_tools.optimise.goals import goal_of
-from csplat_tools.optimise.moves import Moves
-from csplat_tools.optimise.removal import Removal
-from csplat_tools.optimise.report import Report
-from csplat_tools.optimise.reporting import reported
-from csplat_tools.optimise.simplify import SimplifyOptions
-from csplat_tools.optimise.simplify.order import Order
-from csplat_tools.optimise.solving import Solver
-from csplat_tools.optimise.target import Target
-from csplat_tools.optimise.trials import Trials
+from csplat_tools.optimise.candidates import CandidatePool
+from csplat_tools.optimise.precision_search import PrecisionSearch
+from csplat_tools.optimise.pruning_order import PruningOrder, SimplifyOptions
+from csplat_tools.optimise.search_report import SearchReport, make_report
+from csplat_tools.optimise.sh_codings import CodingSearch
+from csplat_tools.optimise.subsets import Pruner
+from csplat_tools.optimise.target_search import TargetSearch, find_goal
+from csplat_tools.optimise.targets import Target
 
 
 @dataclass(frozen=True)
@@ -37,7 +34,7 @@ class Found:
     file: AnalyticFile
     tried: list[AnalyticFile]
     judged: list[AnalyticFile]
-    report: Report
+    report: SearchReport
 
 
 def search(
@@ -68,17 +65,17 @@ def search(
     encoding, model, asked = options or EncodeOptions(), scene.model(), Target(**target)
     judge, decider = _Judge(scene, judging or Views()), _Judge(scene, Views())
     photographs = None if photo_psnr is None else _Judge(scene, Views(photo_psnr=photo_psnr))
-    trials = Trials(encoding, judge, decider, photographs, decode=lambda data: data)
+    trials = CandidatePool(encoding, judge, decider, photographs, decode=lambda data: data)
     removal = None if keep_all else analytic_removal(scene, grades=grades, effort=effort)
     whole = _Splats(scene, model, refits=False, gradable=grades)
-    goal = goal_of(asked, model, photographs)
-    moves = Moves(Solver(trials, goal), Codings(model, encoding, grades), whole, removal)
+    goal = find_goal(asked, model, photographs)
+    moves = TargetSearch(PrecisionSearch(trials, goal), CodingSearch(model, encoding, grades), whole, removal)
     try:
         best = moves.best()
     finally:
         if tried is not None:
             tried += [one.result.data for one in trials.made]
-    report = reported(
+    report = make_report(
         asked, best, trials, splats_before=scene.splats, views_of="virtual", remarks=(),
         encodes=len(trials.made), seconds=0.0,
     )  # fmt: skip
@@ -86,7 +83,7 @@ def search(
     return Found(best.result.data, made, judge.shown, report)
 
 
-def analytic_removal(scene: AnalyticScene, *, grades: bool = False, effort: int = 3) -> Removal:
+def analytic_removal(scene: AnalyticScene, *, grades: bool = False, effort: int = 3) -> Pruner:
     """Return the object that decides how many splats may be pruned."""
     how = SimplifyOptions(effort=effort)
     return _Removal(scene.model(), None, how, grades=grades, progress=None, psnr=None, scene=scene)
@@ -172,7 +169,7 @@ def _encoded(file):
 class _Session:
     """The order of removal, which every number of splats shares."""
 
-    order: Order
+    order: PruningOrder
     splats: int
     options: SimplifyOptions
     value_count: int = 1
@@ -183,7 +180,7 @@ class _Session:
 
 
 @dataclass(eq=False)
-class _Removal(Removal):
+class _Removal(Pruner):
     """The order of removal and the refit that the law gives, in place of measured ones."""
 
     scene: AnalyticScene = None
@@ -192,7 +189,7 @@ class _Removal(Removal):
     def session(self):
         count = len(self.source)
         errors = self.scene.removed(np.arange(count, 0, -1), refitted=False)
-        order = Order(np.arange(count - 1), np.diff(errors), ())
+        order = PruningOrder(np.arange(count - 1), np.diff(errors), ())
         return _Session(order, count, self.options)
 
     def fitted(self, left, allowed, seen):  # noqa: ARG002  # as the measured one is called

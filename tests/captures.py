@@ -13,8 +13,8 @@ from csplat.model import SplatModel, normalise_quats
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.scorer import renderer
-from csplat_tools.optimise.reaching import encode_to
-from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.optimise.pruning_order import SimplifyOptions
+from csplat_tools.optimise.target_encoding import encode_to
 from csplat_tools.views import BLACK, ViewSet, camera_sequence, find_view_set, with_deciders
 from csplat_trainer.pictures import Picture
 

@@ -22,7 +22,8 @@ from csplat_conformance.stated import Proof, Source, prove
 from csplat_render import Camera, render
 from csplat_render.conventions import RenderResult
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools.optimise.simplify import SimplifyOptions, simplify
+from csplat_tools.optimise.pruning import simplify
+from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_trainer.loop import train
 from csplat_trainer.tuning import renders_of, split_views, tune
 

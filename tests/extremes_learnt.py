@@ -16,7 +16,8 @@ from csplat_render import Camera
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.scorer import ReferenceImage, Scorer
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
+from csplat_tools.optimise.pruning import Simplified, simplify
+from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_trainer.data import DataSet
 from csplat_trainer.loop import train
 from csplat_trainer.options import TrainOptions

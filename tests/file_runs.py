@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from trained import run_here, write_photographs
 
-from csplat_tools.training import train
-from csplat_tools.training.train import tuning_after
+from csplat_tools.training import trained_scene
+from csplat_tools.training.trained_scene import tuning_after
 
 
 class FileRuns:
@@ -34,6 +34,8 @@ class FileRuns:
         """Make a file or a PLY; return the report and the messages."""
         report = self.folder / f"{name}.json"
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(train, "tuning_after", lambda **given: replace(tuning_after(**given), iterations=self.TUNED))
+            patch.setattr(
+                trained_scene, "tuning_after", lambda **given: replace(tuning_after(**given), iterations=self.TUNED)
+            )
             messages = run_here("train", self.data, "-o", self.folder / name, *self.WORDS, "--report", report, *more)
         return json.loads(report.read_text()), messages

@@ -17,13 +17,13 @@ from typer.testing import CliRunner
 import csplat
 import csplat_tools
 from csplat.errors import InputError, LimitError
-from csplat_tools.batches import running
-from csplat_tools.batches.budget import Budget
-from csplat_tools.batches.finding import find_tasks, starting_points
-from csplat_tools.batches.looking import RENDERER_BYTES, Look, content_hash, expect, look
-from csplat_tools.batches.page import make_page
-from csplat_tools.batches.records import JOURNAL, Record, open_journal, read_journal
-from csplat_tools.batches.workers import Worker, WorkerLostError
+from csplat_tools.batches import batch_run
+from csplat_tools.batches.batch_page import make_batch_page
+from csplat_tools.batches.batch_run import MemoryBudget
+from csplat_tools.batches.batch_scenes import find_tasks, starting_points
+from csplat_tools.batches.batch_worker import Worker, WorkerLostError
+from csplat_tools.batches.journal import JOURNAL, Record, open_journal, read_journal
+from csplat_tools.batches.scene_job import RENDERER_BYTES, SceneFile, content_hash, estimate_job, inspect_scene
 from csplat_tools.cli.app import app
 
 FAST = ("encode", "--preset", "fast")
@@ -43,7 +43,7 @@ def scenes(tmp_path, make_model):
 @pytest.fixture
 def here(monkeypatch):
     """No processes are started: one scene at a time, in this one."""
-    monkeypatch.setattr(running, "Worker", InThisProcess)
+    monkeypatch.setattr(batch_run, "Worker", InThisProcess)
     monkeypatch.setattr(InThisProcess, "ran", 0)
     return InThisProcess
 
@@ -266,7 +266,7 @@ def test_one_batch_at_a_time_writes_to_a_folder(tmp_path):
 
 
 def test_scenes_wait_for_memory_and_one_that_wants_all_of_it_is_refused():
-    budget, order = Budget(100), []
+    budget, order = MemoryBudget(100), []
     with budget.gate(60):
         thread = threading.Thread(target=lambda: [order.append("in") for _ in [budget.gate(50).__enter__()]])
         thread.start()
@@ -276,9 +276,9 @@ def test_scenes_wait_for_memory_and_one_that_wants_all_of_it_is_refused():
     assert ["first", "in"] == order
     with pytest.raises(LimitError, match="wanted 101, allowed 100"), budget.gate(101):
         pass
-    with Budget(10**9, has_option=True).gate(10**9 + 1) as options:
+    with MemoryBudget(10**9, has_option=True).gate(10**9 + 1) as options:
         assert ("--memory", str(10**9 - RENDERER_BYTES)) == options
-    with Budget(None, 100).gate(101) as options:  # nobody said so: it is tried alone
+    with MemoryBudget(None, 100).gate(101) as options:  # nobody said so: it is tried alone
         assert () == options
 
 
@@ -291,22 +291,22 @@ def test_a_scene_that_wants_more_than_all_of_it_fails(scenes, tmp_path):
 
 
 def test_a_look_knows_the_number_of_splats_and_the_content(scenes):
-    found = look(scenes / "sub" / "b.spz")
+    found = inspect_scene(scenes / "sub" / "b.spz")
     assert (30, "spz") == (found.splats, found.format)
-    assert look(scenes / "text.splat").splats is None
+    assert inspect_scene(scenes / "text.splat").splats is None
     folder = scenes / "statue"
     folder.mkdir()
     (folder / "meta.json").write_text("{}")
     before = content_hash(folder / "meta.json")
     (folder / "quats.webp").write_bytes(b"1")
     assert before != content_hash(folder / "meta.json")
-    assert expect("encode", Look("", 0, 10**6, "")).memory_bytes > expect("encode", found).memory_bytes
+    assert estimate_job("encode", SceneFile("", 0, 10**6, "")).memory_bytes > estimate_job("encode", found).memory_bytes
 
 
 def test_the_page_escapes_what_scenes_are_called(tmp_path):
     record = Record("<b>.ply", "<b>.csplat", FAST, "1", "done", source_bytes=10, output_bytes=1, splats=1)
     failed = replace(record, state="failed", error="<i>", code="E_INPUT")
-    page = make_page([record, failed], tmp_path)
+    page = make_batch_page([record, failed], tmp_path)
     assert "<b>" not in page
     assert "<i>" not in page
 
@@ -332,7 +332,7 @@ def test_a_process_that_is_killed_is_told_and_replaced(scenes, tmp_path):
 @pytest.mark.slow
 def test_the_journal_of_a_process_that_was_killed_is_read_and_goes_on(tmp_path):
     code = (
-        "import os, signal, sys; from pathlib import Path; from csplat_tools.batches.records import *\n"
+        "import os, signal, sys; from pathlib import Path; from csplat_tools.batches.journal import *\n"
         "with open_journal(Path(sys.argv[1])) as journal:\n"
         "    journal.begin(['a.csplat', 'b.csplat'])\n"
         "    journal.add(Record('a.ply', 'a.csplat', ('encode',), '1', 'done', sha256='0'))\n"

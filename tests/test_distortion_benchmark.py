@@ -20,9 +20,8 @@ from csplat_bench.distortion import ablation
 from csplat_bench.distortion import plot as distortion_plot
 from csplat_bench.distortion import tables as distortion_tables
 from csplat_bench.distortion.known import Measured
-from csplat_tools.optimise import fitted, moves
-from csplat_tools.optimise.report import Optimised, Report
-from csplat_tools.optimise.simplify import adjusting
+from csplat_tools.optimise import splat_refit, subsets, target_search
+from csplat_tools.optimise.search_report import Optimised, SearchReport
 
 pytestmark = pytest.mark.area(name="benchmarks")
 
@@ -206,11 +205,14 @@ def test_an_ablation_takes_away_one_part_at_a_time_and_puts_it_back(tmp_path, mo
     parts = []
 
     def encode_to(source, *, psnr, options, keep_all, simplifying):
-        tunes = fitted.adjust_frozen is adjusting.adjust_frozen and moves.TUNING_GAINS > 0.0
-        prices = math.isfinite(adjusting.price_of_bytes(0.05))
+        tunes = (
+            subsets.quantisation_aware_refit is splat_refit.quantisation_aware_refit
+            and target_search.TUNING_GAINS > 0.0
+        )
+        prices = math.isfinite(splat_refit.rate_exponent(0.05))
         has = (tunes, prices, options.grades != 1, simplifying.bands, simplifying.refit, not keep_all)
         parts.append(has)
-        report = Report({"psnr": psnr}, 1000, 9, len(source), 3, 1.0, chosen={"psnr": psnr, "splats": 9})
+        report = SearchReport({"psnr": psnr}, 1000, 9, len(source), 3, 1.0, chosen={"psnr": psnr, "splats": 9})
         return SimpleNamespace(data=bytes(1000 + 100 * has.count(False)), report=report)
 
     monkeypatch.setattr(ablation, "encode_to", encode_to)
@@ -237,7 +239,7 @@ def test_measures_whole_and_simplified_files_beside_a_peer_and_goes_on_where_it_
 
     def encode_to(source, *, psnr, views):
         searches.append((psnr, len(views.teaches), len(views.judges)))
-        return Optimised(None, Report({"psnr": psnr}, 30_000, 900, len(source), 7, 5.0, chosen=chosen))
+        return Optimised(None, SearchReport({"psnr": psnr}, 30_000, 900, len(source), 7, 5.0, chosen=chosen))
 
     monkeypatch.setattr(distortion, "encode_to", encode_to)
 

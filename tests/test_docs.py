@@ -13,7 +13,7 @@ from batch_worker import InThisProcess
 from typer.testing import CliRunner
 
 import csplat
-from csplat_tools.batches import running
+from csplat_tools.batches import batch_run
 from csplat_tools.cli.app import app
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -121,7 +121,7 @@ def test_the_commands_of_readme_and_guides_are_ones_that_csplat_knows():
 @pytest.mark.slow
 def test_the_python_of_readme_and_batch_runs(sample_path, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(running, "Worker", InThisProcess)
+    monkeypatch.setattr(batch_run, "Worker", InThisProcess)
     (tmp_path / "scenes").mkdir()
     (tmp_path / "encoded").mkdir()
     model = csplat.read_ply(sample_path)

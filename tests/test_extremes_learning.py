@@ -36,8 +36,8 @@ from csplat.encoder import Draft, encode_with_report
 from csplat.errors import InputError
 from csplat_conformance.stated import Source, prove
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools.optimise.reaching import encode_to
-from csplat_tools.optimise.simplify import simplify
+from csplat_tools.optimise.pruning import simplify
+from csplat_tools.optimise.target_encoding import encode_to
 from csplat_tools.views import find_view_set
 from csplat_trainer.data.colmap_files import read_points
 from csplat_trainer.loop import train

@@ -34,9 +34,9 @@ from csplat_render.conventions import SplatArrays
 from csplat_render.rasteriser import Rasteriser
 from csplat_tools.cli.app import app
 from csplat_tools.cli.finetune import finetune as finetune_command
-from csplat_tools.optimise.simplify import SimplifyOptions
-from csplat_tools.training.report import ply_splat_bytes
-from csplat_tools.training.searching import smallest_reaching
+from csplat_tools.optimise.pruning_order import SimplifyOptions
+from csplat_tools.training.tuned_file import smallest_reaching
+from csplat_tools.training.tuning_report import ply_splat_bytes
 from csplat_trainer.loss import PhotometricLoss
 from csplat_trainer.pictures import Picture
 from csplat_trainer.tuning import FinetuneOptions, View, Views, renders_of, split_views, tune
@@ -544,14 +544,14 @@ def capture(source, tmp_path_factory):
 def brief_fits(monkeypatch):
     """Fit the splats that are left in a quarter of the usual steps, once."""
     brief = partial(SimplifyOptions, effort=1, bands=False)
-    monkeypatch.setattr("csplat_tools.training.choosing.SimplifyOptions", brief)
+    monkeypatch.setattr("csplat_tools.training.tuning_inputs.SimplifyOptions", brief)
 
 
 @pytest.fixture
 def no_fits(monkeypatch):
     """Leave the splats that are left as they were: where their number is the point."""
     bare = partial(SimplifyOptions, refit=False, bands=False)
-    monkeypatch.setattr("csplat_tools.training.choosing.SimplifyOptions", bare)
+    monkeypatch.setattr("csplat_tools.training.tuning_inputs.SimplifyOptions", bare)
 
 
 @pytest.mark.slow

@@ -9,8 +9,8 @@ pytest.importorskip("numba", reason="tuning wants the extra [render]")
 pytest.importorskip("scipy", reason="tuning wants the extra [render]")
 
 from csplat.encoder import PRESETS, EncodeOptions
-from csplat_tools.training import finetune
-from csplat_tools.training.choosing import Chosen
+from csplat_tools.training import tuned_file
+from csplat_tools.training.tuning_inputs import TuningSubset
 
 USUAL = PRESETS["small"].quality[0]
 ENTRIES = 1024
@@ -36,13 +36,15 @@ def fit(make_model, monkeypatch):
             made = SimpleNamespace(data=data, report=SimpleNamespace(options=settings))
             return SimpleNamespace(coded=lambda _: SimpleNamespace(write=lambda: made))
 
-        monkeypatch.setattr(finetune, "Draft", SimpleNamespace(of=draft))
+        monkeypatch.setattr(tuned_file, "Draft", SimpleNamespace(of=draft))
         whole = make_model(9000, 1)
 
         def choose(count):
-            return Chosen(whole.select(np.arange(count)), np.arange(count), None, {})
+            return TuningSubset(whole.select(np.arange(count)), np.arange(count), None, {})
 
-        chosen, encoding = finetune._fitting(choose(9000), options or EncodeOptions("small"), size_bytes, choose, None)
+        chosen, encoding = tuned_file._fitting(
+            choose(9000), options or EncodeOptions("small"), size_bytes, choose, None
+        )
         return len(chosen.model), encoding, bytes_of(len(chosen.model), encoding, per_db), len(drafts)
 
     return run
@@ -78,5 +80,5 @@ def test_what_the_user_chose_stays(fit):
 
 def test_renders_are_as_good_as_the_scene_at_some_precision(fit):
     _, encoding, _, drafts = fit(10**7)
-    assert finetune._FINEST == encoding.attribute_psnr
+    assert tuned_file._FINEST == encoding.attribute_psnr
     assert 2 == drafts

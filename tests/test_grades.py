@@ -107,11 +107,11 @@ def test_what_rounding_loses_is_foretold():
     from captures import cameras, shell
 
     from csplat_render import render
-    from csplat_tools.optimise.sensitivity import measured_importance
+    from csplat_tools.optimise.scene_sensitivity import measure_importance
 
     scene, views = shell(0), cameras(12)
     options = EncodeOptions(attribute_psnr=58)
-    importance = measured_importance(scene, views, (0.0, 0.0, 0.0), threads=None)
+    importance = measure_importance(scene, views, (0.0, 0.0, 0.0), threads=None)
     plan = make_plan(scene, options, importance_given=True)
     foretold = step_errors(scene, importance.curvatures, plan).sum()
     decoded = csplat.decode(encode_with_report(scene, options).data)

@@ -20,9 +20,9 @@ from captures import cameras, shell
 from csplat import EncodeOptions, encode, read_ply, write_ply
 from csplat_render.virtual_cameras import detail, sample_cloud, scene_frame
 from csplat_tools.cli.app import app
+from csplat_tools.hardest_place import HardestPlaceSearch
+from csplat_tools.html_report import Bar, draw_bars
 from csplat_tools.inspect.info import describe_file
-from csplat_tools.pages.bars import Bar, draw_bars
-from csplat_tools.pages.hardest import HardestPlace
 from csplat_tools.views import comparison_cameras, find_view_set, showing_cameras
 from csplat_tools.views.viewset import ViewSet
 
@@ -157,7 +157,7 @@ def test_the_hardest_place_is_where_the_error_is():
     slightly, badly = source.copy(), source.copy()
     slightly[:, :] += 0.05
     badly[31:39, 70:80] = 1.0
-    place = HardestPlace()
+    place = HardestPlaceSearch()
     for number, seen in enumerate((source, badly, slightly)):
         place.look(number, source, seen)
     found = place.found()
@@ -171,7 +171,7 @@ def test_the_hardest_place_is_where_the_error_is():
     assert left <= 71
     assert bottom >= 37
     assert right >= 78
-    assert HardestPlace().found() is None
+    assert HardestPlaceSearch().found() is None
 
 
 @pytest.mark.slow
@@ -191,6 +191,6 @@ def test_views_of_a_user_are_shown_as_they_are():
 
 
 def test_equal_pictures_have_a_place_too():
-    place = HardestPlace()
+    place = HardestPlaceSearch()
     place.look(0, np.zeros((8, 8, 3), np.float32), np.zeros((8, 8, 3), np.float32))
     assert 99.0 == place.found().psnr

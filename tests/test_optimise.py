@@ -27,16 +27,21 @@ from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import scene_frame
-from csplat_tools.optimise.exchange import error_of_psnr
-from csplat_tools.optimise.optimiser import expected_pictures
-from csplat_tools.optimise.removal import Removal
-from csplat_tools.optimise.report import Report
-from csplat_tools.optimise.search import Window, meet
-from csplat_tools.optimise.sensitivity import measured_for, measured_importance
-from csplat_tools.optimise.simplify import SimplifyOptions
-from csplat_tools.optimise.solving import TUNING_GAINS, Goal, Solver
-from csplat_tools.optimise.target import Target
-from csplat_tools.optimise.trials import Coding, Whole, spread_of
+from csplat_tools.optimise.candidates import CodingChoice, WholeScene, psnr_spread
+from csplat_tools.optimise.precision_search import (
+    TUNING_GAINS,
+    PrecisionSearch,
+    SearchGoal,
+    SearchWindow,
+    find_in_window,
+)
+from csplat_tools.optimise.pruning_order import SimplifyOptions
+from csplat_tools.optimise.rate_distortion import error_of_psnr
+from csplat_tools.optimise.scene_sensitivity import complete_importance, measure_importance
+from csplat_tools.optimise.search_report import SearchReport
+from csplat_tools.optimise.subsets import Pruner
+from csplat_tools.optimise.target_search import expected_renders
+from csplat_tools.optimise.targets import Target
 from csplat_tools.views import BLACK, comparison_cameras, elsewhere, with_deciders
 from csplat_tools.views.timing import picture_seconds
 from csplat_tools.views.viewset import pose
@@ -64,7 +69,7 @@ def photographs(many):
 def search(*given, **how):
     """Search without renders from elsewhere, which are reported alone, and whose cameras take a second to place."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("csplat_tools.optimise.optimiser.elsewhere", lambda _: {})
+        patch.setattr("csplat_tools.optimise.target_search.elsewhere", lambda _: {})
         return found_within(*given, **how)
 
 
@@ -72,13 +77,15 @@ def search(*given, **how):
 
 
 def test_meet_ends_inside_the_window():
-    points = meet(lambda q: q * q / 50, Window(31.9, 32.1, 32.0), start=20.0, slope=1.0, bounds=(0, 100), tries=9)
+    points = find_in_window(
+        lambda q: q * q / 50, SearchWindow(31.9, 32.1, 32.0), start=20.0, slope=1.0, bounds=(0, 100), tries=9
+    )
     assert 31.9 <= points[-1][1] <= 32.1
     assert 40.0 == pytest.approx(points[-1][0], abs=0.1)
 
 
 def test_meet_stops_at_a_bound():
-    points = meet(lambda q: q, Window(200, 201, 200), start=50.0, slope=1.0, bounds=(0, 100), tries=9)
+    points = find_in_window(lambda q: q, SearchWindow(200, 201, 200), start=50.0, slope=1.0, bounds=(0, 100), tries=9)
     assert [50.0, 100.0] == [place for place, _ in points]
 
 
@@ -86,26 +93,28 @@ def test_a_plateau_is_crossed():
     def value(place):
         return 34.0 if place < 55.0 else place - 21.0
 
-    points = meet(value, Window(38.0, 38.25, 38.1), start=42.0, slope=1.0, bounds=(24, 110), tries=9)
+    points = find_in_window(value, SearchWindow(38.0, 38.25, 38.1), start=42.0, slope=1.0, bounds=(24, 110), tries=9)
     assert 38.0 <= points[-1][1] <= 38.25
 
 
 def test_meet_gives_up_where_values_grow_no_more():
-    points = meet(lambda q: min(q, 40.0), Window(50, 51, 50.5), start=39.0, slope=1.0, bounds=(0, 1000), tries=30)
+    points = find_in_window(
+        lambda q: min(q, 40.0), SearchWindow(50, 51, 50.5), start=39.0, slope=1.0, bounds=(0, 1000), tries=30
+    )
     assert len(points) < 6
     assert points[-1][0] < 1000.0
 
 
 @pytest.mark.parametrize(("fine", "stalls"), [(36.2, True), (37.5, False), (40.5, False)])
 def test_a_coding_that_more_precision_hardly_betters_is_no_choice(fine, stalls):
-    part, coding = SimpleNamespace(psnr=45.0, refits=False), Coding("codebook", 1 / 8)
+    part, coding = SimpleNamespace(psnr=45.0, refits=False), CodingChoice("codebook", 1 / 8)
     alike = {"part": part, "coding": coding, "is_careful": True, "is_judged": False, "psnr": 40.0, "size_bytes": 9}
     deflate = SimpleNamespace(deflate_level=10)
     files = [
         SimpleNamespace(**alike, quality=at, decided_psnr=psnr, options=deflate) for at, psnr in ((50, 36), (54, fine))
     ]
     made = [SimpleNamespace(**{**alike, "is_judged": True}, quality=40, decided_psnr=40.0)]
-    solver = Solver(SimpleNamespace(made=made, of=lambda *_: files), Goal(psnr=40.0))
+    solver = PrecisionSearch(SimpleNamespace(made=made, of=lambda *_: files), SearchGoal(psnr=40.0))
     assert stalls == solver.is_stalled(files[0]) == math.isinf(solver.expected(files[1]))
 
 
@@ -116,30 +125,30 @@ def test_what_views_that_judge_see_of_removal_says_where_a_file_has_to_stand():
 
     def solver(judged):
         trials = SimpleNamespace(made=[], judged_psnr=lambda _: psnr_of_mse(judged * allowed) - gains)
-        return Solver(trials, Goal(psnr=34.0))
+        return PrecisionSearch(trials, SearchGoal(psnr=34.0))
 
     assert solver(0.8).level(part) == pytest.approx(psnr_of_mse((0.45 + 0.2) * allowed))
     assert solver(0.45).level(part) == pytest.approx(34.0)
     assert [False, True] == [solver(share).is_hopeless(part) for share in (0.85, 0.95)]
-    assert not Solver(solver(0.95).trials, Goal(size_bytes=1000)).is_hopeless(part)
+    assert not PrecisionSearch(solver(0.95).trials, SearchGoal(size_bytes=1000)).is_hopeless(part)
 
 
 def test_near_what_removal_took_a_decibel_is_dear():
     """Two files as far below the goal as each other: the one whose splats err more needs more precision."""
     part, better = (SimpleNamespace(refits=True, psnr=psnr) for psnr in (34.5, 40.0))
     packed = SimpleNamespace(deflate_level=12)
-    said = {"coding": Coding("scalar"), "quality": 40.0, "options": packed, "is_careful": True, "is_judged": True}
+    said = {"coding": CodingChoice("scalar"), "quality": 40.0, "options": packed, "is_careful": True, "is_judged": True}
     seen = {"psnr": 33.8, "decided_psnr": 33.8, "size_bytes": 1000}
     made = [SimpleNamespace(part=one, **said, **seen) for one in (part, better)]
     trials = SimpleNamespace(made=made, of=lambda part, _coding: [one for one in made if one.part is part])
-    solver = Solver(trials, Goal(psnr=34.0))
+    solver = PrecisionSearch(trials, SearchGoal(psnr=34.0))
     assert solver.expected(made[0]) > solver.expected(made[1]) > math.log(1000)
 
 
 def test_spread_is_that_of_the_views():
-    assert 0.0 == spread_of(np.full(8, 1e-4))
-    assert 10 * math.log10(4) / 2 == pytest.approx(spread_of(np.array([1e-4, 4e-4])))
-    assert math.isnan(spread_of(np.array([1e-4])))
+    assert 0.0 == psnr_spread(np.full(8, 1e-4))
+    assert 10 * math.log10(4) / 2 == pytest.approx(psnr_spread(np.array([1e-4, 4e-4])))
+    assert math.isnan(psnr_spread(np.array([1e-4])))
 
 
 # three searches
@@ -299,7 +308,7 @@ def test_fitting_to_the_quantised_geometry_mends_it(scene):
     coarse = EncodeOptions(opacity_levels=8, scale_step=0.3, quat_levels=8, sh0_step=0.005, sh_step=0.005)
     bare, views = replace(scene, shN=scene.shN[:, :0]), with_deciders(judged_by(cameras(40)))
     how = replace(SMALL, effort=3, view_size=(960, 720))
-    removal = Removal(bare, views, how, grades=False, progress=None, psnr=None, left=300)
+    removal = Pruner(bare, views, how, grades=False, progress=None, psnr=None, left=300)
     part, judge = removal.fitted(300, None, views.decider(bare).psnr), views.judge(bare)
     quick, fitted = (part.coded(coarse, graded=False, quick=quick).write().data for quick in (True, False))
     assert judge.psnr(decode(fitted)) > judge.psnr(decode(quick)) + 0.2
@@ -307,7 +316,7 @@ def test_fitting_to_the_quantised_geometry_mends_it(scene):
 
 def test_so_few_splats_are_fitted_as_are_asked_for(scene):
     views = with_deciders(judged_by(cameras(40)))
-    removal = Removal(scene, views, SMALL, grades=False, progress=None, psnr=30.0)
+    removal = Pruner(scene, views, SMALL, grades=False, progress=None, psnr=30.0)
     assert 3 == len(removal.fitted(3, None, lambda _: 20.0).rows)
 
 
@@ -406,7 +415,7 @@ def unequal():
 @pytest.fixture(scope="module")
 def measured(unequal):
     """Importance of the splats, measured in twelve views."""
-    return measured_importance(unequal, cameras(12), BLACK, threads=None)
+    return measure_importance(unequal, cameras(12), BLACK, threads=None)
 
 
 @pytest.mark.slow
@@ -414,7 +423,7 @@ def test_what_was_measured_grades_splats_and_makes_files_smaller_at_the_same_psn
     judge, files = Scorer.of_source(unequal, cameras(6), BLACK), {}
     for graded in (True, False):
         options = EncodeOptions(attribute_psnr=48.0 if graded else 47.0)
-        whole = Whole(unequal, None, measured, None)
+        whole = WholeScene(unequal, None, measured, None)
         files[graded] = whole.coded(options, graded=graded, quick=False).write()
     assert len(files[True].report.options["grades"]["splats"]) > 1
     assert "grades" not in files[False].report.options
@@ -439,7 +448,7 @@ def test_sensitivity_is_measured_where_it_changes_something(scene, unequal, meas
     views, plain = views_of(cameras(12)), EncodeOptions()
 
     def views_used(source, options=plain, importance=None, *, inside=False):
-        found, count = measured_for(source, views, options, importance, inside=inside)
+        found, count = complete_importance(source, views, options, importance, inside=inside)
         return found is not None, count
 
     taught = len(views.teaches)
@@ -458,7 +467,7 @@ def test_sensitivity_is_measured_where_it_changes_something(scene, unequal, meas
         "weights inside": views_used(unequal, importance=given, inside=True),
     }  # fmt: skip
     weights = np.linspace(1.0, 2.0, 300)
-    found, _ = measured_for(scene, views, plain, weights, inside=False)
+    found, _ = complete_importance(scene, views, plain, weights, inside=False)
     np.testing.assert_array_equal(weights, found.sh)
 
 
@@ -467,12 +476,12 @@ def test_sensitivity_is_measured_where_it_changes_something(scene, unequal, meas
 
 def test_time_is_foretold_by_pictures_and_less_where_all_stay():
     target, options = Target(psnr=30.0), EncodeOptions()
-    assert (520.0, 3000.0) == tuple(expected_pictures(options, target, keep_all=keep) for keep in (True, False))
+    assert (520.0, 3000.0) == tuple(expected_renders(options, target, keep_all=keep) for keep in (True, False))
     fast, extra = EncodeOptions(preset="fast"), EncodeOptions(keep_extra=True)
-    assert [520.0, 520.0] == [expected_pictures(one, target, keep_all=False) for one in (fast, extra)]
-    assert 520.0 == expected_pictures(options, Target(psnr=30.0, max_error={"means": 1.0}), keep_all=False)
-    assert 3000.0 == expected_pictures(fast, Target(keep=0.5), keep_all=False)
-    assert 1200.0 == expected_pictures(options, target, keep_all=False, simplifying=SimplifyOptions(effort=1))
+    assert [520.0, 520.0] == [expected_renders(one, target, keep_all=False) for one in (fast, extra)]
+    assert 520.0 == expected_renders(options, Target(psnr=30.0, max_error={"means": 1.0}), keep_all=False)
+    assert 3000.0 == expected_renders(fast, Target(keep=0.5), keep_all=False)
+    assert 1200.0 == expected_renders(options, target, keep_all=False, simplifying=SimplifyOptions(effort=1))
 
 
 def test_seconds_of_a_picture_are_measured_without_the_first(scene):
@@ -491,7 +500,7 @@ def test_seconds_of_a_picture_are_measured_without_the_first(scene):
 
 @pytest.mark.parametrize(("beside", "said"), [(39.5, "39.50 beside"), (37.0, "37.00 beside: up to 3.0 dB less")])
 def test_what_nobody_looked_at_is_told_and_a_loss_there_by_name(beside, said):
-    report = Report({"psnr": 40.0}, 1, 1, 1, 1, 1.0, psnr=40.0, elsewhere={"beside": beside})
+    report = SearchReport({"psnr": 40.0}, 1, 1, 1, 1, 1.0, psnr=40.0, elsewhere={"beside": beside})
     assert 1 == sum(said in line for line in report.lines())
 
 

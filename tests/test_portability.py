@@ -30,9 +30,9 @@ from csplat_conformance.process import run_program
 from csplat_conformance.report import Status
 from csplat_conformance.serving import Served
 from csplat_selftest.mutation import __main__ as mutation
-from csplat_tools.batches.finding import leads_out
-from csplat_tools.batches.records import JOURNAL, Record, open_journal, read_journal
-from csplat_tools.batches.workers import Worker, WorkerLostError
+from csplat_tools.batches.batch_scenes import leads_out
+from csplat_tools.batches.batch_worker import Worker, WorkerLostError
+from csplat_tools.batches.journal import JOURNAL, Record, open_journal, read_journal
 from csplat_trainer.report import peak_memory
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -22,11 +22,9 @@ from csplat_render.scorer import Scorer, renderer
 from csplat_render.virtual_cameras import is_clear, sample_cloud, scene_frame
 from csplat_tools.cli.app import app
 from csplat_tools.cli.parsing import parse_decibels
-from csplat_tools.optimise.simplify import SimplifyOptions, simplify
-from csplat_tools.optimise.simplify.adjusting import adjust
-from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
-from csplat_tools.optimise.simplify.fitting import Fit
-from csplat_tools.optimise.simplify.order import Side, removal_order, seen_by
+from csplat_tools.optimise.pruning import simplify
+from csplat_tools.optimise.pruning_order import MeasuredViews, SimplifyOptions, find_pruning_order, total_removal
+from csplat_tools.optimise.splat_refit import RefitResult, choose_bands, coefficient_mask, drop_bands, refit_splats
 from csplat_tools.study import prune_share
 from csplat_tools.views import VIEW_COUNT, VIEW_SIZE, camera_sequence, elsewhere, find_view_set, reduced, usual_views
 from csplat_tools.views.agreeing import find_views, removal_keys
@@ -123,7 +121,7 @@ def test_what_is_invisible_goes_first_and_what_is_unseen_stays(source):
     unseen = ~found.removal.seen & (source.opacities > 0.01)
     assert np.isinf(keys[unseen]).all()
     assert (removal_keys(source.opacities, found.removal, keep_unseen=False)[unseen] < 0.0).all()
-    order = removal_order(source, [Side(found.used, found.removal)], SMALL, len(source) // 2)
+    order = find_pruning_order(source, [MeasuredViews(found.used, found.removal)], SMALL, len(source) // 2)
     assert set(order.rows[:10]) == set(range(10))
     assert len(order.rounds) == 2
 
@@ -131,11 +129,11 @@ def test_what_is_invisible_goes_first_and_what_is_unseen_stays(source):
 def test_rounds_ask_one_side_after_the_other(source):
     """Each round measures one side again; the other side keeps its last errors until its turn."""
     parts = [camera_sequence(source, 4, (48, 36), seed=seed) for seed in (1, 2)]
-    sides = [Side(cameras, measure_pruning_error(source, cameras, bands=False)) for cameras in parts]
-    order = removal_order(source, sides, replace(SMALL, rounds=2), len(source) // 2)
+    sides = [MeasuredViews(cameras, measure_pruning_error(source, cameras, bands=False)) for cameras in parts]
+    order = find_pruning_order(source, sides, replace(SMALL, rounds=2), len(source) // 2)
     first = order.rounds[0].removed
     rows = order.kept(len(source), first)
-    keys = removal_keys(source.opacities, seen_by(sides))
+    keys = removal_keys(source.opacities, total_removal(sides))
     np.testing.assert_array_equal(order.errors[:first], np.sort(np.maximum(keys, 0.0))[:first])
     again = measure_pruning_error(source.select(rows), parts[0]).error + sides[1].removal.error[rows]
     places = np.searchsorted(rows, order.rows[first:])
@@ -181,9 +179,9 @@ def test_a_refit_gains_on_views_that_it_did_not_see(source):
 
 def test_a_fit_that_serves_its_own_views_alone_is_refused(source, given, monkeypatch):
     def dark(model, *_arguments, **_options):
-        return Fit(replace(model, sh0=model.sh0 - np.float32(1.0)), None)
+        return RefitResult(replace(model, sh0=model.sh0 - np.float32(1.0)), None)
 
-    monkeypatch.setattr(sys.modules[simplify.__module__], "fit", dark)
+    monkeypatch.setattr(sys.modules[simplify.__module__], "refit_with_bands", dark)
     result = simplify(source, keep=0.6, views=given, options=SMALL)
     assert result.report["refit_refused"]
     assert result.report["check_psnr"] == result.report["check_psnr_pruned"]
@@ -193,7 +191,7 @@ def test_a_fit_that_serves_its_own_views_alone_is_refused(source, given, monkeyp
 def test_what_no_view_shows_is_not_adjusted(source):
     cameras = camera_sequence(source, 4, (48, 36))[:1]
     wanted = [picture + np.float32(0.1) for picture in render_pictures(source, cameras)]
-    adjusted = adjust(source, cameras, wanted, SMALL, steps=8)
+    adjusted = refit_splats(source, cameras, wanted, SMALL, steps=8)
     seen = measure_pruning_error(source, cameras).seen
     assert 0 < np.count_nonzero(seen) < len(source)
     np.testing.assert_array_equal(source.means, adjusted.means)
@@ -206,7 +204,7 @@ def test_transparent_and_opaque_splats_stay_within_alpha(source):
     cameras = camera_sequence(source, 4, (48, 36))
     wanted = render_pictures(source, cameras)
     extreme = replace(source, opacities=np.where(np.arange(len(source)) % 2, 0.0, 1.0).astype(np.float32))
-    adjusted = adjust(extreme, cameras, wanted, SMALL, steps=8)
+    adjusted = refit_splats(extreme, cameras, wanted, SMALL, steps=8)
     assert np.isfinite(adjusted.scales).all()
     assert 0.0 <= adjusted.opacities.min() <= adjusted.opacities.max() <= 1.0
 
@@ -279,9 +277,9 @@ def test_bands_that_are_worth_less_than_their_bits_go():
     bands = np.array([[0.3, 0.3, 0.3], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
     zeros = np.zeros(3)
     removal = PruningError(zeros, zeros, np.array([True, False, True]), bands, 1)
-    stays = band_mask(removal, 1.0)
+    stays = choose_bands(removal, 1.0)
     np.testing.assert_array_equal([[True, False, False], [True, True, True], [True, True, True]], stays)
-    free = free_coefficients(stays)
+    free = coefficient_mask(stays)
     assert [3, 15, 15] == free.sum(axis=1).tolist()
 
 
@@ -291,7 +289,7 @@ def test_bands_without_worth_are_zero_and_others_are_not(source, given):
     stays = result.stays
     assert stays is not None
     assert 0 < np.count_nonzero(~stays) < stays.size
-    np.testing.assert_array_equal(result.model.shN, without(result.model, stays).shN)
+    np.testing.assert_array_equal(result.model.shN, drop_bands(result.model, stays).shN)
     for band, count in result.report["zero_bands"].items():
         span = slice(int(band) ** 2 - 1, (int(band) + 1) ** 2 - 1)
         assert count == np.count_nonzero(~result.model.shN[:, span].any(axis=(1, 2)))

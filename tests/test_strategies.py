@@ -344,7 +344,7 @@ def test_impossible_reductions_are_refused(make_model):
 @pytest.mark.slow
 def test_pruning_and_clustering_want_no_renderer():
     code = (
-        "import sys, json; import csplat_tools.study; from csplat_tools.study.clustering import parse_kmeans;"
+        "import sys, json; import csplat_tools.study; from csplat_tools.study.attribute_codebooks import parse_kmeans;"
         "print(json.dumps([name for name in ('numba', 'torch', 'matplotlib') if name in sys.modules]))"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)

@@ -13,9 +13,8 @@ from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
 from csplat_tools.cli.app import app
 from csplat_tools.files.sizes import parse_size_bytes
-from csplat_tools.optimise.bounds import meet_bounds
-from csplat_tools.optimise.reaching import encode_to
-from csplat_tools.optimise.target import Target, parse_max_error
+from csplat_tools.optimise.target_encoding import encode_to, meet_bounds
+from csplat_tools.optimise.targets import Target, parse_max_error
 
 pytest.importorskip("numba", reason="targets of size and PSNR want the extra [render]")
 
@@ -213,7 +212,7 @@ def test_long_work_is_foretold_unless_it_is_short_or_nobody_is_told(capsys):
 
 def test_the_command_foretells_a_search_before_it_begins(tmp_path, ply, monkeypatch):
     """The search itself is refused: nothing shows in the view that judges."""
-    monkeypatch.setattr("csplat_tools.optimise.optimiser.picture_seconds", lambda *_, **__: 170.0 / 520.0)
+    monkeypatch.setattr("csplat_tools.optimise.target_search.picture_seconds", lambda *_, **__: 170.0 / 520.0)
     K = intrinsics(48, 40, 60.0)
     save_cameras(tmp_path / "away.json", [look_at((40.0, 0.0, 0.0), (80.0, 0.0, 0.0), (0, 0, 1), K, 48, 40)])
     words = ("encode", ply, tmp_path / "s.csplat", "--target-psnr", "30", "--cameras", tmp_path / "away.json")

@@ -31,17 +31,13 @@ from csplat.scene import without_bands
 from csplat_render.camera_files import save_cameras
 from csplat_tools.cli.app import app
 from csplat_tools.study import Reduction
-from csplat_tools.tradeoffs.commands import reduction_command, target_command
-from csplat_tools.tradeoffs.labels import label_marks
-from csplat_tools.tradeoffs.measuring import StageClock, fetched_bytes
-from csplat_tools.tradeoffs.options import USUAL, Wanted, parse_what
-from csplat_tools.tradeoffs.page import make_page, shown_points
-from csplat_tools.tradeoffs.plots import PLOTS, draw_plot
-from csplat_tools.tradeoffs.points import Failure, pareto_front
-from csplat_tools.tradeoffs.running import tradeoff
-from csplat_tools.tradeoffs.setting import read_setting
-from csplat_tools.tradeoffs.sweep import candidates
-from csplat_tools.tradeoffs.tables import format_tradeoff
+from csplat_tools.tradeoffs.sweep_commands import reduction_command, target_command
+from csplat_tools.tradeoffs.sweep_options import USUAL, SweepOptions, parse_sweep, read_setting
+from csplat_tools.tradeoffs.sweep_points import StageClock, SweepFailure, fetched_bytes, pareto_front
+from csplat_tools.tradeoffs.sweep_run import plan_points, tradeoff
+from csplat_tools.tradeoffs.tradeoff_page import make_tradeoff_page, shown_points
+from csplat_tools.tradeoffs.tradeoff_plots import PLOTS, draw_plot, label_marks
+from csplat_tools.tradeoffs.tradeoff_tables import format_tradeoff
 from csplat_tools.views import DataOptions, ViewSet
 from csplat_tools.views.viewset import pose
 
@@ -97,7 +93,7 @@ def setting(capture):
 
 @pytest.fixture(scope="module")
 def measured(setting):
-    return tradeoff(setting, Wanted(what=("presets", "precision"), attribute_psnr=(36.0,)))
+    return tradeoff(setting, SweepOptions(what=("presets", "precision"), attribute_psnr=(36.0,)))
 
 
 # what is measured
@@ -155,9 +151,9 @@ def test_what_is_searched_for_is_what_a_row_says(setting, monkeypatch):
         asked.append((source, words))
         raise InputError("none")
 
-    monkeypatch.setattr("csplat_tools.tradeoffs.sweep.encode_to", fail)
-    wanted = Wanted(what=("targets", "simplify"), preset="fast", psnr=(30.0,), sizes=(9000,), keep=(0.7,))
-    tried = {one.name: one for one in candidates(setting, wanted)}
+    monkeypatch.setattr("csplat_tools.tradeoffs.sweep_run.encode_to", fail)
+    wanted = SweepOptions(what=("targets", "simplify"), preset="fast", psnr=(30.0,), sizes=(9000,), keep=(0.7,))
+    tried = {one.name: one for one in plan_points(setting, wanted)}
     for name, goal in (("target 30 dB", "psnr"), ("target 9.0 kB", "size"), ("keep 0.7", "keep")):
         assert ("simplify" if goal == "keep" else "targets") == tried[name].family
         with pytest.raises(InputError, match="none"):
@@ -474,7 +470,7 @@ def test_commands_quote_what_a_shell_would_read(setting):
 
 
 def test_without_one_point_that_can_be_measured_it_fails(setting):
-    wanted = Wanted(what=("strategies",), opacities=(0.99,), kmeans=())
+    wanted = SweepOptions(what=("strategies",), opacities=(0.99,), kmeans=())
     with pytest.raises(InputError, match=r"no point could be measured; opacity > 0.99: no splat"):
         tradeoff(replace(setting, source=without_bands(setting.source, 0)), wanted)
 
@@ -482,43 +478,43 @@ def test_without_one_point_that_can_be_measured_it_fails(setting):
 @pytest.mark.slow
 def test_a_scene_without_splats_is_swept(setting, make_model, monkeypatch):
     empty = replace(setting, source=make_model(0, 1), source_bytes=1000)
-    found = tradeoff(empty, Wanted(what=("presets",)))
+    found = tradeoff(empty, SweepOptions(what=("presets",)))
     assert [None] * 3 == [one.bytes_per_source_splat for one in found.measured]
     assert {99.0} == {one.psnr for one in found.measured}
     assert "0 splats" in format_tradeoff(found)
     assert "<svg" in draw_plot("size-quality", replace(found, points=found.points[:1]), inline=False)
-    monkeypatch.setattr("csplat_tools.tradeoffs.page.draw_plot", lambda *_, **_options: None)  # takes a second
-    assert make_page(found).startswith("<!doctype html>")
+    monkeypatch.setattr("csplat_tools.tradeoffs.tradeoff_page.draw_plot", lambda *_, **_options: None)  # takes a second
+    assert make_tradeoff_page(found).startswith("<!doctype html>")
 
 
 def test_a_defect_ends_in_a_traceback(setting, monkeypatch):
     def fail(*_args, **_options):
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr("csplat_tools.tradeoffs.sweep.encode_with_report", fail)
+    monkeypatch.setattr("csplat_tools.tradeoffs.sweep_run.encode_with_report", fail)
     with pytest.raises(RuntimeError, match="a defect"):
-        tradeoff(setting, Wanted(what=("presets",)))
+        tradeoff(setting, SweepOptions(what=("presets",)))
 
 
 def test_memory_that_runs_out_costs_one_point(setting, monkeypatch):
-    from csplat_tools.tradeoffs import sweep
+    from csplat_tools.tradeoffs import sweep_run
 
-    whole = sweep.encode_with_report
+    whole = sweep_run.encode_with_report
 
     def fail(model, options, **others):
         if options.preset == "small":
             raise MemoryError
         return whole(model, options, **others)
 
-    monkeypatch.setattr(sweep, "encode_with_report", fail)
-    found = tradeoff(setting, Wanted(what=("presets",)))
-    assert [Failure("small", "presets", "out of memory")] == found.failures
+    monkeypatch.setattr(sweep_run, "encode_with_report", fail)
+    found = tradeoff(setting, SweepOptions(what=("presets",)))
+    assert [SweepFailure("small", "presets", "out of memory")] == found.failures
 
 
 @pytest.mark.slow
 def test_nothing_is_overwritten_unless_forced(capture, tmp_path, monkeypatch):
     plots = {name: PLOTS[name] for name in ("size-quality", "attribute-bytes", "sh-layers")}  # one of each kind
-    monkeypatch.setattr("csplat_tools.tradeoffs.page.PLOTS", plots)
+    monkeypatch.setattr("csplat_tools.tradeoffs.tradeoff_page.PLOTS", plots)
     (tmp_path / "plots").mkdir()
     plot = tmp_path / "plots" / "size-quality.svg"
     mine = {"-o": tmp_path / "page", "--report": tmp_path / "report", "--plots": plot}
@@ -596,9 +592,9 @@ def test_a_wrong_command_line_has_status_2(capture):
 
 
 def test_lists_are_read_in_their_order():
-    assert ("targets", "presets") == parse_what("targets,presets,targets").what
-    assert (*USUAL, "finetune") == parse_what("usual, finetune").what
-    wanted = parse_what("targets=38:2MB:.5e2:38, strategies=0.1:16:256, precision=")
+    assert ("targets", "presets") == parse_sweep("targets,presets,targets").what
+    assert (*USUAL, "finetune") == parse_sweep("usual, finetune").what
+    wanted = parse_sweep("targets=38:2MB:.5e2:38, strategies=0.1:16:256, precision=")
     assert ((38.0, 50.0), (2_000_000,)) == (wanted.psnr, wanted.sizes)
     assert ((0.1,), (16.0, 256.0)) == (wanted.opacities, wanted.kmeans)
     assert () == wanted.attribute_psnr

@@ -11,12 +11,12 @@ from typing import Annotated
 import typer
 
 from csplat.errors import counted
-from csplat_tools.batches.finding import starting_points
-from csplat_tools.batches.page import PAGE
-from csplat_tools.batches.records import JOURNAL
-from csplat_tools.batches.running import Batch, CommandLineError, Step, plan
-from csplat_tools.batches.running import batch as run_batch
-from csplat_tools.batches.scene import Planned
+from csplat_tools.batches.batch_page import PAGE
+from csplat_tools.batches.batch_run import Batch, BatchStep, CommandLineError, plan_batch
+from csplat_tools.batches.batch_run import batch as run_batch
+from csplat_tools.batches.batch_scenes import starting_points
+from csplat_tools.batches.journal import JOURNAL
+from csplat_tools.batches.scene_job import PlannedJob
 from csplat_tools.cli.console import FAILED
 from csplat_tools.cli.groups import Output
 from csplat_tools.cli.options import command
@@ -77,7 +77,7 @@ def batch(
         note(f"left out: {', '.join(points[:_SHOWN_MAX])}: the points that training began with, no scenes")
     try:
         if dry_run:
-            planned = plan(scenes, folder, words, ending=ending, match=match, workers=workers)
+            planned = plan_batch(scenes, folder, words, ending=ending, match=match, workers=workers)
             out.publish(_planned_json(planned), _planned_text(planned))
             return
         with step_progress("batch", _words(), quiet=out.quiet) as progress:
@@ -93,11 +93,11 @@ def batch(
         sys.exit(FAILED)
 
 
-def _words() -> Callable[[Step], str]:
+def _words() -> Callable[[BatchStep], str]:
     """Return a function that describes the progress in a line, with the time left counted from now on."""
     begun = time.monotonic()
 
-    def words(step: Step) -> str:
+    def words(step: BatchStep) -> str:
         failed = f", {step.failed} failed" if step.failed else ""
         left = (time.monotonic() - begun) * (1.0 / step.share - 1.0) if step.share > 0.0 else 0.0
         return f"{step.iteration} of {step.iterations}{failed}" + (
@@ -121,7 +121,7 @@ def _tell_failures(done: Batch) -> None:
         note(f"and {len(done.failures) - _SHOWN_MAX} more: {done.folder / JOURNAL}")
 
 
-def _planned_json(planned: list[Planned]) -> list[dict[str, object]]:
+def _planned_json(planned: list[PlannedJob]) -> list[dict[str, object]]:
     return [
         {
             "path": one.job.task.source,
@@ -137,7 +137,7 @@ def _planned_json(planned: list[Planned]) -> list[dict[str, object]]:
     ]
 
 
-def _planned_text(planned: list[Planned]) -> str:
+def _planned_text(planned: list[PlannedJob]) -> str:
     """Return a table of the planned work, and the total time."""
     rows = []
     for one in planned:

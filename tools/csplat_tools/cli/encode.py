@@ -30,7 +30,7 @@ from csplat_tools.files.streams import check_name, source_path
 from csplat_tools.inspect.glance import SIZE, SPLATS_MAX, glance
 
 if TYPE_CHECKING:
-    from csplat_tools.optimise.target import Target
+    from csplat_tools.optimise.targets import Target
 
 
 _TARGET = "Targets (one of the first four, which want the render extra)"
@@ -94,7 +94,7 @@ class Goal(Group):
         """
         if not self.is_rendered and self.max_error is None:
             return None
-        from csplat_tools.optimise.target import Target, parse_max_error  # imports names of the renderer
+        from csplat_tools.optimise.targets import Target, parse_max_error  # imports names of the renderer
 
         size = parse_bytes(self.target_size)
         loss = None if self.max_loss is None else parse_decibels(self.max_loss)
@@ -302,8 +302,8 @@ def _reach(
     simplifying = None
     if target.is_rendered:
         prepare_renderer(quiet=out.quiet, simplify=True)
-        from csplat_tools.optimise.optimiser import expected_seconds
-        from csplat_tools.optimise.simplify import SimplifyOptions
+        from csplat_tools.optimise.pruning_order import SimplifyOptions
+        from csplat_tools.optimise.target_search import expected_seconds
 
         given = virtual.given()
         simplifying = SimplifyOptions(effort=goal.effort, view_size=given.get("size"))

@@ -122,8 +122,8 @@ def finetune(
     """
     need_trainer(plots=page is not None)
     from csplat_render.lpips import load_lpips
-    from csplat_tools.training import finetune as tuning
-    from csplat_tools.training.report import format_report
+    from csplat_tools.training import tuned_file as tuning
+    from csplat_tools.training.tuning_report import format_tuning_report
     from csplat_trainer.outputs import Outputs
     from csplat_trainer.tuning.options import FinetuneOptions
 
@@ -156,7 +156,7 @@ def finetune(
     read = read_source(source, facts.read(), strict=facts.strict, keep_extra=facts.keep_extra, sh_degree=degree)
     out.findings(read.findings)
     given = {"count": tuning.VIEWS, "size": tuning.VIEW_SIZE, **virtual.given()}
-    aside_count = aside or tuning.usually_aside(given["count"], cameras=views.cameras, data=views.data)
+    aside_count = aside or tuning.default_validation_count(given["count"], cameras=views.cameras, data=views.data)
     around = views.find(read.model, out, near=near, aside=aside_count, **given)
     around.read()
     report = tuning.run_finetuning(
@@ -164,5 +164,5 @@ def finetune(
         prune_unseen=prune_unseen, importance=importance, source_index=source_index, lpips=distance,
         size_bytes=size_bytes, psnr=psnr, page=page, quiet=out.quiet,
     )  # fmt: skip
-    out.remark(format_report(report))
+    out.remark(format_tuning_report(report))
     out.publish(report)

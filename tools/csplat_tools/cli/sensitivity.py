@@ -52,7 +52,7 @@ def sensitivity(
     out.check(inputs=(source, *views.inputs), named={"OUT.npz": output})
     check_name(output, ".npz", "sensitivity", source)
     need_renderer()
-    from csplat_tools.optimise.sensitivity import measure_scene
+    from csplat_tools.optimise.scene_sensitivity import measure_scene
     from csplat_tools.views.timing import pictures_seconds
 
     read = load_model(source)

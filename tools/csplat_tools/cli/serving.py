@@ -25,8 +25,8 @@ from typing import Any
 import typer
 
 from csplat.system import interrupt_main_thread
-from csplat_tools.batches.looking import look
-from csplat_tools.batches.thumbnails import prepare_thumbnails, write_thumbnail
+from csplat_tools.batches.batch_page import prepare_thumbnails, write_thumbnail
+from csplat_tools.batches.scene_job import inspect_scene
 from csplat_tools.cli.app import app, command_function
 from csplat_tools.cli.console import FAILED, WrongCommandLine
 
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def answer(request: dict[str, Any]) -> dict[str, Any]:
-    """Answer a request: `check` or `run` a command line, or `look` at a scene."""
+    """Answer a request: `check` or `run` a command line, or `inspect_scene` at a scene."""
     asked: dict[str, Callable[..., dict[str, Any]]] = {
         "check": _check,
         "look": _look,
@@ -120,7 +120,7 @@ def _is_given(context: Any, name: str) -> bool:
 
 def _look(path: str) -> dict[str, Any]:
     try:
-        return look(Path(path)).as_json()
+        return inspect_scene(Path(path)).as_json()
     except OSError as error:
         reason = error.strerror or type(error).__name__
         return {"error": f"{path}: {reason}", "code": _os_code(error)}

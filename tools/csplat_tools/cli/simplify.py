@@ -23,7 +23,7 @@ _TARGET = "Target (one of them)"
 #: Cost in renders of all training views: for --keep (measured: donut 9, plane3 19), and for a target, which searches
 #: for the share to keep (20 and 45); half of the cost is fitting.
 _PASSES = (20.0, 45.0)
-_OPTIONS = "csplat_tools.optimise.simplify.options:SimplifyOptions"
+_OPTIONS = "csplat_tools.optimise.pruning_order:SimplifyOptions"
 
 
 @command(reads=True, one_of=(("keep", "target_psnr", "max_loss"),), needs={"max_loss": ("data",)}, settings=(_OPTIONS,))
@@ -72,8 +72,8 @@ def simplify(
     """
     need_renderer()
     import csplat_tools
-    from csplat_tools.optimise.simplify import SimplifyOptions
-    from csplat_tools.optimise.target import Target
+    from csplat_tools.optimise.pruning_order import SimplifyOptions
+    from csplat_tools.optimise.targets import Target
     from csplat_tools.views import reduced
     from csplat_tools.views.timing import pictures_seconds
 

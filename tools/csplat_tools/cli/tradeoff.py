@@ -13,7 +13,7 @@ from csplat_tools.cli.view_options import Views
 from csplat_tools.files.console import note
 from csplat_tools.files.extras import need_pictures, need_plots, need_renderer, prepare_renderer
 from csplat_tools.files.streams import STANDARD_STREAM
-from csplat_tools.tradeoffs.options import FAMILIES, Wanted, parse_what
+from csplat_tools.tradeoffs.sweep_options import FAMILIES, SweepOptions, parse_sweep
 
 _SLOW = {"strategies", "targets", "simplify", "finetune"}
 
@@ -36,14 +36,14 @@ def tradeoff(
             " or, from 1 on, entries of codebooks.",
         ),
     ] = "usual",
-    preset: Preset = Wanted.preset,
+    preset: Preset = SweepOptions.preset,
     iterations: Annotated[
         int, typer.Option(metavar="N", min=1, hidden=True, help="Steps of fine-tuning at most.")
-    ] = Wanted.iterations,
+    ] = SweepOptions.iterations,
     modes: Annotated[
         str,
         typer.Option(metavar="exact|standard|fast,...", hidden=True, help="Modes of the renderer that are timed."),
-    ] = ",".join(Wanted.modes),
+    ] = ",".join(SweepOptions.modes),
     lpips: Lpips = None,
     threads: Threads = None,
 ) -> None:
@@ -66,7 +66,7 @@ def tradeoff(
       csplat tradeoff scene.ply --data photographs --size 480x270 --what usual,finetune -o report.html
     """
     wanted = chosen(
-        parse_what, text=what, preset=preset, iterations=iterations, threads=threads,
+        parse_sweep, text=what, preset=preset, iterations=iterations, threads=threads,
         modes=tuple(mode.strip() for mode in modes.split(",")),
     )  # fmt: skip
     if plots == STANDARD_STREAM:
@@ -77,9 +77,9 @@ def tradeoff(
     need_renderer()
     need_pictures()
     import csplat_tools
-    from csplat_tools.tradeoffs.page import check_plots, write_page, write_plots
-    from csplat_tools.tradeoffs.setting import read_setting
-    from csplat_tools.tradeoffs.tables import format_tradeoff
+    from csplat_tools.tradeoffs.sweep_options import read_setting
+    from csplat_tools.tradeoffs.tradeoff_page import check_plots, write_plots, write_tradeoff_page
+    from csplat_tools.tradeoffs.tradeoff_tables import format_tradeoff
 
     check_plots(plots, force=out.force)
     setting = read_setting(
@@ -93,5 +93,5 @@ def tradeoff(
     if plots is not None:
         write_plots(plots, measured)
     if page is not None:
-        write_page(page, measured)
+        write_tradeoff_page(page, measured)
     out.publish(measured.as_json(), format_tradeoff(measured))

@@ -13,10 +13,9 @@ from csplat.types import Progress
 from csplat_tools.files.console import format_bytes
 from csplat_tools.files.scenes import LoadedModel, load_model
 from csplat_tools.files.streams import STANDARD_STREAM, write_bytes
+from csplat_tools.html_report import attribute_figure, definitions, document, table
 from csplat_tools.inspect.info import FileFacts
 from csplat_tools.inspect.words import coding_words, headline, other_metadata, scene_words
-from csplat_tools.pages.bars import attribute_figure
-from csplat_tools.pages.parts import definitions, document, table
 
 _ATTRIBUTES = {
     "opacities": "how dense each splat is",
@@ -110,12 +109,12 @@ def make_page(title: str, facts: FileFacts, beside: _Beside | None = None) -> st
 def _compared(data: bytes | mmap, source: str, progress: Progress | None) -> _Beside:
     """Render file and source: from the views of `psnr` for the scores, and from others to show the hardest place."""
     from csplat_render.scorer import Scorer
-    from csplat_tools.pages.hardest import PICTURES, HardestPlace, picture_row
+    from csplat_tools.hardest_place import IMAGES_NOTE, HardestPlaceSearch, piece_images
     from csplat_tools.views import find_view_set, showing_cameras
 
     loaded, model = load_model(source), decode(data)
     views = find_view_set(loaded.model, count=0)
-    hardest, shown = HardestPlace(), showing_cameras(loaded.model, views)
+    hardest, shown = HardestPlaceSearch(), showing_cameras(loaded.model, views)
     scores = views.judge(loaded.model).scores(model, progress=progress)
     showing = Scorer.of_source(loaded.model, shown, views.judging_background)
     showing.scores(model, ssim=False, on_view=hardest.look)
@@ -128,7 +127,7 @@ def _compared(data: bytes | mmap, source: str, progress: Progress | None) -> _Be
         "worst view": f"{scores.psnr_worst:.2f} dB",
         "SSIM": f"{scores.ssim:.4f}: likeness of structure, 1 at best",
     }
-    return _Beside(facts, f"<p>{escape(PICTURES)}</p>\n{picture_row(place, 'the file')}")
+    return _Beside(facts, f"<p>{escape(IMAGES_NOTE)}</p>\n{piece_images(place, 'the file')}")
 
 
 def _source_words(path: str, source: LoadedModel, size_bytes: int) -> str:

@@ -6,18 +6,31 @@ the canonical form of shapes are those of the codec, and `Draft`, whose colours 
 
 from __future__ import annotations
 
-from csplat_tools.study.clustering import ATTRIBUTES, Book, Clustered, KMeans, cluster_attributes, parse_kmeans
-from csplat_tools.study.encoding import encode_reduced
-from csplat_tools.study.pruning import prune_opacity, prune_share
-from csplat_tools.study.reduction import Reduced, Reduction, reduce_model
-from csplat_tools.study.sizes import attribute_floats, raw_bytes
+from csplat_tools.study.attribute_codebooks import (
+    ATTRIBUTES,
+    AttributeCodebook,
+    Clustered,
+    KMeans,
+    attribute_floats,
+    cluster_attributes,
+    parse_kmeans,
+    raw_bytes,
+)
+from csplat_tools.study.reductions import (
+    ReducedScene,
+    Reduction,
+    encode_reduced,
+    prune_opacity,
+    prune_share,
+    reduce_model,
+)
 
 __all__ = [
     "ATTRIBUTES",
-    "Book",
+    "AttributeCodebook",
     "Clustered",
     "KMeans",
-    "Reduced",
+    "ReducedScene",
     "Reduction",
     "attribute_floats",
     "cluster_attributes",

@@ -24,13 +24,13 @@ from csplat_bench.compression.sizes import books_of
 from csplat_render.lpips import Lpips
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.inspect.info import byte_shares
-from csplat_tools.training.choosing import Chosen, choose_splats, training_views
-from csplat_tools.training.report import judge_models
+from csplat_tools.training.tuning_inputs import TuningSubset, choose_splats, training_views
+from csplat_tools.training.tuning_report import score_models
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.tuning import Clock, FinetuneOptions, Views, tune
 
 #: Splats, and the seconds that it took to choose them, by stage.
-Pick = tuple[Chosen, dict[str, float]]
+Pick = tuple[TuningSubset, dict[str, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class Tuned:
         seconds: time by stage, without judging.
     """
 
-    chosen: Chosen
+    chosen: TuningSubset
     frozen: Frozen
     held: FreeValues
     plain: EncodeResult
@@ -173,7 +173,7 @@ class Bench:
 
     def judge(self, models: Mapping[str, SplatModel]) -> dict[str, Scores]:
         """Scores on the held-out photographs, by name."""
-        judged = judge_models(self.source, models, self.looks, self._lpips, self.threads)
+        judged = score_models(self.source, models, self.looks, self._lpips, self.threads)
         assert judged is not None
         found: dict[str, Any] = {name: dict(one) for name, one in judged.scores.items()}
         return found

@@ -29,9 +29,9 @@ from csplat_bench.common.command import AGAIN, MARKDOWN, OUT, SCENES, TABLES, li
 from csplat_bench.common.kept import Kept, read_kept
 from csplat_bench.common.report import Table, laid_out, tell_machine
 from csplat_bench.common.scenes import ROOT, find_scenes
-from csplat_tools.optimise import fitted, moves, solving
-from csplat_tools.optimise.reaching import encode_to
-from csplat_tools.optimise.simplify import SimplifyOptions, adjusting
+from csplat_tools.optimise import precision_search, splat_refit, subsets, target_search
+from csplat_tools.optimise.pruning_order import SimplifyOptions
+from csplat_tools.optimise.target_encoding import encode_to
 
 _SCENES = "plane3,donut,lego60k,fox120k"
 _KEPT = ROOT / "tools" / "benchmarks" / "ablation"
@@ -60,12 +60,12 @@ _WITHOUT = {
     "nothing": _Without(),
     "adjustment through quantisers": _Without(
         instead=(
-            (fitted, "adjust_frozen", lambda frozen, *_, **__: frozen.start()),
-            (moves, "TUNING_GAINS", 0.0),
-            (solving, "TUNING_GAINS", 0.0),
+            (subsets, "quantisation_aware_refit", lambda frozen, *_, **__: frozen.start()),
+            (target_search, "TUNING_GAINS", 0.0),
+            (precision_search, "TUNING_GAINS", 0.0),
         )
     ),
-    "price of bits in it": _Without(instead=((adjusting, "price_of_bytes", lambda _: math.inf),)),
+    "price of bits in it": _Without(instead=((splat_refit, "rate_exponent", lambda _: math.inf),)),
     "grades": _Without(encoding={"grades": 1}),
     "bands by splat": _Without(simplifying={"bands": False}, sh=True),
     "any fit": _Without(simplifying={"refit": False}),

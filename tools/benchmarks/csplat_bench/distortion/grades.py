@@ -29,7 +29,7 @@ from csplat_render.camera_files import load_cameras
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import scene_frame
 from csplat_tools.files.console import note
-from csplat_tools.optimise.sensitivity import measured_importance, measuring_views
+from csplat_tools.optimise.scene_sensitivity import importance_views, measure_importance
 from csplat_tools.views import BLACK, find_view_set
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg"
@@ -53,14 +53,14 @@ def _rows(scene: Scene) -> list[tuple[str, ...]]:
     source = without_bands(read_ply(scene.path), 0)
     beside = scene.path.with_suffix(".cameras.json")
     given = load_cameras(beside) if beside.exists() else []
-    measures = {"virtual views": measuring_views(source, find_view_set(source)), "half of its cameras": given[::2]}
+    measures = {"virtual views": importance_views(source, find_view_set(source)), "half of its cameras": given[::2]}
     judges = {"cameras of `psnr`": cameras_of(scene.name, source), "the other half": given[1::2][:_JUDGES]}
     kind, rows = scene_frame(source).kind, []
     even = [_file(source, quality) for quality in _EVEN]
     graded: dict[str, tuple[str, list[bytes]]] = {}
     for name, cameras in measures.items():
         if cameras:
-            importance, timing = timed(measured_importance, source, cameras, BLACK, threads=None)
+            importance, timing = timed(measure_importance, source, cameras, BLACK, threads=None)
             graded[name] = f"{timing.wall:.1f}", [_file(source, quality, importance) for quality in _GRADED]
     for judged_by, views in judges.items():
         if views:

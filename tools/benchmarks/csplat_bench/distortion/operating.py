@@ -29,8 +29,8 @@ from csplat_bench.common.report import table, tell_machine
 from csplat_bench.common.scenes import OUT as EVERYTHING
 from csplat_bench.common.scenes import find_scenes
 from csplat_render.scorer import Scorer
-from csplat_tools.optimise.reaching import encode_to
-from csplat_tools.tradeoffs.measuring import fetched_bytes
+from csplat_tools.optimise.target_encoding import encode_to
+from csplat_tools.tradeoffs.sweep_points import fetched_bytes
 from csplat_tools.views import BLACK, comparison_cameras
 
 _SCENES = "plane3,donut,horse,lego60k,fox60k_noreg,fox120k,statue"

@@ -32,10 +32,8 @@ from csplat_bench.common.scenes import find_scenes, judge_of
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.scorer import ReferenceImage, Scorer, renderer
-from csplat_tools.optimise.simplify import SimplifyOptions
-from csplat_tools.optimise.simplify.adjusting import adjust
-from csplat_tools.optimise.simplify.fitting import fit
-from csplat_tools.optimise.simplify.order import Side, removal_order
+from csplat_tools.optimise.pruning_order import MeasuredViews, SimplifyOptions, find_pruning_order
+from csplat_tools.optimise.splat_refit import refit_splats, refit_with_bands
 from csplat_tools.study import prune_share
 from csplat_tools.views import BLACK, VIEW_SIZE, camera_sequence, find_view_set
 from csplat_tools.views.agreeing import find_views
@@ -123,12 +121,12 @@ class _Bench:
         if method in _BY_OPACITY:
             (model, _), timing = timed(prune_share, source, count / len(source), by_area=method == "opacity-area")
         else:
-            rounds, side = 1 if method == "exact" else options.rounds, Side(views.used, views.removal)
-            order, timing = timed(removal_order, source, [side], replace(options, rounds=rounds), count)
+            rounds, side = 1 if method == "exact" else options.rounds, MeasuredViews(views.used, views.removal)
+            order, timing = timed(find_pruning_order, source, [side], replace(options, rounds=rounds), count)
             model = source.select(order.kept(len(source), min(len(source) - count, len(order.rows))))
         result: Left = {"psnr": self._judge.psnr(model), "seconds": timing.wall, "views": len(views.used)}
         if method == "rounds":
-            fitted, timing = timed(fit, model, views.used, self._wanted, options)
+            fitted, timing = timed(refit_with_bands, model, views.used, self._wanted, options)
             own = Scorer(views.used, [ReferenceImage(picture) for picture in self._wanted])
             result |= {"fit_psnr": self._judge.psnr(fitted.model), "fit_seconds": timing.wall}
             result |= {"fit_used": own.psnr(fitted.model), "fit_check": self._checked.psnr(fitted.model)}
@@ -147,7 +145,7 @@ def _pass_milliseconds(source: SplatModel) -> dict[str, float]:
     calls = {
         "render": render,
         "pass": lambda: measure_pruning_error(source, cameras),
-        "step": lambda: adjust(source, cameras, wanted, options, steps=len(cameras)),
+        "step": lambda: refit_splats(source, cameras, wanted, options, steps=len(cameras)),
     }
     turns = [{name: timed(call)[1].wall for name, call in calls.items()} for _ in range(3)]
     return {name: 1000.0 * min(turn[name] for turn in turns) / len(cameras) for name in calls}

@@ -1,0 +1,373 @@
+"""Process one scene, here or on a machine of a cluster: inspect it, run the command unless done before, record it."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import Any
+from urllib.parse import unquote
+
+from csplat import __version__
+from csplat.encoder import EncodeOptions
+from csplat.errors import CsplatError, StoreError, missing
+from csplat.formats import format_of
+from csplat.remote import is_url, store_of
+from csplat_tools.batches.batch_scenes import Task
+from csplat_tools.batches.batch_worker import Worker, WorkerLostError, remove_left
+from csplat_tools.batches.journal import Record
+from csplat_tools.files.by_disk import Scale, expected
+from csplat_tools.files.scenes import FOLDER_NAMES, size_of
+
+THUMBNAILS = "thumbnails"
+_PART_BYTES = 16 << 20
+
+
+@dataclass(frozen=True)
+class SceneJob:
+    """A scene to be processed.
+
+    Attributes:
+        task: the scene.
+        command: the command with the options of all scenes, as words.
+        folder: the folder of outputs, absolute.
+        earlier: the record of an earlier run; `None`: there is none.
+        pending: the output may have been left by a run that did not end by itself.
+        force: an existing output may be replaced, whoever wrote it.
+        threads: number of threads for the command; `None`: it has no such option.
+        resumes: the command has `--resume`, with which it goes on from a folder OUT.work that was left.
+        thumbnail: draw a small render, too.
+    """
+
+    task: Task
+    command: tuple[str, ...]
+    folder: str
+    earlier: Record | None = None
+    pending: bool = False
+    force: bool = False
+    threads: int | None = None
+    resumes: bool = False
+    thumbnail: bool = False
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The command with all options."""
+        return (*self.command, *self.task.options)
+
+    @property
+    def record(self) -> Record:
+        """The record of a failed scene; results are filled in when they are known."""
+        before = "" if self.earlier is None else self.earlier.output_sha256
+        return Record(self.task.source, self.task.output, self.words, __version__, "failed", output_sha256=before)
+
+
+@dataclass(frozen=True)
+class PlannedJob:
+    """The work that a batch would do for a scene.
+
+    Attributes:
+        job: the scene.
+        look: the scene's file; `None`: it cannot be read.
+        is_done: the output is there already, and nothing would be done.
+        seconds: expected time; `None`: nothing is known of the command.
+        memory_bytes: expected peak memory.
+    """
+
+    job: SceneJob
+    look: SceneFile | None
+    is_done: bool
+    seconds: float | None
+    memory_bytes: int
+
+
+#: Reserves memory while a scene's command runs: called with a number of bytes, it yields options for the command.
+Gate = Callable[[int], AbstractContextManager[tuple[str, ...]]]
+
+
+def plan_job(job: SceneJob, worker: Worker) -> PlannedJob:
+    """Inspect a scene and return what would be done, without doing it."""
+    try:
+        with _local_source(job.task.source) as source:
+            found = _inspected(worker, source)
+            assert isinstance(found, SceneFile)
+    except (CsplatError, OSError):
+        return PlannedJob(job, None, False, 0.0, 0)
+    expected = estimate_job(job.command[0], found)
+    return PlannedJob(job, found, _is_done(job, found), expected.seconds, expected.memory_bytes)
+
+
+def run_job(job: SceneJob, worker: Worker, gate: Gate | None = None) -> tuple[Record, bool]:
+    """Process a scene, unless its output is there already.
+
+    Args:
+        job: the scene.
+        worker: the process that runs the command.
+        gate: waits for memory; `None`: there is enough.
+
+    Returns:
+        The record of the scene, and whether anything was done.
+    """
+    record = job.record
+    try:
+        with _local_source(job.task.source) as source:
+            found = _inspected(worker, source)
+            record = replace(record, sha256=found.sha256, source_bytes=found.size_bytes, splats=found.splats)
+            if _is_done(job, found):
+                assert job.earlier is not None
+                return replace(job.earlier, path=job.task.source), False
+            with (
+                (gate or _no_gate)(estimate_job(job.command[0], found).memory_bytes) as options,
+                _local_output(job) as output,
+            ):
+                return _ran(job, record, worker, source, output, options), True
+    except CsplatError as error:
+        return replace(record, code=error.code, error=" ".join(str(error).split())), True
+    except OSError as error:
+        return replace(
+            record, code=errno.errorcode.get(error.errno or 0, "E_OS"), error=" ".join(str(error).split())
+        ), True
+
+
+class SceneError(CsplatError):
+    """Nothing can be done with a scene: a file cannot be fetched, read or replaced."""
+
+    def __init__(self, message: str, code: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+def _ran(job: SceneJob, record: Record, worker: Worker, source: Path, output: Path, options: tuple[str, ...]) -> Record:
+    """Run the command, and return the record with its results."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    if output.exists() and not is_url(job.task.output) and not job.force and not _is_ours(job, output):
+        raise SceneError(f"{job.task.output} is there already, and not by this batch: --force replaces it", "E_INPUT")
+    threads = () if job.threads is None or "--threads" in job.words else ("--threads", str(job.threads))
+    resume = ("--resume",) if job.resumes and output.with_name(f"{output.name}.work").is_dir() else ()
+    words = (job.command[0], str(source), str(output), *job.words[1:], *threads, *options, *resume)
+    picture = str(Path(job.folder) / THUMBNAILS / f"{job.task.output}.jpg")
+    try:
+        said = worker.ask(
+            "run", words=[*words, "--json", "--quiet", "--force"],
+            thumbnail=picture if job.thumbnail and not is_url(job.task.output) else "",
+            scenes=[str(output), str(source)],
+        )  # fmt: skip
+    except WorkerLostError:
+        if worker.pid is not None:
+            remove_left(output, worker.pid)
+        raise
+    record = replace(
+        record, seconds=round(said["seconds"], 3), memory_bytes=said["memory_bytes"], remarks=tuple(said["remarks"])
+    )
+    if said["status"]:
+        shown = said["error"].replace(str(source), job.task.source).replace(str(output), job.task.output)
+        shown = shown.removeprefix(f"{job.task.source}: ")
+        return replace(record, code=said["code"], error=shown)
+    return replace(
+        record, state="done", output_bytes=size_of(output), output_sha256=content_hash(output),
+        splats=_count(said["result"], record.splats),
+    )  # fmt: skip
+
+
+def _count(result: Any, before: int | None) -> int | None:
+    count = result.get("splats") if isinstance(result, dict) else None
+    return count if isinstance(count, int) else before
+
+
+def _inspected(worker: Worker, source: Path) -> SceneFile:
+    found = worker.ask("look", path=str(source))
+    if "error" in found:
+        raise SceneError(found["error"], found["code"])
+    return SceneFile(**found)
+
+
+def _is_done(job: SceneJob, found: SceneFile) -> bool:
+    """Return True if the command's output is there already, unchanged."""
+    earlier = job.earlier
+    if earlier is None or earlier.state != "done" or earlier.key != (found.sha256, job.words, __version__):
+        return False
+    if is_url(job.task.output):
+        return True  # checking the file there would mean to download it
+    return _is_ours(replace(job, pending=False), Path(job.folder) / job.task.output)
+
+
+def _is_ours(job: SceneJob, output: Path) -> bool:
+    """Return True if a batch wrote the output that is there, or may have written it."""
+    if job.pending:
+        return True
+    known = job.earlier.output_sha256 if job.earlier is not None else ""
+    if not known or not output.exists():
+        return False
+    if job.earlier is not None and job.earlier.output_bytes not in (None, size_of(output)):
+        return False
+    return content_hash(output) == known
+
+
+@contextmanager
+def _local_source(source: str) -> Iterator[Path]:
+    """Yield the path of a scene on this machine; a URL is downloaded for that time.
+
+    Raises:
+        CsplatError, OSError: the scene cannot be downloaded.
+    """
+    if not is_url(source):
+        yield Path(source)
+        return
+    with TemporaryDirectory(prefix="csplat-") as folder:
+        local = Path(folder) / (PurePosixPath(source.partition("?")[0]).name or "scene")
+        with closing(store_of(source)) as store, local.open("wb") as copy:
+            for start in range(0, store.size, _PART_BYTES):
+                copy.writelines(store.read([(start, min(start + _PART_BYTES, store.size))]))
+        yield local
+
+
+@contextmanager
+def _local_output(job: SceneJob) -> Iterator[Path]:
+    """Yield the path that the command is to write; if the output is a URL, the file is sent there at the end."""
+    if not is_url(job.task.output):
+        yield Path(job.folder) / job.task.output
+        return
+    with TemporaryDirectory(prefix="csplat-") as folder:
+        local = Path(folder) / PurePosixPath(job.task.output).name
+        yield local
+        if local.exists():
+            _send(local, job.task.output)
+
+
+def _send(local: Path, url: str) -> None:
+    try:
+        from fsspec.core import url_to_fs
+    except ModuleNotFoundError as error:
+        raise missing(error, extra="remote") from None
+    try:
+        files, place = url_to_fs(url)
+        files.put(str(local), place)
+    except Exception as error:  # noqa: BLE001  # each kind of store raises its own
+        name = PurePosixPath(url.partition("?")[0]).name  # the rest may hold what is secret
+        raise StoreError(f"{name} could not be sent: {type(error).__name__}") from None
+
+
+def _no_gate(memory_bytes: int) -> AbstractContextManager[tuple[str, ...]]:  # noqa: ARG001  # as gates have it
+    return nullcontext(())
+
+
+_FILE_SPLAT_BYTES = 16.0  # bytes per splat if a file does not state its count; .splat, SPZ and SOG have about as many
+_UNBOUNDED = 1 << 62
+#: Bytes that a process holds in addition to its command: the renderer draws the thumbnail.
+RENDERER_BYTES = 160_000_000
+#: By command: seconds per scene, seconds per splat, bytes per scene, bytes per splat; `encode` predicts its own if it
+#: can. Measured at SH degree 3 on two cores with 120,000 to 1.1 million splats; bytes include a margin of a fifth.
+_COSTS = {
+    "encode": (0.1, 40e-6, 120e6, 750.0),
+    "decode": (0.05, 2.5e-6, 60e6, 300.0),
+    "convert": (0.05, 9e-6, 140e6, 150.0),
+    "extract": (0.02, 0.1e-6, 40e6, 30.0),
+}
+_OTHER_BYTES = (340e6, 3000.0)  # bytes per scene and per splat of commands that render: a guess on the safe side
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """A scene's file.
+
+    Attributes:
+        sha256: hash of its content; for a folder, of its files and their names.
+        size_bytes: size of the file, or of all files of a folder.
+        splats: number of splats; `None` if the file does not state it.
+        format: the name of its format; "" if it has none.
+        encode_seconds, encode_bytes: expected time and memory of encoding it in memory; `None` if not known.
+    """
+
+    sha256: str
+    size_bytes: int
+    splats: int | None
+    format: str
+    encode_seconds: float | None = None
+    encode_bytes: int | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as JSON-compatible values, which `SceneFile(**...)` takes."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class JobEstimate:
+    """The time and memory that a command is expected to take for a scene.
+
+    Attributes:
+        seconds: expected time on two cores with SH degree 3; `None` if nothing is known of the command.
+        memory_bytes: expected peak memory of the process.
+    """
+
+    seconds: float | None
+    memory_bytes: int
+
+
+def inspect_scene(path: Path) -> SceneFile:
+    """Read a scene's header and hash its content; defects of the scene are left for the command to report.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    size, content = size_of(path), content_hash(path)
+    try:
+        name = format_of(path).name
+        found = expected(path, EncodeOptions(), Scale(memory_bytes=_UNBOUNDED))
+    except (CsplatError, ValueError, MemoryError):  # no prediction for such a file
+        return SceneFile(content, size, None, "")
+    return SceneFile(content, size, found.count, name, found.seconds, found.needs.memory_bytes)
+
+
+def estimate_job(command: str, known: SceneFile) -> JobEstimate:
+    """Return the time and memory that a command with default options is expected to take."""
+    splats = known.splats if known.splats is not None else known.size_bytes / _FILE_SPLAT_BYTES
+    if command == "encode" and known.encode_bytes is not None:
+        return JobEstimate(known.encode_seconds, RENDERER_BYTES + known.encode_bytes)
+    if command not in _COSTS:
+        each, by_splat = _OTHER_BYTES
+        return JobEstimate(None, round(RENDERER_BYTES + each + by_splat * splats))
+    seconds, seconds_by_splat, each, by_splat = _COSTS[command]
+    return JobEstimate(seconds + seconds_by_splat * splats, round(RENDERER_BYTES + each + by_splat * splats))
+
+
+def content_hash(path: Path) -> str:
+    """Return the SHA-256 of a file; for a scene of several files or a folder, that of their names and contents.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    files = _files(path)
+    if files == [path]:
+        return _hashed(path)
+    base = path if path.is_dir() else path.parent
+    lines = [f"{_hashed(one)} {one.relative_to(base).as_posix()}\n" for one in files]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def _files(path: Path) -> list[Path]:
+    """List the files of a scene, or of a folder of results."""
+    folder = path.parent if path.name.lower() in FOLDER_NAMES else path
+    if folder.is_dir():
+        return sorted(one for one in folder.rglob("*") if one.is_file())
+    return [path, *_beside(path)] if path.suffix.lower() == ".gltf" else [path]
+
+
+def _beside(path: Path) -> Iterator[Path]:
+    """Yield the buffer files that a glTF names and that exist in its folder; none if the JSON cannot be parsed."""
+    try:
+        buffers = json.loads(path.read_bytes()).get("buffers", [])
+        names = [unquote(one["uri"]) for one in buffers if not one.get("uri", "data:").startswith("data:")]
+    except (ValueError, TypeError, AttributeError):
+        return
+    for name in names:
+        if (path.parent / name).is_file() and (path.parent / name).resolve().is_relative_to(path.parent.resolve()):
+            yield path.parent / name
+
+
+def _hashed(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

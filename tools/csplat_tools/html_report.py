@@ -1,0 +1,415 @@
+"""Parts of the HTML reports of commands: style, script, tables, bars and plots, in one page that loads nothing else."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree as ET
+
+from csplat_tools.files.console import format_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+_STYLE = """
+:root {
+  color-scheme: light dark;
+  --text: #1d2126; --quiet: #59636e; --line: #d5dae0; --ground: #ffffff; --raised: #f5f7f9; --accent: #0b62a8;
+  --front: #e3f1e9;
+  font: 15px/1.5 system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif;
+}
+@media (prefers-color-scheme: dark) {
+  :root {
+    --text: #e4e8ed; --quiet: #9aa5b1; --line: #333b45; --ground: #14171b; --raised: #1c2127; --accent: #7cc0ff;
+    --front: #1b3328;
+  }
+}
+* { box-sizing: border-box; }
+body { margin: 0; background: var(--ground); color: var(--text); }
+main { max-width: 1320px; margin: 0 auto; padding: 28px 20px 60px; }
+h1 { font-size: 26px; line-height: 1.2; margin: 0 0 6px; overflow-wrap: anywhere; }
+h2 { font-size: 19px; margin: 40px 0 6px; }
+h3 { font-size: 15px; margin: 22px 0 6px; }
+p { margin: 0 0 12px; max-width: 76ch; }
+.quiet, figcaption { color: var(--quiet); font-weight: 400; }
+figure { margin: 0; min-width: 0; }
+figcaption { font-size: 13px; max-width: 76ch; }
+.scroll { overflow-x: auto; }
+.plot svg { display: block; width: 100%; min-width: 600px; max-width: 820px; height: auto; }
+.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 600px), 1fr)); gap: 20px 28px; }
+table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; }
+th, td { padding: 4px 6px; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
+.name { text-align: left; position: sticky; left: 0; background: var(--ground); }
+.words { text-align: left; white-space: normal; min-width: 13em; }
+thead th { color: var(--quiet); font-weight: 600; vertical-align: bottom; white-space: normal; }
+thead button { all: unset; cursor: pointer; color: inherit; }
+thead button:hover, thead button:focus-visible { color: var(--accent); text-decoration: underline; }
+th[aria-sort='ascending'] button::after { content: ' \\25b2'; }
+th[aria-sort='descending'] button::after { content: ' \\25bc'; }
+tr.front td { background: var(--front); }
+.copy {
+  display: none; font: inherit; font-size: 12px; line-height: 1.4; padding: 0 7px; color: var(--accent);
+  background: var(--raised); border: 1px solid var(--line); border-radius: 4px; cursor: pointer;
+}
+.live .copy { display: inline-block; }
+.copy:hover, .copy:focus-visible { border-color: var(--accent); }
+.legend { display: block; columns: 2 420px; column-gap: 36px; font-size: 13px; margin-top: 12px; }
+.legend div { break-inside: avoid; padding-bottom: 4px; }
+.legend dt, .legend dd { display: inline; }
+.legend dt { font-weight: 600; color: var(--text); }
+.commands div { padding: 6px 0; border-bottom: 1px solid var(--line); }
+code { font: 12.5px/1.5 ui-monospace, 'SF Mono', Consolas, monospace; overflow-wrap: anywhere; }
+.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(45%, 150px), 1fr)); gap: 6px; }
+.pictures img { display: block; width: 100%; height: auto; background: #000; border-radius: 4px; }
+dl { display: grid; grid-template-columns: fit-content(28ch) 1fr; gap: 3px 18px; margin: 0; }
+@media (max-width: 640px) { dl { grid-template-columns: 1fr; } dd { padding-bottom: 6px; } }
+dt { color: var(--quiet); }
+dd { margin: 0; overflow-wrap: anywhere; }
+summary { cursor: pointer; margin-top: 12px; }
+"""
+
+_SCRIPT = """
+document.documentElement.classList.add('live');
+for (const table of document.querySelectorAll('table.sortable')) {
+  const heads = [...table.tHead.rows[0].cells];
+  heads.forEach((head, column) => head.querySelector('button')?.addEventListener('click', () => {
+    const rising = head.getAttribute('aria-sort') !== 'ascending';
+    const key = (row) => row.cells[column].dataset.value;
+    const order = (a, b) => {
+      const [x, y] = [key(a), key(b)];
+      if (x === '' || y === '') return Number(x === '') - Number(y === '');
+      const found = head.dataset.kind === 'text' ? x.localeCompare(y) : x - y;
+      return rising ? found : -found;
+    };
+    for (const other of heads) other.removeAttribute('aria-sort');
+    head.setAttribute('aria-sort', rising ? 'ascending' : 'descending');
+    table.tBodies[0].append(...[...table.tBodies[0].rows].sort(order));
+  }));
+}
+const copy = async (text) => {
+  try {
+    await navigator.clipboard.writeText(text);
+    return true;
+  } catch {
+    const area = document.createElement('textarea');
+    area.value = text;
+    document.body.append(area);
+    area.select();
+    const done = document.execCommand('copy');
+    area.remove();
+    return done;
+  }
+};
+for (const button of document.querySelectorAll('button.copy')) {
+  const said = button.textContent;
+  button.addEventListener('click', async () => {
+    const code = document.getElementById(button.dataset.from);
+    const done = await copy(code.textContent);
+    if (!done) {
+      code.closest('details')?.setAttribute('open', '');
+      getSelection().selectAllChildren(code);
+    }
+    button.textContent = done ? 'copied' : 'press Ctrl+C';
+    setTimeout(() => { button.textContent = said; }, 1500);
+  });
+}
+"""
+
+
+def document(title: str, parts: Sequence[str]) -> str:
+    """Return a whole page from the parts of its body; empty ones are left out."""
+    body = "\n".join(part for part in parts if part)
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{_policy()}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta name="referrer" content="no-referrer">\n'
+        f"<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n"
+        f"<body>\n<main>\n{body}\n</main>\n<script>{_SCRIPT}</script>\n</body>\n</html>\n"
+    )
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], words: Collection[int] = ()) -> str:
+    """Return a table: names to the left, numbers to the right.
+
+    Args:
+        header: titles of the columns.
+        rows: their cells.
+        words: indices of columns that hold words, in addition to the first.
+    """
+    kinds = ["words" if place in words else "" if place else "name" for place in range(len(header))]
+    marks = [f' class="{kind}"' if kind else "" for kind in kinds]
+    heads = "".join(f'<th scope="col"{mark}>{escape(one)}</th>' for mark, one in zip(marks, header, strict=True))
+    cells = "\n".join(
+        "<tr>" + "".join(f"<td{mark}>{escape(cell)}</td>" for mark, cell in zip(marks, row, strict=True)) + "</tr>"
+        for row in rows
+    )
+    return f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>\n{cells}\n</tbody></table></div>'
+
+
+def definitions(entries: Mapping[str, str], kind: str = "") -> str:
+    """Return a list of terms and their meanings; of kind `legend` it is laid out in columns."""
+    mark = f' class="{kind}"' if kind else ""
+    lines = [f"<dt>{escape(key)}</dt> <dd>{escape(value)}</dd>" for key, value in entries.items()]
+    return f"<dl{mark}>\n" + "\n".join(f"<div>{line}</div>" if kind else line for line in lines) + "\n</dl>"
+
+
+def copy_button(name: str, text: str) -> str:
+    """Return a button that copies the text of the `command_line` of this name; it is shown only if scripts run."""
+    return f'<button type="button" class="copy" data-from="{name}" title="{escape(text)}">copy</button>'
+
+
+def command_line(name: str, text: str) -> str:
+    """Return a command as an element that `copy_button` finds by its name."""
+    return f'<code id="{name}">{escape(text)}</code>'
+
+
+def _policy() -> str:
+    """Return a Content Security Policy that allows this style, this script, embedded images, and no network."""
+    return (
+        f"default-src 'none'; script-src '{_hash(_SCRIPT)}'; style-src '{_hash(_STYLE)}'; img-src data:;"
+        " connect-src 'none'; base-uri 'none'; form-action 'none'"
+    )
+
+
+def _hash(text: str) -> str:
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+
+
+# Colours that people tell apart whatever colours they see, on white and on black.
+_COLOURS = {
+    "opacities": "#88ccee",
+    "scales": "#5588bb",
+    "quats": "#44aa99",
+    "means": "#2f9a55",
+    "sh0": "#ddcc77",
+    "sh1": "#cc6677",
+    "sh2": "#aa4499",
+    "sh3": "#9a3a72",
+    "overhead": "#8a8a8a",
+}
+_OTHER = "#bbbbbb"
+
+_WIDTH, _ROW, _BAR = 820, 24, 17  # width of the figure, height of a row and of its bar, pixels
+_LETTER, _SIZE = 7.2, 13  # approximate width of a letter, and the font size, pixels
+_GAP = 10  # pixels between text and bar
+
+#: Style of an SVG that stands alone: colours of text and background by the reader's light or dark setting.
+STANDALONE = (
+    "<style>svg{color:#1d2126}.ground{fill:#ffffff}"
+    "@media (prefers-color-scheme:dark){svg{color:#e4e8ed}.ground{fill:#14171b}}</style>"
+    '<rect class="ground" x="-5%" y="-5%" width="110%" height="110%" fill="#ffffff"/>'
+)
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A row of the figure.
+
+    Attributes:
+        label: text before the bar.
+        parts: bytes by attribute, in this order from left to right.
+        text: text after the bar.
+    """
+
+    label: str
+    parts: Mapping[str, int]
+    text: str
+
+
+def draw_bars(bars: Sequence[Bar], *, key: bool, inline: bool = True) -> str:
+    """Draw bars below each other, to one scale.
+
+    Args:
+        bars: the rows, at least one.
+        key: name the colours above the bars, if the labels do not.
+        inline: for a page, whose text colour is used; else with a background of its own.
+    """
+    names = [name for name in _COLOURS if any(bar.parts.get(name) for bar in bars)]
+    names += sorted({name for bar in bars for name in bar.parts if bar.parts[name]} - set(names))
+    left = _GAP + _LETTER * max(len(bar.label) for bar in bars)
+    room = _WIDTH - left - _GAP - _LETTER * max(len(bar.text) for bar in bars)
+    scale = room / max(1, *(sum(bar.parts.values()) for bar in bars))
+    parts, top = _key(names) if key else ([], 0)
+    for bar in bars:
+        parts += _row(bar, left, scale, top)
+        top += _ROW
+    ground = "" if inline else STANDALONE
+    mark = "" if inline else ' font-family="sans-serif" color="#1d2126"'
+    air = 0 if inline else _GAP
+    box = f"{-air} {-air} {_WIDTH + 2 * air} {top + 2 * air}"
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" role="img" font-size="{_SIZE}"'
+    return f'{head} fill="currentColor"{mark}>{ground}{"".join(parts)}</svg>'
+
+
+def attribute_figure(sizes: Mapping[str, int]) -> str:
+    """Return a figure for a page with the bytes of each attribute, whose sum is the size of the file."""
+    whole = sum(sizes.values())
+    bars = [
+        Bar(name, {name: size}, f"{format_bytes(size)}, {100.0 * size / whole:.1f} %") for name, size in sizes.items()
+    ]
+    return f'<figure class="plot"><div class="scroll">{draw_bars(bars, key=False)}</div></figure>'
+
+
+def _row(bar: Bar, left: float, scale: float, top: float) -> list[str]:
+    base = top + _BAR - 4
+    parts = [f'<text x="{left - _GAP:.1f}" y="{base}" text-anchor="end">{escape(bar.label)}</text>']
+    at = left
+    for name, size in bar.parts.items():
+        if size:
+            width = scale * size
+            parts.append(
+                f'<rect x="{at:.2f}" y="{top}" width="{width:.2f}" height="{_BAR}" fill="{_COLOURS.get(name, _OTHER)}">'
+                f"<title>{escape(f'{bar.label}: {name} {size:,} bytes')}</title></rect>"
+            )
+            at += width
+    return [*parts, f'<text x="{at + _GAP / 2:.1f}" y="{base}">{escape(bar.text)}</text>']
+
+
+def _key(names: Sequence[str]) -> tuple[list[str], int]:
+    """Return coloured squares with their names, in as many lines as they take, and the height of these in pixels."""
+    parts, across, top = list[str](), 0.0, 0
+    for name in names:
+        width = _ROW + _LETTER * len(name) + _GAP
+        if across + width > _WIDTH:
+            across, top = 0.0, top + _ROW
+        parts.append(f'<rect x="{across:.1f}" y="{top}" width="13" height="13" fill="{_COLOURS.get(name, _OTHER)}"/>')
+        parts.append(f'<text x="{across + 18:.1f}" y="{top + 11}">{escape(name)}</text>')
+        across += width
+    return parts, top + _ROW + 4
+
+
+#: Placeholder for the colour of text until the SVG is written: no other colour is exactly this.
+INK = "#123457"
+
+_SVG = "{http://www.w3.org/2000/svg}"
+_XLINK = "{http://www.w3.org/1999/xlink}"
+_BLACK = "#1d2126"  # colour of text for readers that do not support styles
+# `font` is no attribute of SVG; older versions of matplotlib write sizes so.
+_FONT = re.compile(r"^(?:\S+\s+)*?(?P<size>[0-9.]+px)\s")
+_SETTINGS: dict[Any, Any] = {  # matplotlib's types name every key there is
+    "svg.fonttype": "none",
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.labelcolor": INK,
+    "legend.framealpha": 0.0,
+    "legend.edgecolor": "none",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.alpha": 0.25,
+    "grid.color": INK,
+    "font.size": 11.0,
+    "text.parse_math": False,  # names of points may hold any character
+}
+
+
+def hover_id(plot: str, name: str) -> str:
+    """Return the id of a point's mark in a plot: `point-` and hexadecimal digits, whatever the names contain."""
+    return f"point-{hashlib.sha256(f'{plot}/{name}'.encode()).hexdigest()[:12]}"
+
+
+def draw_svg(
+    draw: Callable[[Figure], None],
+    size: tuple[float, float],
+    name: str,
+    *,
+    inline: bool,
+    titles: Mapping[str, str] | None = None,
+) -> str:
+    """Draw a figure.
+
+    Args:
+        draw: called with an empty figure.
+        size: width and height, inches.
+        name: name of the plot: ids inside begin with it, so that several plots can share a page.
+        inline: for a page, whose text colour lines and letters take; else with an XML prologue and a background, light
+            or dark by the reader's setting.
+        titles: texts that appear when the mouse rests on a mark, by its id.
+
+    Returns:
+        The SVG, the same for the same figure and version of matplotlib.
+    """
+    import matplotlib as mpl
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context({**_SETTINGS, "svg.hashsalt": name}):
+        figure = Figure(figsize=size, layout="constrained")
+        FigureCanvasSVG(figure)
+        draw(figure)
+        buffer = io.StringIO()
+        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        figure.savefig(buffer, format="svg", metadata=nothing, transparent=True)
+    root = ET.fromstring(buffer.getvalue())  # noqa: S314 -- matplotlib has just written it
+    _clean(root, name, titles or {})
+    if inline:
+        root.attrib.pop("height", None)
+        root.attrib.pop("width", None)
+        return _text(root)
+    root.set("font-family", "sans-serif")
+    root.set("color", _BLACK)
+    for place, child in enumerate(ET.fromstring(f"<g>{STANDALONE}</g>")):  # noqa: S314 -- our own text
+        root.insert(place, child)
+    return f'<?xml version="1.0" encoding="utf-8"?>\n{_text(root)}\n'
+
+
+def _text(root: ET.Element) -> str:
+    return ET.tostring(root, encoding="unicode").replace(INK, "currentColor")
+
+
+def _clean(root: ET.Element, name: str, titles: Mapping[str, str]) -> None:
+    """Turn styles into attributes, prefix ids with the plot's name, and add the titles of points."""
+    for element in list(root.iter()):
+        element.tag = element.tag.removeprefix(_SVG)
+        for child in list(element):
+            if child.tag == f"{_SVG}style":
+                element.remove(child)
+        attributes = {**_as_attributes(element.attrib.pop("style", "")), **element.attrib}
+        element.attrib.clear()
+        for key, value in attributes.items():
+            plain = "href" if key == f"{_XLINK}href" else key
+            element.set(plain, _own_id(plain, value, name, titles))
+        title = titles.get(element.get("id", ""))
+        if title is not None:
+            label = ET.Element("title")
+            label.text = title
+            element.insert(0, label)
+    # The content of matplotlib's own style element, for this SVG alone.
+    root.set("stroke-linejoin", "round")
+    root.set("stroke-linecap", "butt")
+    root.set("role", "img")
+    root.set("xmlns", _SVG.strip("{}"))
+
+
+def _own_id(key: str, value: str, name: str, titles: Mapping[str, str]) -> str:
+    if key == "id" and value not in titles:
+        return f"{name}-{value}"
+    if key == "href":
+        return value.replace("#", f"#{name}-", 1)
+    return value.replace("url(#", f"url(#{name}-")
+
+
+def _as_attributes(style: str) -> dict[str, str]:
+    """Parse `fill: none; stroke: red` into attributes; the font is left to the page."""
+    found: dict[str, str] = {}
+    for part in style.split(";"):
+        key, _, value = (piece.strip() for piece in part.partition(":"))
+        if key == "font":
+            match = _FONT.match(value + " ")
+            if match is not None:
+                found["font-size"] = match["size"]
+        elif key and key != "font-family":
+            found[key] = value
+    return found

@@ -1,0 +1,325 @@
+"""Candidate files of a search, given by splats, coding of their colours and precision; each is made once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from typing import Any, Protocol
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.decoder import decode
+from csplat.encoder import Coded, Draft, EncodeOptions, EncodeResult, Importance, ShCoding
+from csplat.model import SplatModel
+from csplat.types import F64, Progress, null_progress
+from csplat_render.metrics import psnr_of_mse
+from csplat_render.scorer import Scorer
+
+#: Importance of the splats, as for the encoder.
+Weights = NDArray[Any] | Importance
+
+_ENTRIES = (16, 8192)  # least and largest number of entries of a codebook that is chosen here
+_QUICK_LEVEL = 10  # DEFLATE level of drafts: the highest spends half of its time on the last per cent
+
+
+@dataclass(frozen=True)
+class CodingChoice:
+    """The SH bands that are kept, their coding, and the use of quantisation classes.
+
+    Attributes:
+        sh: "codebook", "scalar" or "none"; `None`: as in the options, like the plain encoder.
+        share: entries of a codebook per splat; `None`: as in the options.
+        degree: bands up to this one are kept; `None`: as in the options.
+        adaptive: how much coarser unimportant splats are coded; `None`: as in the options.
+        graded: splats are sorted into quantisation classes by measurements, if there are any; False: measurements are
+            not used.
+    """
+
+    sh: ShCoding | None
+    share: float | None = None
+    degree: int | None = None
+    adaptive: float | None = None
+    graded: bool = True
+
+    def options(self, encoding: EncodeOptions, splats: int) -> EncodeOptions:
+        """Return the encoder's options with this coding, for a file of `splats` splats."""
+        return _options_of(self, encoding, splats)
+
+
+@lru_cache(maxsize=256)  # a search compares the options of its files a thousand times, and each is checked when made
+def _options_of(coding: CodingChoice, encoding: EncodeOptions, splats: int) -> EncodeOptions:
+    size = encoding.codebook_size
+    if coding.sh == "codebook" and coding.share is not None and size is None:
+        size = 1 << round(math.log2(min(max(coding.share * splats, _ENTRIES[0]), _ENTRIES[1])))
+    return replace(
+        encoding,
+        sh_coding=encoding.sh_coding if coding.sh is None else coding.sh,
+        codebook_size=size,
+        sh_degree=encoding.sh_degree if coding.degree is None else coding.degree,
+        adaptive=encoding.adaptive if coding.adaptive is None else coding.adaptive,
+        grades=encoding.grades if coding.graded else 1,
+    )
+
+
+class Subset(Protocol):
+    """Splats that a file is to hold."""
+
+    @property
+    def model(self) -> SplatModel:
+        """The splats before they are quantised."""
+        ...
+
+    @property
+    def shown(self) -> SplatModel:
+        """The splats that are quantised: SH bands may be left out."""
+        ...
+
+    @property
+    def psnr(self) -> float:
+        """PSNR of `shown` on the validation views, dB; infinite for the source's own splats."""
+        ...
+
+    @property
+    def refits(self) -> bool:
+        """True if encoding refits the splats through the quantisers of a file, which needs rendering."""
+        ...
+
+    @property
+    def gradable(self) -> bool:
+        """True if the splats may be sorted into quantisation classes."""
+        ...
+
+    def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:
+        """Quantise and code the splats; `quick` leaves out the refit through the quantisers."""
+        ...
+
+    def said(self, trial: Candidate | None) -> Mapping[str, Any] | None:
+        """Return the entry for a file's options: the splats and, with a file, its quality; `None`: no entry."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class WholeScene:
+    """All splats of a scene.
+
+    Attributes:
+        model: the scene.
+        importance: the caller's importance of the splats.
+        measured: importance measured from views, by which splats are sorted into quantisation classes.
+        progress: progress callback.
+    """
+
+    model: SplatModel
+    importance: Weights | None
+    measured: Importance | None
+    progress: Progress | None
+    psnr: float = math.inf
+    refits: bool = False
+    gradable: bool = True
+
+    @property
+    def shown(self) -> SplatModel:
+        """The whole scene."""
+        return self.model
+
+    def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:  # noqa: ARG002  # the protocol's
+        """Quantise and code the splats."""
+        weights = self.measured if graded and self.measured is not None else self.importance
+        draft = Draft.of(self.model, options, importance=weights, progress=self.progress)
+        return draft.coded(self.progress)
+
+    def said(self, trial: Candidate | None) -> None:  # as the protocol has it
+        """Return no entry: the file holds the scene as it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A candidate file.
+
+    Attributes:
+        part, coding: its splats, and the coding of their colours.
+        quality: the PSNR of each attribute for which it was made, dB; `None`: that of the options.
+        options: options of the encoder.
+        is_careful: it is packed as tightly as the caller requires, and no refit was left out.
+        result: the encoder's result.
+        judge: scorer by the source's renders in the test views.
+        decided_psnr: PSNR on the validation views, dB, by which files are compared.
+        photo_psnr: PSNR against the validation photographs, dB; NaN if there are none.
+        decode: decodes its bytes.
+    """
+
+    part: Subset
+    coding: CodingChoice
+    quality: float | None
+    options: EncodeOptions
+    is_careful: bool
+    result: EncodeResult = field(repr=False)
+    judge: Scorer = field(repr=False)
+    decided_psnr: float
+    photo_psnr: float
+    decode: Callable[[bytes], SplatModel] = field(default=decode, repr=False)
+
+    @cached_property
+    def errors(self) -> F64:
+        """[V] mean squared error against the source, by test view."""
+        return self.judge.errors(self.decode(self.result.data))
+
+    @property
+    def psnr(self) -> float:
+        """PSNR of these errors, pooled, dB: targets refer to it, and files are not compared by it."""
+        return psnr_of_mse(self.judge.pooled(self.errors))
+
+    @property
+    def is_judged(self) -> bool:
+        """True if the file has been scored on the test views."""
+        return "errors" in vars(self)
+
+    def let_judge(self) -> None:
+        """Score the file on the test views: only then may it be written for a PSNR target."""
+        _ = self.errors
+
+    @property
+    def is_packed(self) -> bool:
+        """True if the file is packed as tightly as the caller requires."""
+        return self.is_careful or self.part.refits
+
+    def told(self, result: EncodeResult) -> Candidate:
+        """Return the file with another result, whose options have more entries; its score is kept."""
+        other = replace(self, result=result)
+        vars(other).update({name: vars(self)[name] for name in ("errors",) if name in vars(self)})
+        return other
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the file."""
+        return len(self.result.data)
+
+    @property
+    def splats(self) -> int:
+        """Number of splats of the file."""
+        return self.result.report.splat_count
+
+    @property
+    def grades(self) -> int:
+        """Number of quantisation classes of its splats."""
+        return len(self.result.report.options.get("grades", {}).get("splats", [0]))
+
+    def as_json(self) -> dict[str, Any]:
+        """Return settings, size and PSNR as JSON-compatible values."""
+        options = self.result.report.options
+        return {
+            "splats": self.splats,
+            "preset": self.options.preset,
+            "attribute_psnr": None if self.quality is None else round(self.quality, 3),
+            "deflate_level": options["deflate_level"],
+            "sh_coding": options["sh_coding"],
+            "sh_degree": options["sh_degree"],
+            "codebook_size": options["codebook_size"],
+            "grades": self.grades,
+            "size_bytes": self.size_bytes,
+            "decided_psnr": round(self.decided_psnr, 3),
+            "psnr": round(self.psnr, 3) if self.is_judged else None,
+        }
+
+
+@dataclass(eq=False)
+class CandidatePool:
+    """Makes candidate files and scores them, each once. Owns all that were made.
+
+    Attributes:
+        encoding: the caller's options, which no choice overrides.
+        judge: scorer by the source's renders in the test views, on which a PSNR target is measured; it chooses nothing.
+        decider: scorer by those in the validation views, on which files are compared.
+        photographs: scorer by validation photographs, if the target is a loss against photographs.
+        made: all files, in order.
+        progress: progress callback, called with each file that is made.
+        decode: decodes the bytes of a file; an encoder other than csplat's, such as a formula in tests, brings its own.
+    """
+
+    encoding: EncodeOptions
+    judge: Scorer
+    decider: Scorer
+    photographs: Scorer | None = None
+    made: list[Candidate] = field(default_factory=list)
+    progress: Progress | None = None
+    decode: Callable[[bytes], SplatModel] = decode
+    _judged: WeakKeyDictionary[Subset, float] = field(default_factory=WeakKeyDictionary, init=False)
+
+    @property
+    def renders(self) -> int:
+        """Number of renders made of the files."""
+        return sum(len(self.decider.cameras) + one.is_judged * len(self.judge.cameras) for one in self.made)
+
+    def judged_psnr(self, part: Subset) -> float:
+        """Return the PSNR of a part before quantisation on the test views, dB: the error that pruning takes."""
+        if part not in self._judged:
+            self._judged[part] = self.judge.psnr(part.shown)
+        return self._judged[part]
+
+    def make(
+        self,
+        part: Subset,
+        coding: CodingChoice,
+        quality: float | None,
+        *,
+        quick: bool,
+        encoding: EncodeOptions | None = None,
+    ) -> Candidate:
+        """Make a file, or return the one that was made with the same arguments.
+
+        Args:
+            part: its splats.
+            coding: the coding of their colours.
+            quality: PSNR of each attribute, dB; `None`: that of the options.
+            quick: pack it less tightly if that is most of the work (the decoded splats are the same), and leave out
+                the refit through the quantisers.
+            encoding: options of the encoder, instead of those that all files share.
+        """
+        options = coding.options(encoding or self.encoding, len(part.model))
+        options = options if quality is None else replace(options, attribute_psnr=quality)
+        packing = options.preset != "fast" and options.sh_coding != "codebook" and options.deflate_level is None
+        if quick and packing and not part.refits:
+            options = replace(options, deflate_level=_QUICK_LEVEL)
+        careful = not (quick and (part.refits or packing))
+        for trial in self.made:
+            alike = trial.part is part and trial.options == options and trial.coding.graded == coding.graded
+            if alike and trial.is_careful == careful:
+                return trial
+        tell, stage = self.progress or null_progress, f"file {len(self.made) + 1}"
+        tell(stage, 0.0)
+        coded = part.coded(options, graded=coding.graded, quick=quick)
+        result = coded.write(part.said(None))
+        model = self.decode(result.data)
+        decided_psnr = self.decider.psnr(model)
+        photo_psnr = math.nan if self.photographs is None else self.photographs.psnr(model)
+        trial = Candidate(
+            part, coding, quality, options, careful, result, self.judge, decided_psnr, photo_psnr, self.decode
+        )
+        said = part.said(trial)
+        self.made.append(trial if said is None else trial.told(coded.write(said)))
+        tell(stage, 1.0)
+        return self.made[-1]
+
+    def of(self, part: Subset, coding: CodingChoice, *, careful: bool = False) -> list[Candidate]:
+        """Return files of given splats and coding, at any quality; with `careful`, only those that might be written."""
+        wanted = coding.options(self.encoding, len(part.model))
+        made = [one for one in self.made if one.part is part and one.quality is not None]
+        made = [one for one in made if one.coding.options(self.encoding, len(part.model)) == wanted]
+        return [one for one in made if one.is_careful] if careful else made
+
+
+def psnr_spread(errors: F64) -> float:
+    """Return one standard deviation of a PSNR over other choices of views, in dB, by jackknife.
+
+    Args:
+        errors: [V] mean squared error by view.
+    """
+    if len(errors) < 2 or errors.sum() == 0.0:
+        return math.nan
+    without = (errors.sum() - errors) / (len(errors) - 1)
+    decibels = 10.0 * np.log10(np.maximum(without, np.finfo(np.float64).tiny))
+    return float(np.sqrt((len(errors) - 1) * np.mean(np.square(decibels - decibels.mean()))))

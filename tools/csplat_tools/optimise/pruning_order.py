@@ -1,0 +1,216 @@
+"""Find the pruning order of splats, by the exact error of removing each, measured anew in every round."""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat.types import F64, I64, Progress
+from csplat_render import Camera
+from csplat_render.pruning_error import PruningError, measure_pruning_error
+from csplat_tools.views import VIEW_SIZE, usual_views
+from csplat_tools.views.agreeing import removal_keys
+
+_DEFAULT_EFFORT = 3  # default effort
+
+
+@dataclass(frozen=True)
+class SimplifyOptions:
+    """Options of a simplification.
+
+    Attributes:
+        rounds: number of times that errors are measured anew while splats are pruned, at least 1.
+        refit: fit colours, opacities, scales and rotations of the kept splats to the source's renders.
+        effort: amount of work, 1 to 9: each one less than 3 halves the steps of descent, every two more double them;
+            below 3 a target tries fewer candidates.
+        bands: set SH bands to zero that are worth less than their bits.
+        keep_unseen: keep splats that no view shows.
+        view_size: width and height of training renders, pixels; `None`: chosen by the number of splats.
+        views: largest number of virtual views if no views are given; `None`: chosen by the number of splats.
+        background: red, green, blue behind virtual views; given views have their own.
+        seed: seed of the virtual views, and of the order in which views are used.
+        threads: number of threads; None for all. The result does not depend on it.
+
+    Raises:
+        InputError: a value is out of range.
+    """
+
+    rounds: int = 4
+    refit: bool = True
+    effort: int = _DEFAULT_EFFORT
+    bands: bool = True
+    keep_unseen: bool = True
+    view_size: tuple[int, int] | None = None
+    views: int | None = None
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    seed: int = 0
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.effort <= 9:
+            raise InputError(f"effort is {self.effort}, wanted 1 to 9")
+        for name in ("rounds", "views"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InputError(f"{name} is {value}, wanted 1 or more")
+        if self.view_size is not None and min(self.view_size) < 1:
+            raise InputError(f"view_size is {self.view_size}, wanted pixels")
+
+    def pictures(self, splats: int) -> tuple[int, tuple[int, int]]:
+        """Return the largest number of training views, and the width and height of their renders, for N splats."""
+        views, size = usual_views(splats)
+        return self.views or views, self.view_size or size
+
+    def steps(self, usual: int) -> int:
+        """Return the number of steps in place of the usual one, by effort; fewer if renders are larger than usual."""
+        larger = math.sqrt(math.prod(self.view_size or VIEW_SIZE) / math.prod(VIEW_SIZE))
+        return max(1, round(usual * self.work / max(1.0, larger)))
+
+    @property
+    def work(self) -> float:
+        """The amount of work as a multiple of that with the default effort."""
+        octaves = self.effort - _DEFAULT_EFFORT
+        return 2.0 ** (octaves / 2 if octaves > 0 else octaves)
+
+    @property
+    def is_brief(self) -> bool:
+        """True if a target tries fewer candidates."""
+        return self.effort < _DEFAULT_EFFORT
+
+
+_LEAST_SHARE = 0.01  # fraction of the splats that is left at the end of an order without a given target
+_ROUND_SHARE = 0.72  # fraction left after each round of such an order: splats that hid another may have been pruned
+
+
+@dataclass(frozen=True)
+class PruningRound:
+    """One round of pruning.
+
+    Attributes:
+        removed: number of pruned splats.
+        largest: the largest error of one of them, as a sum over pixels, channels and views.
+        predicted: sum of their errors.
+    """
+
+    removed: int
+    largest: float
+    predicted: float
+
+
+@dataclass(frozen=True, eq=False)
+class PruningOrder:
+    """A pruning order.
+
+    Attributes:
+        rows: [G] int64, source splats in the order of pruning, without those that are never pruned.
+        errors: [G], error of removing each, as measured in its round.
+        rounds: the rounds.
+    """
+
+    rows: I64
+    errors: F64
+    rounds: tuple[PruningRound, ...]
+
+    def kept(self, splat_count: int, gone: int) -> I64:
+        """Return the source splats that are kept if `gone` are pruned, ascending."""
+        stays = np.ones(splat_count, bool)
+        stays[self.rows[:gone]] = False
+        return np.flatnonzero(stays)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredViews:
+    """Views from which splats are measured together.
+
+    Attributes:
+        cameras: the views.
+        removal: the removal errors of the splats that are left, as last measured in these views.
+    """
+
+    cameras: Sequence[Camera]
+    removal: PruningError
+
+    def of_rows(self, rows: NDArray[Any]) -> MeasuredViews:
+        """Return the views with the errors of some of the splats."""
+        return replace(self, removal=self.removal.of_rows(rows))
+
+
+def find_pruning_order(
+    model: SplatModel,
+    sides: Sequence[MeasuredViews],
+    options: SimplifyOptions,
+    left: int | None,
+    progress: Progress | None = None,
+    *,
+    enough: float = math.inf,
+    start: PruningOrder | None = None,
+) -> PruningOrder:
+    """Find the pruning order of splats.
+
+    Args:
+        model: the source.
+        sides: views with the removal errors of the source. Rounds measure one side after the other, and the last
+            measurements of the others still count: with two sides, twice the views at the cost of one.
+        options: rounds, background, threads, `keep_unseen`.
+        left: number of splats to keep; None for an order that may be cut anywhere.
+        progress: progress callback.
+        enough: an order without `left` ends with the round in which the sum of all errors exceeds this.
+        start: an order to continue.
+    """
+    count = len(model)
+    rows, sides = np.arange(count), list(sides)
+    gone, errors, rounds = list[I64](), list[F64](), list[PruningRound]()
+    if start is not None:
+        gone, errors, rounds = [start.rows], [start.errors], list(start.rounds)
+        rows = np.delete(rows, start.rows)
+        sides = [side.of_rows(rows) for side in sides]
+    for target in _targets(count, options, left, len(rows)):
+        if gone:
+            turn = (len(rounds) - 1) % len(sides)
+            removal = measure_pruning_error(
+                model.select(rows), sides[turn].cameras, background=options.background, bands=False,
+                threads=options.threads, progress=progress,
+            )  # fmt: skip
+            sides[turn] = replace(sides[turn], removal=removal)
+        keys = removal_keys(model.opacities[rows], total_removal(sides), keep_unseen=options.keep_unseen)
+        order = np.argsort(keys, kind="stable")[: len(rows) - target]
+        order = order[np.isfinite(keys[order])]
+        if not len(order):
+            break
+        gone.append(rows[order])
+        errors.append(np.maximum(keys[order], 0.0))
+        rounds.append(PruningRound(len(order), float(errors[-1][-1]), float(errors[-1].sum())))
+        rows = np.delete(rows, order)
+        stays = np.delete(np.arange(len(keys)), order)
+        sides = [side.of_rows(stays) for side in sides]
+        if left is None and sum(one.predicted for one in rounds) > enough:
+            break
+    if not gone:
+        return PruningOrder(np.zeros(0, np.int64), np.zeros(0), ())
+    return PruningOrder(np.concatenate(gone), np.concatenate(errors), tuple(rounds))
+
+
+def total_removal(sides: Sequence[MeasuredViews]) -> PruningError:
+    """Return the sum of the removal errors over all sides."""
+    return functools.reduce(operator.add, [side.removal for side in sides])
+
+
+def _targets(count: int, options: SimplifyOptions, left: int | None, now: int) -> list[int]:
+    """Return the number of splats left after each round, in decreasing order."""
+    last = max(1, round(count * _LEAST_SHARE)) if left is None else left
+    if left is not None:
+        targets = [round(count + (last - count) * number / options.rounds) for number in range(1, options.rounds + 1)]
+    else:
+        targets = [now]
+        while targets[-1] > last:
+            targets.append(max(last, int(targets[-1] * _ROUND_SHARE)))
+    return sorted({target for target in targets if target < now}, reverse=True)

@@ -1,0 +1,220 @@
+"""Measure how much renders depend on each splat, for `csplat sensitivity`, tuning and quantisation classes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from csplat.encoder import EncodeOptions, Importance, most_grades, trusted
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat.types import Progress
+from csplat_render import Camera
+from csplat_render.pruning_error import measure_pruning_error
+from csplat_tools.files.streams import open_output
+from csplat_tools.optimise.candidates import Weights
+from csplat_tools.views import Colour, ViewSet, evenly
+from csplat_tools.views.agreeing import find_views
+from csplat_trainer.sensitivity import Sensitivity, measure_sensitivity
+from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, write_sensitivity
+
+_NOTHING = "a scene without splats has no sensitivities"
+_GONE = 0.4  # fraction of the splats on whose removal virtual views have to agree before there are enough views
+_GIVEN = 40  # number of cameras that suffice if cameras are given
+_VIRTUAL = {False: (120, 120), True: (80, 60)}  # by `has SH`: number of small virtual views, for small and large scenes
+_LARGE = 40_000  # splats of a large scene: for fewer, half of the views would change the size of files by a per cent
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSensitivity:
+    """The sensitivities of a scene.
+
+    Attributes:
+        model: the scene.
+        found: the sensitivities by splat.
+        source: kind of the views, see `sensitivity_file.SOURCES`.
+        missed_share: fraction of the splats that only held-out views saw; NaN if none were held out.
+    """
+
+    model: SplatModel
+    found: Sensitivity
+    source: str
+    missed_share: float
+
+    def write(self, path: str) -> None:
+        """Write the file, whole or not at all."""
+        with open_output(path) as stream:
+            write_sensitivity(stream, self.model, self.found, self.source, self.missed_share)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return counts, fractions, and quantiles of every group as JSON-compatible values."""
+        at = (0.0, 0.5, 0.9, 0.99, 1.0)
+        return {
+            "splats": len(self.model),
+            "views": self.found.view_count,
+            "pixels": self.found.pixel_count,
+            "source": self.source,
+            "unseen": int(np.count_nonzero(~self.found.seen)),
+            "unseen_share": self.found.unseen_share,
+            "missed_share": None if np.isnan(self.missed_share) else self.missed_share,
+            "quantiles": {
+                name: {str(q): float(np.quantile(getattr(self.found, name), q)) for q in at} if len(self.model) else {}
+                for name in GROUPS
+            },
+        }
+
+
+def measure_scene(
+    model: SplatModel,
+    views: ViewSet,
+    *,
+    matrices: bool = True,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> SceneSensitivity:
+    """Measure the sensitivities of a scene from training views: all of them, or as many virtual ones as it takes.
+
+    Args:
+        model: the scene.
+        views: the views. Without training views, the test views are used.
+        matrices, threads, progress: as for `measure_views`.
+
+    Raises:
+        InputError: there are no splats, or no views, or they show no splat.
+    """
+    if not len(model):
+        raise InputError(_NOTHING)
+    cameras, check, source = (
+        views.teaches or views.judges,
+        list[Camera](),
+        "training" if views.photographs else "cameras",
+    )
+    if views.virtual and views.teaches:
+        size = (views.teaches[0].W, views.teaches[0].H)
+        found = find_views(model, views, _GONE, size=size, threads=threads, progress=progress)
+        cameras, check, source = found.used, found.check, "virtual"
+    measured = measure_views(model, cameras, views.background, matrices=matrices, threads=threads, progress=progress)
+    missed = float("nan")
+    if check:
+        elsewhere = measure_pruning_error(model, check, background=views.background, bands=False, threads=threads).seen
+        missed = float(np.mean(elsewhere & ~measured.seen))
+    return SceneSensitivity(model, measured, source, missed)
+
+
+def measure_views(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    background: Colour,
+    *,
+    matrices: bool,
+    magnitudes: bool = True,
+    threads: int | None,
+    progress: Progress | None = None,
+) -> Sensitivity:
+    """Measure the sensitivities of a scene from given views.
+
+    Args:
+        model: the scene.
+        cameras: the views, relative to the scene's origin.
+        background: background colour.
+        matrices: measure the matrices of SH coefficients, too.
+        magnitudes: measure gradient magnitudes in addition to the squares from which weights are made.
+        threads: number of threads; `None` for all.
+        progress: progress callback.
+
+    Raises:
+        InputError: there are no splats, or no view shows any.
+    """
+    if not len(model):
+        raise InputError(_NOTHING)
+    if progress is not None:
+        progress("compiling", 0.0)  # the first time takes some seconds
+        measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=matrices, magnitudes=magnitudes)
+        progress("compiling", 1.0)
+    found = measure_sensitivity(
+        model, cameras, background=background, metric=matrices, magnitudes=magnitudes, threads=threads,
+        progress=progress,
+    )  # fmt: skip
+    if not found.seen.any():
+        raise InputError("no view shows any splat: scene and cameras do not belong together")
+    return found
+
+
+def measure_importance(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    background: Colour,
+    *,
+    threads: int | None,
+    progress: Progress | None = None,
+) -> Importance:
+    """Measure the importance for the encoder: SH weights, bounded below by opacity and size, and Gauss–Newton blocks.
+
+    Args:
+        model, cameras, background, threads, progress: as for `measure_views`.
+
+    Raises:
+        InputError: as for `measure_views`.
+    """
+    found = measure_views(
+        model, cameras, background, matrices=False, magnitudes=False, threads=threads, progress=progress
+    )
+    weights = StoredSensitivity.of(model, found).importance()
+    return replace(weights, sh=trusted(weights.sh, model))
+
+
+def importance_views(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
+    """Select the training views from which the precision that splats need is measured.
+
+    Virtual training views look from nearer and farther, from below and from the side, too. Cameras like the test views
+    would show less of what others see: plane3 with quantisation classes from 40 of them has 42 dB on them and 39 on
+    others; from these views, 41 and 40.
+    """
+    return evenly(views.teaches, _VIRTUAL[source.sh_degree > 0][len(source) >= _LARGE] if views.virtual else _GIVEN)
+
+
+def complete_importance(
+    source: SplatModel,
+    views: ViewSet,
+    encoding: EncodeOptions,
+    importance: Weights | None,
+    *,
+    inside: bool,
+    progress: Progress | None = None,
+) -> tuple[Importance | None, int]:
+    """Return the caller's importance, completed by measurements.
+
+    Args:
+        source: the scene.
+        views: the views, of which training views are used.
+        encoding: the caller's options; some leave nothing to sort into quantisation classes.
+        importance: the caller's importance. If it has curvatures, nothing is measured; else it is kept for SH.
+        inside: the views are virtual ones in a surrounding scene, from which nothing is measured.
+        progress: progress callback.
+
+    Returns:
+        Weights and curvatures, `None` if they are not known or would change nothing; and the number of views in which
+        they were measured here.
+    """
+    several = most_grades(len(source), encoding) > 1
+    if isinstance(importance, Importance) and importance.curvatures is not None:
+        return (importance if several else None), 0
+    has_sh = source.sh_degree > 0 and encoding.sh_degree != 0 and encoding.sh_coding != "none"
+    quick = encoding.preset == "fast" and encoding.grades is None
+    if inside or quick or not (several or has_sh):
+        return None, 0
+    seen_from = importance_views(source, views)
+    try:
+        found = measure_importance(source, seen_from, views.background, threads=encoding.threads, progress=progress)
+    except InputError:
+        return None, 0  # no splat is visible
+    if isinstance(importance, Importance):
+        found = replace(importance, curvatures=found.curvatures)
+    elif importance is not None:
+        found = replace(found, sh=np.asarray(importance))
+    if not encoding.shape_codebook_size:
+        found = replace(found, shape_metric=None)  # half of the memory of `found`
+    return found, len(seen_from)

@@ -1,0 +1,219 @@
+"""Describe a search and the file that it found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from csplat.encoder import EncodeResult
+from csplat.errors import counted
+from csplat_render.metrics import psnr_of_mse
+from csplat_tools.files.console import format_bytes
+from csplat_tools.optimise.candidates import Candidate, CandidatePool, psnr_spread
+from csplat_tools.optimise.targets import Target
+from csplat_tools.views import counted_views
+
+_LESS = 1.0  # dB: a PSNR from elsewhere that is lower by more is pointed out
+
+
+@dataclass(frozen=True)
+class SearchReport:
+    """The report of a search.
+
+    Attributes:
+        goal: the target, by name.
+        size_bytes, splats: size of the file and its number of splats.
+        splats_before: number of splats of the scene.
+        encodes: number of files that were made.
+        seconds: time of the whole search.
+        reached: largest errors of the file by measure, for those that are bounded.
+        psnr: PSNR of the file against the source, dB; `None` if nothing was rendered, as for all that follows.
+        photographs: PSNR of `file` and `source` against the test photographs, if there are any.
+        worst_psnr: PSNR of the worst view, dB.
+        spread: standard deviation of the PSNR over other choices of such views, dB.
+        elsewhere: PSNR from virtual views that had no part in the search, dB: `beside` those of `psnr`, and the same
+            `nearer` and `farther`.
+        views: number of test views.
+        views_of: source of the views: `virtual`, or a name.
+        renders: number of renders that were scored.
+        removal_views, sensitivity_views: number of small renders to measure pruning errors, and sensitivities.
+        chosen, tried: the chosen file and all files, see `Trial.as_json`.
+        why, sure: explanations of the choice, and of the reliability of the PSNR.
+    """
+
+    goal: dict[str, Any]
+    size_bytes: int
+    splats: int
+    splats_before: int
+    encodes: int
+    seconds: float
+    reached: dict[str, float] = field(default_factory=dict)
+    psnr: float | None = None
+    photographs: dict[str, float] = field(default_factory=dict)
+    worst_psnr: float | None = None
+    spread: float | None = None
+    elsewhere: dict[str, float] = field(default_factory=dict)
+    views: int = 0
+    views_of: str = ""
+    renders: int = 0
+    removal_views: int = 0
+    sensitivity_views: int = 0
+    chosen: dict[str, Any] = field(default_factory=dict)
+    tried: tuple[dict[str, Any], ...] = ()
+    why: tuple[str, ...] = ()
+    sure: str = ""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as JSON-compatible values."""
+        return asdict(self)
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the report for users, a sentence each."""
+        goal = self.goal
+        asked = [f"{name} within {bound:g}" for name, bound in goal.get("max_error", {}).items()]
+        if "size_bytes" in goal:
+            share = 100.0 * self.size_bytes / goal["size_bytes"]
+            asked.append(f"{format_bytes(goal['size_bytes'])}, of which the file takes {share:.1f} %")
+        if "psnr" in goal:
+            asked.append(f"{goal['psnr']:g} dB, of which it reaches {self.psnr:.2f}")
+        if "keep" in goal:
+            asked.append(f"{100.0 * goal['keep']:g} % of {counted(self.splats_before, 'splat')}")
+        if "max_loss" in goal:
+            asked.append(f"a loss of {goal['max_loss']:g} dB by the photographs that decide")
+        lines = [f"target: {'; '.join(asked)}"]
+        if self.photographs:
+            file, source = self.photographs["file"], self.photographs["source"]
+            lines.append(f"photographs that judge: {file:.2f} dB, the source {source:.2f}")
+        lines += [f"chosen: {line}" for line in self.why]
+        if self.psnr is not None:
+            lines.append(f"PSNR {self.psnr:.2f} dB, {self.sure}")
+            lines += self._elsewhere(self.psnr)
+        cost = f"{counted(self.encodes, 'file')} tried"
+        if self.renders:
+            cost += f", {counted(self.renders, 'picture')} judged"
+        if self.sensitivity_views:
+            cost += f", sensitivity measured in {self.sensitivity_views}"
+        if self.removal_views:
+            cost += f", removal measured in {self.removal_views} small ones"
+        return (*lines, cost)
+
+    def _elsewhere(self, psnr: float) -> list[str]:
+        if not self.elsewhere:
+            return []
+        shown = ", ".join(f"{found:.2f} {kind}" for kind, found in self.elsewhere.items())
+        less = psnr - min(self.elsewhere.values())
+        worse = f": up to {less:.1f} dB less than where it was judged" if less > _LESS else ""
+        return [f"from virtual views that nothing was chosen by, PSNR {shown}{worse}"]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Optimised:
+    """A file that meets a target.
+
+    Attributes:
+        result: the encoder's result; its source index refers to the source.
+        report: the report of the search.
+    """
+
+    result: EncodeResult
+    report: SearchReport
+
+    def __repr__(self) -> str:
+        said, psnr = self.result.report, self.report.psnr
+        quality = "" if psnr is None else f", {psnr:.2f} dB"
+        return f"Optimised({said.size_bytes:,} bytes, {said.splat_count:,} splats{quality})"
+
+    @property
+    def data(self) -> bytes:
+        """The bytes of the file."""
+        return self.result.data
+
+
+_FAR = 0.3  # dB: a PSNR that exceeds the target by more is explained
+
+
+def make_report(
+    target: Target,
+    found: Candidate,
+    trials: CandidatePool,
+    *,
+    splats_before: int,
+    views_of: str,
+    remarks: Sequence[str],
+    **numbers: Any,
+) -> SearchReport:
+    """Build the report of a search.
+
+    Args:
+        target: the target.
+        found: the chosen file.
+        trials: all files that were tried.
+        splats_before: number of splats of the scene.
+        views_of: source of the test views: `virtual`, or a name.
+        remarks: further sentences for `why`.
+        numbers: the other fields of `SearchReport`.
+    """
+    errors, spread = found.errors, psnr_spread(found.errors)
+    worst = min(psnr_of_mse(float(error)) for error in errors)
+    many = counted_views(len(errors), views_of)
+    sure = (
+        f"measured on the file itself, in {many}, which chose nothing but the precision: the worst has {worst:.2f} dB"
+    )
+    if not math.isnan(spread):
+        sure += (
+            f"; other such views would change the {found.psnr:.2f} dB by about {spread:.1f} (one standard deviation)"
+        )
+    return SearchReport(
+        goal=target.as_json(),
+        size_bytes=found.size_bytes,
+        splats=found.splats,
+        splats_before=splats_before,
+        psnr=found.psnr,
+        worst_psnr=worst,
+        spread=None if math.isnan(spread) else round(spread, 3),
+        views=len(errors),
+        views_of=views_of,
+        renders=trials.renders,
+        chosen=found.as_json(),
+        tried=tuple(trial.as_json() for trial in trials.made),
+        why=(*_why(target, found, trials, splats_before), *remarks),
+        sure=sure,
+        **numbers,
+    )
+
+
+def _why(target: Target, found: Candidate, trials: CandidatePool, splats_before: int) -> list[str]:
+    """Return sentences on the coding of SH, the alternatives, and the number of pruned splats."""
+    codings = list(dict.fromkeys(_coding(trial) for trial in trials.made if trial.part is found.part))
+    if found.quality is None:
+        lines = [f"{_coding(found)}, at the precision of the preset {found.options.preset}"]
+    else:
+        lines = [f"{_coding(found)}; each attribute keeps {found.quality:.1f} dB by itself: all steps follow from that"]
+    if found.grades > 1:
+        lines.append(f"splats are sorted into {found.grades} grades by what pictures lose, each with steps of its own")
+    others = [coding for coding in codings if coding != _coding(found)]
+    if others:
+        expected = "look worse" if target.size_bytes is not None else "take more"
+        lines.append(f"tried for these splats, too, and expected to {expected}: {'; '.join(others)}")
+    if target.psnr is not None and found.psnr > target.psnr + _FAR:
+        lines.append("no smaller file of those tried reaches the target")
+    gone = splats_before - found.splats
+    if gone:
+        share = 100.0 * gone / splats_before
+        lines.append(
+            f"{counted(gone, 'splat')} ({share:.0f} %) left out, the others fitted to what the source looks like"
+        )
+    return lines
+
+
+def _coding(trial: Candidate) -> str:
+    options = trial.result.report.options
+    if options["sh_coding"] == "none":
+        return "no SH bands" if trial.part.model.sh_degree else "no SH to code"
+    bands = f"SH degree {options['sh_degree']}"
+    if options["sh_coding"] == "codebook":
+        return f"{bands} by a codebook of {options['codebook_size']}"
+    adaptive = " by importance" if options["adaptive"] == 1.0 else ""
+    return f"{bands} value by value{adaptive}"

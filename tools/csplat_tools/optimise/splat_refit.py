@@ -1,0 +1,330 @@
+"""Refit kept splats to renders of the source, and choose the SH bands that they need."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder import FreeValues, Frozen
+from csplat.model import SplatModel
+from csplat.types import F32, Mask, Progress
+from csplat_render import Camera
+from csplat_render.conventions import Gradients, HasSplats, SplatArrays
+from csplat_render.metrics import squared_error
+from csplat_render.pruning_error import PruningError, measure_pruning_error
+from csplat_render.rasteriser import Rasteriser
+from csplat_tools.optimise.pruning_order import SimplifyOptions
+from csplat_tools.optimise.rate_distortion import LEAST_QUANTISED, rate_exponent
+from csplat_trainer.parameters import Parameters, adam_step, from_model
+from csplat_trainer.tuning.rate import Costs
+from csplat_trainer.tuning.state import TunedScene
+
+#: Learning rates of the first steps per unit of the root mean square error, which counts up to `_LARGEST_ERROR`.
+_RATES = {"logits": 1.95, "scales": 0.39, "quats": 0.023, "sh0": 0.1, "shN": 0.04}
+_SH_FACTOR = 2.0  # factor of the step length for scenes without SH; not used through quantisers
+_LARGEST_ERROR = 0.04  # root mean square error, 0 to 1, above which steps do not become longer
+_BETA2 = 0.98  # Adam's decay rate of squared gradients: errors fall too fast for a longer memory
+_LAST_RATE = 0.02  # fraction of the rates that is left in the last steps
+_SLOPE = 0.07  # fraction of the bytes that a decibel costs after a refit, about
+_COUNT_EVERY = 50  # steps between counts of a file's integers
+_CENTRE_BITS = 24.0  # bits of a splat's centre, about, which is fixed
+_SAMPLE = 8  # every Nth view is rendered to measure the error
+
+
+def refit_splats(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    wanted: Sequence[F32],
+    options: SimplifyOptions,
+    *,
+    steps: int,
+    free: Mask | None = None,
+    progress: Progress | None = None,
+) -> SplatModel:
+    """Move colours, opacities, scales and rotations along the gradient of the squared error, view by view.
+
+    Args:
+        model: the scene.
+        cameras: the views.
+        wanted: [H, W, 3], the reference image of each view.
+        options: background, seed of the order of views, threads.
+        steps: number of steps, one view each.
+        free: [N, K], mask of the SH coefficients beyond the first that may change; None for all.
+        progress: progress callback.
+
+    Returns:
+        The scene; splats that no view shows are unchanged.
+    """
+    scene, teaching = _FloatValues.of(model, free), _TrainingViews(cameras, wanted, options, model.antialiased)
+    factor = 1.0 if model.sh_degree else _SH_FACTOR
+    _descend(scene, teaching, steps, factor * _step_length(teaching.rms(scene.seen())), progress)
+    return scene.moved(model)
+
+
+def quantisation_aware_refit(
+    frozen: Frozen,
+    cameras: Sequence[Camera],
+    wanted: Sequence[F32],
+    options: SimplifyOptions,
+    *,
+    steps: int,
+    progress: Progress | None = None,
+) -> FreeValues:
+    """Refit splats through the quantisers of a file, so that renders are those of the decoded file; its bytes count.
+
+    Args:
+        frozen: the encoder's quantisation.
+        cameras, wanted, options, steps, progress: as for `refit_splats`.
+
+    Returns:
+        Values that `Frozen.coded` takes.
+    """
+    model, scene = frozen.draft.model, _QuantisedValues(TunedScene(frozen))
+    scene.tuned.parameters.beta2 = _BETA2
+    teaching = _TrainingViews(cameras, wanted, options, model.antialiased)
+    rms, removed = teaching.rms(scene.seen()), teaching.rms(model)
+    quantised = max(rms**2 - removed**2, LEAST_QUANTISED * rms**2)
+    if math.isfinite(quantised):
+        values = sum(picture.size for picture in wanted) / len(wanted)
+        # Growth of the error per saved fraction of the bytes; half of it, because views give half of its gradient.
+        scene.price = 0.5 * quantised * values / rate_exponent(_SLOPE)
+    _descend(scene, teaching, steps, _step_length(rms), progress)
+    return scene.tuned.held.copy()
+
+
+class _FittedValues(Protocol):
+    """The values that are fitted, and the splats that are rendered from them."""
+
+    def seen(self) -> SplatArrays: ...
+
+    def step(self, gradients: Gradients, rates: dict[str, float]) -> None: ...
+
+
+class _TrainingViews:
+    """Training views with their reference images."""
+
+    def __init__(
+        self, cameras: Sequence[Camera], wanted: Sequence[F32], options: SimplifyOptions, antialiased: bool
+    ) -> None:
+        self.cameras, self.wanted, self.seed = cameras, wanted, options.seed
+        self.rasteriser = Rasteriser(threads=options.threads)
+        self._background, self._antialiased = options.background, antialiased
+
+    def wrong(self, splats: HasSplats, view: int) -> F32:
+        """Return the error of a view's render, [H, W, 3]: positive if it is too bright."""
+        drawn = self.rasteriser.forward(
+            splats, self.cameras[view], background=self._background, antialiased=self._antialiased
+        )
+        # Straight-through gradient of the clipping: a colour above 1 is pulled back only if the reference is darker.
+        return np.clip(drawn.rgb, 0.0, 1.0) - np.clip(self.wanted[view], 0.0, 1.0)
+
+    def rms(self, splats: HasSplats) -> float:
+        """Return the root mean square error over a sample of the views."""
+        sample = range(0, len(self.cameras), _SAMPLE)
+        errors = [np.mean(np.square(self.wrong(splats, view), dtype=np.float64)) for view in sample]
+        return math.sqrt(np.mean(errors))
+
+
+def _step_length(rms: float) -> float:
+    """Return the length of the first steps for a root mean square error; 0 if it is not finite."""
+    return min(rms, _LARGEST_ERROR) if math.isfinite(rms) else 0.0
+
+
+def _descend(
+    scene: _FittedValues, teaching: _TrainingViews, steps: int, length: float, progress: Progress | None
+) -> None:
+    """Fit the values of a scene by Adam."""
+    count = len(teaching.cameras)
+    rng = np.random.default_rng(teaching.seed)
+    order = np.concatenate([rng.permutation(count) for _ in range(-(-steps // count))])
+    for step, view in enumerate(order[:steps]):
+        gradients = teaching.rasteriser.backward(teaching.wrong(scene.seen(), view))
+        share = max(_LAST_RATE, 0.5 + 0.5 * math.cos(math.pi * (step + 1) / steps))
+        scene.step(gradients, {name: length * share * rate for name, rate in _RATES.items()})
+        if progress is not None:
+            progress("adjusting splats", (step + 1) / steps)
+
+
+@dataclass(eq=False)
+class _FloatValues:
+    """Values without quantisation."""
+
+    means: F32
+    parameters: Parameters
+    free: Mask | None
+
+    @classmethod
+    def of(cls, model: SplatModel, free: Mask | None) -> _FloatValues:
+        parameters = Parameters.starting_at(_values_to_fit(model))
+        parameters.beta2 = _BETA2
+        return cls(model.means, parameters, free)
+
+    def seen(self) -> SplatArrays:
+        v = self.parameters.values
+        return SplatArrays(self.means, v["quats"], v["scales"], self.parameters.alphas, v["sh0"], v["shN"])
+
+    def step(self, gradients: Gradients, rates: dict[str, float]) -> None:
+        alphas = self.parameters.alphas
+        slopes: dict[str, Any] = {name: getattr(gradients, name) for name in ("quats", "scales", "sh0", "shN")}
+        slopes["logits"] = gradients.opacities * alphas * (np.float32(1.0) - alphas)
+        if self.free is not None:
+            gradients.shN[:] *= self.free[:, :, None]  # in place: the rasteriser's buffer, valid until its next pass
+        adam_step(self.parameters, slopes, rates)
+
+    def moved(self, before: SplatModel) -> SplatModel:
+        """Return the scene with the splats that changed; the others, and any that overflowed, are kept bit for bit.
+
+        No step may follow: the optimiser's state is released.
+        """
+        self.parameters.first, self.parameters.second = {}, {}  # as large as the scene, each
+        values, alphas, start = self.parameters.values, self.parameters.alphas, _values_to_fit(before)
+        moved = np.zeros(len(before), bool)
+        for name in ("logits", "scales", "sh0", "shN"):
+            moved |= (values[name] != start[name]).reshape(len(before), -1).any(axis=1)
+        for array in values.values():
+            moved &= np.isfinite(array).reshape(len(before), -1).all(axis=1)
+        rows = moved[:, None]
+        return replace(
+            before,
+            opacities=np.where(moved, alphas, before.opacities),
+            quats=np.where(rows, values["quats"], before.quats),
+            scales=np.where(rows, values["scales"], before.scales),
+            sh0=np.where(rows, values["sh0"], before.sh0),
+            shN=np.where(rows[:, :, None], values["shN"], before.shN),
+        )
+
+
+def _values_to_fit(model: SplatModel) -> dict[str, F32]:
+    """Return the values of a scene that are fitted."""
+    values = from_model(model, model.sh_degree)
+    del values["means"]
+    return values
+
+
+@dataclass(eq=False)
+class _QuantisedValues:
+    """Values that pass through quantisers; `price`: squared error of a render that all bits together are worth."""
+
+    tuned: TunedScene
+    price: float = 0.0
+    _alphas: F32 | None = None
+    _seen: Any = None
+    _costs: Costs | None = None
+
+    def seen(self) -> SplatArrays:
+        self._seen = None  # as large as the scene
+        self._seen, self._alphas = self.tuned.seen()
+        s = self._seen
+        return SplatArrays(s.means, s.quats, s.scales, s.opacities, s.sh0, s.shN)
+
+    def step(self, gradients: Gradients, rates: dict[str, float]) -> None:
+        assert self._alphas is not None
+        if self.tuned.parameters.step % _COUNT_EVERY == 0:
+            costs, splats = self.tuned.count(self._seen, 1.0), len(self._alphas)
+            costs.weight = self.price * splats / (costs.bits + _CENTRE_BITS * splats)
+            self._costs = costs
+        rates = {**rates, "means": 0.0, "sizes": rates["scales"]}
+        self.tuned.step(gradients, self._seen, self._alphas, rates, self._costs if self.price else None)
+
+
+#: Steps of a fit, and of the one after bands were left out.
+FIT_STEPS, BAND_STEPS = 960, 160
+
+
+@dataclass(frozen=True, eq=False)
+class RefitResult:
+    """A refitted scene.
+
+    Attributes:
+        model: the scene.
+        stays: [N, d], mask of the SH bands that are kept; None if bands were not chosen.
+    """
+
+    model: SplatModel
+    stays: Mask | None
+
+
+def refit_with_bands(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    wanted: Sequence[F32],
+    options: SimplifyOptions,
+    *,
+    deciding: int | None = None,
+    progress: Progress | None = None,
+) -> RefitResult:
+    """Refit the splats; set bands to zero that are not worth their bits, and refit the others once more.
+
+    Args:
+        model: the scene, with the source's values.
+        cameras: the views.
+        wanted: [H, W, 3], the source's render of each view.
+        options: `refit` and `bands`, effort, background.
+        deciding: number of views, from the first on, by which bands are chosen; `None`: all.
+        progress: progress callback.
+    """
+    if options.refit:
+        model = refit_splats(model, cameras, wanted, options, steps=options.steps(FIT_STEPS), progress=progress)
+    if not options.bands or not model.sh_degree:
+        return RefitResult(model, None)
+    error = 0.0
+
+    def add(number: int, picture: NDArray[np.float32]) -> None:
+        nonlocal error
+        error += float(np.sum(squared_error(wanted[number], picture)))
+
+    removal = measure_pruning_error(
+        model,
+        cameras[:deciding],
+        background=options.background,
+        on_picture=add,
+        threads=options.threads,
+        progress=progress,
+    )
+    stays = choose_bands(removal, error / max(1, len(model)))
+    if not stays.all():
+        model = drop_bands(model, stays)
+        if options.refit:
+            free = coefficient_mask(stays)
+            model = refit_splats(
+                model, cameras, wanted, options, steps=options.steps(BAND_STEPS), free=free, progress=progress
+            )
+    return RefitResult(model, stays)
+
+
+#: Largest errors of bands 1, 2, 3 that are not worth their bits, as fractions of the scene's error per splat. At the
+#: optimum, a bit reduces the error by the same amount wherever it is spent: a splat has some 30 quantised values, whose
+#: error is half of the whole, and each bit takes 2 ln 2 of its value's error; bands of 9, 15 and 21 values take one and
+#: a half bits for each value.
+BAND_COST = (0.25, 0.4, 0.55)
+
+
+def choose_bands(removal: PruningError, error: float) -> Mask:
+    """Return a mask of the bands to keep, [N, d].
+
+    Args:
+        removal: removal errors of the scene that the bands belong to.
+        error: squared error of the scene per splat, summed over the views of `removal`.
+
+    All bands of a splat that no view saw are kept.
+    """
+    costs = np.array(BAND_COST[: removal.bands.shape[1]])
+    stays: Mask = (removal.bands > error * costs) | ~removal.seen[:, None]
+    return stays
+
+
+def coefficient_mask(stays: Mask) -> Mask:
+    """Return a mask of the SH coefficients beyond the first that belong to kept bands, [N, (d + 1)² − 1]."""
+    columns = [np.zeros((len(stays), 0), bool)]
+    columns += [np.repeat(stays[:, band - 1 : band], 2 * band + 1, axis=1) for band in range(1, stays.shape[1] + 1)]
+    return np.concatenate(columns, axis=1)
+
+
+def drop_bands(model: SplatModel, stays: Mask) -> SplatModel:
+    """Return the scene with zeros in the bands that are not kept."""
+    return replace(model, shN=model.shN * coefficient_mask(stays)[:, :, None].astype(np.float32))

@@ -1,0 +1,447 @@
+"""Prune a scene and refit the kept splats: how many to keep, and the content of a file of fewer splats."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder import Coded, Draft, EncodeOptions, Importance, Origin, most_grades
+from csplat.model import SplatModel
+from csplat.types import F64, I64, Mask, Progress
+from csplat_render.pruning_error import PruningError, measure_pruning_error
+from csplat_tools.optimise.candidates import Candidate
+from csplat_tools.optimise.pruning import PruningSession, prepare_pruning
+from csplat_tools.optimise.pruning_order import SimplifyOptions, find_pruning_order
+from csplat_tools.optimise.rate_distortion import (
+    LEAST_QUANTISED,
+    error_at_size,
+    error_of_psnr,
+    log_bytes_at_error,
+    rate_exponent,
+)
+from csplat_tools.optimise.splat_refit import (
+    BAND_STEPS,
+    FIT_STEPS,
+    choose_bands,
+    coefficient_mask,
+    drop_bands,
+    quantisation_aware_refit,
+    refit_splats,
+)
+from csplat_tools.views import ViewSet, evenly
+from csplat_trainer.sensitivity import measure_sensitivity
+from csplat_trainer.sensitivity_file import StoredSensitivity
+
+Cost = Callable[[F64, F64], F64]
+PsnrOf = Callable[[SplatModel], float]
+
+_USUAL_BYTES = (8.0, 11.0)  # bytes per splat of files of useful quality, without and with SH
+_FRAME_BYTES = 1_000  # bytes of a file without splats: header, index, options, declared errors
+_MOST_REMOVED = 0.7  # largest fraction of the error allowed by a PSNR that pruning may take
+_LEAST_REMOVED = 0.01  # least fraction of the error that is attributed to pruning
+_REFIT_GAIN, _REFIT_GAIN_GROWS = (
+    8.0,
+    1.0,
+)  # dB by which a refit reduces the pruning error, about, and more with twice the work
+_FAR = 2.0  # multiple of the error allowed by a PSNR at which an order ends: splats together err by more than the sum
+_FARTHER = 4.0  # multiple of its error to which an order that was too short is continued
+_CALIBRATIONS = 3  # largest number of times that a first number of splats is corrected by validation views
+_AGREED = 0.05  # fraction of the splats: a correction below this ends them
+_GROWS = 0.85  # power of the pruning error with which the error after a refit grows, about
+_GROW = (0.5, 1.1)  # range of that power if it is taken from two fits
+_NOTHING = 1e-12  # least mean squared error, to divide by
+
+
+@dataclass(eq=False)
+class Pruner:
+    """Prunes a scene and refits the kept splats. Owns views, renders of the source and pruning order, made when needed.
+
+    Attributes:
+        source: the scene.
+        views: the training and validation views.
+        options: options of pruning and fitting.
+        grades: kept splats may be sorted into quantisation classes.
+        progress: progress callback.
+        psnr: target PSNR, dB: the order ends far below it; `None`: another kind of target.
+        left: number of splats to keep, if the target specifies it: the order is made for that number.
+    """
+
+    source: SplatModel
+    views: ViewSet
+    options: SimplifyOptions
+    grades: bool
+    progress: Progress | None
+    psnr: float | None
+    left: int | None = None
+    _session: PruningSession | None = field(default=None, init=False)
+    _fitted: RefittedSubset | None = field(default=None, init=False)
+    _before: tuple[int, float] | None = field(default=None, init=False)
+
+    @property
+    def session(self) -> PruningSession:
+        """The views, renders and pruning order that are shared by all numbers of splats."""
+        if self._session is None:
+            allowed = math.inf if self.psnr is None else _FAR * error_of_psnr(self.psnr)
+            self._session = prepare_pruning(
+                self.source, self.views, self.left, self.options, self.progress, allowed=allowed
+            )
+        return self._session
+
+    @property
+    def view_count(self) -> int:
+        """Number of small renders in which pruning errors were measured, over all passes; 0 if they were not."""
+        if self._session is None:
+            return 0
+        views, later = self._session.views, max(0, len(self._session.order.rounds) - 1)
+        return len(self._session.taught) + len(views.used) * later + len(views.check)
+
+    def fitted(self, left: int, allowed: float | None, seen: PsnrOf) -> RefittedSubset:
+        """Return `left` splats, refitted, but at least those that are never pruned, such as unseen ones.
+
+        Args:
+            left: number of splats to keep.
+            allowed, seen: as for `RefittedSubset`.
+        """
+        gone = len(self.source) - left
+        if gone > len(self.session.order.rows):
+            self._extend(left, math.inf)
+        gone = min(gone, len(self.session.order.rows))
+        self._fitted = RefittedSubset(self.session, gone, allowed, seen, self.grades, self.progress, self._fitted)
+        return self._fitted
+
+    def first_at_psnr(self, psnr: float, slope: float, seen: PsnrOf) -> int:
+        """Return the number of splats to begin with for the smallest file of a PSNR.
+
+        Validation views show more or less of the pruning error than training views; this is measured and corrected.
+
+        Args:
+            psnr: target PSNR, dB.
+            slope: fraction of the bytes that a decibel costs.
+            seen: measures the PSNR of some of the source's splats on the validation views, dB.
+        """
+        return self._calibrated(_at_psnr(psnr, slope), seen)
+
+    def first_at_size(self, size_bytes: int, near: tuple[int, float] | None, slope: float, seen: PsnrOf) -> int:
+        """Return the number of splats to begin with for the best file of a size.
+
+        Args:
+            size_bytes: size of the file.
+            near: number of splats and PSNR in dB of a file of about that size; `None`: there is none.
+            slope, seen: as for `first_at_psnr`.
+        """
+        if near is None:
+            usual = (size_bytes - _FRAME_BYTES) / _USUAL_BYTES[self.source.sh_degree > 0]
+            return max(1, min(len(self.source), int(usual)))
+        return self._calibrated(_at_size(near[0], error_of_psnr(near[1]), slope), seen)
+
+    def next_at_psnr(self, left: int, fitted_psnr: float, psnr: float, slope: float) -> tuple[int, float]:
+        """Predict the number of splats for the smallest file of a PSNR, and the saving as a logarithm of bytes.
+
+        Args:
+            left: number of splats of the last fit.
+            fitted_psnr: their PSNR before quantisation, dB.
+            psnr, slope: as for `first_at_psnr`.
+        """
+        removed = max(error_of_psnr(fitted_psnr), _LEAST_REMOVED * error_of_psnr(psnr))
+        before, self._before = self._before, (left, removed)
+        return self._next(_at_psnr(psnr, slope), (left, removed), self._growing(before, (left, removed)))
+
+    def next_at_size(self, left: int, fitted_psnr: float, psnr: float, slope: float) -> tuple[int, float]:
+        """Predict the number of splats for the best file of a size, and the gain as a logarithm of bytes.
+
+        Args:
+            left: number of splats of a file of that size.
+            fitted_psnr: their PSNR before quantisation, dB.
+            psnr: PSNR of the file, dB.
+            slope: as for `first_at_psnr`.
+        """
+        error = error_of_psnr(psnr)
+        removed = max(min(error_of_psnr(fitted_psnr), error), _LEAST_REMOVED * error)
+        quantised = max(error - removed, LEAST_QUANTISED * error)
+        return self._next(_at_size(left, quantised, slope), (left, removed), _GROWS)
+
+    def _next(self, cost: Cost, known: tuple[int, float], power: float) -> tuple[int, float]:
+        """Return the number of kept splats with the least cost, and by how much it is below the known one."""
+        left, least = self._least(cost, known, power)
+        return left, float(cost(*map(np.atleast_1d, known))[0]) - least
+
+    def _calibrated(self, cost: Cost, seen: PsnrOf) -> int:
+        mends = error_of_psnr(self._mended)
+        left, _ = self._least(cost, None)
+        for _ in range(_CALIBRATIONS):
+            if left == len(self.source):
+                break
+            rows = self.session.pruned(len(self.source) - left)
+            seen_error = mends * error_of_psnr(seen(self.source.select(rows)))
+            before, (left, _) = left, self._least(cost, (left, seen_error))
+            if abs(left - before) <= _AGREED * before:
+                break
+        return left
+
+    def _growing(self, before: tuple[int, float] | None, known: tuple[int, float]) -> float:
+        """Return the power with which the error after a refit grows with the pruning error, from two fits.
+
+        Args:
+            before, known: number of splats and mean squared error of two fits; `None`: there was only one.
+        """
+        if before is None or before[0] == known[0]:
+            return _GROWS
+        removed = math.log(self._error(known[0]) / self._error(before[0]))
+        return min(max(math.log(known[1] / before[1]) / removed, _GROW[0]), _GROW[1]) if removed else _GROWS
+
+    def _least(self, cost: Cost, known: tuple[int, float] | None, power: float = _GROWS) -> tuple[int, float]:
+        """Return the number of kept splats with the least cost, and that cost.
+
+        Args:
+            cost: takes the numbers of kept splats and their errors after a refit.
+            known: number of splats and mean squared error of a fit; `None`: the usual gain of a refit is assumed.
+            power: power of the pruning error with which the error after a refit grows.
+        """
+        while True:
+            errors = self._errors()
+            left = len(self.source) - np.arange(len(errors), dtype=np.float64)
+            fitted = error_of_psnr(self._mended) * errors
+            if known is not None:
+                fitted = known[1] * np.power(errors / self._error(known[0]), power)
+            costs = cost(left, fitted)
+            best = int(np.argmin(costs))
+            if best < len(errors) - 1 or not self._goes_on():
+                return int(left[best]), float(costs[best])
+
+    @property
+    def _mended(self) -> float:
+        return _REFIT_GAIN + _REFIT_GAIN_GROWS * math.log2(self.options.work)
+
+    def _goes_on(self) -> bool:
+        """Continue the pruning order until its error is several times as large; return False if it cannot be."""
+        before = self.session.order
+        self._extend(None, _FARTHER * float(before.errors.sum()))
+        return len(self.session.order.rows) > len(before.rows)
+
+    def _extend(self, left: int | None, enough: float) -> None:
+        """Continue the pruning order, see `find_pruning_order`."""
+        session = self.session
+        order = find_pruning_order(
+            self.source, session.sides, session.options, left, self.progress, enough=enough, start=session.order
+        )
+        self._session = replace(session, order=order)
+
+    def _error(self, left: int) -> float:
+        """Return the predicted mean squared error of pruning all but `left` splats."""
+        errors = self._errors()
+        return max(float(errors[min(len(self.source) - left, len(errors) - 1)]), _NOTHING)
+
+    def _errors(self) -> F64:
+        session = self.session
+        sums = np.concatenate([[0.0], np.cumsum(session.order.errors)]) / session.value_count
+        return sums[: len(self.source)]  # at least one splat is kept
+
+
+def _at_psnr(psnr: float, slope: float) -> Cost:
+    return lambda left, removed: log_bytes_at_error(left, removed, error_of_psnr(psnr), _MOST_REMOVED, slope)
+
+
+def _at_size(splats: int, quantised: float, slope: float) -> Cost:
+    # As a logarithm of bytes, as for a PSNR.
+    power = rate_exponent(slope)
+    return lambda left, removed: power * np.log(error_at_size(left / splats, removed, quantised, slope))
+
+
+_GRADED = 4_000  # least number of splats for quantisation classes: fewer are too similar
+_LEAST_LEFT = 0.2  # fraction of the fit's error that is at least left to bands and quantisation
+_MOST_BANDS = 0.7  # fraction of the error left by the fit that leaving out bands may take at most
+_BAND_TRIES, _FEWER_BANDS = 2, 4.0  # if they take more: number of tries, each with the bound divided by this factor
+_CARRIED_STEPS = 480  # steps of a fit that starts from the result of another
+_FILE_STEPS = 480  # steps of a fit through the quantisers of a file
+_SENSITIVITY_VIEWS = (120, 40)  # number of views to measure the sensitivity of splats, without and with SH
+
+
+@dataclass(eq=False)
+class RefittedSubset:
+    """The splats of a scene that are kept after pruning, refitted.
+
+    Attributes:
+        session: the scene, its views, and the pruning order of its splats.
+        gone: number of pruned splats.
+        allowed: PSNR that files are to have on the validation views, dB: the error that the fit leaves below it
+            determines which SH bands are worth their bits; `None`: the fit's own error does.
+        seen: measures the PSNR of some splats on the validation views, dB.
+        grades: the splats may be sorted into quantisation classes, if there are enough.
+        progress: progress callback.
+        before: a fit with another number of splats, from which this one starts.
+    """
+
+    session: PruningSession
+    gone: int
+    allowed: float | None
+    seen: PsnrOf
+    grades: bool
+    progress: Progress | None
+    before: RefittedSubset | None = None
+    refits: bool = True
+
+    def __post_init__(self) -> None:
+        self._check_psnr = 0.0
+
+    @cached_property
+    def rows(self) -> I64:
+        """[N] int64, the source splats that are kept."""
+        return self.session.pruned(self.gone)
+
+    @property
+    def gradable(self) -> bool:
+        """True if the splats may be sorted into quantisation classes: `grades` is set, and there are enough."""
+        return self.grades and len(self.rows) >= _GRADED
+
+    @property
+    def model(self) -> SplatModel:
+        """The refitted splats before quantisation."""
+        return self._fitted
+
+    @cached_property
+    def fitted_psnr(self) -> float:
+        """PSNR of the refitted splats, with all bands, on the validation views, dB."""
+        return self.seen(self.model)
+
+    @cached_property
+    def banded(self) -> tuple[SplatModel, Mask | None]:
+        """The splats without the SH bands that are not worth their bits, and a mask of kept bands; `None`: all."""
+        session, model = self.session, self.model
+        if not session.options.bands or not model.sh_degree:
+            return model, None
+        error, most = error_of_psnr(session.checked.psnr(model)), math.inf
+        if self.allowed is not None:  # training and validation views see errors of different size
+            fitted, allowed = error_of_psnr(self.fitted_psnr), error_of_psnr(self.allowed)
+            error *= max(allowed / fitted - 1.0, _LEAST_LEFT)
+            most = max(fitted + _MOST_BANDS * (allowed - fitted), (1.0 + _LEAST_LEFT) * fitted)
+        banded, stays = self._left_out(error)
+        for _ in range(0 if self.allowed is None else _BAND_TRIES):
+            if error_of_psnr(self.seen(banded)) <= most:
+                break
+            error /= _FEWER_BANDS
+            del banded  # as large as the scene
+            banded, stays = self._left_out(error)
+        return banded, stays
+
+    @property
+    def shown(self) -> SplatModel:
+        """The splats that are quantised: refitted, without the bands that are left out."""
+        return self.banded[0]
+
+    @property
+    def psnr(self) -> float:
+        """PSNR of `shown` on the validation views, dB."""
+        return self._banded_psnr  # pyright does not take a cached property for the protocol's
+
+    def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:
+        """Quantise and code the splats; unless `quick`, they are refitted through the quantisers before."""
+        session, refit = self.session, self.session.options.refit
+        start = self.banded[0]
+        draft = Draft.of(
+            start, options, importance=self._importance(options, graded=graded),
+            origin=Origin(len(session.source), self.rows, refitted=refit, adjusted=refit),
+            progress=self.progress,
+        )  # fmt: skip
+        if quick or not refit:
+            return draft.coded(self.progress)
+        frozen = draft.frozen(session.source, self.progress)
+        held = quantisation_aware_refit(
+            frozen, session.taught, session.wanted, session.options, steps=session.options.steps(_FILE_STEPS),
+            progress=self.progress,
+        )  # fmt: skip
+        shown = [replace(start, **vars(frozen.seen(values)), means_double=None) for values in (frozen.start(), held)]
+        if self.seen(shown[1]) < self.seen(shown[0]):  # steps of this length may be too long for a handful of splats
+            held, shown = frozen.start(), shown[:1]
+        self._check_psnr = session.checked.psnr(shown[-1])
+        return frozen.coded(held, self.progress)
+
+    def said(self, trial: Candidate | None) -> Mapping[str, Any]:
+        """Return the entry for a file's options: splats of the source, number of views, and PSNRs of the file."""
+        session = self.session
+        said = {"splats": len(session.source), "views": len(session.taught)}
+        figures = {} if trial is None else {"decided_psnr": round(trial.decided_psnr, 3)}
+        if trial is not None and trial.is_careful:
+            figures["check_psnr"] = round(self._check_psnr, 3)
+        return {"simplified": {**said, **figures}}
+
+    @cached_property
+    def _banded_psnr(self) -> float:
+        return self.seen(self.banded[0])
+
+    @cached_property
+    def _fitted(self) -> SplatModel:
+        session, steps = self.session, FIT_STEPS
+        start = session.source.select(self.rows)
+        if not (session.options.refit and self.gone):
+            return start
+        if self.before is not None:
+            start, steps = _with_values_of(self.before.model, self.before.rows, start, self.rows), _CARRIED_STEPS
+        self.before = None  # as large as the scene, and perhaps not used elsewhere
+        return self._adjusted(start, steps)
+
+    def _left_out(self, error: float) -> tuple[SplatModel, Mask]:
+        """Return the splats without the bands that are not worth their bits at a squared error, and the kept bands."""
+        session, model = self.session, self.model
+        stays = choose_bands(self._removal, error * self._removal.value_count / max(1, len(model)))
+        banded = drop_bands(model, stays)
+        if session.options.refit and not stays.all():
+            banded = self._adjusted(banded, BAND_STEPS, coefficient_mask(stays))
+        return banded, stays
+
+    def _adjusted(self, model: SplatModel, steps: int, free: Mask | None = None) -> SplatModel:
+        """Refit the splats; with `free`, only these SH coefficients beyond the first."""
+        session = self.session
+        return refit_splats(
+            model, session.taught, session.wanted, session.options, steps=session.options.steps(steps), free=free,
+            progress=self.progress,
+        )  # fmt: skip
+
+    def _importance(self, options: EncodeOptions, *, graded: bool) -> NDArray[Any] | Importance:
+        if graded and most_grades(len(self.rows), options) > 1 and (self.gradable or options.grades is not None):
+            return self._measured
+        weights = self._removal.squared_weight
+        return replace(self._measured, curvatures=None) if options.shape_codebook_size else weights
+
+    @cached_property
+    def _removal(self) -> PruningError:
+        """The error of removing each splat and each of its SH bands, and the weights of their colours."""
+        session = self.session
+        return measure_pruning_error(
+            self.model, session.views.used, background=session.options.background, threads=session.options.threads,
+            progress=self.progress,
+        )  # fmt: skip
+
+    @cached_property
+    def _measured(self) -> Importance:
+        """The importance of the splats, with Gauss–Newton blocks of the other attributes."""
+        session, count = self.session, _SENSITIVITY_VIEWS[self.model.sh_degree > 0]
+        found = measure_sensitivity(
+            self.model, evenly(session.views.used, count), background=session.options.background, magnitudes=False,
+            threads=session.options.threads, progress=self.progress,
+        )  # fmt: skip
+        return replace(StoredSensitivity.of(self.model, found).importance(), sh=self._removal.squared_weight)
+
+
+def _with_values_of(before: SplatModel, its_rows: I64, start: SplatModel, rows: I64) -> SplatModel:
+    """Return splats of the source with the values of another fit for those that it had; `rows` ascend."""
+    _, there, here = np.intersect1d(its_rows, rows, assume_unique=True, return_indices=True)
+
+    def carried(own: NDArray[np.float32], its: NDArray[np.float32]) -> NDArray[np.float32]:
+        own = own.copy()
+        own[here] = its[there]
+        return own
+
+    return replace(
+        start,
+        quats=carried(start.quats, before.quats),
+        scales=carried(start.scales, before.scales),
+        opacities=carried(start.opacities, before.opacities),
+        sh0=carried(start.sh0, before.sh0),
+        shN=carried(start.shN, before.shN),
+    )

@@ -1,0 +1,350 @@
+"""Run a sweep point by point; a point that fails does not stop the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+from csplat.encoder import PRESETS, EncodeOptions, EncodeResult, encode_with_report
+from csplat.errors import CsplatError, InputError, counted
+from csplat.inputs import File
+from csplat.model import SplatModel
+from csplat.types import Progress, null_progress
+from csplat_render.kernels import thread_count
+from csplat_render.metrics import Scores
+from csplat_tools.files.console import format_about, format_bytes
+from csplat_tools.files.extras import need_renderer
+from csplat_tools.optimise.target_encoding import encode_to
+from csplat_tools.study import Reduction, encode_reduced, parse_kmeans
+from csplat_tools.tradeoffs.machine import describe_machine
+from csplat_tools.tradeoffs.sweep_commands import encode_command, finetune_command, reduction_command, target_command
+from csplat_tools.tradeoffs.sweep_options import SweepOptions, SweepSetting, read_setting
+from csplat_tools.tradeoffs.sweep_points import (
+    DECODE_RUNS,
+    Measurer,
+    ModeTime,
+    PlannedPoint,
+    SweepFailure,
+    SweepFile,
+    SweepPoint,
+    pareto_front,
+)
+from csplat_tools.training.tuned_file import (
+    BYTE_COST,
+    LEARNING_FACTOR,
+    SHAPE_ENTRIES,
+    VIEW_SIZE,
+    VIEWS,
+    choose_and_finetune,
+    default_validation_count,
+)
+from csplat_tools.views import Colour, DataOptions, ViewSet, find_view_set
+from csplat_tools.views.viewset import pose
+from csplat_trainer.tuning import FinetuneOptions
+
+# Seconds by kind of point, on two cores: a fixed part (scores, and for presets those with fewer bands); per million
+# splats; and per second that eight renders of the source take. Only for the estimate that is shown to the user.
+_COSTS = {
+    "presets": (3.6, 12.0, 10.0),
+    "precision": (1.2, 12.0, 4.0),
+    "strategies": (1.2, 12.0, 4.0),
+    "k-means": (1.2, 250.0, 6.0),
+    "distilled": (1.2, 40.0, 80.0),
+    "targets": (1.2, 0.0, 362.5),  # 2,900 renders, see `optimiser`
+    "simplify": (1.2, 40.0, 250.0),
+    "finetune": (1.2, 100.0, 500.0),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Tradeoff:
+    """The results of a sweep.
+
+    Attributes:
+        setting: the scene and its views.
+        wanted: the options of the sweep.
+        points: all points, measured or failed, in the order of the sweep.
+        source_modes: times of rendering the source, by mode of the renderer.
+        source_photographs: the source's scores against photographs, if there are any.
+        machine: processor, system, versions.
+    """
+
+    setting: SweepSetting
+    wanted: SweepOptions
+    points: Sequence[SweepPoint | SweepFailure]
+    source_modes: dict[str, ModeTime]
+    source_photographs: Scores | None
+    machine: dict[str, Any]
+
+    @property
+    def measured(self) -> list[SweepPoint]:
+        """The points that were measured, the smallest file first."""
+        return sorted((one for one in self.points if isinstance(one, SweepPoint)), key=lambda one: one.size_bytes)
+
+    @property
+    def failures(self) -> list[SweepFailure]:
+        """The points that could not be measured."""
+        return [one for one in self.points if isinstance(one, SweepFailure)]
+
+    @property
+    def front(self) -> list[SweepPoint]:
+        """The points that no other one beats in size and `psnr`, the smallest file first."""
+        measured = self.measured
+        return [measured[place] for place in pareto_front([(one.size_bytes, one.psnr) for one in measured])]
+
+    @property
+    def photograph_front(self) -> list[SweepPoint]:
+        """The points that no other one beats in size and PSNR against photographs; empty without photographs."""
+        known = [one for one in self.measured if one.photograph_psnr is not None]
+        return [known[at] for at in pareto_front([(one.size_bytes, one.photograph_psnr or 0.0) for one in known])]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as JSON-compatible values."""
+        setting = self.setting
+        return {
+            "scene": {
+                "name": setting.name,
+                "size_bytes": setting.source_bytes,
+                "splats": len(setting.source),
+                "sh_degree": setting.source.sh_degree,
+                "defects": [str(one) for one in setting.findings],
+            },
+            "views": {
+                "cameras": setting.views.name,
+                "count": len(setting.views.judges),
+                "sizes": sorted({(camera.W, camera.H) for camera in setting.views.judges}),
+                "background": list(setting.views.judging_background),
+            },
+            "machine": self.machine,
+            "times": f"single runs; decoding: the median of {DECODE_RUNS}; rendering: the median over views",
+            "source": {
+                "render": {name: one.as_json() for name, one in self.source_modes.items()},
+                "photographs": None if self.source_photographs is None else self.source_photographs.as_json(),
+            },
+            "pareto": [one.name for one in self.front],
+            "pareto_photographs": [one.name for one in self.photograph_front],
+            "points": [one.as_json() for one in self.points],
+        }
+
+
+def tradeoff(
+    scene: SplatModel | File | SweepSetting,
+    wanted: SweepOptions | None = None,
+    *,
+    cameras: str | None = None,
+    data: DataOptions | None = None,
+    background: Colour | None = None,
+    lpips: str | None = None,
+    say: Callable[[str], None] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Tradeoff:
+    """Make and measure all files of a sweep, as `csplat tradeoff` does. Takes minutes, and requires the render extra.
+
+    Args:
+        scene: a model, or a file; or the `SweepSetting` of an earlier sweep, instead of this and all other inputs.
+        wanted: the points to measure; `None`: presets, precision, strategies, targets and simplification.
+        cameras, data, background: views by which files are chosen and scored, as for `find_view_set`; given by name,
+            so that the report can contain the command for each file.
+        lpips: a file of LPIPS weights, or `auto`; LPIPS is not computed if left out.
+        say: called with a line on the expected time, and with one for each file when it is measured.
+        progress: called with the stage and the fraction of it that is done, 0 to 1.
+
+    Returns:
+        All points, measured or failed; those on the Pareto front; and everything as JSON (`as_json`).
+
+    Examples:
+        >>> import csplat_tools
+        >>> found = csplat_tools.tradeoff("scene.ply", csplat_tools.SweepOptions(what=("presets",)))  # doctest: +SKIP
+        >>> [(point.name, point.size_bytes, point.psnr) for point in found.front]  # doctest: +SKIP
+
+    Raises:
+        InputError: there is nothing to sweep, or not one point could be measured.
+        CsplatError: a file is not valid.
+        OSError: a file cannot be read.
+    """
+    need_renderer()
+    if isinstance(scene, SweepSetting):
+        setting = scene
+    else:
+        setting = read_setting(scene, cameras=cameras, data=data, background=background, lpips=lpips)
+    wanted = wanted or SweepOptions()
+    report: Progress = progress or null_progress
+    tell = say or (lambda _line: None)
+    with thread_count(wanted.threads):
+        measurer = Measurer(setting, wanted.modes, wanted.threads)
+        tried = plan_points(setting, wanted)
+        if not tried:
+            raise InputError("nothing to sweep: what is asked for has no values")
+        costs = [estimated_seconds(one.cost or one.family, setting, wanted, measurer.source_modes) for one in tried]
+        tell(f"{counted(len(tried), 'file')} to make and to measure: about {format_about(sum(costs))} here")
+        points = list[SweepPoint | SweepFailure]()
+        for number, candidate in enumerate(tried):
+            report("the sweep", sum(costs[:number]) / sum(costs))
+            points.append(_measured(measurer, candidate, lambda _stage, done: report("this file", done)))
+            tell(_line(points[-1], number + 1, len(tried)))
+    first = points[0]
+    if isinstance(first, SweepFailure) and all(isinstance(one, SweepFailure) for one in points):
+        raise InputError(f"no point could be measured; {first.name}: {first.error}")
+    machine = describe_machine(wanted.threads)
+    return Tradeoff(setting, wanted, points, measurer.source_modes, measurer.source_photographs, machine)
+
+
+def estimated_seconds(kind: str, setting: SweepSetting, wanted: SweepOptions, modes: dict[str, ModeTime]) -> float:
+    """Estimate the seconds that a point of a kind takes, by the number of splats and the time of a render."""
+    each, by_splats, by_pictures = _COSTS[kind]
+    milliseconds = next((one.milliseconds for name, one in modes.items() if name != "exact"), 100.0)
+    steps = wanted.iterations / SweepOptions.iterations if kind == "finetune" else 1.0
+    return each + by_splats * len(setting.source) / 1e6 + by_pictures * steps * 8.0 * milliseconds / 1000.0
+
+
+def _measured(measurer: Measurer, candidate: PlannedPoint, progress: Progress) -> SweepPoint | SweepFailure:
+    try:
+        return measurer.measure(candidate, progress)
+    except CsplatError as error:
+        return SweepFailure(candidate.name, candidate.family, " ".join(str(error).split()))
+    except MemoryError:
+        return SweepFailure(candidate.name, candidate.family, "out of memory")
+
+
+def _line(point: SweepPoint | SweepFailure, number: int, count: int) -> str:
+    """Return a line on a point that has just been measured."""
+    if isinstance(point, SweepFailure):
+        return f"{number}/{count} {point.name}: {point.error}"
+    size, seconds = format_bytes(point.size_bytes), f"{point.encode_seconds:.1f} s"
+    return f"{number}/{count} {point.name}: {size}, {point.psnr:.2f} dB, {seconds}"
+
+
+_MOST_DISTILLED = 2  # number of SH degrees that are distilled, 0 and 1: each takes as long as a simplification
+
+
+def plan_points(setting: SweepSetting, wanted: SweepOptions) -> list[PlannedPoint]:
+    """List the candidates, quick ones first."""
+    makers = {
+        "presets": _presets,
+        "precision": _precisions,
+        "strategies": _strategies,
+        "targets": _targets,
+        "simplify": _simplified,
+        "finetune": _tuned,
+    }
+    return [one for family, list_of in makers.items() if family in wanted.what for one in list_of(setting, wanted)]
+
+
+def _presets(setting: SweepSetting, wanted: SweepOptions) -> Iterator[PlannedPoint]:
+    for preset in PRESETS:
+        options = EncodeOptions(preset=preset, threads=wanted.threads)
+        command = encode_command(setting, preset, preset)
+        has_bands = setting.source.sh_degree > 0
+        yield PlannedPoint(preset, "presets", command, partial(_encode, setting.source, options), is_partial=has_bands)
+
+
+def _precisions(setting: SweepSetting, wanted: SweepOptions) -> Iterator[PlannedPoint]:
+    for decibels in wanted.attribute_psnr:
+        name = f"attributes {decibels:g} dB"
+        options = EncodeOptions(preset=wanted.preset, attribute_psnr=decibels, threads=wanted.threads)
+        command = encode_command(setting, name, wanted.preset, attribute_psnr=decibels)
+        yield PlannedPoint(name, "precision", command, partial(_encode, setting.source, options))
+
+
+def _strategies(setting: SweepSetting, wanted: SweepOptions) -> Iterator[PlannedPoint]:
+    """Yield candidates that reduce bands, splats and values by simple rules; those that need renders come last."""
+
+    def strategy(name: str, reduction: Reduction, cost: str = "strategies") -> PlannedPoint:
+        how = replace(reduction, threads=wanted.threads)
+        command = reduction_command(setting, name, wanted.preset, reduction)
+        return PlannedPoint(name, "strategies", command, partial(_reduce, setting, wanted, how), cost=cost)
+
+    degree = setting.source.sh_degree
+    for kept in reversed(range(degree)):
+        options = EncodeOptions(preset=wanted.preset, sh_degree=kept, threads=wanted.threads)
+        command = encode_command(setting, f"SH {kept}", wanted.preset, sh_degree=kept)
+        yield PlannedPoint(f"SH {kept}", "strategies", command, partial(_encode, setting.source, options))
+    for tau in wanted.opacities:
+        yield strategy(f"opacity > {tau:g}", Reduction(prune_opacity=tau))
+    if degree and wanted.opacities:
+        tau = wanted.opacities[-1]
+        yield strategy(f"SH 0, opacity > {tau:g}", Reduction(prune_opacity=tau, sh_degree=0))
+    for entries in wanted.kmeans:
+        yield strategy(f"k-means {entries:g}", Reduction(kmeans=parse_kmeans(f"{entries:g}")), "k-means")
+    for kept in reversed(range(min(degree, _MOST_DISTILLED))):
+        yield strategy(f"SH {kept}, distilled", Reduction(sh_degree=kept, distil=True), "distilled")
+
+
+def _targets(setting: SweepSetting, wanted: SweepOptions) -> Iterator[PlannedPoint]:
+    for psnr in wanted.psnr:
+        yield _target(setting, wanted, f"target {psnr:g} dB", psnr=psnr)
+    for size in wanted.sizes:
+        yield _target(setting, wanted, f"target {format_bytes(size)}", size=size)
+
+
+def _target(
+    setting: SweepSetting, wanted: SweepOptions, name: str, psnr: float | None = None, size: int | None = None
+) -> PlannedPoint:
+    command = target_command(setting, name, wanted.preset, target_psnr=psnr, target_size=size)
+    return PlannedPoint(name, "targets", command, partial(_reach, setting, wanted, psnr=psnr, size=size))
+
+
+def _simplified(setting: SweepSetting, wanted: SweepOptions) -> Iterator[PlannedPoint]:
+    for keep in wanted.keep:
+        command = target_command(setting, f"keep {keep:g}", wanted.preset, keep=keep)
+        yield PlannedPoint(f"keep {keep:g}", "simplify", command, partial(_reach, setting, wanted, keep=keep))
+
+
+def _tuned(setting: SweepSetting, wanted: SweepOptions) -> Iterator[PlannedPoint]:
+    one_keep = wanted.keep[len(wanted.keep) // 2 :][:1]  # the middle one alone: each takes minutes
+    for keep in (None, *one_keep):
+        name = "tuned" if keep is None else f"tuned, keep {keep:g}"
+        command = finetune_command(setting, name, wanted, keep)
+        yield PlannedPoint(name, "finetune", command, partial(_tune, setting, wanted, keep))
+
+
+def _encode(source: SplatModel, options: EncodeOptions, progress: Progress) -> SweepFile:
+    return _made(encode_with_report(source, options, progress=progress))
+
+
+def _reduce(setting: SweepSetting, wanted: SweepOptions, reduction: Reduction, progress: Progress) -> SweepFile:
+    return _made(
+        encode_reduced(
+            setting.source, reduction, EncodeOptions(preset=wanted.preset, threads=wanted.threads),
+            views=setting.views, progress=progress,
+        )
+    )  # fmt: skip
+
+
+def _reach(setting: SweepSetting, wanted: SweepOptions, progress: Progress, **asked: Any) -> SweepFile:
+    options = EncodeOptions(preset=wanted.preset, threads=wanted.threads)
+    found = encode_to(setting.source, views=setting.views, options=options, progress=progress, **asked)
+    return _made(found.result, target=found.report.as_json())
+
+
+def _made(result: EncodeResult, **said: Any) -> SweepFile:
+    return SweepFile(result.data, {"encoding": result.report.options, **said})
+
+
+def _tune(setting: SweepSetting, wanted: SweepOptions, keep: float | None, progress: Progress) -> SweepFile:
+    """Make the file of `csplat finetune` with its default options."""
+    itself = not setting.views.photographs
+    encoding = EncodeOptions(preset=wanted.preset, shape_codebook_size=SHAPE_ENTRIES, threads=wanted.threads)
+    options = FinetuneOptions(iterations=wanted.iterations, byte_cost=BYTE_COST[itself])
+    tuned = choose_and_finetune(
+        setting.source, _tuning_views(setting), encoding, options.scaled(LEARNING_FACTOR[itself]), keep=keep,
+        progress=progress,
+    )  # fmt: skip
+    made = tuned.made
+    said = {"steps": made.log["steps"], "best_step": made.log["best_iteration"], "keep": keep, **tuned.chosen.said}
+    return SweepFile(made.data, {"encoding": made.result.report.options, "finetune": said}, tuned.seconds)
+
+
+def _tuning_views(setting: SweepSetting) -> ViewSet:
+    """Return the views of `csplat finetune`: all photographs that are not test views, or more virtual views."""
+    views = setting.views
+    if views.photographs:  # which are in memory already
+        judging = {pose(camera) for camera in views.judges}
+        teaches = [one.camera for one in views.photographs if pose(one.camera) not in judging]
+        return replace(views, teaches=teaches, decides=())
+    return find_view_set(
+        setting.source, cameras=setting.cameras, background=setting.background, count=VIEWS, size=VIEW_SIZE,
+        aside=default_validation_count(VIEWS, cameras=setting.cameras, data=None),
+    )  # fmt: skip

@@ -1,0 +1,220 @@
+"""Train a scene from a data set, and write a PLY, or a file tuned to the same photographs: `csplat train`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import csplat_trainer
+from csplat.encoder import EncodeOptions
+from csplat.errors import InputError, counted
+from csplat.training_record import TrainingRecord
+from csplat_render.kernels import thread_count
+from csplat_render.lpips import load_lpips
+from csplat_tools.files.console import note, step_progress
+from csplat_tools.files.extras import prepare_renderer
+from csplat_tools.files.facts import SceneOverrides
+from csplat_tools.files.streams import write_model
+from csplat_tools.training.training_page import show_views, write_training_page
+from csplat_tools.training.tuned_file import BYTE_COST, default_validation_count, run_finetuning
+from csplat_tools.views import DataOptions, find_view_set
+from csplat_trainer.checkpoint import load_checkpoint
+from csplat_trainer.data import DataSet, load
+from csplat_trainer.options import TrainOptions
+from csplat_trainer.outputs import Outputs, TrainResult
+from csplat_trainer.perceptual import PerceptualLoss
+from csplat_trainer.report import TrainingStep, plot_loss
+from csplat_trainer.tuning import FinetuneOptions
+
+_TUNING = 1 / 6  # steps of the tuning that follows a training, as a fraction of the training's steps
+_BRIEF = 4_000  # training steps up to which a tuning uses full learning rates: after longer training they gain nothing
+
+
+def run_training(
+    data: DataOptions,
+    output: str,
+    options: TrainOptions,
+    files: Outputs,
+    *,
+    facts: SceneOverrides | None = None,
+    plot: str | None = None,
+    page: str | None = None,
+    threads: int | None = None,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Read a data set, train, write the scene.
+
+    Args:
+        data: the data set; every eighth image is held out if it does not specify test images.
+        output: the PLY to write, or `-`.
+        options: options of the training.
+        files: files that are written and read during training.
+        facts: overrides of the metadata that the set provides.
+        plot: a PNG to write with the loss over the steps.
+        page: an HTML report to write.
+        threads: number of threads; `None` for all.
+        quiet: print nothing.
+
+    Returns:
+        Options, losses and figures, JSON-compatible.
+
+    Raises:
+        InputError: a package or the data set is missing, or does not suit the options.
+        OSError: a file cannot be read or written.
+    """
+    result = _trained(data, options, files, plot=plot, threads=threads, quiet=quiet)
+    model = (facts or SceneOverrides()).applied(result.model)
+    write_model(output, model, absolute=False)
+    if page is not None:
+        views = find_view_set(model, data=data, aside=0)
+        write_training_page(page, output, result.log, None, show_views(model, {"trained scene": model}, views, threads))
+    if not quiet:
+        note(f"{output} says how to compare it with its photographs: {TrainingRecord.of(result.model.metadata)}")
+    return result.log
+
+
+def run_training_to_file(
+    data: DataOptions,
+    output: str,
+    options: TrainOptions,
+    files: Outputs,
+    encoding: EncodeOptions,
+    tuning: FinetuneOptions,
+    *,
+    size_bytes: int | None = None,
+    psnr: float | None = None,
+    facts: SceneOverrides | None = None,
+    plot: str | None = None,
+    page: str | None = None,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Read a data set, train, and tune a file to the same photographs; the trained scene itself is not written.
+
+    Args:
+        data, options, facts, plot, page, quiet: as for `run_training`.
+        output: the `.csplat` file to write, or `-`.
+        files: as for `run_training`; checkpoints of the tuning are next to those of the training
+            (`tuning_checkpoint`), and a run goes on from them if the training had ended.
+        encoding: options of the encoder; its number of threads applies to everything.
+        tuning: options of the tuning.
+        size_bytes: largest size of the file.
+        psnr: as for `run_finetuning`.
+
+    Returns:
+        `training`, as `run_training` returns it, and `file`, as `run_finetuning` does.
+
+    Raises:
+        InputError: as for both.
+        OSError: a file cannot be read or written.
+    """
+    further = _tuning_outputs(files, options)
+    for one in _loaded(data).val:  # finds a damaged image before training; they are not kept
+        _ = one.pixels, one.mask
+    result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
+    model = (facts or SceneOverrides()).applied(result.model)
+    views = find_view_set(model, data=data, aside=default_validation_count(0, cameras=None, data=data))
+    known = None
+    if result.metrics is not None and options.eval_views == 0 and options.device == "cpu":
+        known = {"source": {**result.metrics, "lpips": None}}
+    report = run_finetuning(
+        model, views, output, encoding, tuning, further, size_bytes=size_bytes, psnr=psnr, known=known, page=page,
+        training=result.log, quiet=quiet,
+    )  # fmt: skip
+    return {"training": result.log, "file": report}
+
+
+def tuning_after(training: TrainOptions, byte_cost: float | None = None) -> FinetuneOptions:
+    """Return the options of the tuning after a training: the longer it was, the more and the smaller steps.
+
+    Args:
+        training: options of the training.
+        byte_cost: rate weight of a bit per splat in the loss; `None`: the default.
+
+    Raises:
+        InputError: the weight is out of its range.
+    """
+    usual = FinetuneOptions(seed=training.seed, byte_cost=BYTE_COST[False] if byte_cost is None else byte_cost)
+    tuning = usual.scaled(min(1.0, _BRIEF / training.iterations))
+    steps = max(usual.iterations, round(_TUNING * training.iterations))
+    return replace(tuning, iterations=steps, lr_exposure=training.lr_exposure)
+
+
+def tuning_checkpoint(path: str | Path) -> Path:
+    """Return the path of the tuning's checkpoint from that of the training's: run.tuning.npz for run.npz."""
+    return Path(f"{str(path).removesuffix('.npz')}.tuning.npz")
+
+
+def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
+    """Return the checkpoints of the tuning.
+
+    The tuning resumes from its own checkpoint if the run resumes from the one that it writes, and the training had
+    ended. A run that writes no checkpoint, or to another path, makes another file of the same training.
+    """
+    checkpoint = None if files.checkpoint is None else tuning_checkpoint(files.checkpoint)
+    tuned = Outputs(checkpoint, files.checkpoint_every)
+    if files.resume is None or checkpoint is None or not checkpoint.exists():
+        return tuned
+    same = Path(str(files.checkpoint)).resolve() == Path(files.resume).resolve()
+    ended = load_checkpoint(files.resume).iteration >= options.iterations
+    return replace(tuned, resume=checkpoint) if same and ended else tuned
+
+
+def _trained(
+    data: DataOptions, options: TrainOptions, files: Outputs, *, plot: str | None, threads: int | None, quiet: bool
+) -> TrainResult:
+    """Read the data set, train, plot the loss, and print a summary."""
+    _check_inputs(options, files)
+    pictures = _loaded(data)
+    for line in () if quiet else pictures.report:
+        note(line)
+    pictures.read()  # finds a damaged image before kernels are compiled
+    with thread_count(threads):
+        if options.device == "cpu":
+            prepare_renderer(quiet=quiet, gradients=True)
+        with step_progress("training", _state, quiet=quiet) as show:
+            result = csplat_trainer.train(pictures, options, outputs=files, on_step=show)
+    if plot is not None:
+        plot_loss(plot, result.log["losses"], Path(data.path).name)
+    if not quiet:
+        note(_summary(result.log, result.metrics))
+    return result
+
+
+def _loaded(data: DataOptions) -> DataSet:
+    """Load the data set; every eighth image is held out if neither the user nor the set specifies test images."""
+    every = 8 if data.test_every is None else data.test_every
+    return load(data.path, data.size, images=data.images, test_every=every, near=data.near)
+
+
+def _check_inputs(options: TrainOptions, files: Outputs) -> None:
+    """Check the small inputs, before the data set is read and kernels are compiled, which takes long.
+
+    Raises:
+        InputError: weights, checkpoint or torch are absent or damaged, or the path of early renders is not a folder.
+    """
+    if options.lpips_weight > 0.0:
+        PerceptualLoss(load_lpips(files.lpips_weights))
+    elif files.lpips_weights is not None:
+        load_lpips(files.lpips_weights)
+    if files.resume is not None:
+        load_checkpoint(files.resume)
+    if files.previews is not None and Path(files.previews).exists() and not Path(files.previews).is_dir():
+        raise InputError(f"{files.previews} is not a folder")
+
+
+def _state(now: TrainingStep) -> str:
+    return (
+        f"{now.iteration}/{now.iterations}: loss {now.loss:.4f}, PSNR {now.psnr:.2f} dB,"
+        f" {counted(now.splat_count, 'splat')}, SH {now.sh_degree}, {now.seconds:.0f} s, {now.seconds_left:.0f} s left"
+    )
+
+
+def _summary(log: dict[str, Any], metrics: dict[str, Any] | None) -> str:
+    text = f"{counted(log['splat_count'], 'splat')} after {counted(len(log['losses']), 'step')}, {log['seconds']:.1f} s"
+    if metrics is None:
+        return text + "; no test pictures"
+    text += f"; {counted(metrics['views'], 'test picture')}: PSNR {metrics['psnr']:.2f} dB pooled,"
+    text += f" {metrics['psnr_mean']:.2f} mean"
+    text += f", SSIM {metrics['ssim']:.4f}"
+    return text + (f", LPIPS {metrics['lpips']:.4f}" if metrics["lpips"] is not None else "")
