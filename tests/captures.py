@@ -16,7 +16,7 @@ from csplat_render.scorer import renderer
 from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.optimise.target_encoding import encode_to
 from csplat_tools.views import BLACK, ViewSet, camera_sequence, find_view_set, with_deciders
-from csplat_trainer.pictures import Picture
+from csplat_trainer.posed_images import PosedImage
 
 W, H = 48, 40
 
@@ -131,7 +131,7 @@ def photographed(scene):
     seen_from = camera_sequence(scene, 48, SMALL, seed=3)
     rng, draw = np.random.default_rng(1), renderer(scene, BLACK)
     noisy = [np.clip(draw(c).rgb + 0.06 * rng.standard_normal((c.H, c.W, 3)), 0, 1) for c in seen_from]
-    pictures = [Picture(c, np.rint(255.0 * p).astype(np.uint8)) for c, p in zip(seen_from, noisy, strict=True)]
+    pictures = [PosedImage(c, np.rint(255.0 * p).astype(np.uint8)) for c, p in zip(seen_from, noisy, strict=True)]
     teaches = [camera for number, camera in enumerate(seen_from) if number % 8]
     return ViewSet("made", BLACK, teaches, (), seen_from[::8], pictures)
 

@@ -19,10 +19,9 @@ from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.optimise.pruning import Simplified, simplify
 from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_trainer.data import DataSet
-from csplat_trainer.loop import train
-from csplat_trainer.options import TrainOptions
-from csplat_trainer.outputs import TrainResult
-from csplat_trainer.pictures import Picture
+from csplat_trainer.posed_images import PosedImage
+from csplat_trainer.training_loop import train
+from csplat_trainer.training_options import TrainOptions, TrainResult
 from csplat_trainer.tuning import FinetuneOptions, FinetuneResult, renders_of, split_views, tune
 
 SMALL = (160, 120)
@@ -66,7 +65,7 @@ def photographs_of(model: SplatModel, cameras: list[Camera], points: np.ndarray 
     rasteriser, shots = Rasteriser(gradients=False), []
     for camera in cameras:
         pixels = np.clip(rasteriser.forward(model, camera).rgb, 0.0, 1.0)
-        shots.append(Picture(camera, np.rint(pixels * 255).astype(np.uint8)))
+        shots.append(PosedImage(camera, np.rint(pixels * 255).astype(np.uint8)))
     count = 3 * len(shots) // 4
     return DataSet("made", shots[:count], shots[count:], points)
 

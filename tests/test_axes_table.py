@@ -25,8 +25,8 @@ from posed_sets import write_blender, write_colmap_set, write_transforms
 from csplat_render import render
 from csplat_render.camera_paths import orbit_cameras
 from csplat_trainer.data import load
-from csplat_trainer.loop import train
-from csplat_trainer.options import TrainOptions
+from csplat_trainer.training_loop import train
+from csplat_trainer.training_options import TrainOptions
 
 pytestmark = pytest.mark.slow  # each case takes a third of a second
 

@@ -12,12 +12,11 @@ from test_train_loop import QUICK, photographs, resumed_as_if_never_stopped
 from csplat.encoder import Draft, EncodeOptions
 from csplat.errors import InputError
 from csplat_trainer.data import DataSet
-from csplat_trainer.exposure import Exposure, Exposures
-from csplat_trainer.loop import train
-from csplat_trainer.loss import PhotometricLoss
-from csplat_trainer.options import TrainOptions
-from csplat_trainer.outputs import Outputs
-from csplat_trainer.tuning import FinetuneOptions, View, Views, tune
+from csplat_trainer.image_gains import ImageGain, ImageGains
+from csplat_trainer.losses import PhotometricLoss
+from csplat_trainer.training_loop import train
+from csplat_trainer.training_options import Outputs, TrainOptions
+from csplat_trainer.tuning import FinetuneOptions, TuningView, TuningViews, tune
 
 GAINS = np.array([0.7, 1.3, 0.8, 1.2, 0.9, 1.1, 0.75, 1.25, 1.0])  # of training photographs; test: 1
 LONGER = {**QUICK, "iterations": 300, "refine_every": 50, "lr_means": 2e-3, "background": "black"}
@@ -40,9 +39,9 @@ def uneven(data):
 def test_slopes_are_those_of_the_loss_with_the_correction():
     rng = np.random.default_rng(0)
     seen, photograph = (rng.random((20, 24, 3)).astype(np.float32) for _ in range(2))
-    exposures, loss = Exposures(2), PhotometricLoss(20, 24)
+    exposures, loss = ImageGains(2), PhotometricLoss(20, 24)
     exposures.values[0] = rng.uniform(-0.3, 0.3, (2, 3))
-    one, moved = Exposure(exposures, 0, 0.0), []
+    one, moved = ImageGain(exposures, 0, 0.0), []
     exposures.move = lambda number, slope, rate: moved.append((number, slope, rate))  # type: ignore[method-assign]
     slope = one.learnt(seen, loss(one.applied(seen), photograph.copy())[1].copy()).copy()
 
@@ -88,8 +87,8 @@ def test_a_gpu_learns_none(uneven):
 def test_tuning_corrects_exposures_too(make_model, uneven):
     scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))  # that was photographed
     frozen = Draft.of(scene, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)).frozen()
-    teach, judge = ([View(one.camera, one) for one in part] for part in (uneven.train, uneven.test))
-    views = Views(teach, judge, np.zeros(3, np.float32))
+    teach, judge = ([TuningView(one.camera, one) for one in part] for part in (uneven.train, uneven.test))
+    views = TuningViews(teach, judge, np.zeros(3, np.float32))
     plain, corrected = (
         tune(frozen, views, FinetuneOptions(iterations=200, validate_every=50, patience=0, lr_exposure=rate)).log
         for rate in (0.0, 0.05)

@@ -39,12 +39,12 @@ from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.optimise.pruning import simplify
 from csplat_tools.optimise.target_encoding import encode_to
 from csplat_tools.views import find_view_set
-from csplat_trainer.data.colmap_files import read_points
-from csplat_trainer.loop import train
+from csplat_trainer.data.colmap import read_points
 from csplat_trainer.parameters import Parameters, from_model
-from csplat_trainer.resume import adapt
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
+from csplat_trainer.training_checkpoint import fit_to_options
+from csplat_trainer.training_loop import train
 from csplat_trainer.tuning import renders_of, split_views, tune
 
 pytestmark = [
@@ -186,7 +186,7 @@ def test_splats_that_start_in_one_place_are_as_large_as_if_they_filled_the_scene
 def test_a_checkpoint_of_exploded_splats_goes_on_with_those_most_visible():
     model = learnt_from("exploded")
     parameters = Parameters.starting_at(from_model(model, 1))
-    left = adapt(parameters, replace(QUICK, max_splats=40), np.random.default_rng(0))
+    left = fit_to_options(parameters, replace(QUICK, max_splats=40), np.random.default_rng(0))
     largest = {tuple(row) for row in model.means[[44, 46]].tolist()}
     assert 40 == len(left)
     assert largest <= {tuple(row) for row in left.values["means"].tolist()}

@@ -21,6 +21,7 @@ pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'cspl
 
 # Importing them needs what is looked for above.
 from captures import H, W, cameras, photograph, shell
+from csplat_tools.optimise.simplify import SimplifyOptions
 
 import csplat
 import csplat_trainer
@@ -34,15 +35,20 @@ from csplat_render.conventions import SplatArrays
 from csplat_render.rasteriser import Rasteriser
 from csplat_tools.cli.app import app
 from csplat_tools.cli.finetune import finetune as finetune_command
-from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.training.tuned_file import smallest_reaching
 from csplat_tools.training.tuning_report import ply_splat_bytes
-from csplat_trainer.loss import PhotometricLoss
-from csplat_trainer.pictures import Picture
-from csplat_trainer.tuning import FinetuneOptions, View, Views, renders_of, split_views, tune
-from csplat_trainer.tuning.budget import Budget
-from csplat_trainer.tuning.rate import Costs, colour_integers_of, cost_slopes
-from csplat_trainer.tuning.state import TunedScene, sum_by_entry, sum_by_entry_twin
+from csplat_trainer.losses import PhotometricLoss
+from csplat_trainer.posed_images import PosedImage
+from csplat_trainer.tuning import FinetuneOptions, TuningView, TuningViews, renders_of, split_views, tune
+from csplat_trainer.tuning.tuned_scene import (
+    RateTerm,
+    TunedScene,
+    colour_integers_of,
+    cost_slopes,
+    sum_by_entry,
+    sum_by_entry_twin,
+)
+from csplat_trainer.tuning.tuning_loop import RateController
 
 BLACK = np.zeros(3, np.float32)
 QUICK = FinetuneOptions(iterations=30, warm_up=5, validate_every=10, log_every=5)
@@ -138,8 +144,8 @@ def test_pixels_that_do_not_count_teach_nothing(coarse, views):
             buffer = np.empty((*mask.shape, 3), np.float32)
             pixels = np.rint(255.0 * np.clip(one.picture(BLACK, buffer), 0.0, 1.0)).astype(np.uint8)
             pixels[~mask] = value
-            shown.append(View(one.camera, Picture(one.camera, pixels, mask)))
-        return Views(shown, shown[:2], BLACK)
+            shown.append(TuningView(one.camera, PosedImage(one.camera, pixels, mask)))
+        return TuningViews(shown, shown[:2], BLACK)
 
     first, second = (tune(coarse, hidden(value), FEW) for value in (0, 250))
     assert np.array_equal(first.held.sh0, second.held.sh0)
@@ -196,7 +202,7 @@ def test_a_run_whose_files_are_too_large_yet_goes_on(fine, monkeypatch):
     frozen, views = fine
     options = replace(FEW, iterations=30, patience=2, byte_cost=0.0).scaled(5.0)
     assert tune(frozen, views, options, size_bytes=10**9).log["settled"]
-    monkeypatch.setattr(Budget, "overdrawn", lambda *_: 1e-3)
+    monkeypatch.setattr(RateController, "overdrawn", lambda *_: 1e-3)
     assert 30 == tune(frozen, views, options, size_bytes=10**9).log["steps"]
 
 
@@ -329,7 +335,7 @@ def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, g
 def test_a_weight_of_bytes_is_loss_per_bit_and_splat(coarse):
     scene = TunedScene(coarse)
     seen, _ = scene.seen()
-    costs = Costs.counted(scene.frozen, scene.stored(seen), 2e-4)
+    costs = RateTerm.counted(scene.frozen, scene.stored(seen), 2e-4)
     assert costs.loss == pytest.approx(2e-4 * costs.bits / 300)
     assert 5 < costs.bits / 300 < 200
 
@@ -390,13 +396,13 @@ def test_bytes_cost_what_keeps_a_file_to_its_size(source, views, tmp_path):
 
 
 def test_a_file_that_is_too_large_adds_its_excess_to_the_loss():
-    budget = Budget(1_000, 1e-4)
+    budget = RateController(1_000, 1e-4)
     assert (0.0, 0.0, 0.25) == tuple(budget.overdrawn(size, 4_000.0) for size in (900, 1_000, 1_250))
 
 
 def test_bytes_that_are_free_at_first_are_dear_in_time():
     """A scene whose bits grow while values move far, unless they cost what a run begins with."""
-    budget, bits = Budget(100_000, 1e-4), 470_000.0
+    budget, bits = RateController(100_000, 1e-4), 470_000.0
     for count in range(20):
         done = count / 20
         budget.overdrawn(round(37_500 + bits / 8), bits)
@@ -505,18 +511,18 @@ def test_renders_that_teach_are_those_of_the_source(source):
         found = view.picture(BLACK, np.empty((H, W, 3), np.float32))
         assert np.allclose(found, np.clip(wanted, -6e4, 6e4), rtol=6e-4, atol=1e-6)
     with pytest.raises(InputError, match="wanted picture has shape"):
-        View(camera, np.zeros((1, 1, 3), np.float32))
+        TuningView(camera, np.zeros((1, 1, 3), np.float32))
 
 
 def test_views_that_judge_teach_unless_they_are_kept_aside():
-    views = [View(camera, np.zeros((H, W, 3), np.float32)) for camera in cameras(20)]
+    views = [TuningView(camera, np.zeros((H, W, 3), np.float32)) for camera in cameras(20)]
     together, apart = split_views(views, BLACK), split_views(views, BLACK, aside=4)
     assert (20, 16, False) == (len(together.train), len(together.validation), together.kept_aside)
     assert (16, 4, True) == (len(apart.train), len(apart.validation), apart.kept_aside)
     with pytest.raises(InputError, match="leave none"):
         split_views(views, BLACK, aside=20)
     with pytest.raises(InputError, match="at least one view"):
-        Views([], [], BLACK)
+        TuningViews([], [], BLACK)
 
 
 # the command
@@ -625,7 +631,7 @@ def test_a_file_that_is_not_what_was_tuned_is_not_written(capture, tmp_path, mon
         model = decode(data)
         return replace(model, sh0=model.sh0 + np.float32(1e-6))
 
-    monkeypatch.setattr("csplat_trainer.tuning.finetuning.decode", wrong)
+    monkeypatch.setattr("csplat_trainer.tuning.tuned_file.decode", wrong)
     out = tmp_path / "s.csplat"
     result = invoke("finetune", capture / "scene.ply", "--data", capture, "-o", out, *BRIEF)
     assert "holds other sh0 than were tuned" in str(result.exception)
@@ -889,16 +895,16 @@ def test_cameras_that_see_nothing_are_refused(source, tmp_path):
 def test_a_trained_scene_loses_less_when_tuned(data_dir):
     """Lego with few splats, coarse: tuning by photographs regains most of what quantisation lost."""
     from csplat_trainer.data import load
-    from csplat_trainer.loop import train
-    from csplat_trainer.options import TrainOptions
+    from csplat_trainer.training_loop import train
+    from csplat_trainer.training_options import TrainOptions
 
     data = load(data_dir / "images" / "lego200", (64, 64))
     model = train(data, TrainOptions(max_splats=1500, iterations=500, sh_degree=1)).model
     white = np.ones(3, np.float32)
-    views = split_views([View(picture.camera, picture) for picture in data.train], white)
+    views = split_views([TuningView(picture.camera, picture) for picture in data.train], white)
     frozen = Draft.of(model, EncodeOptions(preset="small", attribute_psnr=34.0)).frozen()
     tuned = tune(frozen, views, FinetuneOptions(iterations=400))
-    judges = [View(one.camera, one) for one in data.test[::10]]
+    judges = [TuningView(one.camera, one) for one in data.test[::10]]
 
     def score(scene):
         error = []

@@ -24,8 +24,7 @@ from csplat.encoder.plan import make_plan
 from csplat.encoder.quantise import opacity_levels, quat_levels
 from csplat.errors import InputError
 from csplat.model import normalise_quats
-from csplat_trainer.tuning.rate import cost_slopes
-from csplat_trainer.tuning.state import TunedScene
+from csplat_trainer.tuning.tuned_scene import TunedScene, cost_slopes
 
 ROOT = Path(__file__).resolve().parent.parent
 COUNT = 5_000  # splats, enough for several grades

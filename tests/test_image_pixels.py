@@ -17,7 +17,7 @@ from posed_sets import H, W, assert_dots_are_where_points_fall, change_transform
 from tables import failures
 
 from csplat_trainer.data import load
-from csplat_trainer.data.image_pixels import mask_values, opened_image, read_head, rgb_pixels
+from csplat_trainer.data.image_pixels import mask_values, open_image, read_image_header, rgb_pixels
 
 RAMP = np.linspace(0.0, 1.0, W * H).reshape(H, W)  # 0 to 1 in every kind
 GREY = np.rint(255.0 * RAMP).astype(np.uint8)
@@ -161,7 +161,7 @@ REFUSED = {
 
 
 def pixels_of(path):
-    with opened_image(path) as image:
+    with open_image(path) as image:
         return rgb_pixels(image, path)
 
 
@@ -172,8 +172,8 @@ def test_every_kind_of_pixel_is_read_for_what_it_means(tmp_path):
         write(path)
         found = pixels_of(path)
         assert np.uint8 == found.dtype
-        assert read_head(path).has_alpha == (found.shape[2] == 4)
-        assert (W, H) == read_head(path).size
+        assert read_image_header(path).has_alpha == (found.shape[2] == 4)
+        assert (W, H) == read_image_header(path).size
         if isinstance(wanted, tuple):
             assert wanted == found.shape
             return
@@ -276,7 +276,7 @@ def test_masks_of_every_kind_count_the_same(tmp_path):
         image, told = case
         path = tmp_path / "mask.tif"
         image.save(path)
-        with opened_image(path) as opened:
+        with open_image(path) as opened:
             found = mask_values(opened, path)
         assert ((found.values >= 128) == SHAPE).all()
         assert told == bool(found.taken_as)

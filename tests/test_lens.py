@@ -17,7 +17,7 @@ from posed_sets import cameras, write_colmap, write_picture
 from tables import failures
 
 from csplat_trainer.data import load
-from csplat_trainer.data.colmap_files import read_cameras
+from csplat_trainer.data.colmap import read_cameras
 from csplat_trainer.data.lens import Lens, distorted, undistorted_lens
 
 W, H = 120, 90

@@ -22,8 +22,7 @@ from csplat_render import render  # noqa: E402
 from csplat_render.camera import intrinsics, look_at, relative_to  # noqa: E402
 from csplat_tools.inspect.compare import compare  # noqa: E402
 from csplat_tools.views import DataOptions, find_view_set  # noqa: E402
-from csplat_trainer.evaluate import photograph_judge  # noqa: E402
-from csplat_trainer.pictures import Picture  # noqa: E402
+from csplat_trainer.posed_images import PosedImage, photograph_scorer  # noqa: E402
 
 W, H = 64, 48
 
@@ -167,8 +166,8 @@ def test_cameras_and_data_exclude_each_other(files, tmp_path):
 def test_a_photograph_is_shown_in_front_of_the_background():
     pixels = np.zeros((1, 2, 4), np.uint8)
     pixels[0, 1] = (255, 0, 0, 51)
-    picture = Picture(replace(cameras(1)[0], W=2, H=1), pixels)
-    look = photograph_judge([picture], (0.0, 1.0, 1.0)).look(0)
+    picture = PosedImage(replace(cameras(1)[0], W=2, H=1), pixels)
+    look = photograph_scorer([picture], (0.0, 1.0, 1.0)).look(0)
     shown = look.picture
     assert [[False, False]] == look.covered.tolist()
     assert np.float32 == shown.dtype
@@ -182,7 +181,7 @@ def test_pixels_that_do_not_count_are_not_judged(scene):
     mask = np.zeros((H, W), bool)
     mask[:, : W // 4] = True
     wanted[0][~mask] = 255
-    judge = photograph_judge([Picture(taken[0], wanted[0], mask), Picture(taken[1], wanted[1])], (0.0, 0.0, 0.0))
+    judge = photograph_scorer([PosedImage(taken[0], wanted[0], mask), PosedImage(taken[1], wanted[1])], (0.0, 0.0, 0.0))
     squares = [np.square(one - two / 255.0) for one, two in zip(seen, wanted, strict=True)]
     errors = np.array([squares[0][mask].mean(), squares[1].mean()])
     expected = np.average(errors, weights=[mask.sum(), H * W])

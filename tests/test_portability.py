@@ -33,7 +33,7 @@ from csplat_selftest.mutation import __main__ as mutation
 from csplat_tools.batches.batch_scenes import leads_out
 from csplat_tools.batches.batch_worker import Worker, WorkerLostError
 from csplat_tools.batches.journal import JOURNAL, Record, open_journal, read_journal
-from csplat_trainer.report import peak_memory
+from csplat_trainer.training_report import peak_memory
 
 ROOT = Path(__file__).resolve().parent.parent
 PRODUCT = ("codec/csplat", "conformance/csplat_conformance", "tools/csplat_tools", "trainer")
@@ -62,7 +62,7 @@ USERS = {
     "codec/csplat/memory.py": "the size of the memory, if the system tells",
     "codec/csplat/system.py": "the replacements",
     "conformance/csplat_conformance/serving.py": "waits for pipes, in a thread where it cannot",
-    "trainer/csplat_trainer/report.py": "peak memory, or none",
+    "trainer/csplat_trainer/training_report.py": "peak memory, or none",
 }
 
 

@@ -11,7 +11,7 @@ from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.metrics import psnr
 from csplat_trainer.data import load
-from csplat_trainer.options import TrainOptions
+from csplat_trainer.training_options import TrainOptions
 
 FOLDER = Path(__file__).resolve().parent.parent / "tools" / "sample"
 UP = (0.0, -1.0, 0.0)  # y points down

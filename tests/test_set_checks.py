@@ -17,7 +17,7 @@ from posed_sets import H, W, cameras, change_transforms, to_opengl, write_colmap
 from tables import failures
 
 from csplat_trainer.data import load
-from csplat_trainer.starting import scene_of, starting_splats
+from csplat_trainer.initial_splats import measure_extent, place_splats
 
 POSE = np.array(to_opengl(cameras(10)[0]))
 SHEARED = POSE @ np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
@@ -243,7 +243,7 @@ def test_points_of_one_colour_get_those_of_the_images(tmp_path):
     data = load(tmp_path)
     assert data.points_rgb is None
     assert "all points have the colour 0 0 0: splats start with the colours of the images there" in data.report
-    splats = starting_splats(data.train, scene_of(data.train), 2, 0, np.random.default_rng(0), points=data.points)
+    splats = place_splats(data.train, measure_extent(data.train), 2, 0, np.random.default_rng(0), points=data.points)
     colours = 0.5 + 0.28209479177387814 * splats["sh0"][np.argsort(splats["means"][:, 0])]
     assert colours[1, 1] > 0.1  # a green dot lies there, on black
     assert np.allclose(0.0, colours[1, [0, 2]], atol=1e-6)

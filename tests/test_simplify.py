@@ -28,8 +28,7 @@ from csplat_tools.optimise.splat_refit import RefitResult, choose_bands, coeffic
 from csplat_tools.study import prune_share
 from csplat_tools.views import VIEW_COUNT, VIEW_SIZE, camera_sequence, elsewhere, find_view_set, reduced, usual_views
 from csplat_tools.views.agreeing import find_views, removal_keys
-from csplat_trainer.evaluate import photograph_judge
-from csplat_trainer.pictures import Picture
+from csplat_trainer.posed_images import PosedImage, photograph_scorer
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
@@ -223,9 +222,9 @@ def test_more_loss_lets_more_splats_go(source):
     cameras = camera_sequence(source, 16, (48, 36), seed=5)
     rng = np.random.default_rng(1)
     noisy = [np.clip(p + 0.05 * rng.standard_normal(p.shape), 0, 1) for p in render_pictures(source, cameras)]
-    pictures = [Picture(c, np.rint(255.0 * p).astype(np.uint8)) for c, p in zip(cameras, noisy, strict=True)]
+    pictures = [PosedImage(c, np.rint(255.0 * p).astype(np.uint8)) for c, p in zip(cameras, noisy, strict=True)]
     views = views_of(cameras, pictures)
-    judge = photograph_judge(views.pictures(views.decides), views.background)
+    judge = photograph_scorer(views.pictures(views.decides), views.background)
     sizes = []
     for loss in (0.05, 1.0):
         result = simplify(source, loss=loss, views=views, options=replace(SMALL, bands=False, refit=False))

@@ -17,11 +17,10 @@ from csplat_tools.cli.app import app
 from csplat_tools.training.trained_scene import tuning_after
 from csplat_trainer.data import DataSet
 from csplat_trainer.engine import CpuEngine
-from csplat_trainer.loop import train
-from csplat_trainer.options import TrainOptions
-from csplat_trainer.outputs import Outputs
-from csplat_trainer.pictures import Picture
-from csplat_trainer.starting import scene_of, starting_splats
+from csplat_trainer.initial_splats import measure_extent, place_splats
+from csplat_trainer.posed_images import PosedImage
+from csplat_trainer.training_loop import train
+from csplat_trainer.training_options import Outputs, TrainOptions
 from csplat_trainer.tuning import FinetuneOptions
 
 SIZE = 32
@@ -39,7 +38,7 @@ def photographs(make_model, *, alpha: bool = True) -> DataSet:
             cover = np.maximum(seen.alpha, 1e-6)[..., None]
             colour = np.clip(seen.rgb / cover, 0, 1)
             pixels = np.concatenate([colour, seen.alpha[..., None]], axis=2) if alpha else np.clip(seen.rgb, 0, 1)
-            shots.append(Picture(camera, np.rint(pixels * 255).astype(np.uint8)))
+            shots.append(PosedImage(camera, np.rint(pixels * 255).astype(np.uint8)))
     return DataSet("made", shots[:9], shots[9:])
 
 
@@ -62,9 +61,9 @@ def test_nothing_is_learnt_from_pixels_that_do_not_count(make_data, make_model):
     mask[10:30, :20] = False
 
     def hidden(value: int) -> DataSet:
-        def shown(picture: Picture) -> Picture:
+        def shown(picture: PosedImage) -> PosedImage:
             pixels = np.where(mask[..., None], picture.pixels, np.uint8(value))
-            return Picture(picture.camera, pixels, mask)
+            return PosedImage(picture.camera, pixels, mask)
 
         return DataSet("masked", [shown(one) for one in data.train], [shown(one) for one in data.test])
 
@@ -159,14 +158,16 @@ def test_one_camera_far_away_does_not_stop_splats_from_learning(make_data, make_
     far = replace(data, train=[away, *data.train[1:]])
     assert data.train == data.counted
     assert data.train[1:] == far.counted
-    assert scene_of(data.train).extent == pytest.approx(train(far, TrainOptions(**QUICK)).log["scene_extent"], rel=0.2)
+    assert measure_extent(data.train).extent == pytest.approx(
+        train(far, TrainOptions(**QUICK)).log["scene_extent"], rel=0.2
+    )
 
 
 @pytest.mark.slow
 def test_large_units_make_no_other_scene(make_data, make_model):
     data = make_data(make_model)
 
-    def larger(picture: Picture) -> Picture:
+    def larger(picture: PosedImage) -> PosedImage:
         viewmat = picture.camera.viewmat.copy()
         viewmat[:3, 3] *= 1e5
         return replace(picture, camera=replace(picture.camera, viewmat=viewmat))
@@ -221,10 +222,10 @@ def test_progress_log_and_previews_tell_where_it_stands(make_data, make_model, t
 
 def test_the_hull_holds_what_all_masks_show(make_data, make_model):
     data = make_data(make_model)
-    scene = scene_of(data.train)
+    scene = measure_extent(data.train)
     assert np.linalg.norm(scene.focus) < 0.1
-    found = starting_splats(data.train, scene, 300, 0, np.random.default_rng(0), init="hull")
-    boxed = starting_splats(data.train, scene, 300, 0, np.random.default_rng(0), init="box")
+    found = place_splats(data.train, scene, 300, 0, np.random.default_rng(0), init="hull")
+    boxed = place_splats(data.train, scene, 300, 0, np.random.default_rng(0), init="box")
     assert np.linalg.norm(found["means"], axis=1).mean() < np.linalg.norm(boxed["means"], axis=1).mean()
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from csplat_trainer.loss import LOSS_WEIGHTS, PhotometricLoss, photometric_loss_twin
+from csplat_trainer.losses import LOSS_WEIGHTS, PhotometricLoss, photometric_loss_twin
 
 
 def pictures(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:

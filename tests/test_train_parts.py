@@ -5,15 +5,21 @@ import pytest
 
 from csplat.errors import InputError
 from csplat_render.camera import Camera, intrinsics, orbit
-from csplat_trainer.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from csplat_trainer.densify import ScreenGradients, densify, reset_opacities
-from csplat_trainer.mcmc import add_noise, grow, relocate, share
-from csplat_trainer.options import TrainOptions
 from csplat_trainer.parameters import GROUPS, Parameters, adam_step, from_model, to_model
-from csplat_trainer.pictures import Picture, compose, halved
-from csplat_trainer.report import moving_average
-from csplat_trainer.resume import adapt
-from csplat_trainer.thinning import thin
+from csplat_trainer.posed_images import PosedImage, compose, halve
+from csplat_trainer.strategies import (
+    ScreenGradients,
+    add_noise,
+    densify,
+    grow,
+    prune_least_needed,
+    relocate,
+    reset_opacities,
+    share_opacity,
+)
+from csplat_trainer.training_checkpoint import TrainingCheckpoint, fit_to_options, load_checkpoint, save_checkpoint
+from csplat_trainer.training_options import TrainOptions
+from csplat_trainer.training_report import moving_average
 
 
 @pytest.fixture
@@ -61,7 +67,7 @@ def test_a_model_survives_the_way_through_parameters(make_model):
 @pytest.mark.parametrize("alpha", [0.05, 0.5, 0.9])
 def test_shared_splats_cover_like_one(alpha, count):
     # The integral of what n equal splats cover along a line through their centre is that of the one.
-    shared, factor = share(np.array([alpha]), np.array([count]))
+    shared, factor = share_opacity(np.array([alpha]), np.array([count]))
     x = np.linspace(-12, 12, 20_001)
     one = alpha * np.exp(-(x**2) / 2)
     many = 1 - (1 - shared * np.exp(-(x**2) / (2 * factor**2))) ** count
@@ -147,8 +153,10 @@ def test_densification_keeps_to_the_cap(parameters):
     assert np.float32(-9.0) == parameters.values["logits"][0]
 
 
-def checkpoint_of(parameters: Parameters) -> Checkpoint:
-    return Checkpoint(7, parameters, np.random.default_rng(0).bit_generator.state, [3, 1], {"seed": 0}, {"losses": []})
+def checkpoint_of(parameters: Parameters) -> TrainingCheckpoint:
+    return TrainingCheckpoint(
+        7, parameters, np.random.default_rng(0).bit_generator.state, [3, 1], {"seed": 0}, {"losses": []}
+    )
 
 
 def test_a_checkpoint_comes_back_whole(parameters, tmp_path):
@@ -177,7 +185,7 @@ def test_a_damaged_checkpoint_is_refused(parameters, tmp_path, damage):
 )
 def test_a_checkpoint_adapts_to_other_options(parameters, cap, degree, strategy, count):
     options = TrainOptions(max_splats=cap, sh_degree=degree, strategy=strategy)
-    adapted = adapt(parameters, options, np.random.default_rng(0))
+    adapted = fit_to_options(parameters, options, np.random.default_rng(0))
     assert count == len(adapted)
     assert (count, (degree + 1) ** 2 - 1, 3) == adapted.values["shN"].shape == adapted.second["shN"].shape
 
@@ -220,8 +228,8 @@ def test_a_halved_picture_is_what_its_camera_sees(channels):
     mask = np.ones((7, 10), bool)
     mask[3, 4] = False
     camera = Camera(intrinsics(10, 7, 8.0), np.eye(4), 10, 7)
-    half, behind = halved(Picture(camera, pixels, mask)), np.array([0.2, 0.5, 0.9], np.float32)
-    whole = compose(Picture(camera, pixels), behind, np.empty((7, 10, 3), np.float32))
+    half, behind = halve(PosedImage(camera, pixels, mask)), np.array([0.2, 0.5, 0.9], np.float32)
+    whole = compose(PosedImage(camera, pixels), behind, np.empty((7, 10, 3), np.float32))
     means = whole[:6].reshape(3, 2, 5, 2, 3).mean(axis=(1, 3))
     assert np.abs(compose(half, behind, np.empty((3, 5, 3), np.float32)) - means).max() <= 1.01 / 255
     point = np.array([0.1, -0.05, 1.0])
@@ -234,10 +242,10 @@ def test_a_picture_of_which_half_the_size_would_leave_nothing_stays_as_it_is():
     lines[:, ::2] = True
     camera = Camera(intrinsics(8, 6, 8.0), np.eye(4), 8, 6)
     for picture in (
-        Picture(camera, np.zeros((6, 8, 3), np.uint8), lines),
-        Picture(narrow, np.zeros((6, 1, 3), np.uint8)),
+        PosedImage(camera, np.zeros((6, 8, 3), np.uint8), lines),
+        PosedImage(narrow, np.zeros((6, 1, 3), np.uint8)),
     ):
-        assert halved(picture) is picture
+        assert halve(picture) is picture
 
 
 def test_growth_reaches_the_cap_halfway():
@@ -268,11 +276,11 @@ def test_splats_go_a_few_at_a_time_and_the_last_long_before_the_end():
 
 def test_those_go_that_pictures_need_least(make_model):
     cameras = orbit((0, 0, 0), 6.0, (0, 0, 1), 6, intrinsics(40, 40, 50.0), 40, 40)
-    pictures = [Picture(camera, np.zeros((40, 40, 3), np.uint8)) for camera in cameras]
+    pictures = [PosedImage(camera, np.zeros((40, 40, 3), np.uint8)) for camera in cameras]
     values = from_model(make_model(40, 1, seed=3, scales=np.full((40, 3), -1.2, np.float32)), 1)
     values["logits"][5:15] = -7.0
     parameters = Parameters.starting_at(values)
     parameters.second["means"][:] = np.arange(40, dtype=np.float32)[:, None]
-    thin(parameters, pictures, np.ones(3, np.float32), 30, antialiased=False)
+    prune_least_needed(parameters, pictures, np.ones(3, np.float32), 30, antialiased=False)
     wanted = [*range(5), *range(15, 40)]
     assert wanted == parameters.second["means"][:, 0].tolist()

@@ -7,12 +7,12 @@ torch = pytest.importorskip("torch", reason="the torch wrapper wants torch (the 
 from csplat.errors import InputError
 from csplat_render import lpips
 from csplat_render.camera import Camera
-from csplat_trainer import autograd, cuda
+from csplat_trainer import gsplat_engine, torch_rasteriser
 from csplat_trainer.engine import CpuEngine
-from csplat_trainer.options import TrainOptions
+from csplat_trainer.losses import PerceptualLoss
 from csplat_trainer.parameters import GROUPS, Parameters, from_model
-from csplat_trainer.perceptual import PerceptualLoss
-from csplat_trainer.pictures import Picture
+from csplat_trainer.posed_images import PosedImage
+from csplat_trainer.training_options import TrainOptions
 
 pytestmark = pytest.mark.area(name="torch")
 
@@ -39,7 +39,9 @@ def test_gradients_are_those_of_finite_differences(make_model, camera, degree, a
     weight = torch.tensor(np.random.default_rng(0).standard_normal((20, 24, 3)))
 
     def loss(*tensors):
-        return (autograd.render(*tensors, camera, background=(0.2, 0.4, 0.6), antialiased=antialiased) * weight).sum()
+        return (
+            torch_rasteriser.render(*tensors, camera, background=(0.2, 0.4, 0.6), antialiased=antialiased) * weight
+        ).sum()
 
     # Alpha jumps at 1/255, where the picture has no derivative: a step of 1e-7 meets few such pixels.
     loss(*inputs).backward()
@@ -59,10 +61,11 @@ def test_gradients_are_those_of_finite_differences(make_model, camera, degree, a
 
 def test_two_pictures_can_wait_for_their_gradients(make_model, camera):
     inputs = tensors_of(make_model(6, 1), torch.float32)
-    first, second = (autograd.render(*inputs, camera, background=(value,) * 3) for value in (0.0, 1.0))
+    first, second = (torch_rasteriser.render(*inputs, camera, background=(value,) * 3) for value in (0.0, 1.0))
     together = torch.autograd.grad((first + second).sum(), inputs)
     alone = [
-        torch.autograd.grad(autograd.render(*inputs, camera, background=(v,) * 3).sum(), inputs) for v in (0.0, 1.0)
+        torch.autograd.grad(torch_rasteriser.render(*inputs, camera, background=(v,) * 3).sum(), inputs)
+        for v in (0.0, 1.0)
     ]
     for got, *wanted in zip(together, *alone, strict=True):
         assert torch.allclose(got, sum(wanted), rtol=1e-5, atol=1e-5)
@@ -72,7 +75,7 @@ def test_mixed_types_are_refused(make_model, camera):
     inputs = tensors_of(make_model(2, 0), torch.float32)
     inputs[1] = inputs[1].double()
     with pytest.raises(InputError, match="all float32 or all float64"):
-        autograd.render(*inputs, camera)
+        torch_rasteriser.render(*inputs, camera)
 
 
 def rasterization(
@@ -80,7 +83,7 @@ def rasterization(
 ):
     """Stand in for gsplat's function of this name: render with the CPU rasteriser, with gsplat's arguments."""
     camera = Camera(Ks[0].double().numpy(), viewmats[0].double().numpy(), width, height, near_plane)
-    picture = autograd.render(
+    picture = torch_rasteriser.render(
         means, quats, scales.log(), opacities, colors[:, 0], colors[:, 1:], camera,
         background=tuple(backgrounds[0].tolist()), antialiased=rest["rasterize_mode"] == "antialiased",
         sh_degree=sh_degree,
@@ -94,14 +97,16 @@ def test_the_engine_of_the_gpu_takes_the_same_steps(make_model, camera, loss):
     pixels = np.random.default_rng(0).integers(0, 255, (20, 24, 4)).astype(np.uint8)
     engines = [
         CpuEngine(Parameters.starting_at(from_model(make_model(12, 1), 1)), options),
-        cuda.CudaEngine(Parameters.starting_at(from_model(make_model(12, 1), 1)), options, rasterization, "cpu"),
+        gsplat_engine.GsplatEngine(
+            Parameters.starting_at(from_model(make_model(12, 1), 1)), options, rasterization, "cpu"
+        ),
     ]
     figures = []
     for engine in engines:
         rng = np.random.default_rng(0)
         for step in range(1, 6):
             value = engine.step(
-                Picture(camera, pixels), np.ones(3, np.float32), 1, options.learning_rates(step, 1.0), rng
+                PosedImage(camera, pixels), np.ones(3, np.float32), 1, options.learning_rates(step, 1.0), rng
             )
         figures.append(value)
     assert figures[0].loss == pytest.approx(figures[1].loss, rel=1e-4)
@@ -115,7 +120,7 @@ def test_a_missing_gpu_is_refused_in_one_line():
     if torch.cuda.is_available():
         pytest.skip("this machine has a GPU")
     with pytest.raises(InputError, match="finds no GPU"):
-        cuda.gsplat_rasterization()
+        gsplat_engine.gsplat_rasterization()
 
 
 def test_the_perceptual_loss_is_lpips_with_its_gradient():

@@ -33,10 +33,9 @@ from csplat.types import F32, F64
 from csplat_render.camera import Camera, intrinsics, look_at
 from csplat_render.warmup import warm_up
 from csplat_trainer.data import load
-from csplat_trainer.loop import train
-from csplat_trainer.options import TrainOptions
-from csplat_trainer.outputs import TrainResult
-from csplat_trainer.report import TrainingStep
+from csplat_trainer.training_loop import train
+from csplat_trainer.training_options import TrainOptions, TrainResult
+from csplat_trainer.training_report import TrainingStep
 
 SAMPLE = Path(__file__).resolve().parent.parent / "csplat_tools" / "data" / "sample.ply"
 COMMENTS = ("made by tools/sample/make_sample.py",)

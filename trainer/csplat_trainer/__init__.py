@@ -15,10 +15,9 @@ from csplat import lazy_exports
 
 if TYPE_CHECKING:
     from csplat_trainer.data import DataSet, load
-    from csplat_trainer.loop import train
-    from csplat_trainer.options import TrainOptions
-    from csplat_trainer.outputs import Outputs, TrainResult
-    from csplat_trainer.tuning import Finetuned, FinetuneOptions, Views, finetune
+    from csplat_trainer.training_loop import train
+    from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult
+    from csplat_trainer.tuning import Finetuned, FinetuneOptions, TuningViews, finetune
 
 __all__ = [
     "DataSet",
@@ -27,7 +26,7 @@ __all__ = [
     "Outputs",
     "TrainOptions",
     "TrainResult",
-    "Views",
+    "TuningViews",
     "finetune",
     "load",
     "train",
@@ -37,12 +36,12 @@ _MODULE_OF = {
     "DataSet": "csplat_trainer.data",
     "FinetuneOptions": "csplat_trainer.tuning",
     "Finetuned": "csplat_trainer.tuning",
-    "Outputs": "csplat_trainer.outputs",
-    "TrainOptions": "csplat_trainer.options",
-    "TrainResult": "csplat_trainer.outputs",
-    "Views": "csplat_trainer.tuning",
+    "Outputs": "csplat_trainer.training_options",
+    "TrainOptions": "csplat_trainer.training_options",
+    "TrainResult": "csplat_trainer.training_options",
+    "TuningViews": "csplat_trainer.tuning",
     "finetune": "csplat_trainer.tuning",
     "load": "csplat_trainer.data",
-    "train": "csplat_trainer.loop",
+    "train": "csplat_trainer.training_loop",
 }
 __getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)

@@ -1,4 +1,4 @@
-"""One training step: picture, loss, gradients, Adam, noise; on the CPU, without torch."""
+"""One training step: render, loss, gradients, Adam, noise; on the CPU, without torch."""
 
 from __future__ import annotations
 
@@ -12,16 +12,14 @@ from csplat_render.camera import Camera
 from csplat_render.conventions import SplatArrays
 from csplat_render.kernels import lane_range, parallel_kernel
 from csplat_render.rasteriser import Rasteriser
-from csplat_trainer.densify import ScreenGradients
-from csplat_trainer.exposure import Exposure
-from csplat_trainer.loss import LOSS_WEIGHTS, LossValue, PhotometricLoss
-from csplat_trainer.mcmc import add_noise
-from csplat_trainer.options import TrainOptions
+from csplat_trainer.image_gains import ImageGain
+from csplat_trainer.losses import LOSS_WEIGHTS, LossValue, PerceptualLoss, PhotometricLoss
 from csplat_trainer.parameters import Parameters, adam_step
-from csplat_trainer.perceptual import PerceptualLoss
-from csplat_trainer.pictures import Picture, compose
+from csplat_trainer.posed_images import PosedImage, compose
+from csplat_trainer.strategies import ScreenGradients, add_noise
+from csplat_trainer.training_options import TrainOptions
 
-_LARGEST_LOG = 40.0  # largest log scale whose gradient Adam can square in float32
+_MAX_LOG_SCALE = 40.0  # largest log scale whose gradient Adam can square in float32
 
 
 class Engine(Protocol):
@@ -41,18 +39,18 @@ class Engine(Protocol):
 
     def step(
         self,
-        picture: Picture,
+        image: PosedImage,
         background: F32,
         degree: int,
         rates: dict[str, float],
         rng: Generator,
-        exposure: Exposure | None = None,
+        exposure: ImageGain | None = None,
     ) -> LossValue:
-        """Make one step of training on one picture."""
+        """Make one step of training on one image."""
         ...
 
     def render(self, camera: Camera, background: F32, degree: int) -> F32:
-        """The picture at present, [H, W, 3]."""
+        """The image at present, [H, W, 3]."""
         ...
 
 
@@ -82,17 +80,17 @@ class CpuEngine:
 
     def step(
         self,
-        picture: Picture,
+        image: PosedImage,
         background: F32,
         degree: int,
         rates: dict[str, float],
         rng: Generator,
-        exposure: Exposure | None = None,
+        exposure: ImageGain | None = None,
     ) -> LossValue:
-        """Make one step of training on one picture.
+        """Make one step of training on one image.
 
         Args:
-            picture: the image to fit.
+            image: the image to fit.
             background: [3], behind both.
             degree: degree of the SH bands that are evaluated.
             rates: learning rate of each group of parameters.
@@ -102,12 +100,12 @@ class CpuEngine:
         Returns:
             The photometric figures before the step.
         """
-        options, camera = self._options, picture.camera
+        options, camera = self._options, image.camera
         loss, photograph = self._loss_for(camera)
-        compose(picture, background, photograph)
+        compose(image, background, photograph)
         rgb = self._forward(camera, background, degree)
         shown = rgb if exposure is None else exposure.applied(rgb)
-        value, slope = loss(shown, photograph, picture.mask)
+        value, slope = loss(shown, photograph, image.mask)
         if self._perceptual is not None:
             slope += self._perceptual.gradient(shown, photograph, options.lpips_weight)
         if exposure is not None:
@@ -124,7 +122,7 @@ class CpuEngine:
             self._logit_gradient,
         )
         if self.screen is not None:
-            self.screen.add(_half_pictures(gradients.means2d, camera), gradients.radii > 0)
+            self.screen.add(_per_half_image(gradients.means2d, camera), gradients.radii > 0)
         steps = {
             "means": gradients.means,
             "quats": gradients.quats,
@@ -142,7 +140,7 @@ class CpuEngine:
         return value
 
     def render(self, camera: Camera, background: F32, degree: int) -> F32:
-        """The picture at present, [H, W, 3]; a buffer that the next picture overwrites."""
+        """The image at present, [H, W, 3]; a buffer that the next image overwrites."""
         return self._forward(camera, background, degree)
 
     def _forward(self, camera: Camera, background: F32, degree: int) -> F32:
@@ -157,7 +155,7 @@ class CpuEngine:
         return result.rgb
 
     def _loss_for(self, camera: Camera) -> tuple[PhotometricLoss, F32]:
-        """Loss and photograph buffer of a size of picture."""
+        """Loss and photograph buffer of a size of image."""
         size = (camera.H, camera.W)
         if size not in self._losses:
             weights = LOSS_WEIGHTS[self._options.loss]
@@ -165,8 +163,8 @@ class CpuEngine:
         return self._losses[size]
 
 
-def _half_pictures(norms: F32, camera: Camera) -> F32:
-    """Gradient norms per pixel as norms per half a picture, which thresholds are stated in."""
+def _per_half_image(norms: F32, camera: Camera) -> F32:
+    """Gradient norms per pixel as norms per half a image, which thresholds are stated in."""
     return norms * np.float32(0.5 * max(camera.W, camera.H))
 
 
@@ -211,4 +209,4 @@ def _chain(
         by_logit[i] = (by_alpha[i] + opacity_weight) * alpha * (np.float32(1.0) - alpha)
         if scale_weight > np.float32(0.0):
             for k in range(3):
-                by_scale[i, k] += scale_weight * np.exp(min(scales[i, k], np.float32(_LARGEST_LOG)))
+                by_scale[i, k] += scale_weight * np.exp(min(scales[i, k], np.float32(_MAX_LOG_SCALE)))

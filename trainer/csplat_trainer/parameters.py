@@ -15,9 +15,9 @@ from csplat.model import SplatModel, normalise_quats
 from csplat.types import F32
 from csplat_render.kernels import parallel_kernel, relaxed_kernel
 
-Splats = dict[str, F32]
+ParameterArrays = dict[str, F32]
 
-#: Names of the arrays of `Splats`, in the order of everything that goes through them.
+#: Names of the arrays of `ParameterArrays`, in the order of everything that goes through them.
 GROUPS = ("means", "quats", "scales", "logits", "sh0", "shN")
 
 _BETA1, _EPSILON = 0.9, 1e-15
@@ -38,14 +38,14 @@ class Parameters:
         beta2: share of the mean of squares that a step leaves.
     """
 
-    values: Splats
-    first: Splats
-    second: Splats
+    values: ParameterArrays
+    first: ParameterArrays
+    second: ParameterArrays
     step: int = 0
     beta2: float = 0.999
 
     @classmethod
-    def starting_at(cls, values: Splats) -> Parameters:
+    def starting_at(cls, values: ParameterArrays) -> Parameters:
         """Parameters that have not moved yet."""
         first, second = ({name: np.zeros_like(array) for name, array in values.items()} for _ in range(2))
         return cls(values, first, second)
@@ -70,7 +70,7 @@ class Parameters:
             for name in GROUPS:
                 part[name] = np.ascontiguousarray(part[name][rows])
 
-    def append(self, values: Splats) -> None:
+    def append(self, values: ParameterArrays) -> None:
         """Add splats that Adam knows nothing of."""
         for name in GROUPS:
             self.values[name] = np.concatenate([self.values[name], values[name]])
@@ -78,7 +78,7 @@ class Parameters:
                 memory[name] = np.concatenate([memory[name], np.zeros_like(values[name])])
 
 
-def from_model(model: SplatModel, sh_degree: int) -> Splats:
+def from_model(model: SplatModel, sh_degree: int) -> ParameterArrays:
     """Return the parameters of a model's splats, with SH of another degree (cut, or zeros) if requested."""
     alpha = np.clip(model.opacities.astype(np.float64), 1e-6, 1.0 - 1e-6)
     coefficients = (sh_degree + 1) ** 2 - 1
@@ -95,7 +95,7 @@ def from_model(model: SplatModel, sh_degree: int) -> Splats:
     }
 
 
-def to_model(values: Splats, *, antialiased: bool = False) -> SplatModel:
+def to_model(values: ParameterArrays, *, antialiased: bool = False) -> SplatModel:
     """The splats as a model."""
     return SplatModel(
         means=values["means"].copy(),
@@ -114,7 +114,7 @@ def sigmoid(logits: F32) -> F32:
     return alpha
 
 
-def adam_step(parameters: Parameters, gradients: Splats, rates: dict[str, float]) -> None:
+def adam_step(parameters: Parameters, gradients: ParameterArrays, rates: dict[str, float]) -> None:
     """One step of Adam (no weight decay), then unit quaternions and bounded logits.
 
     Args:
@@ -169,7 +169,7 @@ def _adam(
             slope = g[i]
             mean = b1 * m[i] + a1 * slope
             square = b2 * v[i] + a2 * slope * slope
-            # A splat that no picture sees decays towards denormal numbers, which are slow.
+            # A splat that no image sees decays towards denormal numbers, which are slow.
             mean = mean if abs(mean) > tiny else np.float32(0.0)
             square = square if square > tiny else np.float32(0.0)
             m[i] = mean

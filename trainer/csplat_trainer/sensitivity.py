@@ -4,14 +4,30 @@ The sensitivity of a parameter p is S(p) = Σ_i |∂E_i/∂p| / Σ_i P_i over th
 blue of view i, P_i its pixels; that of a group of parameters is its maximum (Niedermayr, Stumpfegger, Westermann,
 "Compressed 3D Gaussian Splatting for Accelerated Novel View Synthesis", CVPR 2024). For colours that is what counts.
 For opacity and shape the pixels of one view cancel in E_i: a splat that grows brightens here what it darkens there. So
-magnitudes are taken here before pixels and channels are added up; the published figure is reported as well.
+magnitudes are taken here before pixels and channels are added; the published figure is reported as well.
 
-Sums of squares in place of magnitudes are the diagonal of the Gauss-Newton matrix: what a small error of the parameter
-adds to the squared error of the renders. They are the weights of k-means, whose errors are squared too.
+Sums of squares instead of magnitudes are the diagonal of the Gauss–Newton matrix: the squared error that a small error
+of the parameter adds to the renders. They are the weights of k-means, whose errors are squared too.
+
+At a pixel, let s_c be the derivative of channel c towards the exponent of a splat, and t = ∂exponent/∂(Σ / γ²), a
+symmetric matrix, with Σ the splat's covariance and γ² its trace. With Σ2 the covariance on the render, M the linearised
+perspective and d the distance of the pixel from the centre,
+
+    t = h hᵀ + C,  h = γ/√2 · Mᵀ Σ2⁻¹ d
+
+C is 0 except in the antialiased mode, whose opacity depends on the covariance too. h is linear in d: `covariance_forms`
+computes its coefficients once per splat, `_moments` evaluates it at each pixel as (u, v, w) and adds up
+
+    Σ w, Σ w²                        w: the splat's weight at the pixel
+    Σ s, Σ |s|, Σ s²                 s, |s|, s²: summed over channels
+    Σ s t, Σ |s| |t|                 entries xx, yy, zz, xy, xz, yz of t
+    Σ s² |h|²                        squared derivative towards the centre, up to 2 / γ²
+    Σ s² t tᵀ                        21 entries: the Gauss–Newton matrix of the covariance
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,15 +38,40 @@ from numpy.typing import ArrayLike, NDArray
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F32, F64, Progress
+from csplat_render.binning import TILE
+from csplat_render.blending import (
+    BATCH,
+    BATCH_COLUMNS,
+    HALF_TILE,
+    aligned_zeros,
+    alpha_at,
+    batch_entry,
+    begin_tile,
+    gather_batch,
+    pixel_centres,
+    read_planes,
+    tile_extent,
+    transmit,
+    unfinished_rows,
+)
 from csplat_render.camera import Camera
-from csplat_render.conventions import view_vector
-from csplat_render.kernels import thread_count
+from csplat_render.conventions import COMPENSATION_MIN, view_vector
+from csplat_render.kernels import parallel_kernel, relaxed_kernel, thread_count
+from csplat_render.projection import (
+    BLOCK,
+    determinants,
+    jacobian_rows,
+    perspective_jacobian,
+    rotation_matrix,
+    sh_basis,
+    standard_deviation,
+    unit_quaternion,
+    view_direction,
+)
 from csplat_render.rasteriser import Rasteriser
-from csplat_trainer.sensitivity_forms import FORM, covariance_forms
-from csplat_trainer.sensitivity_sums import SUMS, add_view, sum_derivatives
 
 _DIAGONAL = [0, 6, 11, 15, 18, 20]  # indices of the diagonal in a triangle of 6 by 6
-_LARGEST = 1e37  # largest value of a sum; float32 holds six of them
+_MAX_SUM = 1e37  # largest value of a sum; float32 holds six of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +138,7 @@ def measure_sensitivity(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Sensitivity:
-    """Measure what pictures depend on.
+    """Measure what images depend on.
 
     Args:
         model: the scene.
@@ -111,7 +152,7 @@ def measure_sensitivity(
 
     Raises:
         InputError: there is no camera.
-        LimitError: a picture has more than `rasterise.MAX_INTERSECTIONS`.
+        LimitError: a image has more than `rasterise.MAX_INTERSECTIONS`.
     """
     if not cameras:
         raise InputError("measuring sensitivity wants a camera at least")
@@ -147,8 +188,8 @@ class _Derivatives(Rasteriser):
         a, n = last.splats, len(self._model)
         shape, box = self._buffer("shape", (n, 10), np.float64), self._buffer("box", (n, 4), np.int32)
         near, offsets = self._buffer("near", (n,), np.float32), self._buffer("offsets", (n + 1,), np.int64)
-        forms = self._buffer("forms", (n, FORM), np.float64)
-        records = self._buffer("derivatives", (last.intersections, SUMS), self.dtype)
+        forms = self._buffer("forms", (n, FORM_SIZE), np.float64)
+        records = self._buffer("derivatives", (last.intersections, DERIVATIVE_SUMS), self.dtype)
         view = view_vector(camera)
         with thread_count(self.threads):
             covariance_forms(a.means, a.quats, a.scales, view, last.antialiased, shape, near, forms)
@@ -170,7 +211,7 @@ class _Derivatives(Rasteriser):
         pixels = max(1, self._pixel_count)
         self._metric /= np.float32(pixels)
         bends, squares, net, sizes = (
-            _over(sums, pixels) for sums in (self._bends, self._squares, self._net, self._sizes)
+            _mean_over(sums, pixels) for sums in (self._bends, self._squares, self._net, self._sizes)
         )
         kept = self._magnitudes
         return Sensitivity(
@@ -191,8 +232,320 @@ class _Derivatives(Rasteriser):
         )
 
 
-def _over(sums: F64, pixels: int) -> F64:
+def _mean_over(sums: F64, pixels: int) -> F64:
     """Divide the array in place and make it fit float32; sums that have overflowed float64 become 0. Return it."""
     sums /= pixels
     np.nan_to_num(sums, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-    return np.clip(sums, -_LARGEST, _LARGEST, out=sums)
+    return np.clip(sums, -_MAX_SUM, _MAX_SUM, out=sums)
+
+
+#: Numbers per splat that determine how its exponent depends on its covariance.
+FORM_SIZE = 12
+
+
+@parallel_kernel()
+def covariance_forms(lane: int, lanes: int, means: Any, quats: Any, scales: Any, view: Any, antialiased: bool,
+                     shape: Any, near: Any, forms: Any) -> None:  # fmt: skip
+    """Compute the forms that turn a place on a render into the exponent's derivative towards a splat's covariance.
+
+    With Σ2 the covariance on the render, M the linearised perspective and γ² the trace of the covariance Σ, the
+    exponent's derivative towards Σ / γ² is t = h hᵀ + C, h = γ/√2 · Mᵀ Σ2⁻¹ d, d the distance from the centre in
+    pixels. C is 0 but in the antialiased mode, whose opacity depends on the covariance too. Parallel over blocks.
+
+    Args:
+        means: see `project`, as the next two.
+        quats: see `project`.
+        scales: see `project`.
+        view: see `project`.
+        antialiased: see `project`.
+        shape: see `project`.
+        near: [N] float32, above 0 for splats that are drawn.
+        forms: [N, FORM] float64, written for splats that are drawn: the matrix of h, [3, 2] row by row; C, as xx yy zz
+            xy xz yz.
+    """
+    n = means.shape[0]
+    for block in range(lane, (n + BLOCK - 1) // BLOCK, lanes):
+        for i in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
+            if not near[i] > 0.0:
+                continue
+            X, Y, Z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+            x = view[0] * X + view[1] * Y + view[2] * Z + view[9]
+            y = view[3] * X + view[4] * Y + view[5] * Z + view[10]
+            z = view[6] * X + view[7] * Y + view[8] * Z + view[11]
+            j0, j02, j1, j12, _, _ = perspective_jacobian(view, x, y, z)
+            pq = jacobian_rows(view, j0, j02, j1, j12)
+            s0, s1, s2 = (
+                standard_deviation(scales[i, 0]),
+                standard_deviation(scales[i, 1]),
+                standard_deviation(scales[i, 2]),
+            )
+            half = 0.5 * (s0 * s0 + s1 * s1 + s2 * s2)
+            a, b, c = shape[i, 2], shape[i, 3], shape[i, 4]
+            size = math.sqrt(half)
+            for k in range(3):
+                p, q = pq[k], pq[3 + k]
+                forms[i, 2 * k], forms[i, 2 * k + 1] = size * (p * a + q * b), size * (p * b + q * c)
+            forms[i, 6:] = 0.0
+            if antialiased:
+                qw, qx, qy, qz, _ = unit_quaternion(quats[i])
+                r = rotation_matrix(qw, qx, qy, qz)
+                A, B, C = 0.0, 0.0, 0.0
+                for k, s in enumerate((s0, s1, s2)):
+                    u = s * (r[k] * pq[0] + r[3 + k] * pq[1] + r[6 + k] * pq[2])
+                    v = s * (r[k] * pq[3] + r[3 + k] * pq[4] + r[6 + k] * pq[5])
+                    A, B, C = A + u * u, B + u * v, C + v * v
+                bare, dilated = determinants(pq, r, s0, s1, s2, A + C)
+                if bare > COMPENSATION_MIN * dilated:
+                    # The logarithm of √(det Σ2 / det (Σ2 + dilation)), towards Σ2: half the difference of inverses.
+                    da, db, dc = C / bare - a, -B / bare - b, A / bare - c
+                    for e, (k, m) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
+                        left, right = pq[k] * da + pq[3 + k] * db, pq[k] * db + pq[3 + k] * dc
+                        forms[i, 6 + e] = half * (left * pq[m] + right * pq[3 + m])
+
+
+#: Numbers per record. With w the share of a pixel that is the splat's, s_c the derivative of channel c towards the
+#: exponent (that is, towards the logarithm of alpha), t the matrix of `covariance_forms`, |h|² of its first part: sums
+#: over pixels of w, w²; Σ s, Σ |s|, Σ s² over channels; Σ s · t (6 entries); Σ |s| · |t| (6); Σ s² · |h|²; Σ s² · t tᵀ
+#: (the upper triangle of 6 by 6).
+DERIVATIVE_SUMS = 39
+
+_AREA = TILE * TILE
+
+# Offsets of the planes of a tile: transmittance, what lies behind by channel, the current splat's share of the pixel,
+# Σ s, Σ |s|, Σ s², positions about the centre of the tile.
+_RED, _GREEN, _BLUE, _WEIGHT, _SLOPE, _SIZE, _SQUARE, _X, _Y = (_AREA * k for k in range(1, 10))
+_PLANES = 10
+
+
+@parallel_kernel(relaxed=True)
+def sum_derivatives(lane: int, lanes: int, starts: Any, used: Any, ids: Any, slots: Any, shape: Any, box: Any,
+                    forms: Any, tiles_x: int, limits: Any, rgb: Any, records: Any) -> None:  # fmt: skip
+    """One record for every splat in every tile; parallel over tiles, vectorised over the 16 pixels of a row.
+
+    Args:
+        lane: see `blend_backward`.
+        lanes: see `blend_backward`.
+        starts: see `blend_backward`, as the next five.
+        used: see `blend_backward`.
+        ids: see `blend_backward`.
+        slots: see `blend_backward`.
+        shape: see `blend_backward`.
+        box: see `blend_backward`.
+        forms: see `covariance_forms`.
+        tiles_x: see `blend_backward`, as the next.
+        limits: see `blend_backward`.
+        rgb: [H, W, 3], the image.
+        records: [intersections, SUMS], written.
+    """
+    height, width = rgb.shape[:2]
+    planes = aligned_zeros(_PLANES * _AREA, limits)
+    T = planes[:_AREA].reshape((TILE, TILE))
+    ys = pixel_centres()
+    for e in range(_AREA):
+        planes[_X + e] = ys[e % TILE]
+        planes[_Y + e] = ys[e // TILE]
+    batch, rows_ = np.empty((BATCH, BATCH_COLUMNS), limits.dtype), np.empty((BATCH, 2), np.int64)
+    form, sums = np.empty(FORM_SIZE + 3, limits.dtype), np.empty(DERIVATIVE_SUMS, limits.dtype)
+    alpha_min, alpha_cap, stop = limits[0], limits[1], limits[2]
+    zero, one = alpha_min - alpha_min, alpha_min / alpha_min
+    for tile in range(lane, len(used), lanes):
+        X0, Y0, columns, high = tile_extent(tile, tiles_x, width, height)
+        low = 0
+        planes[:_X] = zero
+        begin_tile(T, columns, one)
+        read_planes(rgb, X0, Y0, columns, high, planes, _RED)
+        for begin in range(starts[tile], used[tile], BATCH):
+            low, high = unfinished_rows(T, low, high)
+            count = min(BATCH, used[tile] - begin)
+            gather_batch(ids, begin, begin + count, shape, box, X0, Y0, low, high, ys, batch, rows_)
+            for j in range(count):
+                record = records[slots[begin + j]]
+                first, last = rows_[j, 0], rows_[j, 1]
+                if first >= last:
+                    record[:] = zero
+                    continue
+                body = planes[first * TILE :]
+                row0, row1, a, o, r, g, b, _ = batch_entry(batch, j, first)
+                for y in range(last - first):
+                    row, c0, c1 = body[y * TILE :], row0[y], row1[y]
+                    for x in range(TILE):
+                        full, alpha = alpha_at(row[_X + x], c0, c1, a, o, alpha_min, alpha_cap, zero)
+                        going, weight, row[x] = transmit(row[x], alpha, stop, zero, one)
+                        red, green, blue = weight * r, weight * g, weight * b
+                        row[_RED + x] -= red
+                        row[_GREEN + x] -= green
+                        row[_BLUE + x] -= blue
+                        share = alpha / (one - alpha)
+                        red -= row[_RED + x] * share
+                        green -= row[_GREEN + x] * share
+                        blue -= row[_BLUE + x] * share
+                        free = one if going and full < alpha_cap else zero
+                        row[_WEIGHT + x] = weight
+                        row[_SLOPE + x] = free * (red + green + blue)
+                        row[_SIZE + x] = free * (abs(red) + abs(green) + abs(blue))
+                        row[_SQUARE + x] = free * (red * red + green * green + blue * blue)
+                i = ids[begin + j]
+                dx, dy = X0 + HALF_TILE - shape[i, 0], Y0 + HALF_TILE - shape[i, 1]
+                for e in range(FORM_SIZE):
+                    form[e] = forms[i, e]
+                for k in range(3):
+                    form[FORM_SIZE + k] = forms[i, 2 * k] * dx + forms[i, 2 * k + 1] * dy
+                _moments(body, (last - first) * TILE, form, sums)
+                for e in range(DERIVATIVE_SUMS):
+                    record[e] = sums[e]
+        for k in range(used[tile], starts[tile + 1]):
+            records[slots[k]] = zero
+
+
+@relaxed_kernel
+def _moments(body: Any, count: int, form: Any, sums: Any) -> None:
+    """The sums of one splat over pixels of a tile; `form` is as in `covariance_forms`, then h at the tile's middle."""
+    zero = form[0] - form[0]
+    ax, ay, bx, by, cx, cy = form[0], form[1], form[2], form[3], form[4], form[5]
+    oxx, oyy, ozz, oxy, oxz, oyz = form[6], form[7], form[8], form[9], form[10], form[11]
+    a0, b0, c0 = form[12], form[13], form[14]
+    m0, m1, m2, m3, m4, m5, m6, m7, m8, m9 = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+    n0, n1, n2, n3, n4, n5, n6, n7 = zero, zero, zero, zero, zero, zero, zero, zero
+    for e in range(count):
+        x, y = body[_X + e], body[_Y + e]
+        weight, slope, size, square = body[_WEIGHT + e], body[_SLOPE + e], body[_SIZE + e], body[_SQUARE + e]
+        u, v, w = a0 + ax * x + ay * y, b0 + bx * x + by * y, c0 + cx * x + cy * y
+        xx, yy, zz = u * u + oxx, v * v + oyy, w * w + ozz
+        xy, xz, yz = u * v + oxy, u * w + oxz, v * w + oyz
+        m0 += weight
+        m1 += weight * weight
+        m2 += slope
+        m3 += size
+        m4 += square
+        m5 += slope * xx
+        m6 += slope * yy
+        m7 += slope * zz
+        m8 += slope * xy
+        m9 += slope * xz
+        n0 += slope * yz
+        n1 += size * abs(xx)
+        n2 += size * abs(yy)
+        n3 += size * abs(zz)
+        n4 += size * abs(xy)
+        n5 += size * abs(xz)
+        n6 += size * abs(yz)
+        n7 += square * (u * u + v * v + w * w)
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6] = m0, m1, m2, m3, m4, m5, m6
+    sums[7], sums[8], sums[9], sums[10], sums[11], sums[12], sums[13] = m7, m8, m9, n0, n1, n2, n3
+    sums[14], sums[15], sums[16], sums[17] = n4, n5, n6, n7
+    p0, p1, p2, p3, p4, p5, p6, p7, p8, p9, p10 = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+    p11, p12, p13, p14, p15, p16, p17, p18, p19, p20 = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for e in range(count):
+        x, y, square = body[_X + e], body[_Y + e], body[_SQUARE + e]
+        u, v, w = a0 + ax * x + ay * y, b0 + bx * x + by * y, c0 + cx * x + cy * y
+        xx, yy, zz = u * u + oxx, v * v + oyy, w * w + ozz
+        xy, xz, yz = u * v + oxy, u * w + oxz, v * w + oyz
+        sxx = square * xx
+        syy = square * yy
+        szz = square * zz
+        sxy = square * xy
+        sxz = square * xz
+        syz = square * yz
+        p0 += sxx * xx
+        p1 += sxx * yy
+        p2 += sxx * zz
+        p3 += sxx * xy
+        p4 += sxx * xz
+        p5 += sxx * yz
+        p6 += syy * yy
+        p7 += syy * zz
+        p8 += syy * xy
+        p9 += syy * xz
+        p10 += syy * yz
+        p11 += szz * zz
+        p12 += szz * xy
+        p13 += szz * xz
+        p14 += szz * yz
+        p15 += sxy * xy
+        p16 += sxy * xz
+        p17 += sxy * yz
+        p18 += sxz * xz
+        p19 += sxz * yz
+        p20 += syz * yz
+    sums[18], sums[19], sums[20], sums[21], sums[22], sums[23], sums[24] = p0, p1, p2, p3, p4, p5, p6
+    sums[25], sums[26], sums[27], sums[28], sums[29], sums[30], sums[31] = p7, p8, p9, p10, p11, p12, p13
+    sums[32], sums[33], sums[34], sums[35], sums[36], sums[37], sums[38] = p14, p15, p16, p17, p18, p19, p20
+
+
+@parallel_kernel()
+def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, view: Any, degree: int, shape: Any,
+             near: Any, offsets: Any, records: Any, colour: Any, net: Any, sizes: Any, squares: Any, metric: Any,
+             bends: Any, views: Any) -> None:  # fmt: skip
+    """Add one view's sums for every splat; parallel over blocks of splats, records in one order.
+
+    Args:
+        means: see `project`, as the next two.
+        opacities: see `project`.
+        scales: see `project`.
+        view: see `project`.
+        degree: degree of the spherical harmonics.
+        shape: see `project`.
+        near: [N] float32, above 0 for splats that are drawn.
+        offsets: [N + 1] int64, index of each splat's first record.
+        records: [intersections, SUMS].
+        colour: [N, B, 3] float32, added to: |derivative of the render's sum towards a coefficient|; [0, …] if neither
+            this nor the next two are needed.
+        net: [N, 7] float64, added to: the same towards alpha and the six entries of the covariance over its trace.
+        sizes: [N, 7] float64, added to: the same with magnitudes taken pixel by pixel and channel by channel.
+        squares: [N, 3] float64, added to: squared derivatives of the pixels' channels towards a colour (one channel of
+            it), alpha, and the centre.
+        metric: [N, B (B + 1) / 2] float32, added to: squared derivatives towards SH coefficients, of one channel, the
+            upper triangle of a matrix; [0, …] if it is not needed.
+        bends: [N, 21] float64, added to: squared derivatives of all channels towards the covariance over its trace, as
+            the upper triangle of a matrix over xx, yy, zz, √2 xy, √2 xz, √2 yz.
+        views: [N] int64, added to: 1 if the splat was seen.
+    """
+    n = means.shape[0]
+    count = (degree + 1) * (degree + 1)
+    basis, sums = np.empty(16, np.float64), np.empty(DERIVATIVE_SUMS, np.float64)
+    with_magnitudes = colour.shape[0] > 0
+    for block in range(lane, (n + BLOCK - 1) // BLOCK, lanes):
+        for i in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
+            if not (near[i] > 0.0 and offsets[i + 1] > offsets[i]):
+                continue
+            sums[:] = 0.0
+            for j in range(offsets[i], offsets[i + 1]):
+                for e in range(DERIVATIVE_SUMS):
+                    sums[e] += records[j, e]
+            if not sums[0] > 0.0:
+                continue
+            views[i] += 1
+            x, y, z, _ = view_direction(view, means[i])
+            sh_basis(degree, x, y, z, basis)
+            for c in range(3 if with_magnitudes else 0):
+                if shape[i, 6 + c] > 0.0:
+                    for k in range(count):
+                        colour[i, k, c] += abs(basis[k]) * sums[0]
+            if metric.shape[0] > 0:
+                place = 0
+                for k in range(count):
+                    for m in range(k, count):
+                        metric[i, place] += basis[k] * basis[m] * sums[1]
+                        place += 1
+            alpha = np.float64(opacities[i])
+            if with_magnitudes:
+                net[i, 0] += abs(sums[2]) / alpha
+                sizes[i, 0] += sums[3] / alpha
+            for e in range(6 if with_magnitudes else 0):
+                twice = 1.0 if e < 3 else 2.0  # an entry off the diagonal occurs twice in the covariance
+                net[i, 1 + e] += twice * abs(sums[5 + e])
+                sizes[i, 1 + e] += twice * sums[11 + e]
+            s0, s1, s2 = (
+                standard_deviation(scales[i, 0]),
+                standard_deviation(scales[i, 1]),
+                standard_deviation(scales[i, 2]),
+            )
+            squares[i, 0] += sums[1]
+            squares[i, 1] += sums[4] / (alpha * alpha)
+            squares[i, 2] += 2.0 * sums[17] / (s0 * s0 + s1 * s1 + s2 * s2)
+            place = 0
+            for e in range(6):
+                for f in range(e, 6):
+                    beside = (2.0 if e > 2 else 1.0) * (2.0 if f > 2 else 1.0)
+                    bends[i, place] += math.sqrt(beside) * sums[18 + place]
+                    place += 1

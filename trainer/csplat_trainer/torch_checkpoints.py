@@ -71,7 +71,7 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
     yield replace(scene_of(model), findings=findings)
 
 
-class _Part(NamedTuple):
+class _CheckpointPart(NamedTuple):
     """The splats of one file.
 
     Attributes:
@@ -115,7 +115,7 @@ def _parts(path: Path) -> tuple[list[Path], list[Finding]]:
     return paths, [Finding("ranks", len(paths), text, "note")]
 
 
-def _read(path: Path, sh_degree: int | None) -> _Part:
+def _read(path: Path, sh_degree: int | None) -> _CheckpointPart:
     head = head_of(path)
     kind = by_content(path, head)
     if not head.startswith(_MAGICS):
@@ -152,7 +152,7 @@ def _plain_numbers(torch: Any) -> Any:
     return torch.serialization.safe_globals([make, (make, "numpy.core.multiarray.scalar"), np.dtype, *kinds])
 
 
-def _model_of(said: object, size: int, sh_degree: int | None) -> _Part:
+def _model_of(said: object, size: int, sh_degree: int | None) -> _CheckpointPart:
     inria = _of_inria(said)
     if inria is not None:
         return _bounded(inria, size, sh_degree)
@@ -200,7 +200,7 @@ def _count(means: Any) -> str:
     return counted(shape[0], "splat") if shape else "no tensor"
 
 
-def _bounded(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> _Part:
+def _bounded(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> _CheckpointPart:
     """The splats of tensors, none of which has more numbers than the file has bytes: one may be said to be many."""
     for name in _NAMES.values():
         numbers = getattr(splats.get(name), "numel", None)
@@ -228,7 +228,7 @@ def _bounded(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> _Pa
     arrays = SplatArrays(
         splats["means"], splats["quats"], splats["scales"], splats["opacities"].reshape(-1), model.sh0, model.shN
     )
-    return _Part(model, arrays, 2 if is_flat else 3, findings)
+    return _CheckpointPart(model, arrays, 2 if is_flat else 3, findings)
 
 
 def _array(value: Any) -> Any:

@@ -41,7 +41,7 @@ from csplat_tools.files.streams import check_name
         ("byte_cost", "target_size", "target_psnr"),
     ),
     needs={"near": ("data",), "checkpoint_every": ("checkpoint",)},
-    settings=(ENCODER, "csplat_trainer.tuning.options:FinetuneOptions"),
+    settings=(ENCODER, "csplat_trainer.tuning.tuning_options:FinetuneOptions"),
 )
 def finetune(
     source: Annotated[str, typer.Argument(metavar="IN.ply", help="A trained 3DGS scene.")],
@@ -124,8 +124,8 @@ def finetune(
     from csplat_render.lpips import load_lpips
     from csplat_tools.training import tuned_file as tuning
     from csplat_tools.training.tuning_report import format_tuning_report
-    from csplat_trainer.outputs import Outputs
-    from csplat_trainer.tuning.options import FinetuneOptions
+    from csplat_trainer.training_options import Outputs
+    from csplat_trainer.tuning.tuning_options import FinetuneOptions
 
     if views.data is None and not itself:
         raise typer.BadParameter("wanted one of --data and --self")

@@ -17,8 +17,7 @@ from csplat_tools.cli.view_options import Upright
 from csplat_tools.files.extras import need_trainer
 from csplat_tools.files.streams import check_name
 from csplat_tools.views import DataOptions
-from csplat_trainer.options import BACKGROUNDS, DEVICES, TrainOptions
-from csplat_trainer.outputs import Outputs
+from csplat_trainer.training_options import BACKGROUNDS, DEVICES, Outputs, TrainOptions
 
 _DEFAULT = TrainOptions()
 _KEEP = 0.8  # default fraction of the trained splats that OUT.csplat keeps: some of them are hardly seen
@@ -27,7 +26,7 @@ _KEEP = 0.8  # default fraction of the trained splats that OUT.csplat keeps: som
 @command(
     needs={"preview_every": ("previews",), "checkpoint_every": ("checkpoint",)},
     one_of=(("keep", "target_size", "target_psnr"), ("byte_cost", "target_size", "target_psnr")),
-    settings=("csplat_trainer.options:TrainOptions",),
+    settings=("csplat_trainer.training_options:TrainOptions",),
 )
 def train(
     source: Annotated[str, typer.Argument(metavar="DATA", help="A folder or transforms.json of posed pictures.")],
@@ -140,7 +139,7 @@ def train(
     from csplat_tools.training.trained_scene import run_training, run_training_to_file, tuning_after, tuning_checkpoint
     from csplat_tools.training.tuned_file import SHAPE_ENTRIES, SPLAT_BYTES
     from csplat_tools.training.tuning_report import format_tuning_report
-    from csplat_trainer.checkpoint import load_checkpoint
+    from csplat_trainer.training_checkpoint import load_checkpoint
 
     to_file, size_bytes = Path(output).suffix == ".csplat", parse_bytes(target_size)
     psnr = None if target_psnr is None else parse_decibels(target_psnr)

@@ -21,8 +21,7 @@ from csplat_render.rasteriser import Rasteriser
 from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.optimise.rate_distortion import LEAST_QUANTISED, rate_exponent
 from csplat_trainer.parameters import Parameters, adam_step, from_model
-from csplat_trainer.tuning.rate import Costs
-from csplat_trainer.tuning.state import TunedScene
+from csplat_trainer.tuning.tuned_scene import RateTerm, TunedScene
 
 #: Learning rates of the first steps per unit of the root mean square error, which counts up to `_LARGEST_ERROR`.
 _RATES = {"logits": 1.95, "scales": 0.39, "quats": 0.023, "sh0": 0.1, "shN": 0.04}
@@ -214,7 +213,7 @@ class _QuantisedValues:
     price: float = 0.0
     _alphas: F32 | None = None
     _seen: Any = None
-    _costs: Costs | None = None
+    _costs: RateTerm | None = None
 
     def seen(self) -> SplatArrays:
         self._seen = None  # as large as the scene

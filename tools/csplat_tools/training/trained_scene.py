@@ -19,12 +19,11 @@ from csplat_tools.files.streams import write_model
 from csplat_tools.training.training_page import show_views, write_training_page
 from csplat_tools.training.tuned_file import BYTE_COST, default_validation_count, run_finetuning
 from csplat_tools.views import DataOptions, find_view_set
-from csplat_trainer.checkpoint import load_checkpoint
 from csplat_trainer.data import DataSet, load
-from csplat_trainer.options import TrainOptions
-from csplat_trainer.outputs import Outputs, TrainResult
-from csplat_trainer.perceptual import PerceptualLoss
-from csplat_trainer.report import TrainingStep, plot_loss
+from csplat_trainer.losses import PerceptualLoss
+from csplat_trainer.training_checkpoint import load_checkpoint
+from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult
+from csplat_trainer.training_report import TrainingStep, plot_loss
 from csplat_trainer.tuning import FinetuneOptions
 
 _TUNING = 1 / 6  # steps of the tuning that follows a training, as a fraction of the training's steps

@@ -24,7 +24,7 @@ from csplat_tools.training.training_page import show_views, write_training_page
 from csplat_tools.training.tuning_inputs import TuningSubset, choose_splats, training_views
 from csplat_tools.training.tuning_report import make_tuning_report, score_models
 from csplat_tools.views import ViewSet
-from csplat_trainer.outputs import Outputs
+from csplat_trainer.training_options import Outputs
 from csplat_trainer.tuning import Clock, Finetuned, FinetuneOptions, TuningStep
 
 #: Factor of the learning rates; True: the scene's own renders are the reference instead of photographs. Those can be

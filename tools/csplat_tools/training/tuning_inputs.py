@@ -22,7 +22,7 @@ from csplat_tools.optimise.scene_sensitivity import measure_views
 from csplat_tools.views import VIEW_COUNT, ViewSet, with_deciders
 from csplat_trainer.sensitivity import Sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
-from csplat_trainer.tuning import View, Views, renders_of, split_views
+from csplat_trainer.tuning import TuningView, TuningViews, renders_of, split_views
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,20 +42,20 @@ class TuningSubset:
     said: Mapping[str, Any] = field(default_factory=dict)
 
 
-def training_views(source: SplatModel, views: ViewSet, threads: int | None) -> Views:
+def training_views(source: SplatModel, views: ViewSet, threads: int | None) -> TuningViews:
     """Return the views to tune by: photographs, or renders of the scene itself; none of them is a test view.
 
     Without validation views to decide which step was best, some training views do.
     """
     behind = np.array(views.background, np.float32)
 
-    def looks(cameras: Sequence[Camera]) -> list[View]:
+    def looks(cameras: Sequence[Camera]) -> list[TuningView]:
         if views.photographs:
-            return [View(one.camera, one) for one in views.pictures(cameras)]
+            return [TuningView(one.camera, one) for one in views.pictures(cameras)]
         return renders_of(source, cameras, behind, threads)
 
     teach = looks(views.teaches)
-    return Views(teach, looks(views.decides), behind) if views.decides else split_views(teach, behind)
+    return TuningViews(teach, looks(views.decides), behind) if views.decides else split_views(teach, behind)
 
 
 def choose_splats(

@@ -31,7 +31,7 @@ from csplat_tools.views.placing import CHECKS, camera_sequence, evenly, usual_vi
 from csplat_tools.views.viewset import BLACK, SPLITS, VIRTUAL, WHITE, Colour, Split, ViewSet, pose
 
 if TYPE_CHECKING:
-    from csplat_trainer.pictures import Picture
+    from csplat_trainer.posed_images import PosedImage
 
 
 _ENOUGH = 40  # number of cameras of a file from which they are split into all three roles
@@ -219,7 +219,7 @@ def _named(colour: Colour) -> str:
     return {BLACK: "black", WHITE: "white"}.get(colour) or ",".join(f"{value:g}" for value in colour)
 
 
-def _moved(pictures: Sequence[Picture], shift: NDArray[np.float64]) -> list[Picture]:
+def _moved(pictures: Sequence[PosedImage], shift: NDArray[np.float64]) -> list[PosedImage]:
     return [replace(one, camera=relative_to(shift, one.camera)) for one in pictures]
 
 

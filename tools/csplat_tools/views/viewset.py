@@ -14,7 +14,7 @@ from csplat_render import Camera, Mode
 from csplat_render.scorer import Renderable, Scorer
 
 if TYPE_CHECKING:
-    from csplat_trainer.pictures import Picture
+    from csplat_trainer.posed_images import PosedImage
 
 
 Colour = tuple[float, float, float]
@@ -56,7 +56,7 @@ class ViewSet:
     teaches: Sequence[Camera]
     decides: Sequence[Camera]
     judges: Sequence[Camera]
-    photographs: Sequence[Picture] = ()
+    photographs: Sequence[PosedImage] = ()
     virtual: bool = False
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     notes: tuple[str, ...] = ()
@@ -122,7 +122,7 @@ class ViewSet:
         """
         return self._by_photographs(self.decides, "standard", threads)
 
-    def pictures(self, cameras: Sequence[Camera]) -> list[Picture]:
+    def pictures(self, cameras: Sequence[Camera]) -> list[PosedImage]:
         """Return the photographs that the given cameras took, in the order of the cameras."""
         taken = {id(one.camera): one for one in self.photographs}
         return [taken[id(camera)] for camera in cameras]
@@ -137,12 +137,12 @@ class ViewSet:
             _ = photograph.pixels, photograph.mask
 
     def _by_photographs(self, cameras: Sequence[Camera], mode: Mode, threads: int | None) -> Scorer:
-        from csplat_trainer.evaluate import photograph_judge
+        from csplat_trainer.posed_images import photograph_scorer
 
         if not self.photographs:
             raise InputError("there are no photographs: name a data set")
         shown = self.pictures(cameras)
-        return photograph_judge(shown, self.background, mode=mode, threads=threads, origin=self.origin)
+        return photograph_scorer(shown, self.background, mode=mode, threads=threads, origin=self.origin)
 
 
 def counted_views(count: int, name: str) -> str:

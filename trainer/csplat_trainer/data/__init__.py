@@ -1,6 +1,6 @@
-"""Data sets of posed pictures, in the layouts that people have on disk: `load(path)`."""
+"""Data sets of posed images, in the layouts that people have on disk: `load(path)`."""
 
 from csplat_trainer.data.dataset import DataSet
-from csplat_trainer.data.loading import load
+from csplat_trainer.data.loader import load
 
 __all__ = ["DataSet", "load"]

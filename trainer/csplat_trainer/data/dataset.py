@@ -1,24 +1,32 @@
-"""`DataSet`, and what all readers share: shots that are not read yet, the near plane."""
+"""Data sets, and what their readers share: shots that are not read yet, splits, straightened images, point clouds."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from pathlib import Path
+from functools import cached_property, partial
+from pathlib import Path, PurePosixPath
 
 import numpy as np
+from PIL import ExifTags, Image
+from scipy.ndimage import map_coordinates
 
+from csplat.errors import InputError, counted
+from csplat.files import read_json, read_text
+from csplat.lint import Finding
 from csplat.model import UNSPECIFIED
+from csplat.ply.ply_reader import parse_ply
 from csplat.training_record import TrainingRecord
-from csplat.types import F32, F64
+from csplat.types import F32, F64, U8, Mask
 from csplat.upright import Direction
-from csplat_render.camera import DEFAULT_NEAR, camera_outliers, nearest_point
-from csplat_trainer.data.lens import Lens
-from csplat_trainer.pictures import Picture
+from csplat_render.camera import DEFAULT_NEAR, Camera, camera_outliers, nearest_point
+from csplat_trainer.data.image_files import abbreviate, match_names, normalise_name
+from csplat_trainer.data.image_pixels import MASK_THRESHOLD, ImageHeader, mask_values, open_image, rgb_pixels
+from csplat_trainer.data.lens import Lens, distorted, undistorted_lens
+from csplat_trainer.posed_images import PosedImage, UnreadMask, UnreadPixels
 
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-_NEAR = 0.03  # fraction of the cameras' distance from what they look at
+_NEAR_SHARE = 0.03  # fraction of the cameras' distance from what they look at
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +35,8 @@ class DataSet:
 
     Attributes:
         name: kind and place, for messages: `COLMAP set /data/garden`.
-        train: pictures to learn from, at least one.
-        test: pictures that were held out; none if the set is too small or names none.
+        train: images to learn from, at least one.
+        test: images that were held out; none if the set is too small or names none.
         points: [P, 3] float32, points of the scene, relative to `origin`; `None` if the set has none.
         points_rgb: [P, 3] float32 in 0..1, their colours; `None` if they have none of their own.
         report: what was found, left out and changed, a line each.
@@ -43,8 +51,8 @@ class DataSet:
     """
 
     name: str
-    train: list[Picture]
-    test: list[Picture]
+    train: list[PosedImage]
+    test: list[PosedImage]
     points: F32 | None = None
     points_rgb: F32 | None = None
     report: tuple[str, ...] = ()
@@ -53,7 +61,7 @@ class DataSet:
     test_every: int | None = None
     size: tuple[int, int] | None = None
     images: str | None = None
-    val: list[Picture] = field(default_factory=list)
+    val: list[PosedImage] = field(default_factory=list)
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
@@ -71,14 +79,14 @@ class DataSet:
         return TrainingRecord(background, self.test_every, self.size, self.train[0].camera.near, self.images)
 
     @cached_property
-    def outliers(self) -> list[Picture]:
+    def outliers(self) -> list[PosedImage]:
         """Images whose cameras are far away from all others (`camera_outliers`)."""
         images = [*self.train, *self.test, *self.val]
         outliers = camera_outliers(np.stack([image.camera.viewmat for image in images]), self.points)
         return [image for image, outlier in zip(images, outliers, strict=True) if outlier]
 
     @property
-    def counted(self) -> list[Picture]:
+    def counted(self) -> list[PosedImage]:
         """Training images that determine where the scene lies: all but outliers, or all if only outliers are left."""
         outliers = {id(image) for image in self.outliers}
         return [image for image in self.train if id(image) not in outliers] or self.train
@@ -89,13 +97,13 @@ class DataSet:
         Raises:
             InputError: a file is no image, or is cut short.
         """
-        for picture in (*self.train, *self.test):
-            _ = picture.pixels, picture.mask
+        for image in (*self.train, *self.test):
+            _ = image.pixels, image.mask
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A picture that is known but not read.
+    """A image that is known but not read.
 
     Attributes:
         name: as the set writes it.
@@ -113,7 +121,7 @@ class Shot:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class UnreadDataSet:
     """Result of a reader: everything but the pixels.
 
     Attributes:
@@ -154,4 +162,299 @@ def near_plane(shots: Sequence[Shot], points: F64 | None = None) -> float:
     positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     focus = nearest_point(positions, viewmats[:, 2, :3])
     distance = float(np.median(np.linalg.norm(positions - focus, axis=1)))
-    return min(DEFAULT_NEAR, _NEAR * distance) if distance > 0.0 else DEFAULT_NEAR
+    return min(DEFAULT_NEAR, _NEAR_SHARE * distance) if distance > 0.0 else DEFAULT_NEAR
+
+
+_SCANNET = "train_test_lists.json"  # of ScanNet++
+
+#: Names of lists, and what each is for.
+ROLES = {"train": "training", "val": "validation", "test": "test"}
+
+
+def read_split_lists(folders: Sequence[Path]) -> tuple[dict[str, list[str]], str]:
+    """Read the files that list images: ScanNet++'s `train_test_lists.json`, or text with a name a line.
+
+    Text files are called `test.txt` or `test_list.txt`, and so for `val` and `train`.
+
+    Args:
+        folders: to look in; the first that has any counts.
+
+    Returns:
+        Lines by `train`, `val` and `test`, and the files' names.
+
+    Raises:
+        InputError: a file is not UTF-8 text.
+    """
+    for folder in folders:
+        document = folder / _SCANNET
+        if document.is_file():
+            return _read_scannet_lists(document), document.name
+        files = {role: path for role in ROLES for path in _list_files(folder, role)[:1]}
+        if files:
+            lists = {role: read_text(path).splitlines() for role, path in files.items()}
+            return lists, ", ".join(path.name for path in files.values())
+    return {}, ""
+
+
+def _read_scannet_lists(path: Path) -> dict[str, list[str]]:
+    document = read_json(path)
+    lists = {role: document.get(role) for role in ROLES} if isinstance(document, dict) else {}
+    found = {role: names for role, names in lists.items() if isinstance(names, list)}
+    if not found or not all(isinstance(name, str) for names in found.values() for name in names):
+        raise InputError(f"{path} holds no lists of names, expected train, val or test")
+    return found
+
+
+def _list_files(folder: Path, role: str) -> list[Path]:
+    names = {path.name.casefold(): path for path in folder.glob("*.[tT][xX][tT]")}
+    return [names[name] for name in (f"{role}.txt", f"{role}_list.txt") if name in names]
+
+
+def _names_in(line: str, known: Container[str]) -> list[str]:
+    """Return the names of a line of a list: the line itself, or what is between commas and in quotes; no comments."""
+    line = line.strip()
+    if line in known or normalise_name(line) in known:
+        return [line]
+    if line.startswith("#"):
+        return []
+    return [name for cell in line.split(",") if (name := cell.strip().strip("\"'").strip())]
+
+
+def split_every(shots: Sequence[Shot], every: int, report: list[str]) -> tuple[list[Shot], list[Shot]]:
+    """Hold out the first and then every Nth image, in the order of their names.
+
+    Args:
+        shots: all images.
+        every: N: 8 is the custom; 0 holds out none.
+        report: a line is appended if any is held out.
+
+    Returns:
+        Training images, test images.
+
+    Raises:
+        InputError: N is 1 or negative.
+    """
+    if every < 0 or every == 1:
+        raise InputError(f"a test image every {every} images, expected 2 or more, or 0 for none")
+    ordered = sorted(shots, key=lambda shot: shot.name)
+    if every == 0 or len(ordered) < 2:
+        return ordered, []
+    report.append(f"no split is named: every {every}th image is a test image")
+    return [s for i, s in enumerate(ordered) if i % every], ordered[::every]
+
+
+def split_listed(
+    shots: Sequence[Shot], lists: Mapping[str, Sequence[str]], where: str, report: list[str]
+) -> tuple[list[Shot], list[Shot], list[Shot]]:
+    """Split images by lists of names.
+
+    A list that names none of the images decides nothing. An image on two lists is for test rather than validation, and
+    for validation rather than training. An image on none is for training, unless training images are listed: then it
+    is left out.
+
+    Args:
+        shots: all images.
+        lists: names, or lines of a file, by `train`, `val` and `test`, of which one is there at least.
+        where: the file that has the lists, for messages.
+        report: lines are appended on what each list names.
+
+    Returns:
+        Training, validation and test images.
+
+    Raises:
+        InputError: a name fits two images.
+    """
+    by_name = {shot.name: shot for shot in shots}
+    roles: dict[str, str] = {}
+    heeded = []
+    for role, word in reversed(ROLES.items()):
+        if role not in lists:
+            continue
+        cells = [name for line in lists[role] for name in _names_in(line, by_name)]
+        names = list({PurePosixPath(name).as_posix(): name for name in cells}.values())
+        found, notes = match_names(names, by_name, where)
+        report += notes
+        missing = [name for name in names if name not in found]
+        line = f"{where} names {counted(len(names), f'{word} image')}"
+        there = {0: "none of them is there", 1: "1 of them is there"}.get(len(found), f"{len(found)} of them are there")
+        report.append(f"{line}, {there}; missing: {abbreviate(missing)}" if missing else line)
+        heeded += [role] if found else []
+        twice = [name for name in found.values() if name in roles]
+        if twice:
+            report.append(
+                f"{where}: {counted(len(twice), 'image')} on more than one list, no {word} images: {abbreviate(twice)}"
+            )
+        roles = {**dict.fromkeys(found.values(), role), **roles}
+    unlisted = [shot.name for shot in shots if shot.name not in roles]
+    if "train" not in heeded:
+        roles |= dict.fromkeys(unlisted, "train")
+    elif unlisted:
+        report.append(f"{where}: {counted(len(unlisted), 'image')} on no list, left out: {abbreviate(unlisted)}")
+    train, val, test = ([shot for shot in shots if roles.get(shot.name) == role] for role in ("train", "val", "test"))
+    return train, val, test
+
+
+# Orientations of EXIF that swap width and height, and what undoes them: quarter turns, anticlockwise, then a flip.
+_ON_ITS_SIDE = {5: (1, True), 6: (-1, False), 7: (-1, True), 8: (1, False)}
+
+
+def open_shot(shot: Shot, head: ImageHeader, size: tuple[int, int] | None, near: float) -> PosedImage:
+    """The image of a shot, undistorted, RGBA if the file has transparency; pixels and mask are not read yet.
+
+    Args:
+        shot: the shot to convert.
+        head: header of its file.
+        size: width and height of the image; `None`: the file's.
+        near: the camera's near plane, scene units.
+
+    Raises:
+        InputError: its lens cannot be undone.
+    """
+    width, height = shown_size(shot.path, head.size, shot.lens)
+    lens = shot.lens.scaled(width, height)
+    straight = undistorted_lens(lens) if lens.distorts else lens
+    turned = (width, height) != head.size
+    read = partial(_read_pixels, shot.path, lens, straight, size, turned=turned, with_alpha=head.has_alpha)
+    mask = None if shot.mask is None else UnreadMask(partial(_read_mask, shot.mask, lens, straight, size))
+    width, height = size or (width, height)
+    seen = straight.scaled(width, height)
+    K = np.array([[seen.fx, 0.0, seen.cx], [0.0, seen.fy, seen.cy], [0.0, 0.0, 1.0]])
+    pixels = UnreadPixels(head.has_alpha, read)
+    return PosedImage(Camera(K, shot.viewmat, width, height, near, shot.name), pixels, mask)
+
+
+def shown_size(path: Path, size: tuple[int, int], lens: Lens) -> tuple[int, int]:
+    """Width and height of an image: as stored, or turned by EXIF where its lens is that of the image as shown.
+
+    Args:
+        path: the file.
+        size: width and height as stored.
+        lens: lens of the image.
+    """
+    if not _fits_sideways(size, lens):
+        return size
+    with open_image(path) as image:
+        return (size[1], size[0]) if _is_turned(image, lens) else size
+
+
+def _fits_sideways(size: tuple[int, int], lens: Lens) -> bool:
+    """Return True if an image's sides agree better with its lens when they are swapped."""
+    width, height = size
+    return abs(lens.width * width - lens.height * height) < abs(lens.width * height - lens.height * width)
+
+
+def _is_turned(image: Image.Image, lens: Lens) -> bool:
+    """Return True if EXIF lays an image on its side, and its lens is that of the image as it is shown.
+
+    Programs that find poses read pixels as they are stored, or as they are shown: the size that they give tells which.
+    """
+    sideways = _fits_sideways(image.size, lens)
+    return sideways and image.getexif().get(ExifTags.Base.Orientation) in _ON_ITS_SIDE
+
+
+def _turn_upright(pixels: U8, image: Image.Image) -> U8:
+    """Turn decoded pixels as the file's EXIF specifies."""
+    quarters, flips = _ON_ITS_SIDE[image.getexif()[ExifTags.Base.Orientation]]
+    turned = np.rot90(pixels, quarters)
+    return turned[::-1] if flips else turned
+
+
+def _read_pixels(
+    path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None, *, turned: bool, with_alpha: bool
+) -> U8:
+    """Return the pixels of a file, straight, in the requested size; turned as EXIF specifies, or as they are stored."""
+    with open_image(path) as stored:
+        pixels = rgb_pixels(stored, path)
+        if not with_alpha:
+            pixels = pixels[..., :3]
+        if turned:
+            pixels = _turn_upright(pixels, stored)
+    if lens.distorts:
+        pixels = _undistort(pixels, lens, straight)
+    if size is not None and size != (pixels.shape[1], pixels.shape[0]):
+        # Bicubic, as INRIA's loader; its negative lobes would push colours beyond a clipped alpha.
+        method = Image.Resampling.BICUBIC if pixels.shape[2] == 3 else Image.Resampling.HAMMING
+        pixels = np.asarray(Image.fromarray(pixels).resize(size, method))
+    return np.ascontiguousarray(pixels)
+
+
+def _read_mask(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None) -> Mask:
+    """Return which pixels of an image count: its mask, which may be larger or smaller, is brighter than half there."""
+    sides = int(lens.width), int(lens.height)
+    with open_image(path) as stored:
+        values = mask_values(stored, path).values
+        if _is_turned(stored, lens):
+            values = _turn_upright(values, stored)
+    if values.shape[::-1] != sides:
+        values = np.asarray(Image.fromarray(values).resize(sides, Image.Resampling.NEAREST))
+    if lens.distorts:
+        values = _undistort(values[..., None], lens, straight)[..., 0]
+    if size is not None and size != sides:
+        values = np.asarray(Image.fromarray(values).resize(size, Image.Resampling.BOX))
+    return values >= MASK_THRESHOLD
+
+
+def _undistort(pixels: U8, lens: Lens, straight: Lens) -> U8:
+    """Straighten a image, linear between pixels, colours weighted by their alpha."""
+    height, width = pixels.shape[:2]
+    v, u = np.mgrid[0:height, 0:width] + 0.5
+    x, y = distorted(u, v, lens, straight)
+    channels = [pixels[..., i].astype(np.float64) for i in range(pixels.shape[2])]
+    if len(channels) == 4:
+        channels[:3] = [channel * channels[3] for channel in channels[:3]]
+    at = np.stack([y - 0.5, x - 0.5])
+    moved = [map_coordinates(channel, at, order=1, mode="nearest") for channel in channels]
+    if len(moved) == 4:
+        moved[:3] = [channel / np.maximum(moved[3], 1e-3) for channel in moved[:3]]
+    result: U8 = np.clip(np.rint(np.stack(moved, axis=2)), 0, 255).astype(np.uint8)
+    return result
+
+
+_COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+_GREY = 127.5
+
+
+def finite_points(points: F64, colours: F64) -> tuple[F64, F32]:
+    """Leave out points that are not finite or beyond float32.
+
+    Args:
+        points: [P, 3].
+        colours: [P, 3], 0 to 255; clipped to that.
+
+    Returns:
+        Points, [P, 3] float64, and their colours, [P, 3] float32 in 0..1.
+    """
+    good = (np.abs(points) <= np.finfo(np.float32).max).all(axis=1) & np.isfinite(colours).all(axis=1)
+    return points[good], (np.clip(colours[good], 0.0, 255.0) / 255.0).astype(np.float32)
+
+
+def read_point_cloud(path: Path) -> tuple[F64, F32]:
+    """Read the points of a PLY, with or without colours; without, all are grey.
+
+    Args:
+        path: the file: columns x, y, z; red, green, blue as bytes, 16-bit integers, or floats from 0 to 1.
+
+    Returns:
+        As `finite_points`.
+
+    Raises:
+        InputError: it is no whole PLY, or has no points.
+    """
+    findings: list[Finding] = []
+    try:
+        content = parse_ply(path, findings)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from error
+    if content is None:
+        raise InputError(f"{path}: {next(one.text for one in findings if not one.repairable)}")
+    rows = content[0]
+    names = rows.dtype.names or ()
+    if not {"x", "y", "z"} <= set(names):
+        raise InputError(f"{path} has columns {', '.join(names) or 'none'}, expected x, y, z")
+    points = np.stack([rows[name].astype(np.float64) for name in ("x", "y", "z")], axis=1)
+    columns = next((columns for columns in _COLOURS if set(columns) <= set(names)), None)
+    if columns is None:
+        return finite_points(points, np.full_like(points, _GREY))
+    kind = rows.dtype[columns[0]]
+    scale = 255.0 if kind.kind == "f" else 255.0 / np.iinfo(kind).max
+    return finite_points(points, np.stack([rows[name].astype(np.float64) * scale for name in columns], axis=1))

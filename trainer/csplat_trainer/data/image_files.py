@@ -57,16 +57,16 @@ class FoundImages:
     notes: list[str] = field(default_factory=list)
 
 
-def plain(name: str) -> str:
+def normalise_name(name: str) -> str:
     """Return a path with `/` between its parts, without `.`, empty parts, spaces around it and a drive letter."""
     return PurePosixPath(re.sub(r"^[A-Za-z]:(?=[\\/])", "", name.strip()).replace("\\", "/")).as_posix()
 
 
-def missing_images(missing: Sequence[str], count: int, where: str) -> list[str]:
+def describe_missing(missing: Sequence[str], count: int, where: str) -> list[str]:
     """Report images that are not there: a line, or none if all are."""
     if not missing:
         return []
-    return [f"{where}: {len(missing)} of {counted(count, 'image')} are missing and left out: {shown(missing)}"]
+    return [f"{where}: {len(missing)} of {counted(count, 'image')} are missing and left out: {abbreviate(missing)}"]
 
 
 def find_images(
@@ -87,18 +87,18 @@ def find_images(
         NoImagesError: none of the images is there.
         InputError: as `match_names`.
     """
-    groups = {folder: _sizes(root, folder) for folder in dict.fromkeys(folders)}
+    groups = {folder: _size_folders(root, folder) for folder in dict.fromkeys(folders)}
     for loose in (False, True):
         for folder in sorted(groups, key=lambda one: loose and one == "."):
-            found = [one for path in groups[folder] if (one := _found(path, names, where, loose=loose)).files]
+            found = [one for path in groups[folder] if (one := _find_in(path, names, where, loose=loose)).files]
             if found:
                 large = [one for one in found[1:] if size is not None and _is_large(one, size)]
                 return large[-1] if large else found[0]
     tried = ", ".join(f"{root}/{folder}" if folder != "." else f"{root} itself" for folder in groups)
-    others = next((name for paths in groups.values() for path in paths for name in _below(path)), None)
+    others = next((name for paths in groups.values() for path in paths for name in _images_below(path)), None)
     hint = f"; there are other images, such as {others}" if others else ""
     raise NoImagesError(
-        f"{where}: none of its {len(names)} images is there ({shown(names[:1])}, …): looked in {tried}{hint}"
+        f"{where}: none of its {len(names)} images is there ({abbreviate(names[:1])}, …): looked in {tried}{hint}"
     )
 
 
@@ -115,10 +115,10 @@ def find_masks(root: Path, names: Sequence[str]) -> FoundImages | None:
     Raises:
         InputError: as `match_names`.
     """
-    folder = next((folder for name in ("masks", "mask") for folder in _sizes(root, name)[:1]), None)
+    folder = next((folder for name in ("masks", "mask") for folder in _size_folders(root, name)[:1]), None)
     if folder is None:
         return None
-    known, where = list(_below(folder)), f"{folder.name}/"
+    known, where = list(_images_below(folder)), f"{folder.name}/"
     longer = {f"{name}.png": name for name in names}
     files = {longer[name]: folder / name for name in known if name in longer}
     left = [name for name in names if name not in files]
@@ -130,10 +130,10 @@ def find_masks(root: Path, names: Sequence[str]) -> FoundImages | None:
     return FoundImages(folder, files | {name: folder / to for name, to in matched.items()}, notes)
 
 
-def masks_among(images: Sequence[Path]) -> list[str]:
+def describe_masks_among(images: Sequence[Path]) -> list[str]:
     """Report masks that lie next to the images: a line, or none if there are none."""
     stems = {path.stem for path in images}
-    for name in _below(images[0].parent) if images else ():
+    for name in _images_below(images[0].parent) if images else ():
         stem, path = PurePosixPath(_without_affix(name)).stem, PurePosixPath(name)
         if stem in stems and (stem != path.stem or path.parent.name.casefold() in ("mask", "masks")):
             return [f"there are masks next to the images, such as {name}: they are read from a folder masks alone"]
@@ -187,7 +187,7 @@ def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[t
     """Give the rules in their order: words, and keys of listed and of known names that are equal where names match."""
 
     def decoded(name: str) -> str:
-        return plain(unquote(re.sub(r"^file:(//)?(?=/)", "", name)))
+        return normalise_name(unquote(re.sub(r"^file:(//)?(?=/)", "", name)))
 
     def folded(name: str) -> str:
         return unicodedata.normalize("NFC", decoded(name)).casefold()
@@ -213,17 +213,17 @@ def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[t
         return lambda name: "/".join(parts(name)[-count:])
 
     yield "", [(_as_written, _as_written)]
-    yield "with / for \\, without spaces around it", [(plain, plain)]
-    yield "as a URL", [(decoded, plain)]
+    yield "with / for \\, without spaces around it", [(normalise_name, normalise_name)]
+    yield "as a URL", [(decoded, normalise_name)]
     yield "in another case", [(folded, folded)]
     yield "with another ending", [(unended, unended), (lambda name: folded(unended(name)),) * 2]
     if not folders:
         return
     depths = {len(parts(name)) for name in names}
     for count in range(1, max(depths, default=0)):
-        yield _FOLDER_WORDS[0], in_any_case(without_first(count), plain)
+        yield _FOLDER_WORDS[0], in_any_case(without_first(count), normalise_name)
     for count in sorted(depths):
-        yield _FOLDER_WORDS[1], in_any_case(plain, last(count))
+        yield _FOLDER_WORDS[1], in_any_case(normalise_name, last(count))
 
 
 def _as_written(name: str) -> str:
@@ -245,7 +245,7 @@ def _matched(
     for name in names:
         fitting = index.get(listed_key(name), [])
         if len(fitting) > 1:
-            raise InputError(f"{where}: {name} fits {len(fitting)} names: {shown(sorted(fitting))}")
+            raise InputError(f"{where}: {name} fits {len(fitting)} names: {abbreviate(sorted(fitting))}")
         if fitting:
             other = taken.setdefault(fitting[0], name)
             if other != name:
@@ -258,12 +258,12 @@ def _only_lacks_ending(name: str, known: str) -> bool:
     return known.startswith(_as_written(name) + ".")
 
 
-def shown(names: Sequence[str]) -> str:
+def abbreviate(names: Sequence[str]) -> str:
     """Return names for a message, the first few of them."""
     return ", ".join(names[:_SHOWN]) + (", …" if len(names) > _SHOWN else "")
 
 
-def _sizes(root: Path, folder: str) -> list[Path]:
+def _size_folders(root: Path, folder: str) -> list[Path]:
     """Find a folder and those of smaller images next to it, the largest images first; in another case if need be."""
     path = root / folder
     if folder == "." or not path.parent.is_dir():
@@ -278,13 +278,13 @@ def _sizes(root: Path, folder: str) -> list[Path]:
     return []
 
 
-def _found(folder: Path, names: Sequence[str], where: str, *, loose: bool) -> FoundImages:
+def _find_in(folder: Path, names: Sequence[str], where: str, *, loose: bool) -> FoundImages:
     files = {name: path for name in names if (path := folder / name).is_file()}
     left = [name for name in names if name not in files]
     if not left or (loose and files):
         return FoundImages(folder, files)
     taken = set(files.values())
-    known = [name for name in _below(folder) if folder / name not in taken]
+    known = [name for name in _images_below(folder) if folder / name not in taken]
     matched, notes = match_names(left, known, where, folders=loose)
     return FoundImages(folder, files | {name: folder / to for name, to in matched.items()}, notes)
 
@@ -294,7 +294,7 @@ def _is_large(found: FoundImages, size: tuple[int, int]) -> bool:
     return width >= size[0] and height >= size[1]
 
 
-def _below(folder: Path) -> Iterator[str]:
+def _images_below(folder: Path) -> Iterator[str]:
     """Give the images below a folder, sorted, relative to it; hidden ones and those of macOS' archives are left out."""
     for place, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith((".", "__MACOSX")))

@@ -27,7 +27,7 @@ from csplat.inputs import stand_in
 from csplat.types import F64, U8
 
 #: A mask's values from which on pixels count.
-COUNTS = 128
+MASK_THRESHOLD = 128
 
 _WITH_ALPHA = ("RGBA", "LA", "PA", "RGBa", "La")
 _CONVERTED = (*_WITH_ALPHA, "1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LAB", "HSV")
@@ -56,7 +56,7 @@ _RAW = (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2")  # pillo
 
 
 @dataclass(frozen=True)
-class ImageHead:
+class ImageHeader:
     """The head of an image file.
 
     Attributes:
@@ -82,7 +82,7 @@ class MaskValues:
     """The values of a mask, 0..255.
 
     Attributes:
-        values: [H, W] uint8; pixels count from `COUNTS` on.
+        values: [H, W] uint8; pixels count from `MASK_THRESHOLD` on.
         taken_as: how the file was understood where it is no image of black and white; else "".
     """
 
@@ -91,7 +91,7 @@ class MaskValues:
 
 
 @contextmanager
-def opened_image(path: Path) -> Iterator[Image.Image]:
+def open_image(path: Path) -> Iterator[Image.Image]:
     """Open an image and read its head. Faults in the rest are reported in the same way.
 
     Raises:
@@ -108,13 +108,13 @@ def opened_image(path: Path) -> Iterator[Image.Image]:
         raise InputError(f"{path} is not an image that can be read: {error}") from error
 
 
-def read_head(path: Path) -> ImageHead:
+def read_image_header(path: Path) -> ImageHeader:
     """Read the head of an image file; pixels are not decoded.
 
     Raises:
         InputError: the file is no image, or its pixels are of a kind that is refused.
     """
-    with opened_image(path) as image:
+    with open_image(path) as image:
         stored_as, has_alpha = _stored_as(image, path), _has_alpha(image)
         # The plug-in for PNG would decode all pixels to find EXIF behind them; that for TIFF turns the image itself.
         orientation = 1
@@ -122,10 +122,10 @@ def read_head(path: Path) -> ImageHead:
             orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1)
         # Phones append images for depth or brightness to a JPEG ("MPO"): nobody means them.
         frame_count = 1 if image.format == "MPO" else int(getattr(image, "n_frames", 1))
-        return ImageHead(path, image.size, stored_as, has_alpha, orientation, frame_count)
+        return ImageHeader(path, image.size, stored_as, has_alpha, orientation, frame_count)
 
 
-def opaque_images(heads: Iterable[ImageHead]) -> list[ImageHead]:
+def opaque_images(heads: Iterable[ImageHeader]) -> list[ImageHeader]:
     """Find out whether images have an alpha channel that says nothing, as exporters of photographs write.
 
     Alpha is decoded until an image has some transparency: then that of all counts.
@@ -141,7 +141,7 @@ def opaque_images(heads: Iterable[ImageHead]) -> list[ImageHead]:
     """
     with_alpha = [head for head in heads if head.has_alpha]
     for head in with_alpha:
-        with opened_image(head.path) as image:
+        with open_image(head.path) as image:
             if (rgb_pixels(image, head.path)[..., 3:] < _OPAQUE).any():
                 return []
     return with_alpha
@@ -149,7 +149,7 @@ def opaque_images(heads: Iterable[ImageHead]) -> list[ImageHead]:
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file; its pixels are not read."""
-    with opened_image(path) as image:
+    with open_image(path) as image:
         return image.size
 
 
@@ -196,11 +196,12 @@ def mask_values(image: Image.Image, path: Path) -> MaskValues:
             if alpha.min() < alpha.max():
                 values, taken_as = alpha, "colours are alike all over: alpha is the mask"
     top = int(values.max())
-    if 0 < top < COUNTS:
+    if 0 < top < MASK_THRESHOLD:
         found = np.unique(values)
         if len(found) > 2 or (len(found) == 2 and found[0] > 0):
             raise InputError(
-                f"{path} is a mask of values from {found[0]} to {top}, expected {COUNTS} or more where its image counts"
+                f"{path} is a mask of values from {found[0]} to {top}, expected {MASK_THRESHOLD} or more where its "
+                "image counts"
             )
         taken_as = f"values are {' and '.join(str(value) for value in found)}: {top} counts as white"
         values = np.where(values > 0, 255, 0).astype(np.uint8)
@@ -209,7 +210,7 @@ def mask_values(image: Image.Image, path: Path) -> MaskValues:
 
 def value_range(path: Path) -> tuple[float, float, float]:
     """Return the least and the greatest value of an image as stored, and which value is read as white."""
-    with opened_image(path) as image:
+    with open_image(path) as image:
         white = 1.0 if image.mode == _FLOAT else 255.0 if image.mode in _CONVERTED else 65535.0
         stored = np.asarray(image)
         return float(stored.min()), float(stored.max()), white

@@ -23,12 +23,25 @@ from csplat_render.camera_files import (
     frame_values,
     viewmat_of_opengl,
 )
-from csplat_trainer.data.dataset import Found, Shot
-from csplat_trainer.data.image_files import FoundImages, NoImagesError, find_images, missing_images, plain, shown
-from csplat_trainer.data.image_pixels import image_size, read_head
+from csplat_trainer.data.dataset import (
+    ROLES,
+    Shot,
+    UnreadDataSet,
+    read_point_cloud,
+    read_split_lists,
+    split_every,
+    split_listed,
+)
+from csplat_trainer.data.image_files import (
+    FoundImages,
+    NoImagesError,
+    abbreviate,
+    describe_missing,
+    find_images,
+    normalise_name,
+)
+from csplat_trainer.data.image_pixels import image_size, read_image_header
 from csplat_trainer.data.lens import UNDISTORTER, Lens
-from csplat_trainer.data.point_cloud import read_point_cloud
-from csplat_trainer.data.splits import ROLES, lists_next_to, split_every, split_listed
 
 _POINT_CLOUDS = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
 _BLENDER_AXES = "RFU"  # seen from the front: x to the right, y away, z up
@@ -36,7 +49,7 @@ _RATIONAL = "FULL_OPENCV"
 _FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 
-def read_blender(folder: Path, images: str | None = None) -> Found:
+def read_blender(folder: Path, images: str | None = None) -> UnreadDataSet:
     """Read a set with `transforms_train.json` and, mostly, `transforms_test.json` next to it.
 
     Args:
@@ -59,10 +72,10 @@ def read_blender(folder: Path, images: str | None = None) -> Found:
     val = _shots(_load(val_path), val_path, images, report, needed=False) if val_path.is_file() else []
     _check_distinct([*train, *test, *val], folder)
     points, colours = _points_next_to(train, folder, report)
-    return Found("Blender set", train, test, points, colours, report, coordinate_system=_BLENDER_AXES, val=val)
+    return UnreadDataSet("Blender set", train, test, points, colours, report, coordinate_system=_BLENDER_AXES, val=val)
 
 
-def read_transforms(path: Path, test_every: int, images: str | None = None) -> Found:
+def read_transforms(path: Path, test_every: int, images: str | None = None) -> UnreadDataSet:
     """Read instant-ngp's `transforms.json`, or nerfstudio's, which may list a split and name a point cloud.
 
     Args:
@@ -78,16 +91,16 @@ def read_transforms(path: Path, test_every: int, images: str | None = None) -> F
     points, colours = _points(document, shots, path, report)
     if "test_frames" in document:  # ScanNet++
         test = _shots(document, path, images, report, key="test_frames", needed=False)
-        return Found("transforms.json set", shots, test, points, colours, report)
+        return UnreadDataSet("transforms.json set", shots, test, points, colours, report)
     lists = {role: names for role in ROLES if (names := _listed(document, f"{role}_filenames", path))}
     files = path.name
     if not lists:
-        lists, files = lists_next_to((path.parent,))
+        lists, files = read_split_lists((path.parent,))
     if lists:
         train, val, test = split_listed(shots, lists, files, report)
-        return Found("transforms.json set", train, test, points, colours, report, val=val)
+        return UnreadDataSet("transforms.json set", train, test, points, colours, report, val=val)
     train, test = split_every(shots, test_every, report)
-    return Found("transforms.json set", train, test, points, colours, report, test_every)
+    return UnreadDataSet("transforms.json set", train, test, points, colours, report, test_every)
 
 
 def _check_distinct(shots: Sequence[Shot], folder: Path) -> None:
@@ -136,7 +149,7 @@ def _shots(
     if found.folder != folder:
         report.append(f"images from {found.folder.relative_to(folder).as_posix()}")
     report += found.notes
-    report += missing_images([name for name in names if name not in found.files], len(names), path.name)
+    report += describe_missing([name for name in names if name not in found.files], len(names), path.name)
     masks = _masks(frames, path, report)
     shots = []
     for frame in frames:
@@ -182,9 +195,9 @@ def _frames(document: Mapping[str, Any], field: str, path: Path, report: list[st
             raise InputError(f"{path}, frame {number}: {name} is there twice, with different poses; expected each once")
     for words, names in (("marked as bad", bad), ("without a finite pose", lost)):
         if names:
-            report.append(f"{path.name}: {counted(len(names), 'frame')} {words}, left out: {shown(names)}")
+            report.append(f"{path.name}: {counted(len(names), 'frame')} {words}, left out: {abbreviate(names)}")
     if twice:
-        report.append(f"{path.name}: {counted(len(twice), 'frame')} there twice, read once: {shown(twice)}")
+        report.append(f"{path.name}: {counted(len(twice), 'frame')} there twice, read once: {abbreviate(twice)}")
     if needed and not good:
         raise InputError(f"{path}: none of its {len(frames)} frames has a pose")
     return list(good.values())
@@ -205,7 +218,7 @@ def _folders(names: Sequence[str], images: str | None) -> list[str]:
     """Name the folders to look for images in: as the file says, then what is left of that without leading folders."""
     if images is not None:
         return [images]
-    own = PurePosixPath(plain(names[0])).parent
+    own = PurePosixPath(normalise_name(names[0])).parent
     return [".", *([] if own.is_absolute() else [str(own)]), own.name or ".", "images", "input"]
 
 
@@ -243,7 +256,11 @@ def _points(
         return _points_next_to(shots, path.parent, report)
     if not isinstance(name, str):
         raise InputError(f"{path}: ply_file_path is {name!r}, expected a name")
-    candidates = (path.parent / name, path.parent / plain(name), path.parent / PurePosixPath(plain(name)).name)
+    candidates = (
+        path.parent / name,
+        path.parent / normalise_name(name),
+        path.parent / PurePosixPath(normalise_name(name)).name,
+    )
     cloud = next((candidate for candidate in candidates if candidate.is_file()), None)
     if cloud is None:
         report.append(f"{path.name}: ply_file_path names {name}, which is not there: no points")
@@ -260,7 +277,7 @@ def _points_next_to(train: Sequence[Shot], folder: Path, report: list[str]) -> t
     cloud = next((path for name in _POINT_CLOUDS if (path := folder / name).is_file()), None)
     if cloud is None:
         return None, None
-    if train and read_head(train[0].path).has_alpha:
+    if train and read_image_header(train[0].path).has_alpha:
         report.append(f"{cloud.name} is not read: the images' transparency says where splats may start")
         return None, None
     report.append(f"points from {cloud.name}")
@@ -278,7 +295,7 @@ def _listed(document: Mapping[str, Any], key: str, path: Path) -> list[str]:
 
 def _plain(name: str, image: Path) -> str:
     """Return a name as the file has it: without `./`, with its ending (Blender's sets leave it out)."""
-    return PurePosixPath(plain(name)).with_name(image.name).as_posix()
+    return PurePosixPath(normalise_name(name)).with_name(image.name).as_posix()
 
 
 def _load(path: Path) -> dict[str, Any]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from csplat_trainer.tuning.finetuning import Clock, Finetuned, finetune
-from csplat_trainer.tuning.loop import FinetuneResult, TuningStep, tune
-from csplat_trainer.tuning.options import FinetuneOptions
-from csplat_trainer.tuning.views import View, Views, renders_of, split_views
+from csplat_trainer.tuning.tuned_file import Clock, Finetuned, finetune
+from csplat_trainer.tuning.tuning_loop import FinetuneResult, TuningStep, tune
+from csplat_trainer.tuning.tuning_options import FinetuneOptions, TuningView, TuningViews, renders_of, split_views
 
 __all__ = [
     "Clock",
@@ -13,8 +12,8 @@ __all__ = [
     "FinetuneResult",
     "Finetuned",
     "TuningStep",
-    "View",
-    "Views",
+    "TuningView",
+    "TuningViews",
     "finetune",
     "renders_of",
     "split_views",

@@ -15,9 +15,9 @@ from csplat_bench.common.report import write_json
 from csplat_bench.common.scenes import DATA
 from csplat_tools.files.console import note
 from csplat_trainer.data import DataSet, load
-from csplat_trainer.loop import train
-from csplat_trainer.options import TrainOptions
-from csplat_trainer.report import TrainingStep
+from csplat_trainer.training_loop import train
+from csplat_trainer.training_options import TrainOptions
+from csplat_trainer.training_report import TrainingStep
 
 _TOLD = 5  # lines of progress of a training
 

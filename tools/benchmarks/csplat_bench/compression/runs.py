@@ -27,7 +27,7 @@ from csplat_tools.inspect.info import byte_shares
 from csplat_tools.training.tuning_inputs import TuningSubset, choose_splats, training_views
 from csplat_tools.training.tuning_report import score_models
 from csplat_tools.views import DataOptions, find_view_set
-from csplat_trainer.tuning import Clock, FinetuneOptions, Views, tune
+from csplat_trainer.tuning import Clock, FinetuneOptions, TuningViews, tune
 
 #: Splats, and the seconds that it took to choose them, by stage.
 Pick = tuple[TuningSubset, dict[str, float]]
@@ -88,7 +88,7 @@ class Bench:
         return self.encoding.threads
 
     @cached_property
-    def views(self) -> Views:
+    def views(self) -> TuningViews:
         """Training and validation views of the tuning."""
         return training_views(self.source, self.looks, self.threads)
 

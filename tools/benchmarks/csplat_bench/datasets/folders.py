@@ -12,7 +12,7 @@ from csplat_bench.common.command import listed
 from csplat_bench.datasets.protocols import BLENDER, COLMAP, MAX_WIDTH, OTHER, PROTOCOLS, TRANSFORMS, Protocol
 from csplat_tools.files.console import note
 from csplat_trainer.data.colmap import find_model, read_colmap
-from csplat_trainer.data.dataset import Found
+from csplat_trainer.data.dataset import UnreadDataSet
 from csplat_trainer.data.image_pixels import image_size
 from csplat_trainer.data.transforms import read_blender, read_transforms
 
@@ -190,7 +190,7 @@ def _with_unique_keys(found: list[SceneFolder]) -> list[SceneFolder]:
     return result
 
 
-def _pictures(folder: SceneFolder, factor: int) -> tuple[str | None, Found]:
+def _pictures(folder: SceneFolder, factor: int) -> tuple[str | None, UnreadDataSet]:
     if folder.kind == BLENDER:
         return None, read_blender(folder.path)
     if folder.kind == TRANSFORMS:

@@ -22,8 +22,8 @@ from csplat_bench.datasets.records import File, Record
 from csplat_render.lpips import Lpips
 from csplat_tools.files.console import note
 from csplat_trainer.data import DataSet, load
-from csplat_trainer.evaluate import photograph_judge
-from csplat_trainer.options import TrainOptions
+from csplat_trainer.posed_images import photograph_scorer
+from csplat_trainer.training_options import TrainOptions
 
 #: Name of the trained scene among its compressed files.
 PLY = "PLY"
@@ -145,7 +145,7 @@ def _file(
     name: str, model: SplatModel, size_bytes: int, seconds: float | None, data: DataSet, lpips: Lpips | None
 ) -> File:
     """Score a model on the held-out pictures; papers print the mean over them."""
-    found = photograph_judge(data.test, data.background, origin=(0.0, 0.0, 0.0)).scores(model, lpips=lpips)
+    found = photograph_scorer(data.test, data.background, origin=(0.0, 0.0, 0.0)).scores(model, lpips=lpips)
     return {
         "file": name,
         "size_bytes": size_bytes,

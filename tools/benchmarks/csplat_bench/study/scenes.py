@@ -17,7 +17,7 @@ from csplat_bench.common.scenes import DATA, OUT, cameras_of
 from csplat_bench.study.judge import Distance, Views, renders_at
 from csplat_render import Camera
 from csplat_tools.views import BLACK, DataOptions, ViewSet, find_view_set
-from csplat_trainer.options import TrainOptions
+from csplat_trainer.training_options import TrainOptions
 
 _LPIPS_WEIGHT = 0.1
 

@@ -16,10 +16,10 @@ from csplat_bench.common.measuring import peak_bytes, reset_peak
 from csplat_render.kernels import thread_count
 from csplat_trainer.data import load
 from csplat_trainer.engine import CpuEngine
-from csplat_trainer.options import TrainOptions
+from csplat_trainer.initial_splats import measure_extent, place_splats
 from csplat_trainer.parameters import Parameters, adam_step
-from csplat_trainer.pictures import Picture
-from csplat_trainer.starting import scene_of, starting_splats
+from csplat_trainer.posed_images import PosedImage
+from csplat_trainer.training_options import TrainOptions
 
 #: In addition to `step`, which is all of them, and `CPU`, the seconds of all threads.
 STAGES = ("forward", "loss", "backward", "Adam", "other")
@@ -53,10 +53,10 @@ def measured(folder: Path, count: int, size: tuple[int, int], warm: int, steps: 
     data.read()
     pictures = data.train
     options = TrainOptions(max_splats=count, sh_degree=_DEGREE, strategy="fixed", iterations=warm + steps)
-    rng, scene = np.random.default_rng(0), scene_of(pictures)
+    rng, scene = np.random.default_rng(0), measure_extent(pictures)
 
     def start(splats: int) -> Parameters:
-        return Parameters.starting_at(starting_splats(pictures, scene, splats, _DEGREE, rng))
+        return Parameters.starting_at(place_splats(pictures, scene, splats, _DEGREE, rng))
 
     with thread_count(threads):
         # Engines stay, as for trainer/FIGURES.md: what one gives back the next one would take, unseen. The second
@@ -73,7 +73,7 @@ def measured(folder: Path, count: int, size: tuple[int, int], warm: int, steps: 
 
 
 def _walk(
-    pictures: Sequence[Picture], options: TrainOptions, parameters: Parameters, steps: int
+    pictures: Sequence[PosedImage], options: TrainOptions, parameters: Parameters, steps: int
 ) -> tuple[dict[str, list[float]], list[float], CpuEngine]:
     """Train for some steps; return the seconds of each stage, the mean squared errors, and the engine."""
     spent: dict[str, float] = {}
@@ -87,7 +87,7 @@ def _walk(
 
         return run
 
-    engine, rng, extent = CpuEngine(parameters, options), np.random.default_rng(1), scene_of(pictures).extent
+    engine, rng, extent = CpuEngine(parameters, options), np.random.default_rng(1), measure_extent(pictures).extent
     rasteriser, loss_for = engine._rasteriser, engine._loss_for  # noqa: SLF001 - the stages
 
     def clocked_loss(camera: Any) -> Any:

@@ -1,4 +1,4 @@
-"""`finetune`: a scene and pictures in, a tuned file out. The encoder decides once, values move, then they are coded."""
+"""`finetune`: a scene and views in, a tuned file out. The encoder decides once; then values are tuned and coded."""
 
 from __future__ import annotations
 
@@ -19,12 +19,11 @@ from csplat.training_record import TrainingRecord
 from csplat.types import I64
 from csplat_render.camera import relative_to
 from csplat_trainer.data import DataSet
-from csplat_trainer.outputs import Outputs
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
-from csplat_trainer.tuning.loop import TuningStep, tune
-from csplat_trainer.tuning.options import FinetuneOptions
-from csplat_trainer.tuning.views import View, Views, split_views
+from csplat_trainer.training_options import Outputs
+from csplat_trainer.tuning.tuning_loop import TuningStep, tune
+from csplat_trainer.tuning.tuning_options import FinetuneOptions, TuningView, TuningViews, split_views
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +66,7 @@ class Clock:
 
 def finetune(
     model: SplatModel,
-    views: Views | DataSet,
+    views: TuningViews | DataSet,
     encoding: EncodeOptions | None = None,
     options: FinetuneOptions | None = None,
     *,
@@ -80,7 +79,7 @@ def finetune(
     progress: Callable[[str, float], None] | None = None,
     on_step: Callable[[TuningStep], None] | None = None,
 ) -> Finetuned:
-    """Encode a scene, and move what the file holds until a decoder's pictures look right; `csplat finetune` calls it.
+    """Encode a scene, and move what the file holds until a decoder's images look right; `csplat finetune` calls it.
 
     The same scene, views and options give the same bytes on the same machine, at any number of threads.
 
@@ -151,17 +150,17 @@ def finetune(
     return Finetuned(result, decoded, plain, tuned.log, clock.seconds)
 
 
-def _views_of(data: DataSet, model: SplatModel) -> Views:
+def _views_of(data: DataSet, model: SplatModel) -> TuningViews:
     """Return the training photographs of a data set, in front of the background that the scene records."""
     trained = TrainingRecord.of(model.metadata)
     behind = data.background if trained is None else trained.background
     shift = np.subtract(model.origin, data.origin)
-    looks = [View(relative_to(shift, one.camera), one) for one in data.train]
+    looks = [TuningView(relative_to(shift, one.camera), one) for one in data.train]
     return split_views(looks, np.array(behind, np.float32))
 
 
 def _measured(
-    model: SplatModel, views: Views, encoding: EncodeOptions, progress: Callable[[str, float], None] | None
+    model: SplatModel, views: TuningViews, encoding: EncodeOptions, progress: Callable[[str, float], None] | None
 ) -> Importance:
     """Measure how much the training views depend on each splat."""
     cameras = [one.camera for one in views.train]

@@ -1,18 +1,22 @@
-"""`Picture`: a photograph and its camera in the form that training needs: bytes, converted to float on demand."""
+"""`PosedImage`, an image of a data set and its camera, kept as bytes and converted to float on demand; its scores."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
 from csplat.types import F32, F64, U8, Mask
 from csplat_render.camera import Camera
+from csplat_render.conventions import Mode
 from csplat_render.kernels import parallel_kernel
+from csplat_render.metrics import COVERED_ALPHA, Distance, Scores
+from csplat_render.scorer import ReferenceImage, Scorer
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +25,7 @@ class UnreadPixels:
 
     Attributes:
         has_alpha: True if there is an alpha channel.
-        read: makes the array that `Picture` needs.
+        read: makes the array that `PosedImage` needs.
     """
 
     has_alpha: bool
@@ -38,7 +42,7 @@ class UnreadMask:
     """A mask that is read when it is first asked for, and then kept.
 
     Attributes:
-        read: makes the array that `Picture` needs.
+        read: makes the array that `PosedImage` needs.
     """
 
     read: Callable[[], Mask]
@@ -50,7 +54,7 @@ class UnreadMask:
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class PosedImage:
     """One view of a data set.
 
     Attributes:
@@ -116,42 +120,42 @@ class Picture:
             raise InputError(f"a picture has {pixels.shape[:2]} pixels, its camera {shape} (height, width)")
 
 
-def compose(picture: Picture, background: F32, out: F32) -> F32:
-    """The picture as floats, in front of a background.
+def compose(image: PosedImage, background: F32, out: F32) -> F32:
+    """The image as floats, in front of a background.
 
     Args:
-        picture: the image to compose.
+        image: the image to compose.
         background: [3], the colour behind it.
         out: [H, W, 3] float32, overwritten.
 
     Returns:
         `out`.
     """
-    _compose(np.ascontiguousarray(picture.pixels), background, out)
+    _compose(np.ascontiguousarray(image.pixels), background, out)
     return out
 
 
-def halved(picture: Picture) -> Picture:
-    """The picture at half its width and height: each pixel is the mean of four, weighted with their alpha.
+def halve(image: PosedImage) -> PosedImage:
+    """The image at half its width and height: each pixel is the mean of four, weighted with their alpha.
 
-    A last odd row or column is left out. A pixel counts if all four do; if none would, or the picture is one
+    A last odd row or column is left out. A pixel counts if all four do; if none would, or the image is one
     pixel wide or high, it stays as it is.
     """
-    camera = picture.camera
+    camera = image.camera
     W, H = camera.W // 2, camera.H // 2
     corners = [(slice(y, 2 * H, 2), slice(x, 2 * W, 2)) for y in (0, 1) for x in (0, 1)]
     mask: Mask | None = None
-    if picture.mask is not None:
-        mask = np.asarray(np.stack([picture.mask[corner] for corner in corners]).all(axis=0))
+    if image.mask is not None:
+        mask = np.asarray(np.stack([image.mask[corner] for corner in corners]).all(axis=0))
     if min(W, H) == 0 or (mask is not None and not mask.any()):
-        return picture
+        return image
     smaller = replace(camera, K=np.diag([0.5, 0.5, 1.0]) @ camera.K, W=W, H=H)
-    four = np.stack([picture.pixels[corner] for corner in corners]).astype(np.uint32)
-    alphas = four[..., 3:] if picture.has_alpha else np.ones((4, H, W, 1), np.uint32)
+    four = np.stack([image.pixels[corner] for corner in corners]).astype(np.uint32)
+    alphas = four[..., 3:] if image.has_alpha else np.ones((4, H, W, 1), np.uint32)
     weights = alphas.sum(axis=0)
     colours = ((alphas * four[..., :3]).sum(axis=0) + weights // 2) // np.maximum(weights, 1)
-    pixels = np.concatenate([colours, (weights + 2) // 4], axis=2) if picture.has_alpha else colours
-    return Picture(smaller, np.ascontiguousarray(pixels, np.uint8), mask)
+    pixels = np.concatenate([colours, (weights + 2) // 4], axis=2) if image.has_alpha else colours
+    return PosedImage(smaller, np.ascontiguousarray(pixels, np.uint8), mask)
 
 
 @parallel_kernel()
@@ -168,3 +172,60 @@ def _compose(lane: int, lanes: int, pixels: U8, background: F32, out: F32) -> No
             else:
                 for k in range(3):
                     out[r, c, k] = np.float32(pixels[r, c, k]) * over
+
+
+def photograph_scorer(
+    images: Sequence[PosedImage],
+    background: ArrayLike,
+    *,
+    mode: Mode = "standard",
+    threads: int | None = None,
+    origin: Sequence[float] | None = None,
+) -> Scorer:
+    """Return a judge by photographs; each is composed when its turn comes.
+
+    Args:
+        images: at least one.
+        background: red, green, blue, behind renders and behind photographs that have an alpha channel.
+        mode, threads, origin: as in `Scorer`.
+    """
+    colour = np.asarray(background, np.float32)
+    cameras = [image.camera for image in images]
+    looks = [partial(_reference_image, one, colour) for one in images]
+    masked = any(one.masked is not None for one in images)
+    return Scorer(
+        cameras, looks, colour, mode, threads, origin, [_pixel_count(one) for one in images] if masked else None
+    )
+
+
+def evaluate(
+    render: Callable[[Camera], F32],
+    images: Sequence[PosedImage],
+    background: F32,
+    lpips: Distance | None = None,
+) -> dict[str, Any]:
+    """Compare renders with photographs.
+
+    Args:
+        render: renders a camera's view, [H, W, 3].
+        images: at least one.
+        background: [3], behind photographs that have an alpha channel; `render` uses the same.
+        lpips: the perceptual distance, or `None`.
+
+    Returns:
+        The fields of `csplat_render.metrics.Scores` for all images together.
+    """
+    judge = photograph_scorer(images, background)
+    each = [judge.score(number, render(camera), lpips=lpips) for number, camera in enumerate(judge.cameras)]
+    return Scores.of(each).as_json()
+
+
+def _reference_image(image: PosedImage, background: F32) -> ReferenceImage:
+    shown = compose(image, background, np.empty((image.camera.H, image.camera.W, 3), np.float32))
+    covered = image.pixels[..., 3] >= COVERED_ALPHA * 255.0 if image.has_alpha else None
+    return ReferenceImage(shown, covered, counts=image.mask)
+
+
+def _pixel_count(image: PosedImage) -> int:
+    """Return the number of pixels that count."""
+    return image.camera.W * image.camera.H if image.mask is None else int(image.mask.sum())

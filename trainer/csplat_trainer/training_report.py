@@ -94,16 +94,16 @@ def plot_loss(path: str | Path, losses: Sequence[float], title: str = "") -> Non
         stream.write(buffer.getvalue())
 
 
-def side_by_side(*pictures: F32) -> F32:
+def side_by_side(*images: F32) -> F32:
     """Return images of one height next to each other."""
-    return np.concatenate(pictures, axis=1)
+    return np.concatenate(images, axis=1)
 
 
-def save_picture(path: str | Path, picture: F32) -> None:
-    """Write a picture, [H, W, 3] float in 0..1 (clipped), as a PNG."""
+def save_image(path: str | Path, image: F32) -> None:
+    """Write a image, [H, W, 3] float in 0..1 (clipped), as a PNG."""
     from PIL import Image
 
-    rounded = np.rint(np.clip(picture, 0.0, 1.0) * 255.0).astype(np.uint8)
+    rounded = np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
     buffer = io.BytesIO()
     Image.fromarray(rounded).save(buffer, format="png")
     with atomic_writer(str(path)) as stream:

@@ -1,4 +1,4 @@
-"""Checks of what a set states against what its files are: sizes, lenses, poses; and notes on how they were read."""
+"""Checks of a data set's statements against its files: sizes, lenses, poses; and notes on how they were read."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from csplat.errors import InputError, counted
 from csplat_render.camera import camera_outliers, convergence, nearest_point
 from csplat_render.camera_files import check_intrinsics
-from csplat_trainer.data.dataset import Shot
-from csplat_trainer.data.image_pixels import ImageHead, image_size, mask_values, opened_image, value_range
+from csplat_trainer.data.dataset import Shot, shown_size
+from csplat_trainer.data.image_pixels import ImageHeader, image_size, mask_values, open_image, value_range
 from csplat_trainer.data.lens import Lens, undistorted_lens
-from csplat_trainer.data.pixels import shown_size
 
 _ROUNDING = 1.0  # pixels by which each side of a scaled-down image may be rounded
 _NEARLY = 0.02  # relative, of scales across and down: beyond it an image is turned, or a mask is another image's
@@ -31,7 +30,7 @@ _MEETING = 0.1  # of their distance: lines of sight that pass a point so near me
 _SHOTS, _POINTS = 64, 4096  # shots and points of a set, at most, that are checked for belonging together
 
 
-def check_shots(shots: Sequence[Shot], heads: Mapping[Path, ImageHead]) -> None:
+def check_shots(shots: Sequence[Shot], heads: Mapping[Path, ImageHeader]) -> None:
     """Check lenses against reason, images against their cameras' sizes, and masks against their images'.
 
     Args:
@@ -46,18 +45,18 @@ def check_shots(shots: Sequence[Shot], heads: Mapping[Path, ImageHead]) -> None:
     for shot in shots:
         lens, size = shot.lens, shown_size(shot.path, heads[shot.path].size, shot.lens)
         wanted = (lens.width, lens.height)
-        if _misfit(size, wanted) > _NEARLY >= _misfit((size[1], size[0]), wanted):
+        if _aspect_mismatch(size, wanted) > _NEARLY >= _aspect_mismatch((size[1], size[0]), wanted):
             source = f"which {lens.source} states" if lens.source else "its camera's"
             remedy = "the sides are swapped: turn the images, or find poses of them as they are"
-            raise _misshapen(shot.path, size, wanted, source, remedy)
+            raise _aspect_error(shot.path, size, wanted, source, remedy)
         if shot.mask is not None:
             mask_size = shown_size(shot.mask, image_size(shot.mask), lens)
-            if _misfit(mask_size, size) > _NEARLY:
+            if _aspect_mismatch(mask_size, size) > _NEARLY:
                 remedy = "it is the mask of another image"
-                raise _misshapen(shot.mask, mask_size, size, f"its image's ({shot.name})", remedy)
+                raise _aspect_error(shot.mask, mask_size, size, f"its image's ({shot.name})", remedy)
 
 
-def notes_on_images(shots: Sequence[Shot], heads: Mapping[Path, ImageHead]) -> list[str]:
+def describe_images(shots: Sequence[Shot], heads: Mapping[Path, ImageHeader]) -> list[str]:
     """Report pixels, turns and masks that could mean something else.
 
     Raises:
@@ -75,7 +74,7 @@ def notes_on_images(shots: Sequence[Shot], heads: Mapping[Path, ImageHead]) -> l
         what = f"{counted(len(several), 'file')} with several images: the first of each is read"
         notes.append(f"{what} ({several[0].path.name} has {several[0].frame_count})")
     sizes = {shot.path: shown_size(shot.path, heads[shot.path].size, shot.lens) for shot in shots}
-    misfits = [shot for shot in shots if _misfit(sizes[shot.path], (shot.lens.width, shot.lens.height)) > 0.0]
+    misfits = [shot for shot in shots if _aspect_mismatch(sizes[shot.path], (shot.lens.width, shot.lens.height)) > 0.0]
     if misfits:
         (width, height), lens = sizes[misfits[0].path], misfits[0].lens
         notes.append(
@@ -95,14 +94,14 @@ def notes_on_images(shots: Sequence[Shot], heads: Mapping[Path, ImageHead]) -> l
         )
     mask = next((shot.mask for shot in shots if shot.mask is not None), None)
     if mask is not None:
-        with opened_image(mask) as image:
+        with open_image(mask) as image:
             taken_as = mask_values(image, mask).taken_as
         if taken_as:
             notes.append(f"masks as {mask.name}: {taken_as}")
     return notes
 
 
-def notes_on_lenses(shots: Sequence[Shot]) -> list[str]:
+def describe_lenses(shots: Sequence[Shot]) -> list[str]:
     """Report what is undone, and principal points far from the middle."""
     notes = []
     lenses = list({shot.lens: None for shot in shots})
@@ -124,7 +123,7 @@ def notes_on_lenses(shots: Sequence[Shot]) -> list[str]:
     return notes
 
 
-def notes_on_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | None) -> list[str]:
+def describe_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | None) -> list[str]:
     """Report cameras that are all at one place, see none of the points, or look as inverted poses do.
 
     Args:
@@ -178,12 +177,14 @@ def _sees_any(shot: Shot, points: NDArray[np.floating[Any]]) -> bool:
     return bool(((z > 0.0) & across & down).any())
 
 
-def _misshapen(path: Path, size: tuple[int, int], wanted: tuple[float, float], source: str, remedy: str) -> InputError:
+def _aspect_error(
+    path: Path, size: tuple[int, int], wanted: tuple[float, float], source: str, remedy: str
+) -> InputError:
     found, shape = f"{size[0]}×{size[1]}", f"{wanted[0]:g}×{wanted[1]:g}"
     return InputError(f"{path} is {found} pixels, expected the shape of {shape}, {source}: {remedy}")
 
 
-def _misfit(size: tuple[int, int], wanted: tuple[float, float]) -> float:
+def _aspect_mismatch(size: tuple[int, int], wanted: tuple[float, float]) -> float:
     """Return how much more an image is scaled along one side than the other, relative; 0 if rounding explains it."""
     (low_x, high_x), (low_y, high_y) = (
         ((side - _ROUNDING) / (other + _ROUNDING), (side + _ROUNDING) / max(other - _ROUNDING, 0.5))
@@ -200,7 +201,7 @@ def _is_in_the_middle(lens: Lens) -> bool:
     return low <= lens.cx / lens.width <= high and low <= lens.cy / lens.height <= high
 
 
-def _turn_is_undecided(head: ImageHead) -> bool:
+def _turn_is_undecided(head: ImageHeader) -> bool:
     """Return True if EXIF turns an image and its camera's size leaves open whether the camera's program did so."""
     width, height = head.size
     return head.orientation in (2, 3, 4) or (head.orientation in (5, 6, 7, 8) and width == height)

@@ -1,8 +1,8 @@
-"""Photographs of one scene that were exposed differently: a gain and a shift per photograph and channel.
+"""Per-image gain and bias, for images of one scene that were exposed differently.
 
-Renders are corrected before they are compared with a photograph, as in the code of "A Hierarchical 3D Gaussian
-Representation" (Kerbl et al. 2024, https://arxiv.org/abs/2406.12080). Corrections are learnt together with the splats,
-and no file holds them: together they leave the scene as bright as the photographs are in the mean.
+Renders are corrected before they are compared with an image, as in the code of "A Hierarchical 3D Gaussian
+Representation" (Kerbl et al. 2024, https://arxiv.org/abs/2406.12080). Corrections are trained together with the splats
+and stored in no file: on average they leave the scene as bright as the images are.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from csplat.types import F32, F64
 
 _STATE = (4, 2, 3)  # state of a photograph: values, both of Adam's means, steps
 _BETA1, _BETA2, _EPSILON = 0.9, 0.99, 1e-15
-_MOST = 1.0  # limit on the logarithm of a gain, and on a shift: images that differ by more are not of one scene
+_LIMIT = 1.0  # limit on the logarithm of a gain, and on a shift: images that differ by more are not of one scene
 
 
-class Exposures:
+class ImageGains:
     """Per-image gain and bias of the training photographs, and Adam's memory of them.
 
     Args:
@@ -56,12 +56,12 @@ class Exposures:
         second[:] = _BETA2 * second + (1.0 - _BETA2) * slope * slope
         mean, square = first / (1.0 - _BETA1**steps), second / (1.0 - _BETA2**steps)
         self.values[number] -= rate * mean / (np.sqrt(square) + _EPSILON)
-        np.clip(self.values, -_MOST, _MOST, out=self.values)
+        np.clip(self.values, -_LIMIT, _LIMIT, out=self.values)
         self.values -= self.values.mean(axis=0)
 
 
 @dataclass(frozen=True, eq=False)
-class Exposure:
+class ImageGain:
     """The correction of one photograph.
 
     Attributes:
@@ -70,7 +70,7 @@ class Exposure:
         rate: learning rate.
     """
 
-    among: Exposures
+    among: ImageGains
     number: int
     rate: float
 

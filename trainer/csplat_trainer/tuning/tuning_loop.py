@@ -1,35 +1,40 @@
-"""`tune`: move the values of a frozen scene until its file looks like the pictures."""
+"""`tune`: optimise the values of a frozen scene until renders of its file match the reference images.
+
+A target size is held by the rate weight, the loss per bit and splat: `RateController` adjusts it to the number of bits.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.random import PCG64, Generator
+from numpy.typing import NDArray
 
+from csplat.archives import read_archive
 from csplat.encoder import DecodedValues, FreeValues, Frozen
 from csplat.errors import InputError
+from csplat.files import atomic_writer
 from csplat.types import F32
 from csplat_render.conventions import SplatArrays
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.rasteriser import Rasteriser
-from csplat_trainer.exposure import Exposure, Exposures
-from csplat_trainer.loss import LOSS_WEIGHTS, PhotometricLoss
-from csplat_trainer.report import peak_memory
-from csplat_trainer.tuning.budget import Budget
-from csplat_trainer.tuning.checkpoint import FinetuneCheckpoint, load_finetune, save_finetune
-from csplat_trainer.tuning.options import FinetuneOptions
-from csplat_trainer.tuning.rate import Costs
-from csplat_trainer.tuning.state import TunedScene
-from csplat_trainer.tuning.views import View, Views
+from csplat_trainer.image_gains import ImageGain, ImageGains
+from csplat_trainer.losses import LOSS_WEIGHTS, PhotometricLoss
+from csplat_trainer.parameters import GROUPS, Parameters
+from csplat_trainer.training_report import peak_memory
+from csplat_trainer.tuning.tuned_scene import RateTerm, TunedScene
+from csplat_trainer.tuning.tuning_options import FinetuneOptions, TuningView, TuningViews
 
 _COUNT_EVERY = 50  # steps between counts of the integers
-_LEAST_GAIN = 2e-4  # smallest difference of the score that counts as a gain
+_MIN_GAIN = 2e-4  # smallest difference of the score that counts as a gain
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ class FinetuneResult:
 
 def tune(
     frozen: Frozen,
-    views: Views,
+    views: TuningViews,
     options: FinetuneOptions | None = None,
     *,
     size_bytes: int | None = None,
@@ -99,14 +104,14 @@ def tune(
     Raises:
         InputError: a checkpoint is none, or of another scene, views or options; or a loss or a value is not finite.
     """
-    run = _Run(frozen, views, options or FinetuneOptions(), threads, size_bytes)
+    run = _TuningRun(frozen, views, options or FinetuneOptions(), threads, size_bytes)
     if resume is not None:
         run.go_on(load_finetune(resume, frozen))
     return run.to_the_end(progress, checkpoint, checkpoint_every)
 
 
 @dataclass
-class _Best:
+class _BestValues:
     """The best look so far, and how many that count came after it."""
 
     held: FreeValues
@@ -117,18 +122,18 @@ class _Best:
 
 
 @dataclass
-class _Buffers:
+class _ImageBuffers:
     """Loss and reference image of a size; kept from step to step."""
 
     loss: PhotometricLoss
     wanted: F32
 
 
-class _Run:
+class _TuningRun:
     """A run: the scene, the renderer, the random numbers, the log."""
 
     def __init__(
-        self, frozen: Frozen, views: Views, options: FinetuneOptions, threads: int | None, size_bytes: int | None
+        self, frozen: Frozen, views: TuningViews, options: FinetuneOptions, threads: int | None, size_bytes: int | None
     ) -> None:
         self._views, self._options = views, options
         self._scene = TunedScene(frozen)
@@ -137,13 +142,13 @@ class _Run:
         self._extent = float(np.exp(np.clip(np.median(np.median(frozen.draft.model.scales, axis=1)), -80.0, 80.0)))
         self._rng = Generator(PCG64(options.seed))
         self._iteration, self._queue = 0, list[int]()
-        self._sizes: dict[tuple[int, int], _Buffers] = {}
+        self._sizes: dict[tuple[int, int], _ImageBuffers] = {}
         self._log: dict[str, Any] = {"losses": [], "looks": [], "seconds": 0.0, "views": views.digest}
-        self._exposures = Exposures(len(views.train))
+        self._exposures = ImageGains(len(views.train))
         self._numbers = {id(view): number for number, view in enumerate(views.train)}
-        self._best: _Best | None = None
-        self._costs: Costs | None = None
-        self._budget = None if size_bytes is None else Budget(size_bytes, options.byte_cost)
+        self._best: _BestValues | None = None
+        self._costs: RateTerm | None = None
+        self._budget = None if size_bytes is None else RateController(size_bytes, options.byte_cost)
 
     def go_on(self, checkpoint: FinetuneCheckpoint) -> None:
         """Take up what a checkpoint holds.
@@ -153,7 +158,7 @@ class _Run:
         """
         if checkpoint.log["views"] != self._views.digest:
             raise InputError("the checkpoint is of a run with other views")
-        budget = Budget.of(checkpoint.log.get("budget"))
+        budget = RateController.of(checkpoint.log.get("budget"))
         if (budget and budget.size_bytes) != (self._budget and self._budget.size_bytes):
             raise InputError("the checkpoint is of a run with another target")
         before = {**asdict(FinetuneOptions()), **checkpoint.options}  # an older one does not name all of them
@@ -167,11 +172,11 @@ class _Run:
         self._log = checkpoint.log
         for look in self._log["looks"]:
             look.setdefault("size_bytes", 0)  # older checkpoints lack it if no size was requested
-        self._exposures = Exposures(len(self._views.train), self._log.get("exposures", ()))
-        self._best = _Best(checkpoint.best_held, *checkpoint.best)
+        self._exposures = ImageGains(len(self._views.train), self._log.get("exposures", ()))
+        self._best = _BestValues(checkpoint.best_held, *checkpoint.best)
         self._budget = budget
         if checkpoint.costs:
-            self._costs = Costs(self._scene.frozen, self._byte_cost, checkpoint.costs)
+            self._costs = RateTerm(self._scene.frozen, self._byte_cost, checkpoint.costs)
 
     def to_the_end(
         self, progress: Callable[[TuningStep], None] | None, checkpoint: str | Path | None, checkpoint_every: int
@@ -208,7 +213,7 @@ class _Run:
         return 0 < self._options.patience <= self._best.since
 
     def _step(self) -> float:
-        """One picture; returns its loss before the step."""
+        """One image; returns its loss before the step."""
         if not self._queue:
             self._queue = self._rng.permutation(len(self._views.train)).tolist()
         number = self._queue.pop()
@@ -222,9 +227,9 @@ class _Run:
         rendered = self._render(seen, view)
         buffers = self._buffers(view)
         rate = self._options.lr_exposure * self._options.share(self._iteration)
-        exposure = Exposure(self._exposures, number, rate) if self._options.lr_exposure else None
+        exposure = ImageGain(self._exposures, number, rate) if self._options.lr_exposure else None
         shown = rendered if exposure is None else exposure.applied(rendered)
-        value, slope = buffers.loss(shown, view.picture(self._views.background, buffers.wanted), view.mask)
+        value, slope = buffers.loss(shown, view.image(self._views.background, buffers.wanted), view.mask)
         if not math.isfinite(value.loss):
             if self._iteration == 1:  # before anything has moved
                 raise InputError("the scene's pictures are beyond float32: its colours are too large to be tuned")
@@ -253,7 +258,7 @@ class _Run:
             "shN": (options.lr_shN if self._scene.frozen.book is None else options.lr_entries) * share,
         }
 
-    def _render(self, seen: DecodedValues, view: View) -> F32:
+    def _render(self, seen: DecodedValues, view: TuningView) -> F32:
         splats = SplatArrays(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
         return self._rasteriser.forward(
             splats, view.camera, background=self._views.background, antialiased=self._antialiased
@@ -268,8 +273,8 @@ class _Run:
         for view in self._views.validation:
             buffers, rendered = self._buffers(view), self._render(seen, view)
             if self._options.lr_exposure and id(view) in self._numbers:  # a training view, too
-                rendered = Exposure(self._exposures, self._numbers[id(view)], 0.0).applied(rendered)
-            wanted = view.picture(self._views.background, buffers.wanted)
+                rendered = ImageGain(self._exposures, self._numbers[id(view)], 0.0).applied(rendered)
+            wanted = view.image(self._views.background, buffers.wanted)
             loss += buffers.loss(rendered, wanted, view.mask)[0].loss / len(self._views.validation)
             error += float(np.square(np.clip(rendered, 0, 1) - np.clip(wanted, 0, 1)).sum(dtype=np.float64))
             count += rendered.size if view.mask is None else 3 * int(view.mask.sum())
@@ -284,16 +289,16 @@ class _Run:
             shrinks = overdrawn > 0.0 and not self._budget.exhausted
             score = loss + overdrawn
         self._log["looks"].append({"iteration": self._iteration, "loss": loss, "psnr": psnr, "size_bytes": size_bytes})
-        if self._best is None or score < self._best.score * (1.0 - _LEAST_GAIN):
-            self._best = _Best(self._scene.held.copy(), score, psnr, self._iteration)
+        if self._best is None or score < self._best.score * (1.0 - _MIN_GAIN):
+            self._best = _BestValues(self._scene.held.copy(), score, psnr, self._iteration)
         elif self._options.has_calmed(self._iteration) and not shrinks:
             self._best.since += 1
 
-    def _buffers(self, view: View) -> _Buffers:
+    def _buffers(self, view: TuningView) -> _ImageBuffers:
         size = (view.camera.H, view.camera.W)
         if size not in self._sizes:
             loss = PhotometricLoss(*size, *LOSS_WEIGHTS[self._options.loss])
-            self._sizes[size] = _Buffers(loss, np.empty((*size, 3), np.float32))
+            self._sizes[size] = _ImageBuffers(loss, np.empty((*size, 3), np.float32))
         return self._sizes[size]
 
     def _moment(self, window: list[float], left: float) -> TuningStep:
@@ -350,3 +355,196 @@ class _Run:
             **self._log,
             **({"exposures": np.round(self._exposures.values, 5).tolist()} if self._options.lr_exposure else {}),
         }
+
+
+_TARGET_SHARE = 0.6  # fraction of the steps after which the size should be reached: later ones hardly move a value
+_SIZE_MARGIN = 0.002  # fraction of the size that is left free: counts come every few steps, and files grow between them
+_GAIN, _MAX_CHANGE = 40.0, 0.5  # gain of log(cost) per relative excess of bits, and its largest change at each count
+_WEIGHT_RANGE = (1e-7, 1e-2)
+# Smallest cost, as a fraction of the first: files grow while values move far, and a cost that had fallen to nothing,
+# because bytes were free before, rises too late.
+_MIN_WEIGHT_SHARE = 0.25
+
+
+@dataclass
+class RateController:
+    """Bytes that a file may have, and what they cost at present so that it does.
+
+    Attributes:
+        size_bytes: largest size of the file.
+        byte_cost: rate weight at present: loss per bit and splat.
+        first_bits: bits of the integers at the start of the run; 0: not known yet.
+        goal_bits: bits of the integers of a file of that size, by the last file that was made.
+    """
+
+    size_bytes: int
+    byte_cost: float
+    first_bits: float = 0.0
+    goal_bits: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.byte_cost = min(
+            max(self.byte_cost, _WEIGHT_RANGE[0]), _WEIGHT_RANGE[1]
+        )  # a cost of 0 would stay 0 under any factor
+
+    @property
+    def exhausted(self) -> bool:
+        """True if the rate weight cannot be raised further."""
+        return self.byte_cost >= _WEIGHT_RANGE[1]
+
+    @classmethod
+    def of(cls, stored: Any) -> RateController | None:
+        """The budget of a checkpoint; `None` if it holds none, or not all of its numbers."""
+        names = {one.name for one in fields(cls)}
+        if not isinstance(stored, dict) or stored.keys() != names:
+            return None
+        numbers = all(isinstance(one, (int, float)) and math.isfinite(one) for one in stored.values())
+        return cls(**stored) if numbers else None
+
+    def overdrawn(self, size_bytes: int, bits: float) -> float:
+        """Return the penalty of a file that is too large; its size determines how many bits its integers may have.
+
+        Args:
+            size_bytes: size of the file.
+            bits: bits of its integers, by their order-0 entropy.
+        """
+        allowed = (1.0 - _SIZE_MARGIN) * self.size_bytes
+        self.first_bits = self.first_bits or bits
+        self.goal_bits = max(bits + 8.0 * (allowed - size_bytes), 0.1 * bits)
+        return max(0.0, size_bytes / self.size_bytes - 1.0)
+
+    def weigh(self, bits: float, done: float, first_cost: float) -> None:
+        """Make bytes dearer or cheaper, by how many bits there are and how many should be left.
+
+        Args:
+            bits: bits of the integers at present.
+            done: fraction of the steps done.
+            first_cost: rate weight at the start of the run.
+        """
+        wanted = self.goal_bits + (self.first_bits - self.goal_bits) * max(0.0, 1.0 - done / _TARGET_SHARE)
+        by = min(max(_GAIN * (bits / max(wanted, 1.0) - 1.0), -_MAX_CHANGE), _MAX_CHANGE)
+        least = max(_MIN_WEIGHT_SHARE * min(first_cost, _WEIGHT_RANGE[1]), _WEIGHT_RANGE[0])
+        self.byte_cost = min(max(self.byte_cost * math.exp(by), least), _WEIGHT_RANGE[1])
+
+
+_VERSION = 1
+_FACTS = {
+    "frozen": str, "iteration": int, "step": int, "rng_state": dict, "queue": list, "options": dict, "log": dict,
+    "best": list,
+}  # fmt: skip
+_BEST_COUNT = 4  # numbers of the best look
+_KIND = "csplat finetune"
+_FREE_VALUES = ("means", "quats", "scales", "opacities", "sh0", "sh", "sizes")
+_GROUPS = (*GROUPS, "sizes")
+
+
+@dataclass
+class FinetuneCheckpoint:
+    """A run between two steps.
+
+    Attributes:
+        iteration: steps that were made.
+        parameters: the values, with Adam's memory.
+        rng_state: of the generator of the order of images, JSON-compatible.
+        queue: images that are still to come in this round.
+        options: of the run, as a dictionary.
+        log: what was logged so far.
+        best_held: the best values so far.
+        costs: slopes of the costs of bytes by attribute, as they were last counted; empty if they never were.
+        best: their score and PSNR on the validation views, the step that they stood at, how many looks came after.
+    """
+
+    iteration: int
+    parameters: Parameters
+    rng_state: dict[str, Any]
+    queue: list[int]
+    options: dict[str, Any]
+    log: dict[str, Any]
+    best_held: FreeValues
+    costs: dict[str, NDArray[np.float32]]
+    best: tuple[float, float, int, int]
+
+
+def save_finetune(path: str | Path, checkpoint: FinetuneCheckpoint, frozen: Frozen) -> None:
+    """Write a checkpoint; the file appears under its name only when it is complete."""
+    facts = {
+        "kind": _KIND,
+        "version": _VERSION,
+        "frozen": fingerprint(frozen),
+        "iteration": checkpoint.iteration,
+        "step": checkpoint.parameters.step,
+        "rng_state": checkpoint.rng_state,
+        "queue": checkpoint.queue,
+        "options": checkpoint.options,
+        "log": checkpoint.log,
+        "best": list(checkpoint.best),
+    }
+    arrays: dict[str, NDArray[Any]] = {"facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)}
+    for kind in ("values", "first", "second"):
+        arrays |= {f"{kind}_{name}": getattr(checkpoint.parameters, kind)[name] for name in _GROUPS}
+    arrays |= {f"best_{name}": getattr(checkpoint.best_held, name) for name in _FREE_VALUES}
+    arrays |= {f"costs_{name}": table for name, table in checkpoint.costs.items()}
+    with atomic_writer(str(path)) as stream:
+        np.savez(stream, allow_pickle=False, **arrays)
+
+
+def load_finetune(path: str | Path, frozen: Frozen) -> FinetuneCheckpoint:
+    """Read a checkpoint of a frozen scene.
+
+    Raises:
+        InputError: the file is no checkpoint, was written by another version, or for another scene or other options
+            of the encoder.
+        OSError: it cannot be read.
+    """
+    stored = read_archive(path, "a checkpoint of csplat finetune")
+    facts = stored.facts()
+    if facts.get("kind") != _KIND:
+        stored.refuse("it is of another kind")
+    if facts.get("version") != _VERSION:
+        raise InputError(f"{path} is a checkpoint of version {facts.get('version')}, wanted {_VERSION}")
+    stored.check(facts, _FACTS)
+    if facts["frozen"] != fingerprint(frozen):
+        raise InputError(f"{path} belongs to another scene, or to other options of the encoder")
+    if len(facts["best"]) != _BEST_COUNT or not all(isinstance(one, (int, float)) for one in facts["best"]):
+        stored.refuse(f"its best look is {facts['best']}")
+    parts = [{name: stored[f"{kind}_{name}"] for name in _GROUPS} for kind in ("values", "first", "second")]
+    best = FreeValues(*(stored[f"best_{name}"] for name in _FREE_VALUES))
+    costs = {name.removeprefix("costs_"): array for name, array in stored.items() if name.startswith("costs_")}
+    if any(table.ndim != 2 or table.dtype != np.float32 or not np.isfinite(table).all() for table in costs.values()):
+        stored.refuse("its costs are no tables of float32")
+    score, psnr, iteration, since = facts["best"]
+    checkpoint = FinetuneCheckpoint(
+        facts["iteration"],
+        Parameters(parts[0], parts[1], parts[2], facts["step"]),
+        facts["rng_state"],
+        facts["queue"],
+        facts["options"],
+        facts["log"],
+        best,
+        costs,
+        (score, psnr, iteration, since),
+    )
+    _check(path, checkpoint, frozen.start())
+    return checkpoint
+
+
+def fingerprint(frozen: Frozen) -> str:
+    """A digest of all that was decided, and of the values that it was decided for."""
+    digest, start = hashlib.sha256(repr(frozen.plan).encode()), frozen.start()
+    index = () if frozen.book is None else (frozen.book.index,)
+    for array in (frozen.source_index, *index, *(getattr(start, name) for name in _FREE_VALUES)):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _check(path: str | Path, checkpoint: FinetuneCheckpoint, start: FreeValues) -> None:
+    shapes = {name: getattr(start, name).shape for name in _FREE_VALUES}
+    found: dict[str, list[NDArray[Any]]] = {name: [getattr(checkpoint.best_held, name)] for name in _FREE_VALUES}
+    parameters = checkpoint.parameters
+    for part in (parameters.values, parameters.first, parameters.second):
+        for name in _GROUPS:
+            found[{"logits": "opacities", "shN": "sh"}.get(name, name)].append(part[name])
+    for name, arrays in found.items():
+        for array in arrays:
+            if array.shape != shapes[name] or array.dtype != np.float32 or not np.isfinite(array).all():
+                raise InputError(f"{path}: {name} is {array.dtype} {list(array.shape)}, wanted float32 {shapes[name]}")

@@ -1,21 +1,32 @@
-"""The photometric loss, L1 and SSIM in one pass, with its gradient.
+# torch may be absent:
+# pyright: reportMissingImports=false
+"""The photometric loss, L1 and SSIM in one pass, with its gradient; and LPIPS as a further term.
 
     loss = l1_weight · mean |x − y| + ssim_weight · (1 − mean SSIM(x, y))
 
-SSIM is that of the INRIA trainer: an 11×11 Gaussian window of σ 1.5, zeros beyond the border,
-C1 = 0.01², C2 = 0.03², the mean over all pixels and channels. Both windows of the literature's
-losses are a choice of weights: 0.8 and 0.2 (INRIA), 1 and 0.2 (the study of simple strategies).
+SSIM is that of the INRIA trainer: an 11×11 Gaussian window of σ 1.5, zeros beyond the border, C1 = 0.01², C2 = 0.03²,
+the mean over all pixels and channels. With m1, m2 the blurred images, s11, s22, s12 their blurred (co)variances and
+
+    a = 2 m1 m2 + C1,  b = 2 s12 + C2,  c = m1² + m2² + C1,  d = s11 + s22 + C2,  ssim = a b / (c d)
+
+the gradient towards x is blur(∂/∂m1) + 2 x blur(∂/∂s11) + y blur(∂/∂s12), because the blur is its own transpose.
+Published weights of L1 and SSIM: 0.8 and 0.2 (INRIA), 1 and 0.2 (the study of simple strategies).
+
+LPIPS runs in torch, which is imported when the term is used: it needs the gradient that the renderer's metric lacks.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.errors import InputError
 from csplat.types import F32, F64
 from csplat_render.kernels import parallel_kernel
+from csplat_render.lpips import MIN_SIZE, SCALE, SHIFT, Lpips
 from csplat_render.metric_kernels import (
     C1,
     C2,
@@ -73,7 +84,7 @@ class PhotometricLoss:
         self._gradient = np.empty(self._shape, np.float32)
 
     def __call__(self, rendered: F32, photograph: F32, mask: NDArray[np.bool_] | None = None) -> tuple[LossValue, F32]:
-        """Compare two pictures.
+        """Compare two images.
 
         Args:
             rendered: [H, W, 3], C-contiguous.
@@ -185,7 +196,7 @@ def _l1_alone(lane: int, lanes: int, x: F32, y: F32, l1_step: np.float32, gradie
 def photometric_loss_twin(
     rendered: F64, photograph: F64, l1_weight: float = 0.8, ssim_weight: float = 0.2
 ) -> tuple[LossValue, F64]:
-    """The slow twin of `PhotometricLoss`: float64, whole pictures, one formula after the other.
+    """The slow twin of `PhotometricLoss`: float64, whole images, one formula after the other.
 
     Args:
         rendered: [H, W, 3].
@@ -208,3 +219,78 @@ def photometric_loss_twin(
     gradient = (l1_weight * np.sign(x - y) - ssim_weight * ssim_gradient) / x.size
     l1, mean_ssim, mse = float(np.abs(x - y).mean()), float(ssim.mean()), float(np.square(x - y).mean())
     return LossValue(l1_weight * l1 + ssim_weight * (1 - mean_ssim), l1, mean_ssim, mse), gradient
+
+
+# torch and gsplat may be absent:
+# pyright: reportMissingImports=false
+
+
+_STRIDES, _PADDINGS = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
+_POOLED = (1, 2)  # layers that a 3×3 pooling of stride 2 precedes
+_LPIPS_EPSILON = 1e-10
+
+
+class PerceptualLoss:
+    """LPIPS v0.1 with the AlexNet backbone (https://arxiv.org/abs/1801.03924).
+
+    Args:
+        weights: of the five layers and of their differences.
+
+    Raises:
+        InputError: torch is not installed.
+    """
+
+    def __init__(self, weights: Lpips) -> None:
+        torch = _import_torch()
+        self._kernels = [torch.from_numpy(np.ascontiguousarray(one.transpose(3, 2, 0, 1))) for one in weights.kernels]
+        self._biases = [torch.from_numpy(np.array(one)) for one in weights.biases]
+        self._heads = [torch.from_numpy(np.array(one)).reshape(1, -1, 1, 1) for one in weights.heads]
+        self._shift, self._scale = (torch.from_numpy(one.copy()).reshape(1, 3, 1, 1) for one in (SHIFT, SCALE))
+
+    def distance(self, first: F32, second: F32) -> float:
+        """LPIPS of two images, [H, W, 3] in 0..1."""
+        torch = _import_torch()
+        with torch.no_grad():
+            return float(self._distance(self._tensor(first), self._tensor(second)))
+
+    def gradient(self, rendered: F32, photograph: F32, weight: float) -> F32:
+        """Gradient of `weight` · LPIPS by the rendered image, [H, W, 3]."""
+        x = self._tensor(rendered).requires_grad_(requires_grad=True)
+        (weight * self._distance(x, self._tensor(photograph))).backward()
+        slope: F32 = x.grad[0].permute(1, 2, 0).contiguous().numpy()
+        return slope
+
+    def _tensor(self, image: F32) -> Any:
+        if min(image.shape[:2]) < MIN_SIZE:
+            raise InputError(f"LPIPS wants pictures of at least {MIN_SIZE} pixels a side, found {image.shape[:2]}")
+        return _import_torch().from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None].clone()
+
+    def _distance(self, x: Any, y: Any) -> Any:
+        total: Any = 0.0
+        for one, other, head in zip(self._features(x), self._features(y), self._heads, strict=True):
+            total = total + (head * (_unit(one) - _unit(other)).square()).sum(dim=1).mean()
+        return total
+
+    def _features(self, image: Any) -> list[Any]:
+        functional = _import_torch().nn.functional
+        layers = []
+        x = (2.0 * image - 1.0 - self._shift) / self._scale
+        for k, (kernel, bias) in enumerate(zip(self._kernels, self._biases, strict=True)):
+            if k in _POOLED:
+                x = functional.max_pool2d(x, 3, 2)
+            x = functional.relu(functional.conv2d(x, kernel, bias, _STRIDES[k], _PADDINGS[k]))
+            layers.append(x)
+        return layers
+
+
+def _unit(x: Any) -> Any:
+    """Feature vectors at unit length."""
+    return x / (x.square().sum(dim=1, keepdim=True) + _LPIPS_EPSILON).sqrt()
+
+
+def _import_torch() -> Any:
+    try:
+        import torch
+    except ImportError:
+        raise InputError("torch is not installed: pip install csplat[train]") from None
+    return torch

@@ -1,13 +1,14 @@
-"""`TrainOptions`: every knob of training, checked once."""
+"""`TrainOptions`, checked once; the files that a run writes, and its result."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from pathlib import Path
+from typing import Any, Literal, get_args
 
 from csplat.errors import InputError
-from csplat.model import MAX_SH_DEGREE
+from csplat.model import MAX_SH_DEGREE, SplatModel
 
 #: How splats come and go: `mcmc` grows to the cap and moves dead splats, with noise and
 #: regularisation; `fixed` starts at the cap and moves dead splats; `gradient` clones, splits and
@@ -161,8 +162,8 @@ class TrainOptions:
         The last one happens when two fifths of the steps after the last move of splats are left.
         """
         begin = min(self.refine_end, self.iterations - 1)
-        steps = max(1, int(_THINNED * (self.iterations - begin)))
-        times = min(_THINNINGS, steps)
+        steps = max(1, int(_PRUNING_SHARE * (self.iterations - begin)))
+        times = min(_MAX_PRUNINGS, steps)
         done, rest = divmod(iteration - begin, steps // times)
         return max(0, times + 1 - done) if self.final_share < 1.0 and rest == 0 and done > 0 else 0
 
@@ -198,8 +199,8 @@ class TrainOptions:
 
 
 _GROWTH = 1.05  # factor of the paper
-_THINNINGS = 10  # prunings, at most
-_THINNED = 0.6  # fraction of the steps after the last move of splats in which they happen
+_MAX_PRUNINGS = 10  # prunings, at most
+_PRUNING_SHARE = 0.6  # fraction of the steps after the last move of splats in which they happen
 _LAST_EXPOSURE = 0.05  # share of the learning rate of exposures that is left at the end
 
 _CHOICES = {
@@ -242,3 +243,49 @@ _RANGES: dict[str, tuple[float, float]] = {
     "eval_views": (0, 10**6),
     "log_every": (1, 10**7),
 }
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Files that a run writes on its way.
+
+    Attributes:
+        checkpoint: file for checkpoints (each replaces the last), or `None`.
+        checkpoint_every: steps from one to the next; 0: at the end alone.
+        previews: folder for early renders (photograph and render next to each other), or `None`.
+        preview_every: steps from one to the next; 0: at powers of two from 100 on, and the end.
+        resume: checkpoint to go on from, or `None`.
+        lpips_weights: file of the weights of LPIPS-Alex; `None`: they are looked for in the usual places.
+    """
+
+    checkpoint: str | Path | None = None
+    checkpoint_every: int = 0
+    previews: str | Path | None = None
+    preview_every: int = 0
+    resume: str | Path | None = None
+    lpips_weights: str | Path | None = None
+
+    def preview_due(self, iteration: int, iterations: int) -> bool:
+        """Return True if a preview is due after a step."""
+        if self.previews is None:
+            return False
+        if iteration == iterations:
+            return True
+        if self.preview_every:
+            return iteration % self.preview_every == 0
+        return iteration % 100 == 0 and (iteration // 100).bit_count() == 1
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """Result of a run.
+
+    Attributes:
+        model: the scene.
+        log: JSON-compatible: options, entries on the way, the loss of each step, figures, times.
+        metrics: scores on the test images, see `evaluate`; `None` if there are none.
+    """
+
+    model: SplatModel
+    log: dict[str, Any]
+    metrics: dict[str, Any] | None

@@ -14,8 +14,8 @@ from scipy.spatial import KDTree
 from csplat.errors import InputError
 from csplat.types import F32, F64
 from csplat_render.camera import Camera
-from csplat_trainer.parameters import Splats
-from csplat_trainer.pictures import Picture
+from csplat_trainer.parameters import ParameterArrays
+from csplat_trainer.posed_images import PosedImage
 
 SH_C0 = 0.28209479177387814
 
@@ -30,7 +30,7 @@ _PHOTO_BOX = 1.5  # factor for photographs, which show the surroundings of their
 
 
 @dataclass(frozen=True)
-class StartingScene:
+class SceneExtent:
     """Extent and focus of a scene according to its cameras.
 
     Attributes:
@@ -45,13 +45,13 @@ class StartingScene:
     half: float
 
 
-def scene_of(pictures: Sequence[Picture]) -> StartingScene:
+def measure_extent(images: Sequence[PosedImage]) -> SceneExtent:
     """Find the extent and the focus of the scene.
 
     Args:
-        pictures: at least one, without outliers: `DataSet.counted`.
+        images: at least one, without outliers: `DataSet.counted`.
     """
-    cameras = [picture.camera for picture in pictures]
+    cameras = [image.camera for image in images]
     positions = np.array([camera.position for camera in cameras])
     axes = np.array([camera.viewmat[2, :3] for camera in cameras])
     spread = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max()
@@ -64,17 +64,17 @@ def scene_of(pictures: Sequence[Picture]) -> StartingScene:
     distance = float(np.median(np.linalg.norm(positions - focus, axis=1)))
     half_view = float(np.median([0.5 * min(c.W / c.K[0, 0], c.H / c.K[1, 1]) for c in cameras]))
     half = distance * half_view * _BOX_SHARE
-    if not any(picture.has_alpha for picture in pictures):
+    if not any(image.has_alpha for image in images):
         half = distance * _PHOTO_BOX
     extent = 1.1 * float(spread)
     if extent <= 0.0:  # one camera, or several in one place
         extent = max(distance, 1e-3)
-    return StartingScene(extent, focus, max(half, 1e-6))
+    return SceneExtent(extent, focus, max(half, 1e-6))
 
 
-def starting_splats(
-    pictures: Sequence[Picture],
-    scene: StartingScene,
+def place_splats(
+    images: Sequence[PosedImage],
+    scene: SceneExtent,
     count: int,
     sh_degree: int,
     rng: Generator,
@@ -82,24 +82,24 @@ def starting_splats(
     init: str = "auto",
     points: F32 | None = None,
     colours: F32 | None = None,
-) -> Splats:
+) -> ParameterArrays:
     """Place the splats that training begins with.
 
     Args:
-        pictures: images of the training views.
+        images: images of the training views.
         scene: extent and focus of the scene.
         count: number of splats.
         sh_degree: SH degree of the parameters; bands above 0 begin at zero.
         rng: source of random choices.
         init: `points`, `hull`, `box`, or `auto` for the first of them that there is.
         points: [P, 3], points of the scene, if the data set has any.
-        colours: [P, 3] in 0..1, their colours; `None`: those of the pictures there.
+        colours: [P, 3] in 0..1, their colours; `None`: those of the images there.
 
     Raises:
         InputError: there are no points, or no masks, to start from; or points that are not finite.
     """
     have_points = points is not None and len(points) > 0
-    have_masks = any(picture.has_alpha for picture in pictures)
+    have_masks = any(image.has_alpha for image in images)
     if init == "points" and not have_points:
         raise InputError("the data set holds no points to start from: wanted --set init=hull or init=box")
     if init == "hull" and not have_masks:
@@ -109,21 +109,21 @@ def starting_splats(
         bad = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
         if bad:
             raise InputError(f"{bad} of the data set's {len(points)} points are NaN or infinite: wanted finite ones")
-        if not any(len(_pixels_at(picture, points.astype(np.float64))[0]) for picture in pictures):
+        if not any(len(_pixels_at(image, points.astype(np.float64))[0]) for image in images):
             raise InputError(
                 f"no camera sees any of the data set's {len(points)} points, expected both in the same coordinates:"
                 " --set init=box starts without points"
             )
         if colours is None:
-            colours = _look(pictures, points.astype(np.float64))[2].astype(np.float32)
+            colours = _sample_images(images, points.astype(np.float64))[2].astype(np.float32)
         means, colour = _at_points(points, colours, count, scene, rng)
     else:
         masked = have_masks and init in ("hull", "auto")
-        means, colour = _in_box(pictures, scene, count, rng, masked=masked)
+        means, colour = _in_box(images, scene, count, rng, masked=masked)
     return _splats(means, colour, sh_degree, scene, rng)
 
 
-def _at_points(points: F32, colours: F32, count: int, scene: StartingScene, rng: Generator) -> tuple[F64, F64]:
+def _at_points(points: F32, colours: F32, count: int, scene: SceneExtent, rng: Generator) -> tuple[F64, F64]:
     """Choose some of the points, or all of them and repeat some if more are needed."""
     order = rng.permutation(len(points))
     chosen = np.concatenate([order, rng.integers(0, len(points), max(0, count - len(points)))])[:count]
@@ -137,7 +137,7 @@ def _at_points(points: F32, colours: F32, count: int, scene: StartingScene, rng:
 
 
 def _in_box(
-    pictures: Sequence[Picture], scene: StartingScene, count: int, rng: Generator, *, masked: bool
+    images: Sequence[PosedImage], scene: SceneExtent, count: int, rng: Generator, *, masked: bool
 ) -> tuple[F64, F64]:
     """Find points that cameras see, inside the hull of the masks if requested, with the mean of their pixels."""
     found: list[F64] = []
@@ -145,11 +145,11 @@ def _in_box(
     total = 0
     for _ in range(_BATCHES):
         points = scene.focus + scene.half * rng.uniform(-1.0, 1.0, (_BATCH, 3))
-        seen, hits, colour = _look(pictures, points)
+        seen, hits, colour = _sample_images(images, points)
         keep = seen > 0
         if masked:
             keep &= hits >= (1.0 - _MISSES) * seen - 1e-9
-            keep &= 2 * seen >= len(pictures)
+            keep &= 2 * seen >= len(images)
         found.append(points[keep])
         colours.append(colour[keep])
         total += int(keep.sum())
@@ -162,12 +162,12 @@ def _in_box(
     return means[chosen], colour[chosen]
 
 
-def _look(pictures: Sequence[Picture], points: F64) -> tuple[NDArray[np.int64], NDArray[np.int64], F64]:
+def _sample_images(images: Sequence[PosedImage], points: F64) -> tuple[NDArray[np.int64], NDArray[np.int64], F64]:
     """Return how many images see each point, in how many it falls on the object, and its mean colour there."""
     seen, hits = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     colour = np.zeros((len(points), 3))
-    for picture in pictures:
-        inside, pixels = _pixels_at(picture, points)
+    for image in images:
+        inside, pixels = _pixels_at(image, points)
         seen[inside] += 1
         on = pixels[:, 3] >= _MASK
         hits[inside[on]] += 1
@@ -175,21 +175,21 @@ def _look(pictures: Sequence[Picture], points: F64) -> tuple[NDArray[np.int64], 
     return seen, hits, np.where(hits[:, None] > 0, colour / np.maximum(hits, 1)[:, None], 0.5)
 
 
-def _pixels_at(picture: Picture, points: F64) -> tuple[NDArray[np.int64], F64]:
-    """The points that fall into a picture, and its pixels there, RGBA in 0..1."""
-    camera: Camera = picture.camera
+def _pixels_at(image: PosedImage, points: F64) -> tuple[NDArray[np.int64], F64]:
+    """The points that fall into a image, and its pixels there, RGBA in 0..1."""
+    camera: Camera = image.camera
     V, K = camera.viewmat, camera.K
     x, y, z = (points @ V[axis, :3] + V[axis, 3] for axis in range(3))
     ahead = z > camera.near
     depth = np.where(ahead, z, 1.0)
     u, v = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]
     inside = np.flatnonzero(ahead & (u >= 0) & (u < camera.W) & (v >= 0) & (v < camera.H))
-    if picture.mask is not None:
-        inside = inside[picture.mask[v[inside].astype(np.int64), u[inside].astype(np.int64)]]
-    return inside, picture.at(v[inside].astype(np.int64), u[inside].astype(np.int64))
+    if image.mask is not None:
+        inside = inside[image.mask[v[inside].astype(np.int64), u[inside].astype(np.int64)]]
+    return inside, image.at(v[inside].astype(np.int64), u[inside].astype(np.int64))
 
 
-def _splats(means: F64, colour: F64, sh_degree: int, scene: StartingScene, rng: Generator) -> Splats:
+def _splats(means: F64, colour: F64, sh_degree: int, scene: SceneExtent, rng: Generator) -> ParameterArrays:
     count = len(means)
     spacing = np.log(_neighbour_distances(means, scene)).astype(np.float32)
     quats = rng.standard_normal((count, 4))
@@ -204,7 +204,7 @@ def _splats(means: F64, colour: F64, sh_degree: int, scene: StartingScene, rng: 
     }
 
 
-def _neighbour_distances(points: F64, scene: StartingScene) -> F64:
+def _neighbour_distances(points: F64, scene: SceneExtent) -> F64:
     """Root mean square distance to the nearest three others, never 0.
 
     If most points have others in the very same place, that carries no information: then as if they filled the box.

@@ -58,8 +58,8 @@ def render(
             raise InputError(f"{name} is on device {tensor.device.type}, wanted cpu")
         if tensor.dtype != means.dtype or tensor.dtype not in (torch.float32, torch.float64):
             raise InputError(f"{name} is {tensor.dtype}, wanted all float32 or all float64")
-    picture: Tensor = _Render.apply(*tensors, camera, background, antialiased, sh_degree)  # type: ignore[no-untyped-call]  # torch leaves it so
-    return picture
+    image: Tensor = _Render.apply(*tensors, camera, background, antialiased, sh_degree)  # type: ignore[no-untyped-call]  # torch leaves it so
+    return image
 
 
 class _Render(Function):

@@ -1,6 +1,6 @@
 # torch and gsplat may be absent:
 # pyright: reportMissingImports=false
-"""Training steps on a GPU, with the gsplat package as the rasteriser: the same interface as on the CPU."""
+"""Training steps on a GPU with the gsplat package as rasteriser; the interface is that of `CpuEngine`."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from torch.nn.functional import conv2d
 from csplat.errors import InputError
 from csplat.types import F32
 from csplat_render.camera import Camera
-from csplat_trainer.densify import ScreenGradients
-from csplat_trainer.exposure import Exposure
-from csplat_trainer.loss import LOSS_WEIGHTS, LossValue
-from csplat_trainer.options import TrainOptions
-from csplat_trainer.parameters import GROUPS, Parameters, Splats
-from csplat_trainer.pictures import Picture, compose
+from csplat_trainer.image_gains import ImageGain
+from csplat_trainer.losses import LOSS_WEIGHTS, LossValue
+from csplat_trainer.parameters import GROUPS, ParameterArrays, Parameters
+from csplat_trainer.posed_images import PosedImage, compose
+from csplat_trainer.strategies import ScreenGradients
+from csplat_trainer.training_options import TrainOptions
 
 _BETAS, _EPSILON = (0.9, 0.999), 1e-15
 _C1, _C2, _TAPS, _SIGMA = 0.01**2, 0.03**2, 11, 1.5
 _LOGIT_LIMIT = 14.0
-_GATE_SLOPE, _GATE_CENTRE = 100.0, 0.995  # as in csplat_trainer.mcmc
+_GATE_SLOPE, _GATE_CENTRE = 100.0, 0.995  # as in csplat_trainer.strategies
 
 
 def gsplat_rasterization() -> Callable[..., Any]:
@@ -47,7 +47,7 @@ def gsplat_rasterization() -> Callable[..., Any]:
     return found
 
 
-class CudaEngine:
+class GsplatEngine:
     """Training steps in torch.
 
     Args:
@@ -91,22 +91,22 @@ class CudaEngine:
 
     def step(
         self,
-        picture: Picture,
+        image: PosedImage,
         background: F32,
         degree: int,
         rates: dict[str, float],
         rng: Generator,
-        exposure: Exposure | None = None,
+        exposure: ImageGain | None = None,
     ) -> LossValue:
-        """Make one step of training on one picture: see `CpuEngine.step`. No exposure is learnt here."""
+        """Make one step of training on one image: see `CpuEngine.step`. No exposure is learnt here."""
         assert exposure is None
-        camera = picture.camera
-        photograph = self._upload(compose(picture, background, np.empty((camera.H, camera.W, 3), np.float32)))
+        camera = image.camera
+        photograph = self._upload(compose(image, background, np.empty((camera.H, camera.W, 3), np.float32)))
         rendered, info = self._draw(camera, background, degree)
         if self.screen is not None:
             info["means2d"].retain_grad()
-        if picture.mask is not None:  # what does not count is taken for what is seen
-            counts = torch.from_numpy(picture.mask).to(photograph.device)[..., None]
+        if image.mask is not None:  # what does not count is taken for what is seen
+            counts = torch.from_numpy(image.mask).to(photograph.device)[..., None]
             photograph = torch.where(counts, photograph, rendered.detach())
         total, value = self._loss(rendered, photograph)
         total.backward()  # type: ignore[no-untyped-call]  # torch leaves it so
@@ -118,14 +118,14 @@ class CudaEngine:
         return value
 
     def render(self, camera: Camera, background: F32, degree: int) -> F32:
-        """The picture at present, [H, W, 3]."""
+        """The image at present, [H, W, 3]."""
         with torch.no_grad():
-            picture: F32 = self._draw(camera, background, degree)[0].cpu().numpy()
-        return picture
+            image: F32 = self._draw(camera, background, degree)[0].cpu().numpy()
+        return image
 
     def _draw(self, camera: Camera, background: F32, degree: int) -> tuple[Tensor, dict[str, Any]]:
         v = self._values
-        pictures, _, info = self._rasterization(
+        images, _, info = self._rasterization(
             means=v["means"],
             quats=v["quats"],
             scales=torch.exp(v["scales"]),
@@ -141,7 +141,7 @@ class CudaEngine:
             backgrounds=self._upload(background)[None],
             rasterize_mode="antialiased" if self._options.antialiased else "classic",
         )
-        return pictures[0], info
+        return images[0], info
 
     def _loss(self, x: Tensor, y: Tensor) -> tuple[Tensor, LossValue]:
         l1_weight, ssim_weight = LOSS_WEIGHTS[self._options.loss]
@@ -205,7 +205,7 @@ class CudaEngine:
         return torch.from_numpy(np.array(array)).to(self._device)
 
     @staticmethod
-    def _download(part: dict[str, Tensor]) -> Splats:
+    def _download(part: dict[str, Tensor]) -> ParameterArrays:
         return {name: part[name].detach().cpu().numpy().copy() for name in GROUPS}
 
 

@@ -1,4 +1,4 @@
-"""`train`: from pictures to splats."""
+"""`train`: from images to splats."""
 
 from __future__ import annotations
 
@@ -24,27 +24,22 @@ from csplat_render.camera import Camera, central_camera
 from csplat_render.lpips import Lpips, load_lpips
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.virtual_cameras import scene_frame
-from csplat_trainer.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from csplat_trainer.data import DataSet, load
-from csplat_trainer.densify import ScreenGradients, densify, reset_opacities
 from csplat_trainer.engine import CpuEngine, Engine
-from csplat_trainer.evaluate import evaluate
-from csplat_trainer.exposure import Exposure, Exposures
-from csplat_trainer.mcmc import grow, relocate
-from csplat_trainer.options import TrainOptions
-from csplat_trainer.outputs import Outputs, TrainResult
+from csplat_trainer.image_gains import ImageGain, ImageGains
+from csplat_trainer.initial_splats import SceneExtent, measure_extent, place_splats
+from csplat_trainer.losses import PerceptualLoss
 from csplat_trainer.parameters import Parameters, to_model
-from csplat_trainer.perceptual import PerceptualLoss
-from csplat_trainer.pictures import Picture, compose, halved
-from csplat_trainer.report import TrainingStep, peak_memory, save_picture, side_by_side
-from csplat_trainer.resume import adapt
-from csplat_trainer.starting import StartingScene, scene_of, starting_splats
-from csplat_trainer.thinning import thin
+from csplat_trainer.posed_images import PosedImage, compose, evaluate, halve
+from csplat_trainer.strategies import ScreenGradients, densify, grow, prune_least_needed, relocate, reset_opacities
+from csplat_trainer.training_checkpoint import TrainingCheckpoint, fit_to_options, load_checkpoint, save_checkpoint
+from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult
+from csplat_trainer.training_report import TrainingStep, peak_memory, save_image, side_by_side
 
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 _COLOURS = {"black": _BLACK, "white": _WHITE, "random": _WHITE}  # random: what evaluations are in front of
 _RESET_EVERY = 3000  # steps between resets of the opacities, gradient strategy
-_LEFT_AT_ONCE, _STEPS_BETWEEN = 0.85, 100  # share of the splats that stays where some go late, and steps that follow
+_KEPT_AT_ONCE, _STEPS_BETWEEN = 0.85, 100  # share of the splats that stays where some go late, and steps that follow
 _LARGE_EXTENT = 50.0  # scene units; the weight of the mean standard deviation is meant for scenes that are no larger
 _FIRST_SHARE = 0.5  # of the cap: how many splats mcmc begins with where there are no points
 
@@ -57,21 +52,21 @@ def train(
     progress: Callable[[str, float], None] | None = None,
     on_step: Callable[[TrainingStep], None] | None = None,
 ) -> TrainResult:
-    """Train splats on pictures, as `csplat train` does; wants the packages of the render extra.
+    """Train splats on images, as `csplat train` does; wants the packages of the render extra.
 
-    The same pictures, options and library versions give the same splats on the same machine, at
+    The same images, options and library versions give the same splats on the same machine, at
     any number of threads.
 
     Args:
-        data: pictures, and points of the scene where they are known; or what `load` makes them of: a folder, or a
+        data: images, and points of the scene where they are known; or what `load` makes them of: a folder, or a
             `transforms.json`.
         options: how.
-        outputs: checkpoints and early pictures.
+        outputs: checkpoints and early images.
         progress: is told the stage and the share of it that is done, 0 to 1, every `log_every` steps.
         on_step: is told then where the run stands.
 
     Returns:
-        The scene, the log, and scores on the pictures that were held out.
+        The scene, the log, and scores on the images that were held out.
 
     Examples:
         >>> import csplat, csplat_trainer
@@ -79,7 +74,7 @@ def train(
         >>> csplat.write_ply("scene.ply", found.model)  # doctest: +SKIP
 
     Raises:
-        InputError: there is no picture, an option does not suit the data, or a file is not what it
+        InputError: there is no image, an option does not suit the data, or a file is not what it
             is said to be.
     """
 
@@ -89,8 +84,8 @@ def train(
         if on_step is not None:
             on_step(now)
 
-    pictures = data if isinstance(data, DataSet) else load(data)
-    return _Run(pictures, options or TrainOptions(), outputs or Outputs()).to_the_end(show)
+    images = data if isinstance(data, DataSet) else load(data)
+    return _TrainingRun(images, options or TrainOptions(), outputs or Outputs()).to_the_end(show)
 
 
 @dataclass
@@ -101,7 +96,7 @@ class _Window:
     errors: list[float] = field(default_factory=list)
 
 
-class _Run:
+class _TrainingRun:
     """A run: the engine, the random numbers, the log."""
 
     def __init__(self, data: DataSet, options: TrainOptions, outputs: Outputs) -> None:
@@ -109,18 +104,18 @@ class _Run:
             raise InputError("there is no picture to train on")
         data.read()
         self._data, self._options, self._outputs = data, options, outputs
-        self._scene = scene_of(data.counted)
+        self._scene = measure_extent(data.counted)
         self._rng = Generator(PCG64(options.seed))
         self._iteration = 0
         self._queue: list[int] = []
-        self._halved: dict[int, Picture] = {}
+        self._halved: dict[int, PosedImage] = {}
         self._log: dict[str, Any] = {"entries": [], "evaluations": [], "losses": [], "seconds": 0.0}
         if outputs.resume is None:
             parameters = Parameters.starting_at(self._start(self._scene))
             self._log["growth"] = options.growth_from(len(parameters))
         else:
             parameters = self._go_on(load_checkpoint(outputs.resume))
-        self._exposures = Exposures(len(data.train), self._log.get("exposures", ()))
+        self._exposures = ImageGains(len(data.train), self._log.get("exposures", ()))
         self._lpips = _lpips(options, outputs)
         share = min(1.0, _LARGE_EXTENT / self._scene.extent)
         self._engine = _engine(parameters, replace(options, scale_weight=share * options.scale_weight), self._lpips)
@@ -164,7 +159,7 @@ class _Run:
         metrics = self._evaluate(options.eval_views) if self._data.test else None
         return TrainResult(self._model(), self._full_log(metrics), metrics)
 
-    def _start(self, scene: StartingScene) -> dict[str, F32]:
+    def _start(self, scene: SceneExtent) -> dict[str, F32]:
         options, data = self._options, self._data
         count = options.initial_splats
         if count == 0 and options.strategy in ("fixed", "none"):
@@ -172,7 +167,7 @@ class _Run:
         if count == 0:
             points = 0 if data.points is None or options.init in ("hull", "box") else len(data.points)
             count = points or max(1, int(_FIRST_SHARE * options.max_splats))
-        return starting_splats(
+        return place_splats(
             data.counted,
             scene,
             min(count, options.max_splats),
@@ -183,7 +178,7 @@ class _Run:
             colours=data.points_rgb,
         )
 
-    def _go_on(self, checkpoint: Checkpoint) -> Parameters:
+    def _go_on(self, checkpoint: TrainingCheckpoint) -> Parameters:
         options = self._options
         self._rng.bit_generator.state = checkpoint.rng_state
         self._iteration = checkpoint.iteration
@@ -193,31 +188,31 @@ class _Run:
         if shift.any():  # of a set with other cameras
             means = checkpoint.parameters.values["means"]
             checkpoint.parameters.values["means"] = (means + shift).astype(np.float32)
-        return adapt(checkpoint.parameters, options, self._rng)
+        return fit_to_options(checkpoint.parameters, options, self._rng)
 
     def _step(self, degree: int) -> tuple[float, float]:
         if not self._queue:
             self._queue = self._rng.permutation(len(self._data.train)).tolist()
         number = self._queue.pop()
-        picture = self._picture(number)
+        image = self._picture(number)
         background = self._background
         if self._options.background == "random":
             background = self._rng.random(3, dtype=np.float32)
         rates = self._options.learning_rates(self._iteration, self._scene.extent)
-        exposure = Exposure(self._exposures, number, rates["exposure"]) if self._options.lr_exposure else None
-        value = self._engine.step(picture, background, degree, rates, self._rng, exposure)
+        exposure = ImageGain(self._exposures, number, rates["exposure"]) if self._options.lr_exposure else None
+        value = self._engine.step(image, background, degree, rates, self._rng, exposure)
         if not math.isfinite(value.loss):
             raise InputError(f"the loss is not finite at step {self._iteration}: try smaller learning rates")
         self._log["losses"].append(float(f"{value.loss:.6g}"))
         return value.loss, value.mse
 
-    def _picture(self, number: int) -> Picture:
+    def _picture(self, number: int) -> PosedImage:
         """A photograph that teaches, of the size that its step wants."""
         if not self._options.halves(self._iteration):
             self._halved.clear()
             return self._data.train[number]
         if number not in self._halved:
-            self._halved[number] = halved(self._data.train[number])
+            self._halved[number] = halve(self._data.train[number])
         return self._halved[number]
 
     def _refine(self) -> None:
@@ -250,7 +245,7 @@ class _Run:
         left = max(1, round(count))
         if left >= len(parameters):
             return
-        thin(parameters, self._data.train, self._background, left, antialiased=options.antialiased)
+        prune_least_needed(parameters, self._data.train, self._background, left, antialiased=options.antialiased)
         self._engine.parameters = parameters
         if self._engine.screen is not None:
             self._engine.screen = ScreenGradients.none(len(parameters))
@@ -263,7 +258,7 @@ class _Run:
             return
         spent, begin = float(self._log["seconds"]), time.perf_counter()
         degree = self._options.active_degree(self._iteration)
-        times = math.ceil(math.log(wanted / count) / math.log(_LEFT_AT_ONCE))
+        times = math.ceil(math.log(wanted / count) / math.log(_KEPT_AT_ONCE))
         for left in range(times, 0, -1):
             self._thin(left)
             window = _Window()
@@ -306,11 +301,11 @@ class _Run:
         assert self._outputs.previews is not None
         folder = Path(self._outputs.previews)
         folder.mkdir(parents=True, exist_ok=True)
-        picture = (self._data.test or self._data.train)[0]
-        size = (picture.camera.H, picture.camera.W, 3)
-        photograph = compose(picture, self._background, np.empty(size, np.float32))
-        rendered = self._engine.render(picture.camera, self._background, degree)
-        save_picture(folder / f"{self._iteration:06d}.png", side_by_side(photograph, rendered))
+        image = (self._data.test or self._data.train)[0]
+        size = (image.camera.H, image.camera.W, 3)
+        photograph = compose(image, self._background, np.empty(size, np.float32))
+        rendered = self._engine.render(image.camera, self._background, degree)
+        save_image(folder / f"{self._iteration:06d}.png", side_by_side(photograph, rendered))
 
     def _save(self) -> None:
         assert self._outputs.checkpoint is not None
@@ -318,7 +313,7 @@ class _Run:
             self._log["exposures"] = self._exposures.as_json()
         save_checkpoint(
             self._outputs.checkpoint,
-            Checkpoint(
+            TrainingCheckpoint(
                 self._iteration,
                 self._engine.parameters,
                 dict(self._rng.bit_generator.state),
@@ -333,7 +328,7 @@ class _Run:
         model = to_model(self._engine.parameters.values, antialiased=self._options.antialiased)
         said = {TRAINING: self._data.trained_on(self._behind).as_json()}
         if scene_frame(model).kind == "surrounding":  # an object shows itself, from any side
-            said[VIEW] = _first_view([picture.camera for picture in self._data.train])
+            said[VIEW] = _first_view([image.camera for image in self._data.train])
         model = replace(model, metadata=said, origin=self._data.origin)
         return with_up(model, self._data.up, self._data.coordinate_system)
 
@@ -382,7 +377,7 @@ def _engine(parameters: Parameters, options: TrainOptions, lpips: Lpips | None) 
     if options.lr_exposure > 0.0:
         raise InputError("exposures are learnt on the CPU alone: wanted --device cpu, or no lr_exposure")
     try:
-        from csplat_trainer.cuda import CudaEngine
+        from csplat_trainer.gsplat_engine import GsplatEngine
     except ImportError:
         raise InputError("device cuda: torch is not installed (pip install 'csplat[train]')") from None
-    return CudaEngine(parameters, options)
+    return GsplatEngine(parameters, options)

@@ -1,4 +1,4 @@
-"""Checkpoints: everything a training run needs to go on as if it had not stopped."""
+"""Checkpoints of training: everything a run needs to continue as if it had not stopped, or with other options."""
 
 from __future__ import annotations
 
@@ -9,26 +9,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from csplat.archives import read_archive
 from csplat.errors import InputError
 from csplat.files import atomic_writer
-from csplat_trainer.parameters import GROUPS, Parameters, Splats
+from csplat_trainer.parameters import GROUPS, ParameterArrays, Parameters
+from csplat_trainer.strategies import grow
+from csplat_trainer.training_options import TrainOptions
 
 _VERSION = 1
 _FACTS = {"iteration": int, "step": int, "rng_state": dict, "queue": list, "options": dict, "log": dict}
 
 
 @dataclass
-class Checkpoint:
+class TrainingCheckpoint:
     """A training run between two steps.
 
     Attributes:
         iteration: steps that were made.
         parameters: of the splats, with Adam's memory.
         rng_state: of the generator of every random choice, JSON-compatible.
-        queue: pictures that are still to come in this round.
+        queue: images that are still to come in this round.
         options: of the run, as a dictionary.
         log: what was logged so far.
         origin: what the means are relative to.
@@ -43,7 +46,7 @@ class Checkpoint:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
+def save_checkpoint(path: str | Path, checkpoint: TrainingCheckpoint) -> None:
     """Write a checkpoint; the file appears under its name only when it is complete."""
     facts = {
         "version": _VERSION,
@@ -57,13 +60,13 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
     }
     arrays: dict[str, NDArray[Any]] = {"facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)}
     for kind in ("values", "first", "second"):
-        part: Splats = getattr(checkpoint.parameters, kind)
+        part: ParameterArrays = getattr(checkpoint.parameters, kind)
         arrays |= {f"{kind}_{name}": part[name] for name in GROUPS}
     with atomic_writer(str(path)) as stream:
         np.savez(stream, allow_pickle=False, **arrays)
 
 
-def load_checkpoint(path: str | Path) -> Checkpoint:
+def load_checkpoint(path: str | Path) -> TrainingCheckpoint:
     """Read a checkpoint.
 
     Raises:
@@ -77,7 +80,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     stored.check(facts, _FACTS)
     parts = [{name: stored[f"{kind}_{name}"] for name in GROUPS} for kind in ("values", "first", "second")]
     _check(path, parts)
-    return Checkpoint(
+    return TrainingCheckpoint(
         facts["iteration"],
         Parameters(parts[0], parts[1], parts[2], facts["step"]),
         facts["rng_state"],
@@ -99,7 +102,7 @@ def _origin(path: str | Path, facts: dict[str, Any]) -> tuple[float, float, floa
     return x, y, z
 
 
-def _check(path: str | Path, parts: list[Splats]) -> None:
+def _check(path: str | Path, parts: list[ParameterArrays]) -> None:
     count = len(parts[0]["means"]) if parts[0]["means"].ndim else -1
     coefficients = parts[0]["shN"].shape[1] if parts[0]["shN"].ndim == 3 else -1
     shapes: dict[str, tuple[int, ...]] = {
@@ -115,3 +118,45 @@ def _check(path: str | Path, parts: list[Splats]) -> None:
             array = part[name]
             if array.shape != shape or array.dtype != np.float32 or not np.isfinite(array).all():
                 raise InputError(f"{path}: {name} is {array.dtype} {list(array.shape)}, wanted finite float32 {shape}")
+
+
+def fit_to_options(parameters: Parameters, options: TrainOptions, rng: Generator) -> Parameters:
+    """Make parameters fit the options.
+
+    Too many splats: those that show least (opacity times the area of their two longer axes) go.
+    Too few for a fixed count: splats are added beside others, as growth does. SH bands are cut off,
+    or added as zeros.
+
+    Args:
+        parameters: of a checkpoint; changed in place.
+        options: of the run that goes on.
+        rng: chooses where splats are added.
+
+    Returns:
+        `parameters`.
+    """
+    for part in (parameters.values, parameters.first, parameters.second):
+        _fit_degree(part, options.sh_degree)
+    if len(parameters) > options.max_splats:
+        parameters.keep(_most_visible(parameters, options.max_splats))
+    elif options.strategy == "fixed":
+        while 0 < len(parameters) < options.max_splats:
+            grow(parameters, 2.0, options.max_splats, options.dead_opacity, rng)
+    return parameters
+
+
+def _fit_degree(part: ParameterArrays, degree: int) -> None:
+    wanted = (degree + 1) ** 2 - 1
+    old = part["shN"]
+    if old.shape[1] == wanted:
+        return
+    fitted = np.zeros((len(old), wanted, 3), np.float32)
+    common = min(wanted, old.shape[1])
+    fitted[:, :common] = old[:, :common]
+    part["shN"] = fitted
+
+
+def _most_visible(parameters: Parameters, count: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    longer = np.sort(parameters.values["scales"].astype(np.float64), axis=1)[:, 1:]
+    weight = parameters.alphas * np.exp(np.minimum(longer.sum(axis=1), 700.0))  # below the end of float64
+    return np.sort(np.argsort(-weight, kind="stable")[:count])

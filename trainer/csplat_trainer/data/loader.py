@@ -1,0 +1,321 @@
+"""`load`: recognise a data set, read it, place it, and report what was found."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from csplat.errors import InputError, counted
+from csplat.model import UNSPECIFIED
+from csplat.types import F64
+from csplat.upright import Direction, unit_up, up_of_axes
+from csplat_render.camera import MAX_IMAGE_SIZE, camera_outliers, nearest_point
+from csplat_trainer.data.colmap import find_model, read_colmap
+from csplat_trainer.data.dataset import DataSet, Shot, UnreadDataSet, near_plane, open_shot
+from csplat_trainer.data.dataset_checks import check_shots, describe_images, describe_lenses, describe_poses
+from csplat_trainer.data.image_files import abbreviate
+from csplat_trainer.data.image_pixels import opaque_images, read_image_header
+from csplat_trainer.data.transforms import read_blender, read_transforms
+
+_MAX_NAMED = 3  # folders in a message, at most
+_AGREES = math.cos(math.radians(30.0))  # of the custom of a kind of set with its cameras
+
+
+def load(
+    path: str | os.PathLike[str],
+    size: tuple[int, int] | None = None,
+    *,
+    images: str | None = None,
+    test_every: int = 8,
+    near: float | None = None,
+) -> DataSet:
+    """Find the posed images of a data set. Their pixels are read when they are asked for, or by `DataSet.read`.
+
+    | recognised by | kind |
+    |---|---|
+    | `transforms_train.json` | NeRF-synthetic, made with Blender; RGBA |
+    | `transforms.json` | instant-ngp, nerfstudio |
+    | `sparse/0/cameras.bin` or `.txt` | COLMAP, as Mip-NeRF 360, Tanks and Temples, Deep Blending are laid out |
+
+    What files state is checked against what they hold: `checks`. Lenses are straightened: `lens`.
+
+    Args:
+        path: its folder, or the `transforms.json`.
+        size: width and height to bring all images to, each axis by itself; `None`: as they are.
+        images: the folder of images, `images_4`; `None`: as the set says, of COLMAP sets with `size` the smallest
+            that is large enough.
+        test_every: which share is held out where the set names no test images; 0: none.
+        near: near plane of the cameras, scene units; `None`: one that suits the set.
+
+    Returns:
+        All images, undistorted, with their cameras.
+
+    Raises:
+        InputError: there is no data set, it is damaged, or it holds no images.
+    """
+    path = Path(path)
+    if size is not None and not all(1 <= side <= MAX_IMAGE_SIZE for side in size):
+        raise InputError(f"pictures of {size[0]}×{size[1]} pixels, wanted 1 to {MAX_IMAGE_SIZE} each way")
+    found = _read(path, size, images, test_every)
+    if not found.train:
+        raise InputError(f"{path} leaves no images to train on")
+    doubts = describe_poses([*found.train, *found.test], found.points)
+    found, origin = choose_origin(found)
+    shots = [*found.train, *found.test]
+    heads = {shot.path: read_image_header(shot.path) for shot in (*shots, *found.val)}
+    check_shots([*shots, *found.val], heads)
+    opaque = opaque_images(heads.values())
+    heads |= {head.path: replace(head, has_alpha=False) for head in opaque}
+    near = near_plane(shots, found.points) if near is None else near
+    train, test, val = (
+        [open_shot(shot, heads[shot.path], size, near) for shot in part]
+        for part in (found.train, found.test, found.val)
+    )
+    name = f"{found.kind} {path}"
+    sizes = sorted({(image.camera.W, image.camera.H) for image in (*train, *test)})
+    shown = ", ".join(f"{width}×{height}" for width, height in sizes[:3]) + (", …" if len(sizes) > 3 else "")
+    points = "" if found.points is None else f", {counted(len(found.points), 'point')}"
+    counts = f"{len(found.train)} training and {counted(len(found.test), 'test image')}"
+    counts += f", {len(found.val)} for validation," if found.val else ""
+    report = [f"{name}: {counts} of {shown} pixels{points}", *found.report]
+    masked = sum(shot.mask is not None for shot in shots)
+    if masked:
+        report.append(f"masks hide parts of {counted(masked, 'image')}: they do not count")
+    if opaque:
+        report.append(f"alpha is 1 all over {counted(len(opaque), 'image')}: they count as images without alpha")
+    report += [*describe_lenses(shots), *describe_images(shots, heads), *doubts]
+    with_alpha = sum(heads[shot.path].has_alpha for shot in shots)
+    if 0 < with_alpha < len(shots):
+        background = "white" if 2 * with_alpha >= len(shots) else "black"
+        report.append(f"{with_alpha} of {len(shots)} images have transparency: the background of all is {background}")
+    taught = {shot.path for shot in found.train}
+    both = sum(shot.path in taught for shot in found.test)
+    if both:
+        report.append(f"{counted(both, 'test image')} used for training, too: they do not show what new views are like")
+    if found.points is None and not any(image.has_alpha for image in train):
+        report.append("there are no points: splats start anywhere in view")
+    colours = found.points_rgb
+    if colours is not None and len(colours) and (colours == colours[0]).all():
+        shade = " ".join(f"{value:.3g}" for value in colours[0].tolist())
+        report.append(f"all points have the colour {shade}: splats start with the colours of the images there")
+        colours = None
+    axes, up, said = _choose_axes(found.coordinate_system, shots)
+    data = DataSet(
+        name,
+        train,
+        test,
+        None if found.points is None else found.points.astype(np.float32),
+        colours,
+        tuple(line for line in (*report, said) if line),
+        axes,
+        up,
+        found.test_every,
+        size,
+        images,
+        val,
+        origin,
+    )
+    outliers = describe_outliers(data)
+    return replace(data, report=(*data.report, outliers)) if outliers else data
+
+
+def _choose_axes(custom: str, shots: Sequence[Shot]) -> tuple[str, Direction | None, str]:
+    """The axes of a set, which way is up, and that in words.
+
+    Args:
+        custom: axes that sets of this kind have. Some people keep other coordinates in its files: then the cameras
+            say up.
+        shots: all of the set.
+    """
+    level, usual = estimate_level([shot.viewmat for shot in shots]), up_of_axes(custom)
+    if level is None:
+        return custom, usual, "" if usual else "which way is up is not known: the cameras were held at all angles"
+    if usual is None:
+        return custom, level.up, str(level)
+    if sum(a * b for a, b in zip(usual, level.up, strict=True)) < _AGREES:
+        return UNSPECIFIED, level.up, f"{level}; sets of this kind mostly have other axes"
+    return custom, usual, ""
+
+
+def _read(path: Path, size: tuple[int, int] | None, images: str | None, test_every: int) -> UnreadDataSet:
+    if path.is_file() and path.suffix.lower() == ".json":
+        if path.name == "transforms_train.json":
+            return read_blender(path.parent, images)
+        return read_transforms(path, test_every, images)
+    if not path.is_dir():
+        zipped = path.suffix.lower() == ".zip" and path.is_file()
+        remedy = ": unpack it, and name the folder" if zipped else ""
+        raise InputError(f"{path} is neither a folder nor a transforms.json{remedy}")
+    model = find_model(path)
+    if (path / "transforms_train.json").is_file():
+        found = read_blender(path, images)
+    elif (path / "transforms.json").is_file():
+        found = read_transforms(path / "transforms.json", test_every, images)
+    elif model is not None:
+        found = read_colmap(path, model[0], size, images, test_every)
+        return replace(found, report=[*model[1], *found.report])
+    else:
+        raise InputError(
+            f"{path} is no data set: expected transforms_train.json (Blender), transforms.json (instant-ngp) "
+            f"or sparse/0/cameras.bin (COLMAP){_suggest_place(path)}"
+        )
+    if model is not None:
+        found = replace(found, report=[*found.report, "there is a COLMAP model too, which is not read"])
+    if found.kind == "Blender set" and (path / "transforms.json").is_file():
+        found = replace(found, report=[*found.report, "there is a transforms.json too, which is not read"])
+    return found
+
+
+def _suggest_place(path: Path) -> str:
+    """Say where a data set is instead, as far as that is to be seen."""
+    folders = [*sorted(path.glob("*/")), *sorted(path.glob("*/*/"))]
+    names = ("transforms_train.json", "transforms.json")
+    sets = [one for one in folders if any((one / name).is_file() for name in names) or find_model(one)]
+    if sets:
+        return (
+            "; "
+            + ", ".join(one.relative_to(path).as_posix() for one in sets[:_MAX_NAMED])
+            + " in it may be what you want"
+        )
+    if (path / "database.db").is_file():
+        return "; it holds a database of COLMAP, but no model yet: run `colmap mapper`"
+    return ""
+
+
+Origin = tuple[float, float, float]
+
+_NEAR_SIZES = 256.0  # sizes of the scene; farther from 0, a step of float32 is more than 1.5e-5 of that size
+
+
+def choose_origin(found: UnreadDataSet) -> tuple[UnreadDataSet, Origin]:
+    """Choose an origin for a set, and measure its cameras and points from there.
+
+    The origin is 0 if the set lies around 0 or near it. Else it is the middle of the cameras, rounded to a power of
+    ten below the size of the scene: coordinates of maps (UTM, ECEF) are millions of metres, of which float32 holds
+    halves.
+
+    Args:
+        found: result of a reader.
+
+    Returns:
+        The set relative to the origin, and the origin.
+
+    Raises:
+        InputError: a camera's position exceeds float32.
+    """
+    shots = [*found.train, *found.test, *found.val]
+    viewmats = np.stack([shot.viewmat for shot in shots])
+    for shot in shots:
+        if not np.abs(shot.viewmat[:3, 3]).max() < np.finfo(np.float32).max:
+            far = float(np.abs(shot.viewmat[:3, 3]).max())
+            raise InputError(f"the camera of {shot.name} stands {far:.3g} units from 0, expected a place in the scene")
+    viewmats = viewmats[~camera_outliers(viewmats, found.points)]
+    positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    middle = np.median(positions, axis=0)
+    if found.points is not None and len(found.points):
+        subject = np.median(found.points, axis=0) - middle
+    else:
+        subject = nearest_point(positions - middle, viewmats[:, 2, :3])
+    spread = float(np.median(np.linalg.norm(positions - middle, axis=1)))
+    size = max(spread, float(np.linalg.norm(subject)))
+    if size == 0.0 or np.abs(middle).max() <= _NEAR_SIZES * size:
+        return found, (0.0, 0.0, 0.0)
+    digits = -math.floor(math.log10(size))
+    x, y, z = (round(value, digits) + 0.0 for value in middle.tolist())  # no negative zeros
+    origin = np.array([x, y, z])
+    train, test, val = ([_relative_to(shot, origin) for shot in part] for part in (found.train, found.test, found.val))
+    points = None if found.points is None else found.points - origin
+    words = " ".join(str(value).removesuffix(".0") for value in (x, y, z))
+    report = f"coordinates lie far from 0: the scene is measured from its origin, {words}"
+    return replace(found, train=train, test=test, val=val, points=points, report=[*found.report, report]), (x, y, z)
+
+
+def describe_outliers(data: DataSet) -> str:
+    """Name the cameras that are far away from all others, in a sentence; return "" if there are none.
+
+    They stay training, validation or test images: a training image that shows nothing has no effect.
+    """
+    if not data.outliers:
+        return ""
+    positions = np.stack([image.camera.position for image in (*data.outliers, *data.train, *data.test, *data.val)])
+    distances = np.linalg.norm(positions - np.median(positions[len(data.outliers) :], axis=0), axis=1)
+    nearest, usual = float(distances[: len(data.outliers)].min()), float(np.median(distances[len(data.outliers) :]))
+    times = f", {nearest / usual:,.4g} times the usual distance" if usual > 0.0 else ""
+    names = [str(image.camera.image) for image in data.outliers]
+    who = f"the camera of {names[0]} stands" if len(names) == 1 else f"the cameras of {abbreviate(names)} stand"
+    text = f"{who} {nearest:,.4g} units from the others{times}: not counted for the scene's extent; check the poses"
+    tested = sum(image in data.test for image in data.outliers)
+    return f"{text}, {counted(tested, 'test image')} will score badly" if tested else text
+
+
+def _relative_to(shot: Shot, origin: F64) -> Shot:
+    viewmat = shot.viewmat.copy()
+    viewmat[:3, 3] += viewmat[:3, :3] @ origin
+    return replace(shot, viewmat=viewmat)
+
+
+_TURNED = 0.03  # least mean square, across the weakest direction but one, of the axes that point to the right
+_TILT_MAX = 20.0  # degrees; cameras that were held less level determine nothing
+_UNDECIDED = 0.1  # cosine with the cameras' mean up below which they look down: up is then where they look away from
+
+
+@dataclass(frozen=True)
+class Level:
+    """Up direction according to the cameras of a set.
+
+    Attributes:
+        up: unit length, in the scene's coordinates.
+        tilt_degrees: median error of the images: of their horizons against level ones, or, if `by_horizons` is False,
+            of the cameras' own up against this one. Some images taken with the camera on its side change little.
+        by_horizons: True if up is the direction in which the cameras' right axes point least: people hold cameras level
+            and look up and down. It requires cameras that are turned to several sides; otherwise up is the mean of
+            the cameras' own.
+    """
+
+    up: Direction
+    tilt_degrees: float
+    by_horizons: bool
+
+    def __str__(self) -> str:
+        """The same in words, for people."""
+        words = " ".join(f"{value:g}" for value in self.up)
+        how = "their horizons lie" if self.by_horizons else "their own up lies"
+        return f"up is {words} by the cameras: {how} within {self.tilt_degrees:.1f} degrees of that, for half of them"
+
+
+def estimate_level(viewmats: Sequence[F64]) -> Level | None:
+    """Find up from the cameras of a set.
+
+    Args:
+        viewmats: [4, 4] each, world to camera, OpenCV axes: rows are right, down, forward. At least one.
+
+    Returns:
+        The estimate; `None` if the cameras were held at all angles.
+    """
+    rotations = np.stack([viewmat[:3, :3] for viewmat in viewmats])
+    right, own_up, forward = rotations[:, 0], -rotations[:, 1], rotations[:, 2]
+    values, directions = np.linalg.eigh(np.mean(right[:, :, None] * right[:, None, :], axis=0))
+    mean_up = np.mean(own_up, axis=0)
+    found: list[Level] = []
+    if values[1] > _TURNED:
+        up = directions[:, 0]
+        towards = float(np.sum(up * mean_up))
+        if abs(towards) < _UNDECIDED:
+            towards = -float(np.sum(up * np.mean(forward, axis=0)))
+        up = up if towards >= 0.0 else -up
+        found.append(_measure_level(up, np.arcsin(np.clip(np.sum(right * up, axis=1), -1.0, 1.0)), by_horizons=True))
+    length = float(np.sqrt(np.sum(mean_up**2)))
+    if length > _UNDECIDED:
+        up = mean_up / length
+        found.append(_measure_level(up, np.arccos(np.clip(np.sum(own_up * up, axis=1), -1.0, 1.0)), by_horizons=False))
+    return next((one for one in found if one.tilt_degrees <= _TILT_MAX), None)
+
+
+def _measure_level(up: F64, angles: F64, *, by_horizons: bool) -> Level:
+    tilt = float(np.degrees(np.median(np.abs(angles))))
+    return Level(unit_up([float(value) for value in up]), tilt, by_horizons)

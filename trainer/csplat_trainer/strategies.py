@@ -1,0 +1,291 @@
+"""Changes of the number and places of splats during training: MCMC, gradient-based densification, pruning.
+
+* "3DGS as Markov chain Monte Carlo", Kheradmand et al. 2024, https://arxiv.org/abs/2404.09591. A dead splat moves onto
+  a live one, and both (all n, if several move there) get the opacity and the scales that leave the render as it was,
+  as nearly as n equal splats can; noise then separates them.
+* Densification of the first publication, Kerbl et al. 2023, section 5, https://arxiv.org/abs/2308.04079. A splat whose
+  position on screen has a large gradient is cloned if it is small and split in two if it is large; the transparent are
+  pruned, and opacities are reset from time to time so that floaters die.
+* Pruning of the splats that images need least: the exact squared change of the renders if a splat alone were absent.
+  Splats in the same place are each needed little, and together much: so few are pruned at once, and the others are
+  trained before they are measured again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from csplat.types import F32, F64, I64
+from csplat_render.kernels import lane_range, parallel_kernel
+from csplat_render.pruning_error import measure_pruning_error
+from csplat_trainer.parameters import GROUPS, Parameters, to_model
+from csplat_trainer.posed_images import PosedImage
+
+_MAX_SHARE = 51  # splats in one place at most, as the paper's code has it
+_BINOMIAL = np.array([[float(math.comb(n, k)) for k in range(_MAX_SHARE + 1)] for n in range(_MAX_SHARE + 1)])
+_GATE_SLOPE, _GATE_CENTRE = 100.0, 0.995  # of the paper: noise for splats that are nearly transparent
+_MAX_NOISE = 1.0  # standard deviations per step; the paper's noise flings large splats out of small scenes
+_GATE_OFF = 0.1  # at this opacity and above the gate is below 1e-4
+
+
+def relocate(parameters: Parameters, dead_opacity: float, rng: Generator) -> int:
+    """Move splats that are nearly transparent to live ones, chosen by opacity.
+
+    Args:
+        parameters: changed in place.
+        dead_opacity: at this opacity and below a splat is dead.
+        rng: chooses.
+
+    Returns:
+        How many moved.
+    """
+    alphas = parameters.alphas
+    dead = np.flatnonzero(alphas <= dead_opacity)
+    alive = np.flatnonzero(alphas > dead_opacity)
+    if len(dead) == 0 or len(alive) == 0:
+        return 0
+    sources = _draw_by_opacity(alphas, alive, len(dead), rng)
+    _share_among(parameters, sources, alphas, dead_opacity)
+    for name in GROUPS:
+        parameters.values[name][dead] = parameters.values[name][sources]
+    parameters.forget(dead)
+    return len(dead)
+
+
+def grow(parameters: Parameters, factor: float, cap: int, dead_opacity: float, rng: Generator) -> int:
+    """Add splats beside others that are chosen by opacity, up to a cap.
+
+    Args:
+        parameters: changed in place.
+        factor: how many splats there are afterwards, as a multiple of those there are, below the cap.
+        cap: no more splats than this.
+        dead_opacity: no new splat is more transparent than this.
+        rng: chooses.
+
+    Returns:
+        How many were added.
+    """
+    count = len(parameters)
+    wanted = min(cap, max(count + 1, int(factor * count))) - count
+    if wanted <= 0 or count == 0:
+        return 0
+    alphas = parameters.alphas
+    sources = _draw_by_opacity(alphas, np.arange(count), wanted, rng)
+    _share_among(parameters, sources, alphas, dead_opacity)
+    parameters.append({name: parameters.values[name][sources] for name in GROUPS})
+    return wanted
+
+
+def share_opacity(alphas: F64, counts: I64) -> tuple[F64, F64]:
+    """Opacity and scale of n equal splats in one place that look like one (equation 9 of the paper).
+
+    Args:
+        alphas: opacity of the one.
+        counts: n, at most 51.
+
+    Returns:
+        Opacities of each of the n, and factors of their standard deviations.
+    """
+    shared = 1.0 - (1.0 - alphas) ** (1.0 / counts)
+    # The paper's double sum, added up along its outer index: sum_i C(i - 1, k) = C(n, k + 1).
+    denominator = np.zeros_like(shared)
+    for k in range(int(counts.max(initial=1))):
+        denominator += _BINOMIAL[counts, k + 1] * (-1.0) ** k / math.sqrt(k + 1) * shared ** (k + 1)
+    return shared, alphas / denominator
+
+
+def _draw_by_opacity(alphas: F32, among: I64, count: int, rng: Generator) -> I64:
+    """Draw splats with replacement, each as likely as it is opaque."""
+    edges = np.cumsum(alphas[among].astype(np.float64))
+    drawn = np.searchsorted(edges, rng.random(count) * edges[-1], side="right")
+    chosen: I64 = among[np.minimum(drawn, len(among) - 1)]
+    return chosen
+
+
+def _share_among(parameters: Parameters, sources: I64, alphas: F32, least: float) -> None:
+    places, counts = np.unique(sources, return_counts=True)
+    old = np.clip(alphas[places].astype(np.float64), 1e-7, 1.0 - 1e-7)
+    shared, factor = share_opacity(old, np.minimum(counts + 1, _MAX_SHARE))
+    shared = np.clip(shared, max(least, 1e-6), 1.0 - 1e-6)
+    parameters.values["logits"][places] = np.log(shared / (1.0 - shared))
+    parameters.values["scales"][places] += np.log(factor)[:, None].astype(np.float32)
+    parameters.forget(places)
+
+
+def add_noise(parameters: Parameters, strength: float, normals: F32) -> None:
+    """Move splats at random inside their own shapes, the more the more transparent they are.
+
+    The paper's noise, covariance · normal · gate · strength, but along no axis wider than the splat.
+
+    Args:
+        parameters: the means change, in place.
+        strength: the noise's factor times the learning rate of the means.
+        normals: [N, 3], standard normal numbers.
+    """
+    v = parameters.values
+    _noise(v["means"], v["quats"], v["scales"], v["logits"], np.float32(strength), normals)
+
+
+@parallel_kernel()
+def _noise(
+    lane: int, lanes: int, means: F32, quats: F32, scales: F32, logits: F32, strength: np.float32, normals: F32
+) -> None:
+    """Add the noise to each mean; a thread takes a run of splats."""
+    highest = math.log(_GATE_OFF / (1.0 - _GATE_OFF))
+    for i in range(*lane_range(lane, lanes, means.shape[0])):
+        if logits[i] > highest:
+            continue
+        alpha = 1.0 / (1.0 + math.exp(-logits[i]))
+        gate = strength / (1.0 + math.exp(-_GATE_SLOPE * (1.0 - alpha - _GATE_CENTRE)))
+        w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+        r00, r01, r02 = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+        r10, r11, r12 = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+        r20, r21, r22 = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+        n0, n1, n2 = normals[i, 0], normals[i, 1], normals[i, 2]
+        s0, s1, s2 = math.exp(scales[i, 0]), math.exp(scales[i, 1]), math.exp(scales[i, 2])
+        l0 = (r00 * n0 + r10 * n1 + r20 * n2) * min(gate * s0, _MAX_NOISE) * s0
+        l1 = (r01 * n0 + r11 * n1 + r21 * n2) * min(gate * s1, _MAX_NOISE) * s1
+        l2 = (r02 * n0 + r12 * n1 + r22 * n2) * min(gate * s2, _MAX_NOISE) * s2
+        m0 = np.float32(means[i, 0] + (r00 * l0 + r01 * l1 + r02 * l2))
+        m1 = np.float32(means[i, 1] + (r10 * l0 + r11 * l1 + r12 * l2))
+        m2 = np.float32(means[i, 2] + (r20 * l0 + r21 * l1 + r22 * l2))
+        if np.isfinite(m0) and np.isfinite(m1) and np.isfinite(m2):  # a splat as wide as float32 stays where it is
+            means[i, 0], means[i, 1], means[i, 2] = m0, m1, m2
+
+
+_SPLIT_SIZE = 0.01  # of the extent: larger splats are split, smaller ones cloned
+_SPLIT_SHRINK = 1.6  # of the two halves of a split
+_RESET_ALPHA = 0.01
+_MAX_LOG_SCALE = 60.0  # of a scale whose halves stay within float32
+
+
+@dataclass
+class ScreenGradients:
+    """Mean norm of the gradient by each splat's place on screen, over the images that drew it.
+
+    Attributes:
+        total: [N] float64.
+        count: [N] int64.
+    """
+
+    total: F64
+    count: NDArray[np.int64]
+
+    @classmethod
+    def none(cls, splats: int) -> ScreenGradients:
+        """No image yet."""
+        return cls(np.zeros(splats), np.zeros(splats, np.int64))
+
+    def add(self, norms: F32, drawn: NDArray[np.bool_]) -> None:
+        """Add one image's norms, where it drew the splat."""
+        self.total[drawn] += norms[drawn]
+        self.count[drawn] += 1
+
+    @property
+    def mean(self) -> F64:
+        """The mean, 0 for splats that no image drew."""
+        return self.total / np.maximum(self.count, 1)
+
+
+def densify(
+    parameters: Parameters,
+    screen: ScreenGradients,
+    extent: float,
+    threshold: float,
+    cap: int,
+    dead_opacity: float,
+    rng: Generator,
+) -> int:
+    """Clone and split where the gradient is above a threshold, strongest first up to the cap; prune.
+
+    Args:
+        parameters: changed in place.
+        screen: gathered since the last time.
+        extent: of the scene.
+        threshold: of the mean norm.
+        cap: no more splats than this.
+        dead_opacity: splats at this opacity and below are removed.
+        rng: places the halves of a split.
+
+    Returns:
+        By how much the number of splats changed.
+    """
+    before = len(parameters)
+    alive = parameters.alphas > dead_opacity
+    if not alive.any():
+        return 0
+    strength = np.where(alive, screen.mean, 0.0)
+    room = max(0, cap - int(alive.sum()))
+    strongest = np.argsort(-strength, kind="stable")[:room]
+    chosen = np.sort(strongest[strength[strongest] > threshold])
+    values = parameters.values
+    large = values["scales"][chosen].max(axis=1) > np.log(_SPLIT_SIZE * extent)
+    split = chosen[large]
+    new = {name: values[name][chosen].copy() for name in GROUPS}
+    if len(split):
+        first, second = _split_offsets(values["quats"][split], values["scales"][split], rng)
+        new["means"][large] += second
+        new["scales"][large] -= np.float32(np.log(_SPLIT_SHRINK))
+        values["means"][split] += first
+        values["scales"][split] -= np.float32(np.log(_SPLIT_SHRINK))
+        parameters.forget(split)
+    parameters.keep(np.flatnonzero(alive))
+    parameters.append(new)
+    return len(parameters) - before
+
+
+def reset_opacities(parameters: Parameters) -> None:
+    """Make every splat nearly transparent, so that only those come back that images want."""
+    logit = np.float32(np.log(_RESET_ALPHA / (1.0 - _RESET_ALPHA)))
+    np.minimum(parameters.values["logits"], logit, out=parameters.values["logits"])
+    for memory in (parameters.first, parameters.second):
+        memory["logits"][:] = 0.0
+
+
+def _split_offsets(quats: F32, scales: F32, rng: Generator) -> tuple[F32, F32]:
+    """Two offsets for each splat, drawn from its own shape."""
+    w, x, y, z = quats.astype(np.float64).T
+    rotation = np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        1,
+    )
+    deviations = np.exp(np.minimum(scales.astype(np.float64), _MAX_LOG_SCALE))
+    drawn = rng.standard_normal((2, len(quats), 3)) * deviations
+    first, second = (np.einsum("nij,nj->ni", rotation, one).astype(np.float32) for one in drawn)
+    return first, second
+
+
+_PRUNING_VIEWS = 32  # at most, spread over all, that say what splats are worth
+
+
+def prune_least_needed(
+    parameters: Parameters,
+    images: Sequence[PosedImage],
+    background: NDArray[np.float32],
+    count: int,
+    *,
+    antialiased: bool,
+) -> None:
+    """Remove the splats that images need least.
+
+    Args:
+        parameters: changed in place.
+        images: those that are trained on.
+        background: [3], behind the splats.
+        count: how many stay.
+        antialiased: as the scene is trained.
+    """
+    views = images[:: -(-len(images) // _PRUNING_VIEWS)]
+    model = to_model(parameters.values, antialiased=antialiased)
+    found = measure_pruning_error(model, [one.camera for one in views], background=background, bands=False)
+    parameters.keep(np.sort(np.argsort(-found.error, kind="stable")[:count]))

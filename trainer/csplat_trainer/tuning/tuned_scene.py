@@ -1,0 +1,398 @@
+"""The state of fine-tuning: float values, their quantised form in the file, and the rate term of the loss.
+
+Straight through: images are rendered from the values that a decoder will return, and their gradients are applied to the
+values that were quantised, as if nothing lay between (Bengio et al. 2013, https://arxiv.org/abs/1308.3432). A
+codebook's entry gets the sum of the gradients of all splats that use it.
+
+Rate: a stream's bytes lie near its order-0 entropy, so an integer n of a column costs about −log2 of its relative
+frequency in the column. The slope of that cost, from n − 1 to n + 1, pushes a value towards frequent integers, mostly
+zero; the images push back where it shows. Frequencies are counted again every few steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder import DecodedValues, FreeValues, Frozen
+from csplat.types import F32, I32, I64
+from csplat_render.conventions import Gradients
+from csplat_render.kernels import lane_range, parallel_kernel
+from csplat_trainer.parameters import ParameterArrays, Parameters, adam_step, sigmoid
+
+_ALPHAS = (1e-6, 1.0 - 1e-6)  # range of the opacities that logits are computed from
+
+
+class TunedScene:
+    """Values of a frozen scene, Adam's memory of them, and the way from images' gradients to both.
+
+    Args:
+        frozen: the encoder's decisions.
+        parameters: state to go on from; `None`: the values that the encoder found.
+
+    Attributes:
+        frozen: as given.
+        parameters: named as in training, but `quats`, `scales`, `shN` hold the rows of `FreeValues`; and `sizes`.
+    """
+
+    def __init__(self, frozen: Frozen, parameters: Parameters | None = None) -> None:
+        self.frozen = frozen
+        self.parameters = parameters or Parameters.starting_at(_values(frozen.start()))
+        values, book, shapes = self.parameters.values, frozen.book, frozen.shapes
+        self._users = None if book is None else _users(book.index, book.size)
+        self._escaped = np.zeros(0, np.int64) if book is None else book.escaped
+        self._rows_gradient = np.zeros_like(values["shN"] if book else values["shN"][:0])
+        self._shape_users = None if shapes is None else _users(shapes.index, shapes.size)
+        self._own_shape = np.zeros(0, np.int64) if shapes is None else np.flatnonzero(shapes.escaped)
+
+    @property
+    def held(self) -> FreeValues:
+        """The values as the encoder takes them; all but the opacities are the parameters' own arrays."""
+        return self._held(sigmoid(self.parameters.values["logits"]))
+
+    def _held(self, alphas: F32) -> FreeValues:
+        v = self.parameters.values
+        return FreeValues(v["means"], v["quats"], v["scales"], alphas, v["sh0"], v["shN"], v["sizes"])
+
+    def seen(self) -> tuple[DecodedValues, F32]:
+        """Return the values that a decoder will return, and the opacities before they were quantised."""
+        held = self.held
+        return self.frozen.seen(held), held.opacities
+
+    def stored(self, seen: DecodedValues) -> StreamValues:
+        """Return the contents of the file's streams, as a decoder will return them."""
+        sh = self.frozen.seen_rows(self.parameters.values["shN"]) if self.frozen.book is not None else seen.shN
+        if self.frozen.shapes is None:
+            return StreamValues(seen.quats, seen.scales, self.parameters.values["sizes"], seen.opacities, seen.sh0, sh)
+        quats, scales, sizes = self.frozen.seen_shape_rows(self._held(seen.opacities), seen)
+        return StreamValues(quats, scales, sizes, seen.opacities, seen.sh0, sh)
+
+    def count(self, seen: DecodedValues, weight: float) -> RateTerm:
+        """Count what the integers of the file cost, at a weight in loss per bit and splat."""
+        return RateTerm.counted(self.frozen, self.stored(seen), weight)
+
+    def step(
+        self, gradients: Gradients, seen: DecodedValues, alphas: F32, rates: dict[str, float], costs: RateTerm | None
+    ) -> None:
+        """Move the values against the gradients by what was seen.
+
+        Args:
+            gradients: gradients of the loss.
+            seen, alphas: as `seen` returned them.
+            rates: learning rate of each group.
+            costs: costs of bytes, a further part of the loss.
+        """
+        quats, scales, sizes = self._by_shape(gradients)
+        steps = {
+            "means": gradients.means,
+            "quats": quats,
+            "scales": scales,
+            "sizes": sizes,
+            "logits": gradients.opacities * (alphas * (np.float32(1.0) - alphas)),
+            "sh0": gradients.sh0,
+            "shN": self._by_row(gradients.shN),
+        }
+        if costs is not None:
+            costs.add_to(steps, self.stored(seen))
+        adam_step(self.parameters, steps, rates)
+        self.frozen.constrain(self._held(alphas))
+
+    def _by_row(self, by_splat: F32) -> F32:
+        """Gradients of the rows of SH that the file holds, of those of all splats [N, K, 3]."""
+        book = self.frozen.book
+        if book is None or self._users is None:
+            return by_splat
+        rows, (order, starts) = self._rows_gradient, self._users
+        rows[: book.size] = _sum_by_entry(by_splat, order, starts, book.size)
+        rows[book.size :] = by_splat[self._escaped]
+        return rows
+
+    def _by_shape(self, gradients: Gradients) -> tuple[F32, F32, F32]:
+        """Gradients of the rotations and scales that the file holds, and of what splats add to the latter."""
+        shapes = self.frozen.shapes
+        if shapes is None or self._shape_users is None:
+            return gradients.quats, gradients.scales, np.zeros(0, np.float32)
+        own, (order, starts) = self._own_shape, self._shape_users
+        quats, scales = (
+            np.concatenate([_sum_by_entry(part, order, starts, shapes.size), part[own]])
+            for part in (gradients.quats, gradients.scales)
+        )
+        return quats, scales, gradients.scales.sum(axis=1)
+
+
+def _values(held: FreeValues) -> ParameterArrays:
+    alpha = np.clip(held.opacities.astype(np.float64), *_ALPHAS)
+    return {
+        "means": held.means,
+        "quats": held.quats,
+        "scales": held.scales,
+        "logits": np.log(alpha / (1.0 - alpha)).astype(np.float32),
+        "sh0": held.sh0,
+        "shN": held.sh,
+        "sizes": held.sizes,
+    }
+
+
+def _users(index: NDArray[np.int32], size: int) -> tuple[I64, I64]:
+    """Splats by the entry that they use, and where those of each entry begin, [size + 1]; escaped ones come last."""
+    order = np.argsort(index, kind="stable")
+    starts = np.searchsorted(index[order], np.arange(size + 1))
+    return order.astype(np.int64), starts.astype(np.int64)
+
+
+def _sum_by_entry(values: F32, order: I64, starts: I64, size: int) -> F32:
+    flat = np.empty((size, values[0].size), np.float32)
+    sum_by_entry(values.reshape(len(values), -1), order, starts, flat)
+    return flat.reshape(size, *values.shape[1:])
+
+
+@parallel_kernel()
+def sum_by_entry(lane: int, lanes: int, values: F32, order: I64, starts: I64, out: F32) -> None:
+    """Sum the rows of the users of each entry, in float32 and in their order; vectorises over a row.
+
+    Args:
+        values: [N, C].
+        order: [N], rows of `values` by entry.
+        starts: [size + 1], index in `order` of an entry's first user.
+        out: [size, C], overwritten.
+    """
+    for entry in range(lane, out.shape[0], lanes):
+        total = out[entry]
+        total[:] = np.float32(0.0)
+        for at in range(starts[entry], starts[entry + 1]):
+            row = values[order[at]]
+            for c in range(out.shape[1]):
+                total[c] += row[c]
+
+
+def sum_by_entry_twin(values: F32, order: I64, starts: I64, out: F32) -> None:
+    """The slow twin of `sum_by_entry`."""
+    for entry in range(len(out)):
+        out[entry] = values[order[starts[entry] : starts[entry + 1]]].sum(axis=0)
+
+
+_MAX_INTEGER = 128  # integers beyond ± this cost as much as the last ones
+_ROWS = 1 << 15  # rows of SH that are counted at a time: their integers take several times the memory of the values
+_MAX_SLOPE = 4.0  # bits per step; rare integers are counted too badly for more
+_ROOT2 = np.sqrt(2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class StreamValues:
+    """Contents of a file's streams, as a decoder will return them: arrays as in `Held`, all on their lattices."""
+
+    quats: F32
+    scales: F32
+    sizes: F32
+    opacities: F32
+    sh0: F32
+    sh: F32
+
+
+@dataclass(eq=False)
+class RateTerm:
+    """Slopes of the costs of all attributes, and how they reach the gradients.
+
+    Attributes:
+        frozen: lattices.
+        weight: loss per bit and splat.
+        tables: by attribute, and quantisation class if there are several: slopes in bits per step,
+            [columns, 2 · 128 + 1].
+        bits: bits of all integers together, by their order-0 entropy; without centres and indices, which hardly change.
+    """
+
+    frozen: Frozen
+    weight: float
+    tables: dict[str, F32]
+    bits: float = 0.0
+
+    @classmethod
+    def counted(cls, frozen: Frozen, stored: StreamValues, weight: float) -> RateTerm:
+        """Count the integers of a scene.
+
+        Args:
+            frozen: the encoder's decisions.
+            stored: contents of the streams.
+            weight: loss per bit and splat.
+        """
+        costs = cls(frozen, weight, {})
+        plan = frozen.plan
+        for number, grade in enumerate(_class_steps(frozen)):
+            rows = grade.rows
+            columns = {
+                "scales": _integers(stored.scales[rows], grade.scale_step),
+                "quats": _integers(stored.quats[rows, 1:], grade.quat_step),
+                "opacities": np.rint(np.sqrt(stored.opacities[rows]) * grade.levels).astype(np.int32)[:, None],
+                "sh0": colour_integers_of(stored.sh0[rows, None], grade.sh0_step, plan.chroma_shift).reshape(-1, 3),
+            }
+            for name, values in columns.items():
+                costs._count(_table_name(name, number), [values])
+        costs._count("sizes", [_integers(stored.sizes[:, None], plan.scale_step)])
+        width = 3 * stored.sh.shape[1]
+        if width:
+            parts = (stored.sh[at : at + _ROWS] for at in range(0, max(1, len(stored.sh)), _ROWS))
+            coloured = (colour_integers_of(part, plan.sh_step, plan.chroma_shift) for part in parts)
+            costs._count("shN", (part.reshape(-1, width) for part in coloured))
+        return costs
+
+    def _count(self, name: str, parts: Iterable[NDArray[Any]]) -> None:
+        self.tables[name], bits = cost_slopes(parts)
+        self.bits += bits
+
+    @property
+    def loss(self) -> float:
+        """Rate term of the loss: weight times bits per splat."""
+        return self.weight * self.bits / len(self.frozen.source_index)
+
+    def add_to(self, steps: ParameterArrays, stored: StreamValues) -> None:
+        """Add the slopes to gradients.
+
+        Args:
+            steps: gradients of the loss by group; changed in place.
+            stored: contents of the streams.
+        """
+        plan, tables = self.frozen.plan, self.tables
+        per_bit = np.float32(self.weight / len(stored.opacities))
+        shift = plan.chroma_shift
+        for number, grade in enumerate(_class_steps(self.frozen)):
+            rows = grade.rows
+            scales, quats, opacities, sh0 = (
+                tables[_table_name(name, number)] for name in ("scales", "quats", "opacities", "sh0")
+            )
+            _add_plain(stored.scales[rows], grade.scale_step, 0, scales, per_bit, steps["scales"][rows])
+            _add_plain(stored.quats[rows], grade.quat_step, 1, quats, per_bit, steps["quats"][rows])
+            roots = np.sqrt(stored.opacities[rows])
+            levels = np.minimum(np.rint(roots * np.float32(grade.levels)), _MAX_INTEGER).astype(np.int64)
+            # The level is M √alpha, whose derivative by the logit is M √alpha (1 − alpha) / 2.
+            chain = np.float32(0.5 * grade.levels) * roots * (np.float32(1.0) - stored.opacities[rows])
+            steps["logits"][rows] += per_bit * chain * opacities[0][_MAX_INTEGER + levels]
+            _add_colour(stored.sh0[rows, None], grade.sh0_step, shift, sh0, per_bit, steps["sh0"][rows, None])
+        _add_plain(stored.sizes[:, None], plan.scale_step, 0, tables["sizes"], per_bit, steps["sizes"][:, None])
+        if stored.sh.shape[1]:
+            _add_colour(stored.sh, plan.sh_step, shift, tables["shN"], per_bit, steps["shN"])
+
+
+@dataclass(frozen=True)
+class _ClassSteps:
+    """Rows that have the same steps, one after the other; all of them if there are no quantisation classes."""
+
+    rows: slice
+    scale_step: float
+    quat_step: float
+    levels: float
+    sh0_step: float
+
+
+def _class_steps(frozen: Frozen) -> list[_ClassSteps]:
+    plan, tiles = frozen.plan, frozen.draft.tiles
+    begins = [0] if frozen.draft.grades is None else [
+        number for number, tile in enumerate(tiles) if not number or tile.coarse != tiles[number - 1].coarse
+    ]  # fmt: skip
+    found = []
+    for begin, end in pairwise([*begins, len(tiles)]):
+        coarse = tiles[begin].coarse
+        rows = slice(None) if len(begins) == 1 else slice(tiles[begin].rows[0], tiles[end - 1].rows[-1] + 1)
+        found.append(
+            _ClassSteps(
+                rows,
+                plan.scale_step * 2.0**coarse.scales,
+                coarse.quats / (_ROOT2 * plan.quat_levels),
+                plan.opacity_levels / coarse.opacities,
+                plan.sh0_step * 2.0**coarse.sh0,
+            )
+        )
+    return found
+
+
+def _table_name(name: str, number: int) -> str:
+    return f"{name} {number}" if number else name
+
+
+def cost_slopes(parts: Iterable[NDArray[Any]]) -> tuple[F32, float]:
+    """Slope of the cost of integers in bits per step, and the cost of all of them.
+
+    Args:
+        parts: [n, C] integers each, one part at least: rows of the same C columns.
+
+    Returns:
+        [C, 257] float32, for the integers −128 to 128, and bits.
+    """
+    size = 2 * _MAX_INTEGER + 1
+    counts: NDArray[Any] = np.zeros((0, size), np.int64)
+    for columns in parts:
+        width = columns.shape[1]
+        places = np.clip(columns, -_MAX_INTEGER, _MAX_INTEGER) + (_MAX_INTEGER + size * np.arange(width))
+        found = np.bincount(places.reshape(-1), minlength=width * size).reshape(width, size)
+        counts = counts + found if len(counts) else found
+    count = int(counts.sum(axis=1).max(initial=0))
+    # One more of each and a narrow blur: an integer that happens not to occur is no more than rare.
+    padded = np.pad(counts + 1.0, ((0, 0), (1, 1)), mode="edge")
+    blurred = 0.25 * padded[:, :-2] + 0.5 * padded[:, 1:-1] + 0.25 * padded[:, 2:]
+    bits = -np.log2(blurred / (count + size))
+    slopes = np.gradient(bits, axis=1)
+    shares = counts / max(1, count)
+    entropy = -(counts * np.log2(np.maximum(shares, 1e-12))).sum()
+    return np.clip(slopes, -_MAX_SLOPE, _MAX_SLOPE).astype(np.float32), float(entropy)
+
+
+def colour_integers_of(seen: F32, step: float, shift: int) -> I32:
+    """Y, Co, Cg [..., 3] int32 of colours on their lattice [..., 3], as they are coded."""
+    rgb = _integers(seen, step)
+    red, green, blue = rgb[..., 0], rgb[..., 1], rgb[..., 2]
+    co = red - blue
+    t = blue + (co >> 1)
+    cg = green - t
+    return np.stack([t + (cg >> 1), co >> shift, cg >> shift], axis=-1)
+
+
+def _integers(seen: F32, step: float) -> I32:
+    return np.rint(np.clip(seen.astype(np.float64) / step, -(2.0**30), 2.0**30)).astype(np.int32)
+
+
+@parallel_kernel()
+def _add_plain(
+    lane: int, lanes: int, seen: F32, step: float, first: int, tables: F32, per_bit: np.float32, out: F32
+) -> None:
+    """Add the slopes of plain columns, [n, C] from column `first` on; a thread takes a run of rows."""
+    reach = tables.shape[1] // 2
+    over = np.float32(1.0 / step)
+    begin, end = lane_range(lane, lanes, seen.shape[0])
+    seen, out = seen[begin:end], out[begin:end]
+    for i in range(end - begin):
+        for c in range(first, seen.shape[1]):
+            n = min(max(int(np.rint(seen[i, c] * over)), -reach), reach)
+            out[i, c] += per_bit * over * tables[c - first, reach + n]
+
+
+@parallel_kernel()
+def _add_colour(
+    lane: int, lanes: int, seen: F32, step: float, shift: int, tables: F32, per_bit: np.float32, out: F32
+) -> None:
+    """Add the slopes of colours [n, K, 3] through the transform to luma and chroma; a thread takes a run of rows."""
+    reach = tables.shape[1] // 2
+    over = np.float32(1.0 / step)
+    chroma = np.float32(0.5**shift)
+    begin, end = lane_range(lane, lanes, seen.shape[0])
+    seen, out = seen[begin:end], out[begin:end]
+    for i in range(end - begin):
+        for k in range(seen.shape[1]):
+            red = int(np.rint(seen[i, k, 0] * over))
+            green = int(np.rint(seen[i, k, 1] * over))
+            blue = int(np.rint(seen[i, k, 2] * over))
+            co = red - blue
+            t = blue + (co >> 1)
+            cg = green - t
+            y = t + (cg >> 1)
+            by_y = tables[3 * k, reach + min(max(y, -reach), reach)]
+            by_co = chroma * tables[3 * k + 1, reach + min(max(co >> shift, -reach), reach)]
+            by_cg = chroma * tables[3 * k + 2, reach + min(max(cg >> shift, -reach), reach)]
+            # Y = (R + 2 G + B) / 4, Co = R - B, Cg = G - (R + B) / 2, up to rounding.
+            quarter, half = np.float32(0.25), np.float32(0.5)
+            out[i, k, 0] += per_bit * over * (quarter * by_y + by_co - half * by_cg)
+            out[i, k, 1] += per_bit * over * (half * by_y + by_cg)
+            out[i, k, 2] += per_bit * over * (quarter * by_y - by_co - half * by_cg)
