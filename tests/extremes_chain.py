@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from captures import cameras, views_of
-from csplat_tools.optimise.simplify import SimplifyOptions
 from extremes import COUNT, write_small_scene
 from extremes_learnt import BLACK, COARSE, QUICK, SHORT, photographs_of
 
@@ -24,6 +23,7 @@ from csplat_render import Camera, render
 from csplat_render.conventions import RenderResult
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.optimise import pruning
+from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_trainer.training_loop import train
 from csplat_trainer.tuning import renders_of, split_views, tune
 

@@ -21,7 +21,6 @@ pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'cspl
 
 # Importing them needs what is looked for above.
 from captures import H, W, cameras, photograph, shell
-from csplat_tools.optimise.simplify import SimplifyOptions
 
 import csplat
 import csplat_trainer
@@ -35,6 +34,7 @@ from csplat_render.conventions import SplatArrays
 from csplat_render.rasteriser import Rasteriser
 from csplat_tools.cli.app import app
 from csplat_tools.cli.finetune import finetune as finetune_command
+from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.training.tuned_file import smallest_reaching
 from csplat_tools.training.tuning_report import ply_splat_bytes
 from csplat_trainer.losses import PhotometricLoss
