@@ -13,10 +13,10 @@ from csplat.model import SplatModel, normalise_quats
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.scorer import renderer
-from csplat_tools.optimise.pruning_order import SimplifyOptions
-from csplat_tools.optimise.target_encoding import encode_to
-from csplat_tools.views import BLACK, ViewSet, camera_sequence, find_view_set, with_deciders
-from csplat_trainer.posed_images import PosedImage
+from csplat_tools.optimise.reaching import encode_to
+from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.views import BLACK, ViewSet, camera_sequence, find_view_set, with_validation_views
+from csplat_trainer.pictures import Picture
 
 W, H = 48, 40
 
@@ -28,7 +28,7 @@ def cameras(count):
 
 def views_of(seen_from, photographs=()):
     """Views of which every eighth decides and the others teach; none judges."""
-    return with_deciders(ViewSet("cameras", BLACK, seen_from, (), (), photographs))
+    return with_validation_views(ViewSet("cameras", BLACK, seen_from, (), (), photographs))
 
 
 def shell(coefficients):

@@ -33,7 +33,7 @@ from typing import Any
 import pytest
 from viewer_pages import EnginePage, ViewerPage
 
-from csplat_tools.present.webroot import web_files
+from csplat_tools.present.viewer_page import web_files
 
 ROOT = Path(__file__).resolve().parent.parent
 SERVED = ("tools/viewer", "codec/js", "conformance/csplat_conformance/vectors")

@@ -123,11 +123,11 @@ def sample_path() -> Path:
 @pytest.fixture(scope="module")
 def small_views():
     """Make virtual views that decide and judge small: for searches and reports whose figures nobody reads."""
-    from csplat_tools.views.placing import VirtualSizes
+    from csplat_tools.views.virtual_views import VirtualSizes
 
     small = VirtualSizes(judging=(8, 160, 120), deciding=(12, 80, 60), elsewhere=(12, 80, 60))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("csplat_tools.views.placing.VIRTUAL_SIZES", small)
+        patch.setattr("csplat_tools.views.virtual_views.VIRTUAL_SIZES", small)
         yield
 
 

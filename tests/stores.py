@@ -11,7 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 
 from csplat import read_header
-from csplat_tools.present.server import byte_range
+from csplat_tools.present.viewer_server import byte_range
 
 KEYS = {"key": "nobody", "secret": "nothing"}
 

@@ -31,7 +31,7 @@ from csplat.model import SplatModel
 from csplat_tools.__main__ import main
 from csplat_tools.cli.app import app
 from csplat_tools.cli.encode import encode as encode_command
-from csplat_tools.files.streams import check_output, write_bytes
+from csplat_tools.file_streams import check_output, write_bytes
 
 PROGRAM = [sys.executable, "-m", "csplat_tools"]
 
@@ -69,7 +69,7 @@ def glanced(monkeypatch):
         seen["scenes"].append(len(source))
         return seen["psnr"]
 
-    monkeypatch.setattr("csplat_tools.cli.encode.glance", glance)
+    monkeypatch.setattr("csplat_tools.cli.encode.estimate_psnr", glance)
     monkeypatch.setattr("csplat_tools.cli.encode.seeming_up", lambda _model: None)
     return seen
 
@@ -229,7 +229,7 @@ def test_a_process_imports_little_and_without_the_extra_packages_settings_say_wh
     )
     by_codec, by_info, (*helps, (_, refused)) = json.loads(done.stdout)
     assert [] == [name for name in by_codec if name.startswith("csplat_tools")]
-    shared = {f"csplat_tools.cli.{name}" for name in ("app", "console", "groups", "options", "settings")}
+    shared = {f"csplat_tools.cli.{name}" for name in ("app", "command")}
     assert {"csplat_tools.cli.info"} == {name for name in by_info if name.startswith("csplat_tools.cli.")} - shared
     assert all("--report" in text for text, _ in helps)
     for text, _ in helps[1:]:

@@ -11,9 +11,8 @@ from csplat import EncodeOptions, decode, encode, write_ply
 from csplat.encoder import encode_with_report
 from csplat.errors import InputError
 from csplat_tools.cli.app import app
-from csplat_tools.files.scenes import LoadedModel, load_model
-from csplat_tools.inspect.attributes import attribute_errors
-from csplat_tools.inspect.glance import glance
+from csplat_tools.inspect.comparison import attribute_errors, estimate_psnr
+from csplat_tools.scene_files import LoadedModel, load_model
 from csplat_tools.views import comparison_cameras
 
 
@@ -78,8 +77,8 @@ def call(*words):
 @pytest.mark.usefixtures("renderer")
 def test_a_glance_is_taken_at_no_scene_without_splats_or_with_too_many(scene):
     data = encode(scene, EncodeOptions(preset="fast"))
-    assert glance(scene, data, splats_max=len(scene) - 1) is None
-    assert glance(scene.select(slice(0)), data) is None
+    assert estimate_psnr(scene, data, splats_max=len(scene) - 1) is None
+    assert estimate_psnr(scene.select(slice(0)), data) is None
 
 
 @pytest.mark.usefixtures("renderer")
@@ -87,7 +86,7 @@ def test_a_glance_waits_for_no_compiler(scene, monkeypatch):
     from csplat_render import warmup
 
     monkeypatch.setattr(warmup, "is_cached", lambda kernel: kernel is not warmup.blend)
-    assert glance(scene, encode(scene)) is None
+    assert estimate_psnr(scene, encode(scene)) is None
 
 
 # pairs
@@ -263,7 +262,7 @@ def test_the_virtual_cameras_are_the_default_and_a_glance_sees_what_they_do(file
     result = json.loads(call("compare", *files, "--json"))
     assert "virtual" == result["cameras"]
     assert 8 == len(result["views"])
-    assert abs(result["psnr"] - glance(scene, files[1].read_bytes())) < 0.3
+    assert abs(result["psnr"] - estimate_psnr(scene, files[1].read_bytes())) < 0.3
     assert 10.0 < result["psnr"] < 90.0
 
 

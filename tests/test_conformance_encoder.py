@@ -26,7 +26,7 @@ from csplat_conformance.encoders.matching import pair
 from csplat_conformance.process import Ended, run_program
 from csplat_conformance.report import Status
 from csplat_tools.cli.app import app
-from csplat_tools.files.convert import encode_file
+from csplat_tools.encode_file import encode_file
 
 INPUTS = {one.name: one for one in all_inputs()}
 ENCODABLE = {name: one for name, one in INPUTS.items() if one.source is not None}
@@ -291,7 +291,7 @@ def test_without_a_renderer_pictures_are_skipped_loudly(tmp_path, monkeypatch):
     def absent():
         raise InputError("this needs numba: pip install 'csplat[render]'")
 
-    monkeypatch.setattr("csplat_tools.cli.conformance.need_renderer", absent)
+    monkeypatch.setattr("csplat_tools.cli.conformance.require_renderer", absent)
     result = invoke("--cmd", copying(tmp_path, "ordinary/degree_1"), "--filter", "*/degree_1")
 
     assert 0 == result.exit_code

@@ -5,14 +5,14 @@ import sys
 
 import pytest
 
-from csplat_tools.files.console import (
+from csplat_tools.console import (
     Display,
     displayed,
     format_range,
     format_seconds,
     note,
+    print_data,
     progress_bar,
-    say,
     step_progress,
 )
 
@@ -119,7 +119,7 @@ def test_what_is_said_takes_the_bars_away_first(clock, monkeypatch, capsys):
         clock.now += 5.0
         display.tick()
         assert display._bars is not None
-        say("data")
+        print_data("data")
         assert display._bars is None
         display.tick()
         note("a remark")

@@ -18,11 +18,9 @@ from csplat.ply import read_ply, write_ply
 from csplat.scene import scene_of
 from csplat.turning import in_axes
 from csplat_tools.cli.app import app, command_function
-from csplat_tools.files.by_disk import Scale
-from csplat_tools.files.convert import encode_file
-from csplat_tools.files.converting import convert_file
-from csplat_tools.files.filters import Filters, isolated
-from csplat_tools.files.scenes import opened_scenes
+from csplat_tools.convert_file import Filters, convert_file, find_floaters
+from csplat_tools.encode_file import OutOfCoreOptions, encode_file
+from csplat_tools.scene_files import open_scenes
 
 
 def call(*words, status=0):
@@ -143,9 +141,9 @@ def lonely(seed=0):
 
 def test_splats_without_company_float():
     points, sizes = lonely()
-    assert [3000, 3001] == np.flatnonzero(isolated(points, sizes)).tolist()
-    assert not isolated(points[:5], sizes[:5]).any()
-    assert not isolated(np.zeros((20, 3)), np.ones(20)).any()
+    assert [3000, 3001] == np.flatnonzero(find_floaters(points, sizes)).tolist()
+    assert not find_floaters(points[:5], sizes[:5]).any()
+    assert not find_floaters(np.zeros((20, 3)), np.ones(20)).any()
 
 
 def test_floaters_are_dropped():
@@ -270,9 +268,11 @@ def test_a_packed_scene_that_fits_the_memory_is_unpacked_once(tmp_path, make_mod
         return spz_file.read_packed(*words, any_degree=any_degree)
 
     monkeypatch.setattr(spz, "read_packed", counting)
-    encode_file(str(tmp_path / "a.spz"), str(tmp_path / "a.csplat"), EncodeOptions(), scale=Scale(by_disk=True))
+    encode_file(
+        str(tmp_path / "a.spz"), str(tmp_path / "a.csplat"), EncodeOptions(), scale=OutOfCoreOptions(by_disk=True)
+    )
     assert 1 == len(unpacked)
-    with opened_scenes((tmp_path / "a.spz", tmp_path / "a.spz"), 1 << 30) as (one, _):
+    with open_scenes((tmp_path / "a.spz", tmp_path / "a.spz"), 1 << 30) as (one, _):
         assert 50 == one.count
     assert 3 == len(unpacked)
     assert csplat.decode(tmp_path / "a.csplat").sh_degree == 1

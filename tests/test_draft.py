@@ -13,7 +13,7 @@ from csplat.encoder import Draft, Origin, encode_with_report
 from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
 from csplat_conformance.stated import Source, prove
-from csplat_tools.inspect.info import describe_file
+from csplat_tools.inspect.file_description import describe_file
 
 ROOT = Path(__file__).resolve().parent.parent
 GEOMETRY = ("means", "quats", "scales", "opacities")

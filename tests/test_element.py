@@ -12,7 +12,7 @@ from viewer_pages import read_pixels
 
 from csplat import EncodeOptions, encode
 from csplat_tools.cli.app import app
-from csplat_tools.present.export import export_element
+from csplat_tools.present.viewer_page import export_element
 
 pytestmark = [*IN_CHROMIUM, pytest.mark.area(name="chromium")]
 

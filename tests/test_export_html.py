@@ -12,10 +12,9 @@ from viewer_pages import ViewerPage
 from csplat import decode, encode, read_ply, write_ply
 from csplat.errors import CsplatError
 from csplat_tools.cli.app import app
-from csplat_tools.files.facts import SceneOverrides
-from csplat_tools.present.export import export_page, link_modules
-from csplat_tools.present.viewing import view_wishes
-from csplat_tools.present.webroot import PAGE, WORKER, web_files
+from csplat_tools.present.viewer_page import PAGE, WORKER, export_page, link_modules, web_files
+from csplat_tools.present.viewer_server import page_parameters
+from csplat_tools.scene_files import MetadataOverrides
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +77,7 @@ def cameras(tmp_path):
 @pytest.mark.slow
 def test_a_page_has_its_cameras_axes_and_any_name_and_is_forbidden_the_network(tab, site, make_model, cameras):
     name = "</script><script>alert('é')</script>&.csplat"
-    wishes = view_wishes(str(cameras), SceneOverrides(coordinate_system="RFU"))
+    wishes = page_parameters(str(cameras), MetadataOverrides(coordinate_system="RFU"))
     url = site.add("/page.html", export_page(encode(make_model(20, 0)), name, wishes).page)
     viewer = ViewerPage(tab, site)
     viewer.visit(url)
@@ -100,7 +99,7 @@ def test_the_command_puts_cameras_and_axes_into_the_page(make_model, cameras, tm
     words = [tmp_path / "scene.csplat", tmp_path / "page.html", "--cameras", cameras, "--axes", "RFU"]
     done = invoke(*words)
     assert 0 == done.exit_code, done.output
-    wishes = view_wishes(str(cameras), SceneOverrides(coordinate_system="RFU"))
+    wishes = page_parameters(str(cameras), MetadataOverrides(coordinate_system="RFU"))
     assert {"camera", "axes"} == set(wishes)
     assert export_page(data, "scene.csplat", wishes).page == (tmp_path / "page.html").read_bytes()
 
@@ -205,8 +204,8 @@ def test_the_page_can_go_to_a_pipe(sample, tmp_path):
 
 
 def test_an_incomplete_installation_is_an_error_of_its_own(monkeypatch, tmp_path):
-    import csplat_tools.present.webroot
+    import csplat_tools.present.viewer_page
 
-    monkeypatch.setattr(csplat_tools.present.webroot, "__file__", str(tmp_path / "a" / "b" / "webroot.py"))
+    monkeypatch.setattr(csplat_tools.present.viewer_page, "__file__", str(tmp_path / "a" / "b" / "viewer_page.py"))
     with pytest.raises(CsplatError, match="install csplat again"):
         export_page(b"", "scene.csplat")

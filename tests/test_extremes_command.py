@@ -24,7 +24,7 @@ USUAL = ("half the rows NaN",)  # conditions of the usual tests
 @pytest.fixture
 def unseen(monkeypatch):
     """No scene is looked at after encoding."""
-    monkeypatch.setattr("csplat_tools.cli.encode.glance", lambda *_args, **_options: None)
+    monkeypatch.setattr("csplat_tools.cli.encode.estimate_psnr", lambda *_args, **_options: None)
 
 
 def run(*words):

@@ -10,7 +10,7 @@ from csplat import write_ply
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_tools.cli.app import app
-from csplat_tools.present.film import _durations, check_film, is_film, write_film
+from csplat_tools.render_files import _durations, check_film, is_film, write_film
 
 pytest.importorskip("numba", reason="the renderer needs numba: pip install 'csplat[render]'")
 Image = pytest.importorskip("PIL.Image", reason="films need pillow: pip install 'csplat[render]'")

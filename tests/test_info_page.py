@@ -20,11 +20,11 @@ from captures import cameras, shell
 from csplat import EncodeOptions, encode, read_ply, write_ply
 from csplat_render.virtual_cameras import detail, sample_cloud, scene_frame
 from csplat_tools.cli.app import app
-from csplat_tools.hardest_place import HardestPlaceSearch
-from csplat_tools.html_report import Bar, draw_bars
-from csplat_tools.inspect.info import describe_file
-from csplat_tools.views import comparison_cameras, find_view_set, showing_cameras
-from csplat_tools.views.viewset import ViewSet
+from csplat_tools.inspect.file_description import describe_file
+from csplat_tools.pages.bars import Bar, draw_bars
+from csplat_tools.pages.hardest import HardestPlace
+from csplat_tools.views import comparison_cameras, display_cameras, find_view_set
+from csplat_tools.views.view_sets import ViewSet
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
@@ -178,7 +178,7 @@ def test_the_hardest_place_is_where_the_error_is():
 def test_views_that_are_shown_show_detail(sample_path):
     source = read_ply(sample_path)
     views = find_view_set(source, count=0)
-    shown = showing_cameras(source, views)
+    shown = display_cameras(source, views)
     assert 2 <= len(shown) <= 6
     cloud, nearest = sample_cloud(source, 20_000, np.random.default_rng(1)), 0.4 * scene_frame(source).extent
     best = max(detail(cloud, camera, nearest) for camera in comparison_cameras(source))
@@ -187,7 +187,7 @@ def test_views_that_are_shown_show_detail(sample_path):
 
 def test_views_of_a_user_are_shown_as_they_are():
     own = cameras(3)
-    assert showing_cameras(shell(8), ViewSet("cameras.json", (0.0, 0.0, 0.0), (), (), own)) is own
+    assert display_cameras(shell(8), ViewSet("cameras.json", (0.0, 0.0, 0.0), (), (), own)) is own
 
 
 def test_equal_pictures_have_a_place_too():

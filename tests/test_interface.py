@@ -241,9 +241,9 @@ def test_a_target_that_is_none_is_refused_before_the_scene_is_read(asked, says):
 def views_once():
     """Virtual cameras are searched for once: all commands are called with the same scene."""
     pytest.importorskip("numba", reason="virtual cameras want the extra [render]")
-    from csplat_tools.views import finding
+    from csplat_tools.views import view_sets
 
-    search, known = finding.virtual_cameras, {}
+    search, known = view_sets.virtual_cameras, {}
 
     def find(model, *args, **named):
         key = (*args, *sorted(named.items()))
@@ -252,7 +252,7 @@ def views_once():
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(finding, "virtual_cameras", find)
+        patch.setattr(view_sets, "virtual_cameras", find)
         yield
 
 

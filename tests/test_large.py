@@ -24,7 +24,7 @@ from csplat.large import encode_scene, encoding
 from csplat.scene import scene_of
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
-from csplat_tools.files.by_disk import Scale, encode_by_disk, expected
+from csplat_tools.encode_file import OutOfCoreOptions, encode_out_of_core, estimate_cost
 
 WHOLE = 600  # splats, in place of half a million
 COUNT = 6 * WHOLE
@@ -312,13 +312,13 @@ def ply(model, tmp_path):
 
 
 def test_a_file_goes_by_way_of_the_disk_where_it_is_told(ply, tmp_path):
-    target, scale = tmp_path / "out.csplat", Scale(memory_bytes=300_000_000, by_disk=True)
+    target, scale = tmp_path / "out.csplat", OutOfCoreOptions(memory_bytes=300_000_000, by_disk=True)
     options = EncodeOptions(preset="fast", sh_degree=1, threads=1)
-    foretold = expected(ply, options, scale)
+    foretold = estimate_cost(ply, options, scale)
     assert (COUNT, 1, False) == (foretold.count, foretold.sh_degree, foretold.needs.in_memory)
     assert 0 < foretold.needs.memory_bytes <= 300e6
     stages = []
-    encoded = encode_by_disk(
+    encoded = encode_out_of_core(
         ply, str(target), options, None, scale, strict=False, progress=lambda stage, _done: stages.append(stage)
     )
     assert {"sorting", "coding"} <= set(stages)
@@ -333,7 +333,7 @@ def test_the_command_asks_for_the_disk_as_its_options_say(ply, tmp_path, monkeyp
     def encode_here(_local, _target, _options, _facts, scale, **_):
         asked.append(scale)
 
-    monkeypatch.setattr("csplat_tools.files.convert.encode_by_disk", encode_here)
+    monkeypatch.setattr("csplat_tools.encode_file.encode_by_disk", encode_here)
     run = CliRunner().invoke
     foretold = run(app, ["encode", str(ply), str(target), "--memory", "300MB", "--dry-run", "--json"])
     assert 0 == foretold.exit_code
@@ -343,7 +343,7 @@ def test_the_command_asks_for_the_disk_as_its_options_say(ply, tmp_path, monkeyp
     words = ["--memory", "300MB", "--resume", "--work", "w", "--preset", "fast", "--quiet"]
     done = run(app, ["encode", str(ply), str(target), *words])
     assert 0 == done.exit_code, done.output
-    assert [Scale(memory_bytes=300_000_000, folder="w", resume=True)] == asked
+    assert [OutOfCoreOptions(memory_bytes=300_000_000, folder="w", resume=True)] == asked
     refused = run(app, ["encode", str(ply), str(target), "--resume", "--target-psnr", "40", "--force"])
     assert 2 == refused.exit_code
 
@@ -351,7 +351,7 @@ def test_the_command_asks_for_the_disk_as_its_options_say(ply, tmp_path, monkeyp
 def test_only_large_files_and_small_memories_make_a_command_look_whether_a_scene_fits(ply, tmp_path):
     def may_leave(path, size, **scale):
         os.truncate(path, size)  # no byte of the rest takes room
-        return Scale(**scale).may_leave_memory(path)
+        return OutOfCoreOptions(**scale).may_leave_memory(path)
 
     assert not may_leave(ply, 4 << 20, memory_bytes=1)
     assert may_leave(ply, 5 << 20, memory_bytes=19 << 20)

@@ -27,24 +27,18 @@ from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import scene_frame
-from csplat_tools.optimise.candidates import CodingChoice, WholeScene, psnr_spread
-from csplat_tools.optimise.precision_search import (
-    TUNING_GAINS,
-    PrecisionSearch,
-    SearchGoal,
-    SearchWindow,
-    find_in_window,
-)
-from csplat_tools.optimise.pruning_order import SimplifyOptions
-from csplat_tools.optimise.rate_distortion import error_of_psnr
-from csplat_tools.optimise.scene_sensitivity import complete_importance, measure_importance
-from csplat_tools.optimise.search_report import SearchReport
-from csplat_tools.optimise.subsets import Pruner
-from csplat_tools.optimise.target_search import expected_renders
-from csplat_tools.optimise.targets import Target
-from csplat_tools.views import BLACK, comparison_cameras, elsewhere, with_deciders
-from csplat_tools.views.timing import picture_seconds
-from csplat_tools.views.viewset import pose
+from csplat_tools.optimise.exchange import error_of_psnr
+from csplat_tools.optimise.optimiser import expected_pictures
+from csplat_tools.optimise.removal import Removal
+from csplat_tools.optimise.report import Report
+from csplat_tools.optimise.search import Window, meet
+from csplat_tools.optimise.sensitivity import measured_for, measured_importance
+from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.optimise.solving import TUNING_GAINS, Goal, Solver
+from csplat_tools.optimise.target import Target
+from csplat_tools.optimise.trials import Coding, Whole, spread_of
+from csplat_tools.views import BLACK, comparison_cameras, extra_test_cameras, with_validation_views
+from csplat_tools.views.view_sets import pose_key, render_seconds
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
@@ -69,7 +63,7 @@ def photographs(many):
 def search(*given, **how):
     """Search without renders from elsewhere, which are reported alone, and whose cameras take a second to place."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("csplat_tools.optimise.target_search.elsewhere", lambda _: {})
+        patch.setattr("csplat_tools.optimise.optimiser.extra_test_cameras", lambda _: {})
         return found_within(*given, **how)
 
 
@@ -156,7 +150,7 @@ def test_spread_is_that_of_the_views():
 
 @pytest.mark.slow
 def test_a_psnr_is_reached_by_fewer_splats_and_the_file_says_what_it_is(many, search_at_psnr):
-    found, views = search_at_psnr, with_deciders(judged_by(cameras(40)))
+    found, views = search_at_psnr, with_validation_views(judged_by(cameras(40)))
     decoded = decode_scene(found.data)
     assert 30.0 <= found.report.psnr <= 31.0  # files of so few splats jump
     assert found.report.psnr == pytest.approx(views.judge(many).psnr(decoded.model), abs=1e-4)
@@ -191,7 +185,7 @@ def test_a_size_that_starves_all_splats_is_met_by_fewer(search_at_size):
 @pytest.mark.slow
 def test_a_loss_against_photographs_lets_splats_go(many, photographs, search_at_loss):
     decoded, scores = decode(search_at_loss.data), search_at_loss.report.photographs
-    decider = with_deciders(photographs).photograph_decider()
+    decider = with_validation_views(photographs).photograph_decider()
     assert scores["source"] < 28.0
     assert scores["file"] == pytest.approx(photographs.photograph_judge().psnr(decoded))
     assert scores["file"] >= scores["source"] - 1.0  # other photographs decided:
@@ -306,7 +300,7 @@ def test_what_is_left_is_fitted_to_what_the_source_looks_like(kept, alike):
 def test_fitting_to_the_quantised_geometry_mends_it(scene):
     """Coarse geometry, fine colours: fitted through the quantisers they are better in views that taught nothing."""
     coarse = EncodeOptions(opacity_levels=8, scale_step=0.3, quat_levels=8, sh0_step=0.005, sh_step=0.005)
-    bare, views = replace(scene, shN=scene.shN[:, :0]), with_deciders(judged_by(cameras(40)))
+    bare, views = replace(scene, shN=scene.shN[:, :0]), with_validation_views(judged_by(cameras(40)))
     how = replace(SMALL, effort=3, view_size=(960, 720))
     removal = Pruner(bare, views, how, grades=False, progress=None, psnr=None, left=300)
     part, judge = removal.fitted(300, None, views.decider(bare).psnr), views.judge(bare)
@@ -315,8 +309,8 @@ def test_fitting_to_the_quantised_geometry_mends_it(scene):
 
 
 def test_so_few_splats_are_fitted_as_are_asked_for(scene):
-    views = with_deciders(judged_by(cameras(40)))
-    removal = Pruner(scene, views, SMALL, grades=False, progress=None, psnr=30.0)
+    views = with_validation_views(judged_by(cameras(40)))
+    removal = Removal(scene, views, SMALL, grades=False, progress=None, psnr=30.0)
     assert 3 == len(removal.fitted(3, None, lambda _: 20.0).rows)
 
 
@@ -334,7 +328,7 @@ def test_two_fits_say_how_fast_errors_grow():
 @pytest.mark.parametrize("kind", ["virtual", "cameras", "photographs"])
 def test_no_view_that_judges_decides_or_teaches(many, photographs, kind):
     given = {"virtual": around(many), "cameras": judged_by(cameras(40)), "photographs": photographs}[kind]
-    views = with_deciders(given)
+    views = with_validation_views(given)
     deciders = [views.decider(many)] + ([views.photograph_decider()] if kind == "photographs" else [])
     judges, decides = poses(views.judge(many).cameras), set.union(*(poses(one.cameras) for one in deciders))
     assert judges == poses(given.judges)
@@ -344,7 +338,7 @@ def test_no_view_that_judges_decides_or_teaches(many, photographs, kind):
 
 
 def poses(seen_from):
-    return {pose(camera) for camera in seen_from}
+    return {pose_key(camera) for camera in seen_from}
 
 
 def test_cameras_that_see_nothing_are_refused(scene):
@@ -492,9 +486,9 @@ def test_seconds_of_a_picture_are_measured_without_the_first(scene):
         now[0] += camera.W * camera.H / 1e6
 
     source = SimpleNamespace(renderer=lambda *_, **__: draw)
-    assert pytest.approx(0.0192) == picture_seconds(source, views, clock=lambda: now[0])
+    assert pytest.approx(0.0192) == render_seconds(source, views, clock=lambda: now[0])
     assert [160, 160, 160] == drawn
-    assert pytest.approx(0.0192) == picture_seconds(source, views, mode="exact", clock=lambda: now[0])
+    assert pytest.approx(0.0192) == render_seconds(source, views, mode="exact", clock=lambda: now[0])
     assert [20] == drawn[3:]
 
 
@@ -507,7 +501,7 @@ def test_what_nobody_looked_at_is_told_and_a_loss_there_by_name(beside, said):
 def test_views_elsewhere_are_the_same_ones_nearer_and_farther(scene):
     """Nearer by 0.6, or by less if they would be inside of what they look at."""
     centre = scene_frame(scene).centre
-    near, usual, far = (elsewhere(scene)[kind] for kind in ("nearer", "beside", "farther"))
+    near, usual, far = (extra_test_cameras(scene)[kind] for kind in ("nearer", "beside", "farther"))
     shares = []
     for one, other, third in zip(near, usual, far, strict=True):
         eyes = [np.linalg.inv(camera.viewmat)[:3, 3] - centre for camera in (one, other, third)]

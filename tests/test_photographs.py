@@ -20,7 +20,7 @@ Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip insta
 # Importing them needs what is looked for above.
 from csplat_render import render  # noqa: E402
 from csplat_render.camera import intrinsics, look_at, relative_to  # noqa: E402
-from csplat_tools.inspect.compare import compare  # noqa: E402
+from csplat_tools.inspect.comparison import compare  # noqa: E402
 from csplat_tools.views import DataOptions, find_view_set  # noqa: E402
 from csplat_trainer.posed_images import PosedImage, photograph_scorer  # noqa: E402
 

@@ -18,7 +18,7 @@ from csplat_conformance.stated.matching import UNDECIDED, UNMATCHED
 from csplat_conformance.stated.matching import match as match_source
 from csplat_conformance.stated.pairs import differences as differences_of
 from csplat_conformance.stated.pairs import measure_pairs as measured
-from csplat_tools.inspect.info import describe_file
+from csplat_tools.inspect.file_description import describe_file
 
 
 def differences(source, *rest):

@@ -12,8 +12,8 @@ from csplat import EncodeOptions, encode, read_ply, write_ply
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_tools.cli.app import app
-from csplat_tools.cli.parsing import parse_colour, parse_size
-from csplat_tools.files.pictures import check_folder, panels, picture_names, to_bytes
+from csplat_tools.cli.shared_options import parse_colour, parse_size
+from csplat_tools.render_files import image_names, make_output_folder, side_by_side, to_uint8
 
 
 @pytest.fixture
@@ -218,34 +218,34 @@ def test_a_report_never_takes_the_place_of_the_film(ply, tmp_path):
 
 
 def test_names_that_are_not_unique_are_numbered():
-    assert ["0000_a", "0001_a", "0002"] == picture_names(["left/a.png", "right/A.png".lower(), None])
+    assert ["0000_a", "0001_a", "0002"] == image_names(["left/a.png", "right/A.png".lower(), None])
 
 
 @pytest.mark.parametrize("image", ["../../evil.png", "..\\..\\evil.png", "/etc/evil.png", "C:\\evil.jpg"])
 def test_a_name_never_leads_out_of_the_folder(image):
-    assert ["evil"] == picture_names([image])
+    assert ["evil"] == image_names([image])
 
 
 @pytest.mark.parametrize("image", ["", "..", "/", "...png", ".png"])
 def test_a_name_of_nothing_becomes_a_number_or_stays_harmless(image):
-    (name,) = picture_names([image])
+    (name,) = image_names([image])
     assert name in {"0000", "png"}
 
 
 def test_a_folder_that_is_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="not a folder"):
-        check_folder(str(tmp_path / "file"), ["a.png"], force=True)
+        make_output_folder(str(tmp_path / "file"), ["a.png"], force=True)
 
 
 def test_bytes_are_rounded_and_clipped():
     values = np.array([-1.0, 0.0, 0.5, 1.0, 7.0, np.nan, np.inf], np.float32)
-    assert [0, 0, 128, 255, 255, 0, 255] == to_bytes(values).tolist()
+    assert [0, 0, 128, 255, 255, 0, 255] == to_uint8(values).tolist()
 
 
 def test_panels_show_both_and_the_amplified_difference():
     a, b = np.full((1, 1, 3), 0.5, np.float32), np.full((1, 1, 3), 0.45, np.float32)
-    assert [[128] * 3, [115] * 3, [128] * 3] == panels(a, b, 10.0)[0].tolist()
+    assert [[128] * 3, [115] * 3, [128] * 3] == side_by_side(a, b, 10.0)[0].tolist()
 
 
 def test_sizes_and_colours_are_parsed():

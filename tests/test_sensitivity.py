@@ -17,7 +17,7 @@ from csplat_render.camera import intrinsics, look_at
 from csplat_render.reference_rasteriser import Decisions, render_exact
 from csplat_render.virtual_cameras import scene_frame
 from csplat_tools.cli.app import app
-from csplat_tools.files.importance import weights_of
+from csplat_tools.importance_file import encoder_importance
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, read_sensitivity, write_sensitivity
 
@@ -263,9 +263,9 @@ def test_virtual_views_do_not_say_it_inside_of_surroundings(stored):
     inside = replace(model, means=means, scales=np.broadcast_to(scales, (len(model), 3)).astype(np.float32))
     assert scene_frame(inside).kind == "surrounding"
     virtual = replace(read, source="virtual")
-    assert weights_of(virtual, inside).curvatures is None
-    assert weights_of(read, inside).curvatures is not None
-    assert weights_of(virtual, model).curvatures is not None
+    assert encoder_importance(virtual, inside).curvatures is None
+    assert encoder_importance(read, inside).curvatures is not None
+    assert encoder_importance(virtual, model).curvatures is not None
 
 
 def test_a_file_is_refused_for_another_scene(stored):
@@ -397,7 +397,7 @@ def seen_in_part(tmp_path):
 
 @pytest.mark.slow
 def test_the_command_makes_views_where_there_are_none_and_says_how_long_it_takes(tmp_path, seen_in_part, monkeypatch):
-    monkeypatch.setattr("csplat_tools.views.timing.picture_seconds", lambda *_, **__: 1.0)
+    monkeypatch.setattr("csplat_tools.views.view_sets.render_seconds", lambda *_, **__: 1.0)
     views = ("--views", "20", "--view-size", "48x36")
     done = run("sensitivity", seen_in_part, tmp_path / "s.npz", *views, "--no-matrices")
     assert 0 == done.exit_code, done.stderr

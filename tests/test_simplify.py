@@ -21,14 +21,25 @@ from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_render.scorer import Scorer, renderer
 from csplat_render.virtual_cameras import is_clear, sample_cloud, scene_frame
 from csplat_tools.cli.app import app
-from csplat_tools.cli.parsing import parse_decibels
-from csplat_tools.optimise.pruning import simplify
-from csplat_tools.optimise.pruning_order import MeasuredViews, SimplifyOptions, find_pruning_order, total_removal
-from csplat_tools.optimise.splat_refit import RefitResult, choose_bands, coefficient_mask, drop_bands, refit_splats
+from csplat_tools.cli.shared_options import parse_decibels
+from csplat_tools.optimise.simplify import SimplifyOptions, simplify
+from csplat_tools.optimise.simplify.adjusting import adjust
+from csplat_tools.optimise.simplify.bands import band_mask, free_coefficients, without
+from csplat_tools.optimise.simplify.fitting import Fit
+from csplat_tools.optimise.simplify.order import Side, removal_order, seen_by
 from csplat_tools.study import prune_share
-from csplat_tools.views import VIEW_COUNT, VIEW_SIZE, camera_sequence, elsewhere, find_view_set, reduced, usual_views
-from csplat_tools.views.agreeing import find_views, removal_keys
-from csplat_trainer.posed_images import PosedImage, photograph_scorer
+from csplat_tools.views import (
+    VIEW_COUNT,
+    VIEW_SIZE,
+    camera_sequence,
+    default_views,
+    find_view_set,
+    shrink_cameras,
+    virtual_views,
+)
+from csplat_tools.views.sufficient_views import find_sufficient_views, pruning_keys
+from csplat_trainer.evaluate import photograph_judge
+from csplat_trainer.pictures import Picture
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
@@ -84,26 +95,26 @@ def test_a_longer_sequence_of_cameras_begins_like_a_shorter_one(source):
 def test_no_camera_looks_at_a_long_object_from_inside(source):
     long = replace(source, means=source.means * np.float32([1.0, 12.0, 1.0]))
     frame, cloud = scene_frame(long), sample_cloud(long, 20_000, np.random.default_rng(0))
-    cameras = [*camera_sequence(long, 40, (40, 30)), *elsewhere(long)["nearer"]]
+    cameras = [*camera_sequence(long, 40, (40, 30)), *virtual_views(long)["nearer"]]
     assert frame.kind == "object"
     assert all(is_clear(frame, cloud, camera) for camera in cameras)
 
 
 def test_cameras_of_the_user_are_made_smaller_and_every_eighth_is_kept_aside(source):
     own = camera_sequence(source, 17, (200, 100))
-    small = reduced(own, (48, 36))
+    small = shrink_cameras(own, (48, 36))
     assert {(camera.W, camera.H) for camera in small} == {(59, 29)}
     assert small[0].K[0, 0] == pytest.approx(own[0].K[0, 0] * 59 / 200)
     views = views_of(own)
     assert (len(views.teaches), len(views.decides)) == (15, 2)
     with pytest.raises(InputError, match="2 at least"):
-        find_views(source, views_of(own[:1]), 0.3)
+        find_sufficient_views(source, views_of(own[:1]), 0.3)
 
 
 @pytest.mark.slow
 def test_views_are_added_until_others_agree(source):
     views = find_view_set(source, count=100, size=(24, 18))
-    many = find_views(source, views, 0.3, size=(24, 18))
+    many = find_sufficient_views(source, views, 0.3, size=(24, 18))
     assert len(many.used) in (40, 80, 100)
     positions = {tuple(camera.position) for camera in many.used}
     assert not positions & {tuple(camera.position) for camera in many.check}
@@ -114,13 +125,13 @@ def test_views_are_added_until_others_agree(source):
 
 
 def test_what_is_invisible_goes_first_and_what_is_unseen_stays(source):
-    found = find_views(source, views_of(camera_sequence(source, 9, (48, 36))), 0.5)
-    keys = removal_keys(source.opacities, found.removal)
+    found = find_sufficient_views(source, views_of(camera_sequence(source, 9, (48, 36))), 0.5)
+    keys = pruning_keys(source.opacities, found.removal)
     assert (keys[:10] == -1.0).all()
     unseen = ~found.removal.seen & (source.opacities > 0.01)
     assert np.isinf(keys[unseen]).all()
-    assert (removal_keys(source.opacities, found.removal, keep_unseen=False)[unseen] < 0.0).all()
-    order = find_pruning_order(source, [MeasuredViews(found.used, found.removal)], SMALL, len(source) // 2)
+    assert (pruning_keys(source.opacities, found.removal, keep_unseen=False)[unseen] < 0.0).all()
+    order = removal_order(source, [Side(found.used, found.removal)], SMALL, len(source) // 2)
     assert set(order.rows[:10]) == set(range(10))
     assert len(order.rounds) == 2
 
@@ -132,7 +143,7 @@ def test_rounds_ask_one_side_after_the_other(source):
     order = find_pruning_order(source, sides, replace(SMALL, rounds=2), len(source) // 2)
     first = order.rounds[0].removed
     rows = order.kept(len(source), first)
-    keys = removal_keys(source.opacities, total_removal(sides))
+    keys = pruning_keys(source.opacities, seen_by(sides))
     np.testing.assert_array_equal(order.errors[:first], np.sort(np.maximum(keys, 0.0))[:first])
     again = measure_pruning_error(source.select(rows), parts[0]).error + sides[1].removal.error[rows]
     places = np.searchsorted(rows, order.rows[first:])
@@ -355,7 +366,7 @@ def test_the_command_writes_a_smaller_ply_an_index_and_a_report(source, tmp_path
 
 @pytest.mark.slow
 def test_the_command_takes_cameras_and_prints_json_and_says_how_long_it_takes(source, tmp_path, monkeypatch):
-    monkeypatch.setattr("csplat_tools.views.timing.picture_seconds", lambda _, cameras, **__: cameras[0].W / 800)
+    monkeypatch.setattr("csplat_tools.views.view_sets.render_seconds", lambda _, cameras, **__: cameras[0].W / 800)
     scene, cameras = tmp_path / "scene.ply", tmp_path / "cameras.json"
     write_ply(scene, source)
     save_cameras(cameras, camera_sequence(source, 10, (48, 36)))
@@ -392,9 +403,9 @@ def test_a_wrong_target_is_a_wrong_command_line(source, tmp_path, words):
 
 
 def test_views_of_many_splats_are_larger_and_fewer_and_steps_as_well():
-    assert usual_views(100_000) == (VIEW_COUNT, VIEW_SIZE)
-    assert usual_views(10_000_000) == (VIEW_COUNT // 2, (2 * VIEW_SIZE[0], 2 * VIEW_SIZE[1]))
-    assert SimplifyOptions().pictures(100) == usual_views(100)
+    assert default_views(100_000) == (VIEW_COUNT, VIEW_SIZE)
+    assert default_views(10_000_000) == (VIEW_COUNT // 2, (2 * VIEW_SIZE[0], 2 * VIEW_SIZE[1]))
+    assert SimplifyOptions().pictures(100) == default_views(100)
     assert SimplifyOptions(views=3, view_size=(20, 10)).pictures(10_000_000) == (3, (20, 10))
     usual = SimplifyOptions().steps(400)
     assert SimplifyOptions(view_size=(480, 360)).steps(400) == usual // 2

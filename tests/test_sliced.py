@@ -20,9 +20,9 @@ from csplat_render.camera import intrinsics, look_at
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.scorer import renderer
 from csplat_tools.cli.app import app
-from csplat_tools.files.scenes import LoadedModel, OpenedScene, opened_scenes
+from csplat_tools.scene_files import LoadedModel, OpenedScene, open_scenes
 from csplat_tools.views import comparison_cameras
-from csplat_tools.views.sliced import Sliced, slice_limits
+from csplat_tools.views.sliced_renderer import SlicedScene, slice_limits
 
 UP = (0.0, -1.0, 0.0)
 BEHIND = (0.3, 0.6, 0.1)
@@ -61,7 +61,7 @@ def files_of_both(model, tmp_path):
 @pytest.fixture
 def no_least(monkeypatch):
     """Let any bound of memory do: small scenes fit each that is accepted otherwise."""
-    monkeypatch.setattr(Sliced, "least_bytes", -(10**12))
+    monkeypatch.setattr(SlicedScene, "least_bytes", -(10**12))
 
 
 def by_disk(model, every=1, progress=None):
@@ -72,7 +72,7 @@ def by_disk(model, every=1, progress=None):
 
     scene = replace(scene_of(model), blocks=blocks)
     sample = model.select(slice(None, None, every))
-    return Sliced(scene, sample, every, LITTLE, progress, slice_bytes=60_000)
+    return SlicedScene(scene, sample, every, LITTLE, progress, slice_bytes=60_000)
 
 
 @pytest.fixture
@@ -153,18 +153,18 @@ def test_limits_cut_alike_and_keep_what_is_of_one_depth_together():
 
 
 def test_what_fits_is_read_and_what_does_not_is_opened(files_of_both):
-    with opened_scenes(files_of_both[:2]) as loaded, opened_scenes(files_of_both[:2], LITTLE) as opened:
+    with open_scenes(files_of_both[:2]) as loaded, open_scenes(files_of_both[:2], LITTLE) as opened:
         assert {LoadedModel} == {type(one) for one in loaded}
         assert {OpenedScene} == {type(one) for one in opened}
         assert [one.as_json() for one in loaded] == [one.as_json() for one in opened]
-        with opened_scenes(opened) as again:
+        with open_scenes(opened) as again:
             assert opened == again
-        with opened_scenes((loaded[0], files_of_both[1]), LITTLE) as both:
+        with open_scenes((loaded[0], files_of_both[1]), LITTLE) as both:
             assert {LoadedModel} == {type(one) for one in both}
 
 
 def test_a_sample_has_every_so_manieth_splat(files_of_both, model):
-    with opened_scenes(files_of_both[:2], LITTLE) as (source, _):
+    with open_scenes(files_of_both[:2], LITTLE) as (source, _):
         found, every = replace(source, sample_splats=220).sample()
     assert 7 == every
     np.testing.assert_array_equal(model.means[::7], found.means)
@@ -242,7 +242,7 @@ def test_a_disk_without_room_is_found_before_anything_is_drawn(files_of_both, mo
 
 
 def test_a_bound_that_cannot_be_held_is_refused(files_of_both, monkeypatch):
-    monkeypatch.setattr(Sliced, "least_bytes", 450_000_000)
+    monkeypatch.setattr(SlicedScene, "least_bytes", 450_000_000)
     with pytest.raises(InputError, match=r"^0 MB of memory are too little to draw these scenes, which want 482$"):
         csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
 

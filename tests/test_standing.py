@@ -7,8 +7,8 @@ from csplat import decode, encode, read_ply
 from csplat.model import SplatModel
 from csplat_render.camera_paths import orbit_cameras
 from csplat_render.virtual_cameras import estimate_up, with_estimated_up
-from csplat_tools.cli.parsing import parse_up, up_word
-from csplat_tools.views import find_view_set, showing_cameras
+from csplat_tools.cli.shared_options import parse_up, up_word
+from csplat_tools.views import display_cameras, find_view_set
 
 AXES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
 
@@ -55,7 +55,7 @@ def test_what_a_scene_says_is_not_doubted(said):
 def test_pictures_to_look_at_stand_upright_and_the_judges_stay():
     model = photographed_from((0, 1, 0))
     views = find_view_set(model, count=0)
-    for camera in [*orbit_cameras(model, 4, 64, 48), *showing_cameras(model, views)]:
+    for camera in [*orbit_cameras(model, 4, 64, 48), *display_cameras(model, views)]:
         assert abs(camera.viewmat[0, 1]) < 1e-6
         assert camera.viewmat[1, 1] < 0.0  # down the picture
     assert all(camera.viewmat[1, 1] > 0.0 for camera in views.judges)  # as in a PLY

@@ -12,9 +12,10 @@ from csplat.encoder import encode_with_report
 from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
 from csplat_tools.cli.app import app
-from csplat_tools.files.sizes import parse_size_bytes
-from csplat_tools.optimise.target_encoding import encode_to, meet_bounds
-from csplat_tools.optimise.targets import Target, parse_max_error
+from csplat_tools.console import parse_size_bytes
+from csplat_tools.optimise.bounds import meet_bounds
+from csplat_tools.optimise.reaching import encode_to
+from csplat_tools.optimise.target import Target, parse_max_error
 
 pytest.importorskip("numba", reason="targets of size and PSNR want the extra [render]")
 
@@ -23,7 +24,7 @@ from captures import cameras, photograph, shell
 
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import save_cameras
-from csplat_tools.cli.groups import Output
+from csplat_tools.cli.command import OutputOptions
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
@@ -204,7 +205,7 @@ def test_the_command_loses_no_more_against_photographs_than_is_allowed(tmp_path)
 def test_long_work_is_foretold_unless_it_is_short_or_nobody_is_told(capsys):
     told = {}
     for name, quiet, seconds in (("long", False, 170.0), ("short", False, 5.0), ("quiet", True, 170.0)):
-        Output(quiet=quiet).foretell(lambda seconds=seconds: seconds, "a preset takes seconds")
+        OutputOptions(quiet=quiet).foretell(lambda seconds=seconds: seconds, "a preset takes seconds")
         told[name] = capsys.readouterr().err
     assert "this takes about 2 to 5 minutes here; a preset takes seconds" in told.pop("long")
     assert {"short": "", "quiet": ""} == told

@@ -15,9 +15,9 @@ from csplat.decoder import Limits, decode, decode_api, open_tiles, read_header
 from csplat.errors import CsplatError, LimitError
 from csplat.ply import write_ply
 from csplat_conformance.manifest import load
+from csplat_tools import scene_files
 from csplat_tools.cli.app import app
-from csplat_tools.files import scenes
-from csplat_tools.files.convert import decode_file
+from csplat_tools.convert_file import decode_file
 
 VECTORS = load()
 #: Vectors of several tiles or with extra columns, and some others; none with many splats.
@@ -166,6 +166,6 @@ def test_progress_goes_from_nothing_to_all(many_tiles, tmp_path):
 @pytest.mark.parametrize("suffix", [".csplat", ".ply"])
 def test_who_wants_all_splats_at_once_is_refused_before_the_memory_is_full(many_tiles, tmp_path, monkeypatch, suffix):
     decode_file(str(many_tiles), str(tmp_path / "scene.ply"))
-    monkeypatch.setattr(scenes, "available_bytes", lambda: 4000)
+    monkeypatch.setattr(scene_files, "available_bytes", lambda: 4000)
     with pytest.raises(LimitError, match="allowed 4000"):
-        scenes.load_model(many_tiles.with_suffix(suffix))
+        scene_files.load_model(many_tiles.with_suffix(suffix))

@@ -39,7 +39,7 @@ from csplat_tools.tradeoffs.tradeoff_page import make_tradeoff_page, shown_point
 from csplat_tools.tradeoffs.tradeoff_plots import PLOTS, draw_plot, label_marks
 from csplat_tools.tradeoffs.tradeoff_tables import format_tradeoff
 from csplat_tools.views import DataOptions, ViewSet
-from csplat_tools.views.viewset import pose
+from csplat_tools.views.view_sets import pose_key
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
@@ -176,7 +176,7 @@ def test_no_file_is_chosen_by_what_judges(swept):
     *_, made = swept
     assert len(made) > 1  # fine-tuning has views of its own
     for views in made:
-        roles = [{pose(camera) for camera in role} for role in roles_of(views)]
+        roles = [{pose_key(camera) for camera in role} for role in roles_of(views)]
         assert sum(map(len, roles)) == len(set.union(*roles))
         seen = [[int(camera.image[-6:-4]) for camera in role if camera.image] for role in roles_of(views)]
         assert not {0, 8} & {*seen[0], *seen[1]}

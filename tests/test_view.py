@@ -22,10 +22,9 @@ from viewer_pages import ViewerPage
 from csplat import decode, encode, read_ply, write_ply
 from csplat.errors import FormatError, InputError
 from csplat_tools.cli.app import app
-from csplat_tools.cli.view_options import Upright
-from csplat_tools.present.server import byte_range, open_server
-from csplat_tools.present.viewing import open_scene, view_wishes
-from csplat_tools.present.webroot import web_files
+from csplat_tools.cli.shared_options import OrientationOptions
+from csplat_tools.present.viewer_page import web_files
+from csplat_tools.present.viewer_server import byte_range, open_server, open_viewer_scene, page_parameters
 
 SIZE = 1000
 
@@ -39,7 +38,7 @@ def scene_path(tmp_path, make_model):
 
 @contextmanager
 def served(path, **options):
-    with open_scene(str(path), preset="fast") as scene, open_server(scene, **options) as server:
+    with open_viewer_scene(str(path), preset="fast") as scene, open_server(scene, **options) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
         thread.start()
         try:
@@ -209,7 +208,7 @@ def test_cameras_are_served_beside_the_scene(tmp_path, scene_path):
     entry = {"K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 640, "H": 480}
     cameras = tmp_path / "cameras.json"
     cameras.write_text(json.dumps([entry, entry]))
-    with served(scene_path, wishes=view_wishes(str(cameras))) as server:
+    with served(scene_path, wishes=page_parameters(str(cameras))) as server:
         query = parse_qs(urlsplit(ask(server, "/")[1]["Location"]).query)
         status, headers, body = ask(server, query["camera"][0])
         assert (200, "application/json") == (status, headers["Content-Type"])
@@ -219,13 +218,13 @@ def test_cameras_are_served_beside_the_scene(tmp_path, scene_path):
 @pytest.mark.parametrize("axes", ["RL", "RDX", "RUD", "rdf", "RDFF"])
 def test_axes_that_are_none_are_refused(axes):
     with pytest.raises(typer.BadParameter, match="wanted three letters"):
-        Upright(axes=axes).parse()
+        OrientationOptions(axes=axes).parse()
 
 
 @pytest.mark.parametrize("up", ["", "w", "+-y", "0,0", "0,0,0", "0,nan,1", "x y z"])
 def test_directions_that_are_none_are_refused(up):
     with pytest.raises(typer.BadParameter, match="three numbers as"):
-        Upright(up=up).parse()
+        OrientationOptions(up=up).parse()
 
 
 @pytest.mark.parametrize(
@@ -239,11 +238,11 @@ def test_directions_that_are_none_are_refused(up):
     ],
 )
 def test_the_page_is_told_what_the_user_says_of_up(words, wishes):
-    assert wishes == view_wishes(None, Upright(**words).upright())
+    assert wishes == page_parameters(None, OrientationOptions(**words).upright())
 
 
 def refused(path):
-    with pytest.raises((FormatError, InputError)) as caught, open_scene(str(path), preset="fast"):
+    with pytest.raises((FormatError, InputError)) as caught, open_viewer_scene(str(path), preset="fast"):
         pass
     return str(caught.value)
 
@@ -270,7 +269,7 @@ def test_a_file_that_is_damaged_from_its_first_byte_is_known_by_its_name(scene_p
 def test_a_ply_is_one_whatever_its_name(tmp_path, make_model):
     path = tmp_path / "scene.csplat"
     write_ply(path, make_model(20, 1))
-    with open_scene(str(path), preset="fast") as scene:
+    with open_viewer_scene(str(path), preset="fast") as scene:
         assert 20 == scene.header.splat_count
 
 
@@ -286,7 +285,7 @@ def test_a_taken_port_is_refused(scene_path):
         other.listen()
         port = other.getsockname()[1]
         with (
-            open_scene(str(scene_path), preset="fast") as scene,
+            open_viewer_scene(str(scene_path), preset="fast") as scene,
             pytest.raises(InputError, match=f"port {port} is taken"),
             open_server(scene, port=port),
         ):
@@ -295,7 +294,7 @@ def test_a_taken_port_is_refused(scene_path):
 
 def test_an_address_of_another_machine_is_refused(scene_path):
     with (
-        open_scene(str(scene_path), preset="fast") as scene,
+        open_viewer_scene(str(scene_path), preset="fast") as scene,
         pytest.raises(InputError, match=r"203\.0\.113\.1 is no address of this machine"),
         open_server(scene, host="203.0.113.1"),
     ):

@@ -24,8 +24,8 @@ from csplat_render.camera_files import save_cameras
 from csplat_render.scorer import renderer
 from csplat_tools.cli.app import app
 from csplat_tools.views import BLACK, WHITE, DataOptions, ViewSet, find_view_set
-from csplat_tools.views.viewset import pose
-from csplat_trainer.posed_images import evaluate
+from csplat_tools.views.view_sets import pose_key
+from csplat_trainer.evaluate import evaluate
 
 KINDS = ("rgb", "rgba", "colmap")
 
@@ -51,7 +51,7 @@ def scene(sets):
 
 
 def poses(views):
-    return [{pose(camera) for camera in role} for role in (views.teaches, views.decides, views.judges)]
+    return [{pose_key(camera) for camera in role} for role in (views.teaches, views.decides, views.judges)]
 
 
 def numbers(seen_from):

@@ -36,7 +36,7 @@ arrays["quats"] = np.tile(np.float32([1.0, 0.0, 0.0, 0.0]), (40, 1))
 model = SplatModel(**arrays)
 """
 _PLAIN = """
-from csplat_tools.files.extras import prepare_renderer
+from csplat_tools.optional_packages import prepare_renderer
 prepare_renderer(quiet=True, simplify=False)
 plain = compiled()
 """

@@ -17,15 +17,14 @@ from csplat import __version__, lazy_exports
 from csplat._spec import VERSION_MAJOR, VERSION_MINOR
 
 if TYPE_CHECKING:
-    from csplat_tools.batches.batch_run import Batch, batch
-    from csplat_tools.files.scenes import LoadedModel, SceneLike, load_model
-    from csplat_tools.inspect.compare import Comparison, compare
-    from csplat_tools.optimise.pruning import Simplified, simplify
-    from csplat_tools.optimise.pruning_order import SimplifyOptions
-    from csplat_tools.optimise.search_report import Optimised
-    from csplat_tools.optimise.target_encoding import encode_to
-    from csplat_tools.tradeoffs.sweep_options import SweepOptions
-    from csplat_tools.tradeoffs.sweep_run import Tradeoff, tradeoff
+    from csplat_tools.batches.running import Batch, batch
+    from csplat_tools.inspect.comparison import Comparison, compare
+    from csplat_tools.optimise.reaching import encode_to
+    from csplat_tools.optimise.report import Optimised
+    from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
+    from csplat_tools.scene_files import LoadedModel, SceneLike, load_model
+    from csplat_tools.tradeoffs.options import Wanted
+    from csplat_tools.tradeoffs.running import Tradeoff, tradeoff
     from csplat_tools.views import DataOptions, ViewSet, find_view_set
 
 __all__ = [
@@ -54,23 +53,23 @@ __all__ = [
 VERSIONS = f"csplat {__version__}, format {VERSION_MAJOR}.{VERSION_MINOR}"
 
 _MODULE_OF = {
-    "Batch": "csplat_tools.batches.batch_run",
-    "Comparison": "csplat_tools.inspect.compare",
+    "Batch": "csplat_tools.batches.running",
+    "Comparison": "csplat_tools.inspect.comparison",
     "DataOptions": "csplat_tools.views",
-    "LoadedModel": "csplat_tools.files.scenes",
-    "Optimised": "csplat_tools.optimise.search_report",
-    "SceneLike": "csplat_tools.files.scenes",
-    "Simplified": "csplat_tools.optimise.pruning",
-    "SimplifyOptions": "csplat_tools.optimise.pruning_order",
-    "Tradeoff": "csplat_tools.tradeoffs.sweep_run",
+    "LoadedModel": "csplat_tools.scene_files",
+    "Optimised": "csplat_tools.optimise.report",
+    "SceneLike": "csplat_tools.scene_files",
+    "Simplified": "csplat_tools.optimise.simplify",
+    "SimplifyOptions": "csplat_tools.optimise.simplify",
+    "Tradeoff": "csplat_tools.tradeoffs.running",
     "ViewSet": "csplat_tools.views",
-    "SweepOptions": "csplat_tools.tradeoffs.sweep_options",
-    "batch": "csplat_tools.batches.batch_run",
-    "compare": "csplat_tools.inspect.compare",
-    "encode_to": "csplat_tools.optimise.target_encoding",
+    "Wanted": "csplat_tools.tradeoffs.options",
+    "batch": "csplat_tools.batches.running",
+    "compare": "csplat_tools.inspect.comparison",
+    "encode_to": "csplat_tools.optimise.reaching",
     "find_view_set": "csplat_tools.views",
-    "load_model": "csplat_tools.files.scenes",
-    "simplify": "csplat_tools.optimise.pruning",
-    "tradeoff": "csplat_tools.tradeoffs.sweep_run",
+    "load_model": "csplat_tools.scene_files",
+    "simplify": "csplat_tools.optimise.simplify",
+    "tradeoff": "csplat_tools.tradeoffs.running",
 }
 __getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)

@@ -12,7 +12,7 @@ import numpy as np
 
 from csplat.types import F32, F64, U8
 from csplat_render.metrics import psnr, squared_error
-from csplat_tools.files.pictures import panels, to_bytes
+from csplat_tools.render_files import side_by_side, to_uint8
 
 #: Factor by which the differences that are shown are amplified.
 AMPLIFICATION = 10.0
@@ -71,8 +71,8 @@ class HardestPlaceSearch:
             return None
         number, rows, columns, source, decoded = self._place
         a, b = source[rows, columns], decoded[rows, columns]
-        pieces = [_reduced(one) for one in np.split(panels(a, b, AMPLIFICATION), 3, axis=1)]
-        return ImagePiece(number, float(psnr(a, b)), _framed(source, rows, columns), *pieces)
+        pieces = [_reduced(one) for one in np.split(side_by_side(a, b, AMPLIFICATION), 3, axis=1)]
+        return Place(number, float(psnr(a, b)), _framed(source, rows, columns), *pieces)
 
 
 def piece_images(place: ImagePiece, name: str) -> str:
@@ -118,7 +118,7 @@ def _window_sums(values: F64, height: int, width: int) -> F64:
 
 def _framed(picture: F32, rows: slice, columns: slice) -> U8:
     """Return the whole view, reduced, with a frame that is visible on any background."""
-    shown = _reduced(to_bytes(picture)).copy()
+    shown = _reduced(to_uint8(picture)).copy()
     factor = shown.shape[0] / picture.shape[0]
     top, bottom, left, right = (round(factor * at) for at in (rows.start, rows.stop, columns.start, columns.stop))
     for inset, value in ((0, 0), (1, 255), (2, 0)):

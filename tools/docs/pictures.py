@@ -36,8 +36,8 @@ from csplat_bench.common.report import describe
 from csplat_render import Camera, render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.scorer import Scorer
-from csplat_tools.files.streams import write_bytes, write_json
-from csplat_tools.views.finding import comparison_cameras
+from csplat_tools.file_streams import write_bytes, write_json
+from csplat_tools.views.view_sets import comparison_cameras
 
 FOLDER = Path(__file__).resolve().parent
 SAMPLE = FOLDER.parent / "csplat_tools" / "data" / "sample.ply"

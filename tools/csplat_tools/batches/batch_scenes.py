@@ -17,7 +17,7 @@ from csplat.files import read_text
 from csplat.formats import formats
 from csplat.remote import is_url
 from csplat.system import split_words
-from csplat_tools.files.scenes import FOLDER_NAMES
+from csplat_tools.scene_files import FOLDER_NAMES
 
 _MANIFESTS = (".jsonl", ".csv", ".txt")
 _COLUMNS = ("path", "output", "options")

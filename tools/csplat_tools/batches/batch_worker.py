@@ -15,7 +15,9 @@ from typing import Any
 from csplat.errors import CsplatError
 from csplat.system import NEW_GROUP_FLAGS, interrupt_process
 
-_PROGRAM = "csplat_tools.cli.serving"  # started by its name: `cli` is above this package and may not be imported here
+_PROGRAM = (
+    "csplat_tools.cli.batch_worker"  # started by its name: `cli` is above this package and may not be imported here
+)
 _PATIENCE = 10.0  # seconds that an interrupted process has to tidy up before it is killed
 
 Process = subprocess.Popen[str]
@@ -40,7 +42,7 @@ class Worker:
         self._closed = False
 
     def ask(self, what: str, **values: Any) -> dict[str, Any]:
-        """Send a request, and return the answer of `csplat_tools.cli.serving.answer`.
+        """Send a request, and return the answer of `csplat_tools.cli.batch_worker.answer`.
 
         Raises:
             WorkerLostError: the process ended, or was closed. Files that it had begun to write remain, see `pid`.

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from csplat.errors import InputError
 from csplat.system import locked_folder
-from csplat_tools.files.streams import write_bytes
+from csplat_tools.file_streams import write_bytes
 
 JOURNAL = "batch.jsonl"
 _LOCK = ".batch.lock"  # file that is locked, on Windows only

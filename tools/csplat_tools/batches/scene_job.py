@@ -18,11 +18,11 @@ from csplat.encoder import EncodeOptions
 from csplat.errors import CsplatError, StoreError, missing
 from csplat.formats import format_of
 from csplat.remote import is_url, store_of
-from csplat_tools.batches.batch_scenes import Task
-from csplat_tools.batches.batch_worker import Worker, WorkerLostError, remove_left
-from csplat_tools.batches.journal import Record
-from csplat_tools.files.by_disk import Scale, expected
-from csplat_tools.files.scenes import FOLDER_NAMES, size_of
+from csplat_tools.batches.finding import Task
+from csplat_tools.batches.looking import Look, content_hash, expect
+from csplat_tools.batches.records import Record
+from csplat_tools.batches.workers import Worker, WorkerLostError, remove_left
+from csplat_tools.scene_files import size_on_disk
 
 THUMBNAILS = "thumbnails"
 _PART_BYTES = 16 << 20
@@ -168,7 +168,7 @@ def _ran(job: SceneJob, record: Record, worker: Worker, source: Path, output: Pa
         shown = shown.removeprefix(f"{job.task.source}: ")
         return replace(record, code=said["code"], error=shown)
     return replace(
-        record, state="done", output_bytes=size_of(output), output_sha256=content_hash(output),
+        record, state="done", output_bytes=size_on_disk(output), output_sha256=content_hash(output),
         splats=_count(said["result"], record.splats),
     )  # fmt: skip
 
@@ -202,7 +202,7 @@ def _is_ours(job: SceneJob, output: Path) -> bool:
     known = job.earlier.output_sha256 if job.earlier is not None else ""
     if not known or not output.exists():
         return False
-    if job.earlier is not None and job.earlier.output_bytes not in (None, size_of(output)):
+    if job.earlier is not None and job.earlier.output_bytes not in (None, size_on_disk(output)):
         return False
     return content_hash(output) == known
 

@@ -11,8 +11,8 @@ from typer.core import TyperGroup
 from typer.main import get_group
 
 from csplat_tools import VERSIONS
-from csplat_tools.cli.console import WrongCommandLine, guarded, refuse_command_line
-from csplat_tools.files.console import say
+from csplat_tools.cli.command import UsageError, refuse_command_line, report_errors
+from csplat_tools.console import print_data
 
 #: Commands as `--help` lists them, and the modules of `csplat_tools.cli` that define them.
 _MODULES = {
@@ -65,8 +65,8 @@ class _Commands(TyperGroup):
         if not how.get("standalone_mode", True):
             return super().main(*args, **how)
         try:
-            sys.exit(guarded(super().main)(*args, **{**how, "standalone_mode": False}))
-        except WrongCommandLine as error:
+            sys.exit(report_errors(super().main)(*args, **{**how, "standalone_mode": False}))
+        except UsageError as error:
             refuse_command_line(error)
         except typer.Exit as error:  # help could not be printed
             sys.exit(error.exit_code)
@@ -94,7 +94,7 @@ app = typer.Typer(
 
 def _version(wanted: bool) -> None:
     if wanted:
-        say(VERSIONS)
+        print_data(VERSIONS)
         raise typer.Exit
 
 

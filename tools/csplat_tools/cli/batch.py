@@ -11,17 +11,15 @@ from typing import Annotated
 import typer
 
 from csplat.errors import counted
-from csplat_tools.batches.batch_page import PAGE
-from csplat_tools.batches.batch_run import Batch, BatchStep, CommandLineError, plan_batch
-from csplat_tools.batches.batch_run import batch as run_batch
-from csplat_tools.batches.batch_scenes import starting_points
-from csplat_tools.batches.journal import JOURNAL
-from csplat_tools.batches.scene_job import PlannedJob
-from csplat_tools.cli.console import FAILED
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import command
-from csplat_tools.cli.parsing import parse_bytes
-from csplat_tools.files.console import format_about, format_bytes, format_seconds, format_table, note, step_progress
+from csplat_tools.batches.finding import starting_points
+from csplat_tools.batches.page import PAGE
+from csplat_tools.batches.records import JOURNAL
+from csplat_tools.batches.running import Batch, CommandLineError, Step, plan
+from csplat_tools.batches.running import batch as run_batch
+from csplat_tools.batches.scene import Planned
+from csplat_tools.cli.command import EXIT_FAILED, OutputOptions, command
+from csplat_tools.cli.shared_options import parse_bytes
+from csplat_tools.console import format_bytes, format_estimate, format_seconds, format_table, note, step_progress
 
 _SHOWN_MAX = 50  # failures listed on standard error; the page lists all
 
@@ -32,7 +30,7 @@ def batch(
         str, typer.Argument(metavar="SCENES", help="A folder, or a manifest: .jsonl, or .csv of path, output, options.")
     ],
     folder: Annotated[str, typer.Argument(metavar="OUT", help="The folder of outputs.")],
-    out: Output,
+    out: OutputOptions,
     line: Annotated[
         list[str] | None,
         typer.Argument(metavar="[-- COMMAND OPTIONS]", help="Which takes IN and OUT: encode by default."),
@@ -90,7 +88,7 @@ def batch(
     out.publish(done.as_json(), _text(done))
     _tell_failures(done)
     if done.failures:
-        sys.exit(FAILED)
+        sys.exit(EXIT_FAILED)
 
 
 def _words() -> Callable[[BatchStep], str]:
@@ -149,6 +147,6 @@ def _planned_text(planned: list[PlannedJob]) -> str:
         rows.append((one.job.task.source, one.job.task.output, splats, size, *work))
     left = [one for one in planned if not one.is_done]
     known = [one.seconds for one in left if one.seconds is not None]
-    took = f"{format_about(sum(known))}, one after the other" if len(known) == len(left) else "nobody knows how long"
+    took = f"{format_estimate(sum(known))}, one after the other" if len(known) == len(left) else "nobody knows how long"
     table = format_table(("scene", "output", "splats", "size", "time", "memory"), rows, left=2)
     return f"{table}\n{counted(len(left), 'scene')} to do of {len(planned)}, {took}"

@@ -10,19 +10,17 @@ import typer
 
 from csplat.errors import InputError, counted
 from csplat.files import read_array
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import Lpips, ModeWord, command
-from csplat_tools.cli.parsing import parse_bytes
-from csplat_tools.cli.view_options import SplitWord, Views
-from csplat_tools.files.console import format_bytes, format_table
-from csplat_tools.files.extras import need_renderer, prepare_renderer
-from csplat_tools.files.scenes import OpenedScene, opened_scenes
-from csplat_tools.files.streams import STANDARD_STREAM
-from csplat_tools.inspect.attributes import AttributeErrors
-from csplat_tools.views import counted_views
+from csplat_tools.cli.command import OutputOptions, command
+from csplat_tools.cli.shared_options import Lpips, ModeWord, SplitOption, ViewOptions, parse_bytes
+from csplat_tools.console import format_bytes, format_table
+from csplat_tools.file_streams import STANDARD_STREAM
+from csplat_tools.inspect.comparison import AttributeErrors
+from csplat_tools.optional_packages import prepare_renderer, require_renderer
+from csplat_tools.scene_files import OpenedScene, open_scenes
+from csplat_tools.views import describe_views
 
 if TYPE_CHECKING:
-    from csplat_tools.inspect.compare import Comparison
+    from csplat_tools.inspect.comparison import Comparison
 
 
 _INDEX_BYTES = 1 << 27  # largest size of a source index, which is read as a whole
@@ -47,9 +45,9 @@ _WORDS = {
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="The source: a PLY or .csplat file.")],
     b: Annotated[str, typer.Argument(metavar="B", help="What became of it: a PLY or .csplat file.")],
-    views: Views,
-    out: Output,
-    split: SplitWord = "test",
+    views: ViewOptions,
+    out: OutputOptions,
+    split: SplitOption = "test",
     source_index: Annotated[
         str | None, typer.Option(metavar="FILE.npy", help="What `encode --source-index` wrote: which splat is which.")
     ] = None,
@@ -89,9 +87,9 @@ def compare(
     out.check(inputs=(a, b, *views.inputs, source_index, None if lpips == "auto" else lpips))
     if a == b == STANDARD_STREAM:
         raise typer.BadParameter("A and B cannot both be standard input")
-    need_renderer()
+    require_renderer()
     rows = None if source_index is None else read_array(source_index, most_bytes=_INDEX_BYTES)
-    with opened_scenes((a, b), parse_bytes(memory)) as (source, other), out.bar() as progress:
+    with open_scenes((a, b), parse_bytes(memory)) as (source, other), out.bar() as progress:
         if isinstance(source, OpenedScene):
             if mode == "exact":
                 raise InputError("--mode exact wants both scenes in memory, and they do not fit: take standard")
@@ -103,9 +101,11 @@ def compare(
         model, every = source.sample(progress)
         around = views.find(model, out, count=0, split=split, every=every)
         if mode == "exact":
-            from csplat_tools.views.timing import pictures_seconds
+            from csplat_tools.views.view_sets import total_render_seconds
 
-            out.foretell(lambda: 2 * pictures_seconds(model, around.judges, mode=mode), "--mode standard takes seconds")
+            out.foretell(
+                lambda: 2 * total_render_seconds(model, around.judges, mode=mode), "--mode standard takes seconds"
+            )
         compared = csplat_tools.compare(
             source, other, views=around, source_index=rows, lpips=lpips, pictures=pictures, amplification=amplify,
             background=views.colour, mode=mode, force=out.force,
@@ -160,7 +160,7 @@ def _quality(compared: Comparison) -> str:
         "cover": None if quality.cover is None else f"{100.0 * quality.cover:.1f} %",
     }
     rows = [(name, text) for name, text in values.items() if text is not None]
-    views = counted_views(len(quality.each), compared.cameras)
+    views = describe_views(len(quality.each), compared.cameras)
     head, *others = format_table(("pictures", views), rows).splitlines()
     lines = [head, *(f"{line}  {_WORDS[name]}" for line, (name, _) in zip(others, rows, strict=True))]
     lines += _ignored(compared)

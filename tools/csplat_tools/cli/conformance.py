@@ -21,12 +21,10 @@ from csplat_conformance.encoders.run import TIMEOUT_SECONDS as ENCODER_SECONDS
 from csplat_conformance.near import EXACT
 from csplat_conformance.report import Report, to_json, to_junit, to_table
 from csplat_conformance.runner import TIMEOUT_SECONDS, Choice, parse_levels, run_builtin, run_command
-from csplat_tools.cli.console import FAILED
-from csplat_tools.cli.groups import Group, Output
-from csplat_tools.cli.options import chosen, command
-from csplat_tools.files.console import note, say
-from csplat_tools.files.extras import need_renderer, prepare_renderer
-from csplat_tools.files.streams import STANDARD_STREAM, write_bytes
+from csplat_tools.cli.command import EXIT_FAILED, OptionGroup, OutputOptions, chosen, command
+from csplat_tools.console import note, print_data
+from csplat_tools.file_streams import STANDARD_STREAM, write_bytes
+from csplat_tools.optional_packages import prepare_renderer, require_renderer
 
 _OURS = "-m csplat_tools encode {ply} {out} --source-index {index} --quiet"
 #: Options of a run, which exclude --write-inputs.
@@ -36,7 +34,7 @@ conformance = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
 
 
 @dataclass(frozen=True)
-class Run(Group):
+class RunOptions(OptionGroup):
     """Options of a run of the suite, and of its reports in addition to the JSON."""
 
     filters: Annotated[
@@ -57,14 +55,14 @@ class Run(Group):
         """Patterns of the checks to run, joined by commas as the library takes them; `None`: all."""
         return _joined(self.filters)
 
-    def check(self, out: Output) -> None:
+    def check(self, out: OutputOptions) -> None:
         """Refuse unusable paths of reports before anything is run; XML may go to a terminal."""
         to_stdout = self.junit == STANDARD_STREAM
         if to_stdout and out.as_json:
             raise typer.BadParameter("--json and --junit - both want standard output")
         out.check(None if to_stdout else self.junit)
 
-    def publish(self, report: Report, out: Output, nothing: str) -> None:
+    def publish(self, report: Report, out: OutputOptions, nothing: str) -> None:
         """Publish the report in every form that was requested, and exit with status 1 if it did not pass.
 
         Args:
@@ -76,14 +74,14 @@ class Run(Group):
             typer.Exit: a check failed, or there was none.
         """
         if self.junit == STANDARD_STREAM:
-            say(to_junit(report).rstrip("\n"))
+            print_data(to_junit(report).rstrip("\n"))
         elif self.junit is not None:
             write_bytes(self.junit, to_junit(report).encode())
         out.publish(to_json(report), "" if self.junit == STANDARD_STREAM else to_table(report, verbose=self.verbose))
         if not report.outcomes:
             note(f"error: {nothing}")
         if not report.passed:
-            raise typer.Exit(FAILED)
+            raise typer.Exit(EXIT_FAILED)
 
 
 @conformance.callback()
@@ -101,8 +99,8 @@ def root() -> None:
 @conformance.command()
 @command()
 def decoder(
-    run: Run,
-    out: Output,
+    run: RunOptions,
+    out: OutputOptions,
     program: Annotated[
         str | None, typer.Option("--cmd", metavar="COMMAND", help="Another decoder, with {input} and {outdir}.")
     ] = None,
@@ -157,8 +155,8 @@ def decoder(
 @conformance.command()
 @command(one_of=[("folder", name) for name in _OF_A_RUN])
 def encoder(
-    run: Run,
-    out: Output,
+    run: RunOptions,
+    out: OutputOptions,
     program: Annotated[
         str | None,
         typer.Option("--cmd", metavar="COMMAND", help="Another encoder, with {ply}, {out}, and perhaps {index}."),
@@ -242,7 +240,7 @@ def _picture_judge(levels: Sequence[str], *, quiet: bool) -> tuple[PictureJudge 
     if not {"L3", "L4"} & {*levels}:
         return None, ""
     try:
-        need_renderer()
+        require_renderer()
     except InputError as error:
         return None, str(error)
     ready = cache(lambda: prepare_renderer(quiet=quiet))

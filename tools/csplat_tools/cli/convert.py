@@ -12,21 +12,18 @@ import typer
 from csplat.errors import counted
 from csplat.model import UNSPECIFIED
 from csplat.turning import USUAL
-from csplat_tools.cli.groups import Group, Output
-from csplat_tools.cli.options import ShDegree, command
-from csplat_tools.cli.parsing import parse_axes, parse_numbers
-from csplat_tools.cli.view_options import Upright
-from csplat_tools.files.console import format_bytes, format_table, note
-from csplat_tools.files.converting import convert_file, format_rows
-from csplat_tools.files.filters import Filters
-from csplat_tools.files.streams import STANDARD_STREAM
+from csplat_tools.cli.command import OptionGroup, OutputOptions, command
+from csplat_tools.cli.shared_options import OrientationOptions, ShDegree, parse_axes, parse_numbers
+from csplat_tools.console import format_bytes, format_table, note
+from csplat_tools.convert_file import Filters, convert_file, format_rows
+from csplat_tools.file_streams import STANDARD_STREAM
 
 _CHANGES = "Changes, in this order"
 _COLUMNS = ("format", "endings", "read", "written", "SH degree", "axes", "exact", "has a place for")
 
 
 @dataclass(frozen=True)
-class _Changes(Group):
+class _FilterOptions(OptionGroup):
     """Options that change the scene on its way."""
 
     to_axes: Annotated[
@@ -91,9 +88,9 @@ class _Changes(Group):
 def convert(
     source: Annotated[str, typer.Argument(metavar="IN", help="A scene in any format that is read; a folder; or -.")],
     output: Annotated[str, typer.Argument(metavar="OUT", help="What to write; its name says the format.")],
-    changes: _Changes,
-    upright: Upright,
-    out: Output,
+    changes: _FilterOptions,
+    upright: OrientationOptions,
+    out: OutputOptions,
     sh_degree: ShDegree = None,
     write_as: Annotated[
         str | None, typer.Option("--to", metavar="FORMAT", hidden=True, help="Of OUT, if its name does not say it.")
@@ -143,7 +140,7 @@ def convert(
 
 
 @command()
-def formats(out: Output) -> None:
+def formats(out: OutputOptions) -> None:
     """List the formats that are read and written, and what each has a place for.
 
     `exact`: what comes back bit for bit. `axes`: directions of +x, +y, +z

@@ -6,19 +6,18 @@ from typing import Annotated
 
 import typer
 
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import ShDegree, command
-from csplat_tools.cli.view_options import Upright
-from csplat_tools.files.convert import decode_file
-from csplat_tools.files.streams import check_name
+from csplat_tools.cli.command import OutputOptions, command
+from csplat_tools.cli.shared_options import OrientationOptions, ShDegree
+from csplat_tools.convert_file import decode_file
+from csplat_tools.file_streams import check_name
 
 
 @command(beside=".ply")
 def decode(
     source: Annotated[str, typer.Argument(metavar="IN.csplat", help="A .csplat file, or - for standard input.")],
     output: Annotated[str, typer.Argument(metavar="OUT.ply", help="The file to write, or -; IN.ply by default.")],
-    upright: Upright,
-    out: Output,
+    upright: OrientationOptions,
+    out: OutputOptions,
     sh_degree: ShDegree = None,
     absolute: Annotated[
         bool, typer.Option("--absolute", help="Add the origin to the positions and write them as doubles.")

@@ -16,18 +16,31 @@ from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat.types import Progress
 from csplat_render.virtual_cameras import estimate_up
-from csplat_tools.cli.encoder_options import ENCODER, Encoding, Facts
-from csplat_tools.cli.groups import Group, Output
-from csplat_tools.cli.options import EFFORT, Importance, SourceIndex, command
-from csplat_tools.cli.parsing import parse_bytes, parse_decibels
-from csplat_tools.cli.settings import Settings
-from csplat_tools.cli.view_options import Views, Virtual
-from csplat_tools.files.by_disk import Scale, expected
-from csplat_tools.files.console import format_about, format_bytes, format_table, note
-from csplat_tools.files.convert import Encoded, EncodedScene, Encoder, encode_file
-from csplat_tools.files.extras import need_renderer, prepare_renderer
-from csplat_tools.files.streams import check_name, source_path
-from csplat_tools.inspect.glance import SIZE, SPLATS_MAX, glance
+from csplat_tools.cli.command import LibrarySettings, OptionGroup, OutputOptions, command
+from csplat_tools.cli.shared_options import (
+    EFFORT,
+    ENCODER_SETTINGS,
+    EncodingOptions,
+    Importance,
+    SourceIndex,
+    SourceOptions,
+    ViewOptions,
+    VirtualViewOptions,
+    parse_bytes,
+    parse_decibels,
+)
+from csplat_tools.console import format_bytes, format_estimate, format_table, note
+from csplat_tools.encode_file import (
+    EncodedFile,
+    EncodeFunction,
+    EncoderOutcome,
+    OutOfCoreOptions,
+    encode_file,
+    estimate_cost,
+)
+from csplat_tools.file_streams import check_name, source_path
+from csplat_tools.inspect.comparison import ESTIMATE_SIZE, ESTIMATE_SPLATS_MAX, estimate_psnr
+from csplat_tools.optional_packages import prepare_renderer, require_renderer
 
 if TYPE_CHECKING:
     from csplat_tools.optimise.targets import Target
@@ -40,7 +53,7 @@ _WHOLE = (*_RENDERED, "max_error", "importance", "source_index")  # options that
 
 
 @dataclass(frozen=True)
-class Goal(Group):
+class TargetOptions(OptionGroup):
     """Options of the target that the file is to meet."""
 
     one_of: ClassVar[Sequence[tuple[str, ...]]] = (_RENDERED, ("keep", "keep_all"), ("effort", "keep_all"))
@@ -104,7 +117,7 @@ class Goal(Group):
 
 
 @dataclass(frozen=True)
-class Room(Group):
+class LargeSceneOptions(OptionGroup):
     """Options for encoding scenes larger than memory."""
 
     memory: Annotated[
@@ -138,13 +151,13 @@ class Room(Group):
         ),
     ] = False
 
-    def read(self) -> Scale:
+    def read(self) -> OutOfCoreOptions:
         """Return the options as the library takes them.
 
         Raises:
             InputError: --memory is not a size.
         """
-        return Scale(parse_bytes(self.memory), self.work, self.resume, self.dask)
+        return OutOfCoreOptions(parse_bytes(self.memory), self.work, self.resume, self.dask)
 
 
 @command(
@@ -166,19 +179,19 @@ class Room(Group):
         "view_size": _RENDERED,
         "background": ("cameras", "data"),
     },
-    settings=(ENCODER,),
+    settings=(ENCODER_SETTINGS,),
 )
 def encode(
     source: Annotated[str, typer.Argument(metavar="IN.ply", help="A PLY, other `csplat formats`, or -.")],
     output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="What to write, or -; else IN.csplat.")],
-    encoding: Encoding,
-    goal: Goal,
-    facts: Facts,
-    views: Views,
-    virtual: Virtual,
-    room: Room,
-    out: Output,
-    settings: Settings,
+    encoding: EncodingOptions,
+    goal: TargetOptions,
+    facts: SourceOptions,
+    views: ViewOptions,
+    virtual: VirtualViewOptions,
+    room: LargeSceneOptions,
+    out: OutputOptions,
+    settings: LibrarySettings,
     importance: Importance = None,
     prune_unseen: Annotated[
         bool, typer.Option("--prune-unseen", hidden=True, help="Leave out splats that no view of --importance saw.")
@@ -243,8 +256,8 @@ def encode(
     out.check(output, inputs=(source, importance, *views.inputs), named={"--source-index": source_index})
     check_name(output, ".csplat", "encode", source)
     if goal.is_rendered:
-        need_renderer()
-    reaching: Encoder = partial(_reach, goal, views, virtual, importance, out)
+        require_renderer()
+    reaching: EncodeFunction = partial(_reach, goal, views, virtual, importance, out)
     with out.bar() as progress:
         encoded = encode_file(
             source, output, options, facts=facts.read(), strict=facts.strict, importance=importance,
@@ -259,46 +272,46 @@ def encode(
         if progress is not None:
             progress("eight small renders", 0.0)
         psnr = None if out.quiet else _psnr(encoded, encoding.threads)
-    about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(SIZE)}
-    if not out.quiet and encoded.made is not None and len(encoded.source) <= SPLATS_MAX:
+    about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(ESTIMATE_SIZE)}
+    if not out.quiet and encoded.made is not None and len(encoded.source) <= ESTIMATE_SPLATS_MAX:
         facts.seeming(estimate_up(encoded.source), out, shown=False)
     out.remark(_summary(encoded, psnr, source, output))
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
 
 
-def _say_expected(source: str, options: EncodeOptions, scale: Scale, out: Output) -> None:
+def _say_expected(source: str, options: EncodeOptions, scale: OutOfCoreOptions, out: OutputOptions) -> None:
     """Report memory, disk space and time that an encoding would take."""
     with source_path(source) as local, out.bar() as progress:
         if progress is not None:
             progress("opening", 0.0)
-        found = expected(local, options, scale)
+        found = estimate_cost(local, options, scale)
     needs = found.needs
     where = "in memory" if needs.in_memory else f"by way of the disk, {counted(needs.workers, 'process', 'processes')}"
     text = (
         f"{counted(found.count, 'splat')} of SH degree {found.sh_degree}, {where}: about"
-        f" {format_about(found.seconds)}, {format_bytes(needs.memory_bytes)} of memory,"
+        f" {format_estimate(found.seconds)}, {format_bytes(needs.memory_bytes)} of memory,"
         f" {format_bytes(needs.disk_bytes)} of disk; the file about {format_bytes(found.file_bytes)}"
     )
     out.publish(found.as_json(), text)
 
 
 def _reach(
-    goal: Goal,
-    views: Views,
-    virtual: Virtual,
+    goal: TargetOptions,
+    views: ViewOptions,
+    virtual: VirtualViewOptions,
     importance: str | None,
-    out: Output,
+    out: OutputOptions,
     model: SplatModel,
     encoding: EncodeOptions,
     progress: Progress | None,
-) -> EncodedScene:
+) -> EncoderOutcome:
     """Encode a scene to the target; called by `encode_file` with the last three arguments."""
     import csplat_tools
-    from csplat_tools.files.importance import read_weights
+    from csplat_tools.importance_file import read_encoder_importance
 
     target, around = goal.read(model.unit_metres), None
     assert target is not None
-    weights = None if importance is None else read_weights(importance, model)
+    weights = None if importance is None else read_encoder_importance(importance, model)
     simplifying = None
     if target.is_rendered:
         prepare_renderer(quiet=out.quiet, simplify=True)
@@ -321,25 +334,25 @@ def _reach(
         errors=target.max_error, views=around, options=encoding, keep_all=goal.keep_all, importance=weights,
         simplifying=simplifying, progress=progress,
     )  # fmt: skip
-    return EncodedScene(made.result, "target", made.report.as_json(), made.report.lines())
+    return EncoderOutcome(made.result, "target", made.report.as_json(), made.report.lines())
 
 
-def _stated(encoded: Encoded) -> list[str]:
+def _stated(encoded: EncodedFile) -> list[str]:
     errors = encoded.report.errors
     names = sorted(errors, key=list(MEASURE_NAMES.values()).index)
     rows = [(name, *(f"{value:.4g}" for value in errors[name])) for name in names]
     return [format_table(("stated error", "max", "rms"), rows)] * bool(rows)
 
 
-def _psnr(encoded: Encoded, threads: int | None) -> float | None:
+def _psnr(encoded: EncodedFile, threads: int | None) -> float | None:
     """Return an approximate PSNR in dB; `None` if it is known already, or if measuring it would take long."""
     made = encoded.made
     if made is None or made.said.get("psnr") is not None or find_spec("numba") is None:
         return None
-    return glance(encoded.source, made.result.data, threads=threads)
+    return estimate_psnr(encoded.source, made.result.data, threads=threads)
 
 
-def _summary(encoded: Encoded, psnr: float | None, source: str, output: str) -> str:
+def _summary(encoded: EncodedFile, psnr: float | None, source: str, output: str) -> str:
     """Return the last line: counts, time, sizes and quality."""
     report = encoded.report
     per_splat = f" ({report.size_bytes / report.splat_count:.2f} bytes per splat)" if report.splat_count else ""

@@ -8,11 +8,10 @@ import typer
 
 from csplat.errors import counted
 from csplat.opened import open as opened
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import command
-from csplat_tools.cli.parsing import parse_numbers
-from csplat_tools.files.console import format_bytes
-from csplat_tools.files.streams import check_name, csplat_file, whole_output
+from csplat_tools.cli.command import OutputOptions, command
+from csplat_tools.cli.shared_options import parse_numbers
+from csplat_tools.console import format_bytes
+from csplat_tools.file_streams import check_name, csplat_file, whole_output
 
 
 @command()
@@ -21,7 +20,7 @@ def extract(
         str, typer.Argument(metavar="IN.csplat", help="A .csplat file, its URL, or - for standard input.")
     ],
     output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="The file to write, or -.")],
-    out: Output,
+    out: OutputOptions,
     box: Annotated[
         str, typer.Option(metavar="X,Y,Z,X,Y,Z", help="Two corners; in scene units, relative to the origin.")
     ],

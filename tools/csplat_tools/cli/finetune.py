@@ -9,26 +9,28 @@ from typing import Annotated
 
 import typer
 
-from csplat_tools.cli.encoder_options import ENCODER, Encoding, Facts
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import (
+from csplat_tools.cli.command import LibrarySettings, OutputOptions, chosen, command
+from csplat_tools.cli.shared_options import (
+    ENCODER_SETTINGS,
     ByteCost,
     Checkpoint,
     CheckpointEvery,
+    EncodingOptions,
     Importance,
     Lpips,
+    Near,
     Resume,
     SourceIndex,
-    chosen,
-    command,
+    SourceOptions,
+    ViewOptions,
+    VirtualViewOptions,
+    parse_bytes,
+    parse_decibels,
 )
-from csplat_tools.cli.parsing import parse_bytes, parse_decibels
-from csplat_tools.cli.settings import Settings
-from csplat_tools.cli.view_options import Near, Views, Virtual
-from csplat_tools.files.by_disk import read_degree
-from csplat_tools.files.convert import read_source
-from csplat_tools.files.extras import need_trainer
-from csplat_tools.files.streams import check_name
+from csplat_tools.encode_file import read_degree
+from csplat_tools.file_streams import check_name
+from csplat_tools.optional_packages import require_trainer
+from csplat_tools.scene_files import read_source
 
 
 @command(
@@ -41,17 +43,17 @@ from csplat_tools.files.streams import check_name
         ("byte_cost", "target_size", "target_psnr"),
     ),
     needs={"near": ("data",), "checkpoint_every": ("checkpoint",)},
-    settings=(ENCODER, "csplat_trainer.tuning.tuning_options:FinetuneOptions"),
+    settings=(ENCODER_SETTINGS, "csplat_trainer.tuning.options:FinetuneOptions"),
 )
 def finetune(
     source: Annotated[str, typer.Argument(metavar="IN.ply", help="A trained 3DGS scene.")],
     output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="The file to write.")],
-    encoding: Encoding,
-    facts: Facts,
-    views: Views,
-    virtual: Virtual,
-    out: Output,
-    settings: Settings,
+    encoding: EncodingOptions,
+    facts: SourceOptions,
+    views: ViewOptions,
+    virtual: VirtualViewOptions,
+    out: OutputOptions,
+    settings: LibrarySettings,
     itself: Annotated[
         bool, typer.Option("--self", help="It is to look like the scene's own renders, from all around.")
     ] = False,
@@ -120,7 +122,7 @@ def finetune(
       csplat finetune scene.ply scene.csplat --self
       csplat finetune scene.ply scene.csplat --data capture --checkpoint run.npz --resume run.npz
     """
-    need_trainer(plots=page is not None)
+    require_trainer(plots=page is not None)
     from csplat_render.lpips import load_lpips
     from csplat_tools.training import tuned_file as tuning
     from csplat_tools.training.tuning_report import format_tuning_report

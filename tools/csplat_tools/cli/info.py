@@ -11,20 +11,28 @@ import typer
 
 from csplat.decoder import DeclaredBounds
 from csplat.errors import InputError, counted
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import command
-from csplat_tools.files.console import format_table
-from csplat_tools.files.extras import need_pictures, prepare_renderer
-from csplat_tools.files.streams import STANDARD_STREAM, is_csplat, mapped_csplat
-from csplat_tools.inspect.foreign import describe_foreign
-from csplat_tools.inspect.info import AttributeFacts, CodebookFacts, FileFacts, LayerFacts, describe_file
-from csplat_tools.inspect.words import coding_words, headline, other_metadata, scene_words
+from csplat_tools.cli.command import OutputOptions, command
+from csplat_tools.console import format_table
+from csplat_tools.file_streams import STANDARD_STREAM, is_csplat, mapped_csplat
+from csplat_tools.inspect.file_description import (
+    AttributeSummary,
+    CodebookSummary,
+    FileDescription,
+    LayerSummary,
+    describe_coding,
+    describe_file,
+    describe_other_format,
+    describe_scene,
+    format_headline,
+    other_metadata,
+)
+from csplat_tools.optional_packages import prepare_renderer, require_images
 
 
 @command(reads=True, needs={"beside": ("page",)})
 def info(
     source: Annotated[str, typer.Argument(metavar="SCENE", help="A .csplat file; or any other of `csplat formats`.")],
-    out: Output,
+    out: OutputOptions,
     page: Annotated[str | None, typer.Option(metavar="FILE.html", help="Write a page about it.")] = None,
     beside: Annotated[
         str | None,
@@ -50,27 +58,27 @@ def info(
     out.check(inputs=(source, beside), named={"--page": page})
     if beside is not None:
         prepare_renderer(quiet=out.quiet, ssim=True)
-        need_pictures()
+        require_images()
     if source != STANDARD_STREAM and not is_csplat(Path(source)):
         if page is not None:
             raise InputError(f"{source} is no .csplat file, of which --page tells: `csplat encode` makes one")
-        out.publish(*describe_foreign(source))
+        out.publish(*describe_other_format(source))
         return
     with mapped_csplat(source) as data:
         facts = describe_file(data)
         if page is not None:
-            from csplat_tools.inspect.page import write_page
+            from csplat_tools.inspect.file_report import write_page
 
             with out.bar() as progress:
                 write_page(page, source, data, facts, beside, progress=progress)
     out.publish(facts.as_json(), _format(facts))
 
 
-def _format(facts: FileFacts) -> str:
+def _format(facts: FileDescription) -> str:
     size = facts.header.file_size
     parts = [
         _scene(facts),
-        _sizes("attribute", facts.attributes, size, [coding_words(one) for one in facts.attributes.values()]),
+        _sizes("attribute", facts.attributes, size, [describe_coding(one) for one in facts.attributes.values()]),
         _sizes("layer", facts.layers, size, [counted(one.tiles, "tile") for one in facts.layers.values()]),
         "other bytes: " + ", ".join(f"{name} {number}" for name, number in facts.overhead.items()),
     ]
@@ -86,12 +94,12 @@ def _format(facts: FileFacts) -> str:
     return "\n\n".join(parts)
 
 
-def _scene(facts: FileFacts) -> str:
-    return "\n".join([headline(facts), *(f"{name:12} {value}" for name, value in scene_words(facts).items())])
+def _scene(facts: FileDescription) -> str:
+    return "\n".join([format_headline(facts), *(f"{name:12} {value}" for name, value in describe_scene(facts).items())])
 
 
 def _sizes(
-    title: str, entries: Mapping[str, AttributeFacts | LayerFacts], file_size: int, remarks: Sequence[str]
+    title: str, entries: Mapping[str, AttributeSummary | LayerSummary], file_size: int, remarks: Sequence[str]
 ) -> str:
     rows = [
         (
@@ -106,7 +114,7 @@ def _sizes(
     return "\n".join(f"{line}  {text}".rstrip() for line, text in zip(lines, ["", *remarks], strict=True))
 
 
-def _codebook(codebook: CodebookFacts) -> str:
+def _codebook(codebook: CodebookSummary) -> str:
     bands = f" bands {codebook.bands[0]} to {codebook.bands[-1]}" if codebook.bands else ""
     size = f"{counted(codebook.entries, 'entry', 'entries')}, {counted(codebook.size_bytes, 'byte')}"
     return f"codebook {codebook.id}: {codebook.kind}{bands}, {size}"

@@ -9,19 +9,17 @@ import typer
 from csplat import formats
 from csplat.errors import InputError
 from csplat.lint import Finding
-from csplat_tools.cli.console import FAILED
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import ShDegree, command
-from csplat_tools.files.console import format_table
-from csplat_tools.files.convert import findings_as_json
-from csplat_tools.files.scenes import without_extra
-from csplat_tools.files.streams import STANDARD_STREAM, check_name, source_path, write_model
+from csplat_tools.cli.command import EXIT_FAILED, OutputOptions, command
+from csplat_tools.cli.shared_options import ShDegree
+from csplat_tools.console import format_table
+from csplat_tools.file_streams import STANDARD_STREAM, check_name, source_path, write_model
+from csplat_tools.scene_files import findings_as_json, without_extra_columns
 
 
 @command(reads=True)
 def lint(
     source: Annotated[str, typer.Argument(metavar="SCENE", help="A PLY, a file of `csplat formats`, or -.")],
-    out: Output,
+    out: OutputOptions,
     fix: Annotated[
         str | None, typer.Option(metavar="OUT.ply", help="Write a repaired PLY, where that is safe.")
     ] = None,
@@ -52,7 +50,7 @@ def lint(
         errors = any(one.kind == "error" for one in findings)
         if fix is not None and not errors:
             with formats.open_scene(path, sh_degree=sh_degree) as scene:
-                write_model(fix, scene if keep_extra else without_extra(scene), absolute=False)
+                write_model(fix, scene if keep_extra else without_extra_columns(scene), absolute=False)
     clean = all(one.kind == "note" for one in findings)
     table = _table(findings)
     if fix == STANDARD_STREAM:
@@ -62,7 +60,7 @@ def lint(
     if fix is not None and errors:
         raise InputError(f"{source} cannot be repaired, and {fix} was not written; export the scene again")
     if errors or (fix is None and not clean):
-        raise typer.Exit(FAILED)
+        raise typer.Exit(EXIT_FAILED)
 
 
 def _table(findings: list[Finding]) -> str:

@@ -9,11 +9,10 @@ import typer
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError, counted
 from csplat.merging import merge as merged
-from csplat_tools.cli.encoder_options import Preset
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import command
-from csplat_tools.files.console import format_bytes
-from csplat_tools.files.streams import STANDARD_STREAM, check_name, csplat_file, whole_output
+from csplat_tools.cli.command import OutputOptions, command
+from csplat_tools.cli.shared_options import Preset
+from csplat_tools.console import format_bytes
+from csplat_tools.file_streams import STANDARD_STREAM, check_name, csplat_file, whole_output
 
 
 @command()
@@ -22,7 +21,7 @@ def merge(
         list[str],
         typer.Argument(metavar="A.csplat B.csplat ...", help="Files in the order of their splats; URLs, or one -."),
     ],
-    out: Output,
+    out: OutputOptions,
     target: Annotated[str, typer.Option("--output", "-o", metavar="OUT.csplat", help="The file to write, or -.")],
     preset: Preset = "balanced",
 ) -> None:

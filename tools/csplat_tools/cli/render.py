@@ -12,22 +12,28 @@ import typer
 
 from csplat.errors import counted
 from csplat_render.virtual_cameras import estimate_up
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import ModeWord, Scene, ShDegree, command
-from csplat_tools.cli.parsing import parse_size
-from csplat_tools.cli.view_options import SplitWord, Upright, Views
-from csplat_tools.files.console import note
-from csplat_tools.files.extras import need_renderer, prepare_renderer
-from csplat_tools.files.scenes import load_model
-from csplat_tools.files.streams import STANDARD_STREAM, check_name
-from csplat_tools.present.film import DEFAULT_FPS, MAX_FPS, is_film
-from csplat_tools.present.rendering import find_cameras, render_film, render_folder
+from csplat_tools.cli.command import OutputOptions, command
+from csplat_tools.cli.shared_options import (
+    ModeWord,
+    OrientationOptions,
+    SceneArgument,
+    ShDegree,
+    SplitOption,
+    ViewOptions,
+    parse_size,
+)
+from csplat_tools.console import note
+from csplat_tools.file_streams import STANDARD_STREAM, check_name
+from csplat_tools.optional_packages import prepare_renderer, require_renderer
+from csplat_tools.present.scene_renders import find_cameras, render_film, render_folder
+from csplat_tools.render_files import DEFAULT_FPS, MAX_FPS, is_film
+from csplat_tools.scene_files import load_model
 
 _OTHER_FILMS = (".avi", ".m4v", ".mkv", ".mov", ".mpg", ".webm")
 
 
 @dataclass(frozen=True)
-class _Views(Views):
+class _RenderViewOptions(ViewOptions):
     """Options of the views to render, which are all views of the cameras or the data set, and of their size."""
 
     needs: ClassVar[Mapping[str, tuple[str, ...]]] = dict.fromkeys(("images", "test_every", "split"), ("data",))
@@ -49,18 +55,18 @@ class _Views(Views):
 
 @command(reads=True, needs={"up": ("orbit",), "axes": ("orbit",)})
 def render(
-    source: Scene,
+    source: SceneArgument,
     output: Annotated[
         str, typer.Argument(metavar="OUT", help="A folder for pictures; or NAME.mp4, .webp, .gif, .png: a film.")
     ],
-    views: _Views,
-    upright: Upright,
-    out: Output,
+    views: _RenderViewOptions,
+    upright: OrientationOptions,
+    out: OutputOptions,
     orbit: Annotated[
         int | None,
         typer.Option(metavar="N", min=1, help="N cameras all around, or along those of --cameras or --data."),
     ] = None,
-    split: SplitWord = "test",
+    split: SplitOption = "test",
     fps: Annotated[
         float, typer.Option(metavar="RATE", min=0.1, max=MAX_FPS, help="Pictures per second of a film.")
     ] = DEFAULT_FPS,
@@ -104,7 +110,7 @@ def render(
     out.check(output if film else None, inputs=(source, *views.inputs))
     if not film:
         check_name(output, ".webp", "render", source)
-    need_renderer()
+    require_renderer()
     read = load_model(source, sh_degree=sh_degree)
     out.findings(read.findings)
     model = upright.upright().applied(read.model)

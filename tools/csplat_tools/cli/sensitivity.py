@@ -8,13 +8,12 @@ from typing import Annotated, Any
 import typer
 
 from csplat.errors import counted
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import Scene, Seed, Threads, command
-from csplat_tools.cli.view_options import Views, Virtual
-from csplat_tools.files.console import format_table
-from csplat_tools.files.extras import need_renderer, prepare_renderer
-from csplat_tools.files.scenes import load_model
-from csplat_tools.files.streams import check_name
+from csplat_tools.cli.command import OutputOptions, command
+from csplat_tools.cli.shared_options import SceneArgument, Seed, Threads, ViewOptions, VirtualViewOptions
+from csplat_tools.console import format_table
+from csplat_tools.file_streams import check_name
+from csplat_tools.optional_packages import prepare_renderer, require_renderer
+from csplat_tools.scene_files import load_model
 
 #: Cost of the measurement, in renders of all views.
 _PASSES = 4.4
@@ -23,11 +22,11 @@ _SHOWN = {"colour": "colour (largest of the SH coefficients)", "opacity": "opaci
 
 @command(reads=True)
 def sensitivity(
-    source: Scene,
+    source: SceneArgument,
     output: Annotated[str, typer.Argument(metavar="OUT.npz", help="The file to write.")],
-    views: Views,
-    virtual: Virtual,
-    out: Output,
+    views: ViewOptions,
+    virtual: VirtualViewOptions,
+    out: OutputOptions,
     matrices: Annotated[
         bool,
         typer.Option(
@@ -51,9 +50,9 @@ def sensitivity(
     """
     out.check(inputs=(source, *views.inputs), named={"OUT.npz": output})
     check_name(output, ".npz", "sensitivity", source)
-    need_renderer()
-    from csplat_tools.optimise.scene_sensitivity import measure_scene
-    from csplat_tools.views.timing import pictures_seconds
+    require_renderer()
+    from csplat_tools.optimise.sensitivity import measure_scene
+    from csplat_tools.views.view_sets import total_render_seconds
 
     read = load_model(source)
     out.findings(read.findings)
@@ -63,7 +62,7 @@ def sensitivity(
     count = {"count": 0} if views.cameras is not None else {}
     around = views.find(model, out, seed=seed, aside=None if views.data is None else 0, **virtual.given() | count)
     out.foretell(
-        lambda: _PASSES * pictures_seconds(model, around.teaches or around.judges),
+        lambda: _PASSES * total_render_seconds(model, around.teaches or around.judges),
         "fewer or smaller views take less: --help-all",
     )
     with out.bar() as progress:

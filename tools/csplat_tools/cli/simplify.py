@@ -9,15 +9,22 @@ from typing import Annotated, Any
 import typer
 
 from csplat.errors import counted
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import EFFORT, Scene, Seed, SourceIndex, Threads, chosen, command
-from csplat_tools.cli.parsing import parse_decibels
-from csplat_tools.cli.settings import Settings
-from csplat_tools.cli.view_options import Upright, Views, Virtual
-from csplat_tools.files.console import format_table
-from csplat_tools.files.extras import need_renderer, prepare_renderer
-from csplat_tools.files.scenes import load_model
-from csplat_tools.files.streams import check_name, write_array, write_model
+from csplat_tools.cli.command import LibrarySettings, OutputOptions, chosen, command
+from csplat_tools.cli.shared_options import (
+    EFFORT,
+    OrientationOptions,
+    SceneArgument,
+    Seed,
+    SourceIndex,
+    Threads,
+    ViewOptions,
+    VirtualViewOptions,
+    parse_decibels,
+)
+from csplat_tools.console import format_table
+from csplat_tools.file_streams import check_name, write_array, write_model
+from csplat_tools.optional_packages import prepare_renderer, require_renderer
+from csplat_tools.scene_files import load_model
 
 _TARGET = "Target (one of them)"
 #: Cost in renders of all training views: for --keep (measured: donut 9, plane3 19), and for a target, which searches
@@ -28,13 +35,13 @@ _OPTIONS = "csplat_tools.optimise.pruning_order:SimplifyOptions"
 
 @command(reads=True, one_of=(("keep", "target_psnr", "max_loss"),), needs={"max_loss": ("data",)}, settings=(_OPTIONS,))
 def simplify(
-    source: Scene,
+    source: SceneArgument,
     output: Annotated[str, typer.Argument(metavar="OUT.ply", help="The PLY to write, or -.")],
-    views: Views,
-    virtual: Virtual,
-    upright: Upright,
-    out: Output,
-    settings: Settings,
+    views: ViewOptions,
+    virtual: VirtualViewOptions,
+    upright: OrientationOptions,
+    out: OutputOptions,
+    settings: LibrarySettings,
     keep: Annotated[
         float | None, typer.Option(metavar="SHARE", rich_help_panel=_TARGET, help="Share of the splats that stay.")
     ] = None,
@@ -70,12 +77,12 @@ def simplify(
       csplat simplify scene.ply small.ply --target-psnr 40 --report small.json
       csplat simplify scene.ply small.ply --max-loss 0.3dB --data capture
     """
-    need_renderer()
+    require_renderer()
     import csplat_tools
-    from csplat_tools.optimise.pruning_order import SimplifyOptions
-    from csplat_tools.optimise.targets import Target
-    from csplat_tools.views import reduced
-    from csplat_tools.views.timing import pictures_seconds
+    from csplat_tools.optimise.simplify import SimplifyOptions
+    from csplat_tools.optimise.target import Target
+    from csplat_tools.views import shrink_cameras
+    from csplat_tools.views.view_sets import total_render_seconds
 
     loss = None if max_loss is None else parse_decibels(max_loss)
     psnr = None if target_psnr is None else parse_decibels(target_psnr)
@@ -92,7 +99,7 @@ def simplify(
     options = replace(options, view_size=given.get("size"))
     passes = _PASSES[keep is None] * (0.5 + 0.5 * options.work)
     out.foretell(
-        lambda: passes * pictures_seconds(model, reduced(around.teaches, options.pictures(len(model))[1])),
+        lambda: passes * total_render_seconds(model, shrink_cameras(around.teaches, options.pictures(len(model))[1])),
         "fewer or smaller views take less: --help-all",
     )
     with out.bar() as progress:

@@ -6,14 +6,12 @@ from typing import Annotated
 
 import typer
 
-from csplat_tools.cli.encoder_options import Preset
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import Lpips, Threads, chosen, command
-from csplat_tools.cli.view_options import Views
-from csplat_tools.files.console import note
-from csplat_tools.files.extras import need_pictures, need_plots, need_renderer, prepare_renderer
-from csplat_tools.files.streams import STANDARD_STREAM
-from csplat_tools.tradeoffs.sweep_options import FAMILIES, SweepOptions, parse_sweep
+from csplat_tools.cli.command import OutputOptions, chosen, command
+from csplat_tools.cli.shared_options import Lpips, Preset, Threads, ViewOptions
+from csplat_tools.console import note
+from csplat_tools.file_streams import STANDARD_STREAM
+from csplat_tools.optional_packages import prepare_renderer, require_images, require_plots, require_renderer
+from csplat_tools.tradeoffs.options import FAMILIES, Wanted, parse_what
 
 _SLOW = {"strategies", "targets", "simplify", "finetune"}
 
@@ -21,8 +19,8 @@ _SLOW = {"strategies", "targets", "simplify", "finetune"}
 @command(reads=True, needs={"background": ("cameras", "data")})
 def tradeoff(
     source: Annotated[str, typer.Argument(metavar="SCENE.ply", help="A trained 3DGS scene.")],
-    views: Views,
-    out: Output,
+    views: ViewOptions,
+    out: OutputOptions,
     page: Annotated[
         str | None, typer.Option("--output", "-o", metavar="PAGE.html", help="Write a page with plots and pictures.")
     ] = None,
@@ -73,9 +71,9 @@ def tradeoff(
         raise typer.BadParameter("--plots wants the name of a folder")
     out.check(inputs=(source, *views.inputs, None if lpips == "auto" else lpips), named={"-o": page})
     if page is not None or plots is not None:
-        need_plots()
-    need_renderer()
-    need_pictures()
+        require_plots()
+    require_renderer()
+    require_images()
     import csplat_tools
     from csplat_tools.tradeoffs.sweep_options import read_setting
     from csplat_tools.tradeoffs.tradeoff_page import check_plots, write_plots, write_tradeoff_page

@@ -9,13 +9,21 @@ from typing import Annotated
 import typer
 
 from csplat.encoder import PRESETS, EncodeOptions, PresetName
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import ByteCost, Checkpoint, CheckpointEvery, Resume, Seed, Threads, chosen, command
-from csplat_tools.cli.parsing import parse_bytes, parse_decibels, parse_size
-from csplat_tools.cli.settings import Settings
-from csplat_tools.cli.view_options import Upright
-from csplat_tools.files.extras import need_trainer
-from csplat_tools.files.streams import check_name
+from csplat_tools.cli.command import LibrarySettings, OutputOptions, chosen, command
+from csplat_tools.cli.shared_options import (
+    ByteCost,
+    Checkpoint,
+    CheckpointEvery,
+    OrientationOptions,
+    Resume,
+    Seed,
+    Threads,
+    parse_bytes,
+    parse_decibels,
+    parse_size,
+)
+from csplat_tools.file_streams import check_name
+from csplat_tools.optional_packages import require_trainer
 from csplat_tools.views import DataOptions
 from csplat_trainer.training_options import BACKGROUNDS, DEVICES, Outputs, TrainOptions
 
@@ -33,9 +41,9 @@ def train(
     output: Annotated[
         str, typer.Argument(metavar="OUT.ply|OUT.csplat", help="The scene to write, or a file that was tuned, too.")
     ],
-    upright: Upright,
-    out: Output,
-    settings: Settings,
+    upright: OrientationOptions,
+    out: OutputOptions,
+    settings: LibrarySettings,
     max_splats: Annotated[
         int | None,
         typer.Option(
@@ -135,11 +143,11 @@ def train(
       csplat train capture -o scene.ply --checkpoint run.npz --checkpoint-every 1000
       csplat train capture -o scene.ply --resume run.npz --max-splats 60000
     """
-    need_trainer(plots=plot is not None or page is not None)
-    from csplat_tools.training.trained_scene import run_training, run_training_to_file, tuning_after, tuning_checkpoint
-    from csplat_tools.training.tuned_file import SHAPE_ENTRIES, SPLAT_BYTES
-    from csplat_tools.training.tuning_report import format_tuning_report
-    from csplat_trainer.training_checkpoint import load_checkpoint
+    require_trainer(plots=plot is not None or page is not None)
+    from csplat_tools.training.finetune import SHAPE_ENTRIES, SPLAT_BYTES
+    from csplat_tools.training.report import format_report
+    from csplat_tools.training.train import run_training, run_training_to_file, tuning_after, tuning_checkpoint
+    from csplat_trainer.checkpoint import load_checkpoint
 
     to_file, size_bytes = Path(output).suffix == ".csplat", parse_bytes(target_size)
     psnr = None if target_psnr is None else parse_decibels(target_psnr)

@@ -8,18 +8,16 @@ import typer
 
 from csplat.errors import CsplatError, counted
 from csplat_conformance.stated import MeasureProof, Proof
-from csplat_tools.cli.console import FAILED
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import command
-from csplat_tools.cli.parsing import parse_bytes
-from csplat_tools.files.console import format_table, note
-from csplat_tools.inspect.verify import Verified, verify_file
+from csplat_tools.cli.command import EXIT_FAILED, OutputOptions, command
+from csplat_tools.cli.shared_options import parse_bytes
+from csplat_tools.console import format_table, note
+from csplat_tools.inspect.verification import Verification, verify_file
 
 
 @command(reads=True, needs={"source_index": ("source",), "memory": ("source",)})
 def verify(
     path: Annotated[str, typer.Argument(metavar="F.csplat", help="A .csplat file, or - for standard input.")],
-    out: Output,
+    out: OutputOptions,
     source: Annotated[
         str | None, typer.Option(metavar="IN.ply", help="The PLY it was made from: prove the stated errors.")
     ] = None,
@@ -62,10 +60,10 @@ def verify(
     out.publish(verified.as_json(), "" if out.quiet else _report(verified))
     if not verified.holds:
         _say_why(verified, path, unproved=source is not None and verified.proof is None)
-        raise typer.Exit(FAILED)
+        raise typer.Exit(EXIT_FAILED)
 
 
-def _say_why(verified: Verified, path: str, *, unproved: bool) -> None:
+def _say_why(verified: Verification, path: str, *, unproved: bool) -> None:
     violations = verified.validation.violations
     if violations:
         clauses, codes = (", ".join(sorted({getattr(one, name) for one in violations})) for name in ("clause", "code"))
@@ -76,7 +74,7 @@ def _say_why(verified: Verified, path: str, *, unproved: bool) -> None:
         note(f"error: {failure}")
 
 
-def _report(verified: Verified) -> str:
+def _report(verified: Verification) -> str:
     validation, proof = verified.validation, verified.proof
     lines = [*map(str, (*validation.violations, *validation.unread)), *(f"remark: {one}" for one in validation.remarks)]
     if validation.conforms:

@@ -12,15 +12,18 @@ import typer
 
 from csplat.decoder import decode_scene
 from csplat.errors import counted
-from csplat_tools.cli.encoder_options import Preset
-from csplat_tools.cli.groups import Output
-from csplat_tools.cli.options import Scene, command
-from csplat_tools.cli.view_options import Upright
-from csplat_tools.files.console import format_bytes, note
-from csplat_tools.files.streams import check_name, write_bytes
-from csplat_tools.present import export
-from csplat_tools.present.server import open_server
-from csplat_tools.present.viewing import ViewScene, open_scene, seeming_wishes, view_wishes
+from csplat_tools.cli.command import OutputOptions, command
+from csplat_tools.cli.shared_options import OrientationOptions, Preset, SceneArgument
+from csplat_tools.console import format_bytes, note
+from csplat_tools.file_streams import check_name, write_bytes
+from csplat_tools.present import viewer_page
+from csplat_tools.present.viewer_server import (
+    ViewerScene,
+    estimated_up_parameters,
+    open_server,
+    open_viewer_scene,
+    page_parameters,
+)
 
 _Cameras = Annotated[
     str | None, typer.Option(metavar="FILE.json", help="Look from these cameras, see `csplat render`.")
@@ -29,9 +32,9 @@ _Cameras = Annotated[
 
 @command(serves=True, reads=True)
 def view(
-    source: Scene,
-    upright: Upright,
-    out: Output,
+    source: SceneArgument,
+    upright: OrientationOptions,
+    out: OutputOptions,
     preset: Preset = "fast",
     cameras: _Cameras = None,
     port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="0 finds one that is free.")] = 0,
@@ -52,10 +55,10 @@ def view(
       csplat view scene.csplat --no-browser --port 8000
     """
     out.check(inputs=(source, cameras))
-    wishes = view_wishes(cameras, upright.upright())
+    wishes = page_parameters(cameras, upright.upright())
     with ExitStack() as stack:
         with out.bar() as progress:
-            scene = stack.enter_context(open_scene(source, preset=preset, progress=progress))
+            scene = stack.enter_context(open_viewer_scene(source, preset=preset, progress=progress))
         wishes |= _scene_wishes(scene, cameras, upright, out)
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
@@ -74,10 +77,10 @@ def view(
 
 @command(beside=".html", reads=True)
 def export_html(
-    source: Scene,
+    source: SceneArgument,
     output: Annotated[str, typer.Argument(metavar="PAGE.html", help="The file to write, or -; SCENE.html by default.")],
-    upright: Upright,
-    out: Output,
+    upright: OrientationOptions,
+    out: OutputOptions,
     preset: Preset = "balanced",
     cameras: _Cameras = None,
 ) -> None:
@@ -93,14 +96,14 @@ def export_html(
       csplat export-html scene.ply scene.html --preset small --force
       csplat export-html scene.csplat scene.html --cameras views.json
     """
-    wishes = view_wishes(cameras, upright.upright())
+    wishes = page_parameters(cameras, upright.upright())
     out.check(output, inputs=(source, cameras))
     check_name(output, ".html", "export-html", source)
-    with out.bar() as progress, open_scene(source, preset=preset, progress=progress) as scene:
+    with out.bar() as progress, open_viewer_scene(source, preset=preset, progress=progress) as scene:
         data = scene.read()
         decode_scene(data)
         wishes |= _scene_wishes(scene, cameras, upright, out)
-        exported = export.export_page(data, scene.name, wishes)
+        exported = viewer_page.export_page(data, scene.name, wishes)
         write_bytes(output, exported.page)
         out.findings(scene.findings)
         out.remark(*_encoded(scene, preset))
@@ -114,7 +117,7 @@ def export_html(
 
 @command()
 def export_element(
-    output: Annotated[str, typer.Argument(metavar="OUT.js", help="The file to write, or -.")], out: Output
+    output: Annotated[str, typer.Argument(metavar="OUT.js", help="The file to write, or -.")], out: OutputOptions
 ) -> None:
     """Write the viewer as one script, for scenes in pages of your own.
 
@@ -133,23 +136,25 @@ def export_element(
     """
     out.check(output)
     check_name(output, ".js", "export-element")
-    script = export.export_element()
+    script = viewer_page.export_element()
     write_bytes(output, script)
     out.remark(f"{output}: {format_bytes(len(script))}, {format_bytes(len(gzip.compress(script)))} as servers send it")
     out.publish({"size_bytes": len(script)})
 
 
-def _scene_wishes(scene: ViewScene, cameras: str | None, upright: Upright, out: Output) -> dict[str, str]:
+def _scene_wishes(
+    scene: ViewerScene, cameras: str | None, upright: OrientationOptions, out: OutputOptions
+) -> dict[str, str]:
     """Return the page's parameters of a scene: cameras relative to its origin, and the estimated up direction."""
     wishes = {}
     if cameras is not None:
         report: list[str] = []
-        wishes = view_wishes(cameras, report=report, origin=scene.header.origin)
+        wishes = page_parameters(cameras, report=report, origin=scene.header.origin)
         out.remark(*report)
-    return wishes | seeming_wishes(upright.seeming(scene.seems_up, out))
+    return wishes | estimated_up_parameters(upright.seeming(scene.seems_up, out))
 
 
-def _encoded(scene: ViewScene, preset: str) -> list[str]:
+def _encoded(scene: ViewerScene, preset: str) -> list[str]:
     if not scene.encoded_from:
         return []
     sizes = f"{format_bytes(scene.encoded_from)} -> {format_bytes(scene.size_bytes)}"

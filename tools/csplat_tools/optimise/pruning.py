@@ -18,20 +18,14 @@ from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.metrics import PSNR_CAP
 from csplat_render.pruning_error import measure_pruning_error
-from csplat_render.scorer import Scorer, renderer
-from csplat_tools.files.extras import need_renderer
-from csplat_tools.files.scenes import SceneLike, load_model
-from csplat_tools.optimise.pruning_order import (
-    MeasuredViews,
-    PruningOrder,
-    SimplifyOptions,
-    find_pruning_order,
-    total_removal,
-)
-from csplat_tools.optimise.splat_refit import RefitResult, refit_with_bands
-from csplat_tools.optimise.targets import Target
+from csplat_tools.optimise.simplify.fitting import Fit, fit
+from csplat_tools.optimise.simplify.options import SimplifyOptions
+from csplat_tools.optimise.simplify.order import Order, Side, removal_order, seen_by
+from csplat_tools.optimise.target import Target
+from csplat_tools.optional_packages import require_renderer
+from csplat_tools.scene_files import SceneLike, load_model
 from csplat_tools.views import ViewSet, camera_sequence, find_view_set
-from csplat_tools.views.agreeing import AgreedViews, find_views
+from csplat_tools.views.sufficient_views import SufficientViews, find_sufficient_views
 
 _TRIES = 3  # largest number of fits on the way to a target PSNR
 _AGREE_ON = 0.5  # least fraction of the splats on whose removal views have to agree: fits need the views in any case
@@ -78,7 +72,7 @@ class PruningSession:
     source: SplatModel
     options: SimplifyOptions
     around: ViewSet
-    views: AgreedViews
+    views: SufficientViews
     taught: list[Camera]
     sides: list[MeasuredViews]
     wanted: list[F32]
@@ -130,8 +124,8 @@ def prepare_pruning(
     around = views or find_view_set(source, background=options.background, count=count, size=size, seed=options.seed)
     options = replace(options, background=around.background, view_size=size)
     gone = max(_AGREE_ON, 0.0 if left is None else 1.0 - left / len(source))
-    found = find_views(source, around, gone, size=size, threads=options.threads, progress=progress)
-    sides = [MeasuredViews(found.used, found.removal)]
+    found = find_sufficient_views(source, around, gone, size=size, threads=options.threads, progress=progress)
+    sides = [Side(found.used, found.removal)]
     if around.virtual:
         more = round(len(found.used) * max(1.0, options.work))
         cameras = camera_sequence(source, more, size, seed=options.seed + 1)
@@ -195,7 +189,7 @@ def simplify(
         CsplatError: the scene is not valid.
         OSError: the file cannot be read.
     """
-    need_renderer()
+    require_renderer()
     target = Target(psnr, None, loss, keep)
     source = load_model(scene).model
     options = options or SimplifyOptions()

@@ -14,10 +14,9 @@ from csplat.model import SplatModel
 from csplat.types import Progress
 from csplat_render import Camera
 from csplat_render.pruning_error import measure_pruning_error
-from csplat_tools.files.streams import open_output
-from csplat_tools.optimise.candidates import Weights
-from csplat_tools.views import Colour, ViewSet, evenly
-from csplat_tools.views.agreeing import find_views
+from csplat_tools.file_streams import open_output
+from csplat_tools.views import Colour, ViewSet, evenly_spaced
+from csplat_tools.views.sufficient_views import find_sufficient_views
 from csplat_trainer.sensitivity import Sensitivity, measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, write_sensitivity
 
@@ -94,7 +93,7 @@ def measure_scene(
     )
     if views.virtual and views.teaches:
         size = (views.teaches[0].W, views.teaches[0].H)
-        found = find_views(model, views, _GONE, size=size, threads=threads, progress=progress)
+        found = find_sufficient_views(model, views, _GONE, size=size, threads=threads, progress=progress)
         cameras, check, source = found.used, found.check, "virtual"
     measured = measure_views(model, cameras, views.background, matrices=matrices, threads=threads, progress=progress)
     missed = float("nan")
@@ -173,7 +172,9 @@ def importance_views(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
     would show less of what others see: plane3 with quantisation classes from 40 of them has 42 dB on them and 39 on
     others; from these views, 41 and 40.
     """
-    return evenly(views.teaches, _VIRTUAL[source.sh_degree > 0][len(source) >= _LARGE] if views.virtual else _GIVEN)
+    return evenly_spaced(
+        views.teaches, _VIRTUAL[source.sh_degree > 0][len(source) >= _LARGE] if views.virtual else _GIVEN
+    )
 
 
 def complete_importance(

@@ -9,11 +9,7 @@ from typing import Any
 
 from csplat.encoder import EncodeResult
 from csplat.errors import counted
-from csplat_render.metrics import psnr_of_mse
-from csplat_tools.files.console import format_bytes
-from csplat_tools.optimise.candidates import Candidate, CandidatePool, psnr_spread
-from csplat_tools.optimise.targets import Target
-from csplat_tools.views import counted_views
+from csplat_tools.console import format_bytes
 
 _LESS = 1.0  # dB: a PSNR from elsewhere that is lower by more is pointed out
 

@@ -12,7 +12,7 @@ from typing import Any
 from csplat._spec import MEASURE_NAMES
 from csplat.errors import InputError
 from csplat_render.metrics import PSNR_CAP
-from csplat_tools.files.sizes import NUMBER
+from csplat_tools.console import NUMBER
 
 _LENGTHS = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
 _IN_UNITS = "means"  # the one measure that is a length

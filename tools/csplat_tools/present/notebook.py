@@ -13,8 +13,8 @@ import numpy as np
 from csplat.encoder import EncodeOptions, encode
 from csplat.model import SplatModel
 from csplat_render.virtual_cameras import estimate_up, surface_areas, visible_opacity
-from csplat_tools.present.export import export_page
-from csplat_tools.present.viewing import seeming_wishes
+from csplat_tools.present.viewer_page import export_page
+from csplat_tools.present.viewer_server import estimated_up_parameters
 
 #: Largest number of splats in a frame: some 9 bytes each, a third more as text, are saved with the notebook.
 MOST_SPLATS = 250_000
@@ -37,7 +37,7 @@ def scene_html(model: SplatModel, *, most_splats: int = MOST_SPLATS) -> str:
         InputError: values that no lattice can hold, or the installation is not complete.
     """
     shown = most_visible(model, most_splats)
-    wishes = seeming_wishes(estimate_up(shown))
+    wishes = estimated_up_parameters(estimate_up(shown))
     page = export_page(encode(shown, EncodeOptions(preset="fast")), "scene", wishes).page.decode()
     frame = (
         f'<iframe srcdoc="{html.escape(page)}" sandbox="allow-scripts" title="{html.escape(repr(model))}"'

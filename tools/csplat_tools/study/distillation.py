@@ -18,8 +18,7 @@ from csplat.scene import without_bands
 from csplat.types import F32, Progress
 from csplat_render import Camera
 from csplat_render.refit import fit_colours
-from csplat_render.scorer import Scorer, renderer
-from csplat_tools.views import ViewSet, reduced
+from csplat_tools.views import ViewSet, shrink_cameras
 
 _STEPS = 8  # largest number of conjugate gradient steps; more overfit the training views
 
@@ -62,7 +61,7 @@ class SourceRenders:
         """
         if not views.teaches:
             raise InputError("no view is left to learn colours from")
-        used, aside = reduced(views.teaches), reduced(views.decides)
+        used, aside = shrink_cameras(views.teaches), shrink_cameras(views.decides)
         draw = renderer(source, views.background, threads=threads)
         wanted = [draw(camera).rgb for camera in used]
         check = Scorer.of_source(source, aside, views.background, threads=threads)

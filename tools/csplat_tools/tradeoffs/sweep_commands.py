@@ -11,7 +11,7 @@ import shlex
 from pathlib import PurePath
 from typing import Any
 
-from csplat_tools.files.streams import STANDARD_STREAM
+from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.study import Reduction
 from csplat_tools.tradeoffs.sweep_options import SweepOptions, SweepSetting
 

@@ -19,11 +19,12 @@ from csplat.types import F32, Progress
 from csplat_render import Mode
 from csplat_render.camera import relative_to
 from csplat_render.metrics import Scores, ViewScore, psnr_of_mse, squared_error
-from csplat_render.scorer import Scorer, renderer
-from csplat_tools.hardest_place import HardestPlaceSearch, ImagePiece
-from csplat_tools.inspect.info import byte_shares
-from csplat_tools.tradeoffs.sweep_options import SweepSetting
-from csplat_tools.views import evenly, showing_cameras
+from csplat_tools.inspect.file_description import bytes_by_attribute
+from csplat_tools.pages.hardest import HardestPlace
+from csplat_tools.tradeoffs.points import ModeTime, Partial, Point, TriedFile
+from csplat_tools.tradeoffs.setting import Setting
+from csplat_tools.tradeoffs.sweep import Candidate
+from csplat_tools.views import display_cameras, evenly_spaced
 
 _QUALITY = ("psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips")
 
@@ -294,14 +295,14 @@ class Measurer:
         self._setting, self._modes, self._threads = setting, modes, threads
         views = setting.views
         self._judge = views.judge(setting.source, threads=threads)
-        shown = showing_cameras(setting.source, views)
+        shown = display_cameras(setting.source, views)
         self._showing = (
             None
             if shown is views.judges
             else Scorer.of_source(setting.source, shown, views.judging_background, threads=threads)
         )
         self._photographs = views.photograph_judge(threads=threads) if views.photographs else None
-        places = evenly(range(len(views.judges)), TIMED_VIEWS)
+        places = evenly_spaced(range(len(views.judges)), TIMED_VIEWS)
         self._timed = [(views.judges[place], self._judge.look(place).picture) for place in places]
         self.source_modes: dict[str, ModeTime] = {mode: self._mode_time(setting.source, mode) for mode in modes}
         self.source_photographs = self._source_scores()
@@ -339,7 +340,7 @@ class Measurer:
             stages=made.stages or clock.seconds,
             decode_seconds=decode_seconds,
             modes=modes,
-            attribute_bytes=byte_shares(made.data, header),
+            attribute_bytes=bytes_by_attribute(made.data, header),
             first_picture_bytes=fetched_bytes(header, 0),
             partial=self._partial(made, header) if candidate.is_partial else (),
             hardest=hardest.found(),

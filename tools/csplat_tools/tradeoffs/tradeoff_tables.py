@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from csplat_tools.files.console import format_bytes, format_table
-from csplat_tools.tradeoffs.sweep_points import PartialFetch, SweepPoint
-from csplat_tools.tradeoffs.sweep_run import Tradeoff
-from csplat_tools.views import counted_views
+from csplat_tools.console import format_bytes, format_table
+from csplat_tools.tradeoffs.points import Partial, Point
+from csplat_tools.tradeoffs.running import Tradeoff
+from csplat_tools.views import describe_views
 
 #: Mark before the names of points on the Pareto front.
 MARK = "*"
@@ -124,7 +124,7 @@ def views_line(tradeoff: Tradeoff) -> str:
     setting = tradeoff.setting
     sizes = sorted({(camera.W, camera.H) for camera in setting.views.judges})
     size = f"{sizes[0][0]}x{sizes[0][1]}" if len(sizes) == 1 else f"{len(sizes)} sizes"
-    return f"judged from {counted_views(len(setting.views.judges), setting.views.name)}, {size}"
+    return f"judged from {describe_views(len(setting.views.judges), setting.views.name)}, {size}"
 
 
 def mode_rows(tradeoff: Tradeoff) -> list[tuple[str, ...]]:

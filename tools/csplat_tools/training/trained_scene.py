@@ -12,12 +12,12 @@ from csplat.errors import InputError, counted
 from csplat.training_record import TrainingRecord
 from csplat_render.kernels import thread_count
 from csplat_render.lpips import load_lpips
-from csplat_tools.files.console import note, step_progress
-from csplat_tools.files.extras import prepare_renderer
-from csplat_tools.files.facts import SceneOverrides
-from csplat_tools.files.streams import write_model
-from csplat_tools.training.training_page import show_views, write_training_page
-from csplat_tools.training.tuned_file import BYTE_COST, default_validation_count, run_finetuning
+from csplat_tools.console import note, step_progress
+from csplat_tools.file_streams import write_model
+from csplat_tools.optional_packages import prepare_renderer
+from csplat_tools.scene_files import MetadataOverrides
+from csplat_tools.training.finetune import BYTE_COST, run_finetuning, usually_aside
+from csplat_tools.training.page import show_views, write_page
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.losses import PerceptualLoss
@@ -36,7 +36,7 @@ def run_training(
     options: TrainOptions,
     files: Outputs,
     *,
-    facts: SceneOverrides | None = None,
+    facts: MetadataOverrides | None = None,
     plot: str | None = None,
     page: str | None = None,
     threads: int | None = None,
@@ -63,7 +63,7 @@ def run_training(
         OSError: a file cannot be read or written.
     """
     result = _trained(data, options, files, plot=plot, threads=threads, quiet=quiet)
-    model = (facts or SceneOverrides()).applied(result.model)
+    model = (facts or MetadataOverrides()).applied(result.model)
     write_model(output, model, absolute=False)
     if page is not None:
         views = find_view_set(model, data=data, aside=0)
@@ -83,7 +83,7 @@ def run_training_to_file(
     *,
     size_bytes: int | None = None,
     psnr: float | None = None,
-    facts: SceneOverrides | None = None,
+    facts: MetadataOverrides | None = None,
     plot: str | None = None,
     page: str | None = None,
     quiet: bool = False,
@@ -111,8 +111,8 @@ def run_training_to_file(
     for one in _loaded(data).val:  # finds a damaged image before training; they are not kept
         _ = one.pixels, one.mask
     result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
-    model = (facts or SceneOverrides()).applied(result.model)
-    views = find_view_set(model, data=data, aside=default_validation_count(0, cameras=None, data=data))
+    model = (facts or MetadataOverrides()).applied(result.model)
+    views = find_view_set(model, data=data, aside=usually_aside(0, cameras=None, data=data))
     known = None
     if result.metrics is not None and options.eval_views == 0 and options.device == "cpu":
         known = {"source": {**result.metrics, "lpips": None}}

@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 from csplat.errors import counted
 from csplat.model import SplatModel
 from csplat.types import U8
-from csplat_tools.files.console import format_bytes
-from csplat_tools.files.pictures import to_bytes
-from csplat_tools.files.streams import write_bytes
-from csplat_tools.hardest_place import image_row
-from csplat_tools.html_report import INK, attribute_figure, definitions, document, draw_svg, table
-from csplat_tools.training.tuning_report import SCORES, score_rows
-from csplat_tools.views import ViewSet, evenly
+from csplat_tools.console import format_bytes
+from csplat_tools.file_streams import write_bytes
+from csplat_tools.pages.bars import attribute_figure
+from csplat_tools.pages.hardest import pictures_beside
+from csplat_tools.pages.parts import definitions, document, table
+from csplat_tools.pages.svg import INK, drawn
+from csplat_tools.render_files import to_uint8
+from csplat_tools.training.report import SCORES, score_rows
+from csplat_tools.views import ViewSet, evenly_spaced
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,7 +59,7 @@ def show_views(
     """
     if not views.judges:
         return []
-    places = evenly(range(len(views.judges)), _VIEWS)
+    places = evenly_spaced(range(len(views.judges)), _VIEWS)
     views = replace(views, judges=[views.judges[place] for place in places])
     judge = views.photograph_judge(threads=threads) if views.photographs else views.judge(source, threads=threads)
     wanted = "photograph" if views.photographs else "the source"
@@ -67,8 +69,8 @@ def show_views(
             continue  # it is the reference itself
 
         def look(at: int, picture: NDArray[np.float32], seen: NDArray[np.float32], name: str = name) -> None:
-            rows[at].setdefault(wanted, to_bytes(picture))
-            rows[at][name] = to_bytes(seen)
+            rows[at].setdefault(wanted, to_uint8(picture))
+            rows[at][name] = to_uint8(seen)
 
         judge.scores(model, ssim=False, on_view=look)
     names = [camera.image or f"view {place}" for place, camera in zip(places, judge.cameras, strict=True)]

@@ -15,11 +15,10 @@ from csplat.model import SplatModel
 from csplat.types import I64, Progress
 from csplat_render import Camera
 from csplat_render.pruning_error import measure_pruning_error
-from csplat_tools.files.importance import read_importance
-from csplat_tools.optimise.pruning import simplify
-from csplat_tools.optimise.pruning_order import SimplifyOptions
-from csplat_tools.optimise.scene_sensitivity import measure_views
-from csplat_tools.views import VIEW_COUNT, ViewSet, with_deciders
+from csplat_tools.importance_file import read_importance
+from csplat_tools.optimise.sensitivity import measure_views
+from csplat_tools.optimise.simplify import SimplifyOptions, simplify
+from csplat_tools.views import VIEW_COUNT, ViewSet, with_validation_views
 from csplat_trainer.sensitivity import Sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.tuning import TuningView, TuningViews, renders_of, split_views
@@ -105,8 +104,8 @@ def choose_splats(
     rows = np.flatnonzero(seen) if prune else np.arange(len(source))
     model, said = source.select(rows), {"unseen": len(source) - len(rows)}
     if keep is not None:
-        teaching = with_deciders(replace(views, teaches=measuring, judges=()))
-        model, kept = _pruned(model, teaching, keep * len(source) / len(rows), threads, progress)
+        teaching = with_validation_views(replace(views, teaches=measuring, judges=()))
+        model, kept = _simplified(model, teaching, keep * len(source) / len(rows), threads, progress)
         rows, said = rows[kept], {**said, "simplified_from": len(rows)}
     if given is not None:
         return TuningSubset(model, rows, given.select(rows) if isinstance(given, Importance) else given[rows], said)

@@ -11,9 +11,9 @@ from csplat.encoder import EncodeResult
 from csplat.errors import counted
 from csplat.model import SplatModel
 from csplat_render.metrics import Distance
-from csplat_tools.files.console import format_bytes, format_table
-from csplat_tools.files.scenes import ply_splat_bytes
-from csplat_tools.inspect.info import byte_shares
+from csplat_tools.console import format_bytes, format_table
+from csplat_tools.inspect.file_description import bytes_by_attribute
+from csplat_tools.scene_files import ply_splat_bytes
 from csplat_tools.views import ViewSet
 
 #: Scores that are reported, with their number of digits after the decimal point.
@@ -91,7 +91,7 @@ def make_tuning_report(
         seconds: time by stage.
         said: report of the splats that were pruned.
     """
-    shares = byte_shares(result.data, read_header(result.data))
+    shares = bytes_by_attribute(result.data, read_header(result.data))
     overhead = shares.pop("overhead")
     size, count = len(result.data), len(source)
     return {

@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
-from csplat_tools.views.elsewhere import elsewhere
-from csplat_tools.views.finding import DataOptions, comparison_cameras, find_view_set, with_deciders
-from csplat_tools.views.placing import CHECKS, VIEW_COUNT, VIEW_SIZE, camera_sequence, evenly, reduced, usual_views
-from csplat_tools.views.showing import showing_cameras
-from csplat_tools.views.viewset import BLACK, SPLITS, VIRTUAL, WHITE, Colour, Split, ViewSet, counted_views
+from csplat_tools.views.view_sets import (
+    BLACK,
+    SPLITS,
+    VIRTUAL,
+    WHITE,
+    Colour,
+    DataOptions,
+    Split,
+    ViewSet,
+    comparison_cameras,
+    describe_views,
+    display_cameras,
+    find_view_set,
+    with_validation_views,
+)
+from csplat_tools.views.virtual_views import (
+    HELD_OUT_COUNT,
+    VIEW_COUNT,
+    VIEW_SIZE,
+    camera_sequence,
+    default_views,
+    evenly_spaced,
+    extra_test_cameras,
+    shrink_cameras,
+)
 
 __all__ = [
     "BLACK",
-    "CHECKS",
+    "HELD_OUT_COUNT",
     "SPLITS",
     "VIEW_COUNT",
     "VIEW_SIZE",
@@ -22,12 +42,12 @@ __all__ = [
     "ViewSet",
     "camera_sequence",
     "comparison_cameras",
-    "counted_views",
-    "elsewhere",
-    "evenly",
+    "default_views",
+    "describe_views",
+    "display_cameras",
+    "evenly_spaced",
+    "extra_test_cameras",
     "find_view_set",
-    "reduced",
-    "showing_cameras",
-    "usual_views",
-    "with_deciders",
+    "shrink_cameras",
+    "with_validation_views",
 ]

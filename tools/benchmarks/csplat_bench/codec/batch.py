@@ -31,7 +31,7 @@ from csplat.ply import read_ply
 from csplat_bench.common.command import JSON, MARKDOWN, run
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import find_scenes
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 
 #: Ends a batch that writes to a folder.
 End = Callable[[subprocess.Popen[str], Path], None]

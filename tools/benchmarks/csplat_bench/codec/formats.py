@@ -26,7 +26,7 @@ from csplat_bench.common.peers import find_splat_transform, judged, transform
 from csplat_bench.common.report import optional, table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, find_scenes
 from csplat_render.scorer import Scorer
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 from csplat_tools.views import comparison_cameras
 
 _SCENES = "donut,horse,plane3,lego60k"

@@ -33,7 +33,7 @@ from csplat_conformance.choosing import matching
 from csplat_conformance.encoders import Input, all_inputs
 from csplat_conformance.stated import Source
 from csplat_render.scorer import Scorer
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 from csplat_tools.views import comparison_cameras
 
 FIGURES = ROOT / "conformance" / "csplat_conformance" / "encoders" / "figures.json"

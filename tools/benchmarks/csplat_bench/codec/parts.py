@@ -28,8 +28,7 @@ from csplat.errors import missing
 from csplat_bench.common.command import JSON, MARKDOWN, WrongWords, run
 from csplat_bench.common.measuring import medians, timed
 from csplat_bench.common.report import table, tell_machine, write_json
-from csplat_tools.present.server import open_server
-from csplat_tools.present.viewing import ViewScene
+from csplat_tools.present.viewer_server import ViewerScene, open_server
 
 _BUCKET = "scenes"
 _KEYS = {"key": "nobody", "secret": "nothing"}
@@ -151,7 +150,7 @@ def _process(serve: Any, *words: str) -> Iterator[str]:
 
 def _serve_web(told: Connection, path: str) -> None:
     file = Path(path).resolve()
-    scene = ViewScene(file.name, file, file.stat().st_size, csplat.read_header(file))
+    scene = ViewerScene(file.name, file, file.stat().st_size, csplat.read_header(file))
     with open_server(scene) as server:
         told.send(f"{server.url}scene/{file.name}")
         server.serve_forever()

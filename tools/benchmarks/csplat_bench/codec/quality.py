@@ -44,7 +44,7 @@ from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, Scene, find_scenes, given_cameras, judge_of
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import scene_frame, virtual_cameras
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 
 _SCENES = "fox120k,fox60k_noreg,lego60k,plane3,statue,donut,jacket,horse,angel,st-peter"
 _LIMIT = 1.0  # dB: largest difference between the cameras of the data folder and those that `psnr` chooses

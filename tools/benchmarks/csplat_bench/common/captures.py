@@ -13,7 +13,7 @@ from csplat.errors import InputError
 from csplat.ply import write_ply
 from csplat_bench.common.report import write_json
 from csplat_bench.common.scenes import DATA
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.training_loop import train
 from csplat_trainer.training_options import TrainOptions

@@ -15,7 +15,7 @@ import typer
 from csplat.encoder import PRESETS as KNOWN_PRESETS
 from csplat.encoder import PresetName
 from csplat.errors import CsplatError
-from csplat_tools.files.console import note as tell
+from csplat_tools.console import note as tell
 
 T = TypeVar("T")
 

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from csplat.errors import InputError
 from csplat_bench.common.report import write_json
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 
 T = TypeVar("T")
 

@@ -15,7 +15,7 @@ from csplat.ply import read_ply
 from csplat_bench.common.measuring import Timing, run_timed
 from csplat_bench.common.scenes import Scene
 from csplat_render.scorer import Scorer
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 
 #: Longest run of another program.
 CAP_SECONDS = 600

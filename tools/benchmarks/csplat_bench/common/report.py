@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from csplat.files import atomic_writer
-from csplat_tools.files.console import format_table, note
+from csplat_tools.console import format_table, note
 from csplat_tools.tradeoffs.machine import describe_machine
 
 #: The machine that figures were taken on: descriptions by name.

@@ -19,7 +19,7 @@ from csplat_bench.common.making import blow_up, crowd
 from csplat_render import Camera
 from csplat_render.camera_files import load_cameras
 from csplat_render.scorer import Scorer
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 from csplat_tools.views import BLACK, comparison_cameras
 
 ROOT = Path(__file__).resolve().parents[4]

@@ -49,7 +49,7 @@ from csplat_bench.compression.tables import tables
 from csplat_render.kernels import thread_count
 from csplat_render.lpips import load_lpips
 from csplat_render.warmup import warm_up
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 from csplat_trainer.tuning import FinetuneOptions
 
 _SCENES = ",".join(CAPTURES)

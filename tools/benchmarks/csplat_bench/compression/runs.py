@@ -23,9 +23,9 @@ from csplat_bench.compression.rows import Row, Scores
 from csplat_bench.compression.sizes import books_of
 from csplat_render.lpips import Lpips
 from csplat_render.pruning_error import measure_pruning_error
-from csplat_tools.inspect.info import byte_shares
-from csplat_tools.training.tuning_inputs import TuningSubset, choose_splats, training_views
-from csplat_tools.training.tuning_report import score_models
+from csplat_tools.inspect.file_description import bytes_by_attribute
+from csplat_tools.training.choosing import Chosen, choose_splats, training_views
+from csplat_tools.training.report import judge_models
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.tuning import Clock, FinetuneOptions, TuningViews, tune
 
@@ -153,7 +153,7 @@ class Bench:
         scores = self.judge({"before": before, "after": after})
         colours, shapes = books_of(tuned.frozen)
         kept = len(tuned.frozen.source_index)
-        described = byte_shares(tuned.result.data, read_header(tuned.result.data))
+        described = bytes_by_attribute(tuned.result.data, read_header(tuned.result.data))
         return {
             "splats": kept,
             "before_bytes": len(tuned.plain.data),

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from csplat_bench.common.report import Table, laid_out, optional
 from csplat_bench.compression.rows import Facts, Known, Memory, Row, Scores
-from csplat_tools.files.scenes import ply_splat_bytes
+from csplat_tools.scene_files import ply_splat_bytes
 
 Results = Mapping[str, Known]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from csplat.errors import InputError
 from csplat_bench.common.command import listed
 from csplat_bench.datasets.protocols import BLENDER, COLMAP, MAX_WIDTH, OTHER, PROTOCOLS, TRANSFORMS, Protocol
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 from csplat_trainer.data.colmap import find_model, read_colmap
 from csplat_trainer.data.dataset import UnreadDataSet
 from csplat_trainer.data.image_pixels import image_size

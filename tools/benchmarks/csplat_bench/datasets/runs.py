@@ -20,7 +20,7 @@ from csplat_bench.common.report import write_json
 from csplat_bench.datasets.folders import TEST_EVERY, SceneFolder, choose_pictures
 from csplat_bench.datasets.records import File, Record
 from csplat_render.lpips import Lpips
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.posed_images import photograph_scorer
 from csplat_trainer.training_options import TrainOptions

@@ -33,7 +33,7 @@ from csplat_render import Camera
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.warmup import warm_up
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 
 _SCENES = "lego60k,fox120k,lego@90k,fox@90k,lego@500k,fox@500k"
 _HEADER = (

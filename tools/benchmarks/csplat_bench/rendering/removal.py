@@ -36,7 +36,7 @@ from csplat_tools.optimise.pruning_order import MeasuredViews, SimplifyOptions, 
 from csplat_tools.optimise.splat_refit import refit_splats, refit_with_bands
 from csplat_tools.study import prune_share
 from csplat_tools.views import BLACK, VIEW_SIZE, camera_sequence, find_view_set
-from csplat_tools.views.agreeing import find_views
+from csplat_tools.views.sufficient_views import find_sufficient_views
 
 _SCENES = "plane3,lego60k,fox120k,fox60k_noreg,donut,jacket,statue"
 _BY_OPACITY = ("opacity", "opacity-area")
@@ -103,7 +103,7 @@ class _Bench:
 
     def __init__(self, source: SplatModel, judge: Scorer, options: SimplifyOptions) -> None:
         self._source, self._judge, self._options = source, judge, options
-        self._views = find_views(source, find_view_set(source, count=options.views), 0.5)
+        self._views = find_sufficient_views(source, find_view_set(source, count=options.views), 0.5)
 
     @cached_property
     def _wanted(self) -> list[NDArray[np.float32]]:

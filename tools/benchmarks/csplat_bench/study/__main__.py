@@ -48,7 +48,7 @@ from csplat_bench.study.scenes import BASELINES, OTHERS, OWN, RENDERED, Subject,
 from csplat_bench.study.tables import tables
 from csplat_render.lpips import load_lpips
 from csplat_render.warmup import warm_up
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 
 _FIRST = "study1k"
 _LAST = "study1k-lpips"

@@ -15,7 +15,7 @@ from csplat_bench.common.measuring import timed
 from csplat_bench.study.judge import Views
 from csplat_bench.study.records import How, Measured, Survivors
 from csplat_bench.study.scenes import Subject
-from csplat_tools.inspect.info import byte_shares
+from csplat_tools.inspect.file_description import bytes_by_attribute
 from csplat_tools.study import (
     ATTRIBUTES,
     KMeans,
@@ -26,9 +26,9 @@ from csplat_tools.study import (
     raw_bytes,
     reduce_model,
 )
-from csplat_tools.training.tuned_file import BYTE_COST, SHAPE_ENTRIES
-from csplat_tools.training.tuning_inputs import training_views
-from csplat_tools.views import ViewSet, with_deciders
+from csplat_tools.training.choosing import training_views
+from csplat_tools.training.finetune import BYTE_COST, SHAPE_ENTRIES
+from csplat_tools.views import ViewSet, with_validation_views
 from csplat_trainer.tuning import FinetuneOptions
 
 #: Entries of each of six codebooks of 1,000 splats of SH 1: as large as the published row by its rule, 0.0136 MiB.
@@ -142,7 +142,7 @@ def measure_row(subject: Subject, row: Row) -> Measured:
     start = time.perf_counter()
     views = None
     if subject.teachers is not None:
-        views = with_deciders(ViewSet(subject.name, subject.views.background, subject.teachers, (), ()))
+        views = with_validation_views(ViewSet(subject.name, subject.views.background, subject.teachers, (), ()))
     reduced, strategy = timed(reduce_model, subject.source, row.reduction, views)
     options = EncodeOptions(preset=preset_of(row.preset))
     if row.tuned:
@@ -196,7 +196,7 @@ def attribute_bytes(subject: Subject) -> dict[str, dict[str, int]]:
     wanted = {"balanced": Reduction(), "small": Reduction(), "small, SH 0, τ 0.02": Reduction(0.02, sh_degree=0)}
     for name, reduction in wanted.items():
         data = encode_reduced(source, reduction, EncodeOptions(preset=preset_of(name.partition(",")[0]))).data
-        used = byte_shares(data, read_header(data))
+        used = bytes_by_attribute(data, read_header(data))
         del used["overhead"]
         files[name] = {**_gathered(used), "frame": len(data) - sum(used.values())}
     return files

@@ -37,7 +37,7 @@ from csplat_bench.common.scenes import ROOT, Scene, find_scenes
 from csplat_bench.targets.tables import Build, File, tables
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 from csplat_tools.views import BLACK
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg,angel,fox120k,st-peter,statue"  # the quick ones first

@@ -22,7 +22,7 @@ from csplat_bench.common.measuring import alone
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import DATA
 from csplat_bench.training.stages import STAGES, Steps, measured
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 
 _ROWS = "1000:200x200,20000:200x200,100000:400x400,500000:640x480"
 _HEADER = (

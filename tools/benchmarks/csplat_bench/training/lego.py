@@ -22,7 +22,7 @@ import typer
 from csplat_bench.common.command import LPIPS, listed, run
 from csplat_bench.common.report import describe, optional, table
 from csplat_bench.common.scenes import DATA
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 
 _HEADER = ("splats", "SH", "PSNR mean, dB", "pooled", "covered", "SSIM", "LPIPS", "train, s", "ms/step", "peak, MB")
 

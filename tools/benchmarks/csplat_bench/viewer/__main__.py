@@ -26,7 +26,7 @@ from csplat_bench.common.making import blow_up
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, Scene, find_scenes
 from csplat_bench.viewer.page import HEIGHT, WIDTH, Drawn, File, drawn
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 
 
 def main(

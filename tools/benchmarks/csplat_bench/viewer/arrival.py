@@ -47,7 +47,7 @@ from csplat_bench.viewer.forms import FORMS, size_of
 from csplat_bench.viewer.line import SLOW, Line
 from csplat_bench.viewer.stage import HEIGHT, WIDTH, looked_at, opened_page, pinhole, placed_in
 from csplat_render.metrics import psnr
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 
 _GOOD = 25.0  # dB
 _SMALL = (120, 160)  # rows and columns of what is looked at, as pages/arrival.mjs has them

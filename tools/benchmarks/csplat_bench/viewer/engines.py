@@ -36,10 +36,9 @@ from csplat.errors import InputError
 from csplat_bench.common.browser import open_page, serve
 from csplat_bench.common.command import listed, run
 from csplat_bench.common.report import table
-from csplat_tools.files.console import note
-from csplat_tools.present.export import export_page
-from csplat_tools.present.server import open_server
-from csplat_tools.present.viewing import open_scene
+from csplat_tools.console import note
+from csplat_tools.present.viewer_page import export_page
+from csplat_tools.present.viewer_server import open_server, open_viewer_scene
 
 _PATIENCE = 600.0  # seconds
 _SCREEN = ["xvfb-run", "--auto-servernum", "--server-args=-screen 0 1280x1024x24"]
@@ -106,7 +105,7 @@ def _opened(
 @contextmanager
 def _places(source: Path) -> Iterator[dict[str, str]]:
     """Yield the addresses at which the scene can be opened, by name."""
-    with tempfile.TemporaryDirectory() as folder, open_scene(str(source), preset="fast") as scene:
+    with tempfile.TemporaryDirectory() as folder, open_viewer_scene(str(source), preset="fast") as scene:
         page = Path(folder, "page.html")
         page.write_bytes(export_page(scene.read(), scene.name).page)
         with open_server(scene) as server, serve(folder) as address:

@@ -12,7 +12,7 @@ from http import HTTPStatus
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-from csplat_tools.present.server import byte_range
+from csplat_tools.present.viewer_server import byte_range
 
 #: Files in this folder of a served one come over the slow line, all others at full speed.
 SLOW = "/scenes/"

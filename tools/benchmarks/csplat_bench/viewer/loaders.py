@@ -30,7 +30,7 @@ from csplat_bench.viewer.owners import still
 from csplat_bench.viewer.rules import ENGINES
 from csplat_bench.viewer.stage import looked_at, opened_page, pinhole
 from csplat_render.metrics import psnr
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 
 _LOADS = 20
 _HEADER = (

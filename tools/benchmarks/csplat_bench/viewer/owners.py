@@ -40,8 +40,8 @@ from csplat_bench.viewer.rules import DEGREE, ENGINES, Picture, drawn
 from csplat_bench.viewer.stage import HEIGHT, WIDTH, looked_at, opened_page, pinhole, placed_in
 from csplat_render import Camera
 from csplat_render.metrics import psnr
-from csplat_tools.files.console import note
-from csplat_tools.files.pictures import write_png
+from csplat_tools.console import note
+from csplat_tools.render_files import write_png
 
 _OURS = "ours"  # among the formats of pictures
 _SH_OFF = 0.3  # kernels that are cut make room for what lies behind, in other colours

@@ -13,8 +13,7 @@ from typing import Any, TypedDict
 from csplat.decoder import decode
 from csplat_render.camera import Camera
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools.present.server import open_server
-from csplat_tools.present.viewing import open_scene
+from csplat_tools.present.viewer_server import open_server, open_viewer_scene
 
 WIDTH, HEIGHT = 640, 480
 
@@ -95,7 +94,7 @@ def drawn(page: Any, file: File, runs: int) -> Drawn:
 @contextmanager
 def _served(page: Any, file: File, view: list[Any]) -> Iterator[Any]:
     """Serve a file as `csplat view` does and open it from somewhere; yields the engine's report."""
-    with open_scene(str(file.path), preset="balanced") as scene, open_server(scene) as server:
+    with open_viewer_scene(str(file.path), preset="balanced") as scene, open_server(scene) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
         thread.start()
         try:

@@ -40,7 +40,7 @@ from csplat_bench.common.browser import open_page, serve
 from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, PRESETS, SCENES, listed, preset_of, run
 from csplat_bench.common.report import optional, table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, ROOT, Scene, find_scenes
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 
 _SCENES = "lego60k,fox120k,fontaine,fox-1M,donut,donut-1M"
 Start = Callable[[Decoder, Path], Process | Tab]

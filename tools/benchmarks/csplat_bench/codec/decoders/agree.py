@@ -29,8 +29,8 @@ from csplat_bench.common.command import JSON, PRESETS, listed, preset_of, run
 from csplat_bench.common.making import ARRAYS
 from csplat_bench.common.report import describe, table, write_json
 from csplat_bench.common.scenes import ROOT
-from csplat_tools.files.console import note
-from csplat_tools.files.streams import is_csplat
+from csplat_tools.console import note
+from csplat_tools.file_streams import is_csplat
 
 _ADAPTER = ROOT / "codec" / "js" / "test" / "adapter.mjs"
 

@@ -16,7 +16,7 @@ from csplat.errors import InputError
 from csplat_bench.common.measuring import peak_bytes, reset_peak
 from csplat_bench.common.peers import npm_pinned
 from csplat_bench.common.scenes import ROOT
-from csplat_tools.files.console import note
+from csplat_tools.console import note
 
 DRIVERS = Path(__file__).with_name("drivers")
 

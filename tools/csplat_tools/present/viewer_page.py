@@ -1,13 +1,4 @@
-"""Export one HTML file with a scene, the viewer and the decoder inside, which opens from a disk without a network.
-Also export one script with the viewer alone, for other pages.
-
-A page that was opened as `file:` may not import modules from neighbouring files, and its worker may not import at
-all: origins of such pages equal no other, not even that of their own blobs, which WebKit refuses to a worker's
-`import`, and Chromium to a worker that is a module. So the modules become functions of one classic script. The page
-runs it, and so does the worker, which is made from a blob of the same text; a function can read its own source. A
-policy in the page forbids the network. The page is ASCII: if a server declared another charset, the text would no
-longer match the digests in the policy.
-"""
+"""Export the viewer as one HTML page or one script."""
 
 from __future__ import annotations
 
@@ -19,8 +10,38 @@ import posixpath
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
-from csplat_tools.present.webroot import ELEMENT, PAGE, WORKER, web_files
+from csplat.errors import InputError
+
+#: Paths below the root: the page, the element for other pages, and the module that both start as a worker.
+PAGE = "tools/viewer/index.html"
+ELEMENT = "tools/viewer/element.mjs"
+WORKER = "tools/viewer/worker.mjs"
+
+_FOLDERS = {"tools/viewer": (".html", ".css", ".mjs"), "codec/js": (".mjs",)}
+
+
+def web_files() -> dict[str, Path]:
+    """Find every file that the page may load.
+
+    Returns:
+        Local files by their paths below the root, with slashes: `tools/viewer/index.html`, `codec/js/decoder.mjs`, ...
+
+    Raises:
+        InputError: the installation is not complete.
+    """
+    package = Path(__file__).resolve().parent.parent  # csplat_tools
+    for root in (package / "web", package.parent.parent):  # an installed wheel, a checkout
+        if (root / PAGE).is_file():
+            return {
+                f"{folder}/{path.name}": path
+                for folder, endings in _FOLDERS.items()
+                for path in sorted((root / folder).iterdir())
+                if path.suffix in endings
+            }
+    raise InputError("the page of the viewer is not installed: install csplat again")
+
 
 # Import statements: `import { a, b as c } from '…'`, `import * as a from '…'`, `import '…'`.
 _IMPORT = re.compile(
@@ -78,7 +99,7 @@ _SCENE = """\
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportedPage:
     """An exported page.
 
     Attributes:
@@ -92,7 +113,7 @@ class Exported:
     scene_bytes: int
 
 
-def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None) -> Exported:
+def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None) -> ExportedPage:
     """Put a scene, the viewer and the decoder into one page.
 
     Args:
@@ -124,7 +145,7 @@ def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None
     page, found = _POLICY.subn(lambda match: match[1] + _policy(style, script) + match[2], page)
     assert found == 1, "the page has one policy"
     data = page.encode("ascii", "xmlcharrefreplace")
-    return Exported(data, len(data) - len(coded), len(coded))
+    return ExportedPage(data, len(data) - len(coded), len(coded))
 
 
 def export_element() -> bytes:

@@ -36,7 +36,9 @@ def read_importance(path: str, model: SplatModel) -> NDArray[Any] | Importance |
     return read_sensitivity(path, model) if begin == _ZIP else read_array(path)
 
 
-def weights_of(found: NDArray[Any] | Importance | StoredSensitivity, model: SplatModel) -> NDArray[Any] | Importance:
+def encoder_importance(
+    found: NDArray[Any] | Importance | StoredSensitivity, model: SplatModel
+) -> NDArray[Any] | Importance:
     """Return the importance that the encoder takes, from the content of a file.
 
     Virtual views do not look from where the cameras of a surrounding scene were: they show too little of it to tell
@@ -54,9 +56,9 @@ def weights_of(found: NDArray[Any] | Importance | StoredSensitivity, model: Spla
     return weights
 
 
-def read_weights(path: str, model: SplatModel) -> NDArray[Any] | Importance:
+def read_encoder_importance(path: str, model: SplatModel) -> NDArray[Any] | Importance:
     """Read the importance that the encoder takes from a file, see `read_importance`."""
-    return weights_of(read_importance(path, model), model)
+    return encoder_importance(read_importance(path, model), model)
 
 
 def encode_by_importance(
@@ -80,7 +82,7 @@ def encode_by_importance(
     stored = found if isinstance(found, StoredSensitivity) else None
     if prune_unseen and stored is None:
         raise InputError("only what `csplat sensitivity` wrote says which splats no view saw")
-    weights = weights_of(found, model)
+    weights = encoder_importance(found, model)
     notes = _unheeded(options, weights)
     if not prune_unseen or stored is None or stored.seen.all():
         return _noted(encode_with_report(model, options, importance=weights, progress=progress), *notes)

@@ -20,7 +20,7 @@ from csplat.types import F64, Progress
 from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.pruning_error import PruningError, measure_pruning_error
-from csplat_tools.views import CHECKS, VIEW_SIZE, ViewSet, reduced
+from csplat_tools.views import HELD_OUT_COUNT, VIEW_SIZE, ViewSet, shrink_cameras
 
 _BATCH = 40  # virtual views that are added at a time
 # dB between the errors predicted for used and for held-out views, below which there are enough views. Fits overfit
@@ -30,7 +30,7 @@ _SETTLED = 0.005  # fraction of the splats that only the held-out views show, be
 
 
 @dataclass(frozen=True, eq=False)
-class AgreedViews:
+class SufficientViews:
     """Training views, held-out views, and the removal errors of a source.
 
     Attributes:
@@ -46,7 +46,7 @@ class AgreedViews:
     gap: float
 
 
-def find_views(
+def find_sufficient_views(
     model: SplatModel,
     views: ViewSet,
     gone: float,
@@ -54,7 +54,7 @@ def find_views(
     size: tuple[int, int] = VIEW_SIZE,
     threads: int | None = None,
     progress: Progress | None = None,
-) -> AgreedViews:
+) -> SufficientViews:
     """Take as many training views as needed, and measure the removal errors of the source from them.
 
     Args:
@@ -79,7 +79,7 @@ def find_views(
     if not views.teaches or not views.decides:
         found = len(views.teaches) + len(views.decides)
         raise InputError(f"{found} cameras, wanted 2 at least: one that teaches, one that decides")
-    every, check = reduced(views.teaches, size), reduced(views.decides, size)
+    every, check = shrink_cameras(views.teaches, size), shrink_cameras(views.decides, size)
     if views.virtual:
         # A choice has to be good on other views, too; this is checked on views of the same kind.
         every, check = _parted(every)
@@ -92,7 +92,7 @@ def find_views(
             break
         removal += measured(every[count : count + _BATCH])
         count = min(count + _BATCH, len(every))
-    return AgreedViews(every[:count], check, removal, _gap(model, removal, checked, gone))
+    return SufficientViews(every[:count], check, removal, _gap(model, removal, checked, gone))
 
 
 def _parted(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
@@ -100,12 +100,12 @@ def _parted(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
 
     The latter are taken evenly from the whole sequence: its beginning is not spread as evenly as all of it.
     """
-    count = min(CHECKS, len(cameras) - 1)
+    count = min(HELD_OUT_COUNT, len(cameras) - 1)
     aside = set(np.linspace(0, len(cameras) - 1, count + 2).astype(int)[1:-1].tolist())
     return [one for i, one in enumerate(cameras) if i not in aside], [cameras[i] for i in sorted(aside)]
 
 
-def removal_keys(opacities: NDArray[np.float32], removal: PruningError, *, keep_unseen: bool = True) -> F64:
+def pruning_keys(opacities: NDArray[np.float32], removal: PruningError, *, keep_unseen: bool = True) -> F64:
     """Return the keys by which splats are pruned, the smallest first.
 
     Args:
@@ -124,7 +124,7 @@ def removal_keys(opacities: NDArray[np.float32], removal: PruningError, *, keep_
 
 def _gap(model: SplatModel, used: PruningError, check: PruningError, gone: float) -> float:
     """Return by how many dB the predicted error of the splats to be pruned is larger in held-out views."""
-    keys = removal_keys(model.opacities, used)
+    keys = pruning_keys(model.opacities, used)
     order = np.argsort(keys, kind="stable")[: int(gone * len(model))]
     order = order[np.isfinite(keys[order])]
     there = float(np.sum(used.error[order])) / used.value_count

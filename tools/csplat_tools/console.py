@@ -1,12 +1,10 @@
-"""Data on standard output, everything else on standard error: messages, progress, tables.
-
-Progress is a bar on a terminal, elsewhere a line now and then. There is one standard error, so one display at a time.
-"""
+"""Print data on standard output, and messages, progress and tables on standard error."""
 
 from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 import threading
 import time
@@ -15,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TextIO, TypeVar
 
+from csplat.errors import InputError
 from csplat.types import Progress
 
 if TYPE_CHECKING:
@@ -34,20 +33,20 @@ _WORKING = "working"  # shown if no stage is known
 _MINUTES_FROM = 100.0  # seconds from which durations are given in minutes
 
 #: Work that takes more seconds than this is announced.
-WORTH_SAYING = 10.0
+LONG_WORK_SECONDS = 10.0
 
 
-def say(text: str) -> None:
+def print_data(text: str) -> None:
     """Print data."""
     _echo(text, sys.stdout)
 
 
-def say_json(value: Any) -> None:
+def print_json(value: Any) -> None:
     """Print a value as JSON. It must not contain NaN or infinities: JSON has none."""
-    say(json.dumps(value, indent=2, allow_nan=False))
+    print_data(json.dumps(value, indent=2, allow_nan=False))
 
 
-def finite(value: float | None) -> float | None:
+def finite_or_none(value: float | None) -> float | None:
     """Return the value; `None` for NaN and infinities, which JSON does not have."""
     return value if value is not None and math.isfinite(value) else None
 
@@ -57,7 +56,7 @@ def note(text: str) -> None:
     _echo(text, sys.stderr)
 
 
-class Step(Protocol):
+class RunProgress(Protocol):
     """The progress of a long run: the current iteration, and the number of all."""
 
     @property
@@ -69,7 +68,7 @@ class Step(Protocol):
         """Return the number of all iterations."""
 
 
-S = TypeVar("S", bound=Step)
+S = TypeVar("S", bound=RunProgress)
 
 
 @contextmanager
@@ -105,7 +104,7 @@ def step_progress(
         if len(told) == _TOLD:  # the first steps load and compile: their time is not that of the others
             (begun, first), (seconds, last) = told[0], told[-1]
             left = (seconds - begun) / max(1, last - first) * (now.iterations - last)
-            if left > WORTH_SAYING:
+            if left > LONG_WORK_SECONDS:
                 note(f"{name} takes about {format_range(_SPREAD[0] * left, _SPREAD[1] * left)} from here")
         if display is not None:
             display.tell(name, now.iteration / now.iterations, tell(now))
@@ -222,7 +221,7 @@ def format_seconds(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < _MINUTES_FROM else f"{seconds / 60.0:.0f} minutes"
 
 
-def format_about(seconds: float) -> str:
+def format_estimate(seconds: float) -> str:
     """Format an estimated duration as a range: `20 to 50 s`."""
     return format_range(_ABOUT[0] * seconds, _ABOUT[1] * seconds)
 
@@ -239,7 +238,7 @@ _displays: list[Display] = []  # the display that is shown, at most one: there i
 
 @contextmanager
 def displayed(display: Display) -> Iterator[Display]:
-    """Show progress on this display until the end; `say` and `note` take its bars away first."""
+    """Show progress on this display until the end; `print_data` and `note` take its bars away first."""
     _displays.append(display)
     try:
         yield display
@@ -303,3 +302,26 @@ def _echo(text: str, stream: TextIO) -> None:
         display.close()  # bars and lines on one terminal do not mix
     encoding = stream.encoding or "utf-8"  # file names and metadata may hold characters that it cannot represent
     stream.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
+
+
+#: A regular expression for a number, which is its first group.
+NUMBER = r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
+
+_UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
+_LEAST_FILE = 64  # bytes of a file's header: no file is smaller
+
+
+def parse_size_bytes(text: str) -> int:
+    """Parse a number of bytes from `5MB`, `300 kB`, `1.5MiB` or `123456`; MB is 10⁶, MiB is 2²⁰.
+
+    Raises:
+        InputError: the text is not a size, or is smaller than any file.
+    """
+    found = re.fullmatch(NUMBER + r"\s*([kmg]?i?b?)", text.strip(), re.IGNORECASE)
+    unit = None if found is None else _UNITS.get(found[2].lower())
+    size = None if found is None or unit is None else float(found[1]) * unit
+    if size is None or not 1.0 <= size < 2.0**63:
+        raise InputError(f"a size is {text!r}, wanted bytes, or a number with kB, MB, GB, KiB, MiB or GiB")
+    if size < _LEAST_FILE:
+        raise InputError(f"no file has {size:.0f} bytes or fewer; did you mean {text.strip()}MB?")
+    return int(size)

@@ -1,7 +1,4 @@
-"""Place virtual training cameras: many, small, and evenly spread at any count; reduce the user's own to that size.
-
-Many small renders overfit less than few large ones with the same number of pixels.
-"""
+"""Place virtual cameras around a scene."""
 
 from __future__ import annotations
 
@@ -11,22 +8,32 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from csplat.model import SplatModel
 from csplat.types import F64
 from csplat_render import Camera
-from csplat_render.camera import direction_at, intrinsics, look_at
-from csplat_render.virtual_cameras import FIELD_OF_VIEW, HIDING, SceneFrame, detail, is_clear, sample_cloud, scene_frame
+from csplat_render.camera import direction_at, intrinsics, look_at, relative_to
+from csplat_render.virtual_cameras import (
+    FIELD_OF_VIEW,
+    HIDING,
+    SceneFrame,
+    detail,
+    is_clear,
+    sample_cloud,
+    scene_frame,
+    virtual_cameras,
+)
 
 T = TypeVar("T")
 
 #: Default number of virtual training views, and width and height of their renders, pixels, for small scenes; for larger
-#: ones see `usual_views`.
+#: ones see `default_views`.
 VIEW_COUNT = 160
 VIEW_SIZE = (240, 180)
 
 #: Number of virtual views in addition to those requested, with which choices made on the others are checked.
-CHECKS = 16
+HELD_OUT_COUNT = 16
 
 
 @dataclass(frozen=True)
@@ -62,7 +69,7 @@ _CANDIDATES = 3  # candidates for each view
 _STEPS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)  # powers of 1 / the root of x⁴ = x + 1
 
 
-def usual_views(splats: int) -> tuple[int, tuple[int, int]]:
+def default_views(splats: int) -> tuple[int, tuple[int, int]]:
     """Return the default number of virtual training views, and their width and height, by the number of splats.
 
     The cost of a render grows with splats, not with pixels: for many splats, fewer and larger views are more efficient.
@@ -105,7 +112,7 @@ def camera_sequence(model: SplatModel, count: int, size: tuple[int, int] = VIEW_
     return [cameras[i] for i in [*good, *rest][:count]]
 
 
-def reduced(cameras: Sequence[Camera], size: tuple[int, int] = VIEW_SIZE) -> list[Camera]:
+def shrink_cameras(cameras: Sequence[Camera], size: tuple[int, int] = VIEW_SIZE) -> list[Camera]:
     """Reduce views to about as many pixels as `size` has, if they have more."""
     smaller = []
     for camera in cameras:
@@ -151,7 +158,41 @@ def _in_surroundings(frame: SceneFrame, number: int, point: F64, K: F64, size: t
     return look_at(eye, target, frame.up, K, *size, frame.near)
 
 
-def evenly(those: Sequence[T], most: int) -> list[T]:
+def evenly_spaced(those: Sequence[T], most: int) -> list[T]:
     """Return at most `most` of some items, evenly spread over their order."""
     places = np.linspace(0, len(those) - 1, min(most, len(those))).round().astype(int)
     return [those[i] for i in places]
+
+
+_SEED = 2000  # seed of these views; validation views use 1000 and more
+_NEARER, _FARTHER = (0.6, 0.7, 0.8, 0.9), 2.0  # factors of the distance from the middle of the scene
+# points that are sampled from the scene
+
+
+def extra_test_cameras(source: SplatModel) -> dict[str, list[Camera]]:
+    """Place virtual cameras like those of `psnr` at other places, and the same nearer to and farther from the middle.
+
+    Nearer ones stay outside of the objects that they look at.
+
+    Args:
+        source: the scene; its own cameras are not used.
+
+    Returns:
+        12 cameras of each kind: `beside`, `nearer`, `farther`.
+    """
+    frame = scene_frame(source)
+    beside = virtual_cameras(source, *VIRTUAL_SIZES.elsewhere, seed=_SEED)
+    found = {"beside": beside, "farther": [_at(camera, frame.centre, _FARTHER) for camera in beside]}
+    if not len(source):
+        return {**found, "nearer": beside}
+    cloud = sample_cloud(source, _POINTS, np.random.default_rng(_SEED))
+    tried = [[_at(camera, frame.centre, times) for times in _NEARER] + [camera] for camera in beside]
+    nearer = [next((one for one in those if is_clear(frame, cloud, one)), those[-1]) for those in tried]
+    return {**found, "nearer": nearer}
+
+
+def _at(camera: Camera, centre: NDArray[np.float64], times: float) -> Camera:
+    """Return the camera with its distance from a centre multiplied."""
+    turn = camera.viewmat[:3, :3]
+    eye = -turn.T @ camera.viewmat[:3, 3]
+    return relative_to((1.0 - times) * (eye - centre), camera)

@@ -6,7 +6,7 @@ import os
 from importlib import import_module
 
 from csplat.errors import missing
-from csplat_tools.files.console import note, progress_bar
+from csplat_tools.console import note, progress_bar
 
 _FRUGAL_SPINS = "1000"  # see _wait_frugally
 _PHOTOGRAPHS = (
@@ -16,7 +16,7 @@ _PHOTOGRAPHS = (
 )  # modules needed to read and render photographs, with the package's name if it is another
 
 
-def need_renderer() -> None:
+def require_renderer() -> None:
     """Import the package that rendering needs, to fail before the minutes that reading may take.
 
     Raises:
@@ -40,7 +40,7 @@ def prepare_renderer(
     Raises:
         InputError: numba is not installed.
     """
-    need_renderer()
+    require_renderer()
     from csplat_render.warmup import warm_up
 
     others = [_warm_up_adam] if simplify else []
@@ -55,7 +55,7 @@ def prepare_renderer(
             tell("preparing the renderer", 1.0)
 
 
-def need_trainer(*, plots: bool = False) -> None:
+def require_trainer(*, plots: bool = False) -> None:
     """Import the packages that training on the CPU needs (not torch), after setting how OpenMP threads wait.
 
     Args:
@@ -65,12 +65,12 @@ def need_trainer(*, plots: bool = False) -> None:
         InputError: a package is not installed.
     """
     _wait_frugally()
-    need_photographs()
+    require_photographs()
     if plots:
-        need_plots()
+        require_plots()
 
 
-def need_pictures() -> None:
+def require_images() -> None:
     """Import the package that writing images needs.
 
     Raises:
@@ -79,7 +79,7 @@ def need_pictures() -> None:
     _need("PIL", "pillow")
 
 
-def need_film() -> None:
+def require_film() -> None:
     """Import the package that writing MP4 needs.
 
     Raises:
@@ -88,7 +88,7 @@ def need_film() -> None:
     _need("av", extra="film")
 
 
-def need_plots() -> None:
+def require_plots() -> None:
     """Import the package that drawing plots needs.
 
     Raises:
@@ -97,7 +97,7 @@ def need_plots() -> None:
     _need("matplotlib")
 
 
-def need_photographs() -> None:
+def require_photographs() -> None:
     """Import the packages that reading data sets needs.
 
     Raises:

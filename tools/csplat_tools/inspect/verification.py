@@ -15,14 +15,14 @@ from csplat.model import MAX_SH_DEGREE
 from csplat.types import Progress
 from csplat_conformance.stated import Proof, Source, fits_memory, prove, prove_by_disk
 from csplat_conformance.validator import Validation, validate
-from csplat_tools.files.scenes import size_of
-from csplat_tools.files.streams import mapped_csplat, source_path
+from csplat_tools.file_streams import mapped_csplat, source_path
+from csplat_tools.scene_files import size_on_disk
 
 _INDEX_BYTES = 1 << 27  # largest size of a source index, which is read as a whole
 
 
 @dataclass(frozen=True)
-class Verified:
+class Verification:
     """The outcome of verifying a file.
 
     Attributes:
@@ -65,7 +65,7 @@ def verify_file(
     max_splats: int | None = None,
     memory_bytes: int | None = None,
     progress: Progress | None = None,
-) -> Verified:
+) -> Verification:
     """Look for every violation in a file; if there is none and a source is given, verify its declared errors.
 
     Args:
@@ -85,8 +85,8 @@ def verify_file(
     with mapped_csplat(path) as data:
         validation = validate(data, splats_max=max_splats, progress=progress)
         if source is None or not validation.conforms:
-            return Verified(validation, None)
-        return Verified(validation, _proved(data, source, rows, memory_bytes, progress))
+            return Verification(validation, None)
+        return Verification(validation, _proved(data, source, rows, memory_bytes, progress))
 
 
 def _proved(
@@ -96,7 +96,7 @@ def _proved(
     header, stated = opened.header, opened.declared_bounds
     degree = MAX_SH_DEGREE  # bands above cannot be encoded, and declared errors do not include them
     with source_path(source) as local:
-        if fits_memory(opened, stated.source_count if stated else 0, size_of(local), memory_bytes):
+        if fits_memory(opened, stated.source_count if stated else 0, size_on_disk(local), memory_bytes):
             model = formats.read(local, keep_extra=bool(header.extras), sh_degree=degree)
             return prove(Source.of(model), decode(data), header, stated, rows, progress=progress)
         with formats.open_scene(local, sh_degree=degree) as scene:

@@ -37,7 +37,7 @@ _READING = 0.6  # fraction of the time of a render that reading takes, for progr
 
 
 @dataclass(frozen=True, eq=False)
-class Sliced:
+class SlicedScene:
     """A scene that is drawn without being in memory.
 
     A render takes as much disk space as the arrays of its visible splats, in an unnamed file in the folder for
@@ -102,13 +102,15 @@ class Sliced:
         """
         if mode == "exact":
             raise InputError("mode exact wants the scene in memory, and it does not fit: take standard")
-        return lambda camera: _Picture(self, camera, background, mode, threads).drawn()
+        return lambda camera: _SlicedRender(self, camera, background, mode, threads).drawn()
 
 
-class _Picture:
+class _SlicedRender:
     """A render in progress. Owns the state of its pixels."""
 
-    def __init__(self, scene: Sliced, camera: Camera, background: ArrayLike, mode: Mode, threads: int | None) -> None:
+    def __init__(
+        self, scene: SlicedScene, camera: Camera, background: ArrayLike, mode: Mode, threads: int | None
+    ) -> None:
         from csplat_render.rasteriser import Rasteriser  # numba takes a second to import
 
         self._scene, self._camera, self._background = scene, camera, background

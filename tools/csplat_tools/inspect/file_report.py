@@ -10,12 +10,18 @@ from pathlib import PurePath
 
 from csplat.decoder import DeclaredBounds, decode
 from csplat.types import Progress
-from csplat_tools.files.console import format_bytes
-from csplat_tools.files.scenes import LoadedModel, load_model
-from csplat_tools.files.streams import STANDARD_STREAM, write_bytes
-from csplat_tools.html_report import attribute_figure, definitions, document, table
-from csplat_tools.inspect.info import FileFacts
-from csplat_tools.inspect.words import coding_words, headline, other_metadata, scene_words
+from csplat_tools.console import format_bytes
+from csplat_tools.file_streams import STANDARD_STREAM, write_bytes
+from csplat_tools.inspect.file_description import (
+    FileDescription,
+    describe_coding,
+    describe_scene,
+    format_headline,
+    other_metadata,
+)
+from csplat_tools.pages.bars import attribute_figure
+from csplat_tools.pages.parts import definitions, document, table
+from csplat_tools.scene_files import LoadedModel, load_model
 
 _ATTRIBUTES = {
     "opacities": "how dense each splat is",
@@ -55,7 +61,7 @@ _SCENE = {
 
 
 @dataclass(frozen=True)
-class _Beside:
+class _SourceComparison:
     """The results of a comparison with the source, as text and HTML."""
 
     facts: dict[str, str]
@@ -66,7 +72,7 @@ def write_page(
     path: str,
     name: str,
     data: bytes | mmap,
-    facts: FileFacts,
+    facts: FileDescription,
     source: str | None = None,
     *,
     progress: Progress | None = None,
@@ -90,13 +96,13 @@ def write_page(
     write_bytes(path, make_page(title, facts, beside).encode())
 
 
-def make_page(title: str, facts: FileFacts, beside: _Beside | None = None) -> str:
+def make_page(title: str, facts: FileDescription, beside: _SourceComparison | None = None) -> str:
     """Return the page as HTML: the same for the same file and source."""
     count = facts.header.splat_count
     return document(
         f"{title}: what is in it",
         [
-            f'<h1>{escape(title)}</h1>\n<p class="quiet">{escape(f"{count:,} splats; {headline(facts)}")}</p>',
+            f'<h1>{escape(title)}</h1>\n<p class="quiet">{escape(f"{count:,} splats; {format_headline(facts)}")}</p>',
             _source(beside),
             _bytes(facts),
             _layers(facts),
@@ -106,15 +112,15 @@ def make_page(title: str, facts: FileFacts, beside: _Beside | None = None) -> st
     )
 
 
-def _compared(data: bytes | mmap, source: str, progress: Progress | None) -> _Beside:
+def _compared(data: bytes | mmap, source: str, progress: Progress | None) -> _SourceComparison:
     """Render file and source: from the views of `psnr` for the scores, and from others to show the hardest place."""
     from csplat_render.scorer import Scorer
-    from csplat_tools.hardest_place import IMAGES_NOTE, HardestPlaceSearch, piece_images
-    from csplat_tools.views import find_view_set, showing_cameras
+    from csplat_tools.pages.hardest import PICTURES, HardestPlace, picture_row
+    from csplat_tools.views import display_cameras, find_view_set
 
     loaded, model = load_model(source), decode(data)
     views = find_view_set(loaded.model, count=0)
-    hardest, shown = HardestPlaceSearch(), showing_cameras(loaded.model, views)
+    hardest, shown = HardestPlace(), display_cameras(loaded.model, views)
     scores = views.judge(loaded.model).scores(model, progress=progress)
     showing = Scorer.of_source(loaded.model, shown, views.judging_background)
     showing.scores(model, ssim=False, on_view=hardest.look)
@@ -127,7 +133,7 @@ def _compared(data: bytes | mmap, source: str, progress: Progress | None) -> _Be
         "worst view": f"{scores.psnr_worst:.2f} dB",
         "SSIM": f"{scores.ssim:.4f}: likeness of structure, 1 at best",
     }
-    return _Beside(facts, f"<p>{escape(IMAGES_NOTE)}</p>\n{piece_images(place, 'the file')}")
+    return _SourceComparison(facts, f"<p>{escape(PICTURES)}</p>\n{picture_row(place, 'the file')}")
 
 
 def _source_words(path: str, source: LoadedModel, size_bytes: int) -> str:
@@ -136,17 +142,17 @@ def _source_words(path: str, source: LoadedModel, size_bytes: int) -> str:
     return f"{name}: {len(source.model):,} splats, {format_bytes(source.size_bytes)}, {times}"
 
 
-def _source(beside: _Beside | None) -> str:
+def _source(beside: _SourceComparison | None) -> str:
     if beside is None:
         return ""
     return f"<h2>Beside its source</h2>\n{definitions(beside.facts)}\n<h3>The hardest place</h3>\n{beside.pictures}"
 
 
-def _bytes(facts: FileFacts) -> str:
+def _bytes(facts: FileDescription) -> str:
     sizes = {name: one.size_bytes for name, one in facts.attributes.items()}
     sizes["overhead"] = sum(facts.overhead.values())
     rows = [
-        (name, _ATTRIBUTES.get(name, ""), f"{one.size_bytes:,}", _bits(one.bits_per_splat), coding_words(one))
+        (name, _ATTRIBUTES.get(name, ""), f"{one.size_bytes:,}", _bits(one.bits_per_splat), describe_coding(one))
         for name, one in facts.attributes.items()
     ]
     overhead = ", ".join(f"{name} {number}" for name, number in facts.overhead.items())
@@ -155,7 +161,7 @@ def _bytes(facts: FileFacts) -> str:
     return f"<h2>Where the bytes are</h2>\n{attribute_figure(sizes)}\n{table(head, rows, words=(1, 4))}"
 
 
-def _layers(facts: FileFacts) -> str:
+def _layers(facts: FileDescription) -> str:
     rows = [
         (name, _LAYERS.get(name, ""), f"{one.size_bytes:,}", f"{100.0 * one.size_bytes / facts.header.file_size:.1f} %")
         for name, one in facts.layers.items()
@@ -179,9 +185,9 @@ def _stated(stated: DeclaredBounds) -> str:
     return f"<h2>How exact it says it is</h2>\n<p>{escape(text)} {_CHECK}</p>\n{errors}"
 
 
-def _scene(facts: FileFacts) -> str:
+def _scene(facts: FileDescription) -> str:
     words = {
-        (f"{name} ({_SCENE[name]})" if name in _SCENE else name): value for name, value in scene_words(facts).items()
+        (f"{name} ({_SCENE[name]})" if name in _SCENE else name): value for name, value in describe_scene(facts).items()
     }
     for title, value in (("options of the encoder", facts.options), ("metadata", other_metadata(facts))):
         if value:

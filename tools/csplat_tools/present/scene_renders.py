@@ -18,10 +18,9 @@ from csplat_render.camera import resized
 from csplat_render.camera_files import load_cameras
 from csplat_render.camera_paths import orbit_cameras
 from csplat_render.conventions import RenderResult
-from csplat_tools.files.extras import need_pictures, need_renderer
-from csplat_tools.files.pictures import check_folder, picture_names, to_bytes, write_png
-from csplat_tools.files.streams import check_output, write_array
-from csplat_tools.present.film import check_film, write_film
+from csplat_tools.file_streams import check_output, write_array
+from csplat_tools.optional_packages import require_images, require_renderer
+from csplat_tools.render_files import check_film, image_names, make_output_folder, to_uint8, write_film, write_png
 from csplat_tools.views import BLACK, Colour, DataOptions, Split, find_view_set
 
 _DEFAULT_SIZE = (640, 480)
@@ -115,22 +114,22 @@ def render_folder(
         InputError: a file exists; or the renderer is not installed.
         OSError: a file cannot be written.
     """
-    need_renderer()
-    need_pictures()
-    names = picture_names([camera.image for camera in cameras])
+    require_renderer()
+    require_images()
+    names = image_names([camera.image for camera in cameras])
     endings = [".png", *([".depth.npy"] if depth else []), *([".alpha.png"] if alpha else [])]
     is_new = not Path(folder).exists()
-    target = check_folder(folder, [name + ending for name in names for ending in endings], force=force)
+    target = make_output_folder(folder, [name + ending for name in names for ending in endings], force=force)
     files, ignored = [], 0
     with _removed_if_empty(target if is_new else None):
         pictures = _pictures(model, cameras, background, mode, prepare, progress)
         for name, result in zip(names, pictures, strict=True):
             ignored = max(ignored, result.ignored)
             files.append(target / f"{name}.png")
-            write_png(files[-1], to_bytes(result.rgb))
+            write_png(files[-1], to_uint8(result.rgb))
             if alpha:
                 files.append(target / f"{name}.alpha.png")
-                write_png(files[-1], to_bytes(result.alpha))
+                write_png(files[-1], to_uint8(result.alpha))
             if depth:
                 files.append(target / f"{name}.depth.npy")
                 write_array(str(files[-1]), _mean_depth(result.depth, result.alpha))
@@ -163,13 +162,13 @@ def render_film(
         InputError: the file exists, or its format cannot hold these frames; or the renderer is not installed.
         OSError: the file cannot be written.
     """
-    need_renderer()
+    require_renderer()
     check_output(path, force=force)
     check_film(path, [(camera.W, camera.H) for camera in cameras], fps)
     frames, ignored = [], 0
     for result in _pictures(model, cameras, background, mode, prepare, progress):
         ignored = max(ignored, result.ignored)
-        frames.append(to_bytes(result.rgb))
+        frames.append(to_uint8(result.rgb))
     write_film(path, frames, fps)
     return Rendered((Path(path),), ignored)
 

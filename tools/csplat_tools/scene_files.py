@@ -1,4 +1,4 @@
-"""Read scenes in any format, for commands that look at splats."""
+"""Read scenes in any format, and override their metadata."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ from csplat.lint import Finding, dropped_columns
 from csplat.memory import available_bytes, default_bytes
 from csplat.model import SplatModel
 from csplat.scene import Scene, joined, without_bands
-from csplat.types import Progress
-from csplat_tools.files.streams import is_csplat, kept_path, local_path, mapped_csplat, naming
+from csplat.types import Progress, null_progress
+from csplat.upright import Direction, with_up
+from csplat_tools.file_streams import is_csplat, kept_path, local_path, mapped_csplat, naming, source_path
 
 #: Names of files that stand for the whole folder they are in: SOG as a folder, and with levels.
 FOLDER_NAMES = ("meta.json", "lod-meta.json")
 
 #: Formats that unpack nothing when they are opened, and whose readers take all splats at once in fewer passes.
-READ_ANEW = ("ply", "csplat")
+CHEAP_TO_REOPEN = ("ply", "csplat")
 _SMALL = 1 << 20  # bytes: a file up to this size, in any format, fits in every memory
 #: Bytes that a comparison takes in addition to the scenes' arrays: for the program, and per splat drawn and searched.
 _BASE_BYTES, _SPLAT_BYTES = 200_000_000, 320
@@ -177,7 +178,7 @@ def load_model(scene: SceneLike, *, sh_degree: int | None = None) -> LoadedModel
 
 
 def _loaded(local: Path, sh_degree: int | None = None) -> LoadedModel:
-    size_bytes, name, free = size_of(local), local.name, available_bytes()
+    size_bytes, name, free = size_on_disk(local), local.name, available_bytes()
     if not is_csplat(local):
         if size_bytes > free:
             raise LimitError("memory for all splats at once", size_bytes, free)
@@ -189,8 +190,41 @@ def _loaded(local: Path, sh_degree: int | None = None) -> LoadedModel:
     return LoadedModel(decoded.model, size_bytes, decoded.header, decoded.declared_bounds, name)
 
 
+def read_source(
+    file: File,
+    facts: MetadataOverrides | None = None,
+    *,
+    strict: bool = False,
+    keep_extra: bool = False,
+    sh_degree: int | None = None,
+    progress: Progress | None = None,
+) -> LoadedModel:
+    """Read a scene in any format, and repair defects if that is safe.
+
+    Args:
+        file: a path, or `-`; an open binary file; or bytes.
+        facts: overrides of the scene's metadata.
+        strict: refuse defects that would be repaired.
+        keep_extra: carry columns that splats do not have.
+        sh_degree: leave out the SH bands above, even of a file of a higher degree than 3; `None`: keep all.
+        progress: progress callback.
+
+    Raises:
+        CsplatError: the scene is not usable.
+        OSError: the scene cannot be read.
+    """
+    findings: list[Finding] = []
+    report = progress or null_progress
+    report("reading", 0.0)
+    with source_path(file) as local:
+        model = formats.read(local, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=findings)
+        size_bytes, name = size_on_disk(local), local.name
+    report("reading", 1.0)
+    return LoadedModel((facts or MetadataOverrides()).applied(model), size_bytes, name=name, findings=tuple(findings))
+
+
 @contextmanager
-def opened_scenes(
+def open_scenes(
     given: Sequence[SceneLike | OpenedScene], memory_bytes: int | None = None
 ) -> Iterator[Sequence[LoadedModel] | Sequence[OpenedScene]]:
     """Read scenes that are to be compared: all into memory, or none if they do not fit together.
@@ -220,14 +254,16 @@ def opened_scenes(
             if not isinstance(one, (SplatModel, LoadedModel, OpenedScene)):
                 with naming(one):
                     local[place] = stack.enter_context(kept_path(one))
-        looked_at = memory_bytes is not None or any(size_of(path) > _SMALL for path in local.values())
+        looked_at = memory_bytes is not None or any(size_on_disk(path) > _SMALL for path in local.values())
         if len(local) == len(given) and looked_at:
             opening = stack.enter_context(ExitStack())
             found = [_opened(opening, given[place], path, bound) for place, path in local.items()]
             if _together_bytes(found) > bound:
                 yield found
                 return
-            fits = {place: _in_memory(one) for place, one in enumerate(found) if one.scene.format not in READ_ANEW}
+            fits = {
+                place: _in_memory(one) for place, one in enumerate(found) if one.scene.format not in CHEAP_TO_REOPEN
+            }
             opening.close()
             del found
         loaded = []
@@ -251,7 +287,7 @@ def _opened(stack: ExitStack, given: object, path: Path, bound: int) -> OpenedSc
         with naming(given):
             yield from scene.blocks()
 
-    return OpenedScene(replace(scene, blocks=blocks), size_of(path), path, bound)
+    return OpenedScene(replace(scene, blocks=blocks), size_on_disk(path), path, bound)
 
 
 def _in_memory(opened: OpenedScene) -> LoadedModel:
@@ -265,13 +301,18 @@ def _together_bytes(found: Sequence[OpenedScene]) -> float:
     return _BASE_BYTES + arrays + _SPLAT_BYTES * max(one.count for one in found)
 
 
-def size_of(path: Path) -> int:
+def size_on_disk(path: Path) -> int:
     """Return the size in bytes of a file, or of all files of a folder."""
     if path.name.lower() in FOLDER_NAMES:
         path = path.parent
     if not path.is_dir():
         return path.stat().st_size
     return sum(one.stat().st_size for one in path.rglob("*") if one.is_file())
+
+
+def findings_as_json(findings: tuple[Finding, ...] | list[Finding]) -> list[dict[str, Any]]:
+    """Return findings as JSON-compatible values."""
+    return [{"id": one.id, "kind": one.kind, "count": one.count, "text": one.text} for one in findings]
 
 
 def ply_splat_bytes(sh_degree: int) -> int:
@@ -282,7 +323,7 @@ def ply_splat_bytes(sh_degree: int) -> int:
     return 4 * (14 + 3 * (sh_degree + 1) ** 2)
 
 
-def watched(scene: Scene, stage: str, progress: Progress | None) -> Scene:
+def with_progress(scene: Scene, stage: str, progress: Progress | None) -> Scene:
     """Return the scene with blocks that report progress while they are iterated over to be written."""
     if progress is None:
         return scene
@@ -295,7 +336,7 @@ def watched(scene: Scene, stage: str, progress: Progress | None) -> Scene:
     return replace(scene, blocks=blocks)
 
 
-def without_extra(scene: Scene) -> Scene:
+def without_extra_columns(scene: Scene) -> Scene:
     """Leave out the columns that splats do not have."""
     if not scene.facts.extra:
         return scene
@@ -304,3 +345,34 @@ def without_extra(scene: Scene) -> Scene:
         facts=replace(scene.facts, extra={}),
         blocks=lambda: (replace(model, extra={}) for model in scene.blocks()),
     )
+
+
+@dataclass(frozen=True)
+class MetadataOverrides:
+    """Overrides of a scene's metadata, which a PLY may lack; `None` keeps the file's own.
+
+    Attributes:
+        coordinate_system, unit_metres, antialiased: as in `SplatModel`.
+        licence: text for the metadata.
+        up: the direction that is up, see `with_up`.
+    """
+
+    coordinate_system: str | None = None
+    unit_metres: float | None = None
+    antialiased: bool | None = None
+    licence: str | None = None
+    up: Direction | None = None
+
+    def applied(self, model: SplatModel) -> SplatModel:
+        """Return the model with these overrides."""
+        changes: dict[str, Any] = {
+            name: value for name in ("unit_metres", "antialiased") if (value := getattr(self, name)) is not None
+        }
+        if self.licence is not None:
+            changes["metadata"] = {**model.metadata, "licence": self.licence}
+        model = replace(model, **changes) if changes else model
+        return with_up(model, self.up, self.coordinate_system)
+
+    def applied_to_all(self, scene: Scene) -> Scene:
+        """Return the scene with these overrides."""
+        return replace(scene, facts=self.applied(scene.facts), blocks=lambda: map(self.applied, scene.blocks()))

@@ -1,4 +1,4 @@
-"""`python -m csplat_tools.cli.serving`: a worker process of `csplat batch` that runs commands one after the other.
+"""`python -m csplat_tools.cli.batch_worker`: a worker process of `csplat batch` that runs commands one after the other.
 
 A request is a line of JSON on standard input, its answer one on standard output. When the input ends so does the
 process, even in the middle of a command: the parent is gone.
@@ -28,7 +28,7 @@ from csplat.system import interrupt_main_thread
 from csplat_tools.batches.batch_page import prepare_thumbnails, write_thumbnail
 from csplat_tools.batches.scene_job import inspect_scene
 from csplat_tools.cli.app import app, command_function
-from csplat_tools.cli.console import FAILED, WrongCommandLine
+from csplat_tools.cli.command import EXIT_FAILED, UsageError
 
 _ERROR = "error: "
 _CODE = re.compile(r"\b(E_[A-Z0-9_]+)\b|\((E[A-Z]+)\)$")
@@ -101,7 +101,7 @@ def _check(words: Sequence[str]) -> dict[str, Any]:
             context = command.make_context(f"csplat {name}", ["IN", "OUT", *rest])
             given = [one for one in context.params if _is_given(context, one)]
             command.invoke(context)
-    except WrongCommandLine as error:
+    except UsageError as error:
         return {"wrong": f"csplat {name}: " + " ".join(error.format_message().split())}  # type: ignore[attr-defined]
     except (typer.Exit, SystemExit):
         return {"wrong": f"csplat {name}: what is no option for work, as --help, says nothing here"}
@@ -135,12 +135,12 @@ def _run(words: Sequence[str], thumbnail: str = "", scenes: Sequence[str] = ()) 
     out, err = io.StringIO(), io.StringIO()
     _forget_peak()
     begun = time.perf_counter()
-    status = FAILED
+    status = EXIT_FAILED
     with redirect_stdout(out), redirect_stderr(err):
         try:
             app(list(words), prog_name="csplat")
         except SystemExit as end:
-            status = end.code if isinstance(end.code, int) else FAILED if end.code else 0
+            status = end.code if isinstance(end.code, int) else EXIT_FAILED if end.code else 0
         except Exception as error:  # noqa: BLE001  # a defect of csplat: it is reported for this scene, and the batch goes on
             err.write(traceback.format_exc() + f"{_ERROR}a defect of csplat: {error!r} (E_DEFECT)\n")
     seconds = time.perf_counter() - begun

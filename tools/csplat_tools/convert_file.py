@@ -1,0 +1,343 @@
+"""Convert scene files between formats, and filter their splats on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.decoder import Limits, open_tiles
+from csplat.errors import InputError
+from csplat.formats import Format, formats, named, named_by, open_scene
+from csplat.formats.format import ARRAYS
+from csplat.lint import Finding
+from csplat.model import SplatModel
+from csplat.scene import Scene, without_bands
+from csplat.turning import in_axes, moved, scaled, turned
+from csplat.types import F64, Mask, Progress
+from csplat_tools.file_streams import is_one_way, local_path, mapped_csplat, write_model
+from csplat_tools.scene_files import MetadataOverrides, findings_as_json, size_on_disk, with_progress
+
+_CELL = 0.01  # fraction of a scene's extent: distance within which neighbours count for any splat
+_SPREAD = 4.0  # standard deviations of a splat: distance within which neighbours count if that is farther
+_COMPANY = 8  # number of splats, itself included: with fewer in its neighbourhood a splat is a floater
+
+
+@dataclass(frozen=True)
+class Filters:
+    """Changes of a scene, applied in the order of the fields; `None` and False change nothing.
+
+    Attributes:
+        to_axes: turn the scene to these axes, as in `SplatModel`; a scene without axes is taken to have x right,
+            y down, z forward.
+        rotate: rotate about x, y, z in this order, degrees, counter-clockwise as seen from the tip of the axis.
+        scale: factor by which the scene is enlarged about the origin of its coordinates.
+        translate: offset added to all positions, scene units.
+        crop_box: keep splats whose centres lie between two corners, x y z each.
+        crop_sphere: keep splats whose centres lie within a sphere, x y z and radius.
+        drop_floaters: drop splats that have next to no others around them.
+        sh_degree: leave out the SH bands above.
+    """
+
+    to_axes: str | None = None
+    rotate: tuple[float, float, float] | None = None
+    scale: float | None = None
+    translate: tuple[float, float, float] | None = None
+    crop_box: tuple[float, ...] | None = None
+    crop_sphere: tuple[float, ...] | None = None
+    drop_floaters: bool = False
+    sh_degree: int | None = None
+
+    def applied(self, scene: Scene) -> Scene:
+        """Return the changed scene."""
+        if self.to_axes is not None:
+            scene = in_axes(scene, self.to_axes)
+        if self.rotate is not None:
+            matrix = _rotation(self.rotate)
+            scene = _changed(scene, lambda model: turned(model, matrix))
+        if self.scale is not None:
+            factor = self.scale
+            scene = _changed(scene, lambda model: scaled(model, factor))
+        if self.translate is not None:
+            offset = self.translate
+            scene = _changed(scene, lambda model: moved(model, offset))
+        if self.crop_box is not None:
+            corners = np.sort(np.array(self.crop_box).reshape(2, 3), axis=0)
+            scene = _kept(scene, lambda model: _inside_box(model, corners))
+        if self.crop_sphere is not None:
+            sphere = np.array(self.crop_sphere)
+            scene = _kept(scene, lambda model: _inside_sphere(model, sphere))
+        if self.drop_floaters:
+            scene = _without_floaters(scene)
+        if self.sh_degree is not None:
+            degree = self.sh_degree
+            scene = _changed(scene, lambda model: without_bands(model, degree))
+        return scene
+
+
+def find_floaters(points: F64, sizes: F64) -> Mask:
+    """Find splats with next to no others around them: within 1 % of the extent, or four times their own size.
+
+    Args:
+        points: [N, 3] centres.
+        sizes: [N] standard deviations, scene units.
+
+    Returns:
+        [N] bool, True for isolated splats.
+    """
+    if len(points) < _COMPANY:
+        return np.zeros(len(points), np.bool_)
+    low, high = np.quantile(points, [0.05, 0.95], axis=0)
+    extent = float(np.sqrt(np.sum((high - low) ** 2)))
+    if not extent > 0.0:
+        return np.zeros(len(points), np.bool_)
+    with np.errstate(divide="ignore", over="ignore"):
+        octaves = np.ceil(np.log2(np.maximum(_SPREAD * sizes / (_CELL * extent), 1.0)))
+    octaves = np.minimum(octaves, 40.0).astype(np.int64)
+    found = np.zeros(len(points), np.bool_)
+    for octave in np.unique(octaves):
+        cells = np.floor(np.clip((points - low) / (_CELL * extent * 2.0**octave), -(2.0**19), 2.0**19)).astype(np.int64)
+        keys, counts = np.unique(_key(cells), return_counts=True)
+        own = np.flatnonzero(octaves == octave)
+        company = np.zeros(len(own), np.int64)
+        for step in np.ndindex(3, 3, 3):
+            wanted = _key(cells[own] + (np.array(step) - 1))
+            at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+            company += np.where(keys[at] == wanted, counts[at], 0)
+        found[own] = company < _COMPANY
+    return found
+
+
+def _key(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    x, y, z = (cells[:, k] + (1 << 20) for k in range(3))
+    key: NDArray[np.int64] = (x << 42) | (y << 21) | z
+    return key
+
+
+def _changed(scene: Scene, change: Callable[[SplatModel], SplatModel]) -> Scene:
+    blocks = scene.blocks
+    return replace(scene, facts=change(scene.facts), blocks=lambda: (change(model) for model in blocks()))
+
+
+def _kept(scene: Scene, keep: Callable[[SplatModel], Mask]) -> Scene:
+    def blocks() -> Iterator[SplatModel]:
+        for model in scene.blocks():
+            left = keep(model)
+            if left.any():
+                yield model.select(left)
+
+    count = sum(int(np.count_nonzero(keep(model))) for model in scene.blocks())
+    return replace(scene, count=count, blocks=blocks)
+
+
+def _without_floaters(scene: Scene) -> Scene:
+    """Drop isolated splats; holds centres and sizes of all splats in memory, 16 bytes each."""
+    points, sizes = np.empty((scene.count, 3), np.float32), np.empty(scene.count, np.float32)
+    at = 0
+    for model in scene.blocks():
+        part = slice(at, at + len(model))
+        points[part], sizes[part] = model.means, np.exp(np.clip(model.scales.max(axis=1), -80.0, 80.0))
+        at += len(model)
+    floats = find_floaters(points.astype(np.float64), sizes.astype(np.float64))
+
+    def blocks() -> Iterator[SplatModel]:
+        at = 0
+        for model in scene.blocks():
+            left = ~floats[at : at + len(model)]
+            at += len(model)
+            if left.any():
+                yield model.select(left)
+
+    return replace(scene, count=scene.count - int(np.count_nonzero(floats)), blocks=blocks)
+
+
+def _inside_box(model: SplatModel, corners: F64) -> Mask:
+    places = model.means + np.array(model.origin)
+    inside: Mask = ((places >= corners[0]) & (places <= corners[1])).all(axis=1)
+    return inside
+
+
+def _inside_sphere(model: SplatModel, sphere: F64) -> Mask:
+    places = model.means + np.array(model.origin)
+    inside: Mask = np.sum((places - sphere[:3]) ** 2, axis=1) <= sphere[3] ** 2
+    return inside
+
+
+def _rotation(degrees: tuple[float, float, float]) -> F64:
+    matrix = np.eye(3)
+    for axis, angle in enumerate(np.radians(degrees)):
+        one = np.eye(3)
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        c, s = np.cos(angle), np.sin(angle)
+        one[i, i], one[i, j], one[j, i], one[j, j] = c, -s, s, c
+        matrix = one @ matrix
+    return matrix
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """The outcome of a conversion.
+
+    Attributes:
+        source_format, target_format: names of the formats.
+        count, sh_degree: number of splats and SH degree of the scene that was written, or would be.
+        source_bytes, size_bytes: sizes of the files; the latter is an estimate if nothing was written, `None` if it
+            cannot be estimated.
+        lost: contents that the target has no place for.
+        rounded: names of the arrays that the target rounds.
+        axes: axes before and after.
+        findings: findings in the source.
+    """
+
+    source_format: str
+    target_format: str
+    count: int
+    sh_degree: int
+    source_bytes: int
+    size_bytes: int | None
+    lost: tuple[str, ...]
+    rounded: tuple[str, ...]
+    axes: tuple[str, str]
+    findings: tuple[Finding, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as JSON-compatible values."""
+        return {
+            "source_format": self.source_format,
+            "format": self.target_format,
+            "splats": self.count,
+            "sh_degree": self.sh_degree,
+            "source_bytes": self.source_bytes,
+            "size_bytes": self.size_bytes,
+            "lost": list(self.lost),
+            "rounded": list(self.rounded),
+            "axes": list(self.axes),
+            "defects": findings_as_json(self.findings),
+        }
+
+    def losses(self) -> str:
+        """Describe in one line the contents and precision that are lost; empty if there are none."""
+        words = [*self.lost, *([f"precision of {', '.join(self.rounded)}"] if self.rounded else [])]
+        return "; ".join(words)
+
+
+def convert_file(
+    source: str,
+    target: str,
+    *,
+    read_as: str | None = None,
+    write_as: str | None = None,
+    level: int = 0,
+    facts: MetadataOverrides | None = None,
+    filters: Filters | None = None,
+    no_loss: bool = False,
+    dry_run: bool = False,
+    progress: Progress | None = None,
+) -> Conversion:
+    """Read a scene in one format and write it in another, some splats at a time.
+
+    Args:
+        source: a file, or a folder, or `-`.
+        target: the file or folder to write; its name determines the format unless `write_as` does. The caller has
+            checked that it may be replaced.
+        read_as: the name of the source's format, if its content does not tell.
+        write_as: the name of the target's format.
+        level: level of detail to read from a source that has several; 0 is the finest.
+        facts: overrides of the source's metadata.
+        filters: changes of the scene on the way.
+        no_loss: refuse if anything would be lost.
+        dry_run: write nothing.
+        progress: called with the fraction of splats that is read; some formats read them twice.
+
+    Raises:
+        CsplatError: the source is not whole, the target cannot hold it, or `no_loss` is set and something is lost.
+        OSError: a file cannot be read or written.
+    """
+    writes = named_by(Path(target)) if write_as is None else named(write_as)
+    if writes.write is None:
+        raise InputError(f"{target} would be {writes.title}, which csplat does not write")
+    sh_degree = None if filters is None else filters.sh_degree
+    with local_path(source) as local, open_scene(local, read_as, level=level, sh_degree=sh_degree) as opened:
+        scene = (facts or MetadataOverrides()).applied_to_all(opened)
+        before = scene.facts.coordinate_system
+        scene = (filters or Filters()).applied(scene)
+        lost = writes.losses(scene.facts)
+        rounded = tuple(
+            name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.facts.sh_degree)
+        )
+        made = Conversion(
+            opened.format, writes.name, scene.count, scene.facts.sh_degree, size_on_disk(local),
+            writes.expected_bytes(scene.facts, scene.count), lost, rounded,
+            (before, writes.axes or scene.facts.coordinate_system), (),
+        )  # fmt: skip
+        if no_loss and (lost or rounded):
+            raise InputError(f"{writes.title} does not keep all of {source}: {made.losses()}")
+        if not dry_run:
+            writes.write(Path(target), with_progress(scene, "reading", progress))
+            made = replace(made, size_bytes=size_on_disk(Path(target)))
+        return replace(made, findings=tuple(opened.findings))
+
+
+def decode_file(
+    source: str,
+    target: str,
+    *,
+    sh_degree: int | None = None,
+    absolute: bool = False,
+    max_splats: int | None = None,
+    facts: MetadataOverrides | None = None,
+    progress: Progress | None = None,
+) -> tuple[int, int]:
+    """Read a .csplat file, write a PLY, some splats at a time.
+
+    Args:
+        source: the file, or `-`.
+        target: the PLY to write, or `-`. The caller has checked that it may be replaced.
+        sh_degree: leave out the SH bands above.
+        absolute: add the origin and write doubles.
+        max_splats: refuse a scene of more splats; `None`: no limit.
+        facts: overrides of the file's metadata for the PLY.
+        progress: called with the stage's name and the fraction done.
+
+    Returns:
+        The number of splats written, and their SH degree.
+
+    Raises:
+        CsplatError: the file is not valid, or too large; then there is no PLY.
+        OSError: a file cannot be read or written.
+    """
+    with mapped_csplat(source) as data:
+        opened = open_tiles(data, limits=None if max_splats is None else Limits(splats=max_splats))
+        decoded = Scene(opened.header.splat_count, opened.facts, opened.models)
+        # All bands are decoded, even if some are left out: damage anywhere gives no PLY.
+        scene = Filters(sh_degree=sh_degree).applied((facts or MetadataOverrides()).applied_to_all(decoded))
+        if is_one_way(target):
+            for _ in with_progress(decoded, "checking", progress).blocks():
+                pass
+        write_model(target, with_progress(scene, "decoding", progress), absolute=absolute)
+    return scene.count, scene.facts.sh_degree
+
+
+def format_rows() -> list[tuple[str, ...]]:
+    """Return a row for each format: name, endings, if it is read, if it is written, SH degree, axes, exact, carried."""
+    return [
+        (
+            one.name,
+            " ".join(one.suffixes) or "-",
+            "yes" if one.open is not None else "no",
+            "yes" if one.write is not None else "no",
+            str(one.degree),
+            one.axes or "-",
+            _exactness(one),
+            ", ".join(sorted(name.replace("_", " ") for name in one.carries)) or "-",
+        )
+        for one in formats()
+    ]
+
+
+def _exactness(one: Format) -> str:
+    return "all" if set(ARRAYS) <= one.exact else ", ".join(name for name in ARRAYS if name in one.exact) or "-"

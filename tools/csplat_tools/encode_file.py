@@ -1,0 +1,326 @@
+"""Encode a scene file, in memory or out of core, as `csplat encode` does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, encode_with_report
+from csplat.errors import InputError
+from csplat.formats import format_of, open_scene, read_all
+from csplat.large import Needs, encode_scene, needs_of
+from csplat.lint import Finding, dropped_columns, refuse
+from csplat.memory import default_bytes
+from csplat.model import MAX_SH_DEGREE, SplatModel
+from csplat.types import Progress
+from csplat_tools.console import note
+from csplat_tools.file_streams import (
+    STANDARD_STREAM,
+    source_path,
+    write_array,
+    write_bytes,
+)
+from csplat_tools.scene_files import (
+    CHEAP_TO_REOPEN,
+    LoadedModel,
+    MetadataOverrides,
+    findings_as_json,
+    read_source,
+    size_on_disk,
+)
+
+_FOLDS = 4  # memory of a scene as a multiple of its PLY's size; other formats have to be opened to tell
+#: By SH degree: seconds per million splats to read once, and to code; seconds for a codebook. Within a tenth of the
+#: times measured with copies of fox120k at `balanced`: 10 M and 100 M splats of degree 0, 3 M of degrees 1, 2 and 3,
+#: 30 M of degree 3.
+_SECONDS = ((0.2, 3.1, 0.0), (0.35, 7.0, 8.0), (0.45, 7.3, 12.0), (0.55, 8.0, 20.0))
+#: Bytes per splat of a file, by preset and SH degree 0 to 3.
+_FILE_BYTES = {"fast": (9.0, 9.5, 10.0, 11.0), "balanced": (6.5, 8.0, 8.5, 9.0), "small": (5.0, 6.5, 7.0, 7.5)}
+_SMALL = 4 << 20  # bytes: a file up to this size, in any format, fits in every memory
+
+
+@dataclass(frozen=True)
+class OutOfCoreOptions:
+    """Options for encoding scenes larger than memory.
+
+    Attributes:
+        memory_bytes: bound on the memory; `None`: half of the free memory.
+        folder: the working folder; `None`: next to the file.
+        resume: go on from the content of the working folder.
+        cluster: address of a Dask scheduler.
+        by_disk: a scene of several buckets does not stay in memory, even if it would fit.
+    """
+
+    memory_bytes: int | None = None
+    folder: str | None = None
+    resume: bool = False
+    cluster: str | None = None
+    by_disk: bool = False
+
+    def may_leave_memory(self, path: Path) -> bool:
+        """Return True if a scene may not fit in memory, and has to be opened to tell."""
+        if self.cluster is not None or self.resume or self.by_disk:
+            return True
+        bound = default_bytes() if self.memory_bytes is None else self.memory_bytes
+        size = size_on_disk(path)
+        return size > _SMALL and (format_of(path).name != "ply" or size * _FOLDS > bound)
+
+
+@dataclass(frozen=True)
+class OutOfCoreResult:
+    """The outcome of encoding a scene that was not in memory."""
+
+    facts: SplatModel
+    report: EncodeReport
+    findings: tuple[Finding, ...]
+
+
+def read_degree(options: EncodeOptions) -> int | None:
+    """Return the SH degree with which to read a scene to be encoded; `None` keeps all bands.
+
+    Bands that the encoder drops are read, too, because they are part of the declared errors. A file of a higher degree
+    than models have is readable only if bands are to be left out.
+    """
+    return None if options.sh_degree is None else MAX_SH_DEGREE
+
+
+def encode_out_of_core(
+    local: Path,
+    target: str,
+    options: EncodeOptions,
+    facts: MetadataOverrides | None,
+    scale: OutOfCoreOptions,
+    *,
+    strict: bool,
+    progress: Progress | None,
+) -> OutOfCoreResult | LoadedModel | None:
+    """Encode a scene by way of the disk, or return it if it fits in memory.
+
+    Args:
+        local: the scene, in any format.
+        target: the file to write.
+        options: options of the encoder.
+        facts: overrides of the scene's metadata.
+        scale: memory, disk, workers.
+        strict: refuse defects that would be repaired.
+        progress: progress callback.
+
+    Returns:
+        The outcome of the encoding; or the scene in memory, as `read_source` returns it; `None` if it fits in memory
+        and its format has a reader that is faster from the beginning.
+
+    Raises:
+        CsplatError: as for `encode_scene`; or the scene is too large to go to standard output.
+        OSError: as for `encode_scene`.
+    """
+    if progress is not None:
+        progress("opening", 0.0)
+    with open_scene(local, sh_degree=read_degree(options)) as opened:
+        in_memory = needs_of(opened, options, scale.memory_bytes, by_disk=scale.by_disk).in_memory
+        if in_memory and scale.cluster is None and not scale.resume:
+            if opened.format in CHEAP_TO_REOPEN:
+                return None
+            findings: list[Finding] = []
+            if progress is not None:
+                progress("reading", 0.0)
+            model = read_all(opened, strict=strict, keep_extra=options.keep_extra, report=findings)
+            model = (facts or MetadataOverrides()).applied(model)
+            return LoadedModel(model, size_on_disk(local), name=local.name, findings=tuple(findings))
+        if target == STANDARD_STREAM:
+            raise InputError("the scene does not fit the memory, and would be written by way of the disk: name a file")
+        findings = [*opened.findings]
+        if opened.facts.extra and not options.keep_extra:
+            findings.append(dropped_columns(list(opened.facts.extra)))
+        refuse(findings, strict=strict)
+        scene = (facts or MetadataOverrides()).applied_to_all(opened)
+        try:
+            report = encode_scene(
+                scene, target, options, memory_bytes=scale.memory_bytes, by_disk=scale.by_disk, folder=scale.folder,
+                resume=scale.resume, cluster=scale.cluster, progress=progress,
+                source={"name": local.name, "size": size_on_disk(local), "changed": local.stat().st_mtime_ns},
+            )  # fmt: skip
+        except (KeyboardInterrupt, OSError):
+            folder = Path(scale.folder or f"{target}.work")
+            if folder.exists():
+                note(f"{folder} keeps what is done: --resume goes on with it")
+            raise
+        return OutOfCoreResult(scene.facts, report, tuple(findings))
+
+
+@dataclass(frozen=True)
+class CostEstimate:
+    """The expected cost of an encoding.
+
+    Attributes:
+        count, sh_degree: number of splats and SH degree that will be encoded.
+        needs: memory, disk, workers.
+        seconds: approximate time, from measurements on one core (`_SECONDS`) and the number of workers.
+        file_bytes: approximate size of the file at the preset's precision.
+    """
+
+    count: int
+    sh_degree: int
+    needs: Needs
+    seconds: float
+    file_bytes: int
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as JSON-compatible values."""
+        return {
+            "splats": self.count,
+            "sh_degree": self.sh_degree,
+            "in_memory": self.needs.in_memory,
+            "workers": self.needs.workers,
+            "memory_bytes": self.needs.memory_bytes,
+            "disk_bytes": self.needs.disk_bytes,
+            "seconds": round(self.seconds, 1),
+            "file_bytes": self.file_bytes,
+        }
+
+
+def estimate_cost(local: Path, options: EncodeOptions, scale: OutOfCoreOptions) -> CostEstimate:
+    """Estimate the cost of encoding a scene, without looking at its splats.
+
+    Raises:
+        CsplatError: the scene is not valid, or the memory is too little.
+        OSError: the scene cannot be read.
+    """
+    with open_scene(local, sh_degree=read_degree(options)) as opened:
+        needs = needs_of(opened, options, scale.memory_bytes, by_disk=scale.by_disk)
+        count = opened.count
+        degree = opened.facts.sh_degree if options.sh_degree is None else min(options.sh_degree, opened.facts.sh_degree)
+    read, code, book = _SECONDS[min(degree, 1) if options.preset == "fast" else degree]
+    passes = 1 if needs.in_memory else 4
+    seconds = count / 1e6 * (read * passes + code / needs.workers) + book * min(1.0, count / 5e5) / needs.workers
+    return CostEstimate(count, degree, needs, seconds, round(count * _FILE_BYTES[options.preset][degree]))
+
+
+@dataclass(frozen=True)
+class EncoderOutcome:
+    """An encoded file, with the report of the search that made it, if any.
+
+    Attributes:
+        result: the encoder's result.
+        key: name of the entry of a JSON report that holds `said`; "": none.
+        said: report of the target, the candidates and the choice, JSON-compatible.
+        lines: remarks for the user, a sentence each.
+    """
+
+    result: EncodeResult
+    key: str = ""
+    said: Mapping[str, Any] = field(default_factory=dict)
+    lines: tuple[str, ...] = ()
+
+
+#: Encodes a scene, with a progress callback.
+EncodeFunction = Callable[[SplatModel, EncodeOptions, Progress | None], EncoderOutcome]
+
+
+@dataclass(frozen=True)
+class EncodedFile:
+    """The outcome of an encoding.
+
+    Attributes:
+        source: the scene as it was encoded; without its splats if it did not stay in memory.
+        report: choices and errors.
+        made: the encoded file; `None` if the scene did not stay in memory.
+        findings: findings of lint in the PLY.
+        source_bytes: size of the PLY.
+        seconds: time of reading, encoding and writing.
+    """
+
+    source: SplatModel
+    report: EncodeReport
+    made: EncoderOutcome | None
+    findings: tuple[Finding, ...]
+    source_bytes: int
+    seconds: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as JSON-compatible values."""
+        report, made = self.report, self.made
+        count = report.splat_count
+        return {
+            "splats": count,
+            "size_bytes": report.size_bytes,
+            "source_bytes": self.source_bytes,
+            "ratio": self.source_bytes / report.size_bytes,
+            "bytes_per_splat": report.size_bytes / count if count else None,
+            "tiles": report.tile_count,
+            "seconds": round(self.seconds, 3),
+            "defects": findings_as_json(self.findings),
+            "notes": list(report.notes),
+            "stated_errors": {name: {"max": pair[0], "rms": pair[1]} for name, pair in report.errors.items()},
+            "options": report.options,
+            **({made.key: dict(made.said)} if made is not None and made.key else {}),
+        }
+
+
+def encode_file(
+    source: str,
+    target: str,
+    options: EncodeOptions,
+    *,
+    facts: MetadataOverrides | None = None,
+    strict: bool = False,
+    importance: str | None = None,
+    prune_unseen: bool = False,
+    source_index: str | None = None,
+    encoder: EncodeFunction | None = None,
+    scale: OutOfCoreOptions | None = None,
+    progress: Progress | None = None,
+) -> EncodedFile:
+    """Read a PLY, encode it, write the file.
+
+    Args:
+        source: a PLY, or `-`.
+        target: the file to write, or `-`. The caller has checked that it may be replaced.
+        options: options of the encoder; `keep_extra` applies to reading, too.
+        facts: overrides of the PLY's metadata.
+        strict: refuse defects that would be repaired.
+        importance: a .npy file with one weight per splat of the PLY as read, or a file of `csplat sensitivity`.
+        prune_unseen: leave out the splats that no view of the sensitivities saw.
+        source_index: a .npy file to write: for each splat of the file, its index in the PLY as read.
+        encoder: encodes instead of the plain encoder, such as a target search; it does not get `importance`.
+        scale: memory, disk and workers. An `encoder`, an importance or a source index requires the scene in memory.
+        progress: progress callback.
+
+    Raises:
+        CsplatError: the PLY or the options cannot be used.
+        OSError: a file cannot be read or written.
+    """
+    start, scale = time.perf_counter(), scale or OutOfCoreOptions()
+    in_memory = encoder is not None or importance is not None or source_index is not None
+    read: LoadedModel | None = None
+    with source_path(source) as local:
+        if not in_memory and scale.may_leave_memory(local):
+            done = encode_out_of_core(local, target, options, facts, scale, strict=strict, progress=progress)
+            if isinstance(done, OutOfCoreResult):
+                seconds = time.perf_counter() - start
+                return EncodedFile(done.facts, done.report, None, done.findings, size_on_disk(local), seconds)
+            read = done
+        if read is None:
+            read = read_source(
+                local, facts, strict=strict, keep_extra=options.keep_extra, sh_degree=read_degree(options),
+                progress=progress,
+            )  # fmt: skip
+    model = read.model
+    if encoder is not None:
+        made = encoder(model, options, progress)
+    elif importance is None:
+        if prune_unseen:
+            raise InputError("only what `csplat sensitivity` wrote says which splats no view saw")
+        made = EncoderOutcome(encode_with_report(model, options, progress=progress))
+    else:
+        from csplat_tools.importance_file import encode_by_importance  # imports names of trainer and renderer
+
+        made = EncoderOutcome(
+            encode_by_importance(model, options, importance, prune_unseen=prune_unseen, progress=progress)
+        )
+    write_bytes(target, made.result.data)
+    if source_index is not None:
+        write_array(source_index, made.result.source_index)
+    return EncodedFile(model, made.result.report, made, read.findings, read.size_bytes, time.perf_counter() - start)

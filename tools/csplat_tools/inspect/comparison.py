@@ -1,0 +1,411 @@
+"""Compare two scenes in size, errors of the splats and renders."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import scene as scenes
+from csplat.decoder import StatedErrors, decode, open_tiles
+from csplat.errors import CsplatError, InputError
+from csplat.files import check_room
+from csplat.model import SplatModel
+from csplat.scene import Scene
+from csplat.types import F32, Progress, null_progress
+from csplat_conformance.stated import Source, lattice_radii, match, measure_pairs, prove_by_disk
+from csplat_conformance.stated.pairs import merged
+from csplat_render import Mode
+from csplat_render.camera import Camera, resized
+from csplat_render.lpips import load_lpips
+from csplat_render.metrics import Distance, Scores, ViewScore
+from csplat_render.scorer import OnView, Scorer
+from csplat_tools.console import finite_or_none
+from csplat_tools.file_streams import is_csplat
+from csplat_tools.optional_packages import require_images, require_renderer
+from csplat_tools.render_files import image_names, make_output_folder, side_by_side, write_png
+from csplat_tools.scene_files import LoadedModel, OpenedScene, SceneLike, open_scenes
+from csplat_tools.views import Colour, ViewSet, comparison_cameras, find_view_set
+from csplat_tools.views.sliced_renderer import SlicedScene
+
+Pairing = Literal["index", "order", "search"]
+
+_NEAR = 0.01  # fraction of the scene's spread: splats in the same order are nearer than this, shuffled ones far off
+
+
+@dataclass(frozen=True)
+class AttributeErrors:
+    """Errors of pairs of splats.
+
+    Attributes:
+        pairing: how the pairs are known. `index`: from a source index. `order`: both scenes hold the same number of
+            splats, and the centres show that the order is the same. `search`: a source splat was found within the
+            errors that the file declares, which need not be the original one.
+        matched: number of splats of the other scene that have a partner; only these are measured.
+        unmatched: number of those that have none.
+        errors: largest and rms error by measure, in the order of the registry.
+    """
+
+    pairing: Pairing
+    matched: int
+    unmatched: int
+    errors: dict[str, tuple[float, float]]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as JSON-compatible values; an error that overflowed is `null`."""
+        return {
+            "pairing": self.pairing,
+            "matched": self.matched,
+            "unmatched": self.unmatched,
+            "errors": {
+                name: {"max": finite_or_none(largest), "rms": finite_or_none(rms)}
+                for name, (largest, rms) in self.errors.items()
+            },
+        }
+
+
+def attribute_errors(
+    source: LoadedModel,
+    other: LoadedModel,
+    source_index: NDArray[Any] | None = None,
+    *,
+    progress: Progress | None = None,
+) -> AttributeErrors | None:
+    """Measure the errors of a scene's splats against those of its source.
+
+    Args:
+        source: the scene that `other` was made from.
+        other: the scene whose errors are measured.
+        source_index: [N] integers, the source splat of each splat of `other`; `None`: not known.
+        progress: progress callback of a search.
+
+    Returns:
+        The errors; `None` if the pairs of splats cannot be found.
+
+    Raises:
+        InputError: `source_index` is not one index of a source splat for each splat of `other`.
+    """
+    ours, theirs = Source.of(source.model), other.model
+    if source_index is not None:
+        return AttributeErrors("index", len(theirs), 0, _errors(ours, theirs, source_index))
+    if _same_order(source.model, theirs):
+        return AttributeErrors("order", len(theirs), 0, _errors(ours, theirs, np.arange(len(theirs))))
+    stated, header = other.stated_errors, other.header
+    if header is None or stated is None or not len(theirs):
+        return None
+    bounds = {record.measure: record.max for record in stated.records}
+    if not bounds.keys() >= {"means", "opacities", "sh0"}:
+        return None
+    found = match(ours, theirs, bounds, lattice_radii(theirs, header), progress=progress)
+    matched = np.flatnonzero(found >= 0)
+    if not len(matched):
+        return None
+    errors = _errors(ours, theirs.select(matched), found[matched])
+    return AttributeErrors("search", len(matched), len(theirs) - len(matched), errors)
+
+
+def attribute_errors_out_of_core(
+    source: OpenedScene,
+    other: OpenedScene,
+    source_index: NDArray[Any] | None = None,
+    *,
+    progress: Progress | None = None,
+) -> AttributeErrors | None:
+    """Like `attribute_errors` for scenes not in memory: without a search, and a source index only for .csplat files."""
+    if source_index is not None:
+        if not is_csplat(other.path):
+            return None
+        # For a file that declares no errors and was refitted, all errors are measured.
+        nothing = StatedErrors(source.count, 0, source.facts.sh_degree, refitted=True, records=())
+        opened = replace(open_tiles(other.path), stated_errors=nothing)
+        proof = prove_by_disk(source.scene, opened, source_index, memory_bytes=source.memory_bytes, progress=progress)
+        found = {one.name: (one.measured_max or 0.0, one.measured_rms or 0.0) for one in proof.measures}
+        return AttributeErrors("index", other.count, 0, found)
+    if source.count != other.count or not _same_order(source.sample(progress)[0], other.sample(progress)[0]):
+        return None
+    parts = [
+        (start, len(theirs), measure_pairs(Source.of(ours), theirs, np.arange(len(theirs))))
+        for start, ours, theirs in _beside(source.scene, other.scene, progress)
+    ]
+    found = {name: (one.max, one.rms) for name, one in merged(parts).items()}
+    return AttributeErrors("order", other.count, 0, found)
+
+
+def _beside(a: Scene, b: Scene, progress: Progress | None) -> Iterator[tuple[int, SplatModel, SplatModel]]:
+    """Yield splats of two scenes of equal number, some at a time, with the number of the first of them."""
+    first = scenes.watched(a, "measuring splats", progress or null_progress).blocks()
+    second = scenes.watched(b, "", null_progress).blocks()
+    start, ours, theirs = 0, a.facts, b.facts
+    while start < a.count:
+        ours, theirs = ours if len(ours) else next(first), theirs if len(theirs) else next(second)
+        count = min(len(ours), len(theirs))
+        if count:
+            yield start, ours.select(slice(0, count)), theirs.select(slice(0, count))
+        ours, theirs, start = ours.select(slice(count, None)), theirs.select(slice(count, None)), start + count
+
+
+def _errors(source: Source, other: SplatModel, index: NDArray[Any]) -> dict[str, tuple[float, float]]:
+    return {name: (found.max, found.rms) for name, found in measure_pairs(source, other, index).items()}
+
+
+def _same_order(source: SplatModel, other: SplatModel) -> bool:
+    """Return True if splat i of one scene is splat i of the other: in a shuffled scene half the splats are far off."""
+    if len(source) != len(other) or not len(source):
+        return False
+    means = source.means.astype(np.float64)
+    shift = np.subtract(other.origin, source.origin)
+    distances = np.linalg.norm(other.means.astype(np.float64) + shift - means, axis=1)
+    spread = float(np.median(np.linalg.norm(means - np.median(means, axis=0), axis=1)))
+    return float(np.median(distances)) <= _NEAR * spread
+
+
+#: Given instead of a file of LPIPS weights: look for them in the usual places.
+AUTO_WEIGHTS = "auto"
+
+_PIXEL_BYTES = 13  # bytes per pixel of a render of the source, which is kept
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison:
+    """The outcome of comparing two scenes.
+
+    Attributes:
+        a: the source; opened, but not in memory, if both do not fit together.
+        b: the scene compared with it; likewise.
+        attributes: errors of B's splats; `None` if the pairs of splats cannot be found, which is the usual case
+            without a source index if the scenes are not in memory.
+        quality: scores of B's renders against A's.
+        ignored: number of splats of A that were not drawn because they hold NaN or infinities.
+        cameras: source of the views: the name of a camera file or of a data set, or `virtual`.
+        photographs: scores of A's and B's renders against the photographs of a data set, as JSON of `Scores`, by the
+            keys `split`, `a` and `b`; `None` if there is no data set.
+        background, mode: background colour and renderer mode.
+        notes: remarks about the views.
+        seconds: time of reading scenes that were not in memory, matching, rendering and writing.
+    """
+
+    a: LoadedModel | OpenedScene
+    b: LoadedModel | OpenedScene
+    attributes: AttributeErrors | None
+    quality: Scores
+    ignored: int
+    cameras: str
+    photographs: dict[str, Any] | None
+    background: Colour
+    mode: Mode
+    notes: tuple[str, ...]
+    seconds: float
+
+    def __repr__(self) -> str:
+        return f"Comparison({self.a.size_bytes:,} -> {self.b.size_bytes:,} bytes, {self.quality.psnr:.2f} dB)"
+
+    @property
+    def ratio(self) -> float:
+        """Size of A divided by that of B."""
+        return self.a.size_bytes / self.b.size_bytes
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as JSON-compatible values."""
+        return {
+            "a": self.a.as_json(),
+            "b": self.b.as_json(),
+            "ratio": self.ratio,
+            "attributes": None if self.attributes is None else self.attributes.as_json(),
+            "cameras": self.cameras,
+            "background": list(self.background),
+            "mode": self.mode,
+            "photographs": self.photographs,
+            **self.quality.as_json(),
+            "ignored": {"a": self.ignored, "b": self.quality.ignored},
+            "views": [
+                {name: getattr(one, name) for name in ("image", "psnr", "ssim", "lpips", "cover")}
+                for one in self.quality.each
+            ],
+            "seconds": round(self.seconds, 3),
+        }
+
+
+def compare(
+    a: SceneLike | OpenedScene,
+    b: SceneLike | OpenedScene,
+    *,
+    views: ViewSet | None = None,
+    source_index: NDArray[np.integer[Any]] | None = None,
+    lpips: str | None = None,
+    pictures: str | os.PathLike[str] | None = None,
+    amplification: float = 10.0,
+    background: Colour | None = None,
+    mode: Mode = "standard",
+    force: bool = False,
+    memory_bytes: int | None = None,
+    prepare: Callable[[], object] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Comparison:
+    """Compare a scene with its source, as `csplat compare` does. Requires the packages of the render extra.
+
+    Args:
+        a: the source: a model, or a file in any format.
+        b: the scene compared with it, likewise.
+        views: its test views are rendered; if they have photographs, A and B are scored against these, too. `None`:
+            the eight virtual views of `psnr`, 640×480, in front of black (`find_view_set`).
+        source_index: [N] the splat of A that each splat of B is.
+        lpips: a file of LPIPS weights, or `auto` for the usual places; LPIPS is not computed if left out.
+        pictures: a folder for one PNG per view: the photograph if there is one, A, B, and their amplified difference.
+        amplification: factor by which the difference is amplified.
+        background: red, green, blue, 0..1; that of the views if left out.
+        mode: mode of the renderer.
+        force: existing files of `pictures` may be replaced.
+        memory_bytes: approximate memory that may be taken; the disk is used if that is too little for both files.
+            `None`: half of the free memory. Photographs are not included.
+        prepare: called when all inputs have been read and checked, before the first render.
+        progress: called with the stage and the fraction of it that is done, 0 to 1.
+
+    Examples:
+        >>> import csplat_tools
+        >>> found = csplat_tools.compare("scene.ply", "scene.csplat")  # doctest: +SKIP
+        >>> found.ratio, found.quality.psnr, found.attributes.errors["means"]  # doctest: +SKIP
+        (12.3, 41.2, (0.00021, 0.00009))
+
+    Raises:
+        CsplatError: a file is not valid, or exists; or there are no test views; or the renderer is not installed; or
+            the disk has no room for the splats of a scene that does not fit in memory, or the bound is too low even so.
+        OSError: a file cannot be read or written.
+    """
+    start = time.perf_counter()
+    require_renderer()
+    if pictures is not None:
+        require_images()
+    distance = None if lpips is None else load_lpips(None if lpips == AUTO_WEIGHTS else lpips)
+    with open_scenes((a, b), memory_bytes) as (source, other):
+        views = views or _views(source, background, progress)
+        if not views.judges:
+            raise InputError(f"{views.name} has no {views.split} pictures")
+        by_photographs = views.photograph_judge(mode=mode) if views.photographs else None
+        viewers: list[OnView] = []
+        if pictures is not None:
+            names = image_names([camera.image for camera in views.judges])
+            viewers.append(_ImageWriter(os.fspath(pictures), names, by_photographs, amplification, force=force))
+        first, second, errors = _measured(source, other, views.judges, source_index, progress)
+        if prepare is not None:
+            prepare()
+        judges = None if by_photographs is None else _PhotographScores(by_photographs, distance)
+        viewers += [] if judges is None else [judges]
+        judge = views.judge(first, mode=mode, background=background, progress=progress)
+        quality = judge.scores(second, lpips=distance, on_view=_all_of(viewers), progress=progress)
+        return Comparison(
+            source, other, errors, quality, judge.look(0).ignored, views.name,
+            None if judges is None else {"split": views.split, **judges.as_json()},
+            views.background, mode, views.notes, time.perf_counter() - start,
+        )  # fmt: skip
+
+
+def _views(source: LoadedModel | OpenedScene, background: Colour | None, progress: Progress | None) -> ViewSet:
+    model, every = source.sample(progress)
+    return find_view_set(model, background=background, count=0, every=every)
+
+
+def _measured(
+    source: LoadedModel | OpenedScene,
+    other: LoadedModel | OpenedScene,
+    cameras: Sequence[Camera],
+    source_index: NDArray[np.integer[Any]] | None,
+    progress: Progress | None,
+) -> tuple[SplatModel | SlicedScene, SplatModel | SlicedScene, AttributeErrors | None]:
+    """Return a renderable form of each scene, and the errors of B's splats."""
+    if isinstance(source, LoadedModel) and isinstance(other, LoadedModel):
+        return source.model, other.model, attribute_errors(source, other, source_index, progress=progress)
+    assert isinstance(source, OpenedScene), "both are in memory, or none"
+    assert isinstance(other, OpenedScene), "likewise"
+    kept = sum(_PIXEL_BYTES * camera.W * camera.H for camera in cameras)
+    first, second = (
+        SlicedScene(one.scene, *one.sample(progress), one.memory_bytes - kept, progress) for one in (source, other)
+    )
+    for one in (first, second):
+        if one.memory_bytes < one.least_bytes:
+            bound, least = (one.memory_bytes + kept) / 1e6, (one.least_bytes + kept) / 1e6
+            raise InputError(f"{bound:,.0f} MB of memory are too little to draw these scenes, which want {least:,.0f}")
+    check_room(
+        tempfile.gettempdir(),
+        max(first.disk_bytes, second.disk_bytes),
+        "pictures are drawn: TMPDIR names another folder",
+    )
+    return first, second, attribute_errors_out_of_core(source, other, source_index, progress=progress)
+
+
+class _PhotographScores:
+    """Scorer of A's and B's renders against the photographs."""
+
+    def __init__(self, judge: Scorer, distance: Distance | None) -> None:
+        self._judge, self._distance = judge, distance
+        self._each: dict[str, list[ViewScore]] = {"a": [], "b": []}
+
+    def __call__(self, number: int, a: F32, b: F32) -> None:
+        for each, seen in zip(self._each.values(), (a, b), strict=True):
+            each.append(self._judge.score(number, seen, lpips=self._distance))
+
+    def as_json(self) -> dict[str, Any]:
+        return {name: Scores.of(each).as_json() for name, each in self._each.items()}
+
+
+class _ImageWriter:
+    """Writer of one PNG per view, named after its photograph."""
+
+    def __init__(
+        self, folder: str, names: Sequence[str], photographs: Scorer | None, amplification: float, *, force: bool
+    ) -> None:
+        self._files = [f"{name}.png" for name in names]
+        self._target = make_output_folder(folder, self._files, force=force)
+        self._photographs, self._amplification = photographs, amplification
+
+    def __call__(self, number: int, a: F32, b: F32) -> None:
+        shown = None if self._photographs is None else self._photographs.look(number).picture
+        write_png(self._target / self._files[number], side_by_side(a, b, self._amplification, shown))
+
+
+def _all_of(viewers: Sequence[OnView]) -> OnView:
+    def show(number: int, a: F32, b: F32) -> None:
+        for viewer in viewers:
+            viewer(number, a, b)
+
+    return show
+
+
+#: Width and height of the renders, pixels; smaller ones average errors away: half of 640×480 gives 0.4 dB too much,
+#: this 0.2 at most.
+ESTIMATE_SIZE = (480, 360)
+#: Largest number of splats: more take longer to render than a remark is worth.
+ESTIMATE_SPLATS_MAX = 1_000_000
+
+
+def estimate_psnr(
+    source: SplatModel, data: bytes, *, threads: int | None = None, splats_max: int = ESTIMATE_SPLATS_MAX
+) -> float | None:
+    """Return the approximate PSNR of a file against its source.
+
+    The views are those of `csplat compare`, at another size.
+
+    Args:
+        source: the scene that was encoded.
+        data: the file.
+        threads: number of threads; `None` for all.
+        splats_max: scenes of more splats are not rendered.
+
+    Returns:
+        PSNR in dB; `None` if there are no splats or too many, if the renderer is not compiled yet, which takes longer
+        than the encoding, or if it cannot draw them.
+    """
+    from csplat_render.warmup import is_compiled  # requires numba
+
+    if not 0 < len(source) <= splats_max or not is_compiled():
+        return None
+    try:
+        cameras = [resized(camera, *ESTIMATE_SIZE) for camera in comparison_cameras(source)]
+        return Scorer.of_source(source, cameras, threads=threads).psnr(decode(data, threads=threads))
+    except (CsplatError, MemoryError):  # the file is written: this is a remark on it
+        return None

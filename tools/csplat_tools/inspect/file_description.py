@@ -1,0 +1,564 @@
+"""Describe a file without decoding it, for `csplat info`."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from mmap import mmap
+from typing import Any
+
+from csplat import _spec
+from csplat.decoder import (
+    SceneHeader,
+    StatedErrors,
+    read_cameras,
+    read_header,
+    read_metadata,
+    read_options,
+    read_stated_errors,
+)
+from csplat.errors import FormatError
+from csplat.formats import named, open_scene
+from csplat.model import SplatModel
+from csplat.training import TRAINING, VIEW, TrainedOn
+from csplat.upright import UP, up_of
+from csplat_tools.console import finite_or_none, format_bytes
+from csplat_tools.file_streams import local_path
+from csplat_tools.scene_files import findings_as_json, size_on_disk
+
+
+@dataclass(frozen=True)
+class Span:
+    """The smallest and the largest of some integers."""
+
+    min: int
+    max: int
+
+
+@dataclass(frozen=True)
+class AttributeSummary:
+    """The size and coding of one attribute.
+
+    Attributes:
+        size_bytes: all bytes of the attribute.
+        codebook_bytes: those among them of its columns of codebooks.
+        bits_per_splat: average over all splats; `None` without splats.
+        codings, coders: number of blocks or streams that use each, by name.
+        escaped_splats: number of splats whose values are coded as escapes instead of codebook entries.
+        mapping, step, chroma_shift, levels: fields of the attribute's record; `None` if it has none.
+    """
+
+    size_bytes: int
+    codebook_bytes: int
+    bits_per_splat: float | None
+    codings: Mapping[str, int]
+    coders: Mapping[str, int]
+    escaped_splats: int
+    mapping: str | None = None
+    step: float | None = None
+    chroma_shift: int | None = None
+    levels: int | None = None
+
+
+@dataclass(frozen=True)
+class LayerSummary:
+    """Size of a layer: its tiles, and the codebook chunks that it needs."""
+
+    size_bytes: int
+    codebook_bytes: int
+    bits_per_splat: float | None
+    tiles: int
+
+
+@dataclass(frozen=True)
+class CodebookSummary:
+    """A codebook: its kind, the SH bands that it covers, the number of entries, and the bytes of its chunks."""
+
+    id: int
+    kind: str
+    bands: Sequence[int]
+    entries: int
+    size_bytes: int
+
+
+@dataclass(frozen=True)
+class FileDescription:
+    """A file as it describes itself; sizes in bytes.
+
+    Attributes:
+        header: header and index.
+        attributes, layers: attributes and layers by name, in the order of the registry.
+        codebooks: codebooks in the order of the index.
+        overhead: bytes outside attributes, by name: header, index, chunks of the whole file, frames of the tiles'
+            chunks.
+        cameras: number of cameras; `None` without the chunk, as for all that follows.
+        options, metadata: the file's JSON.
+        stated_errors: the source of which the file is an encoding, and the declared error bounds.
+    """
+
+    header: SceneHeader
+    attributes: Mapping[str, AttributeSummary]
+    layers: Mapping[str, LayerSummary]
+    codebooks: Sequence[CodebookSummary]
+    overhead: Mapping[str, int]
+    cameras: int | None
+    options: Mapping[str, Any] | None
+    metadata: Mapping[str, Any] | None
+    stated_errors: StatedErrors | None
+
+    @property
+    def bytes_per_splat(self) -> float | None:
+        """Size of the whole file divided by the number of splats; `None` without splats."""
+        count = self.header.splat_count
+        return self.header.file_size / count if count else None
+
+    @property
+    def spans(self) -> dict[str, Span]:
+        """Ranges of splat count, lattice exponent and bits per axis over the tiles; empty without tiles."""
+        tiles = self.header.tiles
+        columns = {
+            "splats": [one.splat_count for one in tiles],
+            "exponents": [one.exponent for one in tiles],
+            "bits_per_axis": [max(extent.bit_length() for extent in one.extent) for one in tiles],
+        }
+        return {name: Span(min(values), max(values)) for name, values in columns.items() if values}
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as JSON-compatible values."""
+        header, tiles = self.header, self.header.tiles
+        up = up_of(self.metadata or {}, header.coordinate_system)
+        largest = {"max_scale": finite_or_none(max(tile.max_scale for tile in tiles))} if tiles else {}
+        return {
+            "format": f"csplat {header.version[0]}.{header.version[1]}",
+            "profile": header.profile,
+            "size_bytes": header.file_size,
+            "bytes_per_splat": self.bytes_per_splat,
+            "splats": header.splat_count,
+            "sh_degree": header.sh_degree,
+            "coordinate_system": header.coordinate_system,
+            "up": None if up is None else list(up),
+            "unit_metres": header.unit_metres,
+            "origin": list(header.origin),
+            "antialiased": header.antialiased,
+            "flat": header.flat,
+            "attributes": {
+                name: {key: value for key, value in asdict(one).items() if value is not None or key in _ALWAYS}
+                for name, one in self.attributes.items()
+            },
+            "layers": {name: asdict(one) for name, one in self.layers.items()},
+            "overhead": dict(self.overhead),
+            "codebooks": [asdict(one) for one in self.codebooks],
+            "extra_columns": [{"name": extra.name, "dtype": extra.dtype} for extra in header.extras],
+            "tiles": {"count": len(tiles), **{name: asdict(one) for name, one in self.spans.items()}, **largest},
+            "chunks": [
+                {"type": chunk.type.decode("ascii"), "size_bytes": chunk.size, "offset_bytes": chunk.offset}
+                for chunk in header.directory
+            ],
+            "cameras": self.cameras,
+            "options": self.options,
+            "metadata": self.metadata,
+            "stated_errors": None if self.stated_errors is None else _stated(self.stated_errors),
+        }
+
+
+_ALWAYS = ("bits_per_splat",)
+
+
+def describe_file(data: bytes | mmap) -> FileDescription:
+    """Describe a file by its header, its index, the heads of its blocks, and its small chunks.
+
+    Args:
+        data: the whole file; little of a memory-mapped one is touched.
+
+    Raises:
+        FormatError: header, index, block heads or one of the small chunks are not valid.
+        LimitError: metadata, cameras or options are larger than the decoder's budget.
+    """
+    header = read_header(data)
+    use = attribute_usage(data, header)
+    attributes = {name: _attribute(header, name, one) for name, one in use.items()}
+    cameras = read_cameras(data)
+    return FileDescription(
+        header,
+        attributes,
+        _layers(header),
+        [_codebook(header, record) for record in header.codebooks],
+        _overhead(header, use),
+        None if cameras is None else len(cameras),
+        read_options(data),
+        read_metadata(data),
+        read_stated_errors(data),
+    )
+
+
+def bytes_by_attribute(data: bytes | mmap, header: SceneHeader) -> dict[str, int]:
+    """Return the bytes of each attribute, and as `overhead` those of everything else.
+
+    Raises:
+        FormatError: heads contradict each other.
+    """
+    use = attribute_usage(data, header)
+    return {**{name: one.size_bytes for name, one in use.items()}, "overhead": sum(_overhead(header, use).values())}
+
+
+def _bits(size_bytes: int, count: int) -> float | None:
+    return 8.0 * size_bytes / count if count else None
+
+
+def _attribute(header: SceneHeader, name: str, use: AttributeUsage) -> AttributeSummary:
+    record = next((one for one in header.attributes if _spec.ATTRIBUTE_NAMES[one.attribute] == name), None)
+    known: dict[str, Any] = {}
+    if record is not None:
+        known["mapping"] = _spec.MAPPING_NAMES[record.mapping]
+        if _spec.ATTRIBUTE_KIND[record.attribute] == "lattice":
+            known |= {"step": record.step, "chroma_shift": record.chroma_shift}
+        else:
+            known["levels"] = record.levels
+    return AttributeSummary(
+        use.size_bytes,
+        use.codebook_bytes,
+        _bits(use.size_bytes, header.splat_count),
+        dict(use.codings),
+        dict(use.coders),
+        use.escaped_count,
+        **known,
+    )
+
+
+def _layers(header: SceneHeader) -> dict[str, LayerSummary]:
+    tile_bytes, tile_count, codebook_bytes = Counter[int](), Counter[int](), Counter[int]()
+    for tile in header.tiles:
+        for id_, layer in tile.layers.items():
+            tile_bytes[id_] += layer.size
+            tile_count[id_] += 1
+    for chunk in header.directory:
+        if chunk.type == _spec.CHUNK_CODEBOOK:
+            codebook_bytes[chunk.layer] += chunk.size
+    sizes = {id_: tile_bytes[id_] + codebook_bytes[id_] for id_ in sorted(tile_bytes.keys() | codebook_bytes.keys())}
+    return {
+        _spec.LAYER_NAMES.get(id_, f"layer {id_}"): LayerSummary(
+            size, codebook_bytes[id_], _bits(size, header.splat_count), tile_count[id_]
+        )
+        for id_, size in sizes.items()
+    }
+
+
+def _overhead(header: SceneHeader, use: Mapping[str, AttributeUsage]) -> dict[str, int]:
+    whole = {chunk.type.decode("ascii"): chunk.size for chunk in header.directory if chunk.type != _spec.CHUNK_CODEBOOK}
+    parts = {"header": _spec.HEADER_SIZE, "index": header.index_size, **whole}
+    rest = header.file_size - sum(parts.values()) - sum(one.size_bytes for one in use.values())
+    return {**parts, "tile_frames": rest}
+
+
+def _codebook(header: SceneHeader, record: _spec.CodebookRecord) -> CodebookSummary:
+    chunks = [chunk for chunk in header.directory if chunk.type == _spec.CHUNK_CODEBOOK]
+    return CodebookSummary(
+        record.codebook_id,
+        _spec.CODEBOOK_KIND_NAMES[record.kind],
+        list(range(record.band_first, record.band_last + 1)) if record.band_first else [],
+        record.size,
+        sum(chunk.size for chunk in chunks if chunk.id == record.codebook_id),
+    )
+
+
+def _stated(stated: StatedErrors) -> dict[str, Any]:
+    return {
+        "source_splats": stated.source_count,
+        "pruned_splats": stated.pruned_count,
+        "source_sh_degree": stated.source_sh_degree,
+        "refitted": stated.refitted,
+        "errors": {record.measure: {"max": record.max, "rms": record.rms} for record in stated.records},
+    }
+
+
+_STREAM_CLAUSE = "STR-6"
+
+
+@dataclass
+class AttributeUsage:
+    """The bytes and codings of one attribute, over all tiles.
+
+    Attributes:
+        block_bytes: size of the blocks in tiles: heads, parameters and streams.
+        codebook_bytes: size of the codebook chunks with the attribute's columns.
+        codings, coders: number of blocks or streams that use each, by name.
+        escaped_count: number of splats whose values are coded as escapes instead of codebook entries.
+    """
+
+    block_bytes: int = 0
+    codebook_bytes: int = 0
+    codings: Counter[str] = field(default_factory=Counter)
+    coders: Counter[str] = field(default_factory=Counter)
+    escaped_count: int = 0
+
+    @property
+    def size_bytes(self) -> int:
+        """All bytes of the attribute."""
+        return self.block_bytes + self.codebook_bytes
+
+
+def attribute_usage(data: bytes | mmap, header: SceneHeader) -> dict[str, AttributeUsage]:
+    """Add up the bytes and codings of each attribute.
+
+    Args:
+        data: the file.
+        header: its header and index.
+
+    Returns:
+        By attribute name, in the order of the registry. A codebook of several attributes other than SH bands counts
+        with its first.
+
+    Raises:
+        FormatError: the heads contradict each other, or the data is not one whole file.
+    """
+    if len(data) < header.file_size:
+        raise FormatError(
+            _spec.ERROR_TRUNCATED, len(data), "HDR-5", found=f"{len(data)} bytes", wanted=f"{header.file_size} bytes"
+        )
+    if len(data) > header.file_size:
+        raise FormatError(
+            _spec.ERROR_TRAILING, header.file_size, "HDR-6", found=f"{len(data)} bytes", wanted=f"{header.file_size}"
+        )
+    codebooks = {record.codebook_id: record for record in header.codebooks}
+    use: dict[int, AttributeUsage] = {}
+    for tile in header.tiles:
+        for layer in (one for id_, one in tile.layers.items() if id_ in _spec.LAYER_NAMES):
+            _walk_tile(_Cursor(data, layer.offset, layer.size), codebooks, use)
+    for chunk in header.directory:
+        if chunk.type == _spec.CHUNK_CODEBOOK:
+            attribute = _first_attribute(codebooks[chunk.id], chunk.layer)
+            use.setdefault(attribute, AttributeUsage()).codebook_bytes += chunk.size
+    return {_spec.ATTRIBUTE_NAMES[id_]: use[id_] for id_ in sorted(use)}
+
+
+class _Cursor:
+    """A place in the payload of one chunk."""
+
+    def __init__(self, data: bytes | mmap, offset: int, size: int) -> None:
+        self.data = data
+        self.at = offset + _spec.CHUNK_HEADER_SIZE
+        self.end = offset + size
+
+    def take(self, size: int) -> bytes:
+        data = self.data[self.at : self.at + size]
+        self.skip(size)
+        return data
+
+    def skip(self, size: int) -> None:
+        if size > self.end - self.at:
+            raise FormatError(
+                _spec.ERROR_STREAM, self.at, _STREAM_CLAUSE, found=f"{self.end - self.at} bytes", wanted=size
+            )
+        self.at += size
+
+
+def _walk_tile(cursor: _Cursor, codebooks: Mapping[int, _spec.CodebookRecord], use: dict[int, AttributeUsage]) -> None:
+    head = _spec.unpack_tile_head(cursor.take(_spec.TILE_HEAD_SIZE))
+    for _ in range(head.block_count):
+        start = cursor.at
+        block = _spec.unpack_block_head(cursor.take(_spec.BLOCK_HEAD_SIZE))
+        _name(_spec.ATTRIBUTE_NAMES, block.attribute, "attribute", start)
+        one = use.setdefault(block.attribute, AttributeUsage())
+        one.codings[_name(_spec.CODING_NAMES, block.coding, "coding", start)] += 1
+        _walk_coding(cursor, block.attribute, block.coding, codebooks, one)
+        one.block_bytes += cursor.at - start
+
+
+def _walk_coding(
+    cursor: _Cursor, attribute: int, coding: int, codebooks: Mapping[int, _spec.CodebookRecord], use: AttributeUsage
+) -> None:
+    columns = _spec.ATTRIBUTE_COLUMNS.get(attribute, 1)
+    if coding == _spec.CODING_MORTON:
+        cursor.skip(_spec.MORTON_PARAMS_SIZE)
+    elif coding == _spec.CODING_OFFSET:
+        cursor.skip(_spec.LATTICE_PARAMS_SIZE + 4 * columns)
+    elif coding == _spec.CODING_SIGNED:
+        cursor.skip(_spec.LATTICE_PARAMS_SIZE)
+    elif coding == _spec.CODING_RAW:
+        cursor.skip(_spec.RAW_PARAMS_SIZE)
+    elif coding == _spec.CODING_SPARSE:
+        cursor.skip(_spec.SPARSE_PARAMS_SIZE)
+        _walk_stream(cursor, use)
+    elif coding == _spec.CODING_CODEBOOK:
+        _walk_codebook(cursor, attribute, codebooks, use)
+        return
+    _walk_stream(cursor, use)
+
+
+def _walk_codebook(
+    cursor: _Cursor, attribute: int, codebooks: Mapping[int, _spec.CodebookRecord], use: AttributeUsage
+) -> None:
+    at = cursor.at
+    params = _spec.unpack_codebook_params(cursor.take(_spec.CODEBOOK_PARAMS_SIZE))
+    record = codebooks.get(params.codebook_id)
+    if record is None:
+        raise FormatError(_spec.ERROR_CODEBOOK, at, "CBK-1", found=f"codebook {params.codebook_id}")
+    if attribute == _first_attribute(record, record.band_first):
+        _walk_stream(cursor, use)
+    if attribute == _spec.ATTRIBUTE_SCALES:
+        cursor.skip(_spec.LATTICE_PARAMS_SIZE + 4)
+        _walk_stream(cursor, use)
+    use.escaped_count += params.escape_count
+    if params.escape_count:
+        escape = _spec.unpack_block_head(cursor.take(_spec.BLOCK_HEAD_SIZE))
+        if escape.coding == _spec.CODING_CODEBOOK:  # otherwise the recursion would not be bounded
+            raise FormatError(_spec.ERROR_STREAM, cursor.at, "CBK-5", found="coding codebook")
+        _walk_coding(cursor, attribute, escape.coding, codebooks, use)
+
+
+def _walk_stream(cursor: _Cursor, use: AttributeUsage) -> None:
+    at = cursor.at
+    head = _spec.unpack_stream_head(cursor.take(_spec.STREAM_HEAD_SIZE))
+    use.coders[_name(_spec.CODER_NAMES, head.coder, "coder", at)] += 1
+    cursor.skip(head.coded_size)
+
+
+def _first_attribute(record: _spec.CodebookRecord, band: int) -> int:
+    """Return the id of the attribute whose columns a codebook chunk holds; for SH that of the band."""
+    if record.kind == _spec.CODEBOOK_KIND_SH:
+        name = f"sh{band}"
+    else:
+        name = _spec.CODEBOOK_KIND_ATTRIBUTES[record.kind][0]
+    return next(id_ for id_, one in _spec.ATTRIBUTE_NAMES.items() if one == name)
+
+
+def _name(names: Mapping[int, str], id_: int, what: str, offset: int) -> str:
+    if id_ not in names:
+        raise FormatError(_spec.ERROR_UNSUPPORTED, offset, "RES-2", found=f"{what} {id_}")
+    return names[id_]
+
+
+def format_headline(facts: FileDescription) -> str:
+    """Return a headline: format version, profile, size, bytes per splat."""
+    header, per_splat = facts.header, facts.bytes_per_splat
+    average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
+    version = f"csplat {header.version[0]}.{header.version[1]}"
+    return f"{version}, profile {header.profile}, {format_bytes(header.file_size)}{average}"
+
+
+def describe_scene(facts: FileDescription) -> dict[str, str]:
+    """Return descriptions of the scene, by title."""
+    header = facts.header
+    words = describe_placement(header, header.splat_count, facts.metadata or {})
+    words["tiles"] = _tiles(facts)
+    extras = ", ".join(f"{one.name} ({one.dtype or 'of a type not known here'})" for one in header.extras)
+    if extras:
+        words["extra"] = extras
+    if facts.cameras is not None:
+        words["cameras"] = str(facts.cameras)
+    trained = TrainedOn.of(facts.metadata or {})
+    if trained is not None:
+        words["trained on"] = str(trained)
+    view = (facts.metadata or {}).get(VIEW)
+    if view is not None:
+        words["first view"] = "a camera of the metadata"
+    return words
+
+
+def describe_placement(said: SceneHeader | SplatModel, count: int, metadata: Mapping[str, Any]) -> dict[str, str]:
+    """Return the number of splats, the axes, the up direction, the unit, the origin and flags in words, by title.
+
+    Args:
+        said: header of a .csplat file, or metadata of another one.
+        count: number of splats.
+        metadata: metadata of the scene.
+    """
+    flags = [name for name in ("antialiased", "flat") if getattr(said, name)]
+    up = up_of(metadata, said.coordinate_system)
+    return {
+        "splats": f"{count:,}, SH degree {said.sh_degree}",
+        "axes": str(said.coordinate_system),
+        "up": "unknown" if up is None else " ".join(f"{value:g}" for value in up),
+        "unit": "unknown" if said.unit_metres is None else f"{said.unit_metres:g} m",
+        "origin": " ".join(f"{value:.17g}" for value in said.origin),
+        "flags": ", ".join(flags) or "none",
+    }
+
+
+def other_metadata(facts: FileDescription) -> dict[str, object]:
+    """Return the metadata that `describe_scene` does not describe."""
+    metadata = dict(facts.metadata or {})
+    if TrainedOn.of(metadata) is not None:
+        del metadata[TRAINING]
+    if up_of(metadata) is not None:
+        del metadata[UP]
+    metadata.pop(VIEW, None)
+    return metadata
+
+
+def describe_coding(attribute: AttributeSummary) -> str:
+    """Describe how an attribute is coded."""
+    words = ["+".join(attribute.codings)]
+    if attribute.step is not None:
+        words.append(f"step {attribute.step:.4g}")
+    if attribute.levels:
+        words.append(f"{attribute.levels} levels")
+    if attribute.mapping not in (None, "lattice", "unit_w"):
+        words.append(str(attribute.mapping))
+    if attribute.chroma_shift:
+        words.append(f"chroma / {2**attribute.chroma_shift}")
+    if attribute.codebook_bytes:
+        words.append(f"codebook {format_bytes(attribute.codebook_bytes)}")
+    if attribute.escaped_splats:
+        words.append(f"{attribute.escaped_splats} escaped")
+    words.append("+".join(attribute.coders))
+    return ", ".join(word for word in words if word)
+
+
+def _tiles(facts: FileDescription) -> str:
+    words = {
+        name: str(one.min) if one.min == one.max else f"{one.min} to {one.max}" for name, one in facts.spans.items()
+    }
+    if not words:
+        return "0"
+    count = len(facts.header.tiles)
+    bits = f"{words['bits_per_axis']} bits per axis, exponents {words['exponents']}"
+    return f"{count} of {words['splats']} splats, {bits}"
+
+
+def describe_other_format(source: str) -> tuple[dict[str, Any], str]:
+    """Describe a file by what is known of it before its splats are read.
+
+    Args:
+        source: a scene in any format, or `-`.
+
+    Returns:
+        JSON-compatible values, and the same as text.
+
+    Raises:
+        InputError: the file is in no format that is read, or not whole.
+        OSError: the file cannot be read.
+    """
+    with local_path(source) as path, open_scene(path) as scene:
+        facts, size, count = scene.facts, size_on_disk(path), scene.count
+        per_splat = size / count if count else None
+        said = {
+            "format": scene.format,
+            "size_bytes": size,
+            "bytes_per_splat": per_splat,
+            "splats": count,
+            "levels": list(scene.levels),
+            "sh_degree": facts.sh_degree,
+            "coordinate_system": facts.coordinate_system,
+            "origin": list(facts.origin),
+            "unit_metres": facts.unit_metres,
+            "antialiased": facts.antialiased,
+            "flat": facts.flat,
+            "extra": {name: str(column.dtype) for name, column in facts.extra.items()},
+            "metadata": dict(facts.metadata),
+            "defects": findings_as_json(scene.findings),
+        }
+        average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
+        words = describe_placement(facts, count, facts.metadata)
+        if scene.levels:
+            words["levels"] = f"{' / '.join(f'{one:,}' for one in scene.levels)} splats (csplat convert --level)"
+        if facts.extra:
+            words["extra"] = ", ".join(f"{name} ({column.dtype})" for name, column in facts.extra.items())
+        if facts.metadata:
+            words["metadata"] = json.dumps(facts.metadata, sort_keys=True)
+        lines = [f"{named(scene.format).title}, {format_bytes(size)}{average}"]
+        lines += [f"{name:12} {value}" for name, value in words.items()]
+        lines += [str(one) for one in scene.findings if not one.usual]
+    return said, "\n".join(lines)
