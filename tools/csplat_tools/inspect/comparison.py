@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import scene as scenes
-from csplat.decoder import StatedErrors, decode, open_tiles
+from csplat.decoder import DeclaredBounds, decode, open_tiles
 from csplat.errors import CsplatError, InputError
 from csplat.files import check_room
 from csplat.model import SplatModel
@@ -122,7 +122,7 @@ def attribute_errors_out_of_core(
         if not is_csplat(other.path):
             return None
         # For a file that declares no errors and was refitted, all errors are measured.
-        nothing = StatedErrors(source.count, 0, source.facts.sh_degree, refitted=True, records=())
+        nothing = DeclaredBounds(source.count, 0, source.facts.sh_degree, refitted=True, records=())
         opened = replace(open_tiles(other.path), stated_errors=nothing)
         proof = prove_by_disk(source.scene, opened, source_index, memory_bytes=source.memory_bytes, progress=progress)
         found = {one.name: (one.measured_max or 0.0, one.measured_rms or 0.0) for one in proof.measures}

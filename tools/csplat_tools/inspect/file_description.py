@@ -11,18 +11,18 @@ from typing import Any
 
 from csplat import _spec
 from csplat.decoder import (
+    DeclaredBounds,
     SceneHeader,
-    StatedErrors,
     read_cameras,
+    read_declared_bounds,
     read_header,
     read_metadata,
     read_options,
-    read_stated_errors,
 )
 from csplat.errors import FormatError
 from csplat.formats import named, open_scene
 from csplat.model import SplatModel
-from csplat.training import TRAINING, VIEW, TrainedOn
+from csplat.training_record import TRAINING, VIEW, TrainingRecord
 from csplat.upright import UP, up_of
 from csplat_tools.console import finite_or_none, format_bytes
 from csplat_tools.file_streams import local_path
@@ -106,7 +106,7 @@ class FileDescription:
     cameras: int | None
     options: Mapping[str, Any] | None
     metadata: Mapping[str, Any] | None
-    stated_errors: StatedErrors | None
+    stated_errors: DeclaredBounds | None
 
     @property
     def bytes_per_splat(self) -> float | None:
@@ -189,7 +189,7 @@ def describe_file(data: bytes | mmap) -> FileDescription:
         None if cameras is None else len(cameras),
         read_options(data),
         read_metadata(data),
-        read_stated_errors(data),
+        read_declared_bounds(data),
     )
 
 
@@ -263,7 +263,7 @@ def _codebook(header: SceneHeader, record: _spec.CodebookRecord) -> CodebookSumm
     )
 
 
-def _stated(stated: StatedErrors) -> dict[str, Any]:
+def _stated(stated: DeclaredBounds) -> dict[str, Any]:
     return {
         "source_splats": stated.source_count,
         "pruned_splats": stated.pruned_count,
@@ -448,7 +448,7 @@ def describe_scene(facts: FileDescription) -> dict[str, str]:
         words["extra"] = extras
     if facts.cameras is not None:
         words["cameras"] = str(facts.cameras)
-    trained = TrainedOn.of(facts.metadata or {})
+    trained = TrainingRecord.of(facts.metadata or {})
     if trained is not None:
         words["trained on"] = str(trained)
     view = (facts.metadata or {}).get(VIEW)
@@ -480,7 +480,7 @@ def describe_placement(said: SceneHeader | SplatModel, count: int, metadata: Map
 def other_metadata(facts: FileDescription) -> dict[str, object]:
     """Return the metadata that `describe_scene` does not describe."""
     metadata = dict(facts.metadata or {})
-    if TrainedOn.of(metadata) is not None:
+    if TrainingRecord.of(metadata) is not None:
         del metadata[TRAINING]
     if up_of(metadata) is not None:
         del metadata[UP]

@@ -18,6 +18,7 @@ from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.metrics import PSNR_CAP
 from csplat_render.pruning_error import measure_pruning_error
+from csplat_render.scorer import Scorer, renderer
 from csplat_tools.optimise.simplify.fitting import Fit, fit
 from csplat_tools.optimise.simplify.options import SimplifyOptions
 from csplat_tools.optimise.simplify.order import Order, Side, removal_order, seen_by

@@ -18,6 +18,7 @@ from csplat.scene import without_bands
 from csplat.types import F32, Progress
 from csplat_render import Camera
 from csplat_render.refit import fit_colours
+from csplat_render.scorer import Scorer, renderer
 from csplat_tools.views import ViewSet, shrink_cameras
 
 _STEPS = 8  # largest number of conjugate gradient steps; more overfit the training views

@@ -19,6 +19,7 @@ from csplat.types import F32, Progress
 from csplat_render import Mode
 from csplat_render.camera import relative_to
 from csplat_render.metrics import Scores, ViewScore, psnr_of_mse, squared_error
+from csplat_render.scorer import Scorer, renderer
 from csplat_tools.inspect.file_description import bytes_by_attribute
 from csplat_tools.pages.hardest import HardestPlace
 from csplat_tools.tradeoffs.points import ModeTime, Partial, Point, TriedFile

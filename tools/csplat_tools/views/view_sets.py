@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
-from csplat.training import TrainedOn
+from csplat.training_record import TrainingRecord
 from csplat_render import Camera, Mode
 from csplat_render.camera import relative_to, resized
 from csplat_render.camera_files import load_cameras
@@ -280,7 +280,7 @@ def _of_file(
 ) -> ViewSet:
     report: list[str] = []
     given = list({pose_key(camera): camera for camera in load_cameras(path, report, source.origin)}.values())
-    said = TrainedOn.of(source.metadata)
+    said = TrainingRecord.of(source.metadata)
     colour, notes = _colour(background, said)
     few = len(given) < _ENOUGH
     if few:
@@ -303,7 +303,7 @@ def _of_data(
     require_photographs()
     from csplat_trainer.data import load
 
-    said = TrainedOn.of(source.metadata)
+    said = TrainingRecord.of(source.metadata)
     wanted, notes = _settled(data, said)
     every = _TEST_EVERY if wanted.test_every is None else wanted.test_every
     found = load(wanted.path, wanted.size, images=wanted.images, test_every=every, near=wanted.near)
@@ -326,7 +326,7 @@ def _of_data(
     )  # fmt: skip
 
 
-def _settled(data: DataOptions, said: TrainedOn | None) -> tuple[DataOptions, list[str]]:
+def _settled(data: DataOptions, said: TrainingRecord | None) -> tuple[DataOptions, list[str]]:
     """Return the user's options, completed by the scene's metadata, with remarks on contradictions."""
     values: dict[str, Any] = {}
     notes = []
@@ -339,7 +339,7 @@ def _settled(data: DataOptions, said: TrainedOn | None) -> tuple[DataOptions, li
 
 
 def _colour(
-    background: Colour | None, said: TrainedOn | None, *, photographs: bool = False
+    background: Colour | None, said: TrainingRecord | None, *, photographs: bool = False
 ) -> tuple[Colour, list[str]]:
     """Return the background colour, with remarks on it, which matter most if photographs are compared."""
     if background is not None:
