@@ -20,9 +20,9 @@ from captures import cameras, shell
 from csplat import EncodeOptions, encode, read_ply, write_ply
 from csplat_render.virtual_cameras import detail, sample_cloud, scene_frame
 from csplat_tools.cli.app import app
+from csplat_tools.hardest_place import HardestPlaceSearch
+from csplat_tools.html_report import Bar, draw_bars
 from csplat_tools.inspect.file_description import describe_file
-from csplat_tools.pages.bars import Bar, draw_bars
-from csplat_tools.pages.hardest import HardestPlace
 from csplat_tools.views import comparison_cameras, display_cameras, find_view_set
 from csplat_tools.views.view_sets import ViewSet
 

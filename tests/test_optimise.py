@@ -15,6 +15,7 @@ import extremes
 from analytic_model import AnalyticScene
 from analytic_search import analytic_removal
 from captures import around, cameras, crowded, found_within, judged_by, photographed, shell, views_of
+from csplat_tools.optimise.simplify import SimplifyOptions
 
 from csplat import EncodeOptions, decode
 from csplat.decoder import decode_scene
@@ -27,16 +28,20 @@ from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import scene_frame
-from csplat_tools.optimise.exchange import error_of_psnr
-from csplat_tools.optimise.optimiser import expected_pictures
-from csplat_tools.optimise.removal import Removal
-from csplat_tools.optimise.report import Report
-from csplat_tools.optimise.search import Window, meet
-from csplat_tools.optimise.sensitivity import measured_for, measured_importance
-from csplat_tools.optimise.simplify import SimplifyOptions
-from csplat_tools.optimise.solving import TUNING_GAINS, Goal, Solver
-from csplat_tools.optimise.target import Target
-from csplat_tools.optimise.trials import Coding, Whole, spread_of
+from csplat_tools.optimise.candidates import CodingChoice, WholeScene, psnr_spread
+from csplat_tools.optimise.precision_search import (
+    TUNING_GAINS,
+    PrecisionSearch,
+    SearchGoal,
+    SearchWindow,
+    find_in_window,
+)
+from csplat_tools.optimise.rate_distortion import error_of_psnr
+from csplat_tools.optimise.scene_sensitivity import complete_importance, measure_importance
+from csplat_tools.optimise.search_report import SearchReport
+from csplat_tools.optimise.subsets import Pruner
+from csplat_tools.optimise.target_search import expected_renders
+from csplat_tools.optimise.targets import Target
 from csplat_tools.views import BLACK, comparison_cameras, extra_test_cameras, with_validation_views
 from csplat_tools.views.view_sets import pose_key, render_seconds
 
@@ -63,7 +68,7 @@ def photographs(many):
 def search(*given, **how):
     """Search without renders from elsewhere, which are reported alone, and whose cameras take a second to place."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("csplat_tools.optimise.optimiser.extra_test_cameras", lambda _: {})
+        patch.setattr("csplat_tools.optimise.target_search.extra_test_cameras", lambda _: {})
         return found_within(*given, **how)
 
 
@@ -310,7 +315,7 @@ def test_fitting_to_the_quantised_geometry_mends_it(scene):
 
 def test_so_few_splats_are_fitted_as_are_asked_for(scene):
     views = with_validation_views(judged_by(cameras(40)))
-    removal = Removal(scene, views, SMALL, grades=False, progress=None, psnr=30.0)
+    removal = Pruner(scene, views, SMALL, grades=False, progress=None, psnr=30.0)
     assert 3 == len(removal.fitted(3, None, lambda _: 20.0).rows)
 
 

@@ -13,9 +13,8 @@ from csplat.encoder.measure import measure_errors
 from csplat.errors import InputError
 from csplat_tools.cli.app import app
 from csplat_tools.console import parse_size_bytes
-from csplat_tools.optimise.bounds import meet_bounds
-from csplat_tools.optimise.reaching import encode_to
-from csplat_tools.optimise.target import Target, parse_max_error
+from csplat_tools.optimise.target_encoding import encode_to, meet_bounds
+from csplat_tools.optimise.targets import Target, parse_max_error
 
 pytest.importorskip("numba", reason="targets of size and PSNR want the extra [render]")
 

@@ -17,14 +17,15 @@ from csplat import __version__, lazy_exports
 from csplat._spec import VERSION_MAJOR, VERSION_MINOR
 
 if TYPE_CHECKING:
-    from csplat_tools.batches.running import Batch, batch
+    from csplat_tools.batches.batch_run import Batch, batch
     from csplat_tools.inspect.comparison import Comparison, compare
-    from csplat_tools.optimise.reaching import encode_to
-    from csplat_tools.optimise.report import Optimised
-    from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
+    from csplat_tools.optimise import pruning
+    from csplat_tools.optimise.search_report import Optimised
+    from csplat_tools.optimise.simplify import Simplified, SimplifyOptions
+    from csplat_tools.optimise.target_encoding import encode_to
     from csplat_tools.scene_files import LoadedModel, SceneLike, load_model
-    from csplat_tools.tradeoffs.options import Wanted
-    from csplat_tools.tradeoffs.running import Tradeoff, tradeoff
+    from csplat_tools.tradeoffs.sweep_options import SweepOptions
+    from csplat_tools.tradeoffs.sweep_run import Tradeoff, tradeoff
     from csplat_tools.views import DataOptions, ViewSet, find_view_set
 
 __all__ = [
@@ -45,7 +46,7 @@ __all__ = [
     "encode_to",
     "find_view_set",
     "load_model",
-    "simplify",
+    "pruning",
     "tradeoff",
 ]
 
@@ -53,23 +54,23 @@ __all__ = [
 VERSIONS = f"csplat {__version__}, format {VERSION_MAJOR}.{VERSION_MINOR}"
 
 _MODULE_OF = {
-    "Batch": "csplat_tools.batches.running",
+    "Batch": "csplat_tools.batches.batch_run",
     "Comparison": "csplat_tools.inspect.comparison",
     "DataOptions": "csplat_tools.views",
     "LoadedModel": "csplat_tools.scene_files",
-    "Optimised": "csplat_tools.optimise.report",
+    "Optimised": "csplat_tools.optimise.search_report",
     "SceneLike": "csplat_tools.scene_files",
     "Simplified": "csplat_tools.optimise.simplify",
     "SimplifyOptions": "csplat_tools.optimise.simplify",
-    "Tradeoff": "csplat_tools.tradeoffs.running",
+    "Tradeoff": "csplat_tools.tradeoffs.sweep_run",
     "ViewSet": "csplat_tools.views",
-    "Wanted": "csplat_tools.tradeoffs.options",
-    "batch": "csplat_tools.batches.running",
+    "Wanted": "csplat_tools.tradeoffs.sweep_options",
+    "batch": "csplat_tools.batches.batch_run",
     "compare": "csplat_tools.inspect.comparison",
-    "encode_to": "csplat_tools.optimise.reaching",
+    "encode_to": "csplat_tools.optimise.target_encoding",
     "find_view_set": "csplat_tools.views",
     "load_model": "csplat_tools.scene_files",
     "simplify": "csplat_tools.optimise.simplify",
-    "tradeoff": "csplat_tools.tradeoffs.running",
+    "tradeoff": "csplat_tools.tradeoffs.sweep_run",
 }
 __getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)

@@ -12,7 +12,7 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree as ET
 
-from csplat_tools.files.console import format_bytes
+from csplat_tools.console import format_bytes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

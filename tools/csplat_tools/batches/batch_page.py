@@ -11,12 +11,12 @@ from functools import cache
 from html import escape
 from pathlib import Path
 
-from csplat_tools.batches.records import JOURNAL, Record
-from csplat_tools.batches.scene import THUMBNAILS
-from csplat_tools.batches.thumbnails import THUMBNAIL_SIZE
+from csplat_tools.batches.batch_page import THUMBNAIL_SIZE
+from csplat_tools.batches.journal import JOURNAL, Record
+from csplat_tools.batches.scene_job import THUMBNAILS
 from csplat_tools.console import format_bytes, format_seconds
 from csplat_tools.file_streams import write_bytes
-from csplat_tools.pages.parts import definitions, document, table
+from csplat_tools.html_report import definitions, document, table
 
 PAGE = "index.html"
 _THUMBNAILS_MAX = 1000  # thumbnails on the page, 4 kB each

@@ -24,7 +24,7 @@ from csplat_tools.batches.batch_scenes import Task, find_tasks
 from csplat_tools.batches.batch_worker import Worker, WorkerLostError
 from csplat_tools.batches.journal import JOURNAL, Journal, Record, open_journal, read_journal
 from csplat_tools.batches.scene_job import RENDERER_BYTES, PlannedJob, SceneJob, plan_job, run_job
-from csplat_tools.files.scenes import size_of
+from csplat_tools.scene_files import size_on_disk
 
 _SET_BY_BATCH = ("threads", "memory", "resume")  # options that the batch passes to a command that has them
 _FREE_SHARE = 0.9  # fraction of the free memory that a batch uses if `memory_bytes` is not given
@@ -326,7 +326,7 @@ def run_jobs(
 def job_bytes(job: SceneJob) -> int:
     """Return the size of a source in bytes; 0 if it is a URL or cannot be read."""
     with suppress(OSError):
-        return 0 if is_url(job.task.source) else size_of(Path(job.task.source))
+        return 0 if is_url(job.task.source) else size_on_disk(Path(job.task.source))
     return 0
 
 

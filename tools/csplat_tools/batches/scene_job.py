@@ -18,10 +18,10 @@ from csplat.encoder import EncodeOptions
 from csplat.errors import CsplatError, StoreError, missing
 from csplat.formats import format_of
 from csplat.remote import is_url, store_of
-from csplat_tools.batches.finding import Task
-from csplat_tools.batches.looking import Look, content_hash, expect
-from csplat_tools.batches.records import Record
-from csplat_tools.batches.workers import Worker, WorkerLostError, remove_left
+from csplat_tools.batches.batch_scenes import Task
+from csplat_tools.batches.batch_worker import Worker, WorkerLostError, remove_left
+from csplat_tools.batches.journal import Record
+from csplat_tools.batches.scene_job import SceneFile, content_hash, estimate_job
 from csplat_tools.scene_files import size_on_disk
 
 THUMBNAILS = "thumbnails"

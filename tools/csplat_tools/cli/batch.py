@@ -11,12 +11,12 @@ from typing import Annotated
 import typer
 
 from csplat.errors import counted
-from csplat_tools.batches.finding import starting_points
-from csplat_tools.batches.page import PAGE
-from csplat_tools.batches.records import JOURNAL
-from csplat_tools.batches.running import Batch, CommandLineError, Step, plan
-from csplat_tools.batches.running import batch as run_batch
-from csplat_tools.batches.scene import Planned
+from csplat_tools.batches.batch_page import PAGE
+from csplat_tools.batches.batch_run import Batch, BatchStep, CommandLineError, plan_batch
+from csplat_tools.batches.batch_run import batch as run_batch
+from csplat_tools.batches.batch_scenes import starting_points
+from csplat_tools.batches.journal import JOURNAL
+from csplat_tools.batches.scene_job import PlannedJob
 from csplat_tools.cli.command import EXIT_FAILED, OutputOptions, command
 from csplat_tools.cli.shared_options import parse_bytes
 from csplat_tools.console import format_bytes, format_estimate, format_seconds, format_table, note, step_progress

@@ -11,7 +11,7 @@ from csplat_tools.cli.shared_options import Lpips, Preset, Threads, ViewOptions
 from csplat_tools.console import note
 from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.optional_packages import prepare_renderer, require_images, require_plots, require_renderer
-from csplat_tools.tradeoffs.options import FAMILIES, Wanted, parse_what
+from csplat_tools.tradeoffs.sweep_options import FAMILIES, SweepOptions, parse_sweep
 
 _SLOW = {"strategies", "targets", "simplify", "finetune"}
 

@@ -96,7 +96,7 @@ def attribute_errors(
         return AttributeErrors("index", len(theirs), 0, _errors(ours, theirs, source_index))
     if _same_order(source.model, theirs):
         return AttributeErrors("order", len(theirs), 0, _errors(ours, theirs, np.arange(len(theirs))))
-    stated, header = other.stated_errors, other.header
+    stated, header = other.declared_bounds, other.header
     if header is None or stated is None or not len(theirs):
         return None
     bounds = {record.measure: record.max for record in stated.records}
@@ -123,7 +123,7 @@ def attribute_errors_out_of_core(
             return None
         # For a file that declares no errors and was refitted, all errors are measured.
         nothing = DeclaredBounds(source.count, 0, source.facts.sh_degree, refitted=True, records=())
-        opened = replace(open_tiles(other.path), stated_errors=nothing)
+        opened = replace(open_tiles(other.path), declared_bounds=nothing)
         proof = prove_by_disk(source.scene, opened, source_index, memory_bytes=source.memory_bytes, progress=progress)
         found = {one.name: (one.measured_max or 0.0, one.measured_rms or 0.0) for one in proof.measures}
         return AttributeErrors("index", other.count, 0, found)

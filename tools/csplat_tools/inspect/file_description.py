@@ -95,7 +95,7 @@ class FileDescription:
             chunks.
         cameras: number of cameras; `None` without the chunk, as for all that follows.
         options, metadata: the file's JSON.
-        stated_errors: the source of which the file is an encoding, and the declared error bounds.
+        declared_bounds: the source of which the file is an encoding, and the declared error bounds.
     """
 
     header: SceneHeader
@@ -106,7 +106,7 @@ class FileDescription:
     cameras: int | None
     options: Mapping[str, Any] | None
     metadata: Mapping[str, Any] | None
-    stated_errors: DeclaredBounds | None
+    declared_bounds: DeclaredBounds | None
 
     @property
     def bytes_per_splat(self) -> float | None:
@@ -159,7 +159,7 @@ class FileDescription:
             "cameras": self.cameras,
             "options": self.options,
             "metadata": self.metadata,
-            "stated_errors": None if self.stated_errors is None else _stated(self.stated_errors),
+            "stated_errors": None if self.declared_bounds is None else _stated(self.declared_bounds),
         }
 
 

@@ -12,6 +12,7 @@ from csplat.decoder import DeclaredBounds, decode
 from csplat.types import Progress
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import STANDARD_STREAM, write_bytes
+from csplat_tools.html_report import attribute_figure, definitions, document, table
 from csplat_tools.inspect.file_description import (
     FileDescription,
     describe_coding,
@@ -19,8 +20,6 @@ from csplat_tools.inspect.file_description import (
     format_headline,
     other_metadata,
 )
-from csplat_tools.pages.bars import attribute_figure
-from csplat_tools.pages.parts import definitions, document, table
 from csplat_tools.scene_files import LoadedModel, load_model
 
 _ATTRIBUTES = {
@@ -115,12 +114,12 @@ def make_page(title: str, facts: FileDescription, beside: _SourceComparison | No
 def _compared(data: bytes | mmap, source: str, progress: Progress | None) -> _SourceComparison:
     """Render file and source: from the views of `psnr` for the scores, and from others to show the hardest place."""
     from csplat_render.scorer import Scorer
-    from csplat_tools.pages.hardest import PICTURES, HardestPlace, picture_row
+    from csplat_tools.hardest_place import IMAGES_NOTE, HardestPlaceSearch, piece_images
     from csplat_tools.views import display_cameras, find_view_set
 
     loaded, model = load_model(source), decode(data)
     views = find_view_set(loaded.model, count=0)
-    hardest, shown = HardestPlace(), display_cameras(loaded.model, views)
+    hardest, shown = HardestPlaceSearch(), display_cameras(loaded.model, views)
     scores = views.judge(loaded.model).scores(model, progress=progress)
     showing = Scorer.of_source(loaded.model, shown, views.judging_background)
     showing.scores(model, ssim=False, on_view=hardest.look)
@@ -133,7 +132,7 @@ def _compared(data: bytes | mmap, source: str, progress: Progress | None) -> _So
         "worst view": f"{scores.psnr_worst:.2f} dB",
         "SSIM": f"{scores.ssim:.4f}: likeness of structure, 1 at best",
     }
-    return _SourceComparison(facts, f"<p>{escape(PICTURES)}</p>\n{picture_row(place, 'the file')}")
+    return _SourceComparison(facts, f"<p>{escape(IMAGES_NOTE)}</p>\n{piece_images(place, 'the file')}")
 
 
 def _source_words(path: str, source: LoadedModel, size_bytes: int) -> str:

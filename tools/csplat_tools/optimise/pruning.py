@@ -19,10 +19,15 @@ from csplat_render.conventions import ALPHA_MIN
 from csplat_render.metrics import PSNR_CAP
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_render.scorer import Scorer, renderer
-from csplat_tools.optimise.simplify.fitting import Fit, fit
-from csplat_tools.optimise.simplify.options import SimplifyOptions
-from csplat_tools.optimise.simplify.order import Order, Side, removal_order, seen_by
-from csplat_tools.optimise.target import Target
+from csplat_tools.optimise.pruning_order import (
+    MeasuredViews,
+    PruningOrder,
+    SimplifyOptions,
+    find_pruning_order,
+    total_removal,
+)
+from csplat_tools.optimise.splat_refit import RefitResult, refit_with_bands
+from csplat_tools.optimise.targets import Target
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import SceneLike, load_model
 from csplat_tools.views import ViewSet, camera_sequence, find_view_set
@@ -126,7 +131,7 @@ def prepare_pruning(
     options = replace(options, background=around.background, view_size=size)
     gone = max(_AGREE_ON, 0.0 if left is None else 1.0 - left / len(source))
     found = find_sufficient_views(source, around, gone, size=size, threads=options.threads, progress=progress)
-    sides = [Side(found.used, found.removal)]
+    sides = [MeasuredViews(found.used, found.removal)]
     if around.virtual:
         more = round(len(found.used) * max(1.0, options.work))
         cameras = camera_sequence(source, more, size, seed=options.seed + 1)

@@ -17,7 +17,7 @@ from csplat.model import SplatModel
 from csplat.types import F64, I64, Progress
 from csplat_render import Camera
 from csplat_render.pruning_error import PruningError, measure_pruning_error
-from csplat_tools.optimise.simplify.options import SimplifyOptions
+from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.views.sufficient_views import pruning_keys
 
 _DEFAULT_EFFORT = 3  # default effort

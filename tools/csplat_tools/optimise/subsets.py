@@ -34,7 +34,7 @@ from csplat_tools.optimise.splat_refit import (
     quantisation_aware_refit,
     refit_splats,
 )
-from csplat_tools.views import ViewSet, evenly
+from csplat_tools.views import ViewSet, evenly_spaced
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 
@@ -422,7 +422,7 @@ class RefittedSubset:
         """The importance of the splats, with Gauss–Newton blocks of the other attributes."""
         session, count = self.session, _SENSITIVITY_VIEWS[self.model.sh_degree > 0]
         found = measure_sensitivity(
-            self.model, evenly(session.views.used, count), background=session.options.background, magnitudes=False,
+            self.model, evenly_spaced(session.views.used, count), background=session.options.background, magnitudes=False,
             threads=session.options.threads, progress=self.progress,
         )  # fmt: skip
         return replace(StoredSensitivity.of(self.model, found).importance(), sh=self._removal.squared_weight)

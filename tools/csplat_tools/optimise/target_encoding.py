@@ -12,12 +12,12 @@ from csplat.encoder import EncodeOptions, EncodeResult, encode_with_report
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import Progress
-from csplat_tools.files.extras import need_renderer
-from csplat_tools.files.scenes import SceneLike, load_model
-from csplat_tools.files.sizes import parse_size_bytes
+from csplat_tools.console import parse_size_bytes
 from csplat_tools.optimise.candidates import Weights
 from csplat_tools.optimise.search_report import Optimised, SearchReport
 from csplat_tools.optimise.targets import Target
+from csplat_tools.optional_packages import require_renderer
+from csplat_tools.scene_files import SceneLike, load_model
 from csplat_tools.views import ViewSet, find_view_set
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def encode_to(
     if not target.is_rendered:
         bounded = meet_bounds(source, encoding, target.max_error, importance=importance, progress=progress)
         return _bounded_result(source, target, bounded, start)
-    need_renderer()
+    require_renderer()
     from csplat_tools.optimise.target_search import check_target, search_target
 
     check_target(source, target, encoding, keep_all=keep_all)

@@ -25,8 +25,8 @@ from csplat_tools.optimise.search_report import SearchReport, make_report
 from csplat_tools.optimise.sh_codings import CodingSearch
 from csplat_tools.optimise.subsets import Pruner
 from csplat_tools.optimise.targets import Target
-from csplat_tools.views import VIRTUAL, ViewSet, elsewhere, with_deciders
-from csplat_tools.views.timing import picture_seconds
+from csplat_tools.views import VIRTUAL, ViewSet, virtual_views, with_validation_views
+from csplat_tools.views.view_sets import render_seconds
 
 #: Cost of a target in renders of 640x480: without pruning (measured 380 to 690 with plane3, donut, lego60k, fox120k),
 #: and with it, a fixed part and one that grows with the effort (plane3 at 40 dB, effort 1, 3 and 7: as 0.6 to 1 to 4).
@@ -60,7 +60,7 @@ def search_target(
     Raises:
         InputError: the target is out of reach, no splat shows, or a loss is requested without photographs.
     """
-    views = with_deciders(views)
+    views = with_validation_views(views)
     judge = views.judge(source, threads=encoding.threads)
     if views.name != VIRTUAL and _is_empty(judge):
         raise InputError("no splat shows in the views given: are these cameras of this scene?")
@@ -116,7 +116,7 @@ def expected_seconds(
     Renders some test views to measure their time: the search costs about a fixed number of such renders on any machine.
     """
     pictures = expected_renders(encoding, target, keep_all=keep_all, simplifying=simplifying)
-    return pictures * picture_seconds(source, views.judges, threads=encoding.threads)
+    return pictures * render_seconds(source, views.judges, threads=encoding.threads)
 
 
 def expected_renders(
@@ -156,7 +156,7 @@ def _is_empty(judge: Scorer) -> bool:
 
 def _psnr_elsewhere(source: SplatModel, found: Candidate, views: ViewSet, threads: int | None) -> dict[str, float]:
     """Return the PSNR from views that had no part in the search, by kind."""
-    model, judged = decode(found.result.data), elsewhere(source).items()
+    model, judged = decode(found.result.data), virtual_views(source).items()
     return {
         kind: round(Scorer.of_source(source, cameras, views.background, threads=threads).psnr(model), 3)
         for kind, cameras in judged

@@ -14,9 +14,9 @@ from csplat.model import SplatModel
 from csplat.types import Progress, null_progress
 from csplat_render.kernels import thread_count
 from csplat_render.metrics import Scores
-from csplat_tools.files.console import format_about, format_bytes
-from csplat_tools.files.extras import need_renderer
+from csplat_tools.console import format_bytes, format_estimate
 from csplat_tools.optimise.target_encoding import encode_to
+from csplat_tools.optional_packages import require_renderer
 from csplat_tools.study import Reduction, encode_reduced, parse_kmeans
 from csplat_tools.tradeoffs.machine import describe_machine
 from csplat_tools.tradeoffs.sweep_commands import encode_command, finetune_command, reduction_command, target_command
@@ -41,7 +41,7 @@ from csplat_tools.training.tuned_file import (
     default_validation_count,
 )
 from csplat_tools.views import Colour, DataOptions, ViewSet, find_view_set
-from csplat_tools.views.viewset import pose
+from csplat_tools.views.view_sets import pose_key
 from csplat_trainer.tuning import FinetuneOptions
 
 # Seconds by kind of point, on two cores: a fixed part (scores, and for presets those with fewer bands); per million
@@ -164,7 +164,7 @@ def tradeoff(
         CsplatError: a file is not valid.
         OSError: a file cannot be read.
     """
-    need_renderer()
+    require_renderer()
     if isinstance(scene, SweepSetting):
         setting = scene
     else:
@@ -178,7 +178,7 @@ def tradeoff(
         if not tried:
             raise InputError("nothing to sweep: what is asked for has no values")
         costs = [estimated_seconds(one.cost or one.family, setting, wanted, measurer.source_modes) for one in tried]
-        tell(f"{counted(len(tried), 'file')} to make and to measure: about {format_about(sum(costs))} here")
+        tell(f"{counted(len(tried), 'file')} to make and to measure: about {format_estimate(sum(costs))} here")
         points = list[SweepPoint | SweepFailure]()
         for number, candidate in enumerate(tried):
             report("the sweep", sum(costs[:number]) / sum(costs))
@@ -341,8 +341,8 @@ def _tuning_views(setting: SweepSetting) -> ViewSet:
     """Return the views of `csplat finetune`: all photographs that are not test views, or more virtual views."""
     views = setting.views
     if views.photographs:  # which are in memory already
-        judging = {pose(camera) for camera in views.judges}
-        teaches = [one.camera for one in views.photographs if pose(one.camera) not in judging]
+        judging = {pose_key(camera) for camera in views.judges}
+        teaches = [one.camera for one in views.photographs if pose_key(one.camera) not in judging]
         return replace(views, teaches=teaches, decides=())
     return find_view_set(
         setting.source, cameras=setting.cameras, background=setting.background, count=VIEWS, size=VIEW_SIZE,

@@ -7,14 +7,13 @@ from html import escape
 
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import write_bytes
-from csplat_tools.pages.hardest import PICTURES, picture_row
-from csplat_tools.pages.parts import command_line, copy_button, definitions, document, table
+from csplat_tools.hardest_place import IMAGES_NOTE, piece_images
+from csplat_tools.html_report import command_line, copy_button, definitions, document, table
 from csplat_tools.render_files import make_output_folder
-from csplat_tools.tradeoffs.measuring import DECODE_RUNS
-from csplat_tools.tradeoffs.plots import PLOTS, draw_plot
-from csplat_tools.tradeoffs.points import Point
-from csplat_tools.tradeoffs.running import Tradeoff
-from csplat_tools.tradeoffs.tables import columns_of, mode_rows, partial_rows, views_line
+from csplat_tools.tradeoffs.sweep_points import DECODE_RUNS, SweepPoint
+from csplat_tools.tradeoffs.sweep_run import Tradeoff
+from csplat_tools.tradeoffs.tradeoff_plots import PLOTS, draw_plot
+from csplat_tools.tradeoffs.tradeoff_tables import columns_of, mode_rows, partial_rows, views_line
 from csplat_tools.views import VIRTUAL
 
 _MOST_SHOWN = 9  # largest number of points with images, some 60 kB each

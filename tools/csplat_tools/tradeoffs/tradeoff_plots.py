@@ -9,11 +9,10 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from csplat_tools.console import format_bytes
-from csplat_tools.pages.bars import Bar, draw_bars
-from csplat_tools.pages.svg import INK, drawn, hover
-from csplat_tools.tradeoffs.labels import label_marks
-from csplat_tools.tradeoffs.points import Point
-from csplat_tools.tradeoffs.running import Tradeoff
+from csplat_tools.html_report import INK, Bar, draw_bars, draw_svg, hover_id
+from csplat_tools.tradeoffs.sweep_points import SweepPoint
+from csplat_tools.tradeoffs.sweep_run import Tradeoff
+from csplat_tools.tradeoffs.tradeoff_plots import label_marks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from csplat_tools.console import format_bytes, format_table
-from csplat_tools.tradeoffs.points import Partial, Point
-from csplat_tools.tradeoffs.running import Tradeoff
+from csplat_tools.tradeoffs.sweep_points import PartialFetch, SweepPoint
+from csplat_tools.tradeoffs.sweep_run import Tradeoff
 from csplat_tools.views import describe_views
 
 #: Mark before the names of points on the Pareto front.

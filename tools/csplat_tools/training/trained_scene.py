@@ -16,8 +16,8 @@ from csplat_tools.console import note, step_progress
 from csplat_tools.file_streams import write_model
 from csplat_tools.optional_packages import prepare_renderer
 from csplat_tools.scene_files import MetadataOverrides
-from csplat_tools.training.finetune import BYTE_COST, run_finetuning, usually_aside
-from csplat_tools.training.page import show_views, write_page
+from csplat_tools.training.training_page import show_views, write_training_page
+from csplat_tools.training.tuned_file import BYTE_COST, default_validation_count, run_finetuning
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.losses import PerceptualLoss
@@ -112,7 +112,7 @@ def run_training_to_file(
         _ = one.pixels, one.mask
     result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (facts or MetadataOverrides()).applied(result.model)
-    views = find_view_set(model, data=data, aside=usually_aside(0, cameras=None, data=data))
+    views = find_view_set(model, data=data, aside=default_validation_count(0, cameras=None, data=data))
     known = None
     if result.metrics is not None and options.eval_views == 0 and options.device == "cpu":
         known = {"source": {**result.metrics, "lpips": None}}

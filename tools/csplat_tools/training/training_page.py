@@ -16,12 +16,10 @@ from csplat.model import SplatModel
 from csplat.types import U8
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import write_bytes
-from csplat_tools.pages.bars import attribute_figure
-from csplat_tools.pages.hardest import pictures_beside
-from csplat_tools.pages.parts import definitions, document, table
-from csplat_tools.pages.svg import INK, drawn
+from csplat_tools.hardest_place import image_row
+from csplat_tools.html_report import INK, attribute_figure, definitions, document, draw_svg, table
 from csplat_tools.render_files import to_uint8
-from csplat_tools.training.report import SCORES, score_rows
+from csplat_tools.training.tuning_report import SCORES, score_rows
 from csplat_tools.views import ViewSet, evenly_spaced
 
 if TYPE_CHECKING:

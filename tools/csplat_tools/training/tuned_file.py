@@ -18,12 +18,12 @@ from csplat_render.kernels import thread_count
 from csplat_render.metrics import Distance
 from csplat_tools.console import format_bytes, note, progress_bar, step_progress
 from csplat_tools.file_streams import write_array, write_bytes
-from csplat_tools.optimise.exchange import BYTES_PER_DB
+from csplat_tools.optimise.rate_distortion import BYTES_PER_DB
 from csplat_tools.optional_packages import prepare_renderer
-from csplat_tools.training.choosing import Chosen, choose_splats, training_views
-from csplat_tools.training.page import show_views, write_page
-from csplat_tools.training.report import as_report, judge_models
-from csplat_tools.training.searching import smallest_reaching
+from csplat_tools.training.training_page import show_views, write_training_page
+from csplat_tools.training.tuned_file import smallest_reaching
+from csplat_tools.training.tuning_inputs import TuningSubset, choose_splats, training_views
+from csplat_tools.training.tuning_report import make_tuning_report, score_models
 from csplat_tools.views import ViewSet
 from csplat_trainer.training_options import Outputs
 from csplat_trainer.tuning import Clock, Finetuned, FinetuneOptions, TuningStep

@@ -16,8 +16,9 @@ from csplat.types import I64, Progress
 from csplat_render import Camera
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.importance_file import read_importance
-from csplat_tools.optimise.sensitivity import measure_views
-from csplat_tools.optimise.simplify import SimplifyOptions, simplify
+from csplat_tools.optimise import pruning
+from csplat_tools.optimise.scene_sensitivity import measure_views
+from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.views import VIEW_COUNT, ViewSet, with_validation_views
 from csplat_trainer.sensitivity import Sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
@@ -133,5 +134,5 @@ def _pruned(
     if keep >= 1.0:
         return model, np.arange(len(model))
     options = SimplifyOptions(threads=threads)
-    result = simplify(model, keep=keep, views=views, options=options, progress=progress)
+    result = pruning(model, keep=keep, views=views, options=options, progress=progress)
     return result.model, result.source_index

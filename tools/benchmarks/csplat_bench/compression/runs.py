@@ -24,8 +24,8 @@ from csplat_bench.compression.sizes import books_of
 from csplat_render.lpips import Lpips
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.inspect.file_description import bytes_by_attribute
-from csplat_tools.training.choosing import Chosen, choose_splats, training_views
-from csplat_tools.training.report import judge_models
+from csplat_tools.training.tuning_inputs import TuningSubset, choose_splats, training_views
+from csplat_tools.training.tuning_report import score_models
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.tuning import Clock, FinetuneOptions, TuningViews, tune
 

@@ -56,8 +56,8 @@ from csplat_bench.distortion.tables import tables
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import scene_frame
 from csplat_tools.console import note
-from csplat_tools.optimise.reaching import encode_to
-from csplat_tools.optimise.sensitivity import measured_importance, measuring_views
+from csplat_tools.optimise.scene_sensitivity import importance_views, measure_importance
+from csplat_tools.optimise.target_encoding import encode_to
 from csplat_tools.views import BLACK, find_view_set
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg,angel,st-peter,fox120k,statue"  # the quick ones first

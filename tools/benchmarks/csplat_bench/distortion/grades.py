@@ -29,7 +29,7 @@ from csplat_render.camera_files import load_cameras
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import scene_frame
 from csplat_tools.console import note
-from csplat_tools.optimise.sensitivity import measured_importance, measuring_views
+from csplat_tools.optimise.scene_sensitivity import importance_views, measure_importance
 from csplat_tools.views import BLACK, find_view_set
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg"

@@ -26,8 +26,8 @@ from csplat_tools.study import (
     raw_bytes,
     reduce_model,
 )
-from csplat_tools.training.choosing import training_views
-from csplat_tools.training.finetune import BYTE_COST, SHAPE_ENTRIES
+from csplat_tools.training.tuned_file import BYTE_COST, SHAPE_ENTRIES
+from csplat_tools.training.tuning_inputs import training_views
 from csplat_tools.views import ViewSet, with_validation_views
 from csplat_trainer.tuning import FinetuneOptions
 
