@@ -3,7 +3,7 @@
 import json
 import threading
 
-from csplat_tools.cli.batch_worker import answer
+from csplat_tools.cli.batch_protocol import answer
 
 
 class InThisProcess:

@@ -5,7 +5,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from csplat_tools.optimise.simplify import SimplifyOptions
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -14,9 +13,10 @@ from csplat.model import SplatModel, normalise_quats
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.scorer import renderer
+from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.optimise.target_encoding import encode_to
 from csplat_tools.views import BLACK, ViewSet, camera_sequence, find_view_set, with_validation_views
-from csplat_trainer.pictures import Picture
+from csplat_trainer.posed_images import PosedImage
 
 W, H = 48, 40
 

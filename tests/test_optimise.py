@@ -15,7 +15,6 @@ import extremes
 from analytic_model import AnalyticScene
 from analytic_search import analytic_removal
 from captures import around, cameras, crowded, found_within, judged_by, photographed, shell, views_of
-from csplat_tools.optimise.simplify import SimplifyOptions
 
 from csplat import EncodeOptions, decode
 from csplat.decoder import decode_scene
@@ -36,6 +35,7 @@ from csplat_tools.optimise.precision_search import (
     SearchWindow,
     find_in_window,
 )
+from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.optimise.rate_distortion import error_of_psnr
 from csplat_tools.optimise.scene_sensitivity import complete_importance, measure_importance
 from csplat_tools.optimise.search_report import SearchReport

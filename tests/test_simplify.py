@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 pytest.importorskip("numba", reason="simplification wants the extra [render]")
 
 from captures import views_of
-from csplat_tools.optimise.simplify import SimplifyOptions
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
@@ -23,8 +22,8 @@ from csplat_render.scorer import Scorer, renderer
 from csplat_render.virtual_cameras import is_clear, sample_cloud, scene_frame
 from csplat_tools.cli.app import app
 from csplat_tools.cli.shared_options import parse_decibels
-from csplat_tools.optimise import pruning
-from csplat_tools.optimise.pruning_order import MeasuredViews, find_pruning_order, total_removal
+from csplat_tools.optimise.pruning import simplify
+from csplat_tools.optimise.pruning_order import MeasuredViews, SimplifyOptions, find_pruning_order, total_removal
 from csplat_tools.optimise.splat_refit import RefitResult, choose_bands, coefficient_mask, drop_bands, refit_splats
 from csplat_tools.study import prune_share
 from csplat_tools.views import (
@@ -32,13 +31,12 @@ from csplat_tools.views import (
     VIEW_SIZE,
     camera_sequence,
     default_views,
+    extra_test_cameras,
     find_view_set,
     shrink_cameras,
-    virtual_views,
 )
 from csplat_tools.views.sufficient_views import find_sufficient_views, pruning_keys
-from csplat_trainer.evaluate import photograph_judge
-from csplat_trainer.pictures import Picture
+from csplat_trainer.posed_images import PosedImage, photograph_scorer
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
@@ -94,7 +92,7 @@ def test_a_longer_sequence_of_cameras_begins_like_a_shorter_one(source):
 def test_no_camera_looks_at_a_long_object_from_inside(source):
     long = replace(source, means=source.means * np.float32([1.0, 12.0, 1.0]))
     frame, cloud = scene_frame(long), sample_cloud(long, 20_000, np.random.default_rng(0))
-    cameras = [*camera_sequence(long, 40, (40, 30)), *virtual_views(long)["nearer"]]
+    cameras = [*camera_sequence(long, 40, (40, 30)), *extra_test_cameras(long)["nearer"]]
     assert frame.kind == "object"
     assert all(is_clear(frame, cloud, camera) for camera in cameras)
 
@@ -157,7 +155,7 @@ def test_exact_errors_choose_better_than_opacity(source):
     views = views_of(camera_sequence(source, 32, (48, 36), seed=3))
     for rounds in (1, SMALL.rounds):
         options = replace(SMALL, rounds=rounds, refit=False, bands=False)
-        scores[rounds] = judge.psnr(pruning(source, keep=0.8, views=views, options=options).model)
+        scores[rounds] = judge.psnr(simplify(source, keep=0.8, views=views, options=options).model)
     by_opacity = [judge.psnr(prune_share(source, 0.8, by_area=by_area)[0]) for by_area in (False, True)]
     assert min(scores.values()) > max(by_opacity) + 3.0
 
@@ -167,7 +165,7 @@ def test_exact_errors_choose_better_than_opacity(source):
 
 @pytest.mark.slow
 def test_keeping_a_share_keeps_that_many_and_says_which(source, given):
-    result = pruning(source, keep=0.5, views=given, options=replace(SMALL, refit=False))
+    result = simplify(source, keep=0.5, views=given, options=replace(SMALL, refit=False))
     assert len(result.model) == 225
     np.testing.assert_array_equal(source.means[result.source_index], result.model.means)
     report = result.report
@@ -182,7 +180,7 @@ def test_a_refit_gains_on_views_that_it_did_not_see(source):
     shell = source.select(slice(10, 300))
     shell = replace(shell, scales=shell.scales + np.float32(0.7), shN=shell.shN[:, :0])
     views = views_of(camera_sequence(shell, 40, (48, 36), seed=3))
-    report = pruning(shell, keep=0.5, views=views, options=replace(SMALL, bands=False)).report
+    report = simplify(shell, keep=0.5, views=views, options=replace(SMALL, bands=False)).report
     assert report["check_psnr"] > report["check_psnr_pruned"] + 1.5
 
 
@@ -190,8 +188,8 @@ def test_a_fit_that_serves_its_own_views_alone_is_refused(source, given, monkeyp
     def dark(model, *_arguments, **_options):
         return RefitResult(replace(model, sh0=model.sh0 - np.float32(1.0)), None)
 
-    monkeypatch.setattr(sys.modules[pruning.__module__], "refit_with_bands", dark)
-    result = pruning(source, keep=0.6, views=given, options=SMALL)
+    monkeypatch.setattr(sys.modules[simplify.__module__], "refit_with_bands", dark)
+    result = simplify(source, keep=0.6, views=given, options=SMALL)
     assert result.report["refit_refused"]
     assert result.report["check_psnr"] == result.report["check_psnr_pruned"]
     np.testing.assert_array_equal(source.sh0[result.source_index], result.model.sh0)
@@ -221,7 +219,7 @@ def test_transparent_and_opaque_splats_stay_within_alpha(source):
 @pytest.mark.slow
 @pytest.mark.parametrize(("goal", "refit"), [(35.0, False), (28.0, True)])
 def test_a_target_psnr_is_reached(source, given, goal, refit):
-    result = pruning(source, psnr=goal, views=given, options=replace(SMALL, bands=False, refit=refit))
+    result = simplify(source, psnr=goal, views=given, options=replace(SMALL, bands=False, refit=refit))
     assert result.report["decided_psnr"] >= goal
     assert given.decider(source).psnr(result.model) == pytest.approx(result.report["decided_psnr"])
     assert len(result.model) < len(source)
@@ -237,7 +235,7 @@ def test_more_loss_lets_more_splats_go(source):
     judge = photograph_scorer(views.pictures(views.decides), views.background)
     sizes = []
     for loss in (0.05, 1.0):
-        result = pruning(source, loss=loss, views=views, options=replace(SMALL, bands=False, refit=False))
+        result = simplify(source, loss=loss, views=views, options=replace(SMALL, bands=False, refit=False))
         assert judge.psnr(result.model) >= judge.psnr(source) - loss
         sizes.append(len(result.model))
     assert sizes[0] > sizes[1]
@@ -245,11 +243,11 @@ def test_more_loss_lets_more_splats_go(source):
 
 def test_a_loss_wants_photographs(source):
     with pytest.raises(InputError, match="name a data set"):
-        pruning(source, loss=0.3, options=SMALL)
+        simplify(source, loss=0.3, options=SMALL)
 
 
 def test_nothing_changes_where_everything_stays(source, given):
-    result = pruning(source, keep=1.0, views=given, options=replace(SMALL, refit=False))
+    result = simplify(source, keep=1.0, views=given, options=replace(SMALL, refit=False))
     assert len(result.model) == len(source)
     np.testing.assert_array_equal(source.shN, result.model.shN)
 
@@ -265,13 +263,13 @@ def test_nothing_changes_where_everything_stays(source, given):
 )
 def test_as_many_stay_as_were_asked_for_and_one_at_least(source, given, keep, options, left):
     chosen = replace(SMALL, refit=False, bands=False, **options)
-    assert left == len(pruning(source, keep=keep, views=given, options=chosen).model)
+    assert left == len(simplify(source, keep=keep, views=given, options=chosen).model)
 
 
 @pytest.mark.slow
 def test_the_result_does_not_depend_on_threads(source, given):
     one, two = (
-        pruning(source, keep=0.5, views=given, options=replace(SMALL, bands=False, threads=threads))
+        simplify(source, keep=0.5, views=given, options=replace(SMALL, bands=False, threads=threads))
         for threads in (1, 2)
     )
     np.testing.assert_array_equal(one.source_index, two.source_index)
@@ -294,7 +292,7 @@ def test_bands_that_are_worth_less_than_their_bits_go():
 
 @pytest.mark.slow
 def test_bands_without_worth_are_zero_and_others_are_not(source, given):
-    result = pruning(source, keep=0.4, views=given, options=SMALL)
+    result = simplify(source, keep=0.4, views=given, options=SMALL)
     stays = result.stays
     assert stays is not None
     assert 0 < np.count_nonzero(~stays) < stays.size
@@ -310,7 +308,7 @@ def test_bands_without_worth_are_zero_and_others_are_not(source, given):
 def test_several_targets_and_options_out_of_range_are_refused(source):
     for given, says in (({}, "no target"), ({"psnr": 40.0, "keep": 0.5}, "one of them")):
         with pytest.raises(InputError, match=says):
-            pruning(source, options=SMALL, **given)
+            simplify(source, options=SMALL, **given)
     for wrong in ({"rounds": 0}, {"effort": 0}, {"effort": 10}, {"views": 0}, {"view_size": (0, 1)}):
         with pytest.raises(InputError, match="wanted"):
             SimplifyOptions(**wrong)
@@ -319,7 +317,7 @@ def test_several_targets_and_options_out_of_range_are_refused(source):
 
 def test_an_empty_scene_is_refused(source):
     with pytest.raises(InputError, match="without splats"):
-        pruning(source.select(slice(0, 0)), keep=0.5)
+        simplify(source.select(slice(0, 0)), keep=0.5)
 
 
 def test_decibels_are_read_with_and_without_their_unit():

@@ -25,7 +25,7 @@ from csplat_render.scorer import renderer
 from csplat_tools.cli.app import app
 from csplat_tools.views import BLACK, WHITE, DataOptions, ViewSet, find_view_set
 from csplat_tools.views.view_sets import pose_key
-from csplat_trainer.evaluate import evaluate
+from csplat_trainer.posed_images import evaluate
 
 KINDS = ("rgb", "rgba", "colmap")
 

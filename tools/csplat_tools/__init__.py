@@ -19,9 +19,9 @@ from csplat._spec import VERSION_MAJOR, VERSION_MINOR
 if TYPE_CHECKING:
     from csplat_tools.batches.batch_run import Batch, batch
     from csplat_tools.inspect.comparison import Comparison, compare
-    from csplat_tools.optimise import pruning
+    from csplat_tools.optimise.pruning import Simplified, simplify
+    from csplat_tools.optimise.pruning_order import SimplifyOptions
     from csplat_tools.optimise.search_report import Optimised
-    from csplat_tools.optimise.simplify import Simplified, SimplifyOptions
     from csplat_tools.optimise.target_encoding import encode_to
     from csplat_tools.scene_files import LoadedModel, SceneLike, load_model
     from csplat_tools.tradeoffs.sweep_options import SweepOptions
@@ -46,7 +46,7 @@ __all__ = [
     "encode_to",
     "find_view_set",
     "load_model",
-    "pruning",
+    "simplify",
     "tradeoff",
 ]
 
@@ -60,17 +60,17 @@ _MODULE_OF = {
     "LoadedModel": "csplat_tools.scene_files",
     "Optimised": "csplat_tools.optimise.search_report",
     "SceneLike": "csplat_tools.scene_files",
-    "Simplified": "csplat_tools.optimise.simplify",
-    "SimplifyOptions": "csplat_tools.optimise.simplify",
+    "Simplified": "csplat_tools.optimise.pruning",
+    "SimplifyOptions": "csplat_tools.optimise.pruning_order",
     "Tradeoff": "csplat_tools.tradeoffs.sweep_run",
     "ViewSet": "csplat_tools.views",
-    "Wanted": "csplat_tools.tradeoffs.sweep_options",
+    "SweepOptions": "csplat_tools.tradeoffs.sweep_options",
     "batch": "csplat_tools.batches.batch_run",
     "compare": "csplat_tools.inspect.comparison",
     "encode_to": "csplat_tools.optimise.target_encoding",
     "find_view_set": "csplat_tools.views",
     "load_model": "csplat_tools.scene_files",
-    "simplify": "csplat_tools.optimise.simplify",
+    "simplify": "csplat_tools.optimise.pruning",
     "tradeoff": "csplat_tools.tradeoffs.sweep_run",
 }
 __getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)

@@ -72,7 +72,7 @@ class HardestPlaceSearch:
         number, rows, columns, source, decoded = self._place
         a, b = source[rows, columns], decoded[rows, columns]
         pieces = [_reduced(one) for one in np.split(side_by_side(a, b, AMPLIFICATION), 3, axis=1)]
-        return Place(number, float(psnr(a, b)), _framed(source, rows, columns), *pieces)
+        return ImagePiece(number, float(psnr(a, b)), _framed(source, rows, columns), *pieces)
 
 
 def piece_images(place: ImagePiece, name: str) -> str:

@@ -11,12 +11,20 @@ from functools import cache
 from html import escape
 from pathlib import Path
 
-from csplat_tools.batches.batch_page import THUMBNAIL_SIZE
+import numpy as np
+
+from csplat.errors import CsplatError
+from csplat.formats import format_of, open_scene
+from csplat.model import SplatModel
+from csplat.scene import joined
+from csplat.training_record import TrainingRecord
 from csplat_tools.batches.journal import JOURNAL, Record
 from csplat_tools.batches.scene_job import THUMBNAILS
 from csplat_tools.console import format_bytes, format_seconds
 from csplat_tools.file_streams import write_bytes
 from csplat_tools.html_report import definitions, document, table
+from csplat_tools.optional_packages import prepare_renderer, require_images
+from csplat_tools.render_files import to_uint8
 
 PAGE = "index.html"
 _THUMBNAILS_MAX = 1000  # thumbnails on the page, 4 kB each
@@ -127,7 +135,7 @@ def prepare_thumbnails() -> bool:
         True if thumbnails can be drawn here; this requires the extra `render`.
     """
     try:
-        need_pictures()
+        require_images()
         prepare_renderer(quiet=True)
     except CsplatError:
         return False
@@ -161,7 +169,7 @@ def _jpeg(model: SplatModel) -> bytes:
     width, height = THUMBNAIL_SIZE
     camera = orbit_cameras(model, 1, _FINER * width, _FINER * height)[0]
     said = TrainingRecord.of(model.metadata)
-    picture = to_bytes(render(model, camera, background=said.background if said else (0.0, 0.0, 0.0), mode="fast").rgb)
+    picture = to_uint8(render(model, camera, background=said.background if said else (0.0, 0.0, 0.0), mode="fast").rgb)
     buffer = io.BytesIO()
     Image.fromarray(picture).resize(THUMBNAIL_SIZE, Image.Resampling.BOX).save(
         buffer, "JPEG", quality=_JPEG_QUALITY, optimize=True

@@ -16,7 +16,7 @@ from csplat.errors import CsplatError
 from csplat.system import NEW_GROUP_FLAGS, interrupt_process
 
 _PROGRAM = (
-    "csplat_tools.cli.batch_worker"  # started by its name: `cli` is above this package and may not be imported here
+    "csplat_tools.cli.batch_protocol"  # started by its name: `cli` is above this package and may not be imported here
 )
 _PATIENCE = 10.0  # seconds that an interrupted process has to tidy up before it is killed
 
@@ -42,7 +42,7 @@ class Worker:
         self._closed = False
 
     def ask(self, what: str, **values: Any) -> dict[str, Any]:
-        """Send a request, and return the answer of `csplat_tools.cli.batch_worker.answer`.
+        """Send a request, and return the answer of `csplat_tools.cli.batch_protocol.answer`.
 
         Raises:
             WorkerLostError: the process ended, or was closed. Files that it had begun to write remain, see `pid`.

@@ -21,8 +21,8 @@ from csplat.remote import is_url, store_of
 from csplat_tools.batches.batch_scenes import Task
 from csplat_tools.batches.batch_worker import Worker, WorkerLostError, remove_left
 from csplat_tools.batches.journal import Record
-from csplat_tools.batches.scene_job import SceneFile, content_hash, estimate_job
-from csplat_tools.scene_files import size_on_disk
+from csplat_tools.encode_file import OutOfCoreOptions, estimate_cost
+from csplat_tools.scene_files import FOLDER_NAMES, size_on_disk
 
 THUMBNAILS = "thumbnails"
 _PART_BYTES = 16 << 20
@@ -313,10 +313,10 @@ def inspect_scene(path: Path) -> SceneFile:
     Raises:
         OSError: the file cannot be read.
     """
-    size, content = size_of(path), content_hash(path)
+    size, content = size_on_disk(path), content_hash(path)
     try:
         name = format_of(path).name
-        found = expected(path, EncodeOptions(), Scale(memory_bytes=_UNBOUNDED))
+        found = estimate_cost(path, EncodeOptions(), OutOfCoreOptions(memory_bytes=_UNBOUNDED))
     except (CsplatError, ValueError, MemoryError):  # no prediction for such a file
         return SceneFile(content, size, None, "")
     return SceneFile(content, size, found.count, name, found.seconds, found.needs.memory_bytes)

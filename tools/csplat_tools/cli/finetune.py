@@ -43,7 +43,7 @@ from csplat_tools.scene_files import read_source
         ("byte_cost", "target_size", "target_psnr"),
     ),
     needs={"near": ("data",), "checkpoint_every": ("checkpoint",)},
-    settings=(ENCODER_SETTINGS, "csplat_trainer.tuning.options:FinetuneOptions"),
+    settings=(ENCODER_SETTINGS, "csplat_trainer.tuning.tuning_options:FinetuneOptions"),
 )
 def finetune(
     source: Annotated[str, typer.Argument(metavar="IN.ply", help="A trained 3DGS scene.")],

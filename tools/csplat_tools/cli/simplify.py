@@ -79,7 +79,7 @@ def simplify(
     """
     require_renderer()
     import csplat_tools
-    from csplat_tools.optimise.simplify import SimplifyOptions
+    from csplat_tools.optimise.pruning_order import SimplifyOptions
     from csplat_tools.optimise.targets import Target
     from csplat_tools.views import shrink_cameras
     from csplat_tools.views.view_sets import total_render_seconds

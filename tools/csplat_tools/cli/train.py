@@ -147,7 +147,7 @@ def train(
     from csplat_tools.training.trained_scene import run_training, run_training_to_file, tuning_after, tuning_checkpoint
     from csplat_tools.training.tuned_file import SHAPE_ENTRIES, SPLAT_BYTES
     from csplat_tools.training.tuning_report import format_tuning_report
-    from csplat_trainer.checkpoint import load_checkpoint
+    from csplat_trainer.training_checkpoint import load_checkpoint
 
     to_file, size_bytes = Path(output).suffix == ".csplat", parse_bytes(target_size)
     psnr = None if target_psnr is None else parse_decibels(target_psnr)

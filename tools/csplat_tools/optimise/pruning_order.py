@@ -17,7 +17,7 @@ from csplat.model import SplatModel
 from csplat.types import F64, I64, Progress
 from csplat_render import Camera
 from csplat_render.pruning_error import PruningError, measure_pruning_error
-from csplat_tools.optimise.pruning_order import SimplifyOptions
+from csplat_tools.views import VIEW_SIZE, default_views
 from csplat_tools.views.sufficient_views import pruning_keys
 
 _DEFAULT_EFFORT = 3  # default effort
@@ -67,7 +67,7 @@ class SimplifyOptions:
 
     def pictures(self, splats: int) -> tuple[int, tuple[int, int]]:
         """Return the largest number of training views, and the width and height of their renders, for N splats."""
-        views, size = usual_views(splats)
+        views, size = default_views(splats)
         return self.views or views, self.view_size or size
 
     def steps(self, usual: int) -> int:
@@ -181,7 +181,7 @@ def find_pruning_order(
                 threads=options.threads, progress=progress,
             )  # fmt: skip
             sides[turn] = replace(sides[turn], removal=removal)
-        keys = pruning_keys(model.opacities[rows], seen_by(sides), keep_unseen=options.keep_unseen)
+        keys = pruning_keys(model.opacities[rows], total_removal(sides), keep_unseen=options.keep_unseen)
         order = np.argsort(keys, kind="stable")[: len(rows) - target]
         order = order[np.isfinite(keys[order])]
         if not len(order):

@@ -15,6 +15,7 @@ from csplat.types import Progress
 from csplat_render import Camera
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.file_streams import open_output
+from csplat_tools.optimise.candidates import Weights
 from csplat_tools.views import Colour, ViewSet, evenly_spaced
 from csplat_tools.views.sufficient_views import find_sufficient_views
 from csplat_trainer.sensitivity import Sensitivity, measure_sensitivity

@@ -9,7 +9,11 @@ from typing import Any
 
 from csplat.encoder import EncodeResult
 from csplat.errors import counted
+from csplat_render.metrics import psnr_of_mse
 from csplat_tools.console import format_bytes
+from csplat_tools.optimise.candidates import Candidate, CandidatePool, psnr_spread
+from csplat_tools.optimise.targets import Target
+from csplat_tools.views import describe_views
 
 _LESS = 1.0  # dB: a PSNR from elsewhere that is lower by more is pointed out
 
@@ -153,7 +157,7 @@ def make_report(
     """
     errors, spread = found.errors, psnr_spread(found.errors)
     worst = min(psnr_of_mse(float(error)) for error in errors)
-    many = counted_views(len(errors), views_of)
+    many = describe_views(len(errors), views_of)
     sure = (
         f"measured on the file itself, in {many}, which chose nothing but the precision: the worst has {worst:.2f} dB"
     )

@@ -422,8 +422,8 @@ class RefittedSubset:
         """The importance of the splats, with Gauss–Newton blocks of the other attributes."""
         session, count = self.session, _SENSITIVITY_VIEWS[self.model.sh_degree > 0]
         found = measure_sensitivity(
-            self.model, evenly_spaced(session.views.used, count), background=session.options.background, magnitudes=False,
-            threads=session.options.threads, progress=self.progress,
+            self.model, evenly_spaced(session.views.used, count), background=session.options.background,
+            magnitudes=False, threads=session.options.threads, progress=self.progress,
         )  # fmt: skip
         return replace(StoredSensitivity.of(self.model, found).importance(), sh=self._removal.squared_weight)
 

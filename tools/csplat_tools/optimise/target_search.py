@@ -25,7 +25,7 @@ from csplat_tools.optimise.search_report import SearchReport, make_report
 from csplat_tools.optimise.sh_codings import CodingSearch
 from csplat_tools.optimise.subsets import Pruner
 from csplat_tools.optimise.targets import Target
-from csplat_tools.views import VIRTUAL, ViewSet, virtual_views, with_validation_views
+from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_validation_views
 from csplat_tools.views.view_sets import render_seconds
 
 #: Cost of a target in renders of 640x480: without pruning (measured 380 to 690 with plane3, donut, lego60k, fox120k),
@@ -156,7 +156,7 @@ def _is_empty(judge: Scorer) -> bool:
 
 def _psnr_elsewhere(source: SplatModel, found: Candidate, views: ViewSet, threads: int | None) -> dict[str, float]:
     """Return the PSNR from views that had no part in the search, by kind."""
-    model, judged = decode(found.result.data), virtual_views(source).items()
+    model, judged = decode(found.result.data), extra_test_cameras(source).items()
     return {
         kind: round(Scorer.of_source(source, cameras, views.background, threads=threads).psnr(model), 3)
         for kind, cameras in judged

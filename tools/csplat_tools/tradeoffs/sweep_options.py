@@ -16,7 +16,11 @@ from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat_render import Mode
 from csplat_render.conventions import MODES
+from csplat_render.lpips import load_lpips
+from csplat_render.metrics import Distance
 from csplat_tools.console import parse_size_bytes
+from csplat_tools.scene_files import LoadedModel, load_model, read_source
+from csplat_tools.views import Colour, DataOptions, ViewSet, find_view_set
 
 #: Groups of points, in the order in which they are measured: quick ones come first.
 FAMILIES = ("presets", "precision", "strategies", "targets", "simplify", "finetune")

@@ -20,10 +20,9 @@ from csplat_render import Mode
 from csplat_render.camera import relative_to
 from csplat_render.metrics import Scores, ViewScore, psnr_of_mse, squared_error
 from csplat_render.scorer import Scorer, renderer
-from csplat_tools.hardest_place import HardestPlaceSearch
+from csplat_tools.hardest_place import HardestPlaceSearch, ImagePiece
 from csplat_tools.inspect.file_description import bytes_by_attribute
 from csplat_tools.tradeoffs.sweep_options import SweepSetting
-from csplat_tools.tradeoffs.sweep_points import ModeTime, PartialFetch, PlannedPoint, SweepFile, SweepPoint
 from csplat_tools.views import display_cameras, evenly_spaced
 
 _QUALITY = ("psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips")

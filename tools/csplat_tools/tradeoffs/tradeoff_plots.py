@@ -12,7 +12,6 @@ from csplat_tools.console import format_bytes
 from csplat_tools.html_report import INK, Bar, draw_bars, draw_svg, hover_id
 from csplat_tools.tradeoffs.sweep_points import SweepPoint
 from csplat_tools.tradeoffs.sweep_run import Tradeoff
-from csplat_tools.tradeoffs.tradeoff_plots import label_marks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -21,7 +21,6 @@ from csplat_tools.file_streams import write_array, write_bytes
 from csplat_tools.optimise.rate_distortion import BYTES_PER_DB
 from csplat_tools.optional_packages import prepare_renderer
 from csplat_tools.training.training_page import show_views, write_training_page
-from csplat_tools.training.tuned_file import smallest_reaching
 from csplat_tools.training.tuning_inputs import TuningSubset, choose_splats, training_views
 from csplat_tools.training.tuning_report import make_tuning_report, score_models
 from csplat_tools.views import ViewSet

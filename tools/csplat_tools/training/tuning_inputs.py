@@ -16,9 +16,9 @@ from csplat.types import I64, Progress
 from csplat_render import Camera
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.importance_file import read_importance
-from csplat_tools.optimise import pruning
+from csplat_tools.optimise.pruning import simplify
+from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.optimise.scene_sensitivity import measure_views
-from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.views import VIEW_COUNT, ViewSet, with_validation_views
 from csplat_trainer.sensitivity import Sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
@@ -106,7 +106,7 @@ def choose_splats(
     model, said = source.select(rows), {"unseen": len(source) - len(rows)}
     if keep is not None:
         teaching = with_validation_views(replace(views, teaches=measuring, judges=()))
-        model, kept = _simplified(model, teaching, keep * len(source) / len(rows), threads, progress)
+        model, kept = _pruned(model, teaching, keep * len(source) / len(rows), threads, progress)
         rows, said = rows[kept], {**said, "simplified_from": len(rows)}
     if given is not None:
         return TuningSubset(model, rows, given.select(rows) if isinstance(given, Importance) else given[rows], said)
@@ -134,5 +134,5 @@ def _pruned(
     if keep >= 1.0:
         return model, np.arange(len(model))
     options = SimplifyOptions(threads=threads)
-    result = pruning(model, keep=keep, views=views, options=options, progress=progress)
+    result = simplify(model, keep=keep, views=views, options=options, progress=progress)
     return result.model, result.source_index

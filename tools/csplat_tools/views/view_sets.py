@@ -32,7 +32,7 @@ from csplat_tools.views import virtual_views
 from csplat_tools.views.virtual_views import HELD_OUT_COUNT, camera_sequence, default_views, evenly_spaced
 
 if TYPE_CHECKING:
-    from csplat_trainer.pictures import Picture
+    from csplat_trainer.posed_images import PosedImage
 
 
 Colour = tuple[float, float, float]
@@ -74,7 +74,7 @@ class ViewSet:
     teaches: Sequence[Camera]
     decides: Sequence[Camera]
     judges: Sequence[Camera]
-    photographs: Sequence[Picture] = ()
+    photographs: Sequence[PosedImage] = ()
     virtual: bool = False
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     notes: tuple[str, ...] = ()
@@ -140,7 +140,7 @@ class ViewSet:
         """
         return self._by_photographs(self.decides, "standard", threads)
 
-    def pictures(self, cameras: Sequence[Camera]) -> list[Picture]:
+    def pictures(self, cameras: Sequence[Camera]) -> list[PosedImage]:
         """Return the photographs that the given cameras took, in the order of the cameras."""
         taken = {id(one.camera): one for one in self.photographs}
         return [taken[id(camera)] for camera in cameras]
@@ -155,12 +155,12 @@ class ViewSet:
             _ = photograph.pixels, photograph.mask
 
     def _by_photographs(self, cameras: Sequence[Camera], mode: Mode, threads: int | None) -> Scorer:
-        from csplat_trainer.evaluate import photograph_judge
+        from csplat_trainer.posed_images import photograph_scorer
 
         if not self.photographs:
             raise InputError("there are no photographs: name a data set")
         shown = self.pictures(cameras)
-        return photograph_judge(shown, self.background, mode=mode, threads=threads, origin=self.origin)
+        return photograph_scorer(shown, self.background, mode=mode, threads=threads, origin=self.origin)
 
 
 def describe_views(count: int, name: str) -> str:
@@ -364,7 +364,7 @@ def _named(colour: Colour) -> str:
     return {BLACK: "black", WHITE: "white"}.get(colour) or ",".join(f"{value:g}" for value in colour)
 
 
-def _moved(pictures: Sequence[Picture], shift: NDArray[np.float64]) -> list[Picture]:
+def _moved(pictures: Sequence[PosedImage], shift: NDArray[np.float64]) -> list[PosedImage]:
     return [replace(one, camera=relative_to(shift, one.camera)) for one in pictures]
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from csplat.encoder import FreeValues, Frozen
 from csplat_tools.scene_files import ply_splat_bytes
-from csplat_trainer.tuning.rate import colour_integers_of
+from csplat_trainer.tuning.tuned_scene import colour_integers_of
 
 _FLOAT = 4
 _SHAPE = 7  # floats of rotation and scales

@@ -34,7 +34,7 @@ from csplat_bench.datasets.tables import means_table, notes, scenes_table
 from csplat_render.lpips import load_lpips
 from csplat_render.warmup import warm_up
 from csplat_tools.console import note
-from csplat_trainer.options import Device, TrainOptions
+from csplat_trainer.training_options import Device, TrainOptions
 
 
 def main(

@@ -38,7 +38,6 @@ from csplat_bench.common.scenes import OUT
 from csplat_bench.photographs.tables import plot, tables
 from csplat_render.lpips import Lpips, load_lpips
 from csplat_tools.cli.shared_options import parse_size
-from csplat_trainer.checkpoint import load_checkpoint
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.posed_images import photograph_scorer
 from csplat_trainer.training_checkpoint import load_checkpoint

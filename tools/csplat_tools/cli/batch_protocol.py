@@ -1,4 +1,4 @@
-"""`python -m csplat_tools.cli.batch_worker`: a worker process of `csplat batch` that runs commands one after the other.
+"""A worker process of `csplat batch` that runs commands one after another: `python -m csplat_tools.cli.batch_protocol`.
 
 A request is a line of JSON on standard input, its answer one on standard output. When the input ends so does the
 process, even in the middle of a command: the parent is gone.
