@@ -2,7 +2,7 @@
 
 import csplat
 from csplat.encoder import EncodeOptions, encode_with_report
-from csplat.encoder.measure import measure_errors
+from csplat.encoder.error_bounds import measure_errors
 from csplat_conformance.validator import validate
 
 

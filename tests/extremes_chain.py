@@ -13,7 +13,7 @@ from extremes_learnt import BLACK, COARSE, QUICK, SHORT, photographs_of
 
 from csplat import decode, read_ply
 from csplat.decoder import read_declared_bounds, read_header
-from csplat.encoder import Draft, EncodeResult, encode_with_report
+from csplat.encoder import EncodePlan, EncodeResult, encode_with_report, fix_quantisation
 from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import SplatModel
@@ -111,9 +111,9 @@ def _learn(source: SplatModel) -> Learnt:
 
 def _tune(source: SplatModel, seen_from: list[Camera]) -> SplatModel:
     views = split_views(renders_of(source, seen_from, BLACK, None), BLACK, aside=2)
-    frozen = Draft.of(source, COARSE).frozen()
+    frozen = fix_quantisation(EncodePlan.of(source, COARSE))
     result = tune(frozen, views, replace(SHORT, iterations=20))
-    return decode(frozen.coded(result.held).write().data)
+    return decode(frozen.encode(result.held).write().data)
 
 
 def assert_finite(model: SplatModel) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from extremes import COPIES, COUNT, DRAWN, NAMES, judge, scene
 
 from csplat import EncodeOptions, SplatModel, decode
-from csplat.encoder import Draft, Frozen
+from csplat.encoder import EncodePlan, FixedQuantisation, fix_quantisation
 from csplat_render import Camera
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.scorer import ReferenceImage, Scorer
@@ -77,11 +77,11 @@ def trained(name: str) -> TrainResult:
 
 
 @cache
-def tuned(name: str, count: int = 52) -> tuple[Frozen, FinetuneResult, Scorer]:
+def tuned(name: str, count: int = 52) -> tuple[FixedQuantisation, FinetuneResult, Scorer]:
     """Tune the scene as a file to `count` images but four; return it and a judge of those four."""
     source = learnt_from(name)
     views = split_views(renders_of(source, virtual_cameras(source, count, 48, 36), BLACK, None), BLACK, aside=4)
-    frozen = Draft.of(source, COARSE).frozen()
+    frozen = fix_quantisation(EncodePlan.of(source, COARSE))
     aside = Scorer(
         [view.camera for view in views.validation],
         [ReferenceImage(view.wanted.astype(np.float32)) for view in views.validation],
@@ -92,7 +92,7 @@ def tuned(name: str, count: int = 52) -> tuple[Frozen, FinetuneResult, Scorer]:
 def before_and_after(name: str) -> tuple[SplatModel, SplatModel]:
     """Return what the file decodes to without and with tuning."""
     frozen, result, _ = tuned(name)
-    before, after = (decode(frozen.coded(held).write().data) for held in (frozen.start(), result.held))
+    before, after = (decode(frozen.encode(held).write().data) for held in (frozen.start(), result.held))
     return before, after
 
 

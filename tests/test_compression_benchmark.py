@@ -13,7 +13,7 @@ pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
 from captures import cameras, photograph, shell
 
 from csplat import EncodeOptions
-from csplat.encoder import Draft
+from csplat.encoder import EncodePlan, fix_quantisation
 from csplat.errors import InputError
 from csplat_bench.common.captures import CAPTURES, choose_captures
 from csplat_bench.common.command import run as command
@@ -62,7 +62,7 @@ def test_integers_take_whole_bytes_by_the_range_of_their_column():
 
 @pytest.mark.parametrize("options", [BOOKS, EncodeOptions(attribute_psnr=28.0, sh_coding="scalar")])
 def test_integers_of_a_frozen_scene_are_as_many_as_its_file_holds(source, options):
-    frozen = Draft.of(source, options).frozen()
+    frozen = fix_quantisation(EncodePlan.of(source, options))
     colours, shapes = books_of(frozen)
     n = len(source)
     rows = n if colours is None else colours.entries + colours.escaped
@@ -73,22 +73,24 @@ def test_integers_of_a_frozen_scene_are_as_many_as_its_file_holds(source, option
 
 
 def test_a_file_is_smaller_than_its_integers(source):
-    frozen = Draft.of(source, EncodeOptions(attribute_psnr=45.0, sh_coding="scalar")).frozen()
-    assert len(frozen.coded(frozen.start()).write().data) < integer_bytes(integer_columns(frozen, frozen.start()))
+    frozen = fix_quantisation(EncodePlan.of(source, EncodeOptions(attribute_psnr=45.0, sh_coding="scalar")))
+    assert len(frozen.encode(frozen.start()).write().data) < integer_bytes(integer_columns(frozen, frozen.start()))
 
 
 # controls
 
 
 def test_without_quantisers_the_values_themselves_are_seen_and_move_freely(source):
-    plain = Draft.of(source, EncodeOptions(preset="fast", attribute_psnr=30.0, sh_coding="scalar")).frozen()
+    plain = fix_quantisation(
+        EncodePlan.of(source, EncodeOptions(preset="fast", attribute_psnr=30.0, sh_coding="scalar"))
+    )
     frozen = Unquantised.freeing(plain)
     start = frozen.start()
     for name in ("means", "scales", "opacities", "sh0"):
-        assert np.array_equal(getattr(source, name)[frozen.source_index], getattr(frozen.seen(start), name)) or (
+        assert np.array_equal(getattr(source, name)[frozen.source_index], getattr(frozen.dequantise(start), name)) or (
             name == "scales"  # in their gauge
         )
-    assert not np.array_equal(plain.seen(plain.start()).sh0, frozen.seen(start).sh0)
+    assert not np.array_equal(plain.dequantise(plain.start()).sh0, frozen.dequantise(start).sh0)
     start.means += 100.0
     moved = start.means.copy()
     frozen.constrain(start)
@@ -98,7 +100,7 @@ def test_without_quantisers_the_values_themselves_are_seen_and_move_freely(sourc
 def test_the_control_learns(source):
     wanted = renders_of(source, cameras(10), BLACK, None)
     off = replace(source, sh0=source.sh0 + np.float32(0.3))
-    frozen = Unquantised.freeing(Draft.of(off, EncodeOptions(preset="fast", sh_coding="scalar")).frozen())
+    frozen = Unquantised.freeing(fix_quantisation(EncodePlan.of(off, EncodeOptions(preset="fast", sh_coding="scalar"))))
     options = FinetuneOptions(iterations=60, warm_up=10, validate_every=20, byte_cost=0.0)
     log = tune(frozen, split_views(wanted, BLACK, aside=2), options).log
     assert log["best_psnr"] > log["start_psnr"] + 3.0

@@ -9,8 +9,8 @@ import pytest
 
 from csplat import EncodeOptions, decode, encode
 from csplat.decoder import decode_scene, read_declared_bounds, read_options
-from csplat.encoder import Draft, Origin, encode_with_report
-from csplat.encoder.measure import measure_errors
+from csplat.encoder import EncodePlan, Origin, encode_tiles, encode_with_report, fix_quantisation
+from csplat.encoder.error_bounds import measure_errors
 from csplat.errors import InputError
 from csplat_conformance.stated import Source, prove
 from csplat_tools.inspect.file_description import describe_file
@@ -31,8 +31,8 @@ WAYS = {
 @pytest.mark.parametrize("way", WAYS)
 def test_the_scene_is_what_a_decoder_sees_but_for_its_colours(make_model, way):
     model = make_model(260, 2)
-    draft = Draft.of(model, EncodeOptions(**WAYS[way]))
-    result = draft.coded().write()
+    draft = EncodePlan.of(model, EncodeOptions(**WAYS[way]))
+    result = encode_tiles(draft).write()
     decoded = decode(result.data)
     for name in GEOMETRY:
         assert getattr(decoded, name).tobytes() == getattr(draft.scene, name)[result.source_index].tobytes(), name
@@ -42,14 +42,14 @@ def test_the_scene_is_what_a_decoder_sees_but_for_its_colours(make_model, way):
 
 def test_a_draft_makes_the_file_of_encode(make_model):
     model = make_model(300, 3)
-    assert encode(model) == Draft.of(model).coded().write().data
+    assert encode(model) == encode_tiles(EncodePlan.of(model)).write().data
 
 
 def test_other_colours_change_colours_alone(make_model):
     model = make_model(260, 2)
-    draft = Draft.of(model, EncodeOptions(attribute_psnr=80.0))
+    draft = EncodePlan.of(model, EncodeOptions(attribute_psnr=80.0))
     fitted = draft.with_colours(model.sh0 + 1, 0 * model.shN)
-    before, after = (decode_scene(one.coded().write().data) for one in (draft, fitted))
+    before, after = (decode_scene(encode_tiles(one).write().data) for one in (draft, fitted))
     for name in GEOMETRY:
         assert np.array_equal(getattr(before.model, name), getattr(after.model, name)), name
     np.testing.assert_allclose(before.model.sh0 + 1, after.model.sh0, atol=0.02)
@@ -62,12 +62,12 @@ def test_other_colours_change_colours_alone(make_model):
 def test_colours_of_other_splats_are_refused(make_model):
     model = make_model(20, 1)
     with pytest.raises(InputError):
-        Draft.of(model).with_colours(model.sh0[:-1], model.shN)
+        EncodePlan.of(model).with_colours(model.sh0[:-1], model.shN)
 
 
 def test_a_file_is_written_twice_with_the_same_splats(make_model):
     model = make_model(200, 2)
-    coded = Draft.of(model, EncodeOptions(tile_splats=70)).coded()
+    coded = encode_tiles(EncodePlan.of(model, EncodeOptions(tile_splats=70)))
     first = coded.write()
     second = coded.write({"fitted": {"psnr": 41.5}})
     assert first.data == coded.write().data
@@ -89,7 +89,7 @@ def test_what_is_said_stands_in_the_options(make_model):
 
 def test_a_file_says_what_it_stands_for(make_model):
     model, rows = make_model(300, 1), np.arange(100, 250)
-    result = Draft.of(model.select(rows), origin=Origin(300, rows)).coded().write()
+    result = encode_tiles(EncodePlan.of(model.select(rows), origin=Origin(300, rows))).write()
     stated = read_declared_bounds(result.data)
     assert (300, 150, False) == (stated.source_count, stated.pruned_count, stated.refitted)
     assert set(rows) == set(result.source_index)
@@ -98,13 +98,13 @@ def test_a_file_says_what_it_stands_for(make_model):
 
 def test_an_origin_of_other_splats_is_refused(make_model):
     with pytest.raises(InputError, match="an origin of 5 splats, wanted 4"):
-        Draft.of(make_model(4, 0), origin=Origin(9, np.arange(5)))
+        EncodePlan.of(make_model(4, 0), origin=Origin(9, np.arange(5)))
 
 
 def test_the_geometry_of_a_refitted_file_is_proved(make_model):
     source, rows = make_model(400, 3), np.arange(100, 300)
-    draft = Draft.of(source.select(rows), origin=Origin(len(source), rows))
-    result = draft.with_colours(draft.scene.sh0 + 1, draft.scene.shN).coded().write()
+    draft = EncodePlan.of(source.select(rows), origin=Origin(len(source), rows))
+    result = encode_tiles(draft.with_colours(draft.scene.sh0 + 1, draft.scene.shN)).write()
     scene = decode_scene(result.data)
     whole = prove(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index)
     assert whole.holds
@@ -133,7 +133,7 @@ def test_a_file_of_adjusted_shapes_states_its_means_alone(make_model):
 def test_errors_are_stated_against_a_scene_that_was_not_drafted(make_model):
     source = make_model(150, 1)
     drawn = replace(source, means=source.means + np.float32(0.25))
-    coded = Draft.of(drawn).coded()
+    coded = encode_tiles(EncodePlan.of(drawn))
     decoded = decode(coded.write().data)
     result = coded.against(source, decoded).write()
     truth = measure_errors(source, decoded, result.source_index)
@@ -146,9 +146,9 @@ def test_errors_are_stated_against_a_scene_that_was_not_drafted(make_model):
 
 def test_values_that_were_not_touched_freeze_to_the_same_splats(make_model):
     model = make_model(300, 2)
-    draft = Draft.of(model, EncodeOptions(sh_coding="scalar"))
-    frozen = draft.frozen()
-    plain, thawed = draft.coded().write(), frozen.coded(frozen.start()).write()
+    draft = EncodePlan.of(model, EncodeOptions(sh_coding="scalar"))
+    frozen = fix_quantisation(draft)
+    plain, thawed = encode_tiles(draft).write(), frozen.encode(frozen.start()).write()
     assert np.array_equal(plain.source_index, thawed.source_index)
     one, other = decode(plain.data), decode(thawed.data)
     for name in ("means", "opacities", *COLOURS):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import csplat
 from csplat import SplatModel
 from csplat.encoder import PRESETS, EncodeOptions, encode, encode_with_report
-from csplat.encoder.measure import ErrorSums, measure_errors
+from csplat.encoder.error_bounds import ErrorSums, measure_errors
 from csplat.errors import CsplatError, InputError
 
 PRESET_NAMES = tuple(PRESETS)
@@ -227,7 +227,7 @@ def test_any_step_for_any_magnitude(make_model, step, magnitude):
 
 def test_an_error_that_no_file_can_state_is_refused():
     with pytest.raises(InputError, match="covariance"):
-        ErrorSums(3, {"covariance": 1e160}, {"covariance": math.inf}).stated()
+        ErrorSums(3, {"covariance": 1e160}, {"covariance": math.inf}).declared()
 
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)

@@ -15,7 +15,7 @@ import pytest
 
 import csplat
 from csplat.decoder import decode_scene
-from csplat.encoder import PRESETS, geometry, quantise
+from csplat.encoder import PRESETS, quantisation, shape_codebook
 from csplat_conformance import encoders
 from csplat_conformance.encoders import EncoderChoice, all_inputs, run_encoder
 from csplat_conformance.encoders.cut import find_cuts
@@ -246,7 +246,7 @@ def rounding(rint):
     """Let our encoder round otherwise."""
     numpy = types.ModuleType("numpy")
     vars(numpy).update(vars(np), rint=rint)
-    with mock.patch.object(quantise, "np", numpy), mock.patch.object(geometry, "np", numpy):
+    with mock.patch.object(quantisation, "np", numpy), mock.patch.object(shape_codebook, "np", numpy):
         yield
 
 

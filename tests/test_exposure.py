@@ -9,7 +9,7 @@ pytest.importorskip("numba", reason="the trainer wants the extra [train]")
 
 from test_train_loop import QUICK, photographs, resumed_as_if_never_stopped
 
-from csplat.encoder import Draft, EncodeOptions
+from csplat.encoder import EncodeOptions, EncodePlan, fix_quantisation
 from csplat.errors import InputError
 from csplat_trainer.data import DataSet
 from csplat_trainer.image_gains import ImageGain, ImageGains
@@ -86,7 +86,7 @@ def test_a_gpu_learns_none(uneven):
 @pytest.mark.slow
 def test_tuning_corrects_exposures_too(make_model, uneven):
     scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))  # that was photographed
-    frozen = Draft.of(scene, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)).frozen()
+    frozen = fix_quantisation(EncodePlan.of(scene, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)))
     teach, judge = ([TuningView(one.camera, one) for one in part] for part in (uneven.train, uneven.test))
     views = TuningViews(teach, judge, np.zeros(3, np.float32))
     plain, corrected = (

@@ -29,7 +29,7 @@ from extremes_chain import LEARNT, assert_finite, chain_of
 
 from csplat import decode, read_ply, write_ply
 from csplat.decoder import read_declared_bounds, read_header
-from csplat.encoder.measure import measure_errors
+from csplat.encoder.error_bounds import measure_errors
 from csplat.errors import LimitError
 from csplat_conformance.stated import Source, prove
 from csplat_render import render

@@ -32,7 +32,7 @@ from extremes_learnt import (
 
 from csplat import EncodeOptions, decode, encode
 from csplat.decoder import read_declared_bounds, read_header
-from csplat.encoder import Draft, encode_with_report
+from csplat.encoder import EncodePlan, encode_with_report, fix_quantisation
 from csplat.errors import InputError
 from csplat_conformance.stated import Source, prove
 from csplat_render.virtual_cameras import virtual_cameras
@@ -224,6 +224,6 @@ def test_splats_wider_than_float32_are_tuned():
     source = learnt_from("needles").select(slice(40))
     source = replace(source, scales=np.full_like(source.scales, 100.0))
     views = split_views(renders_of(source, virtual_cameras(source, 6, 32, 24), BLACK, None), BLACK, aside=2)
-    frozen = Draft.of(source, COARSE).frozen()
+    frozen = fix_quantisation(EncodePlan.of(source, COARSE))
     result = tune(frozen, views, replace(SHORT, iterations=20))
-    assert_finite(decode(frozen.coded(result.held).write().data))
+    assert_finite(decode(frozen.encode(result.held).write().data))

@@ -26,7 +26,7 @@ import csplat
 import csplat_trainer
 from csplat import EncodeOptions, decode, encode, write_ply
 from csplat.decoder import read_declared_bounds, read_options
-from csplat.encoder import Draft
+from csplat.encoder import EncodePlan, fix_quantisation
 from csplat.errors import InputError
 from csplat_render import render
 from csplat_render.camera_files import save_cameras
@@ -64,7 +64,7 @@ def source():
 @pytest.fixture(scope="module")
 def coarse(source):
     """The scene as a coarse file holds it, with a codebook."""
-    return Draft.of(source, COARSE).frozen()
+    return fix_quantisation(EncodePlan.of(source, COARSE))
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_photographs_of_a_data_set_teach_in_front_of_what_was_behind_the_scene(c
 def fine():
     """Few splats, coded so finely that tuning gains nothing, and views of them."""
     few = shell(3).select(slice(0, 40))
-    frozen = Draft.of(few, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar")).frozen()
+    frozen = fix_quantisation(EncodePlan.of(few, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar")))
     return frozen, split_views(renders_of(few, cameras(8), BLACK, None), BLACK, aside=3)
 
 
@@ -124,10 +124,10 @@ def fine():
     ids=["codebook", "scalar", "shapes", "no SH"],
 )
 def test_a_tuned_file_looks_better_than_one_that_is_not_and_is_hardly_larger(source, views, encoding):
-    frozen = Draft.of(source, encoding).frozen()
-    before = frozen.coded(frozen.start()).write().data
+    frozen = fix_quantisation(EncodePlan.of(source, encoding))
+    before = frozen.encode(frozen.start()).write().data
     tuned = tune(frozen, views, QUICK)
-    after = frozen.coded(tuned.held).write().data
+    after = frozen.encode(tuned.held).write().data
     assert psnr(decode(after), views.validation) > psnr(decode(before), views.validation) + 0.5
     assert len(after) < 1.1 * len(before)
 
@@ -155,11 +155,11 @@ def test_pixels_that_do_not_count_teach_nothing(coarse, views):
 @pytest.mark.slow
 def test_the_decoded_file_scores_what_was_scored_while_tuning(coarse, views):
     frozen, tuned = coarse, tune(coarse, views, FEW)
-    decoded = decode(frozen.coded(tuned.held).write().data)
+    decoded = decode(frozen.encode(tuned.held).write().data)
     rasteriser, error = Rasteriser(), []
     rows = np.argsort(frozen.source_index)
-    order = np.argsort(frozen.coded(tuned.held).write().source_index)
-    seen = frozen.seen(tuned.held)
+    order = np.argsort(frozen.encode(tuned.held).write().source_index)
+    seen = frozen.dequantise(tuned.held)
     for name in ("means", "shN"):
         assert np.array_equal(getattr(decoded, name)[order], getattr(seen, name)[rows])
     splats = SplatArrays(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
@@ -171,10 +171,10 @@ def test_the_decoded_file_scores_what_was_scored_while_tuning(coarse, views):
 
 @pytest.mark.slow
 def test_costly_bytes_make_small_files(source, views):
-    sizes, frozen = [], Draft.of(source, EncodeOptions(sh_coding="scalar")).frozen()
+    sizes, frozen = [], fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar")))
     for cost in (0.0, 1e-3, 1e-2):
         tuned = tune(frozen, views, replace(QUICK, byte_cost=cost))
-        sizes.append(len(frozen.coded(tuned.held).write().data))
+        sizes.append(len(frozen.encode(tuned.held).write().data))
     assert sizes[0] > sizes[1] > sizes[2]
 
 
@@ -212,7 +212,9 @@ def test_a_run_whose_files_are_too_large_yet_goes_on(fine, monkeypatch):
 @pytest.mark.area(name="rasteriser")
 def test_gradients_of_entries_are_those_of_all_their_users(source, views):
     """A sum over users, against finite differences of the loss by an entry's values."""
-    frozen = Draft.of(source, EncodeOptions(attribute_psnr=60.0, sh_coding="codebook", codebook_size=16)).frozen()
+    frozen = fix_quantisation(
+        EncodePlan.of(source, EncodeOptions(attribute_psnr=60.0, sh_coding="codebook", codebook_size=16))
+    )
     scene, view = TunedScene(frozen), views.train[0]
     loss, rasteriser = PhotometricLoss(H, W, 1.0, 0.0), Rasteriser(dtype=np.float64)
     seen, _ = scene.seen()
@@ -281,20 +283,20 @@ def test_costs_are_the_entropy_and_their_slopes_point_away_from_what_is_common()
 
 
 def test_costs_take_the_integers_that_are_coded(source):
-    frozen = Draft.of(source, EncodeOptions(sh_coding="scalar", chroma_shift=1)).frozen()
+    frozen = fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar", chroma_shift=1)))
     scene = TunedScene(frozen)
     seen, _ = scene.seen()
-    found = colour_integers_of(seen.shN, frozen.plan.sh_step, 1)
-    from csplat.encoder.colour import quantise_rows
+    found = colour_integers_of(seen.shN, frozen.parameters.sh_step, 1)
+    from csplat.encoder.quantisation import quantise_sh
 
-    columns, _, _ = quantise_rows(frozen.start().sh, frozen.plan, None)
+    columns, _, _ = quantise_sh(frozen.start().sh, frozen.parameters, None)
     assert np.array_equal(columns.transpose(2, 1, 0), found)
 
 
 @pytest.mark.parametrize("group", ["scales", "sh0", "logits", "quats", "shN"])
 def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, group):
     """A made-up cost, quadratic in the integers, has slopes that finite differences know."""
-    frozen = Draft.of(source, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)).frozen()
+    frozen = fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)))
     scene = TunedScene(frozen)
     seen, _ = scene.seen()
     stored = scene.stored(seen)
@@ -307,7 +309,7 @@ def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, g
     costs.add_to(steps, stored)
     for other, slopes in steps.items():
         assert slopes.any() == (other == group)
-    plan = frozen.plan
+    plan = frozen.parameters
     if group == "scales":
         assert np.allclose(steps["scales"], 0.01 * stored.scales / plan.scale_step**2, rtol=1e-4)
     elif group == "quats":
@@ -347,17 +349,19 @@ def test_a_weight_of_bytes_is_loss_per_bit_and_splat(coarse):
 def test_the_same_seed_makes_the_same_bytes_at_any_number_of_threads(source, views):
     files = []
     for seed, threads in ((1, 1), (1, 2), (2, 1)):
-        frozen = Draft.of(source, COARSE).frozen()
+        frozen = fix_quantisation(EncodePlan.of(source, COARSE))
         tuned = tune(frozen, views, replace(FEW, seed=seed), threads=threads)
-        files.append(frozen.coded(tuned.held).write().data)
+        files.append(frozen.encode(tuned.held).write().data)
     assert files[0] == files[1]
     assert files[0] != files[2]
 
 
 def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path):
-    frozen = Draft.of(
-        source, EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32)
-    ).frozen()
+    frozen = fix_quantisation(
+        EncodePlan.of(
+            source, EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32)
+        )
+    )
     file = tmp_path / "c.npz"
     middle = []
 
@@ -368,28 +372,28 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path)
     whole = tune(frozen, views, FEW, progress=keep, checkpoint=file, checkpoint_every=3)
     file.write_bytes(middle[0])
     rest = tune(frozen, views, FEW, resume=file)
-    assert frozen.coded(whole.held).write().data == frozen.coded(rest.held).write().data
+    assert frozen.encode(whole.held).write().data == frozen.encode(rest.held).write().data
     assert whole.log["losses"] == rest.log["losses"]
     assert whole.log["looks"] == rest.log["looks"]
 
 
 @pytest.mark.slow
 def test_bytes_cost_what_keeps_a_file_to_its_size(source, views, tmp_path):
-    frozen = Draft.of(source, EncodeOptions(attribute_psnr=34.0)).frozen()
-    before = len(frozen.coded(frozen.start()).write().data)
+    frozen = fix_quantisation(EncodePlan.of(source, EncodeOptions(attribute_psnr=34.0)))
+    before = len(frozen.encode(frozen.start()).write().data)
     options, costs = replace(QUICK, byte_cost=4e-3), []
     for share, steps in ((0.93, 120), (1.5, 60)):
         tuned = tune(frozen, views, replace(options, iterations=steps), size_bytes=int(share * before))
-        assert len(frozen.coded(tuned.held).write().data) <= share * before
+        assert len(frozen.encode(tuned.held).write().data) <= share * before
         best = next(look for look in tuned.log["looks"] if look["iteration"] == tuned.log["best_iteration"])
-        assert best["size_bytes"] == len(frozen.coded(tuned.held).write().data)
+        assert best["size_bytes"] == len(frozen.encode(tuned.held).write().data)
         costs.append(tuned.log["byte_cost"])
     assert costs[0] > options.byte_cost > costs[1]
     file = tmp_path / "run.npz"
     half = replace(FEW, iterations=8)
     tune(frozen, views, half, size_bytes=before, checkpoint=file)
     whole, rest = (tune(frozen, views, half, size_bytes=before, resume=one) for one in (None, file))
-    assert frozen.coded(whole.held).write().data == frozen.coded(rest.held).write().data
+    assert frozen.encode(whole.held).write().data == frozen.encode(rest.held).write().data
     assert whole.log["byte_cost"] == rest.log["byte_cost"]
     with pytest.raises(InputError, match="another target"):
         tune(frozen, views, half, resume=file)
@@ -439,7 +443,7 @@ def test_a_checkpoint_that_does_not_name_an_option_had_it_as_usual(coarse, views
 def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, coarse, views, tmp_path):
     file = tmp_path / "c.npz"
     tune(coarse, views, replace(QUICK, iterations=5), checkpoint=file)
-    other = Draft.of(source, replace(COARSE, attribute_psnr=29.0)).frozen()
+    other = fix_quantisation(EncodePlan.of(source, replace(COARSE, attribute_psnr=29.0)))
     with pytest.raises(InputError, match="another scene"):
         tune(other, views, QUICK, resume=file)
     np.savez(tmp_path / "n.npz", facts=np.frombuffer(b'{"version": 1}', np.uint8))
@@ -902,7 +906,7 @@ def test_a_trained_scene_loses_less_when_tuned(data_dir):
     model = train(data, TrainOptions(max_splats=1500, iterations=500, sh_degree=1)).model
     white = np.ones(3, np.float32)
     views = split_views([TuningView(picture.camera, picture) for picture in data.train], white)
-    frozen = Draft.of(model, EncodeOptions(preset="small", attribute_psnr=34.0)).frozen()
+    frozen = fix_quantisation(EncodePlan.of(model, EncodeOptions(preset="small", attribute_psnr=34.0)))
     tuned = tune(frozen, views, FinetuneOptions(iterations=400))
     judges = [TuningView(one.camera, one) for one in data.test[::10]]
 
@@ -916,4 +920,4 @@ def test_a_trained_scene_loses_less_when_tuned(data_dir):
 
     plain = decode(encode(model, EncodeOptions(preset="small", attribute_psnr=34.0)))
     best, lost = score(model), score(plain)
-    assert score(decode(frozen.coded(tuned.held).write().data)) > lost + 0.6 * (best - lost)
+    assert score(decode(frozen.encode(tuned.held).write().data)) > lost + 0.6 * (best - lost)

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from csplat.encoder.gauge import fix_gauge
+from csplat.encoder.quantisation import canonicalise_shape
 
 
 def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
@@ -29,7 +29,7 @@ def random_shapes(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_keeps_the_covariance():
     quats, scales = random_shapes(5000, 0)
-    rotation, ordered = fix_gauge(quats, scales)
+    rotation, ordered = canonicalise_shape(quats, scales)
     before, after = covariances(quats, scales), covariances(rotation.T, ordered.T)
     size = np.linalg.norm(before, axis=(1, 2))
     assert float((np.linalg.norm(after - before, axis=(1, 2)) / size).max()) < 1e-5
@@ -37,7 +37,7 @@ def test_keeps_the_covariance():
 
 def test_sorts_the_scales_and_makes_w_largest():
     quats, scales = random_shapes(5000, 1)
-    rotation, ordered = fix_gauge(quats, scales)
+    rotation, ordered = canonicalise_shape(quats, scales)
     assert (np.diff(ordered, axis=0) <= 0).all()
     assert (rotation[0] >= np.abs(rotation).max(axis=0)).all()
     np.testing.assert_allclose(np.linalg.norm(rotation, axis=0), 1.0, atol=1e-6)
@@ -53,8 +53,8 @@ def test_descriptions_of_one_ellipsoid_become_one(order, sign):
         axes = -axes
     turn = quaternion_of(axes)
     again = np.stack([product(quat, turn) for quat in quats.astype(np.float64)]) * sign
-    first = fix_gauge(quats, scales)
-    second = fix_gauge(again.astype(np.float32), scales[:, list(order)])
+    first = canonicalise_shape(quats, scales)
+    second = canonicalise_shape(again.astype(np.float32), scales[:, list(order)])
     np.testing.assert_allclose(second[0], first[0], atol=2e-6)
     np.testing.assert_array_equal(second[1], first[1])
 

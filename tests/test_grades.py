@@ -11,17 +11,15 @@ import pytest
 from checked import encoded
 
 import csplat
-from csplat.encoder import Draft, EncodeOptions, Importance, encode_with_report
-from csplat.encoder.apart import cut_scene
-from csplat.encoder.colour import quantise_colour
-from csplat.encoder.curvature import GRADED, Curvatures, step_errors
-from csplat.encoder.draft import tried_rows
-from csplat.encoder.geometry import quantise_shape
-from csplat.encoder.grades import choose_grades
-from csplat.encoder.importance import trusted
-from csplat.encoder.measure import covariance_entries
-from csplat.encoder.plan import make_plan
-from csplat.encoder.quantise import opacity_levels, quat_levels
+from csplat.encoder import EncodeOptions, EncodePlan, Importance, encode_tiles, encode_with_report, fix_quantisation
+from csplat.encoder.coding_parameters import choose_parameters
+from csplat.encoder.encode_plan import trial_rows
+from csplat.encoder.error_bounds import covariance_entries
+from csplat.encoder.quantisation import opacity_levels, quantise_colour, quat_levels
+from csplat.encoder.quantisation_classes import choose_classes
+from csplat.encoder.shape_codebook import quantise_shape
+from csplat.encoder.tiling import cut_scene
+from csplat.encoder.weights import CLASSED_ATTRIBUTES, GaussNewtonBlocks, apply_weight_floor, rounding_errors
 from csplat.errors import InputError
 from csplat.model import normalise_quats
 from csplat_trainer.tuning.tuned_scene import TunedScene, cost_slopes
@@ -37,7 +35,7 @@ def unequal(model, seed=0, spread=3.0):
     roots = rng.normal(size=(len(model), 6, 3))
     rows, columns = np.triu_indices(6)
     matrices = (roots @ roots.transpose(0, 2, 1))[:, rows, columns]
-    return Curvatures(size, matrices * size[:, None], 1e3 * size, size)
+    return GaussNewtonBlocks(size, matrices * size[:, None], 1e3 * size, size)
 
 
 def important(model, **changes):
@@ -54,9 +52,9 @@ def model(make_model):
 
 def test_shape_curvatures_are_those_of_the_covariance(make_model):
     model = make_model(50, 0)
-    plan = make_plan(model, EncodeOptions(scale_step=1.0, quat_levels=100), importance_given=True)
+    plan = choose_parameters(model, EncodeOptions(scale_step=1.0, quat_levels=100), importance_given=True)
     curvatures = unequal(model)
-    found = step_errors(model, curvatures, plan)
+    found = rounding_errors(model, curvatures, plan)
     rows, columns = np.triu_indices(6)
     matrices = np.zeros((50, 6, 6))
     matrices[:, rows, columns] = matrices[:, columns, rows] = curvatures.shapes
@@ -90,7 +88,7 @@ def _multiplied(q, turn):
 def test_twice_the_step_is_four_times_the_error(model):
     curvatures = unequal(model)
     fine, coarse = (
-        step_errors(model, curvatures, make_plan(model, EncodeOptions(**options), importance_given=True))
+        rounding_errors(model, curvatures, choose_parameters(model, EncodeOptions(**options), importance_given=True))
         for options in (
             {"position_step": 0.01, "scale_step": 0.01, "sh0_step": 0.01, "quat_levels": 200, "opacity_levels": 200},
             {"position_step": 0.02, "scale_step": 0.02, "sh0_step": 0.02, "quat_levels": 100, "opacity_levels": 100},
@@ -111,8 +109,8 @@ def test_what_rounding_loses_is_foretold():
     scene, views = shell(0), cameras(12)
     options = EncodeOptions(attribute_psnr=58)
     importance = measure_importance(scene, views, (0.0, 0.0, 0.0), threads=None)
-    plan = make_plan(scene, options, importance_given=True)
-    foretold = step_errors(scene, importance.curvatures, plan).sum()
+    plan = choose_parameters(scene, options, importance_given=True)
+    foretold = rounding_errors(scene, importance.curvatures, plan).sum()
     decoded = csplat.decode(encode_with_report(scene, options).data)
     lost = np.mean([np.mean(np.square(render(decoded, view).rgb - render(scene, view).rgb)) for view in views])
     assert foretold / 1.6 < lost < 1.6 * foretold
@@ -127,9 +125,9 @@ def test_grades_have_steps_of_their_own(model):
     said = graded.report.options["grades"]
     assert sum(said["splats"]) == COUNT
     assert len(said["splats"]) == graded.report.tile_count > plain.report.tile_count == 1
-    for name in GRADED:
+    for name in CLASSED_ATTRIBUTES:
         assert min(said[name]) == (1 if name in ("opacities", "quats") else 0)
-    assert any(max(said[name]) > 1 for name in GRADED)
+    assert any(max(said[name]) > 1 for name in CLASSED_ATTRIBUTES)
     assert graded.report.notes == ()
 
 
@@ -167,15 +165,15 @@ def test_few_splats_are_of_one_grade(make_model):
 
 
 def test_where_nothing_is_lost_all_is_one_grade(model):
-    nothing = Curvatures(np.zeros(COUNT), np.zeros((COUNT, 21)), np.zeros(COUNT), np.zeros(COUNT))
+    nothing = GaussNewtonBlocks(np.zeros(COUNT), np.zeros((COUNT, 21)), np.zeros(COUNT), np.zeros(COUNT))
     result, _ = encoded(model, Importance(np.ones(COUNT), curvatures=nothing))
     assert "grades" not in result.report.options
 
 
 def test_a_frozen_scene_has_one_grade(model):
-    frozen = Draft.of(model, importance=important(model), graded=False).frozen()
-    assert frozen.draft.grades is None
-    assert frozen.draft.options.grades is None
+    frozen = fix_quantisation(EncodePlan.of(model, importance=important(model), allow_classes=False))
+    assert frozen.encode_plan.classes is None
+    assert frozen.encode_plan.options.grades is None
 
 
 def test_huge_values_stay_apart_from_their_grade(model):
@@ -189,18 +187,18 @@ def test_huge_values_stay_apart_from_their_grade(model):
 
 
 def test_the_scene_of_a_draft_is_what_a_decoder_sees(model):
-    draft = Draft.of(model, importance=important(model))
-    result = draft.coded().write()
+    draft = EncodePlan.of(model, importance=important(model))
+    result = encode_tiles(draft).write()
     decoded = csplat.decode(result.data)
     for name in ("means", "quats", "scales", "opacities"):
         np.testing.assert_array_equal(getattr(draft.scene, name)[result.source_index], getattr(decoded, name))
 
 
 def test_what_is_frozen_of_several_grades_is_what_a_decoder_sees(model):
-    frozen = Draft.of(model, importance=important(model)).frozen()
+    frozen = fix_quantisation(EncodePlan.of(model, importance=important(model)))
     held = frozen.start()
-    result = frozen.coded(held).write()
-    decoded, seen = csplat.decode(result.data), frozen.seen(held)
+    result = frozen.encode(held).write()
+    decoded, seen = csplat.decode(result.data), frozen.dequantise(held)
     order = np.argsort(frozen.source_index)[result.source_index]
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(seen, name)[order], getattr(decoded, name))
@@ -209,13 +207,13 @@ def test_what_is_frozen_of_several_grades_is_what_a_decoder_sees(model):
 def test_integers_of_each_grade_are_counted_as_they_are_coded(make_model):
     """Counts are those of the encoder: integers divided by the multiple of their class."""
     model = make_model(8_000, 0)  # counts of fewer differ by more than a thousandth
-    frozen = Draft.of(model, EncodeOptions(sh_coding="none"), importance=important(model)).frozen()
-    scene, plan, tiles = TunedScene(frozen), frozen.plan, frozen.draft.tiles
+    frozen = fix_quantisation(EncodePlan.of(model, EncodeOptions(sh_coding="none"), importance=important(model)))
+    scene, plan, tiles = TunedScene(frozen), frozen.parameters, frozen.encode_plan.tiles
     held, bits = scene.held, 0.0
-    grades = list(dict.fromkeys(tile.coarse for tile in tiles))
+    grades = list(dict.fromkeys(tile.factors for tile in tiles))
     assert len(grades) > 1
     for coarse in grades:
-        rows = np.concatenate([tile.rows for tile in tiles if tile.coarse == coarse])
+        rows = np.concatenate([tile.rows for tile in tiles if tile.factors == coarse])
         shape = quantise_shape(held.quats[rows], held.scales[rows], plan, None, coarse)
         alpha = opacity_levels(held.opacities[rows], plan.opacity_levels, square=True, multiple=coarse.opacities)
         colour = quantise_colour(
@@ -227,14 +225,14 @@ def test_integers_of_each_grade_are_counted_as_they_are_coded(make_model):
 
 
 def test_codings_are_tried_on_splats_of_all_grades(model):
-    plan, grades = choose_grades(
-        model, unequal(model), make_plan(model, EncodeOptions(), importance_given=True), EncodeOptions()
+    plan, grades = choose_classes(
+        model, unequal(model), choose_parameters(model, EncodeOptions(), importance_given=True), EncodeOptions()
     )
     tiles = cut_scene(model, plan, grades)
-    found = grades.index[tried_rows(model, tiles, grades)]
+    found = grades.index[trial_rows(model, tiles, grades)]
     assert set(found) == set(grades.index)
     np.testing.assert_allclose(np.bincount(found) / len(found), np.bincount(grades.index) / COUNT, atol=0.05)
-    assert set(tried_rows(model, tiles, None)) == set(tiles[len(tiles) // 2].rows)
+    assert set(trial_rows(model, tiles, None)) == set(tiles[len(tiles) // 2].rows)
 
 
 def test_one_splat_does_not_say_how_precise_the_others_have_to_be(model):
@@ -311,15 +309,15 @@ console.log(hash.digest('hex'));
 
 
 def test_tiles_of_a_grade_are_as_coarse_as_it_is(model):
-    plan = make_plan(model, EncodeOptions(), importance_given=True)
-    finer, grades = choose_grades(model, unequal(model), plan, EncodeOptions())
+    plan = choose_parameters(model, EncodeOptions(), importance_given=True)
+    finer, grades = choose_classes(model, unequal(model), plan, EncodeOptions())
     tiles = cut_scene(model, finer, grades)
     assert sorted(np.concatenate([tile.rows for tile in tiles])) == list(range(COUNT))
     for tile in tiles:
         assert len(set(grades.index[tile.rows])) == 1
-        assert tile.coarse == grades.coarse[grades.index[tile.rows[0]]]
-        assert tile.exponent >= tile.coarse.means
-    assert min(one.means for one in grades.coarse) == min(one.sh0 for one in grades.coarse) == 0
+        assert tile.factors == grades.factors[grades.index[tile.rows[0]]]
+        assert tile.exponent >= tile.factors.means
+    assert min(one.means for one in grades.factors) == min(one.sh0 for one in grades.factors) == 0
     weights = unequal(model).means
     assert (
         weights[grades.index == 0].mean() > weights[grades.index == grades.index.max()].mean()
@@ -352,10 +350,10 @@ def test_coarse_rotations_are_multiples_within_bounds(levels, multiple):
 def test_measured_weights_are_trusted_down_to_half_of_what_is_suggested(model):
     measured = np.zeros((COUNT, 2))
     measured[:10] = 1.0
-    floored = trusted(measured, model)
+    floored = apply_weight_floor(measured, model)
     assert (floored >= measured).all()
     assert floored[10:].min() > 0.0
-    np.testing.assert_allclose(floored[10:, 0], trusted(measured[:, 0], model)[10:])
+    np.testing.assert_allclose(floored[10:, 0], apply_weight_floor(measured[:, 0], model)[10:])
     assert floored[10:].mean() < 0.6 * measured.mean()
 
 

@@ -6,13 +6,13 @@ import sys
 import numpy as np
 import pytest
 
-from csplat.encoder import nearest
+from csplat.encoder import kmeans
 from csplat.encoder.kmeans import (
     assign,
     cluster,
     rank_by_frequency,
+    search_nearest,
 )
-from csplat.encoder.nearest import search
 from csplat.errors import InputError
 
 
@@ -42,13 +42,13 @@ def distortion(points, weights, entries, index):
 # Nearest entries.
 
 
-@pytest.mark.parametrize("entry_count", [1, 2, 300, nearest._COLUMNS + 3])
+@pytest.mark.parametrize("entry_count", [1, 2, 300, kmeans._PRODUCT_COLUMNS + 3])
 def test_assign_finds_the_first_nearest_entry(entry_count):
     rng = np.random.default_rng(1)
     points = rng.integers(-3, 4, (600, 4)).astype(np.int16)  # many equal distances
     entries = rng.integers(-3, 4, (entry_count, 4)).astype(np.int32)
     expected = squared_distances(points, entries)
-    index, error = search(points, entries)
+    index, error = search_nearest(points, entries)
     assert index.dtype == np.uint32
     np.testing.assert_array_equal(expected.argmin(1), index)
     np.testing.assert_array_equal(expected.min(1), error)
@@ -58,9 +58,9 @@ def test_search_is_exact_just_below_the_bound():
     rng = np.random.default_rng(2)
     points = (rng.integers(0, 2, (500, 45)) * 690 - 345 + rng.integers(-2, 3, (500, 45))).astype(np.int16)
     entries = points[:100].astype(np.int32) + rng.integers(-1, 2, (100, 45)).astype(np.int32)
-    assert nearest._shift(points, entries) == 0
+    assert kmeans._shift(points, entries) == 0
     expected = squared_distances(points, entries)
-    index, error = search(points, entries)
+    index, error = search_nearest(points, entries)
     np.testing.assert_array_equal(expected.argmin(1), index)
     np.testing.assert_array_equal(expected.min(1), error)
 
@@ -69,12 +69,12 @@ def test_search_is_exact_just_below_the_bound():
 def test_shift_keeps_every_partial_sum_below_the_bound(largest):
     points = np.full((2, 45), largest, np.int32)
     points[1] = -largest - 1
-    shift = nearest._shift(points, points)
-    small = nearest._shifted(points, shift)
+    shift = kmeans._shift(points, points)
+    small = kmeans._shift_right(points, shift)
     norm = float((small**2).sum(1).max())
     assert shift > 0
-    assert norm * 1.5 < nearest._EXACT
-    assert nearest._shifted(points, shift - 1).max() ** 2 * 45 * 1.5 > nearest._EXACT / 4
+    assert norm * 1.5 < kmeans._EXACT
+    assert kmeans._shift_right(points, shift - 1).max() ** 2 * 45 * 1.5 > kmeans._EXACT / 4
 
 
 @pytest.mark.parametrize("entry_count", [2, 300])
@@ -85,16 +85,16 @@ def test_search_for_another_entry_skips_the_own_one(entry_count):
 
 
 def test_search_for_another_entry_skips_the_own_one_in_a_second_block_of_columns():
-    points = np.random.default_rng(6).integers(-9, 10, (nearest._COLUMNS + 3, 4)).astype(np.int32)
+    points = np.random.default_rng(6).integers(-9, 10, (kmeans._PRODUCT_COLUMNS + 3, 4)).astype(np.int32)
     points[-1] = points[0]
-    assert_others_are_found(points, np.r_[0:50, nearest._COLUMNS - 50 : len(points)])
+    assert_others_are_found(points, np.r_[0:50, kmeans._PRODUCT_COLUMNS - 50 : len(points)])
 
 
 def assert_others_are_found(points, rows):
     """Compare what is found for some of the points with a search in the matrix of all distances."""
     expected = squared_distances(points[rows], points)
     expected[np.arange(len(expected)), np.arange(len(points))[rows]] = 10**6
-    index, error = search(points, points, other=True)
+    index, error = search_nearest(points, points, other=True)
     np.testing.assert_array_equal(expected.argmin(1), index[rows])
     np.testing.assert_array_equal(expected.min(1), error[rows])
 
@@ -112,7 +112,7 @@ def test_large_points_are_assigned_to_nearly_nearest_entries():
 def test_searching_near_groups_loses_less_than_two_per_cent():
     points, _ = blobs(4000, 12, 900, 8.0)
     entries = points[:1024].astype(np.int32)
-    exact, near = search(points, entries), search(points, entries, near_groups=8)
+    exact, near = search_nearest(points, entries), search_nearest(points, entries, near_groups=8)
     assert np.all(near[1] >= exact[1])
     assert near[1].sum() <= 1.02 * exact[1].sum()
     found = squared_distances(points[:500], entries)[np.arange(500), near[0][:500]]
@@ -122,7 +122,9 @@ def test_searching_near_groups_loses_less_than_two_per_cent():
 def test_searching_all_groups_is_the_full_search():
     points, _ = blobs()
     entries = points[:100].astype(np.int32)
-    np.testing.assert_array_equal(search(points, entries)[1], search(points, entries, near_groups=10)[1])
+    np.testing.assert_array_equal(
+        search_nearest(points, entries)[1], search_nearest(points, entries, near_groups=10)[1]
+    )
 
 
 def test_assign_gives_no_index_for_no_points():
@@ -287,10 +289,10 @@ def digest(threads=None):
 @pytest.mark.slow
 def test_neither_our_threads_nor_those_of_blas_change_the_bytes():
     program = (
-        "import runpy, sys; from csplat.encoder import nearest\n"
+        "import runpy, sys; from csplat.encoder import kmeans\n"
         f"digest = runpy.run_path({__file__!r})['digest']\n"
         "print(digest())\n"
-        "nearest._openblas = lambda: None  # its threads cannot be set\n"
+        "kmeans._openblas = lambda: None  # its threads cannot be set\n"
         "print(digest())"
     )
     run = subprocess.run(
@@ -313,10 +315,10 @@ def test_neither_our_threads_nor_those_of_blas_change_the_bytes():
 
 @pytest.mark.slow
 def test_blas_keeps_its_own_thread_count():
-    control = nearest._openblas()
+    control = kmeans._openblas()
     if control is None:
         pytest.skip("NumPy's BLAS here is not an OpenBLAS whose threads can be set")
     before = control[0]()
-    with nearest.one_blas_thread():
+    with kmeans.one_blas_thread():
         assert control[0]() == 1
     assert control[0]() == before

@@ -17,8 +17,8 @@ import pytest
 from typer.testing import CliRunner
 
 from csplat import EncodeOptions, InputError, decode, encode, encode_with_report, read_ply, write_ply
-from csplat.encoder import buckets, draft
-from csplat.encoder.buckets import Curve, bucket_rows
+from csplat.encoder import encode_plan, encode_tiles, tiling
+from csplat.encoder.tiling import BucketCurve, bucket_rows
 from csplat.formats import open_scene
 from csplat.large import encode_scene, encoding
 from csplat.scene import scene_of
@@ -34,8 +34,8 @@ FAST = EncodeOptions(preset="fast", threads=1, sh_degree=1, sh_coding="codebook"
 @pytest.fixture(autouse=True)
 def small_buckets(monkeypatch):
     """Scenes of thousands of splats are large."""
-    for module in (buckets, draft, encoding):
-        monkeypatch.setattr(module, "WHOLE", WHOLE)
+    for module in (tiling, encode_plan, encoding):
+        monkeypatch.setattr(module, "BUCKET_SPLATS", WHOLE)
 
 
 encode_large = partial(encode_scene, by_disk=True)
@@ -54,8 +54,8 @@ def model(sample_path):
 def whole(model):
     """The bytes that the scene has in memory."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(buckets, "WHOLE", WHOLE)
-        patch.setattr(draft, "WHOLE", WHOLE)
+        patch.setattr(tiling, "BUCKET_SPLATS", WHOLE)
+        patch.setattr(encode_plan, "BUCKET_SPLATS", WHOLE)
         return encode(model, FAST)
 
 
@@ -82,10 +82,10 @@ def test_a_file_of_many_buckets_conforms_and_states_its_errors(model, whole):
 
 
 def test_colours_that_were_fitted_anew_are_those_that_are_decided_on(model):
-    other = draft.Draft.of(model, FAST).with_colours(model.sh0 + 0.5, -model.shN)
+    other = encode_plan.EncodePlan.of(model, FAST).with_colours(model.sh0 + 0.5, -model.shN)
     assert other.sample is not None
-    assert np.array_equal(-model.shN[buckets.sample_rows(COUNT)], other.sample.model.shN)
-    decoded = decode(other.coded().write().data)
+    assert np.array_equal(-model.shN[tiling.sample_rows(COUNT)], other.sample.model.shN)
+    decoded = decode(encode_tiles(other).write().data)
     assert abs(decoded.sh0.mean() - model.sh0.mean() - 0.5) < 0.01
 
 
@@ -259,7 +259,7 @@ def test_buckets_are_neighbours_and_hold_every_splat_once(model):
 def test_a_bucket_that_the_sample_misjudged_is_cut_into_equal_parts():
     rng = np.random.default_rng(1)
     means = rng.normal(0, 1, (COUNT, 3)).astype(np.float32)
-    means[buckets.sample_rows(COUNT)] += 100.0  # the sampled rows lie apart from all others
+    means[tiling.sample_rows(COUNT)] += 100.0  # the sampled rows lie apart from all others
     parts = bucket_rows(means)
     assert np.array_equal(np.arange(COUNT), np.sort(np.concatenate(parts)))
     assert max(map(len, parts)) <= WHOLE
@@ -270,7 +270,7 @@ def test_a_bucket_that_the_sample_misjudged_is_cut_into_equal_parts():
 
 
 def test_a_small_scene_has_one_bucket():
-    assert 1 == Curve.through(np.zeros((10, 3), np.float32), WHOLE).count
+    assert 1 == BucketCurve.through(np.zeros((10, 3), np.float32), WHOLE).count
 
 
 @pytest.mark.slow

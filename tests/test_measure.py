@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from csplat.encoder.measure import ErrorSums, measure_errors
+from csplat.encoder.error_bounds import ErrorSums, measure_errors
 from csplat.errors import InputError
 from csplat.model import normalise_quats
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from csplat.encoder.metric import Metric, reassign, refine
+from csplat.encoder.kmeans import reassign_by_metric, refine_by_metric
+from csplat.encoder.weights import ErrorMetric
 
 
 def scene(count=400, size=3, channels=2, entry_count=30, seed=0):
@@ -11,7 +12,7 @@ def scene(count=400, size=3, channels=2, entry_count=30, seed=0):
     roots = rng.normal(size=(count, size, size))
     matrices = roots @ roots.transpose(0, 2, 1)
     rows, columns = np.triu_indices(size)
-    metric = Metric(rng.random(count).astype(np.float32), matrices[:, rows, columns].astype(np.float32))
+    metric = ErrorMetric(rng.random(count).astype(np.float32), matrices[:, rows, columns].astype(np.float32))
     entries = np.rint(points[:entry_count]).astype(np.int32)
     return points, matrices, metric, entries
 
@@ -37,14 +38,14 @@ def test_the_first_parts_keep_their_matrices():
 def test_reassign_finds_the_best_where_all_are_tried():
     points, matrices, metric, entries = scene()
     errors = np.stack([exact(points - entry, matrices, np.ones(len(points))) for entry in entries], axis=1)
-    found = reassign(points, metric, entries, np.zeros(len(points), np.int64), 2, tried=len(entries))
+    found = reassign_by_metric(points, metric, entries, np.zeros(len(points), np.int64), 2, tried=len(entries))
     np.testing.assert_allclose(errors.min(axis=1), errors[np.arange(len(points)), found], rtol=1e-4)
 
 
 def test_refine_makes_errors_smaller_and_leaves_no_dead_entry():
     points, _, metric, entries = scene()
     start = np.linalg.norm((points[:, None] - entries).reshape(len(points), len(entries), -1), axis=2).argmin(axis=1)
-    moved, index = refine(points, metric, entries, start, 1)
+    moved, index = refine_by_metric(points, metric, entries, start, 1)
     before = metric.errors(points - entries[start], slice(None)).sum()
     assert metric.errors(points - moved[index], slice(None)).sum() < 0.8 * before
     assert set(range(len(moved))) == set(index.tolist())
@@ -54,13 +55,13 @@ def test_refine_makes_errors_smaller_and_leaves_no_dead_entry():
 def test_does_not_depend_on_threads():
     points, _, metric, entries = scene(3000, 5, 3, 200)
     start = np.zeros(len(points), np.int64)
-    one, two = (refine(points, metric, entries, start, threads) for threads in (1, 2))
+    one, two = (refine_by_metric(points, metric, entries, start, threads) for threads in (1, 2))
     np.testing.assert_array_equal(one[0], two[0])
     np.testing.assert_array_equal(one[1], two[1])
 
 
 def test_entries_stay_where_their_points_weigh_nothing():
     points, _, metric, entries = scene(50, 2, 1, 5)
-    silent = Metric(np.zeros(50, np.float32), np.zeros_like(metric.triangles))
-    moved, _ = refine(points, silent, entries, np.arange(50) % 5, 1)
+    silent = ErrorMetric(np.zeros(50, np.float32), np.zeros_like(metric.triangles))
+    moved, _ = refine_by_metric(points, silent, entries, np.arange(50) % 5, 1)
     assert {tuple(row) for row in moved.reshape(len(moved), -1)} <= {tuple(row) for row in entries.reshape(5, -1)}

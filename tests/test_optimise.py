@@ -19,7 +19,7 @@ from captures import around, cameras, crowded, found_within, judged_by, photogra
 from csplat import EncodeOptions, decode
 from csplat.decoder import decode_scene
 from csplat.encoder import Importance
-from csplat.encoder.measure import measure_errors
+from csplat.encoder.error_bounds import measure_errors
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_conformance.stated import Source, prove

@@ -10,7 +10,7 @@ import pytest
 from csplat import _spec
 from csplat.decoder import decode_scene, read_header
 from csplat.encoder import EncodeOptions, encode, encode_with_report
-from csplat.encoder.measure import measure_errors
+from csplat.encoder.error_bounds import measure_errors
 from csplat.errors import CsplatError, InputError
 from csplat.model import normalise_quats
 from csplat_conformance.stated import Source, prove

@@ -15,10 +15,10 @@ from chromium import absent
 import csplat
 from csplat import _spec
 from csplat.decoder import decode_scene
-from csplat.encoder import Draft, EncodeOptions, Importance, encode_with_report
-from csplat.encoder.gauge import fix_gauge
-from csplat.encoder.measure import covariance_entries
-from csplat.encoder.shape_covariances import mean_axes, unit_covariances
+from csplat.encoder import EncodeOptions, EncodePlan, Importance, encode_tiles, encode_with_report
+from csplat.encoder.error_bounds import covariance_entries
+from csplat.encoder.quantisation import canonicalise_shape
+from csplat.encoder.shape_codebook import mean_axes, unit_covariances
 from csplat.errors import InputError
 from csplat.model import normalise_quats
 from csplat_conformance.adapter import answer
@@ -128,8 +128,8 @@ def test_huge_scales_leave_their_tile_without(make_model):
 
 
 def test_the_scene_of_a_draft_has_the_decoded_shapes(make_model):
-    draft = Draft.of(few_shapes(make_model, degree=0), EncodeOptions(shape_codebook_size=16))
-    result = draft.coded().write()
+    draft = EncodePlan.of(few_shapes(make_model, degree=0), EncodeOptions(shape_codebook_size=16))
+    result = encode_tiles(draft).write()
     decoded = csplat.decode(result.data)
     for name in ("means", "quats", "scales", "opacities"):
         np.testing.assert_array_equal(getattr(draft.scene, name)[result.source_index], getattr(decoded, name))
@@ -149,7 +149,7 @@ def test_axes_of_covariances_come_back():
     quats, scales = normalise_quats(rng.normal(size=(300, 4)).astype(np.float32)), rng.normal(0, 1, (300, 3))
     covariances, sizes = unit_covariances(quats.T, scales.T)
     np.testing.assert_allclose(1.0, covariances[:3].sum(axis=0), rtol=1e-12)
-    rotation, found = fix_gauge(*mean_axes(covariances))
+    rotation, found = canonicalise_shape(*mean_axes(covariances))
     again, zero = unit_covariances(rotation, found)
     np.testing.assert_allclose(covariances, again, atol=1e-6)
     np.testing.assert_allclose(0.0, zero, atol=1e-6)

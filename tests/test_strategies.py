@@ -9,7 +9,7 @@ import pytest
 
 from csplat import EncodeOptions, decode
 from csplat.decoder import decode_scene
-from csplat.encoder.measure import covariance_errors, measure_errors
+from csplat.encoder.error_bounds import covariance_errors, measure_errors
 from csplat.errors import InputError
 from csplat_conformance.stated import Source, prove
 from csplat_tools.study import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from csplat import _spec
-from csplat.encoder.streams import Coding, signed_stream, unsigned_stream
+from csplat.encoder.entropy import DeflateSettings, signed_stream, unsigned_stream
 from csplat.errors import InputError
 
 
@@ -58,7 +58,9 @@ UNSIGNED = {
 @pytest.mark.parametrize("name", UNSIGNED)
 def test_unsigned_streams_read_back(name, mode, library):
     values = UNSIGNED[name].astype(np.int64)
-    stream = unsigned_stream(values, Coding(6, library), delta=mode == "delta", signed_delta=mode == "signed_delta")
+    stream = unsigned_stream(
+        values, DeflateSettings(6, library), delta=mode == "delta", signed_delta=mode == "signed_delta"
+    )
     assert values.tolist() == read(stream)[1]
 
 
@@ -67,19 +69,19 @@ def test_unsigned_streams_read_back(name, mode, library):
 def test_signed_streams_read_back_at_every_width(dtype, level):
     limits = np.iinfo(dtype)
     values = np.array([0, 1, -1, limits.min, limits.max, 5, -5] * 50, dtype)
-    head, read_back = read(signed_stream(values, Coding(level)))
+    head, read_back = read(signed_stream(values, DeflateSettings(level)))
     assert np.dtype(dtype).itemsize == head.width
     assert [int(v) % 2 ** (8 * head.width) for v in values] == read_back
 
 
 def test_elements_are_no_wider_than_the_largest_needs():
-    assert 1 == read(signed_stream(np.array([-128, 127], np.int32), Coding()))[0].width
-    assert 2 == read(signed_stream(np.array([-129], np.int32), Coding()))[0].width
-    assert 3 == read(unsigned_stream(np.array([1 << 16]), Coding()))[0].width
+    assert 1 == read(signed_stream(np.array([-128, 127], np.int32), DeflateSettings()))[0].width
+    assert 2 == read(signed_stream(np.array([-129], np.int32), DeflateSettings()))[0].width
+    assert 3 == read(unsigned_stream(np.array([1 << 16]), DeflateSettings()))[0].width
 
 
 def test_a_constant_plane_costs_a_few_bytes():
-    assert len(unsigned_stream(np.full(65536, 200), Coding(1))) <= _spec.STREAM_HEAD_SIZE + 3
+    assert len(unsigned_stream(np.full(65536, 200), DeflateSettings(1))) <= _spec.STREAM_HEAD_SIZE + 3
 
 
 #: As the SH of splats of which some have none: noise, cut by runs of zeros.
@@ -89,16 +91,16 @@ CUT = np.where(np.repeat(RNG.random(20_000) < 0.6, 3), np.int8(0), NOISE)
 
 def test_short_runs_are_written_as_runs_where_that_is_smaller():
     pairs = np.repeat(RNG.integers(-100, 100, 30_000).astype(np.int8), RNG.integers(1, 4, 30_000))
-    assert _spec.TRANSFORM_RUN_LENGTH in read(signed_stream(pairs, Coding(12)))[0].transforms
-    assert _spec.TRANSFORM_RUN_LENGTH not in read(signed_stream(NOISE, Coding(12)))[0].transforms
+    assert _spec.TRANSFORM_RUN_LENGTH in read(signed_stream(pairs, DeflateSettings(12)))[0].transforms
+    assert _spec.TRANSFORM_RUN_LENGTH not in read(signed_stream(NOISE, DeflateSettings(12)))[0].transforms
 
 
 def test_the_lowest_level_finds_runs_and_no_matches_in_noise():
-    assert len(signed_stream(CUT, Coding(1))) < 1.15 * len(signed_stream(CUT, Coding(12)))
-    assert len(signed_stream(NOISE, Coding(1))) < 1.05 * len(signed_stream(NOISE, Coding(12)))
+    assert len(signed_stream(CUT, DeflateSettings(1))) < 1.15 * len(signed_stream(CUT, DeflateSettings(12)))
+    assert len(signed_stream(NOISE, DeflateSettings(1))) < 1.05 * len(signed_stream(NOISE, DeflateSettings(12)))
 
 
 @pytest.mark.parametrize("arguments", [(0,), (13,), (6, "gzip")])
 def test_refuses_a_level_or_library_that_does_not_exist(arguments):
     with pytest.raises(InputError):
-        Coding(*arguments)
+        DeflateSettings(*arguments)

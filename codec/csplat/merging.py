@@ -17,8 +17,8 @@ import numpy as np
 from csplat import _spec
 from csplat.decoder import read_header
 from csplat.encoder import EncodeOptions
-from csplat.encoder.container import FileChunk, FileTile, SceneFields, json_payload, parts
-from csplat.encoder.streams import Coding
+from csplat.encoder.container import FileChunk, FileTile, SceneFields, file_pieces, json_payload
+from csplat.encoder.entropy import DeflateSettings
 from csplat.errors import InputError
 from csplat.files import BinaryWriter, opened_for_writing
 from csplat.inputs import File
@@ -167,10 +167,10 @@ def _agreed_chunks(scenes: Sequence[SplatFile]) -> list[FileChunk]:
     """Metadata and cameras, as far as all files have the same."""
     chunks = []
     if metadata := _agreed([scene.metadata or {} for scene in scenes]):
-        chunks.append(FileChunk(_spec.CHUNK_METADATA, json_payload(metadata, Coding())))
+        chunks.append(FileChunk(_spec.CHUNK_METADATA, json_payload(metadata, DeflateSettings())))
     cameras = [scene.cameras for scene in scenes]
     if cameras[0] is not None and all(one == cameras[0] for one in cameras):
-        chunks.append(FileChunk(_spec.CHUNK_CAMERAS, json_payload(cameras[0], Coding())))
+        chunks.append(FileChunk(_spec.CHUNK_CAMERAS, json_payload(cameras[0], DeflateSettings())))
     return chunks
 
 
@@ -182,7 +182,7 @@ def _agreed(values: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def _written(scene: SceneFields, tiles: Sequence[FileTile], output: str | os.PathLike[str] | BinaryWriter) -> Merged:
     size = 0
     with opened_for_writing(output) as stream:
-        for part in parts(scene, tiles):
+        for part in file_pieces(scene, tiles):
             stream.write(part)
             size += len(part)
     return Merged(sum(tile.splat_count for tile in tiles), len(tiles), size)

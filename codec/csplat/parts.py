@@ -10,7 +10,7 @@ from itertools import accumulate
 
 from csplat import _spec
 from csplat.decoder.container import SceneHeader, Tile, open_chunk
-from csplat.encoder.container import CodebookTable, FileChunk, FileTile, Later, Payload, SceneFields, parts
+from csplat.encoder.container import CodebookTable, FileChunk, FileTile, LazyPayload, Payload, SceneFields, file_pieces
 from csplat.files import BinaryWriter, opened_for_writing
 from csplat.stores import Window
 
@@ -59,7 +59,7 @@ def write_part(
     fields = scene_fields(window, header, tables, chunks)
     size = 0
     with opened_for_writing(output) as stream:
-        for part in parts(fields, copied):
+        for part in file_pieces(fields, copied):
             stream.write(part)
             size += len(part)
     return Part(tuple(tile.index for tile in tiles), sum(tile.splat_count for tile in tiles), size)
@@ -107,7 +107,7 @@ class TileCopies:
         self._files = files
         self._records: dict[int, list[_spec.LayerRecord]] = {layer: [] for layer in _spec.LAYER_NAMES}
 
-    def of(self, tile: Tile, changed: Mapping[int, Later] | None = None) -> FileTile:
+    def of(self, tile: Tile, changed: Mapping[int, LazyPayload] | None = None) -> FileTile:
         """A tile; layers of unknown ids are left out.
 
         Args:
@@ -118,7 +118,7 @@ class TileCopies:
         for layer in _spec.LAYER_NAMES.keys() & tile.layers.keys() - layers.keys():
             record, places = tile.layers[layer], self._records[layer]
             read = partial(self._read, layer, len(places))
-            layers[layer] = Later(record.size - _spec.CHUNK_HEADER_SIZE, record.crc, read)
+            layers[layer] = LazyPayload(record.size - _spec.CHUNK_HEADER_SIZE, record.crc, read)
             places.append(record)
         return FileTile(
             tile.splat_count, tile.exponent, tile.corner, tile.extent, tile.max_scale, layers, tile.tables

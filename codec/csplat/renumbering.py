@@ -12,7 +12,7 @@ from typing import IO
 from csplat import _spec
 from csplat.decoder.container import SceneHeader, Tile
 from csplat.decoder.tiles import codebook_references
-from csplat.encoder.container import CodebookTable, FileChunk, FileTile, Later, chunk_crc
+from csplat.encoder.container import CodebookTable, FileChunk, FileTile, LazyPayload, chunk_crc
 from csplat.parts import InTurn, TileCopies, chunk_payload
 from csplat.stores import Window
 
@@ -30,11 +30,11 @@ class Spool:
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream = stream
 
-    def put(self, kind: bytes, payload: bytes) -> Later:
+    def put(self, kind: bytes, payload: bytes) -> LazyPayload:
         """Put the payload of a chunk aside."""
         start = self._stream.seek(0, os.SEEK_END)
         self._stream.write(payload)
-        return Later(len(payload), chunk_crc(kind, payload), partial(self._again, start, len(payload)))
+        return LazyPayload(len(payload), chunk_crc(kind, payload), partial(self._again, start, len(payload)))
 
     def _again(self, start: int, size: int) -> bytes:
         self._stream.seek(start)
@@ -101,7 +101,7 @@ def renumbered(window: Window, header: SceneHeader, ids: Mapping[int, int], spoo
         ids: the new ids by the old ones.
         spool: where chunks wait that are rewritten; others are read when they are written.
     """
-    changed: dict[int, dict[int, Later]] = {}
+    changed: dict[int, dict[int, LazyPayload]] = {}
     naming = [
         (tile, tile.layers[layer])
         for layer in range(_spec.SH_DEGREE_MAX + 1)
@@ -132,7 +132,7 @@ def _naming_layers(header: SceneHeader, tile: Tile, ids: Mapping[int, int]) -> s
 
 def _rewritten(
     window: Window, header: SceneHeader, record: _spec.LayerRecord, ids: Mapping[int, int], spool: Spool
-) -> Later | None:
+) -> LazyPayload | None:
     """A chunk with other ids, put aside; `None` where it names no codebook."""
     with window.store.telling():
         places = list(codebook_references(window.view, header, record))

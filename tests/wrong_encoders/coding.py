@@ -6,7 +6,7 @@ import time
 import zlib
 
 from csplat import _spec
-from csplat.encoder import apart, blocks, codebook, coded, container, scene, streams, tile
+from csplat.encoder import container, entropy, pipeline, sh_codebook, tiling
 from wrong_encoders.mistake import DEGREE_3, PLAIN, Harm, Mistake, replaced
 
 CHANCE = (Harm.DETERMINISM, ("L1", ""))
@@ -74,7 +74,7 @@ MISTAKES = {
         BROKEN,
         ("L1", "TIL-1"),
         "ordinary/two_tiles",
-        stage=replaced(apart, "cut", lambda cut: lambda means, lattice, _: cut(means, lattice, len(means))),
+        stage=replaced(tiling, "cut_tiles", lambda cut: lambda means, lattice, _: cut(means, lattice, len(means))),
         options={"means_coding": "axis"},
     ),
     # blocks and streams
@@ -82,35 +82,35 @@ MISTAKES = {
         "bit 0 of a Morton code is that of z",
         BROKEN,
         ("L1", "TIL-10"),
-        stage=replaced(tile, "morton_codes", lambda codes: lambda q: codes(q[::-1])),
+        stage=replaced(tiling, "morton_codes", lambda codes: lambda q: codes(q[::-1])),
     ),
     "morton_signed_shift": Mistake(
         "codes count bits from 1",
         BROKEN,
         ("L1", "MOR-2"),
         stage=replaced(
-            blocks, "morton_block", lambda block: lambda codes, bits, coding: block(codes * 2, bits, coding)
+            entropy, "morton_block", lambda block: lambda codes, bits, coding: block(codes * 2, bits, coding)
         ),
     ),
     "blocks_swapped": Mistake(
         "rotations come before scales",
         BROKEN,
         ("L1", "TLE-2"),
-        stage=replaced(tile, "tile_payload", swapped_blocks),
+        stage=replaced(pipeline, "tile_payload", swapped_blocks),
     ),
     "zlib_for_deflate": Mistake(
         "DEFLATE is what zlib.compress gives",
         BROKEN,
         ("L1", "COD-2"),
         DEGREE_3,
-        stage=replaced(streams, "_deflate", with_zlib_header),
+        stage=replaced(entropy, "_deflate", with_zlib_header),
     ),
     "deflate_tail": Mistake(
         "an inflate stops by itself",
         BROKEN,
         ("L1", "COD-2"),
         DEGREE_3,
-        stage=replaced(streams, "_deflate", with_a_tail),
+        stage=replaced(entropy, "_deflate", with_a_tail),
     ),
     "transforms_reversed": Mistake(
         "transforms are listed as a decoder needs them",
@@ -129,16 +129,16 @@ MISTAKES = {
         "any start of a k-means is as good as another",
         *CHANCE,
         DEGREE_3,
-        stage=replaced(codebook, "cluster", seeded_by_chance),
+        stage=replaced(sh_codebook, "cluster", seeded_by_chance),
         options=OF_CODEBOOK,
     ),
     "time_in_options": Mistake(
-        "a file says when it was made", *CHANCE, PLAIN, stage=replaced(coded, "chosen_settings", with_time)
+        "a file says when it was made", *CHANCE, PLAIN, stage=replaced(pipeline, "encoding_settings", with_time)
     ),
     "sums_in_any_order": Mistake(
         "sums of threads may be added as they come",
         *CHANCE,
         PLAIN,
-        stage=replaced(scene, "stated_errors", summed_in_any_order),
+        stage=replaced(pipeline, "declared_errors", summed_in_any_order),
     ),
 }

@@ -5,7 +5,7 @@ from unittest import mock
 
 import numpy as np
 
-from csplat.encoder import coded, colour, geometry, quantise, tile
+from csplat.encoder import pipeline, quantisation, sh_codebook, shape_codebook, tiling
 from wrong_encoders.mistake import DEGREE_3, DENSE, Harm, Mistake, replaced
 
 PICTURE = (Harm.PICTURE, ("L4", ""))
@@ -61,7 +61,7 @@ def half_away(values, out=None):
     return np.multiply(np.sign(values), np.floor(np.abs(values) + 0.5), out=out, dtype=values.dtype)
 
 
-def rounding(module, name, rint, where=(quantise, geometry)):
+def rounding(module, name, rint, where=(quantisation, shape_codebook)):
     """Round otherwise while a function runs."""
 
     def make(function):
@@ -76,7 +76,7 @@ def rounding(module, name, rint, where=(quantise, geometry)):
     return replaced(module, name, make)
 
 
-def truncated(module, name, where=(quantise, geometry)):
+def truncated(module, name, where=(quantisation, shape_codebook)):
     stage = rounding(module, name, np.trunc, where)
     return Mistake("a cast rounds", *COARSE, DEGREE_3, stage=stage, options={"sh_coding": "scalar", "threads": 1})
 
@@ -123,29 +123,32 @@ MISTAKES = {
         "w need not be the largest, and what leaves ±M is clipped",
         *PICTURE,
         DENSE,
-        stage=replaced(geometry, "fix_gauge", no_gauge),
+        stage=replaced(shape_codebook, "canonicalise_shape", no_gauge),
     ),
     "w_sign_lost": Mistake(
-        "w is what is left of length 1", *PICTURE, DENSE, stage=replaced(geometry, "fix_gauge", sign_of_w_lost)
+        "w is what is left of length 1",
+        *PICTURE,
+        DENSE,
+        stage=replaced(shape_codebook, "canonicalise_shape", sign_of_w_lost),
     ),
     "scales_sorted_alone": Mistake(
         "the order of scales has nothing to do with rotations",
         *PICTURE,
         "ordinary/needles_and_discs",
-        stage=replaced(geometry, "fix_gauge", sorted_alone),
+        stage=replaced(shape_codebook, "canonicalise_shape", sorted_alone),
     ),
     # rounding
-    "means_truncated": truncated(tile, "quantise_means"),
-    "scales_truncated": truncated(tile, "quantise_shape", (geometry,)),
-    "quats_truncated": truncated(geometry, "quat_levels"),
-    "opacities_truncated": truncated(tile, "opacity_levels"),
-    "sh0_truncated": truncated(tile, "quantise_colour"),
-    "sh_truncated": truncated(colour, "quantise_rows"),
-    "all_truncated": truncated(coded, "encode_tile"),
+    "means_truncated": truncated(tiling, "quantise_means"),
+    "scales_truncated": truncated(pipeline, "quantise_shape", (shape_codebook,)),
+    "quats_truncated": truncated(shape_codebook, "quat_levels"),
+    "opacities_truncated": truncated(pipeline, "opacity_levels"),
+    "sh0_truncated": truncated(pipeline, "quantise_colour"),
+    "sh_truncated": truncated(sh_codebook, "quantise_sh"),
+    "all_truncated": truncated(pipeline, "encode_tile"),
     "half_away": Mistake(
         "halves are rounded away from zero",
         Harm.HARMLESS,
-        stage=rounding(coded, "encode_tile", half_away),
+        stage=rounding(pipeline, "encode_tile", half_away),
         options={"threads": 1},
     ),
     # colours
@@ -153,14 +156,14 @@ MISTAKES = {
         "Cg comes before Co",
         *PICTURE,
         DEGREE_3,
-        stage=replaced(colour, "colour_integers", chroma_exchanged),
+        stage=replaced(quantisation, "colour_integers", chroma_exchanged),
         options={"sh_coding": "scalar"},
     ),
     "chroma_by_matrix": Mistake(
         "lifting is the matrix of YCoCg",
         *PICTURE,
         DEGREE_3,
-        stage=replaced(colour, "colour_integers", real_matrix),
+        stage=replaced(quantisation, "colour_integers", real_matrix),
         options={"sh_coding": "scalar"},
     ),
     # range
@@ -169,13 +172,13 @@ MISTAKES = {
         Harm.PICTURE,
         ("L2", "CNF-6"),
         "nasty/outlier",
-        stage=replaced(tile, "quantise_means", wrapped_means),
+        stage=replaced(tiling, "quantise_means", wrapped_means),
     ),
     "opacities_wrapped": Mistake(
         "256 levels and a byte for them",
         *PICTURE,
         "ordinary/transparent_and_opaque",
-        stage=replaced(tile, "opacity_levels", wrapped_opacities),
+        stage=replaced(pipeline, "opacity_levels", wrapped_opacities),
         options={"opacity_levels": 256},
     ),
 }

@@ -6,7 +6,7 @@ from unittest import mock
 import numpy as np
 
 from csplat import _spec, ply
-from csplat.encoder import coded, draft, measure, scene, tile
+from csplat.encoder import encode_plan, error_bounds, pipeline
 from wrong_encoders.mistake import DEGREE_3, DENSE, PLAIN, STRONG, Harm, Mistake, changed, replaced
 from wrong_encoders.reading import without_band_sign
 from wrong_encoders.serr import counts, head, refitted, stated
@@ -19,7 +19,7 @@ L3 = ("L3", "SER-5")
 
 def told(change):
     """Return a stage change: what is stated, by measure, is made of what would be."""
-    return replaced(scene, "stated_errors", lambda states: lambda errors, origin: change(states(errors, origin)))
+    return replaced(pipeline, "declared_errors", lambda states: lambda errors, origin: change(states(errors, origin)))
 
 
 def scaled(only, kind, factor):
@@ -62,8 +62,8 @@ def not_relative(_errors):
     def run(source_quats, source_scales, quats, scales):
         wide = np.clip(source_scales, -88, 88).astype(np.float64)
         top = wide.max(axis=0)
-        ours = measure.covariance_entries(quats, np.exp(2.0 * (np.clip(scales, -88, 88) - top)))
-        squared = np.square(ours - measure.covariance_entries(source_quats, np.exp(2.0 * (wide - top))))
+        ours = error_bounds.covariance_entries(quats, np.exp(2.0 * (np.clip(scales, -88, 88) - top)))
+        squared = np.square(ours - error_bounds.covariance_entries(source_quats, np.exp(2.0 * (wide - top))))
         squared[3:] *= 2.0
         return float(np.sqrt(squared.sum(axis=0).max())), float(squared.sum())
 
@@ -121,7 +121,7 @@ def none_of(*names):
 
 @contextlib.contextmanager
 def scales_without_bound():
-    with mock.patch.object(measure, "SCALE_MOST", 340.0), mock.patch.object(draft, "SCALE_MOST", 340.0):
+    with mock.patch.object(error_bounds, "SCALE_MOST", 340.0), mock.patch.object(encode_plan, "SCALE_MOST", 340.0):
         yield
 
 
@@ -173,7 +173,7 @@ MISTAKES = {
         Harm.BOUND,
         L3,
         f"{DEGREE_3},ordinary/plane",
-        stage=replaced(tile, "value_errors", in_single),
+        stage=replaced(pipeline, "value_errors", in_single),
     ),
     "stated_in_single": Mistake(
         "an error can be a float32, rounded to the nearest",
@@ -183,13 +183,13 @@ MISTAKES = {
         data=stated(lambda r: r._replace(max=float(np.float32(r.max)), rms=float(np.float32(r.rms)))),
     ),
     "means_by_axis": Mistake(
-        "max is over components, of means too", Harm.BOUND, L3, stage=replaced(tile, "distance_errors", by_axis)
+        "max is over components, of means too", Harm.BOUND, L3, stage=replaced(pipeline, "distance_errors", by_axis)
     ),
     "covariance_not_relative": Mistake(
         "the error of a covariance is that of its entries",
         Harm.BOUND,
         L3,
-        stage=replaced(tile, "covariance_errors", not_relative),
+        stage=replaced(pipeline, "covariance_errors", not_relative),
     ),
     "covariance_not_clipped": Mistake(
         "scales need no bound",
@@ -203,7 +203,7 @@ MISTAKES = {
         Harm.BOUND,
         L3,
         inputs=f"{DEGREE_3},{STRONG}",
-        stage=replaced(tile, "covariance_errors", with_w_of_the_source),
+        stage=replaced(pipeline, "covariance_errors", with_w_of_the_source),
     ),
     "rms_over_components": Mistake("a mean is over all numbers", Harm.BOUND, L3, stage=told(over_components)),
     "rms_over_source": Mistake(
@@ -211,7 +211,7 @@ MISTAKES = {
         Harm.BOUND,
         L3,
         keep=lambda m: np.flatnonzero(m.opacities >= 0.5),
-        stage=replaced(scene, "stated_errors", over_the_source),
+        stage=replaced(pipeline, "declared_errors", over_the_source),
     ),
     # statements about the source
     "pruned_invented": Mistake("counts are decoration", Harm.FACTS, ("L2", "SRC-1"), data=counts(3, 3)),
@@ -261,7 +261,7 @@ MISTAKES = {
         ("L4", ""),
         DEGREE_3,
         scene=changed(shN=without_band_sign),
-        stage=replaced(coded, "file_chunks", without_chunk),
+        stage=replaced(pipeline, "file_chunks", without_chunk),
     ),
     "some_errors_left_out": Mistake(
         "the others are stated",

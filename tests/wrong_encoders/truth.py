@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import csplat
-from csplat.encoder.measure import ErrorSums, distance_errors, measured_sums
+from csplat.encoder.error_bounds import ErrorSums, distance_errors, measured_sums
 from wrong_encoders import plyrows
 
 

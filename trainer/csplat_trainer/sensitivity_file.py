@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.archives import read_archive
-from csplat.encoder import Curvatures, Importance
+from csplat.encoder import GaussNewtonBlocks, Importance
 from csplat.errors import InputError
 from csplat.model import SplatModel
 
@@ -94,10 +94,10 @@ class StoredSensitivity:
             self._floored("colour_squares"), self._floored("shape_squares"), *matrices, self._curvatures()
         )
 
-    def _curvatures(self) -> Curvatures:
+    def _curvatures(self) -> GaussNewtonBlocks:
         """Return the same by attribute, not only in ratios, with nothing in place of the values that no view saw."""
         opacity, shape, means = (self.groups[f"{name}_squares"] / _CHANNELS for name in ("opacity", "shape", "means"))
-        return Curvatures(
+        return GaussNewtonBlocks(
             opacity, self.shape_matrices * (shape / _SHAPE)[:, None], means, self.groups["colour_squares"]
         )
 

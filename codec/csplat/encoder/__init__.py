@@ -1,44 +1,50 @@
-"""The encoder: what whoever uses it may import is here.
+"""The encoder's interface for other packages.
 
-`encode` and `encode_with_report` make a file in one go. `Draft` makes it in steps, for those who look at what became of
-the scene before they choose its colours (`Draft.coded`), or tune all of its values (`Draft.frozen`). The last names are
-parts of the encoder that serve others by themselves.
+`encode` and `encode_with_report` make a file in one call. `EncodePlan` and `encode_tiles` make it in steps, for callers
+that refit colours to the planned geometry; `fix_quantisation` is for callers that tune all values.
 """
 
 from __future__ import annotations
 
-from csplat.encoder.coded import Coded, EncodeReport, EncodeResult
-from csplat.encoder.curvature import Curvatures
-from csplat.encoder.draft import Draft, Origin
-from csplat.encoder.frozen import DecodedValues, FreeValues, Frozen
-from csplat.encoder.gauge import fix_gauge
-from csplat.encoder.grades import most_grades
-from csplat.encoder.importance import Importance, trusted
+from csplat.encoder.encode_options import PRESETS, Deflate, EncodeOptions, MeansCoding, PresetName, ShCoding
+from csplat.encoder.encode_plan import EncodePlan, Origin
+from csplat.encoder.fixed_quantisation import DecodedValues, FixedQuantisation, FreeValues, fix_quantisation
 from csplat.encoder.kmeans import cluster
-from csplat.encoder.options import PRESETS, Deflate, EncodeOptions, MeansCoding, PresetName, ShCoding
-from csplat.encoder.pipeline import encode, encode_with_report
+from csplat.encoder.pipeline import (
+    EncodedTiles,
+    EncodeReport,
+    EncodeResult,
+    encode,
+    encode_tiles,
+    encode_with_report,
+)
+from csplat.encoder.quantisation import canonicalise_shape
+from csplat.encoder.quantisation_classes import max_class_count
+from csplat.encoder.weights import GaussNewtonBlocks, Importance, apply_weight_floor
 
 __all__ = [
     "PRESETS",
-    "Coded",
-    "Curvatures",
     "DecodedValues",
     "Deflate",
-    "Draft",
     "EncodeOptions",
+    "EncodePlan",
     "EncodeReport",
     "EncodeResult",
+    "EncodedTiles",
+    "FixedQuantisation",
     "FreeValues",
-    "Frozen",
+    "GaussNewtonBlocks",
     "Importance",
     "MeansCoding",
     "Origin",
     "PresetName",
     "ShCoding",
+    "apply_weight_floor",
+    "canonicalise_shape",
     "cluster",
     "encode",
+    "encode_tiles",
     "encode_with_report",
-    "fix_gauge",
-    "most_grades",
-    "trusted",
+    "fix_quantisation",
+    "max_class_count",
 ]

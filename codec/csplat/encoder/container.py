@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from csplat import _spec
-from csplat.encoder.streams import Coding, unsigned_stream
+from csplat.encoder.entropy import DeflateSettings, unsigned_stream
 
 
 @dataclass(frozen=True)
-class Later:
+class LazyPayload:
     """A payload that is read when it is written.
 
     Attributes:
@@ -32,7 +32,7 @@ class Later:
         return self.size
 
 
-Payload = bytes | Later
+Payload = bytes | LazyPayload
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,10 @@ class SceneFields:
     chunks: Sequence[FileChunk] = field(default=())
 
 
-def json_payload(value: Any, coding: Coding) -> bytes:
+def json_payload(value: Any, deflate: DeflateSettings) -> bytes:
     """Return the payload of a JSON chunk (spec 5.4): keys sorted, so that equal content gives equal bytes."""
     text = json.dumps(value, ensure_ascii=False, sort_keys=True, allow_nan=False, separators=(",", ":"))
-    return unsigned_stream(np.frombuffer(text.encode(), np.uint8), coding)
+    return unsigned_stream(np.frombuffer(text.encode(), np.uint8), deflate)
 
 
 def tile_payload(layer: int, blocks: Sequence[bytes]) -> bytes:
@@ -94,18 +94,18 @@ def tile_payload(layer: int, blocks: Sequence[bytes]) -> bytes:
     return _spec.pack_tile_head(_spec.TileHead(layer, len(blocks), 0)) + b"".join(blocks)
 
 
-def write(scene: SceneFields, tiles: Sequence[FileTile]) -> bytes:
-    """Lay out a file in memory; see `parts`."""
-    return b"".join(parts(scene, tiles))
+def write_file(scene: SceneFields, tiles: Sequence[FileTile]) -> bytes:
+    """Lay out a file in memory; see `file_pieces`."""
+    return b"".join(file_pieces(scene, tiles))
 
 
-def parts(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[bytes]:
+def file_pieces(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[bytes]:
     """Lay out header, index and chunks in the order the spec recommends (4.3.6), and give the file piece by piece."""
     index_size = _index_size(scene, tiles)
     offset = _spec.HEADER_SIZE + index_size
     directory: list[_spec.DirectoryRecord] = []
     layers: dict[tuple[int, int], _spec.LayerRecord] = {}
-    for place, chunk in _in_order(scene, tiles):
+    for place, chunk in _ordered_chunks(scene, tiles):
         where = (_spec.CHUNK_HEADER_SIZE + len(chunk.payload), offset, chunk_crc(chunk.type, chunk.payload))
         if place is None:
             directory.append(_spec.DirectoryRecord(chunk.type, _flags(chunk.type), chunk.id, chunk.layer, 0, 0, *where))
@@ -116,8 +116,8 @@ def parts(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[bytes]:
     assert len(index) == index_size
     yield _header(len(index), offset)
     yield index
-    for _, chunk in _in_order(scene, tiles):
-        yield _head(chunk.type, len(chunk.payload))
+    for _, chunk in _ordered_chunks(scene, tiles):
+        yield _chunk_head(chunk.type, len(chunk.payload))
         yield chunk.payload if isinstance(chunk.payload, bytes) else chunk.payload.read()
 
 
@@ -125,11 +125,13 @@ def _flags(kind: bytes) -> int:
     return sum(getattr(_spec, f"CHUNK_FLAG_{name.upper()}") for name in _spec.CHUNK_FLAGS[kind])
 
 
-def _head(kind: bytes, size: int) -> bytes:
+def _chunk_head(kind: bytes, size: int) -> bytes:
     return _spec.pack_chunk_header(_spec.ChunkHeader(kind, _flags(kind), 0, size))
 
 
-def _in_order(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[tuple[tuple[int, int] | None, FileChunk]]:
+def _ordered_chunks(
+    scene: SceneFields, tiles: Sequence[FileTile]
+) -> Iterator[tuple[tuple[int, int] | None, FileChunk]]:
     """Yield each chunk with its (tile, layer), or None for chunks of the whole file."""
     yield from ((None, chunk) for chunk in scene.chunks if chunk.type != _spec.CHUNK_CODEBOOK)
     for layer in _spec.LAYER_NAMES:
@@ -145,7 +147,7 @@ def chunk_crc(kind: bytes, payload: Payload) -> int:
     """CHK-1: of a chunk's header and payload."""
     if not isinstance(payload, bytes):
         return payload.crc
-    return zlib.crc32(payload, zlib.crc32(_head(kind, len(payload))))
+    return zlib.crc32(payload, zlib.crc32(_chunk_head(kind, len(payload))))
 
 
 def _index_size(scene: SceneFields, tiles: Sequence[FileTile]) -> int:

@@ -1,14 +1,23 @@
-"""Weighted k-means over lattice integers: the same bytes at any thread count.
+"""Weighted k-means over lattice integers."""
 
-Searches are exact (`nearest`); centroids are float64 sums in the order of the points,
-rounded to integers; all chance comes from one seeded generator.
-"""
+from __future__ import annotations
 
-from collections.abc import Callable
+import ctypes
+import math
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from csplat.encoder.nearest import search
+from csplat.encoder.weights import ErrorMetric, doubled_triangles, matrix_products
 from csplat.errors import InputError
 from csplat.types import F32, F64, I16, I32, I64, U32
 
@@ -51,26 +60,26 @@ def cluster(
     Raises:
         InputError: shapes, dtypes, weights or numbers outside these ranges.
     """
-    w = _check(points, weights)
+    w = _check_points(points, weights)
     if min(size, sample_per_entry) <= 0 or min(iterations, near_groups, seed) < 0:
         raise InputError("cluster: size and sample_per_entry must be > 0, other numbers >= 0")
     if len(points) <= size:
         return _distinct(points)
     rng = np.random.default_rng(seed)
-    rows, sample_w = _sample(w, size * sample_per_entry, rng)
+    rows, sample_w = _priority_sample(w, size * sample_per_entry, rng)
     sample = points[rows]
     entries = _first_entries(sample, sample_w, size, rng, near_groups, threads)
     for step in range(iterations + 1):
         most = size >> (2 + 4 * step // iterations) if step < iterations else 0
         if step == iterations:
             sample, sample_w = points, w
-        index, error = search(sample, entries, near_groups, threads)
-        entries = _means(sample, sample_w, index, entries)
+        index, error = search_nearest(sample, entries, near_groups, threads)
+        entries = _move_to_means(sample, sample_w, index, entries)
         _relocate(entries, index, sample, sample_w, error, most, rng, threads)
         if progress:
             progress(step + 1, iterations + 2)
     index = assign(points, entries, near_groups=near_groups, threads=threads)
-    entries = _means(points, w, index, entries)
+    entries = _move_to_means(points, w, index, entries)
     if progress:
         progress(iterations + 2, iterations + 2)
     distinct, merged = _distinct(entries)
@@ -94,12 +103,12 @@ def assign(points: I16 | I32, entries: I32, *, near_groups: int = 0, threads: in
     Raises:
         InputError: shapes or dtypes that are not those above.
     """
-    _check(points, None)
+    _check_points(points, None)
     if entries.ndim != 2 or entries.dtype != np.int32 or entries.shape[1] != points.shape[1]:
         raise InputError(f"assign: entries {entries.dtype} {entries.shape}, points {points.shape}")
     if not len(entries):
         raise InputError("assign: no entries")
-    return search(points, entries, near_groups, threads)[0]
+    return search_nearest(points, entries, near_groups, threads)[0]
 
 
 def rank_by_frequency(index: U32, entries: I32) -> tuple[U32, I32]:
@@ -119,7 +128,7 @@ def rank_by_frequency(index: U32, entries: I32) -> tuple[U32, I32]:
     return rank[index], entries[order]
 
 
-def _check(points: I16 | I32, weights: F32 | None) -> F64:
+def _check_points(points: I16 | I32, weights: F32 | None) -> F64:
     if points.ndim != 2 or not points.shape[1] or points.dtype not in (np.int16, np.int32):
         found = f"{points.dtype} {points.shape}"
         raise InputError(f"k-means: points are int16 or int32 [N, D], found {found}")
@@ -136,7 +145,7 @@ def _largest(keys: F64, count: int) -> I64:
     return np.sort(np.argpartition(keys, len(keys) - count)[len(keys) - count :])
 
 
-def _sample(w: F64, count: int, rng: np.random.Generator) -> tuple[I64, F64]:
+def _priority_sample(w: F64, count: int, rng: np.random.Generator) -> tuple[I64, F64]:
     """Priority sampling: an unbiased weighted sample that keeps every heavy row.
 
     Duffield, Lund, Thorup, "Priority sampling for estimation of arbitrary subset sums".
@@ -150,7 +159,7 @@ def _sample(w: F64, count: int, rng: np.random.Generator) -> tuple[I64, F64]:
     return rows, np.maximum(w[rows], threshold)
 
 
-def _draw(importance: F64, count: int, rng: np.random.Generator) -> I64:
+def _draw_rows(importance: F64, count: int, rng: np.random.Generator) -> I64:
     """Draw up to `count` different rows with a chance that grows with their importance."""
     count = min(count, int(np.count_nonzero(importance)))
     if count == 0:
@@ -168,15 +177,15 @@ def _first_entries(
     error = np.ones(len(sample))
     entries = np.empty((0, sample.shape[1]), np.int32)
     for done in range(1, _SEED_ROUNDS + 1):
-        new = sample[_draw(w * error, size * done // _SEED_ROUNDS - len(entries), rng)]
+        new = sample[_draw_rows(w * error, size * done // _SEED_ROUNDS - len(entries), rng)]
         entries = np.concatenate([entries, new.astype(np.int32)])
         if len(new) and done < _SEED_ROUNDS:
-            found = search(sample, new.astype(np.int32), near, threads)[1]
+            found = search_nearest(sample, new.astype(np.int32), near, threads)[1]
             error = np.minimum(error, found) if len(entries) > len(new) else found
     return entries
 
 
-def _means(points: I16 | I32, w: F64, index: U32, entries: I32) -> I32:
+def _move_to_means(points: I16 | I32, w: F64, index: U32, entries: I32) -> I32:
     """Move each entry to the rounded mean of its points; one of no weight stays."""
     where = index.astype(np.int64)
     total = np.bincount(where, w, len(entries))
@@ -208,7 +217,7 @@ def _relocate(
     harm = np.bincount(index, w * error, len(entries))
     loss = weight
     if most:
-        loss = weight * search(entries, entries, 0, threads, other=True)[1]
+        loss = weight * search_nearest(entries, entries, 0, threads, other=True)[1]
     cheap, worst = np.argsort(loss, kind="stable"), np.argsort(-harm, kind="stable")
     limit = max(most, int(np.count_nonzero(weight == 0)))
     count = int(np.count_nonzero((loss[cheap] < harm[worst] / 2)[:limit]))
@@ -229,3 +238,325 @@ def _distinct(rows: I16 | I32) -> tuple[I32, U32]:
 def _drop_unused(entries: I32, index: U32) -> tuple[I32, U32]:
     used = np.bincount(index, minlength=len(entries)) > 0
     return entries[used], (np.cumsum(used) - 1).astype(np.uint32)[index]
+
+
+_Find = Callable[[F32, int], tuple[I64, F32]]  # rows [x, 1] and the number of the first
+
+_EXACT = 2.0**23  # below it float32 holds every multiple of 1/2
+_PRODUCT_ROWS, _PRODUCT_COLUMNS = 256, 4096  # points and entries of one product: a result of 4 MiB
+_GROUPED_ROWS = 4096  # points that share one sort by group
+_GROUP_ITERATIONS = 4
+_BLAS = threading.Lock()  # its thread count is one for the process: one search at a time
+
+
+def search_nearest(
+    points: I16 | I32,
+    entries: I32,
+    near_groups: int = 0,
+    threads: int | None = None,
+    *,
+    other: bool = False,
+) -> tuple[U32, F64]:
+    """Find the entry nearest to each point, and how far it is.
+
+    Minimises |c|**2 / 2 - x.c: one product of [x, 1] and [c, -|c|**2 / 2].
+
+    Args:
+        points: [N, D], lattice integers. Where max|x| max|c| + max|c|**2 / 2 reaches 2**23
+            (norms of about 2,300) both are first divided by a power of two and rounded.
+        entries: [K, D], K > 0.
+        near_groups: 0, or how many groups of about sqrt(K) entries to search for a point.
+        threads: worker threads, all processors unless told.
+        other: point n may not find entry n (the points are the entries; `near_groups` 0).
+
+    Returns:
+        index [N] uint32, the first of equally near entries when all are searched; and the
+        squared distance [N] float64, of the divided integers, in units of the lattice.
+    """
+    shift = _shift(points, entries)
+    coarse = _shift_right(entries, shift)
+    index = np.zeros(len(points), np.uint32)
+    error = np.zeros(len(points))
+    width, length = points.shape[1] + 1, _PRODUCT_ROWS
+    find = _every_entry(_matrix(coarse), other)
+    if 0 < near_groups < _group_count(len(entries)):
+        length = _GROUPED_ROWS
+        find = _near_entries(coarse, near_groups, threads)
+
+    def work(starts: range) -> None:
+        x = np.ones((length, width), np.float32)
+        for a in starts:
+            part = slice(a, min(a + length, len(points)))
+            rows = x[: part.stop - a]
+            rows[:, :-1] = points[part] if shift == 0 else _shift_right(points[part], shift)
+            index[part], best = find(rows, a)
+            norm = np.einsum("nd,nd->n", rows, rows, dtype=np.float64) - 1.0
+            error[part] = (norm - 2.0 * best) * 4.0**shift
+
+    workers = max(1, min(threads or os.cpu_count() or 1, -(-len(points) // length)))
+    jobs = [range(w * length, len(points), workers * length) for w in range(workers)]
+    with one_blas_thread():
+        if workers == 1:  # to start a thread takes longer than a small search
+            work(jobs[0])
+        else:
+            with ThreadPoolExecutor(workers) as pool:
+                list(pool.map(work, jobs))
+    return index, error
+
+
+def _shift(points: I16 | I32, entries: I32) -> int:
+    """Return the least shift after which every product is exact."""
+    x, c = _largest_norm(points), _largest_norm(entries)
+    slack = math.sqrt(points.shape[1])  # rounding moves a vector by half of this at most
+    shift = 0
+    while (x + slack) * (c + slack) + (c + slack) ** 2 / 2 >= _EXACT:
+        x, c, shift = x / 2, c / 2, shift + 1
+    return shift
+
+
+def _largest_norm(rows: I16 | I32) -> float:
+    largest = 0.0
+    for a in range(0, len(rows), _GROUPED_ROWS):
+        part = rows[a : a + _GROUPED_ROWS].astype(np.float64)
+        largest = max(largest, float(np.einsum("nd,nd->n", part, part).max()))
+    return math.sqrt(largest)
+
+
+def _shift_right(rows: I16 | I32, shift: int) -> I64:
+    return (rows.astype(np.int64) + ((1 << shift) >> 1)) >> shift
+
+
+def _matrix(entries: I64) -> F32:
+    """Return [D + 1, K]: the entries as columns, minus half their squares below."""
+    half = np.einsum("kd,kd->k", entries, entries) * -0.5
+    return np.concatenate([entries.T, half[None]]).astype(np.float32)
+
+
+def _every_entry(matrix: F32, other: bool) -> _Find:
+    def find(x: F32, start: int) -> tuple[I64, F32]:
+        rows = np.arange(len(x))
+        index = np.zeros(len(x), np.int64)
+        best = np.full(len(x), -np.inf, np.float32)
+        for k in range(0, matrix.shape[1], _PRODUCT_COLUMNS):
+            scores = x @ matrix[:, k : k + _PRODUCT_COLUMNS]
+            if other:
+                own = rows + (start - k)
+                here = (own >= 0) & (own < scores.shape[1])
+                scores[rows[here], own[here]] = -np.inf
+            first = scores.argmax(1)
+            score = scores[rows, first]
+            better = score > best
+            index[better] = first[better] + k
+            best[better] = score[better]
+        return index, best
+
+    return find
+
+
+def _group_count(entry_count: int) -> int:
+    return math.isqrt(entry_count)
+
+
+def _near_entries(entries: I64, near: int, threads: int | None) -> _Find:
+    centres, label = _groups(entries, threads)
+    order = np.argsort(label, kind="stable")
+    matrix, coarse = _matrix(entries[order]), _matrix(centres)
+    bounds = np.searchsorted(label[order], np.arange(len(centres) + 1))
+
+    def find(x: F32, _: int) -> tuple[I64, F32]:
+        index = np.zeros(len(x), np.int64)
+        best = np.full(len(x), -np.inf, np.float32)
+        negated = x @ -coarse
+        chosen = np.argpartition(negated, near - 1, axis=1)[:, :near].astype(np.uint16).ravel()
+        by_group = np.argsort(chosen, kind="stable")
+        ends = np.searchsorted(chosen[by_group], np.arange(len(centres) + 1))
+        for g in range(len(centres)):
+            rows = by_group[ends[g] : ends[g + 1]] // near
+            if len(rows) == 0 or bounds[g] == bounds[g + 1]:
+                continue
+            scores = x[rows] @ matrix[:, bounds[g] : bounds[g + 1]]
+            first = scores.argmax(1)
+            score = scores[np.arange(len(rows)), first]
+            better = score > best[rows]
+            index[rows[better]] = first[better] + bounds[g]
+            best[rows[better]] = score[better]
+        return order[index], best
+
+    return find
+
+
+def _groups(entries: I64, threads: int | None) -> tuple[I64, U32]:
+    """Put the entries into about sqrt(K) groups by plain k-means; the means of the groups."""
+    count = _group_count(len(entries))
+    rows = entries.astype(np.int32)
+    centres = rows[np.arange(count) * len(rows) // count]
+    label, _ = search_nearest(rows, centres, 0, threads)
+    for _ in range(_GROUP_ITERATIONS - 1):
+        size = np.bincount(label, minlength=count)
+        sums = [np.bincount(label, column, count) for column in rows.T]
+        used = size > 0
+        centres[used] = np.rint(np.stack(sums, 1)[used] / size[used, None])
+        label, _ = search_nearest(rows, centres, 0, threads)
+    return centres.astype(np.int64), label
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Let each product run on one thread, where NumPy's BLAS is an OpenBLAS that lets us.
+
+    Our threads already fill the processors. OpenBLAS's wait for each other by spinning:
+    with one other program at work these products took 20 times as long.
+    """
+    control = _openblas()
+    if control is None:
+        yield
+        return
+    with _BLAS:
+        before = control[0]()
+        control[1](1)
+        try:
+            yield
+        finally:
+            control[1](before)
+
+
+@cache
+def _openblas() -> tuple[Callable[[], int], Callable[[int], object]] | None:
+    core = sys.modules.get("numpy._core._multiarray_umath") or sys.modules.get("numpy.core._multiarray_umath")
+    beside = Path(np.__file__).parent.parent / "numpy.libs"
+    paths = [str(getattr(core, "__file__", "")), *map(str, sorted(beside.glob("*openblas*")))]
+    for path in filter(None, paths):
+        try:
+            library = ctypes.CDLL(path)
+        except OSError:
+            continue
+        for name in ("scipy_openblas_{}64_", "openblas_{}64_", "scipy_openblas_{}", "openblas_{}"):
+            get = getattr(library, name.format("get_num_threads"), None)
+            put = getattr(library, name.format("set_num_threads"), None)
+            if get and put:
+                return get, put
+    return None
+
+
+Floats = NDArray[Any]
+
+_CANDIDATES = 96  # entries for a point: its own and the nearest to that
+_REFINE_ROUNDS = 2  # how often entries move
+_METRIC_BLOCK = 1 << 12
+_RIDGE = 1e-3  # fraction of the mean diagonal: holds an entry in place if its points do not determine it
+
+
+def reassign_by_metric(
+    points: Floats, metric: ErrorMetric, entries: Floats, index: I64, threads: int, tried: int
+) -> I64:
+    """Give each point the best of the entries near its own.
+
+    Args:
+        points: [N, D, C].
+        metric: metric of the points.
+        entries: [K, D, C].
+        index: [N], the entry of each point.
+        threads: number to use; the result does not depend on it.
+        tried: number of entries to try: its own and that one's nearest neighbours.
+
+    Returns:
+        [N].
+    """
+    with one_blas_thread():
+        return _assign_by_metric(points, metric, entries, index, threads, tried)
+
+
+def refine_by_metric(points: Floats, metric: ErrorMetric, entries: I32, index: I64, threads: int) -> tuple[I32, I64]:
+    """Give each point the best of the entries near its own, and move the entries; twice.
+
+    Args:
+        points: [N, D, C], in lattice steps.
+        metric: metric of the points.
+        entries: [K, D, C] lattice integers.
+        index: [N], the entry of each point.
+        threads: number to use; the result does not depend on it.
+
+    Returns:
+        entries [K', D, C], distinct, each used; index [N].
+    """
+    with one_blas_thread():
+        for _ in range(_REFINE_ROUNDS):
+            index = _assign_by_metric(points, metric, entries, index, threads, _CANDIDATES)
+            entries = _solve_entries(points, metric, entries, index)
+        index = _assign_by_metric(points, metric, entries, index, threads, _CANDIDATES)
+    flat, place = np.unique(entries.reshape(len(entries), -1), axis=0, return_inverse=True)
+    index = place.reshape(-1)[index]
+    used, index = np.unique(index, return_inverse=True)
+    return flat[used].reshape(-1, *entries.shape[1:]), index.reshape(-1)
+
+
+def _assign_by_metric(
+    points: Floats, metric: ErrorMetric, entries: Floats, index: I64, threads: int, tried: int
+) -> I64:
+    """Take the best of the candidates: w xᵀMx falls out, what is left is linear in Mx and M."""
+    near = _neighbours(entries, tried)
+    size, channels = entries.shape[1:]
+    above, beside = np.triu_indices(size)
+    wide = entries.astype(np.float64)
+    table = np.concatenate(
+        [-2.0 * wide.reshape(len(wide), -1), np.einsum("kpc,kpc->kp", wide[:, above], wide[:, beside])], axis=1
+    )
+    order = np.argsort(index, kind="stable")
+    ends = np.searchsorted(index[order], np.arange(len(entries) + 1))
+    best = index.copy()
+
+    def work(groups: Sequence[int]) -> None:
+        for group in groups:
+            rows = order[ends[group] : ends[group + 1]]
+            if not len(rows):
+                continue
+            features = np.empty((len(rows), table.shape[1]))
+            features[:, : size * channels] = matrix_products(metric.triangles[rows], points[rows]).reshape(
+                len(rows), -1
+            )
+            features[:, size * channels :] = doubled_triangles(metric.triangles[rows])
+            best[rows] = near[group, (features @ table[near[group]].T).argmin(axis=1)]
+
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        list(pool.map(work, [range(start, len(entries), threads) for start in range(threads)]))
+    return best
+
+
+def _neighbours(entries: Floats, tried: int) -> I64:
+    """[K, candidates]: each entry itself, and those nearest to it."""
+    flat = entries.reshape(len(entries), -1).astype(np.float64)
+    squares = np.einsum("kd,kd->k", flat, flat)
+    count = min(tried, len(flat))
+    near = np.empty((len(flat), count), np.int64)
+    for at in range(0, len(flat), 256):
+        part = slice(at, at + 256)
+        distance = squares - 2.0 * (flat[part] @ flat.T)
+        rows = np.arange(len(distance))
+        distance[rows, at + rows] = -np.inf
+        near[part] = np.argpartition(distance, count - 1, axis=1)[:, :count]
+    return np.sort(near, axis=1)
+
+
+def _solve_entries(points: Floats, metric: ErrorMetric, entries: I32, index: I64) -> I32:
+    """Return the entries, [K, D, C], that minimise the sums of the points' errors, rounded."""
+    count, size, channels = entries.shape
+    above, beside = np.triu_indices(size)
+    weights = metric.weights.astype(np.float64)
+    matrices = np.zeros((count, size, size))
+    for place, (i, j) in enumerate(zip(above, beside, strict=True)):
+        sums = np.bincount(index, weights * metric.triangles[:, place], count)
+        matrices[:, i, j] = matrices[:, j, i] = sums
+    wanted = np.empty((count, size, channels))
+    products = np.empty((len(points), size, channels))
+    for at in range(0, len(points), _METRIC_BLOCK):
+        part = slice(at, at + _METRIC_BLOCK)
+        products[part] = matrix_products(metric.triangles[part], points[part])
+    for part_of in range(size):
+        for c in range(channels):
+            wanted[:, part_of, c] = np.bincount(index, weights * products[:, part_of, c], count)
+    ridge = _RIDGE * np.einsum("kii->k", matrices) / size
+    ridge[ridge == 0.0] = 1.0
+    matrices[:, range(size), range(size)] += ridge[:, None]
+    wanted += ridge[:, None, None] * entries
+    solved: I32 = np.rint(np.linalg.solve(matrices, wanted)).astype(np.int32)
+    return solved

@@ -1,17 +1,62 @@
-"""From a model to the bytes of a file in one go."""
+"""From a model to the bytes of a file, in one call or in the steps of `encode_tiles` and `EncodedTiles.write`.
+
+A file may record its own PSNR: write it, measure it, and write it again with the result, which takes no time compared
+with encoding the tiles.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.coded import EncodeResult
-from csplat.encoder.draft import Draft, Origin
-from csplat.encoder.importance import Importance
-from csplat.encoder.options import EncodeOptions
-from csplat.model import SplatModel
+from csplat import _spec
+from csplat.encoder import entropy
+from csplat.encoder.coding_parameters import CodingParameters, StepFactors
+from csplat.encoder.container import FileChunk, FileTile, SceneFields, json_payload, tile_payload, write_file
+from csplat.encoder.encode_options import EncodeOptions
+from csplat.encoder.encode_plan import EncodePlan, Origin
+from csplat.encoder.error_bounds import (
+    ErrorSums,
+    covariance_errors,
+    distance_errors,
+    measured_sums,
+    take_precise_means,
+    value_errors,
+)
+from csplat.encoder.quantisation import (
+    check_finite,
+    lattice_step,
+    lattice_values,
+    opacity_levels,
+    opacity_values,
+    quantise_colour,
+)
+from csplat.encoder.sh_codebook import FileCodebooks, ShTables, encode_sh
+from csplat.encoder.shape_codebook import (
+    SHAPE_CODEBOOK_ID,
+    ShapePart,
+    ShapeTables,
+    quantise_shape,
+    shape_blocks,
+    shape_codebook_chunk,
+)
+from csplat.encoder.tiling import QuantisedTile, TileSplats, quantise_and_sort, take_rows
+from csplat.encoder.weights import Importance
+from csplat.errors import InputError, counted
+from csplat.model import UNSPECIFIED, SplatModel
+from csplat.types import F32, Progress
+
+Integers = NDArray[Any]
+
+_FEW_TILES, _SMALL_TILE = 16, 256  # tiles, and mean splats per tile, below which many small tiles cause no note
+_COLOUR_MEASURES = tuple(_spec.MEASURE_NAMES[id] for id in range(_spec.MEASURE_SH0, _spec.MEASURE_SH0 + 4))
+_SHAPE_MEASURES = tuple(_spec.MEASURE_NAMES[id] for id in (_spec.MEASURE_COVARIANCE, _spec.MEASURE_OPACITIES))
 
 
 def encode(
@@ -22,7 +67,7 @@ def encode(
     Args:
         model: the scene.
         options: presets and knobs; the default preset is "balanced".
-        progress: is told the stage and the share of it that is done, 0 to 1.
+        progress: called with the stage and the fraction of it that is done, 0 to 1.
 
     Returns:
         The bytes of a `.csplat` file. Same model, options and library versions: same bytes, at any thread count.
@@ -49,21 +94,387 @@ def encode_with_report(
     said: Mapping[str, Any] | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> EncodeResult:
-    """Compress a scene and say how: what `csplat encode` calls where no target is given.
+    """Compress a scene, and report choices and errors: `csplat encode` without a target.
 
     Args:
-        model, options, importance, origin, progress: as of `Draft.of`.
-        said: as of `Coded.write`.
+        model, options, importance, origin, progress: see `EncodePlan.of`.
+        said: metadata to record, see `EncodedTiles.write`.
 
     Examples:
         >>> import csplat
         >>> result = csplat.encode_with_report(csplat.read_ply("scene.ply"))
-        >>> most, rms = result.report.errors["opacities"]  # of any splat, and over all, as the file states them
-        >>> 0.0 < rms < most < 0.1
+        >>> largest, rms = result.report.errors["opacities"]  # as the file declares them
+        >>> 0.0 < rms < largest < 0.1
         True
 
     Raises:
         InputError: as `encode`; or an importance of another shape, or negative, or not finite.
     """
-    draft = Draft.of(model, options, importance=importance, origin=origin, progress=progress)
-    return draft.coded(progress).write(said)
+    plan = EncodePlan.of(model, options, importance=importance, origin=origin, progress=progress)
+    return encode_tiles(plan, progress=progress).write(said)
+
+
+@dataclass(frozen=True)
+class EncodeReport:
+    """Choices of the encoder, and the errors and bytes that resulted.
+
+    Attributes:
+        options: the options set by the caller, and the steps and codings chosen; the file records them too.
+        errors: (max, rms) by measure, as the file declares them (spec 5.5).
+        splat_count: splats in the file.
+        tile_count: tiles in the file.
+        size_bytes: size of the file.
+        notes: warnings for the user, a sentence each.
+    """
+
+    options: dict[str, Any]
+    errors: dict[str, tuple[float, float]]
+    splat_count: int
+    tile_count: int
+    size_bytes: int
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class EncodeResult:
+    """An encoded file, and the source splat of each of its splats.
+
+    Attributes:
+        data: the file.
+        source_index: [N] int64; row i of the decoded arrays is row source_index[i] of the model, or of its `Origin`.
+        report: choices and errors.
+    """
+
+    data: bytes
+    source_index: NDArray[np.int64]
+    report: EncodeReport
+
+
+@dataclass(frozen=True)
+class EncodedTile:
+    """One encoded tile.
+
+    Attributes:
+        tile: index record and payloads.
+        rows: [n], rows of the model in decoding order.
+        errors: errors of its splats.
+        coarsened: attributes with a value so large that the tile's lattice had to be coarser.
+    """
+
+    tile: FileTile
+    rows: NDArray[np.intp]
+    errors: ErrorSums
+    coarsened: frozenset[str]
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedTiles:
+    """An encoded scene: a file but for the metadata about itself.
+
+    Attributes:
+        plan: the complete plan.
+        codebooks: codebooks of the whole file.
+        tiles: the tiles.
+        errors: errors to declare.
+    """
+
+    plan: EncodePlan
+    codebooks: FileCodebooks
+    tiles: Sequence[EncodedTile]
+    errors: ErrorSums
+
+    @property
+    def source_index(self) -> NDArray[np.int64]:
+        """Index in the source of each splat of the file, [N] in decoding order."""
+        rows = np.concatenate([part.rows for part in self.tiles]) if self.tiles else np.zeros(0, np.int64)
+        index: NDArray[np.int64] = self.plan.origin.source_index[rows]
+        return index
+
+    def against(self, source: SplatModel, decoded: SplatModel) -> EncodedTiles:
+        """Return the same tiles, declaring the errors against another scene than the one encoded.
+
+        Args:
+            source: the scene that the plan's `Origin` refers to.
+            decoded: the decoded file.
+        """
+        return replace(self, errors=measured_sums(source, decoded, self.source_index))
+
+    def write(self, metadata: Mapping[str, Any] | None = None) -> EncodeResult:
+        """Write the file.
+
+        Args:
+            metadata: JSON-compatible entries to record next to the encoder's settings.
+
+        Raises:
+            InputError: an error is too large to be declared.
+        """
+        settings = {**(metadata or {}), **encoding_settings(self.plan, self.codebooks.tables)}
+        chunks = file_chunks(self.plan, self.errors, settings)
+        data = write_file(scene_fields(self.plan, self.codebooks, chunks), [part.tile for part in self.tiles])
+        notes = make_notes(self.tiles, strict=self.plan.parameters.lattice.strict)
+        errors = declared_errors(self.errors, self.plan.origin)
+        report = EncodeReport(settings, errors, self.errors.count, len(self.tiles), len(data), notes)
+        return EncodeResult(data, self.source_index, report)
+
+
+def encode_tiles(
+    plan: EncodePlan,
+    codebooks: FileCodebooks | None = None,
+    *,
+    errors: ErrorSums | None = None,
+    progress: Progress | None = None,
+) -> EncodedTiles:
+    """Encode the tiles of a scene: most of the work.
+
+    Args:
+        plan: the scene; its SH coding may still be open.
+        codebooks: SH codebooks, if the plan's SH coding is decided; `None`: decide it now.
+        errors: errors to declare; `None`: those of the tiles.
+        progress: see `EncodePlan.of`.
+
+    Raises:
+        InputError: values that no lattice can hold.
+    """
+    if codebooks is None:
+        parameters, codebooks = plan.choose_sh_coding(progress)
+        plan = replace(plan, parameters=parameters)
+    tiles = _encode_all(plan, codebooks.tables, progress)
+    errors = errors or ErrorSums.total(part.errors for part in tiles)
+    if plan.shapes is not None:
+        record, chunk = shape_codebook_chunk(plan.shapes, plan.parameters.deflate)
+        codebooks = replace(codebooks, records=[*codebooks.records, record], chunks=[*codebooks.chunks, chunk])
+    return EncodedTiles(plan, codebooks, tiles, errors)
+
+
+def _encode_all(plan: EncodePlan, tables: ShTables, progress: Progress | None) -> list[EncodedTile]:
+    threads, done = plan.options.thread_count, 0
+
+    def encode_one(tile: TileSplats) -> EncodedTile:
+        nonlocal done
+        encoded = encode_tile(plan.model, tile, plan.parameters, tables, plan.shapes)
+        done += len(tile.rows)
+        if progress is not None:
+            progress("tiles", done / max(1, len(plan.model)))
+        return encoded
+
+    if threads == 1 or len(plan.tiles) < 2:
+        return [encode_one(tile) for tile in plan.tiles]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(encode_one, plan.tiles))
+
+
+def make_notes(tiles: Sequence[EncodedTile], *, strict: bool) -> tuple[str, ...]:
+    """Return warnings about outliers that cost their neighbours precision, and about too small a `position_error`."""
+    notes = []
+    splats = sum(part.tile.splat_count for part in tiles)
+    if strict and len(tiles) > max(_FEW_TILES, splats // _SMALL_TILE):
+        notes.append(
+            f"means: so small an error takes {counted(len(tiles), 'tile')}, each of which takes bytes of its own"
+        )
+    counts = Counter(name for part in tiles for name in part.coarsened)
+    notes += [
+        f"{name}: huge values coarsen {count} of {counted(len(tiles), 'tile')}; remove them, or see the stated errors"
+        for name, count in sorted(counts.items())
+    ]
+    return tuple(notes)
+
+
+def encode_tile(
+    model: SplatModel,
+    tile: TileSplats,
+    parameters: CodingParameters,
+    tables: ShTables,
+    shapes: ShapeTables | None = None,
+) -> EncodedTile:
+    """Quantise, code and measure one tile (spec 5.2).
+
+    Args:
+        model: the whole scene.
+        tile: the tile's rows and steps.
+        parameters: the file's lattices and codings.
+        tables: SH coding of the whole file.
+        shapes: shape codebook of the whole file, if there is one.
+    """
+    result = _TileResult(parameters, tile.factors)
+    quantised = quantise_and_sort(model, tile, parameters)
+    rows = quantised.rows
+    part = None if shapes is None else shapes.part(rows)
+    result.add_opacities(take_rows(model.opacities, rows))
+    max_scale = result.add_shapes(take_rows(model.quats, rows), take_rows(model.scales, rows), part)
+    result.add_means(take_precise_means(model, rows), quantised, lattice_step(parameters.lattice.step, tile.exponent))
+    result.add_sh0(take_rows(model.sh0, rows))
+    layers: dict[int, list[bytes]] = {_spec.ATTRIBUTE_LAYER[_spec.ATTRIBUTE_SH0]: result.blocks}
+    used: tuple[int, ...] = () if part is None else (SHAPE_CODEBOOK_ID,)
+    if model.sh_degree:
+        sh = encode_sh(model.shN, rows, parameters, tables)
+        layers |= {layer: [block] for layer, block in sh.blocks.items()}
+        used = (*sh.tables, *used)
+        if sh.exponent:
+            result.coarsened.add("shN")
+        for measure, errors in sh.errors.items():
+            result.add_errors(measure, errors)
+    if tables.extras:
+        layers[_spec.LAYER_EXTRA] = [
+            entropy.raw_block(column, take_rows(model.extra[name], rows), parameters.deflate)
+            for column, name in enumerate(tables.extras)
+        ]
+    corner, extent = quantised.corner, quantised.q.max(axis=1)
+    file_tile = FileTile(
+        splat_count=len(rows),
+        exponent=tile.exponent,
+        corner=(int(corner[0]), int(corner[1]), int(corner[2])),
+        extent=(int(extent[0]), int(extent[1]), int(extent[2])),
+        max_scale=max_scale,
+        layers={layer: tile_payload(layer, parts) for layer, parts in layers.items()},
+        tables=used,
+    )
+    return EncodedTile(
+        file_tile, rows, ErrorSums(len(rows), result.largest, result.squares), frozenset(result.coarsened)
+    )
+
+
+@dataclass
+class _TileResult:
+    """Blocks and errors of a tile, collected attribute by attribute in the order of the blocks."""
+
+    parameters: CodingParameters
+    factors: StepFactors
+    blocks: list[bytes] = field(default_factory=list)
+    largest: dict[str, float] = field(default_factory=dict)
+    squares: dict[str, float] = field(default_factory=dict)
+    coarsened: set[str] = field(default_factory=set)
+
+    def add_errors(self, measure: str, errors: tuple[float, float]) -> None:
+        self.largest[measure], self.squares[measure] = errors
+
+    def add_opacities(self, opacities: F32) -> None:
+        levels = self.parameters.opacity_levels
+        q = opacity_levels(opacities, levels, square=True, multiple=self.factors.opacities)
+        self.blocks.append(entropy.levels_block(q, self.parameters.deflate))
+        self.add_errors("opacities", value_errors(opacities, opacity_values(q, levels, square=True)))
+
+    def add_shapes(self, quats: F32, scales: F32, part: ShapePart | None) -> float:
+        """Add scales and rotations; return the largest decoded scale."""
+        shape = quantise_shape(quats, scales, self.parameters, part, self.factors)
+        if shape.exponent > self.factors.scales:
+            self.coarsened.add("scales")
+        check_finite("scales", shape.decoded_scales)
+        self.blocks.extend(shape_blocks(shape.scales, shape.exponent, shape.quats, part, self.parameters.deflate))
+        self.add_errors("covariance", covariance_errors(quats.T, scales.T, shape.decoded_quats, shape.decoded_scales))
+        return float(shape.decoded_scales.max())
+
+    def add_means(self, source: NDArray[Any], quantised: QuantisedTile, step: float) -> None:
+        q, deflate = quantised.q, self.parameters.deflate
+        if quantised.codes is None:
+            self.blocks.append(entropy.axis_block(q, deflate))
+        else:
+            self.blocks.append(entropy.morton_block(quantised.codes, max(1, int(q.max()).bit_length()), deflate))
+        decoded = lattice_values(q + quantised.corner[:, None], step)
+        check_finite("means", decoded)
+        self.add_errors("means", distance_errors(np.ascontiguousarray(source.T), decoded))
+
+    def add_sh0(self, sh0: F32) -> None:
+        parameters, source = self.parameters, np.ascontiguousarray(sh0.T)
+        colour = quantise_colour(source, parameters.sh0_step, parameters.chroma_shift, self.factors.sh0)
+        if colour.exponent > self.factors.sh0:
+            self.coarsened.add("sh0")
+        block = entropy.offset_block(_spec.ATTRIBUTE_SH0, colour.columns, colour.exponent, parameters.deflate)
+        self.blocks.append(block)
+        check_finite("sh0", colour.decoded)
+        self.add_errors("sh0", value_errors(source, colour.decoded))
+
+
+def encoding_settings(plan: EncodePlan, tables: ShTables) -> dict[str, Any]:
+    """Return the options of the caller and the choices of the encoder, JSON-compatible: the OPTS chunk."""
+    parameters, options = plan.parameters, plan.options
+    return {
+        "asked": options.chosen(),
+        "encoder": _versions(parameters),
+        "position_step": parameters.lattice.step,
+        "position_bits": parameters.lattice.bits,
+        "means_coding": "morton" if parameters.morton else "axis",
+        "scale_step": parameters.scale_step,
+        "opacity_levels": parameters.opacity_levels,
+        "quat_levels": parameters.quat_levels,
+        "sh0_step": parameters.sh0_step,
+        "sh_step": parameters.sh_step,
+        "sh_degree": parameters.sh_degree,
+        "sh_coding": parameters.sh_coding,
+        "chroma_shift": parameters.chroma_shift,
+        "adaptive": parameters.adaptive if parameters.sh_coding == "scalar" else 0.0,
+        "codebook_size": 0 if tables.book is None else tables.book.size,
+        **_shape_settings(plan.shapes),
+        **({} if plan.classes is None else {"grades": plan.classes.as_json()}),
+        "deflate_level": parameters.deflate.level,
+        "deflate": parameters.deflate.library,
+        "seed": options.seed,
+    }
+
+
+def _shape_settings(shapes: ShapeTables | None) -> dict[str, Any]:
+    if shapes is None:
+        return {}
+    return {"shape_codebook_size": shapes.size, "shape_escape_fraction": float(shapes.escaped.mean())}
+
+
+def declared_errors(errors: ErrorSums, origin: Origin) -> dict[str, tuple[float, float]]:
+    """Return (max, rms) by measure, without the measures of refitted values, whose errors mean nothing."""
+    declared = errors.declared()
+    if not origin.refitted:
+        return declared
+    fitted = (*_COLOUR_MEASURES, *_SHAPE_MEASURES) if origin.adjusted else _COLOUR_MEASURES
+    return {name: pair for name, pair in declared.items() if name not in fitted}
+
+
+def file_chunks(plan: EncodePlan, errors: ErrorSums, settings: dict[str, Any]) -> list[FileChunk]:
+    """Return the chunks of the whole file: metadata, cameras, options, declared errors."""
+    model, deflate, chunks = plan.model, plan.parameters.deflate, []
+    try:
+        if model.metadata:
+            chunks.append(FileChunk(_spec.CHUNK_METADATA, json_payload(dict(model.metadata), deflate)))
+        if model.cameras is not None:
+            chunks.append(FileChunk(_spec.CHUNK_CAMERAS, json_payload(list(model.cameras), deflate)))
+    except (TypeError, ValueError) as problem:
+        raise InputError(f"metadata or cameras are not JSON: {problem}") from None
+    chunks.append(FileChunk(_spec.CHUNK_OPTIONS, json_payload(settings, deflate)))
+    chunks.append(FileChunk(_spec.CHUNK_STATED_ERRORS, _declared_errors_chunk(plan, errors)))
+    return chunks
+
+
+def scene_fields(plan: EncodePlan, codebooks: FileCodebooks, chunks: Sequence[FileChunk]) -> SceneFields:
+    """Gather the scene fields of header and index."""
+    model, parameters = plan.model, plan.parameters
+    directions = {letter: id for id, letter in _spec.DIRECTION_LETTER.items()}
+    letters = ("", "", "") if model.coordinate_system == UNSPECIFIED else tuple(model.coordinate_system)
+    flags = model.antialiased * _spec.SCENE_FLAG_ANTIALIASED | model.flat * _spec.SCENE_FLAG_FLAT
+    return SceneFields(
+        sh_degree=parameters.sh_degree,
+        scene_flags=flags,
+        axes=bytes(directions[letter] for letter in letters),
+        unit_metres=model.unit_metres or 0.0,
+        origin=model.origin,
+        attributes=parameters.attribute_records(),
+        extras=plan.extras,
+        codebooks=codebooks.records,
+        chunks=[*chunks, *codebooks.chunks],
+    )
+
+
+def _declared_errors_chunk(plan: EncodePlan, errors: ErrorSums) -> bytes:
+    model, origin = plan.model, plan.origin
+    ids = {name: id for id, name in _spec.MEASURE_NAMES.items()}
+    bounds = sorted((ids[name], *pair) for name, pair in declared_errors(errors, origin).items())
+    count, flags = origin.source_count, origin.refitted * _spec.ERROR_FLAG_REFITTED
+    head = _spec.StatedErrorsHead(count, count - errors.count, model.sh_degree, flags, len(bounds))
+    records = [_spec.pack_stated_error_record(_spec.StatedErrorRecord(id, 0, 0, 0, *pair)) for id, *pair in bounds]
+    return _spec.pack_stated_errors_head(head) + b"".join(records)
+
+
+def _versions(parameters: CodingParameters) -> str:
+    from importlib.metadata import PackageNotFoundError, version  # a tenth of the time that importing the encoder takes
+
+    try:
+        own = version("csplat")
+    except PackageNotFoundError:
+        own = "unpackaged"
+    return f"csplat {own}, numpy {np.__version__}, {parameters.deflate.library}"

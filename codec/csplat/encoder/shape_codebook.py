@@ -1,10 +1,4 @@
-"""The shape stage: shapes coded directly, or a codebook of shapes up to size if it makes the file smaller (spec 6.4.5).
-
-The covariance divided by its trace is clustered, as in Niedermayr, Stumpfegger and Westermann ("Compressed 3D Gaussian
-Splatting for Accelerated Novel View Synthesis", CVPR 2024); the trace stays each splat's own. Means of matrices of
-trace 1 have trace 1, so they need no normalisation. Which splats are assigned to the codebook and which keep their own
-shape ("escapes") depends on bytes and error: see `_worth_it`.
-"""
+"""Shapes."""
 
 from __future__ import annotations
 
@@ -16,32 +10,38 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.gauge import fix_gauge
-from csplat.encoder.geometry import Shape, quantise_shape
-from csplat.encoder.kmeans import cluster, rank_by_frequency
-from csplat.encoder.metric import Metric, reassign
-from csplat.encoder.nearest import search
-from csplat.encoder.options import EncodeOptions
-from csplat.encoder.plan import Plan
-from csplat.encoder.quantise import quat_levels, quat_values
-from csplat.encoder.shape_covariances import mean_axes, unit_covariances
-from csplat.encoder.shape_tables import ShapePart, ShapeTables, shape_blocks, shape_book
-from csplat.encoder.tile import tile_order
-from csplat.encoder.tiling import Tile
+from csplat import _spec
+from csplat.encoder import entropy
+from csplat.encoder.coding_parameters import SAME_STEPS, CodingParameters, StepFactors
+from csplat.encoder.container import CodebookTable, FileChunk
+from csplat.encoder.encode_options import EncodeOptions
+from csplat.encoder.entropy import DeflateSettings, signed_stream
+from csplat.encoder.error_bounds import covariance_entries
+from csplat.encoder.kmeans import cluster, rank_by_frequency, reassign_by_metric, search_nearest
+from csplat.encoder.quantisation import (
+    canonicalise_shape,
+    lattice_exponent,
+    lattice_step,
+    lattice_values,
+    quat_levels,
+    quat_values,
+)
+from csplat.encoder.tiling import TileSplats, quantise_and_sort
+from csplat.encoder.weights import ErrorMetric
 from csplat.model import SplatModel
 from csplat.types import F32, F64, I16, I32, I64, Progress
 
 Rows = NDArray[np.intp]
 
-_UNIT = 2048  # lattice steps of a trace: searches are exact up to norms of about 2,300
+_TRACE_STEPS = 2048  # lattice steps of a trace: searches are exact up to norms of about 2,300
 _USERS = 6  # splats per entry below which an entry does not pay for itself
 _ROUNDS = 2  # rounds of clustering; from the second on, escaped splats have no influence
 _METRIC_ROUNDS = 2
 _TRIED = 64  # entries tried for a splat, if a metric ranks them
 _MOST_RESIZED = 0.7  # largest summand of the log scales: beyond it, the metric is no longer linear
-_CLEAR = 30.0  # log sizes are clipped to this: the error is already as large as can be
+_LOG_SIZE_MAX = 30.0  # log sizes are clipped to this: the error is already as large as can be
 _ESCAPES = 0.05  # fraction of the splats, if nothing is known of the cost of an error
-_ROOTS = np.sqrt([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # an entry off the diagonal occurs twice
+_OFF_DIAGONAL_ROOTS = np.sqrt([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # an entry off the diagonal occurs twice
 _DIMENSIONS = 6  # dimensions of a shape: a bit per splat divides its squared error by 2**(2/6)
 _MOST_STEPS = 2.0**20  # in log scale: above this, its tile may be coarser than the file's lattice
 _TABLE_ID = 2  # bytes of the table id in a tile's record
@@ -49,7 +49,7 @@ _OVERHEAD = 128  # bytes of records, heads and checksums that come with a codebo
 
 
 @dataclass(frozen=True, eq=False)
-class _Scene:
+class _ShapeInput:
     """Input of the shape stage.
 
     Attributes:
@@ -63,16 +63,21 @@ class _Scene:
     covariances: F64
     sizes: F64
     weights: F64
-    metric: Metric | None
+    metric: ErrorMetric | None
     plain: F64
     fits: NDArray[np.bool_]
     bits: float
 
 
 def choose_shapes(
-    model: SplatModel, weights: F32, metric: Metric | None, tiles: Sequence[Tile], plan: Plan, options: EncodeOptions,
+    model: SplatModel,
+    weights: F32,
+    metric: ErrorMetric | None,
+    tiles: Sequence[TileSplats],
+    parameters: CodingParameters,
+    options: EncodeOptions,
     report: Progress,
-) -> ShapeTables | None:  # fmt: skip
+) -> ShapeTables | None:
     """Make the codebook, and find the splats that are assigned to it.
 
     Args:
@@ -80,7 +85,7 @@ def choose_shapes(
         weights: [N], of the squared error of a covariance over its trace; only ratios matter.
         metric: how errors of xx, yy, zz, √2 xy, √2 xz, √2 yz weigh together; None: each for itself.
         tiles: how the scene is cut.
-        plan: the lattices.
+        parameters: the lattices.
         options: `shape_codebook_size`, `shape_escape_fraction`, `seed`.
         report: progress.
 
@@ -90,7 +95,7 @@ def choose_shapes(
     size = min(options.shape_codebook_size or 0, len(model) // _USERS)
     if size < 1:
         return None
-    scene = _scene(model, weights, metric, plan)
+    scene = _shape_input(model, weights, metric, parameters)
     fraction = options.shape_escape_fraction
     if fraction is None and metric is None:
         fraction = _ESCAPES
@@ -98,37 +103,41 @@ def choose_shapes(
     tables: ShapeTables | None = None
     for step in range(_ROUNDS):
         report("shapes", step / _ROUNDS)
-        entries, index = _cluster(scene, taking, size, plan, options.seed, options.thread_count)
-        errors, summand = _served_errors(scene, entries, index, plan)
+        entries, index = _cluster(scene, taking, size, parameters, options.seed, options.thread_count)
+        errors, summand = _assignment_errors(scene, entries, index, parameters)
         if fraction is None:
-            served = _worth_it(scene, errors, index, summand)
+            assigned = _worth_it(scene, errors, index, summand)
         else:
-            served = _but_worst(scene, errors, fraction)
-        if not served.any():
+            assigned = _all_but_worst(scene, errors, fraction)
+        if not assigned.any():
             return None
-        tables = _tables(entries, index, summand, served)
-        taking = scene.weights * served
+        tables = _rank_entries(entries, index, summand, assigned)
+        taking = scene.weights * assigned
     assert tables is not None
-    tables = _where_smaller(model, tables, tiles, plan)
+    tables = _keep_where_smaller(model, tables, tiles, parameters)
     report("shapes", 1.0)
     return tables
 
 
-def _scene(model: SplatModel, weights: F32, metric: Metric | None, plan: Plan) -> _Scene:
-    rotation, scales = (model.quats.T, model.scales.T) if plan.gauged else fix_gauge(model.quats, model.scales)
+def _shape_input(
+    model: SplatModel, weights: F32, metric: ErrorMetric | None, parameters: CodingParameters
+) -> _ShapeInput:
+    rotation, scales = (
+        (model.quats.T, model.scales.T) if parameters.canonical else canonicalise_shape(model.quats, model.scales)
+    )
     covariances, sizes = unit_covariances(rotation, scales)
-    fits = np.abs(scales).max(axis=0) < _MOST_STEPS * plan.scale_step
-    n = np.rint(np.where(fits, scales, 0.0).astype(np.float64) / plan.scale_step).astype(np.int64)
-    q = quat_levels(rotation, plan.quat_levels)
-    seen, seen_sizes = unit_covariances(quat_values(q, plan.quat_levels), n * plan.scale_step)
+    fits = np.abs(scales).max(axis=0) < _MOST_STEPS * parameters.scale_step
+    n = np.rint(np.where(fits, scales, 0.0).astype(np.float64) / parameters.scale_step).astype(np.int64)
+    q = quat_levels(rotation, parameters.quat_levels)
+    seen, seen_sizes = unit_covariances(quat_values(q, parameters.quat_levels), n * parameters.scale_step)
     bits = sum(_entropy(column[fits]) for column in (*n, *q))
-    plain = _errors(covariances, seen, seen_sizes - sizes, weights, metric)
-    return _Scene(covariances, sizes, weights.astype(np.float64), metric, plain, fits, bits)
+    plain = _covariance_errors(covariances, seen, seen_sizes - sizes, weights, metric)
+    return _ShapeInput(covariances, sizes, weights.astype(np.float64), metric, plain, fits, bits)
 
 
-def _errors(wanted: F64, found: F64, larger: F64, weights: NDArray[Any], metric: Metric | None) -> F64:
+def _covariance_errors(wanted: F64, found: F64, larger: F64, weights: NDArray[Any], metric: ErrorMetric | None) -> F64:
     """[N] weighted squared error of covariances [6, N], `found` · e^(2 · larger) in place of `wanted`."""
-    difference = _vectors(found * np.exp(2.0 * np.clip(larger, -_CLEAR, _CLEAR)) - wanted)
+    difference = _vectors(found * np.exp(2.0 * np.clip(larger, -_LOG_SIZE_MAX, _LOG_SIZE_MAX)) - wanted)
     if metric is not None:
         return metric.errors(difference[:, :, None], slice(None))
     return np.asarray(np.einsum("ni,ni->n", difference, difference) * weights)
@@ -136,32 +145,34 @@ def _errors(wanted: F64, found: F64, larger: F64, weights: NDArray[Any], metric:
 
 def _vectors(covariances: F64) -> F64:
     """[N, 6] vectors whose distances are those of the matrices."""
-    return np.ascontiguousarray((covariances * _ROOTS[:, None]).T)
+    return np.ascontiguousarray((covariances * _OFF_DIAGONAL_ROOTS[:, None]).T)
 
 
 def _points(covariances: F64) -> I16:
     """The same on a lattice."""
-    return np.rint(_vectors(covariances) * _UNIT).astype(np.int16)
+    return np.rint(_vectors(covariances) * _TRACE_STEPS).astype(np.int16)
 
 
-def _cluster(scene: _Scene, weights: F64, size: int, plan: Plan, seed: int, threads: int) -> tuple[I32, I64]:
+def _cluster(
+    scene: _ShapeInput, weights: F64, size: int, parameters: CodingParameters, seed: int, threads: int
+) -> tuple[I32, I64]:
     """Train entries [6, K] on the file's lattices, and give each splat its own, [N]."""
     points = _points(scene.covariances)
     _, start = cluster(points, weights.astype(np.float32), size, seed=seed, threads=threads)
-    entries, seen = _on_lattices(scene, weights, start.astype(np.int64), plan)
-    index = search(points, _points(seen).astype(np.int32), 0, threads)[0].astype(np.int64)
+    entries, seen = _on_lattices(scene, weights, start.astype(np.int64), parameters)
+    index = search_nearest(points, _points(seen).astype(np.int32), 0, threads)[0].astype(np.int64)
     if scene.metric is None:
         return entries, index
     vectors = _vectors(scene.covariances)[:, :, None]
     for step in range(_METRIC_ROUNDS):
         if step:
-            entries, seen = _on_lattices(scene, weights, index, plan)
-            index = search(points, _points(seen).astype(np.int32), 0, threads)[0].astype(np.int64)
-        index = reassign(vectors, scene.metric, _vectors(seen)[:, :, None], index, threads, _TRIED)
+            entries, seen = _on_lattices(scene, weights, index, parameters)
+            index = search_nearest(points, _points(seen).astype(np.int32), 0, threads)[0].astype(np.int64)
+        index = reassign_by_metric(vectors, scene.metric, _vectors(seen)[:, :, None], index, threads, _TRIED)
     return entries, index
 
 
-def _on_lattices(scene: _Scene, weights: F64, index: I64, plan: Plan) -> tuple[I32, F64]:
+def _on_lattices(scene: _ShapeInput, weights: F64, index: I64, parameters: CodingParameters) -> tuple[I32, F64]:
     """[6, K] integers of the weighted mean covariance of each entry's splats; [6, K] what they decode to."""
     index = np.unique(index, return_inverse=True)[1].reshape(-1)  # entries that serve nobody are gone
     count = int(index.max()) + 1
@@ -170,25 +181,29 @@ def _on_lattices(scene: _Scene, weights: F64, index: I64, plan: Plan) -> tuple[I
     total = np.bincount(index, weights, count)
     sums = np.stack([np.bincount(index, weights * entry, count) for entry in scene.covariances])
     rotation, scales = mean_axes(sums / total)
-    rotation, scales = fix_gauge(rotation, scales)
+    rotation, scales = canonicalise_shape(rotation, scales)
     scales = np.maximum(scales, scales[0] - 20.0)  # thinner than this is as good as flat
-    n = np.rint(scales.astype(np.float64) / plan.scale_step).astype(np.int32)
-    entries = np.unique(np.concatenate([n - n[:1], quat_levels(rotation, plan.quat_levels)]), axis=1)
-    return entries, unit_covariances(quat_values(entries[3:], plan.quat_levels), entries[:3] * plan.scale_step)[0]
+    n = np.rint(scales.astype(np.float64) / parameters.scale_step).astype(np.int32)
+    entries = np.unique(np.concatenate([n - n[:1], quat_levels(rotation, parameters.quat_levels)]), axis=1)
+    return entries, unit_covariances(
+        quat_values(entries[3:], parameters.quat_levels), entries[:3] * parameters.scale_step
+    )[0]
 
 
-def _served_errors(scene: _Scene, entries: I32, index: I64, plan: Plan) -> tuple[F64, I32]:
+def _assignment_errors(scene: _ShapeInput, entries: I32, index: I64, parameters: CodingParameters) -> tuple[F64, I32]:
     """[N] weighted squared error of each splat by its entry, and [N] the summand that makes it least."""
-    seen, sizes = unit_covariances(quat_values(entries[3:], plan.quat_levels), entries[:3] * plan.scale_step)
+    seen, sizes = unit_covariances(
+        quat_values(entries[3:], parameters.quat_levels), entries[:3] * parameters.scale_step
+    )
     found = seen[:, index]
     factor = np.zeros(len(index)) if scene.metric is None else _best_size(scene.covariances, found, scene.metric)
-    steps = (scene.sizes + factor - sizes[index]) / plan.scale_step
+    steps = (scene.sizes + factor - sizes[index]) / parameters.scale_step
     summand = np.rint(np.where(scene.fits, steps, 0.0)).astype(np.int32)
-    larger = sizes[index] + summand * plan.scale_step - scene.sizes
-    return _errors(scene.covariances, found, larger, scene.weights, scene.metric), summand
+    larger = sizes[index] + summand * parameters.scale_step - scene.sizes
+    return _covariance_errors(scene.covariances, found, larger, scene.weights, scene.metric), summand
 
 
-def _best_size(wanted: F64, found: F64, metric: Metric) -> F64:
+def _best_size(wanted: F64, found: F64, metric: ErrorMetric) -> F64:
     """Return [N], the summand of the log scales that brings `found` [6, N] closest to `wanted`; 0 keeps the trace."""
     a, b = _vectors(found)[:, :, None], _vectors(wanted)[:, :, None]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -197,7 +212,7 @@ def _best_size(wanted: F64, found: F64, metric: Metric) -> F64:
     return np.clip(0.5 * np.log(np.where(usable, ratio, 1.0)), -_MOST_RESIZED, _MOST_RESIZED)
 
 
-def _worth_it(scene: _Scene, errors: F64, index: I64, summand: I32) -> NDArray[np.bool_]:
+def _worth_it(scene: _ShapeInput, errors: F64, index: I64, summand: I32) -> NDArray[np.bool_]:
     """Return True for the splats to assign: those whose error grows by less than the bits that it saves are worth.
 
     Bits are worth what they buy elsewhere: at the plan's steps, one more for every splat would remove 2 ln 2 / 6 of
@@ -218,46 +233,250 @@ def _entropy(values: NDArray[Any]) -> float:
     return -float((shares * np.log2(shares)).sum())
 
 
-def _but_worst(scene: _Scene, errors: F64, fraction: float) -> NDArray[np.bool_]:
+def _all_but_worst(scene: _ShapeInput, errors: F64, fraction: float) -> NDArray[np.bool_]:
     """All but a share of the splats, those with the largest weighted error."""
-    served = scene.fits.copy()
+    assigned = scene.fits.copy()
     worst = np.argsort(-np.where(scene.fits, errors, np.inf), kind="stable")
-    served[worst[: int(len(errors) * fraction)]] = False
-    return served
+    assigned[worst[: int(len(errors) * fraction)]] = False
+    return assigned
 
 
-def _tables(entries: I32, index: I64, summand: I32, served: NDArray[np.bool_]) -> ShapeTables:
+def _rank_entries(entries: I32, index: I64, summand: I32, assigned: NDArray[np.bool_]) -> ShapeTables:
     """Drop entries that serve nobody, and number the others by how many they serve."""
-    used, place = np.unique(index[served], return_inverse=True)
+    used, place = np.unique(index[assigned], return_inverse=True)
     ranked, order = rank_by_frequency(place.astype(np.uint32), np.ascontiguousarray(entries[:, used].T))
     full = np.full(len(index), len(used), np.int32)
-    full[served] = ranked.astype(np.int32)
-    return ShapeTables(np.ascontiguousarray(order.T), full, np.where(served, summand, 0).astype(np.int32))
+    full[assigned] = ranked.astype(np.int32)
+    return ShapeTables(np.ascontiguousarray(order.T), full, np.where(assigned, summand, 0).astype(np.int32))
 
 
-def _where_smaller(model: SplatModel, tables: ShapeTables, tiles: Sequence[Tile], plan: Plan) -> ShapeTables | None:
+def _keep_where_smaller(
+    model: SplatModel, tables: ShapeTables, tiles: Sequence[TileSplats], parameters: CodingParameters
+) -> ShapeTables | None:
     """Keep the codebook for the tiles that are smaller with it, if all of them together are."""
     escaped, saved = tables.escaped, 0
     for tile in tiles:
-        rows = tile_order(model, tile, plan)[0]
+        rows = quantise_and_sort(model, tile, parameters).rows
         part = tables.part(rows)
         if part is None:
             continue
         quats, scales = model.quats[rows], model.scales[rows]
-        plain = quantise_shape(quats, scales, plan)
+        plain = quantise_shape(quats, scales, parameters)
         gain = -1
         if plain.exponent == 0:
-            served = quantise_shape(quats, scales, plan, part)
-            gain = _size(plain, None, plan) - _size(served, part, plan) - _TABLE_ID
+            assigned = quantise_shape(quats, scales, parameters, part)
+            gain = _shape_bytes(plain, None, parameters) - _shape_bytes(assigned, part, parameters) - _TABLE_ID
         if gain > 0:
             saved += gain
         else:
             escaped[tile.rows] = True
     if escaped.all():
         return None
-    kept = _tables(tables.entries, tables.index.astype(np.int64), tables.summand, ~escaped)
-    return kept if saved > len(shape_book(kept, plan.coding)[1].payload) + _OVERHEAD else None
+    kept = _rank_entries(tables.entries, tables.index.astype(np.int64), tables.summand, ~escaped)
+    return kept if saved > len(shape_codebook_chunk(kept, parameters.deflate)[1].payload) + _OVERHEAD else None
 
 
-def _size(shape: Shape, part: ShapePart | None, plan: Plan) -> int:
-    return sum(len(block) for block in shape_blocks(shape.scales, shape.exponent, shape.quats, part, plan.coding))
+def _shape_bytes(shape: QuantisedShape, part: ShapePart | None, parameters: CodingParameters) -> int:
+    return sum(
+        len(block) for block in shape_blocks(shape.scales, shape.exponent, shape.quats, part, parameters.deflate)
+    )
+
+
+Integers = NDArray[Any]
+
+#: Id of the codebook: above those of the SH stage.
+SHAPE_CODEBOOK_ID = _spec.SH_DEGREE_MAX + 1
+
+
+@dataclass(frozen=True, eq=False)
+class ShapePart:
+    """Codebook entries of the splats of a tile.
+
+    Attributes:
+        index: [n] int32, entry of each splat; `size` means "escaped".
+        size: entries of the codebook.
+        assigned: [n] bool, True for splats that are not escaped.
+        scales: [3, assigned] int32, their log scales on the file's lattice. quats: [3, assigned], their rotations.
+        summand: [n] int32, the part of the scales that is each splat's own; 0 for the escaped.
+    """
+
+    index: I32
+    size: int
+    assigned: NDArray[np.bool_]
+    scales: I32
+    quats: I32
+    summand: I32
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeTables:
+    """Decisions of the shape stage for the whole file.
+
+    Attributes:
+        entries: [6, K] int32, log scales up to a summand on the file's lattice, x, y, z of the rotation.
+        index: [N] int32, entry of each splat; K means "escaped". In a tile that is smaller without, all are.
+        summand: [N] int32, in steps of the scales' lattice; 0 for the escaped.
+    """
+
+    entries: I32
+    index: I32
+    summand: I32
+
+    @property
+    def size(self) -> int:
+        """Entries of the codebook."""
+        return int(self.entries.shape[1])
+
+    @property
+    def escaped(self) -> NDArray[np.bool_]:
+        """[N], which splats have a shape of their own."""
+        return np.asarray(self.index == self.size, np.bool_)
+
+    def part(self, rows: NDArray[np.intp]) -> ShapePart | None:
+        """Return what is said of some splats; None if all are escaped."""
+        index, summand = self.index[rows], self.summand[rows]
+        assigned = np.asarray(index < self.size, np.bool_)
+        if not assigned.any():
+            return None
+        entries = np.take(self.entries, index[assigned], axis=1)
+        return ShapePart(index, self.size, assigned, entries[:3] + summand[assigned], entries[3:], summand)
+
+    def select(self, order: NDArray[Any]) -> ShapeTables:
+        """The same for the splats `order`."""
+        return ShapeTables(self.entries, self.index[order], self.summand[order])
+
+
+def shape_codebook_chunk(tables: ShapeTables, deflate: DeflateSettings) -> tuple[CodebookTable, FileChunk]:
+    """Return the index record and the chunk of the codebook."""
+    head = _spec.pack_codebook_head(_spec.CodebookHead(SHAPE_CODEBOOK_ID, 0, 0))
+    stream = signed_stream(np.ascontiguousarray(tables.entries).reshape(-1), deflate)
+    record = CodebookTable(SHAPE_CODEBOOK_ID, _spec.CODEBOOK_KIND_SHAPE, (0, 0), tables.size)
+    return record, FileChunk(_spec.CHUNK_CODEBOOK, head + stream, SHAPE_CODEBOOK_ID)
+
+
+def shape_blocks(
+    scales: Integers, exponent: int, quats: Integers, part: ShapePart | None, deflate: DeflateSettings
+) -> list[bytes]:
+    """Code scales [3, n] and quats [3, n] of a tile: directly, or by codebook if there is a part."""
+    if part is None:
+        return [
+            entropy.offset_block(_spec.ATTRIBUTE_SCALES, scales, exponent, deflate),
+            entropy.signed_block(_spec.ATTRIBUTE_QUATS, quats, 0, deflate),
+        ]
+    assert exponent == 0, "a codebook lies on the file's lattice"
+    escaped = ~part.assigned
+    count = int(np.count_nonzero(escaped))
+    own_scales = own_quats = b""
+    if count:
+        own_scales = entropy.offset_block(_spec.ATTRIBUTE_SCALES, scales[:, escaped], 0, deflate)
+        own_quats = entropy.signed_block(_spec.ATTRIBUTE_QUATS, quats[:, escaped], 0, deflate)
+    return [
+        entropy.codebook_block(
+            _spec.ATTRIBUTE_SCALES, SHAPE_CODEBOOK_ID, part.index, count, own_scales, deflate, summand=part.summand
+        ),
+        entropy.codebook_block(_spec.ATTRIBUTE_QUATS, SHAPE_CODEBOOK_ID, None, count, own_quats, deflate),
+    ]
+
+
+@dataclass(frozen=True)
+class QuantisedShape:
+    """Rotations and scales of a tile in columns: integers, the scales' exponent, and what the decoder will see."""
+
+    scales: Integers
+    exponent: int
+    quats: Integers
+    decoded_scales: F32
+    decoded_quats: F32
+
+
+def quantise_shape(
+    quats: F32,
+    scales: F32,
+    parameters: CodingParameters,
+    part: ShapePart | None = None,
+    coarse: StepFactors = SAME_STEPS,
+) -> QuantisedShape:
+    """Quantise rotations [n, 4] and log scales [n, 3] of a tile in their gauge, which they may be in already.
+
+    Args:
+        quats: w x y z.
+        scales: logarithms.
+        parameters: the lattices.
+        part: what a codebook says of these splats; those that it serves take its integers.
+        coarse: by how much the tile's steps are coarser, where there is no codebook.
+    """
+    rotation, sorted_scales = (quats.T, scales.T) if parameters.canonical else canonicalise_shape(quats, scales)
+    exponent = max(coarse.scales, lattice_exponent(float(np.abs(sorted_scales).max()), parameters.scale_step))
+    step = lattice_step(parameters.scale_step, exponent)
+    n = np.rint(sorted_scales.astype(np.float64) / step).astype(np.int64)
+    q = quat_levels(rotation, parameters.quat_levels, coarse.quats)
+    if part is not None:
+        n[:, part.assigned], q[:, part.assigned] = part.scales, part.quats
+    return QuantisedShape(n, exponent, q, lattice_values(n, step), quat_values(q, parameters.quat_levels))
+
+
+def dequantised_shapes(
+    quats: F32,
+    scales: F32,
+    tiles: Sequence[TileSplats],
+    parameters: CodingParameters,
+    shapes: ShapeTables | None = None,
+) -> tuple[F32, F32]:
+    """Rotations [N, 4] and log scales [N, 3] as a decoder will see them."""
+    seen = np.empty_like(quats), np.empty_like(scales)
+    for tile in tiles:
+        part = None if shapes is None else shapes.part(tile.rows)
+        shape = quantise_shape(quats[tile.rows], scales[tile.rows], parameters, part, tile.factors)
+        seen[0][tile.rows], seen[1][tile.rows] = shape.decoded_quats.T, shape.decoded_scales.T
+    return seen
+
+
+Floats = NDArray[Any]
+
+_FLATTEST = 1e-30  # of a trace: rounding may leave an eigenvalue at 0 or below
+
+
+def unit_covariances(quats: Floats, scales: Floats) -> tuple[F64, F64]:
+    """Return covariances over their trace, and half the logarithm of the trace.
+
+    Args:
+        quats: [4, n], w x y z.
+        scales: [3, n], log standard deviations.
+
+    Returns:
+        [6, n] float64, xx, yy, zz, xy, xz, yz; [n] float64.
+    """
+    wide = scales.astype(np.float64)
+    top = wide.max(axis=0)
+    variances = np.exp(2.0 * (wide - top))
+    trace = variances.sum(axis=0)
+    return covariance_entries(quats, variances / trace), top + 0.5 * np.log(trace)
+
+
+def mean_axes(covariances: F64) -> tuple[F32, F32]:
+    """Return rotations [n, 4] and log standard deviations [n, 3] of covariances [6, n], in no particular gauge."""
+    xx, yy, zz, xy, xz, yz = covariances
+    matrices = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
+    values, axes = np.linalg.eigh(matrices)
+    axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # a rotation, no reflection
+    scales = 0.5 * np.log(np.maximum(values, _FLATTEST))
+    return _quaternions(axes).astype(np.float32), scales.astype(np.float32)
+
+
+def _quaternions(R: F64) -> F64:
+    """[n, 4] quaternions of rotation matrices [n, 3, 3]: of four formulas the one that divides by the largest."""
+    xx, yy, zz = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
+    x, y, z = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
+    xy, xz, yz = R[:, 0, 1] + R[:, 1, 0], R[:, 0, 2] + R[:, 2, 0], R[:, 1, 2] + R[:, 2, 1]
+    rows = np.stack(
+        [
+            np.stack([1.0 + xx + yy + zz, x, y, z], axis=1),
+            np.stack([x, 1.0 + xx - yy - zz, xy, xz], axis=1),
+            np.stack([y, xy, 1.0 - xx + yy - zz, yz], axis=1),
+            np.stack([z, xz, yz, 1.0 - xx - yy + zz], axis=1),
+        ],
+        axis=1,
+    )
+    best = np.einsum("nii->ni", rows).argmax(axis=1)
+    chosen = rows[np.arange(len(rows)), best]
+    return np.asarray(chosen / np.linalg.norm(chosen, axis=1, keepdims=True))

@@ -1,91 +1,129 @@
-"""Cut a scene into tiles of nearby splats, outliers apart (spec 3, 4.3.5)."""
+"""Tiles: which splats share one, and their order (spec 3, 4.3.5).
+
+A scene of up to `BUCKET_SPLATS` splats is analysed as a whole. Of a larger one a sample of that size is analysed; a
+Morton curve through the sample cuts space into buckets, and each bucket is cut into tiles by itself, so that no more
+than a bucket has to be in memory. Neither depends on how much memory there is, so the file does not either.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.types import F32
+from csplat.encoder.coding_parameters import SAME_STEPS, CodingParameters, Lattice, StepFactors
+from csplat.encoder.entropy import morton_codes
+from csplat.encoder.quantisation import (
+    largest_exact,
+    lattice_step,
+    lattice_values,
+    opacity_levels,
+    opacity_values,
+    quantise_means,
+)
+from csplat.encoder.quantisation_classes import QuantisationClasses
+from csplat.model import SplatModel
+from csplat.types import F32, F64, I64, U8, Mask
 
 Rows = NDArray[np.intp]
+Integers = NDArray[Any]
 
-_FEW = 48  # splats for which a tile of their own costs more than a coarser lattice loses
+#: Splats that are analysed as a whole: maximum size of a bucket, and size of the sample of a larger scene.
+BUCKET_SPLATS = 1 << 19
+
+_OWN_TILE_MIN = 48  # splats; a smaller tile costs more bytes than the coarser lattice that it avoids
 _FINEST = 2.0**45  # steps from zero to a tile's far corner: float32 holds 2**24 of them
+_OUTLIER_BLOCK = 1 << 14  # splats per block of temporaries
+_BUCKET_FILL = 0.8  # fraction of a bucket to fill: the sample predicts bucket sizes within a few per cent
+_CURVE_EDGE = 0.005  # fraction of the splats on either side that lies beyond the curve's cube
+_CURVE_TOP = (1 << 16) - 1  # cells along a side of the cube, less one
+_CURVE_BLOCK = 1 << 16  # splats per block of temporaries
+_CONTRAST_BUCKETS = 16  # buckets in which neighbours are compared
 
 
 @dataclass(frozen=True)
-class Lattice:
-    """The positions' lattice.
+class TileSplats:
+    """Splats of one tile, not yet sorted.
 
     Attributes:
-        step: of the file, scene units, > 0.
-        bits: per axis and tile at most, 1 to 16; a tile whose box needs more is cut or coarsened.
-        finest: tiles use all their bits (a step given in bits) instead of stopping at `step`.
-        strict: no tile has a coarser step, however many tiles that takes.
-    """
-
-    step: float
-    bits: int
-    finest: bool = False
-    strict: bool = False
-
-
-@dataclass(frozen=True)
-class Coarse:
-    """By how much the steps of a tile's attributes are coarser than the file's, by choice (grades.py).
-
-    Attributes:
-        opacities, quats: integers are multiples of this, >= 1.
-        scales, means, sh0: the step is the file's times 2**this, >= 0.
-    """
-
-    opacities: int = 1
-    scales: int = 0
-    quats: int = 1
-    means: int = 0
-    sh0: int = 0
-
-
-EVEN = Coarse()
-
-
-@dataclass(frozen=True)
-class Tile:
-    """Splats of one tile, before they are ordered.
-
-    Attributes:
-        rows: [n] places in the model.
-        exponent: the step of the tile's means is the file's times 2**exponent.
-        coarse: by how much the others' steps are coarser.
+        rows: [n] rows of the model.
+        exponent: the tile's step of the means is the file's times 2**exponent.
+        factors: how much coarser the other steps are than the file's.
     """
 
     rows: Rows
     exponent: int
-    coarse: Coarse = EVEN
+    factors: StepFactors = SAME_STEPS
 
 
-def cut(means: F32, lattice: Lattice, tile_splats: int) -> list[Tile]:
-    """Cut by k-d medians into at most `tile_splats`, and by halves of space what is too wide for the lattice.
+@dataclass(frozen=True, eq=False)
+class QuantisedTile:
+    """Means of a tile as integers, in decoding order.
 
-    Halving space peels off outliers: the core keeps its step whatever lies far away.
+    Attributes:
+        rows: [n] rows of the model.
+        q: [3, n] integers from the tile's corner, >= 0.
+        corner: [3] integers from the file's origin.
+        codes: [n] Morton codes, ascending; None if means are coded AXIS.
+    """
+
+    rows: Rows
+    q: Integers
+    corner: Integers
+    codes: I64 | None
+
+
+def cut_scene(
+    model: SplatModel,
+    parameters: CodingParameters,
+    classes: QuantisationClasses | None = None,
+    buckets: Sequence[Rows] | None = None,
+) -> list[TileSplats]:
+    """Cut a scene into tiles: by class or bucket, and within it by which attributes are outliers.
+
+    An outlier is a value that the file's lattice does not hold; one of them coarsens the lattice of its tile, up to
+    65,535 other splats. They get tiles of their own, after those of the other splats of their class or bucket.
+
+    Args:
+        model: the scene.
+        parameters: steps and tile size.
+        classes: quantisation classes, whose splats share steps; `None`: all splats share them.
+        buckets: `bucket_rows` of the model, if known.
+    """
+    flags = _outlier_flags(model, parameters)
+    if classes is not None:
+        groups = classes.index if flags is None else classes.index + np.uint8(len(classes.factors)) * flags
+        return _cut_groups(model.means, np.arange(len(model)), groups, classes.factors, parameters)
+    tiles: list[TileSplats] = []
+    for rows in bucket_rows(model.means) if buckets is None else buckets:
+        tiles += _cut_groups(model.means, rows, None if flags is None else flags[rows], [SAME_STEPS], parameters)
+    return tiles
+
+
+def cut_tiles(means: F32, lattice: Lattice, tile_splats: int) -> list[TileSplats]:
+    """Cut by k-d medians down to `tile_splats`, and by halves of space what is too wide for the lattice.
+
+    Halving space separates distant outliers, so that the core keeps its step.
 
     Args:
         means: [N, 3] float32.
-        lattice: the step and how many bits of it a tile may use.
-        tile_splats: splats per tile at most.
+        lattice: the file's step, and the bits per axis of a tile.
+        tile_splats: maximum number of splats per tile.
 
     Returns:
-        Tiles in an order that keeps neighbours together.
+        Tiles, neighbours next to each other.
     """
     if len(means) == 0:
         return []
     limit = float((1 << lattice.bits) - 1)
     wide = 4.0 if lattice.finest else 1.0  # a step given in bits follows the box; only outliers are cut off
-    few = 1 if lattice.strict else _FEW
-    tiles: list[Tile] = []
+    few = 1 if lattice.strict else _OWN_TILE_MIN
+    tiles: list[TileSplats] = []
     pending = [(np.arange(len(means), dtype=np.intp), np.ascontiguousarray(means.T))]
     while pending:
         rows, points = pending.pop()
@@ -100,18 +138,10 @@ def cut(means: F32, lattice: Lattice, tile_splats: int) -> list[Tile]:
             halves = _halve(points[axis], tile_splats)
         else:
             reach = float(max(np.abs(low).max(), np.abs(high).max()))
-            tiles.append(Tile(rows, tile_exponent(extent, reach, lattice)))
+            tiles.append(TileSplats(rows, tile_exponent(extent, reach, lattice)))
             continue
         pending += [(rows[half], np.take(points, half, axis=1)) for half in halves]  # the near half is popped first
     return tiles
-
-
-def _halve(coordinate: F32, tile_splats: int) -> list[Rows]:
-    """Split at a multiple of the tile size, so that tiles are full; the first half comes last, to be popped first."""
-    parts = math.ceil(len(coordinate) / tile_splats)
-    share = len(coordinate) * (parts // 2) // parts
-    order = np.argpartition(coordinate, share)
-    return [order[share:], order[:share]]
 
 
 def tile_exponent(extent: float, reach: float, lattice: Lattice) -> int:
@@ -122,7 +152,7 @@ def tile_exponent(extent: float, reach: float, lattice: Lattice) -> int:
         reach: largest magnitude of a coordinate, scene units.
         lattice: step and bits.
     """
-    # One step is left for the rounding of both ends.
+    # One step is reserved for rounding at both ends.
     needed = _log2(extent / lattice.step / ((1 << lattice.bits) - 2 if lattice.bits > 1 else 1))
     floor = _log2(reach / lattice.step / _FINEST)
     if not lattice.finest:
@@ -131,6 +161,188 @@ def tile_exponent(extent: float, reach: float, lattice: Lattice) -> int:
     if reach == 0.0:
         return 0
     return max(lowest, floor) if extent == 0.0 else max(lowest, needed, floor)
+
+
+def quantise_and_sort(model: SplatModel, tile: TileSplats, parameters: CodingParameters) -> QuantisedTile:
+    """Quantise the means of a tile, and sort its splats by Morton code unless means are coded AXIS."""
+    step = lattice_step(parameters.lattice.step, tile.exponent)
+    n = quantise_means(np.ascontiguousarray(take_rows(model.means, tile.rows).T), step)
+    corner = n.min(axis=1)
+    q = n - corner[:, None]
+    if not parameters.morton:
+        return QuantisedTile(tile.rows, q, corner, None)
+    # 48 bits of code and 16 of place: sorting whole keys is stable, and much faster than sorting places.
+    keys = morton_codes(q).astype(np.uint64)
+    keys <<= np.uint64(16)
+    keys |= np.arange(len(keys), dtype=np.uint64)
+    keys.sort()
+    order = (keys & np.uint64(0xFFFF)).astype(np.intp)
+    codes = (keys >> np.uint64(16)).astype(np.int64)
+    return QuantisedTile(tile.rows[order], np.take(q, order, axis=1), corner, codes)
+
+
+def dequantised_means(means: F32, tiles: Sequence[TileSplats], parameters: CodingParameters) -> F32:
+    """Return means [N, 3] as decoded."""
+    decoded = np.empty_like(means)
+    for tile in tiles:
+        step = lattice_step(parameters.lattice.step, tile.exponent)
+        decoded[tile.rows] = lattice_values(quantise_means(np.ascontiguousarray(means[tile.rows].T), step), step).T
+    return decoded
+
+
+def dequantised_opacities(opacities: F32, tiles: Sequence[TileSplats], parameters: CodingParameters) -> F32:
+    """Return alpha [N] as decoded."""
+    decoded, levels = np.empty_like(opacities), parameters.opacity_levels
+    for tile in tiles:
+        q = opacity_levels(opacities[tile.rows], levels, square=True, multiple=tile.factors.opacities)
+        decoded[tile.rows] = opacity_values(q, levels, square=True)
+    return decoded
+
+
+def take_rows(values: NDArray[Any], rows: NDArray[np.intp]) -> NDArray[Any]:
+    """Return rows of an array: `take` is twice as fast as indexing."""
+    return np.take(values, rows, axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class BucketCurve:
+    """A Morton curve through space, cut into buckets.
+
+    Attributes:
+        corner: [3] float64, corner of the cube that the curve fills; splats outside are moved to its faces.
+        scale: cells per scene unit.
+        bounds: [B - 1] int64, first code of each bucket but the first, ascending.
+    """
+
+    corner: F64
+    scale: float
+    bounds: I64
+
+    @classmethod
+    def through(cls, means: F32, count: int) -> BucketCurve:
+        """Cut the curve so that buckets get about equal numbers of splats.
+
+        Args:
+            means: [n, 3] float32, means of the sample.
+            count: splats in the scene.
+        """
+        if count <= BUCKET_SPLATS:
+            return cls(np.zeros(3), 0.0, np.zeros(0, np.int64))
+        points = np.sort(means.astype(np.float64), axis=0)
+        edge = int(len(points) * _CURVE_EDGE)
+        low, high = points[edge], points[len(points) - 1 - edge]
+        side = float((high - low).max())
+        curve = cls(low, _CURVE_TOP / side if side > 0.0 else 0.0, np.zeros(0, np.int64))
+        buckets = math.ceil(count / (_BUCKET_FILL * BUCKET_SPLATS))
+        codes = np.sort(curve._codes(means))
+        places = np.arange(1, buckets, dtype=np.int64) * len(codes) // buckets
+        return cls(curve.corner, curve.scale, np.unique(codes[places]))
+
+    @property
+    def count(self) -> int:
+        """Number of buckets."""
+        return len(self.bounds) + 1
+
+    def bucket_of(self, means: F32) -> Rows:
+        """Return the bucket of each splat, [n]."""
+        if not len(self.bounds):
+            return np.zeros(len(means), np.intp)
+        return np.searchsorted(self.bounds, self._codes(means), side="right")
+
+    def _codes(self, means: F32) -> I64:
+        codes = np.empty(len(means), np.int64)
+        for at in range(0, len(means), _CURVE_BLOCK):
+            cells = (means[at : at + _CURVE_BLOCK].T.astype(np.float64) - self.corner[:, None]) * self.scale
+            codes[at : at + _CURVE_BLOCK] = morton_codes(np.clip(cells, 0, _CURVE_TOP).astype(np.int32))
+        return codes
+
+
+def bucket_rows(means: F32) -> Sequence[Rows]:
+    """Return the rows of each bucket of a scene in memory, ascending."""
+    if len(means) <= BUCKET_SPLATS:
+        return [np.arange(len(means), dtype=np.intp)]
+    curve = BucketCurve.through(means[sample_rows(len(means))], len(means))
+    bucket = curve.bucket_of(means)
+    order = np.argsort(bucket, kind="stable")
+    ends = np.searchsorted(bucket[order], np.arange(curve.count + 1))
+    found = [order[start:end] for start, end in pairwise(ends)]
+    return [rows[part] for rows in found for part in bucket_slices(len(rows)) if len(rows)]
+
+
+def bucket_slices(count: int) -> list[slice]:
+    """Cut a bucket that got more than `BUCKET_SPLATS` splats into equal parts, in the scene's order."""
+    parts = max(1, math.ceil(count / BUCKET_SPLATS))
+    return [slice(count * part // parts, count * (part + 1) // parts) for part in range(parts)]
+
+
+def sample_rows(count: int) -> I64:
+    """Return the rows of the sample of a scene with more than `BUCKET_SPLATS` splats, evenly spaced."""
+    return np.arange(BUCKET_SPLATS, dtype=np.int64) * count // BUCKET_SPLATS
+
+
+def contrast_buckets(buckets: int) -> list[int]:
+    """Return the buckets in which neighbours are compared, which a sample of the scene does not contain."""
+    return sorted({place * buckets // _CONTRAST_BUCKETS for place in range(_CONTRAST_BUCKETS)})
+
+
+def _cut_groups(
+    means: F32, rows: Rows, groups: U8 | None, factors: Sequence[StepFactors], parameters: CodingParameters
+) -> list[TileSplats]:
+    """Cut the splats `rows`, each group by itself; the class of a group is its number modulo the classes."""
+    tiles: list[TileSplats] = []
+    for group in (0,) if groups is None else np.unique(groups):
+        chosen = rows if groups is None else rows[groups == group]
+        shared = factors[int(group) % len(factors)]
+        lattice = replace(parameters.lattice, step=lattice_step(parameters.lattice.step, shared.means))
+        tiles += (
+            TileSplats(chosen[tile.rows], tile.exponent + shared.means, shared)
+            for tile in cut_tiles(means[chosen], lattice, parameters.tile_splats)
+        )
+    return tiles
+
+
+def _outlier_flags(model: SplatModel, parameters: CodingParameters) -> U8 | None:
+    """Return [N] with a bit for each attribute that has an outlier; None if no splat has one."""
+    # Colours go through sums and differences of two channels.
+    limits = (
+        (model.scales, largest_exact(parameters.scale_step)),
+        (model.sh0, largest_exact(parameters.sh0_step) / 2.0),
+        (
+            model.shN[:, : parameters.sh_coefficients],
+            largest_exact(min(parameters.sh_step, parameters.codebook_step)) / 2.0,
+        ),
+    )
+    flags: U8 | None = None
+    for bit, (values, limit) in enumerate(limits):
+        if _may_exceed(values, limit):
+            flags = np.zeros(len(model), np.uint8) if flags is None else flags
+            flags |= _exceeds(values, limit).view(np.uint8) << np.uint8(bit)
+    return flags if flags is not None and flags.any() else None
+
+
+def _may_exceed(values: F32, limit: float) -> bool:
+    """Return True if a value may reach the limit: one pass over memory, by the sum of squares."""
+    flat: NDArray[Any] = values.reshape(-1) if values.flags.c_contiguous else values
+    with np.errstate(over="ignore"):
+        axes = "ijk"[: flat.ndim]
+        return not 4.0 * float(np.einsum(f"{axes},{axes}->", flat, flat)) < limit * limit  # float32 sums lose digits
+
+
+def _exceeds(values: F32, limit: float) -> Mask:
+    """Return True for the rows with a value that reaches the limit, [N]."""
+    found = np.zeros(len(values), bool)
+    for at in range(0, len(values), _OUTLIER_BLOCK):
+        part = values[at : at + _OUTLIER_BLOCK]
+        found[at : at + _OUTLIER_BLOCK] = np.abs(part.reshape(len(part), -1)).max(axis=1, initial=0.0) >= limit
+    return found
+
+
+def _halve(coordinate: F32, tile_splats: int) -> list[Rows]:
+    """Split at a multiple of the tile size, so that tiles are full; the first half comes last, to be popped first."""
+    parts = math.ceil(len(coordinate) / tile_splats)
+    share = len(coordinate) * (parts // 2) // parts
+    order = np.argpartition(coordinate, share)
+    return [order[share:], order[:share]]
 
 
 def _log2(ratio: float) -> int:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.buckets import Curve
+from csplat.encoder.tiling import BucketCurve
 from csplat.errors import InputError
 from csplat.model import SplatModel
 
@@ -73,7 +73,7 @@ class BucketWriter:
 
     folder: Path
     layout: Layout
-    curve: Curve
+    curve: BucketCurve
     room_bytes: int
     counts: NDArray[np.int64] = field(init=False)
     _waiting: list[list[list[NDArray[Any]]]] = field(init=False)

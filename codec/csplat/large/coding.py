@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from csplat import _spec
-from csplat.encoder.apart import cut_scene
-from csplat.encoder.codebook import Books, served
-from csplat.encoder.container import FileTile, Later, chunk_crc
-from csplat.encoder.draft import within_binary32
-from csplat.encoder.measure import ErrorSums
-from csplat.encoder.plan import Plan
-from csplat.encoder.tile import EncodedTile, encode_tile
+from csplat.encoder.coding_parameters import CodingParameters
+from csplat.encoder.container import FileTile, LazyPayload, chunk_crc
+from csplat.encoder.encode_plan import clip_scales
+from csplat.encoder.error_bounds import ErrorSums
+from csplat.encoder.pipeline import EncodedTile, encode_tile
+from csplat.encoder.sh_codebook import FileCodebooks, assign_splats
+from csplat.encoder.tiling import cut_scene
 from csplat.files import atomic_writer
 from csplat.large.bucket_files import Layout, bucket_path, damaged, read_splats
 
@@ -54,8 +54,8 @@ class Coding:
     """
 
     layout: Layout
-    plan: Plan
-    books: Books
+    plan: CodingParameters
+    books: FileCodebooks
 
 
 def code_bucket(folder: Path, bucket: Bucket, coding: Coding) -> None:
@@ -72,8 +72,8 @@ def code_bucket(folder: Path, bucket: Bucket, coding: Coding) -> None:
     """
     if _said_path(folder, bucket).exists():
         return
-    model = within_binary32(read_splats(bucket_path(folder, bucket.place), coding.layout, bucket.rows))
-    tables = served(coding.books, model, coding.plan, threads=1)
+    model = clip_scales(read_splats(bucket_path(folder, bucket.place), coding.layout, bucket.rows))
+    tables = assign_splats(coding.books, model, coding.plan, threads=1)
     said, size = [], 0
     with atomic_writer(_chunks_path(folder, bucket)) as stream:
         for tile in cut_scene(model, coding.plan):
@@ -126,7 +126,7 @@ def _said(coded: EncodedTile, start: int) -> dict[str, Any]:
 def _tile(said: Mapping[str, Any], chunks: Path) -> EncodedTile:
     fields = dict(said["tile"])
     fields["layers"] = {
-        int(layer): Later(size, crc, partial(_read_payload, chunks, offset, size, crc))
+        int(layer): LazyPayload(size, crc, partial(_read_payload, chunks, offset, size, crc))
         for layer, (offset, size, crc) in fields["layers"].items()
     }
     for name in ("corner", "extent", "tables"):

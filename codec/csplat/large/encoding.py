@@ -12,16 +12,13 @@ import numpy as np
 
 from csplat import __version__
 from csplat.encoder import EncodeOptions, EncodeReport, encode_with_report
-from csplat.encoder.buckets import WHOLE, looked_at
-from csplat.encoder.codebook import Books, settled
-from csplat.encoder.coded import notes_on
-from csplat.encoder.container import parts
-from csplat.encoder.draft import Draft, Origin
-from csplat.encoder.measure import ErrorSums
-from csplat.encoder.plan import Plan
-from csplat.encoder.scene import chosen_settings, extra_columns, file_chunks, file_scene
-from csplat.encoder.statistics import contrast_of
-from csplat.encoder.tile import EncodedTile
+from csplat.encoder.coding_parameters import CodingParameters, measure_contrast
+from csplat.encoder.container import file_pieces
+from csplat.encoder.encode_plan import EncodePlan, Origin, extra_records
+from csplat.encoder.error_bounds import ErrorSums
+from csplat.encoder.pipeline import EncodedTile, encoding_settings, file_chunks, make_notes, scene_fields
+from csplat.encoder.sh_codebook import FileCodebooks, final_parameters
+from csplat.encoder.tiling import BUCKET_SPLATS, contrast_buckets
 from csplat.errors import InputError
 from csplat.files import atomic_writer, check_room
 from csplat.large.bucket_files import BucketWriter, Layout, bucket_path, read_splats
@@ -74,13 +71,13 @@ def needs_of(scene: Scene, options: EncodeOptions, memory_bytes: int | None = No
     row = _layout(scene, options).row_bytes
     whole = _PROGRAM + int(scene.count * row * _WHOLE_ROW)
     file_bytes = int(scene.count * row * _CODED)
-    if scene.count <= WHOLE or (whole <= bound and not by_disk):
+    if scene.count <= BUCKET_SPLATS or (whole <= bound and not by_disk):
         if memory_bytes is not None and whole > bound:
             raise _too_low(bound, whole)
         return Needs(True, options.thread_count, whole, file_bytes)
     if options.shape_codebook_size:
         raise InputError(f"a codebook of shapes wants the scene in memory, about {whole / _MB:,.0f} MB")
-    worker = _PROGRAM + int(WHOLE * row * _PER_ROW)
+    worker = _PROGRAM + int(BUCKET_SPLATS * row * _PER_ROW)
     here = worker + _ROOM
     if here > bound:
         raise _too_low(bound, here)
@@ -179,14 +176,14 @@ class _Encoding:
             self._sort()
         if "contrast" not in work.state:
             buckets = work.buckets
-            some = (buckets[number] for number in looked_at(len(buckets)))
+            some = (buckets[number] for number in contrast_buckets(len(buckets)))
             work.note(
-                contrast=contrast_of(
+                contrast=measure_contrast(
                     read_splats(bucket_path(work.folder, one.place), work.layout, one.rows) for one in some
                 )
             )
         draft, books = self._decide()
-        self._code(Coding(work.layout, draft.plan, books))
+        self._code(Coding(work.layout, draft.parameters, books))
         report = self._write(draft, books)
         work.remove()
         return report
@@ -213,20 +210,22 @@ class _Encoding:
         writer.flush()
         work.note(counts=writer.counts.tolist())
 
-    def _decide(self) -> tuple[Draft, Books]:
+    def _decide(self) -> tuple[EncodePlan, FileCodebooks]:
         """Decide on the sample; what comes back has no splats."""
         work, survey = self.work, self.work.survey
         assert survey is not None
-        sample = Draft.of(survey.sample, self.options, contrast=work.state["contrast"], progress=self.progress)
-        plan, books = replace(sample, plan=settled(sample.plan, survey.largest)).decided(self.progress)
+        sample = EncodePlan.of(survey.sample, self.options, contrast=work.state["contrast"], progress=self.progress)
+        plan, books = replace(sample, parameters=final_parameters(sample.parameters, survey.largest)).choose_sh_coding(
+            self.progress
+        )
         return self._without_splats(plan, books)
 
-    def _without_splats(self, plan: Plan, books: Books) -> tuple[Draft, Books]:
+    def _without_splats(self, plan: CodingParameters, books: FileCodebooks) -> tuple[EncodePlan, FileCodebooks]:
         facts, tables = self.work.layout.facts, books.tables
         none = np.zeros(0, np.intp)
         origin = Origin(self.scene.count, none)
-        extras = extra_columns(facts, self.options)
-        draft = Draft(facts, self.options, origin, None, plan, [], extras, None, None)
+        extras = extra_records(facts, self.options)
+        draft = EncodePlan(facts, self.options, origin, None, plan, [], extras, None, None)
         return draft, replace(books, tables=tables.select(none))
 
     def _code(self, coding: Coding) -> None:
@@ -247,18 +246,18 @@ class _Encoding:
             done += bucket.stop - bucket.start
             self.progress("coding", done / self.scene.count)
 
-    def _write(self, draft: Draft, books: Books) -> EncodeReport:
+    def _write(self, draft: EncodePlan, books: FileCodebooks) -> EncodeReport:
         tiles: list[EncodedTile] = []
         for bucket in self.work.buckets:
             tiles += coded_bucket(self.work.folder, bucket) or ()
         errors = ErrorSums.total(part.errors for part in tiles)
-        settings = chosen_settings(draft, books.tables)
-        fields = file_scene(draft, books, file_chunks(draft, errors, settings))
+        settings = encoding_settings(draft, books.tables)
+        fields = scene_fields(draft, books, file_chunks(draft, errors, settings))
         size, payloads = 0, sum(len(payload) for part in tiles for payload in part.tile.layers.values())
         with atomic_writer(self.target) as stream:
-            for piece in parts(fields, [part.tile for part in tiles]):
+            for piece in file_pieces(fields, [part.tile for part in tiles]):
                 stream.write(piece)
                 size += len(piece)
                 self.progress("writing", min(1.0, size / max(1, payloads)))
-        notes = notes_on(tiles, strict=draft.plan.lattice.strict)
-        return EncodeReport(settings, errors.stated(), errors.count, len(tiles), size, notes)
+        notes = make_notes(tiles, strict=draft.parameters.lattice.strict)
+        return EncodeReport(settings, errors.declared(), errors.count, len(tiles), size, notes)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from csplat.encoder.buckets import Curve, sample_rows
-from csplat.encoder.codebook import largest_sh
+from csplat.encoder.sh_codebook import largest_sh
+from csplat.encoder.tiling import BucketCurve, sample_rows
 from csplat.large.bucket_files import Layout
 from csplat.model import SplatModel
 from csplat.scene import Scene
@@ -25,7 +25,7 @@ class Survey:
 
     sample: SplatModel
     largest: float
-    curve: Curve
+    curve: BucketCurve
 
 
 def take_survey(scene: Scene, layout: Layout) -> Survey:
@@ -43,4 +43,4 @@ def take_survey(scene: Scene, layout: Layout) -> Survey:
             array[first:last] = values[rows[first:last] - where.start]
         largest = max(largest, largest_sh(block.shN))
     sample = layout.model(arrays)
-    return Survey(sample, largest, Curve.through(sample.means, scene.count))
+    return Survey(sample, largest, BucketCurve.through(sample.means, scene.count))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from csplat.encoder.buckets import Curve, slices
+from csplat.encoder.tiling import BucketCurve, bucket_slices
 from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat.large.bucket_files import Layout, bucket_path, damaged, read_splats, write_splats
@@ -88,7 +88,7 @@ class Work:
         if "curve" not in self.state:
             return None
         said = self.state["curve"]
-        curve = Curve(np.array(said["corner"]), said["scale"], np.array(said["bounds"], np.int64))
+        curve = BucketCurve(np.array(said["corner"]), said["scale"], np.array(said["bounds"], np.int64))
         return Survey(read_splats(self.folder / _SAMPLE, self.layout), self.state["largest"], curve)
 
     def keep(self, survey: Survey) -> None:
@@ -105,7 +105,9 @@ class Work:
     @property
     def buckets(self) -> list[Bucket]:
         """Buckets in the order of the file; known after the second pass."""
-        parts = [(place, part) for place, count in enumerate(self.state["counts"]) if count for part in slices(count)]
+        parts = [
+            (place, part) for place, count in enumerate(self.state["counts"]) if count for part in bucket_slices(count)
+        ]
         return [Bucket(number, place, part.start, part.stop) for number, (place, part) in enumerate(parts)]
 
     def clear_buckets(self) -> None:

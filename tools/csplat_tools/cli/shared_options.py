@@ -27,7 +27,7 @@ _DATA = "Photographs of --data (by default as the scene was trained)"
 _VIEWS = "Views (virtual ones by default)"
 
 #: The dataclass whose fields `--set` takes for the encoder, as `module:name`.
-ENCODER_SETTINGS = "csplat.encoder.options:EncodeOptions"
+ENCODER_SETTINGS = "csplat.encoder.encode_options:EncodeOptions"
 
 SceneArgument = Annotated[
     str, typer.Argument(metavar="SCENE", help="A PLY, a .csplat file, another of `csplat formats`, or -.")

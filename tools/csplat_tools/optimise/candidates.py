@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import Coded, Draft, EncodeOptions, EncodeResult, Importance, ShCoding
+from csplat.encoder import EncodedTiles, EncodeOptions, EncodePlan, EncodeResult, Importance, ShCoding, encode_tiles
 from csplat.model import SplatModel
 from csplat.types import F64, Progress, null_progress
 from csplat_render.metrics import psnr_of_mse
@@ -93,7 +93,7 @@ class Subset(Protocol):
         """True if the splats may be sorted into quantisation classes."""
         ...
 
-    def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:
+    def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> EncodedTiles:
         """Quantise and code the splats; `quick` leaves out the refit through the quantisers."""
         ...
 
@@ -126,11 +126,11 @@ class WholeScene:
         """The whole scene."""
         return self.model
 
-    def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:  # noqa: ARG002  # the protocol's
+    def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> EncodedTiles:  # noqa: ARG002  # the protocol's
         """Quantise and code the splats."""
         weights = self.measured if graded and self.measured is not None else self.importance
-        draft = Draft.of(self.model, options, importance=weights, progress=self.progress)
-        return draft.coded(self.progress)
+        draft = EncodePlan.of(self.model, options, importance=weights, progress=self.progress)
+        return encode_tiles(draft, progress=self.progress)
 
     def said(self, trial: Candidate | None) -> None:  # as the protocol has it
         """Return no entry: the file holds the scene as it is."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from csplat.encoder import EncodeOptions, Importance, most_grades, trusted
+from csplat.encoder import EncodeOptions, Importance, apply_weight_floor, max_class_count
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import Progress
@@ -163,7 +163,7 @@ def measure_importance(
         model, cameras, background, matrices=False, magnitudes=False, threads=threads, progress=progress
     )
     weights = StoredSensitivity.of(model, found).importance()
-    return replace(weights, sh=trusted(weights.sh, model))
+    return replace(weights, sh=apply_weight_floor(weights.sh, model))
 
 
 def importance_views(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
@@ -201,7 +201,7 @@ def complete_importance(
         Weights and curvatures, `None` if they are not known or would change nothing; and the number of views in which
         they were measured here.
     """
-    several = most_grades(len(source), encoding) > 1
+    several = max_class_count(len(source), encoding) > 1
     if isinstance(importance, Importance) and importance.curvatures is not None:
         return (importance if several else None), 0
     has_sh = source.sh_degree > 0 and encoding.sh_degree != 0 and encoding.sh_coding != "none"

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder import FreeValues, Frozen
+from csplat.encoder import FixedQuantisation, FreeValues
 from csplat.model import SplatModel
 from csplat.types import F32, Mask, Progress
 from csplat_render import Camera
@@ -66,7 +66,7 @@ def refit_splats(
 
 
 def quantisation_aware_refit(
-    frozen: Frozen,
+    frozen: FixedQuantisation,
     cameras: Sequence[Camera],
     wanted: Sequence[F32],
     options: SimplifyOptions,
@@ -81,9 +81,9 @@ def quantisation_aware_refit(
         cameras, wanted, options, steps, progress: as for `refit_splats`.
 
     Returns:
-        Values that `Frozen.coded` takes.
+        Values that `FixedQuantisation.coded` takes.
     """
-    model, scene = frozen.draft.model, _QuantisedValues(TunedScene(frozen))
+    model, scene = frozen.encode_plan.model, _QuantisedValues(TunedScene(frozen))
     scene.tuned.parameters.beta2 = _BETA2
     teaching = _TrainingViews(cameras, wanted, options, model.antialiased)
     rms, removed = teaching.rms(scene.seen()), teaching.rms(model)

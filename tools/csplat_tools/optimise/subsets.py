@@ -11,7 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder import Coded, Draft, EncodeOptions, Importance, Origin, most_grades
+from csplat.encoder import (
+    EncodedTiles,
+    EncodeOptions,
+    EncodePlan,
+    Importance,
+    Origin,
+    encode_tiles,
+    fix_quantisation,
+    max_class_count,
+)
 from csplat.model import SplatModel
 from csplat.types import F64, I64, Mask, Progress
 from csplat_render.pruning_error import PruningError, measure_pruning_error
@@ -339,27 +348,29 @@ class RefittedSubset:
         """PSNR of `shown` on the validation views, dB."""
         return self._banded_psnr  # pyright does not take a cached property for the protocol's
 
-    def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> Coded:
+    def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> EncodedTiles:
         """Quantise and code the splats; unless `quick`, they are refitted through the quantisers before."""
         session, refit = self.session, self.session.options.refit
         start = self.banded[0]
-        draft = Draft.of(
+        draft = EncodePlan.of(
             start, options, importance=self._importance(options, graded=graded),
             origin=Origin(len(session.source), self.rows, refitted=refit, adjusted=refit),
             progress=self.progress,
         )  # fmt: skip
         if quick or not refit:
-            return draft.coded(self.progress)
-        frozen = draft.frozen(session.source, self.progress)
+            return encode_tiles(draft, progress=self.progress)
+        frozen = fix_quantisation(draft, session.source, self.progress)
         held = quantisation_aware_refit(
             frozen, session.taught, session.wanted, session.options, steps=session.options.steps(_FILE_STEPS),
             progress=self.progress,
         )  # fmt: skip
-        shown = [replace(start, **vars(frozen.seen(values)), means_double=None) for values in (frozen.start(), held)]
+        shown = [
+            replace(start, **vars(frozen.dequantise(values)), means_double=None) for values in (frozen.start(), held)
+        ]
         if self.seen(shown[1]) < self.seen(shown[0]):  # steps of this length may be too long for a handful of splats
             held, shown = frozen.start(), shown[:1]
         self._check_psnr = session.checked.psnr(shown[-1])
-        return frozen.coded(held, self.progress)
+        return frozen.encode(held, self.progress)
 
     def said(self, trial: Candidate | None) -> Mapping[str, Any]:
         """Return the entry for a file's options: splats of the source, number of views, and PSNRs of the file."""
@@ -403,7 +414,7 @@ class RefittedSubset:
         )  # fmt: skip
 
     def _importance(self, options: EncodeOptions, *, graded: bool) -> NDArray[Any] | Importance:
-        if graded and most_grades(len(self.rows), options) > 1 and (self.gradable or options.grades is not None):
+        if graded and max_class_count(len(self.rows), options) > 1 and (self.gradable or options.grades is not None):
             return self._measured
         weights = self._removal.squared_weight
         return replace(self._measured, curvatures=None) if options.shape_codebook_size else weights

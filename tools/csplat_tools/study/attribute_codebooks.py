@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from csplat.encoder import cluster, fix_gauge
+from csplat.encoder import canonicalise_shape, cluster
 from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats
 from csplat.types import F32, F64, U32, Progress
@@ -186,7 +186,7 @@ def _canonicalised(model: SplatModel, how: KMeans) -> SplatModel:
     if "quats" not in how.sizes or not len(model):
         return model
     if how.gauge:
-        quats, scales = fix_gauge(model.quats, model.scales)
+        quats, scales = canonicalise_shape(model.quats, model.scales)
         return replace(
             model, quats=normalise_quats(np.ascontiguousarray(quats.T)), scales=np.ascontiguousarray(scales.T)
         )

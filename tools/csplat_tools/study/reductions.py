@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from csplat.decoder import decode
-from csplat.encoder import Draft, EncodeOptions, EncodeResult, Origin
+from csplat.encoder import EncodeOptions, EncodePlan, EncodeResult, Origin, encode_tiles
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.scene import without_bands
@@ -192,11 +192,11 @@ def encode_reduced(
     reduced = reduce_with(source, reduction, teacher if clusters else None, progress)
     said, origin = dict(reduced.said), Origin(len(source), reduced.source_index, refitted=teacher is not None)
     model = _with_bands(reduced.model, source.sh_degree) if clusters else source.select(reduced.source_index)
-    draft = Draft.of(model, encoding, origin=origin, progress=progress)
+    draft = EncodePlan.of(model, encoding, origin=origin, progress=progress)
     if teacher is not None and not clusters:
         taught = _with_bands(teacher.taught(draft.scene, degree, progress), source.sh_degree)
         draft = draft.with_colours(taught.sh0, taught.shN)
-    coded = draft.coded(progress)
+    coded = encode_tiles(draft, progress=progress)
     if teacher is not None or clusters:
         decoded = decode(coded.write().data)
         coded = coded.against(source, decoded) if clusters else coded

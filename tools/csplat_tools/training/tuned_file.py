@@ -10,7 +10,7 @@ from typing import Any, Protocol, TypeVar
 
 import csplat_trainer
 from csplat.decoder import decode
-from csplat.encoder import PRESETS, Draft, EncodeOptions, Origin
+from csplat.encoder import PRESETS, EncodeOptions, EncodePlan, Origin, encode_tiles
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import Progress
@@ -255,8 +255,10 @@ def _fitting(
 
     def room(encoding: EncodeOptions) -> tuple[float, dict[str, Any]]:
         """Return the factor from the size of a draft to the size allowed, and the options that the encoder chose."""
-        draft = Draft.of(chosen.model, encoding, importance=chosen.importance, graded=False, progress=progress)
-        made = draft.coded(progress).write()
+        draft = EncodePlan.of(
+            chosen.model, encoding, importance=chosen.importance, allow_classes=False, progress=progress
+        )
+        made = encode_tiles(draft, progress=progress).write()
         return size_bytes / len(made.data), made.report.options
 
     for _ in range(_TRIES):

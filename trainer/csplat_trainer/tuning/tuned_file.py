@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import DecodedValues, Draft, EncodeOptions, EncodeResult, Importance, Origin
+from csplat.encoder import DecodedValues, EncodeOptions, EncodePlan, EncodeResult, Importance, Origin, fix_quantisation
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
 from csplat.training_record import TrainingRecord
@@ -117,9 +117,11 @@ def finetune(
     if importance is None:
         importance = _measured(model, views, encoding, progress)
     with clock.stage("encoding"):
-        draft = Draft.of(model, encoding, importance=importance, origin=origin, graded=False, progress=progress)
-        frozen = draft.frozen(source or model, progress)
-        coded = frozen.coded(frozen.start())
+        draft = EncodePlan.of(
+            model, encoding, importance=importance, origin=origin, allow_classes=False, progress=progress
+        )
+        frozen = fix_quantisation(draft, source or model, progress)
+        coded = frozen.encode(frozen.start())
         plain = coded.write()
 
     def told(steps: int) -> dict[str, Any]:
@@ -144,9 +146,9 @@ def finetune(
             checkpoint_every=files.checkpoint_every, resume=files.resume, threads=encoding.threads,
         )  # fmt: skip
     with clock.stage("encoding"):
-        result = frozen.coded(tuned.held).write(told(tuned.log["best_iteration"]))
+        result = frozen.encode(tuned.held).write(told(tuned.log["best_iteration"]))
         decoded = decode(result.data)
-    _check_identity(frozen.seen(tuned.held), frozen.source_index, result, decoded)
+    _check_identity(frozen.dequantise(tuned.held), frozen.source_index, result, decoded)
     return Finetuned(result, decoded, plain, tuned.log, clock.seconds)
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder import DecodedValues, FreeValues, Frozen
+from csplat.encoder import DecodedValues, FixedQuantisation, FreeValues
 from csplat.types import F32, I32, I64
 from csplat_render.conventions import Gradients
 from csplat_render.kernels import lane_range, parallel_kernel
@@ -40,7 +40,7 @@ class TunedScene:
         parameters: named as in training, but `quats`, `scales`, `shN` hold the rows of `FreeValues`; and `sizes`.
     """
 
-    def __init__(self, frozen: Frozen, parameters: Parameters | None = None) -> None:
+    def __init__(self, frozen: FixedQuantisation, parameters: Parameters | None = None) -> None:
         self.frozen = frozen
         self.parameters = parameters or Parameters.starting_at(_values(frozen.start()))
         values, book, shapes = self.parameters.values, frozen.book, frozen.shapes
@@ -62,14 +62,14 @@ class TunedScene:
     def seen(self) -> tuple[DecodedValues, F32]:
         """Return the values that a decoder will return, and the opacities before they were quantised."""
         held = self.held
-        return self.frozen.seen(held), held.opacities
+        return self.frozen.dequantise(held), held.opacities
 
     def stored(self, seen: DecodedValues) -> StreamValues:
         """Return the contents of the file's streams, as a decoder will return them."""
-        sh = self.frozen.seen_rows(self.parameters.values["shN"]) if self.frozen.book is not None else seen.shN
+        sh = self.frozen.dequantise_sh_rows(self.parameters.values["shN"]) if self.frozen.book is not None else seen.shN
         if self.frozen.shapes is None:
             return StreamValues(seen.quats, seen.scales, self.parameters.values["sizes"], seen.opacities, seen.sh0, sh)
-        quats, scales, sizes = self.frozen.seen_shape_rows(self._held(seen.opacities), seen)
+        quats, scales, sizes = self.frozen.dequantise_shape_rows(self._held(seen.opacities), seen)
         return StreamValues(quats, scales, sizes, seen.opacities, seen.sh0, sh)
 
     def count(self, seen: DecodedValues, weight: float) -> RateTerm:
@@ -206,13 +206,13 @@ class RateTerm:
         bits: bits of all integers together, by their order-0 entropy; without centres and indices, which hardly change.
     """
 
-    frozen: Frozen
+    frozen: FixedQuantisation
     weight: float
     tables: dict[str, F32]
     bits: float = 0.0
 
     @classmethod
-    def counted(cls, frozen: Frozen, stored: StreamValues, weight: float) -> RateTerm:
+    def counted(cls, frozen: FixedQuantisation, stored: StreamValues, weight: float) -> RateTerm:
         """Count the integers of a scene.
 
         Args:
@@ -221,7 +221,7 @@ class RateTerm:
             weight: loss per bit and splat.
         """
         costs = cls(frozen, weight, {})
-        plan = frozen.plan
+        plan = frozen.parameters
         for number, grade in enumerate(_class_steps(frozen)):
             rows = grade.rows
             columns = {
@@ -256,7 +256,7 @@ class RateTerm:
             steps: gradients of the loss by group; changed in place.
             stored: contents of the streams.
         """
-        plan, tables = self.frozen.plan, self.tables
+        plan, tables = self.frozen.parameters, self.tables
         per_bit = np.float32(self.weight / len(stored.opacities))
         shift = plan.chroma_shift
         for number, grade in enumerate(_class_steps(self.frozen)):
@@ -288,22 +288,22 @@ class _ClassSteps:
     sh0_step: float
 
 
-def _class_steps(frozen: Frozen) -> list[_ClassSteps]:
-    plan, tiles = frozen.plan, frozen.draft.tiles
-    begins = [0] if frozen.draft.grades is None else [
-        number for number, tile in enumerate(tiles) if not number or tile.coarse != tiles[number - 1].coarse
+def _class_steps(frozen: FixedQuantisation) -> list[_ClassSteps]:
+    plan, tiles = frozen.parameters, frozen.encode_plan.tiles
+    begins = [0] if frozen.encode_plan.classes is None else [
+        number for number, tile in enumerate(tiles) if not number or tile.factors != tiles[number - 1].factors
     ]  # fmt: skip
     found = []
     for begin, end in pairwise([*begins, len(tiles)]):
-        coarse = tiles[begin].coarse
+        factors = tiles[begin].factors
         rows = slice(None) if len(begins) == 1 else slice(tiles[begin].rows[0], tiles[end - 1].rows[-1] + 1)
         found.append(
             _ClassSteps(
                 rows,
-                plan.scale_step * 2.0**coarse.scales,
-                coarse.quats / (_ROOT2 * plan.quat_levels),
-                plan.opacity_levels / coarse.opacities,
-                plan.sh0_step * 2.0**coarse.sh0,
+                plan.scale_step * 2.0**factors.scales,
+                factors.quats / (_ROOT2 * plan.quat_levels),
+                plan.opacity_levels / factors.opacities,
+                plan.sh0_step * 2.0**factors.sh0,
             )
         )
     return found

@@ -19,7 +19,7 @@ from numpy.random import PCG64, Generator
 from numpy.typing import NDArray
 
 from csplat.archives import read_archive
-from csplat.encoder import DecodedValues, FreeValues, Frozen
+from csplat.encoder import DecodedValues, FixedQuantisation, FreeValues
 from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat.types import F32
@@ -74,7 +74,7 @@ class FinetuneResult:
 
 
 def tune(
-    frozen: Frozen,
+    frozen: FixedQuantisation,
     views: TuningViews,
     options: FinetuneOptions | None = None,
     *,
@@ -133,13 +133,20 @@ class _TuningRun:
     """A run: the scene, the renderer, the random numbers, the log."""
 
     def __init__(
-        self, frozen: Frozen, views: TuningViews, options: FinetuneOptions, threads: int | None, size_bytes: int | None
+        self,
+        frozen: FixedQuantisation,
+        views: TuningViews,
+        options: FinetuneOptions,
+        threads: int | None,
+        size_bytes: int | None,
     ) -> None:
         self._views, self._options = views, options
         self._scene = TunedScene(frozen)
         self._rasteriser = Rasteriser(threads=threads)
-        self._antialiased = frozen.draft.model.antialiased
-        self._extent = float(np.exp(np.clip(np.median(np.median(frozen.draft.model.scales, axis=1)), -80.0, 80.0)))
+        self._antialiased = frozen.encode_plan.model.antialiased
+        self._extent = float(
+            np.exp(np.clip(np.median(np.median(frozen.encode_plan.model.scales, axis=1)), -80.0, 80.0))
+        )
         self._rng = Generator(PCG64(options.seed))
         self._iteration, self._queue = 0, list[int]()
         self._sizes: dict[tuple[int, int], _ImageBuffers] = {}
@@ -280,7 +287,7 @@ class _TuningRun:
             count += rendered.size if view.mask is None else 3 * int(view.mask.sum())
         costs = self._scene.count(seen, self._options.byte_cost)
         psnr = psnr_of_mse(error / count)
-        size_bytes = len(self._scene.frozen.coded(self._scene.held).write().data)
+        size_bytes = len(self._scene.frozen.encode(self._scene.held).write().data)
         shrinks = False
         if self._budget is None:
             score = loss + costs.loss
@@ -465,7 +472,7 @@ class FinetuneCheckpoint:
     best: tuple[float, float, int, int]
 
 
-def save_finetune(path: str | Path, checkpoint: FinetuneCheckpoint, frozen: Frozen) -> None:
+def save_finetune(path: str | Path, checkpoint: FinetuneCheckpoint, frozen: FixedQuantisation) -> None:
     """Write a checkpoint; the file appears under its name only when it is complete."""
     facts = {
         "kind": _KIND,
@@ -488,7 +495,7 @@ def save_finetune(path: str | Path, checkpoint: FinetuneCheckpoint, frozen: Froz
         np.savez(stream, allow_pickle=False, **arrays)
 
 
-def load_finetune(path: str | Path, frozen: Frozen) -> FinetuneCheckpoint:
+def load_finetune(path: str | Path, frozen: FixedQuantisation) -> FinetuneCheckpoint:
     """Read a checkpoint of a frozen scene.
 
     Raises:
@@ -528,9 +535,9 @@ def load_finetune(path: str | Path, frozen: Frozen) -> FinetuneCheckpoint:
     return checkpoint
 
 
-def fingerprint(frozen: Frozen) -> str:
+def fingerprint(frozen: FixedQuantisation) -> str:
     """A digest of all that was decided, and of the values that it was decided for."""
-    digest, start = hashlib.sha256(repr(frozen.plan).encode()), frozen.start()
+    digest, start = hashlib.sha256(repr(frozen.parameters).encode()), frozen.start()
     index = () if frozen.book is None else (frozen.book.index,)
     for array in (frozen.source_index, *index, *(getattr(start, name) for name in _FREE_VALUES)):
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeResult, FreeValues, Frozen
+from csplat.encoder import EncodeResult, FixedQuantisation, FreeValues
 from csplat.model import SplatModel
 from csplat_bench.common.making import ARRAYS
 from csplat_bench.compression.rows import Step
@@ -27,8 +27,8 @@ def ablation(bench: Bench, tuned: Tuned) -> list[Step]:
         A row for each; its size is as `sizes` counts it.
     """
     frozen, start, log = tuned.frozen, tuned.frozen.start(), tuned.seconds
-    before = frozen.seen(start)
-    pruned, size = frozen.draft.model, len(tuned.chosen.model)
+    before = frozen.dequantise(start)
+    pruned, size = frozen.encode_plan.model, len(tuned.chosen.model)
     colours, shapes = books_of(frozen)
     coefficients = 3 * bench.source.shN.shape[1]
     by_colour = _served_colours(frozen, before.shN)
@@ -60,9 +60,9 @@ def ablation(bench: Bench, tuned: Tuned) -> list[Step]:
     ]
 
 
-def _served_colours(frozen: Frozen, shN: NDArray[np.float32]) -> SplatModel:
+def _served_colours(frozen: FixedQuantisation, shN: NDArray[np.float32]) -> SplatModel:
     """The scene before quantisation, SH by codebook if it has one."""
-    model = frozen.draft.model
+    model = frozen.encode_plan.model
     if frozen.book is None:
         return model
     served = np.zeros_like(model.shN)  # bands that are not kept are gone
@@ -72,7 +72,7 @@ def _served_colours(frozen: Frozen, shN: NDArray[np.float32]) -> SplatModel:
 
 
 def _served_shapes(
-    frozen: Frozen, model: SplatModel, quats: NDArray[np.float32], scales: NDArray[np.float32]
+    frozen: FixedQuantisation, model: SplatModel, quats: NDArray[np.float32], scales: NDArray[np.float32]
 ) -> SplatModel:
     """The scene before quantisation, shapes by codebook if it has one."""
     if frozen.shapes is None:
@@ -81,22 +81,21 @@ def _served_shapes(
     return replace(model, quats=np.where(own, model.quats, quats), scales=np.where(own, model.scales, scales))
 
 
-def _as_model(frozen: Frozen, held: FreeValues) -> SplatModel:
+def _as_model(frozen: FixedQuantisation, held: FreeValues) -> SplatModel:
     """Return the model that a decoder will reconstruct, without writing a file."""
-    seen, model = frozen.seen(held), frozen.draft.model
+    seen, model = frozen.dequantise(held), frozen.encode_plan.model
     shN = np.zeros_like(model.shN)
     shN[:, : seen.shN.shape[1]] = seen.shN
     arrays = {name: getattr(seen, name) for name in ARRAYS if name != "shN"}
     return replace(model, **arrays, shN=shN)
 
 
-def _unordered(frozen: Frozen, held: FreeValues) -> EncodeResult:
+def _unordered(frozen: FixedQuantisation, held: FreeValues) -> EncodeResult:
     """The same file with the splats of each tile in the order of the source, their centres coded axis by axis."""
-    draft = frozen.draft
-    tiles = [replace(tile, rows=tile.rows[np.argsort(frozen.source_index[tile.rows])]) for tile in draft.tiles]
-    return (
-        replace(frozen, draft=replace(draft, tiles=tiles, plan=replace(draft.plan, morton=False))).coded(held).write()
-    )
+    plan = frozen.encode_plan
+    tiles = [replace(tile, rows=tile.rows[np.argsort(frozen.source_index[tile.rows])]) for tile in plan.tiles]
+    plan = replace(plan, tiles=tiles, parameters=replace(plan.parameters, morton=False))
+    return replace(frozen, encode_plan=plan).encode(held).write()
 
 
 def _same_set(one: SplatModel, other: SplatModel) -> bool:

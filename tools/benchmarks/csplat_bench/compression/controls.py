@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
-from csplat.encoder import DecodedValues, EncodeOptions, FreeValues, Frozen, Importance
+from csplat.encoder import DecodedValues, EncodeOptions, FixedQuantisation, FreeValues, Importance
 from csplat.model import SplatModel
 from csplat_bench.common.measuring import timed
 from csplat_bench.compression.rows import Control
@@ -17,11 +17,11 @@ from csplat_bench.compression.runs import Bench
 from csplat_trainer.tuning import tune
 
 
-class Unquantised(Frozen):
+class Unquantised(FixedQuantisation):
     """A frozen scene whose quantisers do nothing: tuning it is training on, with the same steps and the same views."""
 
     @classmethod
-    def freeing(cls, frozen: Frozen) -> Unquantised:
+    def freeing(cls, frozen: FixedQuantisation) -> Unquantised:
         """The same scene; it must have no codebooks."""
         assert frozen.book is None
         assert frozen.shapes is None
@@ -30,7 +30,7 @@ class Unquantised(Frozen):
     def constrain(self, held: FreeValues) -> None:
         """Leave values where they are: no file bounds them."""
 
-    def seen(self, held: FreeValues) -> DecodedValues:
+    def dequantise(self, held: FreeValues) -> DecodedValues:
         """The values themselves, in arrays of their own."""
         here = held.copy()
         return DecodedValues(here.means, here.quats, here.scales, here.opacities, here.sh0, here.sh)
@@ -48,14 +48,14 @@ def control(bench: Bench) -> Control:
     run, timing = timed(tune, Unquantised.freeing(frozen), bench.views, tuning, threads=bench.threads)
     held = run.held
     trained = replace(
-        frozen.draft.model, means=held.means, quats=held.quats, scales=held.scales, opacities=held.opacities,
+        frozen.encode_plan.model, means=held.means, quats=held.quats, scales=held.scales, opacities=held.opacities,
         sh0=held.sh0, shN=held.sh,
     )  # fmt: skip
     rows = np.searchsorted(chosen.rows, frozen.source_index)
     told = chosen.importance
     weights = told.select(rows) if isinstance(told, Importance) else told[rows]
     again = bench.frozen(trained, frozen.source_index, bench.encoding, weights)
-    data = again.coded(again.start()).write().data
+    data = again.encode(again.start()).write().data
     scores = bench.judge({"source": bench.source, "trained on": trained, "then a file": decode(data)})
     return {
         "steps": run.log["steps"],

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from csplat.encoder import Draft, EncodeOptions
+from csplat.encoder import EncodeOptions, EncodePlan, fix_quantisation
 from csplat_bench.common.captures import Training
 from csplat_bench.common.kept import Kept
 from csplat_bench.compression.ablation import ablation
@@ -98,6 +98,6 @@ def warm(bench: Bench) -> None:
     """Compile what a tuning runs: no row is to pay for it."""
     some = bench.source.select(slice(0, 500))
     options = EncodeOptions(sh_coding="codebook", codebook_size=16, threads=bench.threads)
-    frozen = Draft.of(some, options, graded=False).frozen()
+    frozen = fix_quantisation(EncodePlan.of(some, options, allow_classes=False))
     tune(frozen, bench.views, FinetuneOptions(iterations=1), threads=bench.threads)
     measure_sensitivity(some, bench.looks.teaches[:1], metric=True)

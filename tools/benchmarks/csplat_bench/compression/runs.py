@@ -13,7 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode, read_header
-from csplat.encoder import Draft, EncodeOptions, EncodeResult, FreeValues, Frozen, Importance, Origin
+from csplat.encoder import (
+    EncodeOptions,
+    EncodePlan,
+    EncodeResult,
+    FixedQuantisation,
+    FreeValues,
+    Importance,
+    Origin,
+    fix_quantisation,
+)
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
@@ -47,7 +56,7 @@ class Tuned:
     """
 
     chosen: TuningSubset
-    frozen: Frozen
+    frozen: FixedQuantisation
     held: FreeValues
     plain: EncodeResult
     result: EncodeResult
@@ -119,13 +128,13 @@ class Bench:
     def frozen(
         self, model: SplatModel, rows: NDArray[np.int64], encoding: EncodeOptions,
         importance: NDArray[Any] | Importance, progress: _Stages | None = None,
-    ) -> Frozen:  # fmt: skip
+    ) -> FixedQuantisation:  # fmt: skip
         """Freeze splats that are some of the source's."""
-        draft = Draft.of(
-            model, encoding, importance=importance, origin=Origin(len(self.source), rows), graded=False,
+        draft = EncodePlan.of(
+            model, encoding, importance=importance, origin=Origin(len(self.source), rows), allow_classes=False,
             progress=progress,
         )  # fmt: skip
-        return draft.frozen(self.source, progress)
+        return fix_quantisation(draft, self.source, progress)
 
     def tuned(self, encoding: EncodeOptions, pick: Pick | None = None) -> Tuned:
         """Freeze, tune, write.
@@ -139,11 +148,11 @@ class Bench:
         clock = Clock(dict(seconds))
         with clock.stage("clustering"):
             frozen = self.frozen(chosen.model, chosen.rows, encoding, chosen.importance, stages)
-        plain = frozen.coded(frozen.start()).write()  # not a part of the work: what it would have been without
+        plain = frozen.encode(frozen.start()).write()  # not a part of the work: what it would have been without
         with clock.stage("tuning"):
             run = tune(frozen, views, self.tuning, threads=self.threads)
         with clock.stage("encoding"):
-            result = frozen.coded(run.held).write()
+            result = frozen.encode(run.held).write()
         return Tuned(chosen, frozen, run.held, plain, result, run.log, {**clock.seconds, "of it shapes": stages.shapes})
 
     def row(self, tuned: Tuned) -> Row:
@@ -192,7 +201,7 @@ class _Stages:
 
 def _same(tuned: Tuned, decoded: SplatModel) -> bool:
     """Return True if a decoded file equals the tuned values bit for bit."""
-    seen = tuned.frozen.seen(tuned.held)
+    seen = tuned.frozen.dequantise(tuned.held)
     places = np.argsort(tuned.frozen.source_index)[
         np.searchsorted(np.sort(tuned.frozen.source_index), tuned.result.source_index)
     ]

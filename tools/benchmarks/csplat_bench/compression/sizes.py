@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder import FreeValues, Frozen
+from csplat.encoder import FixedQuantisation, FreeValues
 from csplat_tools.scene_files import ply_splat_bytes
 from csplat_trainer.tuning.tuned_scene import colour_integers_of
 
@@ -32,7 +32,7 @@ class Book:
     escaped: int
 
 
-def books_of(frozen: Frozen) -> tuple[Book | None, Book | None]:
+def books_of(frozen: FixedQuantisation) -> tuple[Book | None, Book | None]:
     """The codebooks of a frozen scene, of SH and of shapes; `None` if the encoder made none."""
     colours, shapes = frozen.book, frozen.shapes
     return (
@@ -86,17 +86,19 @@ def _whole_bytes(low: int, high: int) -> int:
     return (int(high - low).bit_length() + 7) // 8
 
 
-def integer_columns(frozen: Frozen, held: FreeValues) -> Sequence[NDArray[np.int64]]:
+def integer_columns(frozen: FixedQuantisation, held: FreeValues) -> Sequence[NDArray[np.int64]]:
     """Every integer that the file of some values holds, as arrays [n, C], in no order of meaning.
 
     Args:
         frozen: the encoder's decisions.
         held: values, constrained.
     """
-    plan, seen = frozen.plan, frozen.seen(held)
-    quats, scales, sizes = frozen.seen_shape_rows(held, seen)
-    sh = frozen.seen_rows(held.sh)
-    columns = [_lattice(seen.means[tile.rows], plan.lattice.step * 2.0**tile.exponent) for tile in frozen.draft.tiles]
+    plan, seen = frozen.parameters, frozen.dequantise(held)
+    quats, scales, sizes = frozen.dequantise_shape_rows(held, seen)
+    sh = frozen.dequantise_sh_rows(held.sh)
+    columns = [
+        _lattice(seen.means[tile.rows], plan.lattice.step * 2.0**tile.exponent) for tile in frozen.encode_plan.tiles
+    ]
     columns += [
         _lattice(scales, plan.scale_step),
         _lattice(sizes[:, None], plan.scale_step),

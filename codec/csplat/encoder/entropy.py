@@ -1,4 +1,4 @@
-"""Integers to coded bytes: transforms, then one coder (spec 6)."""
+"""Coded bytes of integers: transforms, DEFLATE, and the blocks of a tile (spec 6)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.errors import InputError
+from csplat.types import I64
 
 Integers = NDArray[Any]
 
-_QUICK_LEVEL = 1  # DEFLATE level at which samples decide
+_FASTEST_LEVEL = 1  # DEFLATE level at which samples decide
 _SHORT_RUN = 1.5  # bytes in the mean run, above which RUN_LENGTH may save more than it costs decoders
 _LONG_RUN = 32  # bytes in the mean run, above which it is tried at that level
 _SAMPLE = 4096  # bytes of each of four samples
@@ -25,7 +26,7 @@ _GAIN = 0.98  # fraction of the bytes below which runs are worth the time that t
 
 
 @dataclass(frozen=True)
-class Coding:
+class DeflateSettings:
     """DEFLATE level and library.
 
     Attributes:
@@ -44,13 +45,13 @@ class Coding:
 
 
 def unsigned_stream(
-    values: Integers, coding: Coding, *, delta: bool = False, signed_delta: bool = False, fixed_width: int = 0
+    values: Integers, deflate: DeflateSettings, *, delta: bool = False, signed_delta: bool = False, fixed_width: int = 0
 ) -> bytes:
     """Write a stream of unsigned integers.
 
     Args:
         values: [n], n >= 1, integers from 0 to 2**56 - 1 (any unsigned dtype without differences).
-        coding: level and library of DEFLATE.
+        deflate: level and library of DEFLATE.
         delta: code differences from the element before; pays if values ascend.
         signed_delta: code differences that fall as well as rise (DELTA, then ZIGZAG).
         fixed_width: bytes of an element; 0 takes as many as the largest needs.
@@ -60,43 +61,43 @@ def unsigned_stream(
     """
     width = fixed_width or _width(int(values.max()))
     if not (delta or signed_delta):
-        return _finish(values, width, (_spec.TRANSFORM_NONE,), coding)
+        return _make_stream(values, width, (_spec.TRANSFORM_NONE,), deflate)
     differences = np.empty(len(values), np.int64)
     differences[0] = values[0]
     np.subtract(values[1:], values[:-1], out=differences[1:], dtype=np.int64, casting="unsafe")
     if signed_delta:
         half = 1 << (8 * width - 1)
         wrapped = ((differences + half) & (2 * half - 1)) - half
-        return _finish(_zigzag(wrapped), width, (_spec.TRANSFORM_DELTA, _spec.TRANSFORM_ZIGZAG), coding)
+        return _make_stream(_zigzag(wrapped), width, (_spec.TRANSFORM_DELTA, _spec.TRANSFORM_ZIGZAG), deflate)
     differences &= (1 << (8 * width)) - 1
-    return _finish(differences, width, (_spec.TRANSFORM_DELTA,), coding)
+    return _make_stream(differences, width, (_spec.TRANSFORM_DELTA,), deflate)
 
 
-def smooth_stream(values: Integers, coding: Coding) -> bytes:
+def smooth_stream(values: Integers, deflate: DeflateSettings) -> bytes:
     """Write unsigned integers as they are or as differences, whichever is smaller.
 
     Neighbours in Morton order often have like colours and sizes, but not in every scene.
 
     Args:
         values: [n], n >= 1, integers from 0 to 2**32 - 1.
-        coding: level and library of DEFLATE; at the lowest level the entropies decide instead of trials.
+        deflate: level and library of DEFLATE; at the lowest level the entropies decide instead of trials.
     """
-    if coding.level > _QUICK_LEVEL:
-        return min(unsigned_stream(values, coding), unsigned_stream(values, coding, signed_delta=True), key=len)
+    if deflate.level > _FASTEST_LEVEL:
+        return min(unsigned_stream(values, deflate), unsigned_stream(values, deflate, signed_delta=True), key=len)
     low = values.astype(np.uint8)
     differences = np.diff(low)  # modulo 256; a zigzag renames symbols and does not change the entropy
-    return unsigned_stream(values, coding, signed_delta=_entropy(differences) < _entropy(low))
+    return unsigned_stream(values, deflate, signed_delta=_entropy(differences) < _entropy(low))
 
 
-def signed_stream(values: Integers, coding: Coding) -> bytes:
+def signed_stream(values: Integers, deflate: DeflateSettings) -> bytes:
     """Write a stream of signed integers, zigzagged.
 
     Args:
         values: [n], n >= 1, signed integers of at most 32 bits.
-        coding: level and library of DEFLATE.
+        deflate: level and library of DEFLATE.
     """
     folded = _zigzag(values)
-    return _finish(folded, _width(int(folded.max())), (_spec.TRANSFORM_ZIGZAG,), coding)
+    return _make_stream(folded, _width(int(folded.max())), (_spec.TRANSFORM_ZIGZAG,), deflate)
 
 
 def deflate_library(wanted: str) -> str:
@@ -132,18 +133,18 @@ def _zigzag(values: Integers) -> Integers:
     return ((values << 1) ^ (values >> (bits - 1))).view(f"u{values.itemsize}")
 
 
-def _finish(values: Integers, width: int, transforms: tuple[int, ...], coding: Coding) -> bytes:
+def _make_stream(values: Integers, width: int, transforms: tuple[int, ...], deflate: DeflateSettings) -> bytes:
     """Cut into byte planes, choose the coder, and put the head before the bytes."""
     steps = [step for step in transforms if step != _spec.TRANSFORM_NONE]
     if width > 1:
         steps.append(_spec.TRANSFORM_BYTE_PLANES)
     planes = _byte_planes(values, width)
-    runs = _run_length(planes, _LONG_RUN if coding.level <= _QUICK_LEVEL else _SHORT_RUN)
+    runs = _run_length(planes, _LONG_RUN if deflate.level <= _FASTEST_LEVEL else _SHORT_RUN)
     packed = planes
-    if runs is not None and _is_smaller(runs, planes, coding):
+    if runs is not None and _is_smaller(runs, planes, deflate):
         packed = runs
         steps.append(_spec.TRANSFORM_RUN_LENGTH)
-    coder, coded = _code(packed, coding)
+    coder, coded = _code(packed, deflate)
     head = _spec.StreamHead(
         width=width,
         coder=coder,
@@ -156,9 +157,9 @@ def _finish(values: Integers, width: int, transforms: tuple[int, ...], coding: C
     return _spec.pack_stream_head(head) + coded
 
 
-def _is_smaller(runs: NDArray[np.uint8], planes: NDArray[np.uint8], coding: Coding) -> bool:
+def _is_smaller(runs: NDArray[np.uint8], planes: NDArray[np.uint8], deflate: DeflateSettings) -> bool:
     """Return True if runs compress to at most `_GAIN` of the planes they replace, by a quick trial to save time."""
-    trial = replace(coding, level=min(coding.level, _TRIAL_LEVEL))
+    trial = replace(deflate, level=min(deflate.level, _TRIAL_LEVEL))
     return len(_code(runs, trial)[1]) <= _GAIN * len(_code(planes, trial)[1])
 
 
@@ -192,24 +193,24 @@ def _run_length(data: NDArray[np.uint8], least: float) -> NDArray[np.uint8] | No
     return np.concatenate([values, sizes.astype(np.uint8), (sizes >> 8).astype(np.uint8)])
 
 
-def _code(packed: NDArray[np.uint8], coding: Coding) -> tuple[int, bytes]:
+def _code(packed: NDArray[np.uint8], deflate: DeflateSettings) -> tuple[int, bytes]:
     """Return the coder with the fewest bytes, and the bytes."""
     raw = packed.tobytes()
     best, coded = _spec.CODER_STORED, raw
     if len(raw) > 3:
-        deflated = _deflate(raw, coding)
+        deflated = _deflate(raw, deflate)
         if len(deflated) < len(coded):
             best, coded = _spec.CODER_DEFLATE, deflated
     return best, coded
 
 
-def _deflate(raw: bytes, coding: Coding) -> bytes:
-    if coding.library == "zlib":
-        return _zlib(raw, min(coding.level, 9), zlib.Z_DEFAULT_STRATEGY)
-    if coding.level <= _QUICK_LEVEL:
+def _deflate(raw: bytes, deflate: DeflateSettings) -> bytes:
+    if deflate.library == "zlib":
+        return _zlib(raw, min(deflate.level, 9), zlib.Z_DEFAULT_STRATEGY)
+    if deflate.level <= _FASTEST_LEVEL:
         return _quickest(raw)
     # If nothing but runs repeats, matches that libdeflate finds by chance cost more than they save.
-    return min(_libdeflate(raw, coding.level), *(way(raw) for way in _WITHOUT_MATCHES), key=len)
+    return min(_libdeflate(raw, deflate.level), *(way(raw) for way in _WITHOUT_MATCHES), key=len)
 
 
 def _quickest(raw: bytes) -> bytes:
@@ -236,3 +237,131 @@ _WITHOUT_MATCHES: tuple[Callable[[bytes], bytes], ...] = (
     lambda data: _zlib(data, 1, zlib.Z_RLE),
     lambda data: _zlib(data, 1, zlib.Z_HUFFMAN_ONLY),
 )
+
+
+_MOSTLY = 0.9  # share of the splats from which on a mask is not worth the time that it takes decoders
+
+
+def levels_block(q: Integers, deflate: DeflateSettings) -> bytes:
+    """Opacities, LEVELS: q [n], 0 to M."""
+    return _block_head(_spec.ATTRIBUTE_OPACITIES, _spec.CODING_LEVELS) + unsigned_stream(q, deflate)
+
+
+def morton_block(codes: I64, bits: int, deflate: DeflateSettings) -> bytes:
+    """Means, MORTON: codes [n], ascending, below 2**(3·bits)."""
+    params = _spec.pack_morton_params(_spec.MortonParams(bits, 0, 0))
+    head = _block_head(_spec.ATTRIBUTE_MEANS, _spec.CODING_MORTON)
+    return head + params + unsigned_stream(codes, deflate, delta=True)
+
+
+def axis_block(q: Integers, deflate: DeflateSettings) -> bytes:
+    """Means, AXIS: q [3, n], 0 to 2**24 - 1, any order."""
+    stream = unsigned_stream(q.reshape(-1), deflate, signed_delta=True)
+    return _block_head(_spec.ATTRIBUTE_MEANS, _spec.CODING_AXIS) + stream
+
+
+def offset_block(attribute: int, integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
+    """OFFSET: integers [C, n], any sign, at most 2**32 - 1 apart in each column."""
+    return _block_head(attribute, _spec.CODING_OFFSET) + _code_offsets(integers, exponent, deflate)
+
+
+def signed_block(attribute: int, integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
+    """SIGNED: integers [C, n] of at most 32 bits."""
+    head = _block_head(attribute, _spec.CODING_SIGNED) + _spec.pack_lattice_params(_spec.LatticeParams(exponent, 0))
+    return head + signed_stream(np.ascontiguousarray(integers).reshape(-1), deflate)
+
+
+def sparse_block(attribute: int, integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
+    """SPARSE: integers [C, n] of at most 32 bits, not all of them 0."""
+    has = integers.any(axis=0)
+    params = _spec.SparseParams(exponent, 0, int(np.count_nonzero(has)))
+    mask = unsigned_stream(np.packbits(has, bitorder="little"), deflate, fixed_width=1)
+    head = _block_head(attribute, _spec.CODING_SPARSE) + _spec.pack_sparse_params(params)
+    return head + mask + signed_stream(np.ascontiguousarray(integers[:, has]).reshape(-1), deflate)
+
+
+def signed_or_sparse_block(attribute: int, integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
+    """SIGNED or SPARSE, whichever is smaller: integers [C, n] of at most 32 bits, not all of them 0."""
+    plain = signed_block(attribute, integers, exponent, deflate)
+    if np.count_nonzero(integers.any(axis=0)) > _MOSTLY * integers.shape[1]:
+        return plain
+    sparse = sparse_block(attribute, integers, exponent, deflate)
+    return sparse if len(sparse) < len(plain) else plain
+
+
+def codebook_block(
+    attribute: int,
+    codebook_id: int,
+    index: Integers | None,
+    escape_count: int,
+    escape: bytes,
+    deflate: DeflateSettings,
+    summand: Integers | None = None,
+) -> bytes:
+    """CODEBOOK.
+
+    Args:
+        attribute: registry id.
+        codebook_id: which codebook.
+        index: [n]; none for blocks that use that of the codebook's first block.
+        escape_count: splats with the index "escaped".
+        escape: their block, empty where there are none.
+        deflate: how to code the index.
+        summand: [n], for scales of the kind SHAPE: what is added to all three.
+    """
+    params = _spec.pack_codebook_params(_spec.CodebookParams(codebook_id, 0, escape_count))
+    streams = b"" if index is None else unsigned_stream(index, deflate)
+    if summand is not None:
+        streams += _code_offsets(summand[None], 0, deflate)
+    return _block_head(attribute, _spec.CODING_CODEBOOK) + params + streams + escape
+
+
+def raw_block(column: int, values: NDArray[Any], deflate: DeflateSettings) -> bytes:
+    """RAW: the bits of an extra column's values [n]."""
+    bits = np.ascontiguousarray(values, values.dtype.newbyteorder("<")).view(f"<u{values.itemsize}")
+    params = _spec.pack_raw_params(_spec.RawParams(column, 0))
+    stream = unsigned_stream(bits, deflate, fixed_width=values.itemsize)
+    return _block_head(_spec.ATTRIBUTE_EXTRA, _spec.CODING_RAW) + params + stream
+
+
+def _code_offsets(integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
+    offsets = integers.min(axis=1).astype("<i4")
+    elements = integers - offsets.astype(integers.dtype)[:, None]
+    stored: bytes = _spec.pack_lattice_params(_spec.LatticeParams(exponent, 0)) + offsets.tobytes()
+    return stored + smooth_stream(elements.reshape(-1), deflate)
+
+
+def _block_head(attribute: int, deflate: int) -> bytes:
+    return _spec.pack_block_head(_spec.BlockHead(attribute, deflate, 0))
+
+
+_SPREAD = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+
+
+def morton_codes(q: NDArray[Any]) -> NDArray[np.int64]:
+    """Interleave the bits of three axes: bit 3·b + a of a code is bit b of axis a (spec 6.4.2).
+
+    Args:
+        q: [3, n] integers, 0 to 2**21 - 1.
+
+    Returns:
+        [n] int64.
+    """
+    codes = np.zeros(q.shape[1], np.int64)
+    spread = np.empty(q.shape[1], np.int64)
+    shifted = np.empty_like(spread)
+    for axis in range(3):
+        np.copyto(spread, q[axis], casting="unsafe")
+        for shift, mask in _SPREAD:
+            np.left_shift(spread, shift, out=shifted)
+            np.bitwise_or(spread, shifted, out=spread)
+            np.bitwise_and(spread, mask, out=spread)
+        np.left_shift(spread, axis, out=spread)
+        np.bitwise_or(codes, spread, out=codes)
+    return codes

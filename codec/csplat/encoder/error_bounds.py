@@ -37,7 +37,7 @@ class ErrorSums:
         count = max(1, self.count)
         return {name: (self.largest[name], float(np.sqrt(self.squares[name] / count))) for name in self.largest}
 
-    def stated(self) -> dict[str, tuple[float, float]]:
+    def declared(self) -> dict[str, tuple[float, float]]:
         """Return `bounds()` a hair wider: whoever checks them may round in another order (spec SER-5).
 
         Raises:
@@ -65,7 +65,7 @@ class ErrorSums:
         return ErrorSums(count, largest, squares)
 
 
-def true_means(model: SplatModel, rows: NDArray[Any]) -> Floats:
+def take_precise_means(model: SplatModel, rows: NDArray[Any]) -> Floats:
     """Return the centres of some splats relative to the origin, [n, 3]: float64 where the model has doubles."""
     if model.means_double is None:
         return np.take(model.means, rows, axis=0)
@@ -164,7 +164,7 @@ def measured_sums(source: SplatModel, decoded: SplatModel, source_index: NDArray
 
 def _errors_of_rows(source: SplatModel, decoded: SplatModel, rows: NDArray[Any], part: slice) -> ErrorSums:
     pairs = {
-        "means": distance_errors(true_means(source, rows).T, decoded.means[part].T),
+        "means": distance_errors(take_precise_means(source, rows).T, decoded.means[part].T),
         "covariance": covariance_errors(
             source.quats[rows].T, source.scales[rows].T, decoded.quats[part].T, decoded.scales[part].T
         ),

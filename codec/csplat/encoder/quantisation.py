@@ -1,17 +1,16 @@
-"""Values to lattice integers, and back as the decoder will see them (spec 7).
-
-Arrays are in columns, [C, n]: what the streams want, and what keeps NumPy's inner loops long.
-"""
+"""Values to lattice integers, and back as a decoder reconstructs them (spec 7)."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.encoder.coding_parameters import CodingParameters
 from csplat.errors import InputError
 from csplat.types import F32, I32, I64
 
@@ -147,14 +146,14 @@ def colour_integers(rgb: Floats, shift: int, coarse: I32 | None = None) -> Integ
     r, g, b = rgb.astype(np.float64) if wide else rgb
     kind = np.int64 if wide else np.int32
     real = r.dtype.type
-    co = _round((r - b) * real(0.5**shift), kind, coarse)
-    cg = _round((g - (r + b) * real(0.5)) * real(0.5**shift), kind, coarse)
+    co = _round_multiples((r - b) * real(0.5**shift), kind, coarse)
+    cg = _round_multiples((g - (r + b) * real(0.5)) * real(0.5**shift), kind, coarse)
     full_co, full_cg = co << shift, cg << shift
     rest = r + g + b
     rest -= full_cg + full_co - 2 * (full_co >> 1)
     rest /= real(3)
     rest += full_cg >> 1
-    return np.stack([_round(rest, kind, coarse), co, cg])
+    return np.stack([_round_multiples(rest, kind, coarse), co, cg])
 
 
 def colour_lifted(columns: Integers, shift: int) -> Integers:
@@ -166,7 +165,7 @@ def colour_lifted(columns: Integers, shift: int) -> Integers:
     return np.stack([b + co, cg + t, b])
 
 
-def _round(values: Floats, kind: type[np.signedinteger[Any]], coarse: I32 | None = None) -> Integers:
+def _round_multiples(values: Floats, kind: type[np.signedinteger[Any]], coarse: I32 | None = None) -> Integers:
     if coarse is None:
         result: Integers = np.rint(values).astype(kind)
         return result
@@ -178,3 +177,115 @@ def check_finite(name: str, values: F32) -> None:
     """Refuse what no lattice integer can bring back into float32."""
     if not np.isfinite(values).all():
         raise InputError(f"{name} too large to quantise: values at the end of float32's range")
+
+
+@dataclass(frozen=True)
+class QuantisedColour:
+    """Colours on a lattice: Y, Co, Cg columns, the tile's exponent, and what the decoder will see."""
+
+    columns: Integers
+    exponent: int
+    decoded: F32
+
+
+def quantise_colour(rgb: F32, step: float, shift: int, coarse: int = 0) -> QuantisedColour:
+    """Quantise colours [3, ..., n] on the lattice of `step` times 2**coarse, or a coarser one that holds them."""
+    exponent = max(coarse, lattice_exponent(2.0 * float(np.abs(rgb).max(initial=0.0)), step))
+    tile_step = lattice_step(step, exponent)
+    real = np.float32 if exponent == 0 else np.float64
+    columns = colour_integers(rgb * real(1.0 / tile_step), shift)
+    return QuantisedColour(columns, exponent, lattice_values(colour_lifted(columns, shift), tile_step))
+
+
+def quantise_sh(source: F32, parameters: CodingParameters, coarse: I32 | None) -> tuple[Integers, int, F32]:
+    """Quantise SH on the plan's lattice, splat by splat.
+
+    Args:
+        source: [n, K, 3] float32.
+        parameters: step and chroma shift.
+        coarse: [n], as in `colour_integers`, or None.
+
+    Returns:
+        Columns [3, K, n], as narrow as they may be; the tile's exponent; [n, K, 3] float32 as decoded.
+    """
+    n, coefficients, _ = source.shape
+    largest = max(abs(float(source.max(initial=0.0))), abs(float(source.min(initial=0.0))))
+    exponent = lattice_exponent(2.0 * largest, parameters.sh_step)
+    step = lattice_step(parameters.sh_step, exponent)
+    coarsest = 0 if coarse is None else int(coarse.max(initial=0))
+    columns = np.empty((3, coefficients, n), _narrowest(2.0 * largest / step + 1.0 + 2.0**coarsest))
+    decoded = np.empty(source.shape, np.float32)
+    real = np.float32 if exponent == 0 else np.float64
+    for at in range(0, n, _ROWS):
+        part = slice(at, at + _ROWS)
+        rgb = np.ascontiguousarray(source[part].transpose(2, 1, 0))
+        some = None if coarse is None else coarse[part]
+        quantised = colour_integers(rgb * real(1.0 / step), parameters.chroma_shift, some)
+        columns[:, :, part] = quantised
+        decoded[part] = lattice_values(colour_lifted(quantised, parameters.chroma_shift), step).transpose(2, 1, 0)
+    check_finite("shN", decoded)
+    return columns, exponent, decoded
+
+
+def _narrowest(largest: float) -> type[np.signedinteger[Any]]:
+    return np.int8 if largest < 127 else np.int16 if largest < 32767 else np.int32
+
+
+_ROWS = 2048  # splats at a time: rows of 45 floats and their columns stay in the second-level cache
+
+
+Columns = tuple[F32, F32, F32, F32]
+
+
+def canonicalise_shape(quats: F32, scales: F32) -> tuple[F32, F32]:
+    """Sort the scales descending and make w the largest component of the rotation.
+
+    Args:
+        quats: [n, 4] float32, w x y z, unit length within 1e-3.
+        scales: [n, 3] float32, log standard deviations.
+
+    Returns:
+        [4, n] float32 rotation in columns, unit length, w >= |x|, |y|, |z|; [3, n] float32 scales in columns.
+        The covariance of each splat is that of the arguments.
+    """
+    w, x, y, z = (np.ascontiguousarray(quats[:, i]) for i in range(4))
+    a, b, c = (np.ascontiguousarray(scales[:, i]) for i in range(3))
+    # Half turns about (x+y), (y+z), (x+y) exchange two axes and keep the rotation proper. Right products with
+    # (0, 1, 1, 0) and (0, 0, 1, 1); their length, sqrt 2 each, is taken out by the last normalisation.
+    for axes in ((0, 1), (1, 2), (0, 1)):
+        first, second = (a, b) if axes == (0, 1) else (b, c)
+        swap = first < second
+        low, high = np.minimum(first, second), np.maximum(first, second)
+        if axes == (0, 1):
+            a, b = high, low
+            turned = (-(x + y), w - z, w + z, x - y)
+        else:
+            b, c = high, low
+            turned = (-(y + z), y - z, w - x, w + x)
+        w, x, y, z = _exchange_axes(swap, turned, (w, x, y, z))
+    w, x, y, z = _largest_component_first(w, x, y, z)
+    length = np.sqrt(w * w + x * x + y * y + z * z)
+    np.copysign(length, w, out=length)
+    rotation = np.stack([w, x, y, z])
+    rotation /= length
+    return rotation, np.stack([a, b, c])
+
+
+def _exchange_axes(swap: NDArray[np.bool_], turned: Columns, kept: Columns) -> Columns:
+    """The turned rotation, at unit length, where axes are exchanged, and the one that was elsewhere."""
+    root = np.float32(np.sqrt(0.5))
+    w, x, y, z = (np.where(swap, new * root, old) for new, old in zip(turned, kept, strict=True))
+    return w, x, y, z
+
+
+def _largest_component_first(w: F32, x: F32, y: F32, z: F32) -> Columns:
+    """Multiply from the right by 1, i, j or k so that the component of largest magnitude becomes w."""
+    aw, ax, ay, az = np.abs(w), np.abs(x), np.abs(y), np.abs(z)
+    x_leads = ax > np.maximum(aw, np.maximum(ay, az))
+    y_leads = ~x_leads & (ay > np.maximum(aw, az))
+    z_leads = ~x_leads & ~y_leads & (az > aw)
+    flat = np.where(x_leads, -x, np.where(y_leads, -y, np.where(z_leads, -z, w)))
+    new_x = np.where(x_leads, w, np.where(y_leads, -z, np.where(z_leads, y, x)))
+    new_y = np.where(x_leads, z, np.where(y_leads, w, np.where(z_leads, -x, y)))
+    new_z = np.where(x_leads, -y, np.where(y_leads, x, np.where(z_leads, w, z)))
+    return flat, new_x, new_y, new_z

@@ -1,0 +1,362 @@
+"""Lattice steps, levels and codings of a file, chosen from the options and the scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.encoder.encode_options import PRESETS, EncodeOptions
+from csplat.encoder.entropy import DeflateSettings, deflate_library, morton_codes
+from csplat.model import SplatModel
+from csplat.types import F32
+
+_EXTENT_SAMPLE = 1 << 16  # splats from which sizes and extents are estimated
+_EDGE = 0.02  # share of splats on either side that does not count as the scene's extent
+_MOST_BITS = 16  # per axis of a tile
+_LEAST_STEP = 1e-250
+_LOOK = 1024  # splats of which few scenes pass for multiples of a power of two
+_FINER = 0.8  # of a step: how fine the source's grid may be, and be worth its bits
+_HALF_DIAGONAL = 3.0**0.5 / 2.0  # of a lattice cell, in steps: no centre is moved farther
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """The positions' lattice.
+
+    Attributes:
+        step: of the file, scene units, > 0.
+        bits: per axis and tile at most, 1 to 16; a tile whose box needs more is cut or coarsened.
+        finest: tiles use all their bits (a step given in bits) instead of stopping at `step`.
+        strict: no tile has a coarser step, however many tiles that takes.
+    """
+
+    step: float
+    bits: int
+    finest: bool = False
+    strict: bool = False
+
+
+@dataclass(frozen=True)
+class StepFactors:
+    """By how much the steps of a tile's attributes are coarser than the file's, by choice (grades.py).
+
+    Attributes:
+        opacities, quats: integers are multiples of this, >= 1.
+        scales, means, sh0: the step is the file's times 2**this, >= 0.
+    """
+
+    opacities: int = 1
+    scales: int = 0
+    quats: int = 1
+    means: int = 0
+    sh0: int = 0
+
+
+SAME_STEPS = StepFactors()
+
+
+@dataclass(frozen=True)
+class CodingParameters:
+    """Everything that is decided before the first splat is quantised.
+
+    Attributes:
+        lattice: of the means.
+        morton: means are coded MORTON and splats are sorted; otherwise AXIS, in the model's order.
+        sh_degree: bands that are kept.
+        scale_step, sh0_step, sh_step: lattice steps, rounded to float32.
+        sh_coding: "auto", "codebook", "scalar" or "none"; the SH stage settles "auto".
+        codebook_step: lattice step of the bands 1 to 3 if they get a codebook, whose entries are worth more precision.
+        codebook_share: entries per splat.
+        codebook_most: entries at most.
+        escape_fraction: share of the splats that are coded directly.
+        escape_coarse: their values are multiples of 2**escape_coarse steps.
+        deflate: how streams are coded.
+        canonical: rotations and scales are in their gauge, and are to stay as they are, though they may have left it a
+            little: the integers that the tuning of a frozen scene saw are those that are written.
+    """
+
+    lattice: Lattice
+    morton: bool
+    scale_step: float
+    opacity_levels: int
+    quat_levels: int
+    sh0_step: float
+    sh_step: float
+    chroma_shift: int
+    sh_degree: int
+    codebook_step: float
+    codebook_share: float
+    codebook_most: int
+    escape_fraction: float
+    escape_coarse: int
+    sh_coding: str
+    adaptive: float
+    tile_splats: int
+    deflate: DeflateSettings
+    canonical: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("scale_step", "sh0_step", "sh_step", "codebook_step"):  # ATT-10: "a binary32 value"
+            object.__setattr__(self, name, float(np.float32(getattr(self, name))))
+
+    @property
+    def sh_coefficients(self) -> int:
+        """Coefficients of the bands 1 to `sh_degree`."""
+        return (self.sh_degree + 1) ** 2 - 1
+
+    def attribute_records(self) -> list[_spec.AttributeRecord]:
+        """Return the file's attribute records (spec 4.3.1)."""
+        lattice, ycocg = _spec.MAPPING_LATTICE, _spec.MAPPING_YCOCG
+        levels = self.opacity_levels, self.quat_levels
+        shift = self.chroma_shift
+        records = [
+            _spec.AttributeRecord(_spec.ATTRIBUTE_OPACITIES, _spec.MAPPING_SQUARE, 0, 0, levels[0], 0.0),
+            _spec.AttributeRecord(_spec.ATTRIBUTE_SCALES, lattice, 0, 0, 0, self.scale_step),
+            _spec.AttributeRecord(_spec.ATTRIBUTE_QUATS, _spec.MAPPING_UNIT_W, 0, 0, levels[1], 0.0),
+            _spec.AttributeRecord(_spec.ATTRIBUTE_MEANS, lattice, 0, 0, 0, self.lattice.step),
+            _spec.AttributeRecord(_spec.ATTRIBUTE_SH0, ycocg, shift, 0, 0, self.sh0_step),
+        ]
+        for band in range(1, self.sh_degree + 1):
+            attribute = _spec.ATTRIBUTE_SH0 + band
+            records.append(_spec.AttributeRecord(attribute, ycocg, shift, 0, 0, self.sh_step))
+        return records
+
+
+def band_slice(band: int) -> slice:
+    """Return the coefficients of an SH band among those of the bands 1 to 3."""
+    return slice(band * band - 1, (band + 1) ** 2 - 1)
+
+
+def choose_parameters(
+    model: SplatModel, options: EncodeOptions, *, importance_given: bool, contrast: float | None = None
+) -> CodingParameters:
+    """Resolve options, preset and scene, of which `contrast` may be known, into a plan."""
+    preset = PRESETS[options.preset]
+    degree = model.sh_degree if options.sh_degree is None else min(options.sh_degree, model.sh_degree)
+    if options.sh_coding == "none":
+        degree = 0
+    sh_coding = preset.sh_coding if options.sh_coding == "auto" else options.sh_coding
+    quality = preset.quality[0 if degree else 1]
+    sh_quality = preset.sh_quality
+    if options.attribute_psnr is not None:
+        quality, sh_quality = options.attribute_psnr, options.attribute_psnr + preset.sh_quality - preset.quality[0]
+    statistics = scene_statistics(model, contrast)
+    steps = _steps(statistics, quality, sh_quality, has_sh=degree > 0)
+    return CodingParameters(
+        lattice=_lattice(model, options, steps.means),
+        morton=options.means_coding != "axis",
+        scale_step=_default_to(options.scale_step, _source_step(model.scales, steps.scales)),
+        opacity_levels=_default_to(options.opacity_levels, steps.opacity_levels),
+        quat_levels=_default_to(options.quat_levels, steps.quat_levels),
+        sh0_step=_default_to(options.sh0_step, steps.sh0),
+        sh_step=_default_to(options.sh_step, steps.sh),
+        codebook_step=_default_to(options.sh_step, steps.sh / 2**preset.codebook_finer),
+        codebook_share=preset.codebook_share,
+        codebook_most=preset.codebook_most,
+        escape_fraction=preset.escape_fraction,
+        escape_coarse=0 if options.sh_step else preset.codebook_finer,
+        chroma_shift=_default_to(options.chroma_shift, 1),
+        sh_degree=degree,
+        sh_coding=sh_coding if degree else "none",
+        adaptive=_default_to(options.adaptive, preset.adaptive if importance_given else 0.0),
+        tile_splats=options.tile_splats,
+        deflate=DeflateSettings(
+            level=_default_to(options.deflate_level, preset.deflate_level),
+            library=deflate_library(options.deflate),
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class _AttributeSteps:
+    """Lattice steps and level counts; `means` is 0 where the scene has no extent."""
+
+    means: float
+    scales: float
+    opacity_levels: int
+    quat_levels: int
+    sh0: float
+    sh: float
+
+
+def _steps(statistics: SceneStatistics, quality: float, sh_quality: float, *, has_sh: bool) -> _AttributeSteps:
+    """Choose the steps at which each attribute alone costs about `quality` dB.
+
+    The factors are the medians over ten scenes of the step that costs 50 dB, divided by the scene's statistics; a
+    quarter to a third of spread remains (2 to 3 dB). Bits are spent best where every dimension errs alike; the
+    differences of quality between attributes are where that was found to lie, with and without SH.
+    """
+    contrast = statistics.contrast
+    for_quats, for_sh0 = (0.0, -2.0) if has_sh else (-1.5, 2.5)
+
+    def coarse(decibels: float) -> float:
+        return float(10.0 ** ((50.0 - decibels) / 20.0))
+
+    opacities = contrast / (0.012 * coarse(quality + for_quats))
+    quats = contrast * statistics.size**0.75 * 2090.0 / coarse(quality + for_quats)
+    return _AttributeSteps(
+        means=2.2e-4 * coarse(quality) * statistics.reach / contrast,
+        scales=min(0.5, 0.04 * coarse(quality) / contrast),
+        opacity_levels=int(np.clip(np.ceil(opacities), 8, 255)),
+        quat_levels=int(np.clip(np.ceil(quats), 8, 255)),
+        sh0=0.07 * coarse(quality + for_sh0),
+        sh=0.0135 * coarse(sh_quality),
+    )
+
+
+def _default_to(chosen: Any, otherwise: Any) -> Any:
+    return otherwise if chosen is None else chosen
+
+
+def _lattice(model: SplatModel, options: EncodeOptions, wanted: float) -> Lattice:
+    """Choose the means' step: given, from an error, from bits over the core of the scene, or by the quality."""
+    if options.position_error is not None:
+        return Lattice(options.position_error / _HALF_DIAGONAL, _MOST_BITS, strict=True)
+    if options.position_step is not None:
+        return Lattice(options.position_step, _MOST_BITS)
+    if len(model) == 0:
+        return Lattice(1.0, _MOST_BITS)
+    rows = slice(None, None, max(1, len(model) // _EXTENT_SAMPLE))
+    points = np.sort(model.means[rows].astype(np.float64), axis=0)
+    edge = int(len(points) * _EDGE)
+    core = points[[edge, len(points) - 1 - edge]]
+    extent = float((core[1] - core[0]).max()) or float((points[-1] - points[0]).max())
+    reach = float(np.abs(core).max())
+    if options.position_bits is not None:
+        return Lattice(_clamp_step(extent / ((1 << options.position_bits) - 2), reach), options.position_bits, True)
+    step = _source_step(model.means, wanted or extent / (1 << _MOST_BITS))
+    return Lattice(_clamp_step(step, reach), _MOST_BITS)
+
+
+def _source_step(values: F32, step: float) -> float:
+    """Return the grid that the values lie on, where none finer is wanted: they come back as they were, in fewer bits.
+
+    Centres and log scales of SPZ, and of what was SPZ once, are multiples of a power of two.
+    """
+    if not (step > _LEAST_STEP and values.any()):
+        return step
+    grid = 2.0 ** math.ceil(math.log2(_FINER * step))
+    if not (_on_grid(values[:_LOOK], grid) and _on_grid(values, grid)):
+        return step
+    while _on_grid(values, 2.0 * grid):
+        grid *= 2.0
+    return grid
+
+
+def _on_grid(values: F32, grid: float) -> bool:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return not np.fmod(values, np.float32(grid)).any()
+
+
+def _clamp_step(step: float, reach: float) -> float:
+    """Keep the step normal, and no finer than float32 is at the end of the scene's core."""
+    step = max(step, reach * 2.0**-40)
+    return step if np.isfinite(step) and step > _LEAST_STEP else 1.0
+
+
+#: A channel's colour per coefficient of degree 0.
+COLOUR_PER_SH0 = 0.28209479177387814
+
+_STATISTICS_SAMPLE = 1 << 16  # splats that are sampled
+_RUNS = 16  # runs of neighbours among the sampled splats
+_NEIGHBOUR_DISTANCE = 8  # places in Morton order
+_CORE = 0.8  # share of the splats within the scene's reach
+_BITS = 16
+_LARGEST = 1e38  # largest cells per scene unit, within float32
+
+
+@dataclass(frozen=True)
+class SceneStatistics:
+    """Three numbers of a scene.
+
+    Attributes:
+        reach: distance from the median centre that 80 % of the splats keep, scene units, >= 0.
+        contrast: rms difference of colours of near splats, weighted with their opacities, in [0.02, 1].
+        size: median of the largest standard deviation, as a share of the reach, in [1e-4, 1].
+    """
+
+    reach: float
+    contrast: float
+    size: float
+
+
+def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneStatistics:
+    """Look at a sample of a scene; the same model gives the same numbers.
+
+    Args:
+        model: the scene.
+        contrast: as in `measure_contrast`, if the model is itself a sample, whose splats are no neighbours.
+    """
+    if len(model) == 0:
+        return SceneStatistics(0.0, 0.2, 0.01)
+    points, reach = _reach(model.means)
+    largest = np.take(model.scales, _spread(len(model)), axis=0).max(axis=1)
+    size = float(np.exp(np.clip(np.median(largest), -80, 80))) / reach if reach else 1.0
+    if contrast is None:
+        contrast = _rms(*_contrast(model, points, reach))
+    return SceneStatistics(reach, float(np.clip(contrast, 0.02, 1.0)), float(np.clip(size, 1e-4, 1.0)))
+
+
+def measure_contrast(parts: Iterable[SplatModel]) -> float:
+    """Contrast of a scene of which these are parts, each with all splats of its place."""
+    sums = [_contrast(part, *_reach(part.means)) for part in parts if len(part)]
+    return _rms(sum(squares for squares, _ in sums), sum(weights for _, weights in sums))
+
+
+def _spread(count: int) -> NDArray[np.intp]:
+    return np.arange(0, count, max(1, count // _STATISTICS_SAMPLE))
+
+
+def _reach(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
+    """The centres that are looked at, and how far 80 % of them lie from the median one."""
+    points = np.take(means, _spread(len(means)), axis=0).astype(np.float64)
+    distance = points - np.median(points, axis=0)
+    top = float(np.abs(distance).max())
+    return points, top and top * float(np.quantile(np.sqrt(np.square(distance / top).sum(axis=1)), _CORE))
+
+
+def _rms(squares: float, weights: float) -> float:
+    return COLOUR_PER_SH0 * float(np.sqrt(squares / weights)) if weights else 0.2
+
+
+def _contrast(model: SplatModel, sample: NDArray[np.float64], reach: float) -> tuple[float, float]:
+    """Return the summed weighted squares of colour differences of splats a few places apart in Morton order."""
+    squares = weights = 0.0
+    if len(model) <= _NEIGHBOUR_DISTANCE or not reach:
+        return squares, weights
+    for rows in _neighbours(model.means, np.median(sample, axis=0), 2.0 * reach):
+        near, far = rows[:-_NEIGHBOUR_DISTANCE], rows[_NEIGHBOUR_DISTANCE:]
+        weight = model.opacities[near].astype(np.float64) * model.opacities[far]
+        colour = np.clip(model.sh0[near].astype(np.float64) - model.sh0[far], -10, 10)
+        squares += float((np.square(colour).mean(axis=1) * weight).sum())
+        weights += float(weight.sum())
+    return squares, weights
+
+
+def _neighbours(means: NDArray[np.float32], centre: NDArray[Any], reach: float) -> list[NDArray[np.intp]]:
+    """Return runs of splats in Morton order: all of a small scene, some of a large one."""
+    codes = np.empty(len(means), np.int64)
+    scale, top = np.float32(min(1.0 / reach, _LARGEST)), (1 << _BITS) - 1
+    shift = np.float32(0.5) - (centre / reach).astype(np.float32)
+    for at in range(0, len(means), _STATISTICS_SAMPLE):
+        with np.errstate(over="ignore"):  # infinity is clipped like all that is out of reach
+            place = means[at : at + _STATISTICS_SAMPLE].T * scale + shift[:, None]
+        codes[at : at + _STATISTICS_SAMPLE] = morton_codes((np.clip(place, 0, 1) * top).astype(np.int32))
+    if len(means) <= 2 * _STATISTICS_SAMPLE:
+        return [np.argsort(codes, kind="stable")]
+    bounds = np.sort(codes[:: len(codes) // _STATISTICS_SAMPLE])
+    length = len(bounds) // _RUNS
+    share = max(1, length * _STATISTICS_SAMPLE // len(means))
+    runs = []
+    for run in range(_RUNS):
+        first, last = bounds[run * length], bounds[min(run * length + share, len(bounds) - 1)]
+        rows = np.flatnonzero((codes >= first) & (codes <= last))
+        if len(rows) > _NEIGHBOUR_DISTANCE:
+            runs.append(rows[np.argsort(codes[rows], kind="stable")])
+    return runs

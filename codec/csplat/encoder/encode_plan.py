@@ -1,0 +1,263 @@
+"""The plan of a file: steps, quantisation classes, tiles and shape codebook are chosen, colours may still change.
+
+    plan = EncodePlan.of(model, options)
+    plan = plan.with_colours(*fit_colours(plan.scene))  # optional
+    encoded = encode_tiles(plan)
+    encoded.write({"fitted": {"psnr": measure(encoded.write().data)}})
+
+The encoder has no renderer. A caller that has one renders `EncodePlan.scene` before colours are encoded, and the file
+before it records its own PSNR. A caller that tunes all values uses `fix_quantisation` instead of `encode_tiles`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.encoder.coding_parameters import CodingParameters, choose_parameters, measure_contrast
+from csplat.encoder.encode_options import EncodeOptions
+from csplat.encoder.error_bounds import SCALE_MOST
+from csplat.encoder.quantisation_classes import QuantisationClasses, choose_classes
+from csplat.encoder.sh_codebook import (
+    FileCodebooks,
+    ShBook,
+    assign_splats,
+    choose_sh_coding,
+    final_parameters,
+    largest_sh,
+)
+from csplat.encoder.shape_codebook import ShapeTables, choose_shapes, dequantised_shapes
+from csplat.encoder.tiling import (
+    BUCKET_SPLATS,
+    TileSplats,
+    bucket_rows,
+    contrast_buckets,
+    cut_scene,
+    dequantised_means,
+    dequantised_opacities,
+    sample_rows,
+)
+from csplat.encoder.weights import Importance, checked_blocks, sh_metric, shape_metric, shape_weights, splat_weights
+from csplat.errors import InputError
+from csplat.model import SplatModel, check_model
+from csplat.types import F32, I64, Progress, null_progress
+
+_EXTRA_COLUMNS_MAX = 255  # TLE-2: block_count is a byte
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """The source that a scene was derived from, by pruning or by changing values.
+
+    Attributes:
+        source_count: splats of the source.
+        source_index: [N] int64, index in the source of each splat.
+        refitted: colours differ from those of the source; the file declares no errors for them.
+        adjusted: opacities, rotations or scales differ too.
+    """
+
+    source_count: int
+    source_index: I64
+    refitted: bool = False
+    adjusted: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class EncodePlan:
+    """A scene, and the encoder's choices about its geometry.
+
+    Attributes:
+        model: the scene, with the colours to encode.
+        options: the caller's options.
+        origin: the source that the scene was derived from.
+        importance: importance of its splats for renders, if known.
+        parameters: steps and codings; that of SH may still be open.
+        tiles: rows of the model and steps, by tile.
+        extras: records of the extra columns to write.
+        shapes: the shape codebook, if there is one.
+        classes: quantisation classes of the splats, if there are several.
+        sample: for a scene of more than `BUCKET_SPLATS` splats of unknown importance: the plan of the sample that
+            choices are made on.
+        buckets: rows of each bucket of such a scene.
+    """
+
+    model: SplatModel
+    options: EncodeOptions
+    origin: Origin
+    importance: NDArray[Any] | Importance | None
+    parameters: CodingParameters
+    tiles: Sequence[TileSplats]
+    extras: Sequence[_spec.ExtraRecord]
+    shapes: ShapeTables | None
+    classes: QuantisationClasses | None
+    sample: EncodePlan | None = None
+    buckets: Sequence[NDArray[np.intp]] = ()
+
+    @classmethod
+    def of(
+        cls,
+        model: SplatModel,
+        options: EncodeOptions | None = None,
+        *,
+        importance: NDArray[Any] | Importance | None = None,
+        origin: Origin | None = None,
+        allow_classes: bool = True,
+        contrast: float | None = None,
+        progress: Progress | None = None,
+    ) -> EncodePlan:
+        """Plan the encoding of a scene.
+
+        Args:
+            model: the scene.
+            options: presets and knobs; the default preset is "balanced".
+            importance: [N] weights >= 0 of the splats, in place of opacity × projected size; or an `Importance`.
+            origin: the source that the scene was derived from; `None`: the scene itself.
+            allow_classes: allow several quantisation classes, if the importance has Gauss-Newton blocks.
+            contrast: contrast of the scene that the model is a sample of (`measure_contrast`).
+            progress: called with the stage and the fraction of it that is done, 0 to 1; from any thread.
+
+        Raises:
+            InputError: values that no lattice can hold, an option that the model does not allow, or an importance or
+                origin with another number of splats.
+        """
+        check_model("the encoder", model)
+        options = EncodeOptions() if options is None else options
+        if not isinstance(options, EncodeOptions):
+            raise InputError(f"options is {options!r}, wanted csplat.EncodeOptions(preset=...)")
+        origin = origin or Origin(len(model), np.arange(len(model)))
+        if len(origin.source_index) != len(model):
+            raise InputError(f"an origin of {len(origin.source_index)} splats, wanted {len(model)}")
+        model = clip_scales(model)
+        if len(model) > BUCKET_SPLATS and importance is None and not options.shape_codebook_size:
+            return cls._of_many(model, options, origin, progress)
+        parameters = choose_parameters(model, options, importance_given=importance is not None, contrast=contrast)
+        extras = extra_records(model, options)
+        blocks = checked_blocks(model, importance) if allow_classes else None
+        parameters, classes = choose_classes(model, blocks, parameters, options)
+        tiles = cut_scene(model, parameters, classes)
+        shapes = None
+        if options.shape_codebook_size and len(model):
+            weights = shape_weights(model, importance)
+            metric = shape_metric(weights, importance)
+            shapes = choose_shapes(model, weights, metric, tiles, parameters, options, progress or null_progress)
+        return cls(model, options, origin, importance, parameters, tiles, extras, shapes, classes)
+
+    @classmethod
+    def _of_many(
+        cls, model: SplatModel, options: EncodeOptions, origin: Origin, progress: Progress | None
+    ) -> EncodePlan:
+        buckets = bucket_rows(model.means)
+        contrast = measure_contrast(model.select(buckets[place]) for place in contrast_buckets(len(buckets)))
+        sample = cls.of(model.select(sample_rows(len(model))), options, contrast=contrast, progress=progress)
+        sample = replace(sample, parameters=final_parameters(sample.parameters, largest_sh(model.shN)))
+        tiles, extras = cut_scene(model, sample.parameters, buckets=buckets), extra_records(model, options)
+        return cls(model, options, origin, None, sample.parameters, tiles, extras, None, None, sample, buckets)
+
+    @cached_property
+    def scene(self) -> SplatModel:
+        """The scene with means, shapes and opacities as decoded, in the model's order, colours unchanged."""
+        model, tiles, parameters = self.model, self.tiles, self.parameters
+        quats, scales = dequantised_shapes(model.quats, model.scales, tiles, parameters, self.shapes)
+        return replace(
+            model,
+            means=dequantised_means(model.means, tiles, parameters),
+            quats=quats,
+            scales=scales,
+            opacities=dequantised_opacities(model.opacities, tiles, parameters),
+            means_double=None,
+        )
+
+    def with_colours(self, sh0: F32, shN: F32) -> EncodePlan:
+        """Return the plan with refitted colours.
+
+        Args:
+            sh0: [N, 3] float32.
+            shN: [N, K, 3] float32, of the model's SH degree.
+
+        Raises:
+            InputError: they have another shape or type, or are not finite.
+        """
+        model = replace(self.model, sh0=sh0, shN=shN)
+        rows = None if self.sample is None else sample_rows(len(model))
+        sample = None if self.sample is None else self.sample.with_colours(sh0[rows], shN[rows])
+        return replace(self, model=model, origin=replace(self.origin, refitted=True), sample=sample)
+
+    def choose_sh_coding(self, progress: Progress | None = None) -> tuple[CodingParameters, FileCodebooks]:
+        """Choose how SH is coded.
+
+        Returns:
+            The complete parameters, and the codebooks with the entry of each splat.
+        """
+        model, parameters, importance = self.model, self.parameters, self.importance
+        if self.sample is not None:
+            return self._assign_all(*self.sample.choose_sh_coding(progress))
+        uses_weights = parameters.adaptive > 0.0 or parameters.sh_coding in ("auto", "codebook")
+        weights = splat_weights(model, importance) if importance is not None or uses_weights else None
+        return choose_sh_coding(
+            model,
+            parameters,
+            self.options,
+            weights=weights,
+            metric=sh_metric(model, weights, importance),
+            measured=importance is not None,
+            trial=trial_rows(model, self.tiles, self.classes),
+            progress=progress or null_progress,
+        )
+
+    def _assign_all(
+        self, parameters: CodingParameters, codebooks: FileCodebooks
+    ) -> tuple[CodingParameters, FileCodebooks]:
+        """Apply the choices made on the sample to all splats."""
+        tables, count = codebooks.tables, len(self.model)
+        index = None if tables.book is None else np.empty(count, np.int32)
+        weights = None if tables.weights is None else np.empty(count, np.float32)
+        for rows in self.buckets if index is not None or weights is not None else ():
+            part = assign_splats(codebooks, self.model.select(rows), parameters, self.options.thread_count)
+            if weights is not None and part.weights is not None:
+                weights[rows] = part.weights
+            if index is not None and part.book is not None:
+                index[rows] = part.book.index
+        book = None if tables.book is None or index is None else ShBook(tables.book.entries, index)
+        return parameters, replace(codebooks, tables=replace(tables, weights=weights, book=book))
+
+
+def trial_rows(model: SplatModel, tiles: Sequence[TileSplats], classes: QuantisationClasses | None) -> NDArray[np.intp]:
+    """Return about a tile's rows, of all quantisation classes, on which SH codings are compared."""
+    if not tiles:
+        return np.zeros(0, np.intp)
+    if classes is None:
+        return tiles[len(tiles) // 2].rows
+    return np.arange(0, len(model), math.ceil(len(model) / _spec.TILE_SPLATS_MAX))
+
+
+def clip_scales(model: SplatModel) -> SplatModel:
+    """Clip log scales to ±88, which decoders treat alike (CNF-6), so that they do not coarsen other splats' lattice."""
+    if not len(model) or float(np.abs(model.scales).max()) <= SCALE_MOST:
+        return model
+    return replace(model, scales=np.clip(model.scales, -SCALE_MOST, SCALE_MOST))
+
+
+def extra_records(model: SplatModel, options: EncodeOptions) -> list[_spec.ExtraRecord]:
+    """Return the records of the extra columns to write: none unless `keep_extra` is set."""
+    records: list[_spec.ExtraRecord] = []
+    if not options.keep_extra:
+        return records
+    if len(model.extra) > _EXTRA_COLUMNS_MAX:
+        raise InputError(f"{len(model.extra)} extra columns, a file has at most {_EXTRA_COLUMNS_MAX}")
+    ids = {name: id for id, name in _spec.EXTRA_DTYPE_NAMES.items()}
+    for name, column in model.extra.items():
+        text = name.encode()
+        kind = f"{column.dtype.kind}{8 * column.dtype.itemsize}"
+        if kind not in ids:
+            raise InputError(f"extra column {name!r} has dtype {column.dtype}, wanted one of {', '.join(ids)}")
+        if not 1 <= len(text) <= _spec.EXTRA_NAME_MAX or any(ord(c) < 32 or ord(c) == 127 for c in name):
+            raise InputError(f"extra column {name!r}: a name has 1 to {_spec.EXTRA_NAME_MAX} bytes, no control codes")
+        records.append(_spec.ExtraRecord(ids[kind], len(text), text.ljust(_spec.EXTRA_NAME_MAX, b"\0")))
+    return records

@@ -1,0 +1,333 @@
+"""A scene whose encoding is fixed while its values change: fine-tuning sees the values that a decoder will see.
+
+`fix_quantisation` makes every discrete choice once: steps, tiles, codebooks, the entry of each splat, escapes, and zero
+SH bands. `FixedQuantisation.dequantise` then returns, for any values, the decoded values, by the functions that encode
+the tiles; `FixedQuantisation.encode` encodes these values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder.coding_parameters import CodingParameters, band_slice
+from csplat.encoder.encode_plan import EncodePlan, Origin
+from csplat.encoder.error_bounds import measured_sums
+from csplat.encoder.pipeline import EncodedTiles, encode_tiles
+from csplat.encoder.quantisation import (
+    canonicalise_shape,
+    colour_integers,
+    colour_lifted,
+    lattice_values,
+    quantise_colour,
+    quantise_sh,
+    quat_levels,
+    quat_values,
+)
+from csplat.encoder.sh_codebook import FileCodebooks, ShBook, ShTables, make_codebooks, sh_coarseness
+from csplat.encoder.shape_codebook import ShapeTables, dequantised_shapes
+from csplat.encoder.tiling import dequantised_means, dequantised_opacities, quantise_and_sort
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat.types import F32, I32, I64, Progress
+
+_THREADED_MIN = 50_000  # splats; with fewer, threads take longer to start than they save
+
+
+@dataclass(eq=False)
+class FreeValues:
+    """Values before quantisation, float32; fine-tuning changes them in place.
+
+    Attributes:
+        means: [N, 3].
+        quats: [S, 4], in canonical axis order; one per splat, or the codebook's entries and then the escaped splats.
+        scales: [S, 3], log standard deviations of the same.
+        opacities: [N], alpha.
+        sh0: [N, 3].
+        sh: [R, K, 3], bands 1 to the degree kept; one per splat, or the codebook's entries and then the escaped splats.
+        sizes: [N], offset of a splat's log scales from its entry, 0 if it is escaped; [0] without a shape codebook.
+    """
+
+    means: F32
+    quats: F32
+    scales: F32
+    opacities: F32
+    sh0: F32
+    sh: F32
+    sizes: F32
+
+    def copy(self) -> FreeValues:
+        """Return a deep copy."""
+        return FreeValues(*(getattr(self, one.name).copy() for one in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class DecodedValues:
+    """Values as decoded: the arrays of a `SplatModel`, unchecked, SH up to the degree kept."""
+
+    means: F32
+    quats: F32
+    scales: F32
+    opacities: F32
+    sh0: F32
+    shN: F32
+
+
+@dataclass(frozen=True, eq=False)
+class FixedQuantisation:
+    """Choices of the encoder that stay fixed while values are tuned.
+
+    Attributes:
+        encode_plan: the plan, with splats in tile order and canonical axis order.
+        tables: SH coding.
+        source: the scene that declared errors are measured against.
+        low, high: [N, 3] float32, the box of each splat's tile, which its mean must not leave.
+        zero: [N, K] bool, SH coefficients that stay zero, if there is no SH codebook; else None.
+    """
+
+    encode_plan: EncodePlan
+    tables: ShTables
+    source: SplatModel
+    low: F32
+    high: F32
+    zero: NDArray[np.bool_] | None
+
+    @property
+    def parameters(self) -> CodingParameters:
+        """Steps and codings."""
+        return self.encode_plan.parameters
+
+    @property
+    def source_index(self) -> I64:
+        """Index in the source of each splat, [N]."""
+        return self.encode_plan.origin.source_index
+
+    @property
+    def book(self) -> ShBook | None:
+        """The SH codebook, if there is one."""
+        return self.tables.book
+
+    @property
+    def shapes(self) -> ShapeTables | None:
+        """The shape codebook, if there is one."""
+        return self.encode_plan.shapes
+
+    def start(self) -> FreeValues:
+        """Return the values of the planned scene."""
+        model, parameters = self.encode_plan.model, self.parameters
+        sh = np.ascontiguousarray(model.shN[:, : parameters.sh_coefficients])
+        if self.book is not None:
+            sh = np.concatenate([_entry_values(self.book.entries, parameters), sh[self.book.escaped]])
+        quats, scales, sizes = model.quats, model.scales, np.zeros(0, np.float32)
+        if self.shapes is not None:
+            shared, own = self.shapes.entries, self.shapes.escaped
+            quats = np.concatenate([quat_values(shared[3:], parameters.quat_levels).T, quats[own]])
+            scales = np.concatenate([lattice_values(shared[:3], parameters.scale_step).T, scales[own]])
+            sizes = lattice_values(self.shapes.summand, parameters.scale_step)
+        values = FreeValues(model.means, quats, scales, model.opacities, model.sh0, sh, sizes).copy()
+        self.constrain(values)
+        return values
+
+    def constrain(self, values: FreeValues) -> None:
+        """Move values in place to what the file can hold: means inside their tiles, w >= 0, zeros at zero."""
+        np.clip(values.means, self.low, self.high, out=values.means)
+        negative = values.quats[:, 0] < 0.0
+        if negative.any():
+            values.quats[negative] *= np.float32(-1.0)
+        if self.zero is not None:
+            np.copyto(values.sh, np.float32(0.0), where=self.zero[:, :, None])
+        if self.shapes is not None:
+            values.sizes[self.shapes.escaped] = 0.0
+
+    def encode(self, values: FreeValues, progress: Progress | None = None) -> EncodedTiles:
+        """Encode values, whose decoder returns `dequantise(values)`, in the order of the file's source index.
+
+        Args:
+            values: constrained values.
+            progress: see `EncodePlan.of`.
+
+        Returns:
+            Tiles that declare errors against the source, but none of colours, which were refitted.
+        """
+        shapes, quats, scales = self._shape_values(values)
+        model, kept = self.encode_plan.model, values.sh.shape[1]
+        shN, codebooks = np.zeros_like(model.shN), FileCodebooks(self.tables)
+        if self.book is not None:
+            shN[self.book.escaped, :kept] = values.sh[self.book.size :]
+            codebooks = make_codebooks(self.tables, self._requantised(self.book, values.sh), self.parameters)
+        else:
+            shN[:, :kept] = values.sh
+        model = replace(model, means_double=None)
+        decoded = replace(model, **vars(self.dequantise(values)))
+        model = replace(
+            model, means=values.means, quats=quats, scales=scales, opacities=values.opacities, sh0=values.sh0, shN=shN
+        )
+        errors = measured_sums(self.source, decoded, self.source_index)
+        return encode_tiles(
+            replace(self.encode_plan, model=model, shapes=shapes), codebooks, errors=errors, progress=progress
+        )
+
+    def dequantise(self, values: FreeValues) -> DecodedValues:
+        """Return what a decoder of the file returns for `values`, bit for bit, in their order."""
+        tiles, parameters = self.encode_plan.tiles, self.parameters
+        if self.encode_plan.options.threads == 1 or len(self.encode_plan.model) < _THREADED_MIN:
+            shN, (quats, scales) = self.dequantise_sh(values.sh), self._dequantise_shapes(values)
+            means, sh0 = dequantised_means(values.means, tiles, parameters), self.dequantise_sh0(values.sh0)
+        else:
+            with ThreadPoolExecutor(2) as pool:  # NumPy releases the interpreter; the three take about as long
+                later_sh = pool.submit(self.dequantise_sh, values.sh)
+                later_shapes = pool.submit(self._dequantise_shapes, values)
+                means, sh0 = dequantised_means(values.means, tiles, parameters), self.dequantise_sh0(values.sh0)
+                shN, (quats, scales) = later_sh.result(), later_shapes.result()
+        opacities = dequantised_opacities(values.opacities, tiles, parameters)
+        return DecodedValues(means, quats, scales, opacities, sh0, shN)
+
+    def dequantise_sh0(self, sh0: F32) -> F32:
+        """Return degree-0 colours [N, 3] as decoded."""
+        parameters, decoded = self.parameters, np.empty_like(sh0)
+        for tile in self.encode_plan.tiles:
+            columns = np.ascontiguousarray(sh0[tile.rows].T)
+            colour = quantise_colour(columns, parameters.sh0_step, parameters.chroma_shift, tile.factors.sh0)
+            decoded[tile.rows] = colour.decoded.T
+        return decoded
+
+    def dequantise_sh(self, sh: F32) -> F32:
+        """Return SH of all splats [N, K, 3] as decoded, from `FreeValues.sh`."""
+        parameters = self.parameters
+        if self.book is not None:
+            decoded = self._requantised(self.book, sh).dequantise(parameters)
+            decoded[self.book.escaped] = self._dequantise_escapes(self.book, sh)
+            return decoded
+        decoded = np.empty_like(sh)
+        for tile in self.encode_plan.tiles:
+            coarse = sh_coarseness(tile.rows, parameters, self.tables)
+            decoded[tile.rows] = quantise_sh(sh[tile.rows], parameters, coarse)[2]
+        return decoded
+
+    def dequantise_sh_rows(self, sh: F32) -> F32:
+        """Return `FreeValues.sh` [R, K, 3] as decoded, the codebook's entries by themselves."""
+        if self.book is None:
+            return self.dequantise_sh(sh)
+        entries = _entry_values(self._requantised(self.book, sh).entries, self.parameters)
+        return np.concatenate([entries, self._dequantise_escapes(self.book, sh)])
+
+    def dequantise_shape_rows(self, values: FreeValues, decoded: DecodedValues) -> tuple[F32, F32, F32]:
+        """Return quats, scales and sizes of `values` as decoded, entries by themselves; see `dequantise` for the rest.
+
+        Args:
+            values: constrained values.
+            decoded: `dequantise(values)`.
+        """
+        shapes = self._shape_values(values)[0]
+        if shapes is None:
+            return decoded.quats, decoded.scales, values.sizes
+        own, parameters = shapes.escaped, self.parameters
+        quats = np.concatenate([quat_values(shapes.entries[3:], parameters.quat_levels).T, decoded.quats[own]])
+        scales = np.concatenate([lattice_values(shapes.entries[:3], parameters.scale_step).T, decoded.scales[own]])
+        return quats, scales, lattice_values(shapes.summand, parameters.scale_step)
+
+    def _dequantise_shapes(self, values: FreeValues) -> tuple[F32, F32]:
+        shapes, quats, scales = self._shape_values(values)
+        return dequantised_shapes(quats, scales, self.encode_plan.tiles, self.parameters, shapes)
+
+    def _dequantise_escapes(self, book: ShBook, sh: F32) -> F32:
+        own = sh[book.size :]
+        return quantise_sh(own, self.parameters, np.full(len(own), self.parameters.escape_coarse, np.int32))[2]
+
+    def _shape_values(self, values: FreeValues) -> tuple[ShapeTables | None, F32, F32]:
+        """Return the shape codebook of these values, and the quats and scales of the escaped splats, by splat."""
+        if self.shapes is None:
+            return None, values.quats, values.scales
+        parameters, size, own = self.parameters, self.shapes.size, self.shapes.escaped
+        scales = np.rint(values.scales[:size].T / parameters.scale_step)
+        entries = np.concatenate([scales.astype(np.int32), quat_levels(values.quats[:size].T, parameters.quat_levels)])
+        summand = np.rint(values.sizes / parameters.scale_step).astype(np.int32)
+        by_splat = np.zeros_like(self.encode_plan.model.quats), np.zeros_like(self.encode_plan.model.scales)
+        by_splat[0][:, 0] = 1.0
+        by_splat[0][own], by_splat[1][own] = values.quats[size:], values.scales[size:]
+        return ShapeTables(entries, self.shapes.index, summand), *by_splat
+
+    def _requantised(self, book: ShBook, sh: F32) -> ShBook:
+        return ShBook(_entry_integers(sh[: book.size], self.parameters), book.index)
+
+
+def fix_quantisation(
+    plan: EncodePlan, source: SplatModel | None = None, progress: Progress | None = None
+) -> FixedQuantisation:
+    """Complete a plan, and leave all values free.
+
+    Args:
+        plan: the scene.
+        source: the scene that the plan's `Origin` refers to; `None`: the plan's own.
+        progress: see `EncodePlan.of`.
+
+    Raises:
+        InputError: there are no splats, or the source has another number of them than the origin records.
+    """
+    if not len(plan.model):
+        raise InputError("a scene without splats has nothing to tune")
+    source = plan.model if source is None else source
+    wanted = plan.origin.source_count
+    if len(source) != wanted:
+        raise InputError(f"a source of {len(source)} splats, wanted {wanted}: that of the origin")
+    parameters, codebooks = plan.choose_sh_coding(progress)
+    parameters = replace(parameters, canonical=True)
+    rows = [quantise_and_sort(plan.model, tile, parameters).rows for tile in plan.tiles]
+    order = np.concatenate(rows).astype(np.int64)
+    plan = replace(_reordered(plan, order, [len(part) for part in rows]), parameters=parameters)
+    tables, means = codebooks.tables.select(order), plan.model.means
+    low, high = np.empty_like(means), np.empty_like(means)
+    for tile in plan.tiles:
+        low[tile.rows], high[tile.rows] = means[tile.rows].min(axis=0), means[tile.rows].max(axis=0)
+    return FixedQuantisation(plan, tables, source, low, high, _zero_coefficients(plan, tables))
+
+
+def _reordered(plan: EncodePlan, order: I64, counts: Sequence[int]) -> EncodePlan:
+    """Put the splats into tile order and canonical axis order; drop what only an open SH coding needs."""
+    model = plan.model.select(order)
+    rotation, scales = canonicalise_shape(model.quats, model.scales)
+    ends = np.cumsum(counts)
+    return replace(
+        plan,
+        model=replace(model, quats=np.ascontiguousarray(rotation.T), scales=np.ascontiguousarray(scales.T)),
+        origin=Origin(plan.origin.source_count, plan.origin.source_index[order], refitted=True),
+        importance=None,
+        tiles=[
+            replace(tile, rows=np.arange(end - count, end))
+            for tile, count, end in zip(plan.tiles, counts, ends, strict=True)
+        ],
+        shapes=None if plan.shapes is None else plan.shapes.select(order),
+        sample=None,
+        buckets=(),
+    )
+
+
+def _zero_coefficients(plan: EncodePlan, tables: ShTables) -> NDArray[np.bool_] | None:
+    parameters = plan.parameters
+    kept = parameters.sh_coefficients
+    if tables.book is not None or not kept:
+        return None
+    zero = np.empty((len(plan.model), kept), np.bool_)
+    for tile in plan.tiles:
+        coarse = sh_coarseness(tile.rows, parameters, tables)
+        columns, _, _ = quantise_sh(plan.model.shN[tile.rows, :kept], parameters, coarse)
+        for band in range(1, parameters.sh_degree + 1):
+            span = band_slice(band)
+            zero[tile.rows, span] = (columns[:, span] == 0).all(axis=(0, 1))[:, None]
+    return zero
+
+
+def _entry_values(entries: I32, parameters: CodingParameters) -> F32:
+    """Return [size, K, 3] float32 of Y, Co, Cg integers [3, K, size] on the SH lattice."""
+    rgb = colour_lifted(entries, parameters.chroma_shift).transpose(2, 1, 0)
+    return np.ascontiguousarray(rgb * parameters.sh_step, np.float32)
+
+
+def _entry_integers(values: F32, parameters: CodingParameters) -> I32:
+    """Return Y, Co, Cg integers [3, K, size] on the SH lattice of values [size, K, 3]."""
+    rgb = np.ascontiguousarray(values.transpose(2, 1, 0)) * np.float32(1.0 / parameters.sh_step)
+    return colour_integers(rgb, parameters.chroma_shift).astype(np.int32, copy=False)

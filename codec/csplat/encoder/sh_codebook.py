@@ -1,0 +1,516 @@
+"""SH bands 1 to 3: each splat coded by itself, or by a codebook with escapes, whichever is smaller at equal error.
+
+(Spec 6.4.4, 6.4.5, 7.1.) A codebook is trained on the whole scene, or on its sample if the scene has more splats than
+a bucket; an `AssignmentRule` then gives the other splats their entries.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.encoder import entropy
+from csplat.encoder.coding_parameters import CodingParameters, band_slice
+from csplat.encoder.container import CodebookTable, FileChunk
+from csplat.encoder.encode_options import EncodeOptions
+from csplat.encoder.entropy import signed_stream
+from csplat.encoder.kmeans import assign, cluster, rank_by_frequency, refine_by_metric
+from csplat.encoder.quantisation import colour_integers, colour_lifted, largest_exact, lattice_values, quantise_sh
+from csplat.encoder.weights import ErrorMetric, splat_weights
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat.types import F32, F64, I16, I32, U32, Progress
+
+Rows = NDArray[np.intp]
+
+_CLIP = 511  # lattice steps; beyond it a coefficient is escaped, so that searches stay exact in float32
+_BLOCK = 1 << 14  # splats per block of temporaries
+_TRIAL_SPLATS = 1 << 14  # splats on which scalar coding is tried
+_CODEBOOK_SPLATS_MIN = 256  # splats; below, a codebook costs more than it saves
+_GROUPED_ENTRIES_MIN = 4096  # entries from which searching near groups saves more time than it loses error
+_FULL_SHARE_SPLATS = 1 << 15  # a smaller scene gets as many entries as one of this size, if each has enough users
+_USERS_MIN = 6  # splats per entry, below which an entry costs more bytes than it saves
+_ESCAPE_CANDIDATES = 4  # candidates for escape, as a multiple of the number of escapes
+_IMPORTANT = 0.95  # quantile of the weights above which a splat is quantised on the full lattice
+_COARSEST = 6  # log2 of the coarsest multiple of the SH step
+_SLACK = 1.0 + 2.0**-18  # covers the rounding of float32 differences in declared errors
+_CODEBOOK_ID = 0
+
+
+@dataclass(frozen=True, eq=False)
+class ShBook:
+    """An SH codebook and its users.
+
+    Attributes:
+        entries: [3, K, size] Y, Co, Cg integers on the file's lattice.
+        index: [N] int32, entry of each splat; `size` means "escaped".
+    """
+
+    entries: I32
+    index: I32
+
+    @property
+    def size(self) -> int:
+        """Entries of the codebook."""
+        return int(self.entries.shape[2])
+
+    @property
+    def escaped(self) -> NDArray[np.intp]:
+        """Splats that bypass the codebook, ascending."""
+        return np.flatnonzero(self.index == self.size)
+
+    def select(self, order: NDArray[Any]) -> ShBook:
+        """Return the codebook with the users `order`."""
+        return ShBook(self.entries, self.index[order])
+
+    def dequantise(self, parameters: CodingParameters) -> F32:
+        """Return SH of all splats as decoded, [N, K, 3]; rows of escaped splats have no meaning."""
+        rgb = np.ascontiguousarray(colour_lifted(self.entries, parameters.chroma_shift).transpose(2, 1, 0))
+        return np.take(lattice_values(rgb, parameters.sh_step), self.index, axis=0, mode="clip")
+
+
+@dataclass(frozen=True)
+class ShTables:
+    """SH coding of the whole file, as its tiles need it.
+
+    Attributes:
+        weights: [N] importance, or None if all splats are treated alike.
+        reference: weight above which a splat is quantised on the full lattice.
+        book: the codebook, if there is one.
+        ids: codebook ids.
+        layers: layers that use them.
+        extras: names of the extra columns to write.
+    """
+
+    weights: F32 | None = None
+    reference: float = 1.0
+    book: ShBook | None = None
+    ids: Sequence[int] = ()
+    layers: Sequence[int] = ()
+    extras: Sequence[str] = ()
+
+    def select(self, order: NDArray[Any]) -> ShTables:
+        """Return the tables of the splats `order`."""
+        weights = None if self.weights is None else self.weights[order]
+        return replace(self, weights=weights, book=None if self.book is None else self.book.select(order))
+
+
+@dataclass(frozen=True, eq=False)
+class AssignmentRule:
+    """The rule that assigns splats that took no part in training.
+
+    Attributes:
+        entries: [size, 3K] int32, R, G, B of each coefficient.
+        near_groups: see `assign`.
+        threshold: weighted squared error from which a splat is escaped.
+    """
+
+    entries: I32
+    near_groups: int
+    threshold: float
+
+
+@dataclass(frozen=True)
+class FileCodebooks:
+    """SH tables, index records and chunks of the codebooks, and the rule for splats not yet assigned."""
+
+    tables: ShTables
+    records: Sequence[CodebookTable] = ()
+    chunks: Sequence[FileChunk] = ()
+    rule: AssignmentRule | None = None
+
+
+@dataclass(frozen=True)
+class EncodedSh:
+    """SH of a tile.
+
+    Attributes:
+        blocks: block of each layer; a band of zeros has none.
+        errors: largest error and sum of squares by measure.
+        exponent: the tile's lattice is coarser by 2**exponent.
+        tables: ids of the codebooks used.
+    """
+
+    blocks: Mapping[int, bytes]
+    errors: Mapping[str, tuple[float, float]]
+    exponent: int
+    tables: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class _TrainedCodebook:
+    """A codebook, before its entries are written as Y, Co, Cg.
+
+    Attributes:
+        index: [N] int32; the codebook's size means "escaped".
+        entries: [size, 3K] int32, R, G, B of each coefficient.
+        error: weighted mean of the remaining squared error.
+        rule: rule for splats not trained on.
+    """
+
+    index: I32
+    entries: I32
+    error: float
+    rule: AssignmentRule
+
+
+@dataclass(frozen=True, eq=False)
+class _ErrorWeights:
+    """Weights of squared errors: by splat and, if there is a metric, by pair of coefficients."""
+
+    weights: F32
+    metric: ErrorMetric | None
+    measured: bool
+
+    def errors(self, difference: F32, rows: Rows | slice) -> F64:
+        """Return weighted squared errors [n] of differences [n, 3K]."""
+        if self.metric is not None:
+            return self.metric.errors(difference.reshape(len(difference), -1, 3), rows)
+        squares = np.einsum("ij,ij->i", difference, difference, dtype=np.float64)
+        return np.asarray(squares * self.weights[rows])
+
+
+def choose_sh_coding(
+    model: SplatModel,
+    parameters: CodingParameters,
+    options: EncodeOptions,
+    *,
+    weights: F32 | None,
+    metric: ErrorMetric | None,
+    measured: bool,
+    trial: Rows,
+    progress: Progress,
+) -> tuple[CodingParameters, FileCodebooks]:
+    """Choose how SH is coded, and train the codebook if there is one.
+
+    Args:
+        model: the scene.
+        parameters: `sh_coding` is "auto", "codebook", "scalar" or "none".
+        options: `codebook_size`, `escape_fraction`, `keep_extra`, `seed`.
+        weights: [N] float32, importance of the splats; None if no choice depends on it.
+        metric: Gauss-Newton blocks of the coefficients; None: their errors add up, weighted by splat.
+        measured: the weights are measured, not guessed from opacity and size.
+        trial: rows of about a tile, on which scalar coding is tried.
+        progress: called with the stage and the fraction done.
+
+    Returns:
+        The parameters with SH coding and step, and the codebooks.
+    """
+    tables = ShTables(weights, _reference_weight(weights), extras=tuple(model.extra) if options.keep_extra else ())
+    scalar = replace(parameters, sh_coding="scalar" if parameters.sh_degree else "none"), FileCodebooks(tables)
+    if parameters.sh_coding not in ("auto", "codebook") or weights is None or not len(model):
+        return scalar
+    fine = replace(parameters, sh_coding="codebook", sh_step=parameters.codebook_step)
+    kept, is_open = parameters.sh_coefficients, parameters.sh_coding == "auto"
+    if is_open and (len(model) < _CODEBOOK_SPLATS_MIN or not _escapes_fit(largest_sh(model.shN[:, :kept]), fine)):
+        return scalar
+    error_weights = _ErrorWeights(weights, None if metric is None else metric.first(kept), measured)
+    trained = _train(model, error_weights, fine, options, progress)
+    rgb = trained.entries.reshape(len(trained.entries), -1, 3).transpose(2, 1, 0).astype(np.float32)
+    columns = colour_integers(np.ascontiguousarray(rgb), fine.chroma_shift)
+    codebooks = replace(make_codebooks(tables, ShBook(columns, trained.index), fine), rule=trained.rule)
+    if is_open and not _codebook_pays(model, error_weights, trained, codebooks, trial[:_TRIAL_SPLATS], parameters):
+        return scalar
+    return fine, codebooks
+
+
+def final_parameters(parameters: CodingParameters, largest: float) -> CodingParameters:
+    """Rule out a codebook if the scene's largest SH coefficient is beyond what an escape can hold."""
+    fine = replace(parameters, sh_step=parameters.codebook_step)
+    if parameters.sh_coding == "auto" and not _escapes_fit(largest, fine):
+        return replace(parameters, sh_coding="scalar")
+    return parameters
+
+
+def largest_sh(shN: F32) -> float:
+    """Return the magnitude of the largest coefficient."""
+    return float(max(shN.max(initial=0.0), -shN.min(initial=0.0)))
+
+
+def assign_splats(codebooks: FileCodebooks, model: SplatModel, parameters: CodingParameters, threads: int) -> ShTables:
+    """Assign splats that took no part in training.
+
+    Args:
+        codebooks: trained on a sample of the scene.
+        model: at most a bucket of the scene; the result may depend on which splats are searched together.
+        parameters: the final parameters.
+        threads: threads of the search; no effect on the result.
+    """
+    tables, rule = codebooks.tables, codebooks.rule
+    weights = None if tables.weights is None else splat_weights(model, None)
+    if rule is None or tables.book is None or weights is None:
+        return replace(tables, weights=weights)
+    points = _lattice_points(model.shN, parameters)
+    index = assign(points, rule.entries, near_groups=rule.near_groups, threads=threads).astype(np.int32)
+    errors = _errors(model.shN, index, rule.entries, parameters, _ErrorWeights(weights, None, measured=False))
+    index[errors >= rule.threshold] = tables.book.size
+    return replace(tables, weights=weights, book=ShBook(tables.book.entries, index))
+
+
+def make_codebooks(tables: ShTables, book: ShBook, parameters: CodingParameters) -> FileCodebooks:
+    """Make the tables, the index record and the chunks of a codebook."""
+    bands = range(1, parameters.sh_degree + 1)
+    chunks = []
+    for band in bands:
+        head = _spec.pack_codebook_head(_spec.CodebookHead(_CODEBOOK_ID, band, 0))
+        columns = np.ascontiguousarray(book.entries[:, band_slice(band)]).reshape(-1)
+        stream = signed_stream(columns, parameters.deflate)
+        chunks.append(FileChunk(_spec.CHUNK_CODEBOOK, head + stream, _CODEBOOK_ID, band))
+    record = CodebookTable(_CODEBOOK_ID, _spec.CODEBOOK_KIND_SH, (1, parameters.sh_degree), book.size)
+    tables = replace(tables, book=book, ids=(_CODEBOOK_ID,), layers=tuple(bands))
+    return FileCodebooks(tables, (record,), tuple(chunks))
+
+
+def sh_coarseness(rows: Rows, parameters: CodingParameters, tables: ShTables) -> I32 | None:
+    """Return the power of two by which the SH of each splat is coarser than the lattice, or None for 0."""
+    if tables.weights is None or parameters.adaptive == 0.0:
+        return None
+    with np.errstate(divide="ignore"):
+        ratio = np.log2(tables.reference / tables.weights[rows].astype(np.float64))
+    return np.clip(np.rint(0.5 * parameters.adaptive * ratio), 0, _COARSEST).astype(np.int32)
+
+
+def encode_sh(shN: F32, rows: Rows, parameters: CodingParameters, tables: ShTables) -> EncodedSh:
+    """Encode the bands 1 to `parameters.sh_degree` of a tile.
+
+    Args:
+        shN: [N, K, 3], of the whole model, whose degree may be higher.
+        rows: [n], the tile's splats in decoding order.
+        parameters: steps and codings.
+        tables: SH coding of the whole file.
+    """
+    source = np.take(shN, rows, axis=0)
+    kept = parameters.sh_coefficients
+    sums = _BandSums(source.shape[1])
+    sums.add(source[:, kept:], np.float32(0), kept)
+    layers: dict[int, bytes] = {}
+    exponent = 0
+    if tables.book is not None:
+        layers = _encode_by_codebook(source[:, :kept], tables.book.select(rows), parameters, tables.ids[0], sums)
+    elif kept:
+        coarse = sh_coarseness(rows, parameters, tables)
+        columns, exponent, decoded = quantise_sh(source[:, :kept], parameters, coarse)
+        sums.add(source[:, :kept], decoded, 0)
+        layers = dict(_scalar_blocks(columns, exponent, parameters))
+    return EncodedSh(layers, sums.by_band(), exponent, tuple(tables.ids))
+
+
+def _scalar_blocks(columns: NDArray[Any], exponent: int, parameters: CodingParameters) -> Iterator[tuple[int, bytes]]:
+    """Yield layer and block of each band that is not all zero, of columns [3, K, n]."""
+    for band in range(1, parameters.sh_degree + 1):
+        part = columns[:, band_slice(band)]
+        if part.any():
+            flat = part.reshape(-1, columns.shape[2])
+            attribute = _spec.ATTRIBUTE_SH0 + band
+            yield band, entropy.signed_or_sparse_block(attribute, flat, exponent, parameters.deflate)
+
+
+def _encode_by_codebook(
+    source: F32, book: ShBook, parameters: CodingParameters, id_: int, sums: _BandSums
+) -> dict[int, bytes]:
+    """Return blocks with the indices in band 1, and the escaped splats' own values in every band."""
+    decoded, escaped = book.dequantise(parameters), book.escaped
+    coarse = np.full(len(escaped), parameters.escape_coarse, np.int32)
+    columns, exponent, own = quantise_sh(source[escaped], parameters, coarse)
+    if exponent:
+        raise InputError("SH coefficients too large to be escapes of a codebook: use scalar SH coding")
+    decoded[escaped] = own
+    sums.add(source, decoded, 0)
+    layers = {}
+    for band in range(1, parameters.sh_degree + 1):
+        attribute = _spec.ATTRIBUTE_SH0 + band
+        escape = b""
+        if len(escaped):
+            flat = columns[:, band_slice(band)].reshape(-1, len(escaped))
+            escape = entropy.signed_block(attribute, flat, 0, parameters.deflate)
+        index = book.index if band == 1 else None
+        layers[band] = entropy.codebook_block(attribute, id_, index, len(escaped), escape, parameters.deflate)
+    return layers
+
+
+class _BandSums:
+    """Largest error and sum of squares of a tile, by coefficient."""
+
+    def __init__(self, coefficients: int) -> None:
+        self._largest = np.zeros(coefficients)
+        self._squares = np.zeros(coefficients)
+
+    def add(self, source: F32, decoded: F32 | np.float32, first: int) -> None:
+        """Add [n, k, 3] values of the coefficients `first` to `first` + k - 1."""
+        difference = source - decoded
+        if not difference.size:
+            return
+        flat = difference.reshape(len(difference), -1)  # reductions over whole rows are ten times faster
+        span = slice(first, first + difference.shape[1])
+        squares = np.einsum("ij,ij->j", flat, flat, dtype=np.float64)
+        self._squares[span] += squares.reshape(-1, 3).sum(axis=1)
+        np.abs(flat, out=flat)
+        np.maximum(self._largest[span], flat.max(axis=0).reshape(-1, 3).max(axis=1), out=self._largest[span])
+
+    def by_band(self) -> dict[str, tuple[float, float]]:
+        """Return (largest, sum of squares) by measure, with a margin for the rounding of float32 differences."""
+        result = {}
+        for band in range(1, round((len(self._largest) + 1) ** 0.5)):
+            largest = float(self._largest[band_slice(band)].max()) * _SLACK
+            squares = float(self._squares[band_slice(band)].sum()) * _SLACK
+            result[_spec.MEASURE_NAMES[_spec.MEASURE_SH0 + band]] = (largest, squares)
+        return result
+
+
+def _reference_weight(weights: F32 | None) -> float:
+    """Return the 95th percentile of the weights, of the positive ones if most are 0."""
+    if weights is None or not len(weights):
+        return 1.0
+    if (reference := float(np.quantile(weights, _IMPORTANT))) > 0.0:
+        return reference
+    positive = weights[weights > 0.0]
+    return float(np.quantile(positive, _IMPORTANT)) if len(positive) else 1.0
+
+
+def _escapes_fit(largest: float, parameters: CodingParameters) -> bool:
+    """Return True if every splat could be an escape: its lattice is the file's, which no tile makes coarser."""
+    return 2.0 * largest < largest_exact(parameters.sh_step)
+
+
+def _train(
+    model: SplatModel,
+    error_weights: _ErrorWeights,
+    parameters: CodingParameters,
+    options: EncodeOptions,
+    progress: Progress,
+) -> _TrainedCodebook:
+    weights, threads = error_weights.weights, options.thread_count
+    points = _lattice_points(model.shN, parameters)
+    size = _codebook_size(len(model), parameters, options)
+    effort = {"near_groups": 8, "iterations": 6, "sample_per_entry": 16} if size >= _GROUPED_ENTRIES_MIN else {}
+
+    def report_steps(done: int, steps: int) -> None:
+        progress("codebook", done / steps)
+
+    found = cluster(points, weights, size, seed=options.seed, threads=threads, progress=report_steps, **effort)
+    if error_weights.metric is not None:
+        found = _refine(model.shN, points, error_weights.metric, found, parameters, threads)
+    ranked, entries = rank_by_frequency(found[1], found[0])
+    index = ranked.astype(np.int32)
+    errors = _errors(model.shN, index, entries, parameters, error_weights)
+    escaped = _choose_escapes(model.shN, errors, parameters, options, error_weights)
+    threshold = float(errors[escaped].min(initial=np.inf))
+    errors[escaped] = 0.0
+    index[escaped] = len(entries)
+    total = float(weights.sum(dtype=np.float64)) or 1.0
+    rule = AssignmentRule(entries, effort.get("near_groups", 0), threshold)
+    return _TrainedCodebook(index, entries, float(errors.sum()) / total, rule)
+
+
+def _refine(
+    shN: F32, points: I16, metric: ErrorMetric, found: tuple[I32, U32], parameters: CodingParameters, threads: int
+) -> tuple[I32, U32]:
+    """Improve a codebook under the metric."""
+    entries, index = found
+    count = points.shape[1] // 3
+    targets = np.clip(shN[:, :count] * np.float32(1.0 / parameters.sh_step), -_CLIP, _CLIP)
+    start = entries.reshape(-1, count, 3)
+    entries, places = refine_by_metric(targets, metric, start, index.astype(np.int64), threads)
+    return np.clip(entries, -_CLIP, _CLIP).reshape(len(entries), -1), places.astype(np.uint32)
+
+
+def _lattice_points(shN: F32, parameters: CodingParameters) -> I16:
+    """Return [N, 3K] R, G, B integers of the bands that are kept, clipped to what searches are exact for."""
+    kept = parameters.sh_coefficients
+    points = np.empty((len(shN), 3 * kept), np.int16)
+    for at in range(0, len(shN), _BLOCK):
+        rows = shN[at : at + _BLOCK, :kept].reshape(-1, 3 * kept)
+        rows = np.clip(rows, -_CLIP * parameters.sh_step, _CLIP * parameters.sh_step)
+        points[at : at + _BLOCK] = np.rint(rows * np.float32(1.0 / parameters.sh_step))
+    return points
+
+
+def _codebook_size(count: int, parameters: CodingParameters, options: EncodeOptions) -> int:
+    """Return the number of entries: an entry costs about 20 bytes, and saves error for its users."""
+    if options.codebook_size is not None:
+        return options.codebook_size
+    share = parameters.codebook_share
+    size = max(count * share, min(_FULL_SHARE_SPLATS * share, count / _USERS_MIN))
+    return min(1 << max(round(math.log2(max(1.0, size))), 4), parameters.codebook_most)
+
+
+def _errors(shN: F32, index: I32, entries: I32, parameters: CodingParameters, error_weights: _ErrorWeights) -> F64:
+    """Return the weighted squared error of each splat, [N]; infinite if a coefficient was clipped."""
+    kept = parameters.sh_coefficients
+    table = entries.astype(np.float32) * np.float32(parameters.sh_step)
+    errors = np.empty(len(shN))
+    for at in range(0, len(shN), _BLOCK):
+        part = slice(at, at + _BLOCK)
+        difference = shN[part, :kept].reshape(-1, 3 * kept).copy()
+        clipped = np.abs(difference).max(axis=1) > (_CLIP - 1) * parameters.sh_step
+        difference -= table[index[part]]
+        errors[part] = error_weights.errors(difference, part)
+        errors[part][clipped] = np.inf
+    return errors
+
+
+def _choose_escapes(
+    shN: F32, errors: F64, parameters: CodingParameters, options: EncodeOptions, error_weights: _ErrorWeights
+) -> Rows:
+    """Return the splats to escape: those with the largest weighted error, and all that were clipped.
+
+    If weights were measured, those that gain most, and none that gains nothing: the splat with the largest weight may
+    lie near its entry, and escapes are coarser than entries.
+    """
+    fraction = parameters.escape_fraction if options.escape_fraction is None else options.escape_fraction
+    clipped = int(np.count_nonzero(~np.isfinite(errors)))
+    count = max(int(len(errors) * fraction), clipped)
+    worst = np.argsort(-errors, kind="stable")
+    if not error_weights.measured or not count:
+        return np.sort(worst[:count])
+    candidates = worst[: _ESCAPE_CANDIDATES * count]
+    source = shN[candidates, : parameters.sh_coefficients]
+    own = quantise_sh(source, parameters, np.full(len(candidates), parameters.escape_coarse, np.int32))[2]
+    gain = errors[candidates] - error_weights.errors((source - own).reshape(len(candidates), -1), candidates)
+    if options.escape_fraction is None:
+        count = max(min(count, int(np.count_nonzero(gain > 0.0))), clipped)
+    return np.sort(candidates[np.argsort(-gain, kind="stable")[:count]])
+
+
+def _codebook_pays(
+    model: SplatModel,
+    error_weights: _ErrorWeights,
+    trained: _TrainedCodebook,
+    codebooks: FileCodebooks,
+    trial: Rows,
+    parameters: CodingParameters,
+) -> bool:
+    """Return True if the codebook has fewer bytes than scalar coding at equal error.
+
+    Scalar coding is tried on a few splats at two steps, between which its bytes are linear in the error's logarithm.
+    """
+    count = len(model)
+    spent = sum(len(chunk.payload) for chunk in codebooks.chunks) / count
+    shares = np.bincount(trained.index) / count
+    spent -= float((shares * np.log2(np.maximum(shares, 1e-12))).sum()) / 8
+    fine_bytes, fine_error = _try_scalar(model, error_weights, trial, parameters)
+    coarser = replace(parameters, sh_step=2 * parameters.sh_step)
+    coarse_bytes, coarse_error = _try_scalar(model, error_weights, trial, coarser)
+    escaped = float((trained.index == len(trained.entries)).mean())
+    spent += escaped * fine_bytes
+    if not 0.0 < fine_error < coarse_error:
+        return spent < fine_bytes
+    per_halving = (fine_bytes - coarse_bytes) / math.log2(coarse_error / fine_error)
+    return spent + per_halving * math.log2(max(trained.error, 1e-30) / fine_error) < fine_bytes
+
+
+def _try_scalar(
+    model: SplatModel, error_weights: _ErrorWeights, trial: Rows, parameters: CodingParameters
+) -> tuple[float, float]:
+    """Return bytes per splat and weighted mean squared error of scalar coding."""
+    source = np.take(model.shN, trial, axis=0)[:, : parameters.sh_coefficients]
+    columns, _, decoded = quantise_sh(source, parameters, None)
+    size = sum(len(block) for _, block in _scalar_blocks(columns, 0, parameters))
+    errors = error_weights.errors((source - decoded).reshape(len(trial), -1), trial)
+    return size / len(trial), float(errors.sum() / (error_weights.weights[trial].sum(dtype=np.float64) or 1.0))
