@@ -1,6 +1,6 @@
-"""Record of a scene's training, as far as later renders of it depend on that (spec 5.4).
+"""The record of a scene's training, as far as later comparisons with its images depend on it (spec 5.4).
 
-Its training may leave one of its cameras, too, under `VIEW`: from there a viewer shows the scene first.
+The metadata may also hold one of the training cameras under `VIEW`: a viewer shows the scene from there first.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ _COLOURS = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
 
 @dataclass(frozen=True)
 class TrainingRecord:
-    """Settings of the training that a comparison of the scene with its photographs has to repeat.
+    """Settings of a training that a comparison of the scene with its images has to repeat.
 
     Attributes:
         background: red, green, blue behind the splats, 0..1.
-        test_every: every Nth photograph was held out, 0 for none; `None`: the data set names them itself.
-        size: width and height that the photographs were scaled to, pixels; `None`: they were not.
-        near: near plane of the cameras, scene units; `None`: not known.
-        images: for COLMAP sets, the folder of images; `None`: the reader chose.
+        test_every: every Nth image was held out, 0 for none; `None`: the data set names the test images itself.
+        size: width and height that the images were scaled to, pixels; `None`: they were not scaled.
+        near: near plane of the cameras, scene units; `None`: unknown.
+        images: for COLMAP data sets, the folder of images; `None`: the reader's choice.
     """
 
     background: tuple[float, float, float]
@@ -40,41 +40,43 @@ class TrainingRecord:
 
     @classmethod
     def of(cls, metadata: Mapping[str, Any]) -> TrainingRecord | None:
-        """Return the record in a scene's metadata; `None` if it has none, or none that can be understood."""
+        """Return the record in a scene's metadata; `None` if there is none that can be understood."""
         try:
             return cls.from_json(metadata[TRAINING]) if TRAINING in metadata else None
         except InputError:
             return None
 
     @classmethod
-    def from_json(cls, said: object) -> TrainingRecord:
-        """The inverse of `as_json`; members of other names are passed over.
+    def from_json(cls, record: object) -> TrainingRecord:
+        """Parse the result of `as_json`, ignoring unknown members.
 
         Raises:
-            InputError: there is no background, or a member is not what it is called.
+            InputError: there is no background, or a member has another type or range.
         """
-        if not isinstance(said, Mapping):
-            raise InputError(f"{TRAINING} is {said!r}, wanted an object")
-        background = _member(said, "background", lambda value: _are(value, 3, _is_share), "three numbers of 0 to 1")
-        size = _member(said, "size", lambda value: _are(value, 2, _is_count), "two whole numbers above 0")
-        near = _member(said, "near", _is_length, "a number above 0")
-        every = _member(said, "test_every", _is_split, "0, or a whole number above 1")
-        images = _member(said, "images", _is_name, "a name")
+        if not isinstance(record, Mapping):
+            raise InputError(f"{TRAINING} is {record!r}, wanted an object")
+        background = _member(
+            record, "background", lambda value: _are(value, 3, _is_fraction), "three numbers of 0 to 1"
+        )
+        size = _member(record, "size", lambda value: _are(value, 2, _is_count), "two whole numbers above 0")
+        near = _member(record, "near", _is_length, "a number above 0")
+        every = _member(record, "test_every", _is_interval, "0, or a whole number above 1")
+        images = _member(record, "images", _is_name, "a name")
         if background is None:
             raise InputError(f"{TRAINING} names no background")
         red, green, blue = (float(value) for value in background)
         return cls((red, green, blue), every, None if size is None else (size[0], size[1]), near, images)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the JSON for the metadata, without unknown values."""
-        said: dict[str, Any] = {"background": list(self.background)}
+        """Return the JSON for the metadata, without members that are unknown."""
+        record: dict[str, Any] = {"background": list(self.background)}
         for name in ("test_every", "near", "images"):
             if getattr(self, name) is not None:
-                said[name] = getattr(self, name)
-        return said if self.size is None else {**said, "size": list(self.size)}
+                record[name] = getattr(self, name)
+        return record if self.size is None else {**record, "size": list(self.size)}
 
     def __str__(self) -> str:
-        """The same in words, for people."""
+        """Describe the settings in words."""
         colour = _COLOURS.get(self.background) or " ".join(f"{value:g}" for value in self.background)
         words = [f"{colour} background"]
         if self.test_every is not None:
@@ -88,18 +90,18 @@ class TrainingRecord:
         return ", ".join(words)
 
 
-def _member(said: Mapping[str, Any], name: str, suits: Callable[[Any], bool], wanted: str) -> Any:
-    value = said.get(name)
-    if value is not None and not suits(value):
+def _member(record: Mapping[str, Any], name: str, is_valid: Callable[[Any], bool], wanted: str) -> Any:
+    value = record.get(name)
+    if value is not None and not is_valid(value):
         raise InputError(f"{name} of {TRAINING} is {value!r}, wanted {wanted}")
     return value
 
 
-def _are(values: object, count: int, suits: Callable[[Any], bool]) -> bool:
-    return isinstance(values, list | tuple) and len(values) == count and all(suits(value) for value in values)
+def _are(values: object, count: int, is_valid: Callable[[Any], bool]) -> bool:
+    return isinstance(values, list | tuple) and len(values) == count and all(is_valid(value) for value in values)
 
 
-def _is_share(value: Any) -> bool:
+def _is_fraction(value: Any) -> bool:
     return type(value) in (int, float) and 0.0 <= value <= 1.0
 
 
@@ -107,7 +109,7 @@ def _is_length(value: Any) -> bool:
     return type(value) in (int, float) and 0.0 < value <= sys.float_info.max
 
 
-def _is_split(value: Any) -> bool:
+def _is_interval(value: Any) -> bool:
     return type(value) is int and (value == 0 or 1 < value <= _MAX_COUNT)
 
 

@@ -15,9 +15,10 @@ from csplat import scene as scenes
 from csplat.decoder import DeclaredBounds, Limits, SceneHeader, decode_scene
 from csplat.errors import LimitError
 from csplat.inputs import File
-from csplat.lint import Finding, dropped_columns
+from csplat.lint import Finding
 from csplat.memory import available_bytes, default_bytes
 from csplat.model import SplatModel
+from csplat.ply.column_names import dropped_columns
 from csplat.scene import Scene, joined, without_bands
 from csplat.types import Progress, null_progress
 from csplat.upright import Direction, with_up

@@ -31,10 +31,12 @@ from csplat.upright import UP, unit_up, up_of
 
 _PREFIX = "csplat"
 _SHOWN = 80  # characters of a comment in a message
-#: ns-export of nerfstudio names the axis that points up; Brush writes the same for every scene, whatever is up in it.
+#: ns-export of nerfstudio names the axis that points up. Brush writes the same axis for every scene, so its comment is
+#: ignored.
 _VERTICAL_AXIS = re.compile(r"vertical axis\s*:\s*([+-]?)([xyz])", re.IGNORECASE)
-_SAYS_NOTHING = "exported from brush"
-#: Words of Brush and splat-transform for `antialiased` (mip) and `flat` (2dgs). Postshot has the former, in lower case.
+_BRUSH = "exported from brush"
+#: Comments of Brush and splat-transform for `antialiased` (mip) and `flat` (2dgs); Postshot writes the former in lower
+#: case.
 _MODES: dict[tuple[str, ...], str] = {
     ("splatrendermode:", "default"): "",
     ("splatrendermode:", "mip"): "antialiased",
@@ -42,18 +44,21 @@ _MODES: dict[tuple[str, ...], str] = {
     ("antialiased", "0"): "",
     ("antialiased", "1"): "antialiased",
 }
+#: float64 positions keep origin 0 if their centre is nearer than this many spreads: then float32 relative to 0 is at
+#: most four bits coarser than relative to the centre.
+_NEAR_SPREADS = 16.0
 
 
 @dataclass
 class CommentMetadata:
-    """Scene metadata from comments; defaults for what they leave out.
+    """Scene metadata from header comments, with defaults for what these leave out.
 
     Attributes:
         origin: `None` if no comment names one.
         origin_is_added: x, y and z of the file are absolute: the origin has been added to them.
         coordinate_system, unit_metres, antialiased, flat: as in `SplatModel`.
-        metadata: `comments`, the lines that are not ours; `licence`; `training`; `up`; `view`.
-        findings: what was understood from the comments of other programs.
+        metadata: `comments` (the lines that are not ours), `licence`, `training`, `up`, `view`.
+        findings: findings about the comments of other programs.
     """
 
     origin: tuple[float, float, float] | None = None
@@ -72,68 +77,45 @@ class CommentMetadata:
 
 
 def parse_comments(comments: Sequence[str]) -> CommentMetadata:
-    """Read the comment lines of a header, without the word `comment`.
+    """Parse the comment lines of a header, without the word `comment`.
 
     Raises:
-        InputError: a line begins as ours but its value cannot be understood. To skip an origin
-            would put the scene elsewhere, to skip its background would judge it wrongly.
+        InputError: a line is ours but its value cannot be understood. Ignoring an origin would move the scene; ignoring
+            its background would spoil comparisons.
     """
-    facts = CommentMetadata()
+    metadata = CommentMetadata()
     others: list[str] = []
     vertical: list[str] = []
-    by_brush = any(comment.strip().lower() == _SAYS_NOTHING for comment in comments)
+    by_brush = any(comment.strip().lower() == _BRUSH for comment in comments)
     for comment in comments:
         words = comment.split()
         mode = _MODES.get(tuple(comment.lower().split()))
         if words[:2] == [_PREFIX, TRAINING]:
-            facts.metadata[TRAINING] = _training(comment).as_json()
+            metadata.metadata[TRAINING] = _training(comment).as_json()
         elif words[:2] == [_PREFIX, VIEW]:
-            facts.metadata[VIEW] = _view(comment)
+            metadata.metadata[VIEW] = _view(comment)
         elif mode is not None:
-            facts.antialiased |= mode == "antialiased"
-            facts.flat |= mode == "flat"
+            metadata.antialiased |= mode == "antialiased"
+            metadata.flat |= mode == "flat"
         elif _VERTICAL_AXIS.fullmatch(comment.strip()) and not by_brush:
             vertical.append(comment.strip())
-        elif words[:1] != [_PREFIX] or len(words) < 2 or not _parse_fact(facts, words[1], words[2:]):
+        elif words[:1] != [_PREFIX] or len(words) < 2 or not _set_field(metadata, words[1], words[2:]):
             others.append(comment)
-    others += _set_vertical_axis(facts, vertical)
+    others += _set_vertical_axis(metadata, vertical)
     if others:
-        facts.metadata["comments"] = others
-    return facts
-
-
-def _set_vertical_axis(facts: CommentMetadata, comments: Sequence[str]) -> Sequence[str]:
-    """Take the up axis from a comment if nothing else names it; return the comments that carry other information."""
-    if not comments:
-        return ()
-    directions = set()
-    for comment in comments:
-        found = _VERTICAL_AXIS.fullmatch(comment)
-        assert found is not None, "it was matched before"
-        sign, axis = found.groups()
-        directions.add(tuple((-1.0 if sign == "-" else 1.0) * (axis.lower() == one) + 0.0 for one in "xyz"))
-    if len(directions) > 1:
-        text = f"the comments {' and '.join(map(repr, comments))} contradict each other: none is taken"
-        facts.findings.append(Finding("vertical-axis", len(comments), text, "note"))
-        return comments
-    said = up_of(facts.metadata, facts.coordinate_system)
-    if said is not None:
-        return () if said == directions.pop() else comments
-    facts.metadata[UP] = list(directions.pop())
-    text = f"the comment {comments[0]!r} says which axis is up"
-    facts.findings.append(Finding("vertical-axis", 1, text, "note"))
-    return ()
+        metadata.metadata["comments"] = others
+    return metadata
 
 
 def format_comments(model: SplatModel, *, absolute: bool) -> list[str]:
-    """Write the facts of a model as comment lines, without the word `comment`.
+    """Return the metadata of a model as comment lines, without the word `comment`.
 
     Args:
         model: the scene.
         absolute: positions are written with the origin added.
 
     Returns:
-        Lines of ASCII (other characters become question marks), none for what is default.
+        Lines of ASCII (other characters become question marks), none for defaults.
     """
     lines = [line for one in _strings(model.metadata.get("comments")) for line in one.splitlines()]
     if absolute or any(model.origin):
@@ -162,23 +144,72 @@ def format_comments(model: SplatModel, *, absolute: bool) -> list[str]:
     return [line.encode("ascii", "replace").decode("ascii") for line in lines]
 
 
-def _parse_fact(facts: CommentMetadata, key: str, values: Sequence[str]) -> bool:
-    """Take over one field; return `False` if the key is none of ours."""
+def split_origin(means: NDArray[Any], metadata: CommentMetadata) -> tuple[F32, tuple[float, float, float], F64 | None]:
+    """Split the positions of a PLY into float32 means and the origin they are relative to.
+
+    Args:
+        means: [N, 3] x, y, z of the file, float32 or float64.
+        metadata: metadata from the comments of the file, with their origin.
+
+    Returns:
+        [N, 3] float32 and three float64, in scene units; and the positions in doubles if the former do not represent
+        them exactly.
+    """
+    with np.errstate(over="ignore"):  # the model refuses what leaves float32
+        if means.dtype == np.float32:
+            origin = None if metadata.origin_is_added else metadata.origin
+            return means, origin or (0.0, 0.0, 0.0), None
+        positions = means
+        origin = metadata.origin
+        if origin is None:
+            origin = _choose_origin(means)
+        elif not metadata.origin_is_added:
+            positions = means + np.array(origin)
+        rounded = (positions - np.array(origin)).astype(np.float32)
+        exact = np.array_equal(rounded + np.array(origin), positions)
+        return rounded, origin, None if exact else positions
+
+
+def _set_vertical_axis(metadata: CommentMetadata, comments: Sequence[str]) -> Sequence[str]:
+    """Take the up axis from comments unless something else names it; return the comments to keep."""
+    if not comments:
+        return ()
+    directions = set()
+    for comment in comments:
+        found = _VERTICAL_AXIS.fullmatch(comment)
+        assert found is not None, "it was matched before"
+        sign, axis = found.groups()
+        directions.add(tuple((-1.0 if sign == "-" else 1.0) * (axis.lower() == one) + 0.0 for one in "xyz"))
+    if len(directions) > 1:
+        text = f"the comments {' and '.join(map(repr, comments))} contradict each other: none is taken"
+        metadata.findings.append(Finding("vertical-axis", len(comments), text, "note"))
+        return comments
+    stated = up_of(metadata.metadata, metadata.coordinate_system)
+    if stated is not None:
+        return () if stated == directions.pop() else comments
+    metadata.metadata[UP] = list(directions.pop())
+    text = f"the comment {comments[0]!r} says which axis is up"
+    metadata.findings.append(Finding("vertical-axis", 1, text, "note"))
+    return ()
+
+
+def _set_field(metadata: CommentMetadata, key: str, values: Sequence[str]) -> bool:
+    """Set the field of a comment; return `False` if its key is not ours."""
     if key in ("origin", "absolute_origin"):
         x, y, z = _numbers(key, values, 3)
-        facts.origin, facts.origin_is_added = (x, y, z), key == "absolute_origin"
+        metadata.origin, metadata.origin_is_added = (x, y, z), key == "absolute_origin"
     elif key == "coordinate_system" and len(values) == 1:
-        facts.coordinate_system = values[0]
+        metadata.coordinate_system = values[0]
     elif key == UP:
-        facts.metadata[UP] = _up(values)
+        metadata.metadata[UP] = _up(values)
     elif key == "unit_metres":
-        (facts.unit_metres,) = _numbers(key, values, 1)
+        (metadata.unit_metres,) = _numbers(key, values, 1)
     elif key == "antialiased" and not values:
-        facts.antialiased = True
+        metadata.antialiased = True
     elif key == "flat" and not values:
-        facts.flat = True
+        metadata.flat = True
     elif key == "licence" and values:
-        facts.metadata["licence"] = " ".join(values)
+        metadata.metadata["licence"] = " ".join(values)
     else:
         return False
     return True
@@ -193,40 +224,39 @@ def _up(values: Sequence[str]) -> list[float]:
 
 
 def _training(comment: str) -> TrainingRecord:
-    said = _json(comment)
     try:
-        return TrainingRecord.from_json(said)
+        return TrainingRecord.from_json(_json(comment))
     except InputError as error:
-        raise _misunderstood(comment, str(error)) from None
+        raise _comment_error(comment, str(error)) from None
 
 
 def _view(comment: str) -> dict[str, Any]:
-    """Parse a camera, which only viewers of the scene use."""
-    said = _json(comment)
-    if not isinstance(said, dict) or not _is_json(said):
-        raise _misunderstood(comment, "wanted an object of finite numbers")
-    return said
+    """Parse a camera; only viewers of the scene use its members."""
+    view = _json(comment)
+    if not isinstance(view, dict) or not _is_json(view):
+        raise _comment_error(comment, "wanted an object of finite numbers")
+    return view
 
 
-def _is_json(said: object) -> bool:
+def _is_json(value: object) -> bool:
     try:
-        json.dumps(said, allow_nan=False)
+        json.dumps(value, allow_nan=False)
     except (TypeError, ValueError, RecursionError):
         return False
     return True
 
 
 def _json(comment: str) -> object:
-    """Parse the JSON after the first two words, in which spaces count."""
+    """Parse the JSON after the first two words, keeping its spaces."""
     try:
         return json.loads("".join(comment.split(None, 2)[2:]))
     except RecursionError:
-        raise _misunderstood(comment, "too many brackets") from None
+        raise _comment_error(comment, "too many brackets") from None
     except ValueError:
-        raise _misunderstood(comment, "not JSON") from None
+        raise _comment_error(comment, "not JSON") from None
 
 
-def _misunderstood(comment: str, reason: str) -> InputError:
+def _comment_error(comment: str, reason: str) -> InputError:
     return InputError(f"the header comment {comment[:_SHOWN]!r} cannot be understood: {reason}")
 
 
@@ -245,42 +275,11 @@ def _strings(value: object) -> list[str]:
     return [one for one in value if isinstance(one, str)] if isinstance(value, list) else []
 
 
-#: float64 positions keep origin 0 while their centre is nearer than this many spreads: float32
-#: relative to 0 then is at most four bits coarser than relative to the centre.
-_NEAR_SPREADS = 16.0
+def _choose_origin(positions: F64) -> tuple[float, float, float]:
+    """Choose an origin for float64 positions so that float32 loses nothing visible.
 
-
-def split_origin(means: NDArray[Any], facts: CommentMetadata) -> tuple[F32, tuple[float, float, float], F64 | None]:
-    """Split the positions of a PLY into float32 means and the origin they are relative to.
-
-    Args:
-        means: [N, 3] x, y, z as the file has them, float32 or float64.
-        facts: metadata from the comments of the file, with their origin.
-
-    Returns:
-        [N, 3] float32 and three float64, in scene units; and the positions in doubles, where float32 does not hold
-        what is left of them.
-    """
-    with np.errstate(over="ignore"):  # the model refuses what leaves float32
-        if means.dtype == np.float32:
-            origin = None if facts.origin_is_added else facts.origin
-            return means, origin or (0.0, 0.0, 0.0), None
-        positions = means
-        origin = facts.origin
-        if origin is None:
-            origin = _origin_for(means)
-        elif not facts.origin_is_added:
-            positions = means + np.array(origin)
-        rounded = (positions - np.array(origin)).astype(np.float32)
-        exact = np.array_equal(rounded + np.array(origin), positions)
-        return rounded, origin, None if exact else positions
-
-
-def _origin_for(positions: F64) -> tuple[float, float, float]:
-    """Choose an origin for float64 positions so that float32 loses nothing that shows.
-
-    Zero, where float32 is exact or the scene lies around zero; else its centre (the median, which
-    outliers do not move), rounded to a power of two near the scene's spread.
+    Zero if float32 is exact or the scene lies around zero; otherwise its centre (the median, which outliers do not
+    move), rounded to a power of two near the scene's spread.
     """
     if len(positions) == 0 or np.array_equal(positions, positions.astype(np.float32)):
         return (0.0, 0.0, 0.0)

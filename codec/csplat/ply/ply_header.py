@@ -73,11 +73,11 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
     Args:
         path: path of the file.
         findings: anything noticed is appended.
-        kind: name of the kind of PLY that is wanted, of `csplat.detect.KINDS`.
+        kind: name of the expected kind of PLY, a key of `csplat.detect.KINDS`.
 
     Raises:
-        InputError: not a PLY of columns, or one without an end of its header.
-        OSError: it cannot be read.
+        InputError: the file is not such a PLY, or its header has no end.
+        OSError: the file cannot be read.
     """
     head = head_of(path)
     if head.startswith(_WIDE_MARKS) and is_ply(head[2:].replace(b"\0", b"")):
@@ -94,33 +94,33 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
     raw = data[: end.end()]
     if raw[3:5] not in (b"\r\n", b"\r") and raw[3:4] == b"\r" and raw.endswith(b"\r\n"):
         raw = raw[:-1]  # lines end with CR: the LF is the first byte of a row
-    text, oddities = _as_plyfile_takes_it(raw)
+    text, oddities = _rewrite_header(raw)
     if start:
         oddities.insert(0, "a byte order mark")
     if oddities:
         findings.append(Finding("unusual-header", len(oddities), f"the header has {', '.join(oddities)}", "note"))
     if not raw.isascii():
         count = sum(byte > 127 for byte in raw)
-        said = f"{counted(count, 'byte')} of the header outside ASCII: read as question marks"
-        findings.append(Finding("non-ascii-header", count, said, "note"))
+        note = f"{counted(count, 'byte')} of the header outside ASCII: read as question marks"
+        findings.append(Finding("non-ascii-header", count, note, "note"))
     text = bytes(byte if byte < 128 else ord("?") for byte in text)
     lines = [line.split() for line in text.splitlines()]
     findings += _count_findings(lines, path.stat().st_size)
-    return PlyHeader(start, text, any(words[:2] == [b"format", b"ascii"] for words in lines), _elements(lines))
+    return PlyHeader(start, text, any(words[:2] == [b"format", b"ascii"] for words in lines), _parse_elements(lines))
 
 
-def _as_plyfile_takes_it(raw: bytes) -> tuple[bytes, list[str]]:
-    """Rewrite a header in the same number of bytes, and list what was unusual; return it unchanged if nothing was."""
+def _rewrite_header(raw: bytes) -> tuple[bytes, list[str]]:
+    """Rewrite a header for plyfile in the same number of bytes, and list what was unusual about it."""
     first_end = _LINE_END.search(raw)
     assert first_end is not None, "there is a line end_header"
     end = first_end[0]
     lines = raw.split(end)[:-1]
-    spelled = [_spelled(line) for line in lines]
-    if lines[-1] == b"end_header" and all(lines) and lines == spelled and (end == b"\n" or not _has_line_end(lines)):
+    normalised = [_normalise_line(line) for line in lines]
+    if lines[-1] == b"end_header" and all(lines) and lines == normalised and (end == b"\n" or not _has_line_end(lines)):
         return raw, []
     lines = _LINE_END.split(raw)[:-1]
-    spelled = [_spelled(line) for line in lines]
-    changed = [old for old, new in zip(lines, spelled, strict=True) if old.split() != new.split()]
+    normalised = [_normalise_line(line) for line in lines]
+    changed = [old for old, new in zip(lines, normalised, strict=True) if old.split() != new.split()]
     words = dict.fromkeys(word for line in changed for word in line.split() if word != word.lower())
     blank = sum(not line.strip() for line in lines)
     kinds = {one[0] for one in _LINE_END.finditer(raw)}
@@ -128,7 +128,7 @@ def _as_plyfile_takes_it(raw: bytes) -> tuple[bytes, list[str]]:
     oddities += [f"capitals in {' '.join(word.decode('ascii', 'replace') for word in [*words][:3])}"] if words else []
     oddities += ["spaces next to end_header"] if lines[-1].lower() != b"end_header" else []
     oddities += ["line ends of two kinds"] if len(kinds) > 1 else []
-    kept = [line for line in spelled if line.strip()]
+    kept = [line for line in normalised if line.strip()]
     text = b"\n".join([*kept, b""])
     kept[1] += b" " * (len(raw) - len(text))  # plyfile finds the rows by their place in the file
     return b"\n".join([*kept, b""]), oddities
@@ -138,25 +138,25 @@ def _has_line_end(lines: list[bytes]) -> bool:
     return any(_LINE_END.search(line) for line in lines)
 
 
-def _spelled(line: bytes) -> bytes:
-    """Write a line of a header in small letters, but for names and free text; never longer than before."""
+def _normalise_line(line: bytes) -> bytes:
+    """Return a header line in lower case except for names and free text; never longer than before."""
     words = line.split()
     keyword = words[0].lower() if words else b""
     if keyword in _FREE_TEXT:
         return keyword + line.lstrip()[len(keyword) :]
     if keyword in (b"ply", b"format", b"end_header"):
-        spelled = [word.lower() for word in words]
+        normalised = [word.lower() for word in words]
     elif keyword == b"property":
-        spelled = [*(word.lower() for word in words[:-1]), words[-1]]
+        normalised = [*(word.lower() for word in words[:-1]), words[-1]]
     elif keyword == b"element":
         named = [word.lower() if word.lower() == SPLAT_ELEMENT.encode() else word for word in words[1:]]
-        spelled = [keyword, *named]
+        normalised = [keyword, *named]
     else:
         return line
-    return line if words == spelled and keyword not in (b"ply", b"end_header") else b" ".join(spelled)
+    return line if words == normalised and keyword not in (b"ply", b"end_header") else b" ".join(normalised)
 
 
-def _elements(lines: list[list[bytes]]) -> list[PlyElement]:
+def _parse_elements(lines: list[list[bytes]]) -> list[PlyElement]:
     found: list[PlyElement] = []
     for words in lines:
         if words[:1] == [b"element"] and len(words) == 3:
@@ -183,13 +183,13 @@ def _count_findings(lines: list[list[bytes]], size: int) -> list[Finding]:
     return findings
 
 
-Rows = list[list[str]]
+TextRows = list[list[str]]
 
 _TEXT_LINE_END = re.compile(r"\r\n|\r|\n")
 _NAN = re.compile(r"(?<!\S)[+-]?(?:nan\([a-z]*\)|1\.#(?:ind|[qs]nan)0*)(?!\S)", re.IGNORECASE)
 _INFINITY = re.compile(r"(?<!\S)([+-]?)1\.#inf0*(?!\S)", re.IGNORECASE)
 _EXPONENT = re.compile(r"(?<!\S)([+-]?(?:\d+\.?\d*|\.\d+))d([+-]?\d+)(?!\S)", re.IGNORECASE)
-#: By what they are for messages, numbers that other languages write, and how Python does.
+#: Numbers as other languages write them: description for messages, pattern, and Python's spelling.
 _SPELLINGS = {
     "NaN as Microsoft's C writes it": (_NAN, "nan"),
     "infinity as Microsoft's C writes it": (_INFINITY, r"\1inf"),
@@ -200,39 +200,40 @@ _NO_THOUSANDS = re.compile(r"\d,(?!\d{3}(?!\d))\d")  # not followed by three dig
 
 
 class _RowError(ValueError):
-    """Rows that are none, for the reason that a finding names."""
+    """Text that does not form the declared rows; the finding says why."""
 
     def __init__(self, finding: Finding) -> None:
         super().__init__(finding.text)
         self.finding = finding
 
 
-def parse_text_rows(body: bytes, elements: Sequence[PlyElement]) -> tuple[Rows | None, list[Finding]]:
-    """Take the rows of all elements apart, however they are laid out.
+def parse_text_rows(body: bytes, elements: Sequence[PlyElement]) -> tuple[TextRows | None, list[Finding]]:
+    """Split text into the rows of all elements, whatever its layout.
 
     Args:
-        body: the file behind its header.
-        elements: what the header declares.
+        body: the file after its header.
+        elements: elements that the header declares.
 
     Returns:
-        The words of each row, `None` where there are fewer rows than declared or one has more or fewer values; and
-        what was unusual.
+        The words of each row, and findings. The rows are `None` if fewer are there than declared, or if one has more
+        or fewer values.
     """
     text = body.decode("ascii", "replace")
-    said = []
-    for what, (pattern, written) in _SPELLINGS.items():
-        text, count = pattern.subn(written, text)
-        said += [f"{what} ({counted(count, 'number')})"] if count else []
+    oddities = []
+    for name, (pattern, spelling) in _SPELLINGS.items():
+        text, count = pattern.subn(spelling, text)
+        oddities += [f"{name} ({counted(count, 'number')})"] if count else []
     first: _RowError | None = None
-    for separated, what in _separations(text):
+    for separated, separators in _separations(text):
         lines = [line.split() for line in _TEXT_LINE_END.split(separated)]
         try:
-            rows, laid_out, rest = _laid_out(lines, elements)
+            rows, layout, rest = _split_rows(lines, elements)
         except _RowError as error:
             first = first or error
             continue
-        said += [what] * bool(what) + laid_out
-        findings = [Finding("unusual-rows", len(said), f"the rows have {', '.join(said)}", "note")] if said else []
+        oddities += [separators] * bool(separators) + layout
+        note = f"the rows have {', '.join(oddities)}"
+        findings = [Finding("unusual-rows", len(oddities), note, "note")] if oddities else []
         size = len(" ".join(rest))
         if size:
             findings.append(Finding("trailing-bytes", size, f"{size} bytes after the last row: ignored", "repair"))
@@ -242,7 +243,7 @@ def parse_text_rows(body: bytes, elements: Sequence[PlyElement]) -> tuple[Rows |
 
 
 def _separations(text: str) -> list[tuple[str, str]]:
-    """The text with nothing but spaces between numbers, in each way that its commas can be meant; and that way."""
+    """Return the text with only spaces between numbers, once for each possible meaning of its commas."""
     if "," not in text and ";" not in text:
         return [(text, "")]
     found = []
@@ -251,16 +252,16 @@ def _separations(text: str) -> list[tuple[str, str]]:
     return [*found, (re.sub("[,;]", " ", text), "commas or semicolons between numbers"), (text, "")]
 
 
-def _laid_out(lines: Rows, elements: Sequence[PlyElement]) -> tuple[Rows, list[str], list[str]]:
-    """Give each row the values of one; what is unusual of the lines; and the words behind the last row.
+def _split_rows(lines: TextRows, elements: Sequence[PlyElement]) -> tuple[TextRows, list[str], list[str]]:
+    """Return the rows, what is unusual about their lines, and the words after the last row.
 
-    Rows may share lines, or go on in the next one, as long as each line or each row ends with one of the other: a value
-    that is missing does not shift those behind it.
+    Rows may share a line or continue on the next one, as long as every line end is a row end or every row end is a
+    line end: so a missing value never shifts those after it.
     """
     blank = next((at for at in range(len(lines) - 1, -1, -1) if lines[at]), -1) + 1 - sum(map(bool, lines))
-    said = ["blank lines"] if blank else []
+    oddities = ["blank lines"] if blank else []
     lines = [line for line in lines if line]
-    rows: Rows = []
+    rows: TextRows = []
     at = 0
     for element in elements:
         width = len(element.properties)
@@ -276,20 +277,22 @@ def _laid_out(lines: Rows, elements: Sequence[PlyElement]) -> tuple[Rows, list[s
         ends = list(accumulate(map(len, lines[at:])))
         count = next((number for number, end in enumerate(ends, 1) if end >= width * element.count), len(ends))
         ends = ends[:count]
-        wanted = set(range(width, width * element.count + 1, width))
-        if not ends or ends[-1] != width * element.count or not (wanted <= set(ends) or set(ends) <= wanted):
+        row_ends = set(range(width, width * element.count + 1, width))
+        if not ends or ends[-1] != width * element.count or not (row_ends <= set(ends) or set(ends) <= row_ends):
             row, line = next((pair for pair in enumerate(lines[at:]) if len(pair[1]) != width), (0, []))
             text = f"row {row} of {element.name} has {len(line)} values, expected {width}"
             raise _RowError(Finding("malformed", 1, text, "error"))
         words = [word for line in lines[at : at + count] for word in line]
         rows += [words[first : first + width] for first in range(0, len(words), width)]
-        said.append(f"{element.count} of {element.name} in {count} lines" if count > 1 else "all values in one line")
+        oddities.append(
+            f"{element.count} of {element.name} in {count} lines" if count > 1 else "all values in one line"
+        )
         at += count
     rest = [word for line in lines[at:] for word in line]
     if rest and len(rows) != at:
         text = f"there are {counted(len(rest), 'value')} behind rows that are not in lines of their own"
         raise _RowError(Finding("malformed", len(rest), text, "error"))
-    return rows, said, rest
+    return rows, oddities, rest
 
 
 def _truncated(element: PlyElement, present: int) -> Finding:

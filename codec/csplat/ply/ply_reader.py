@@ -22,8 +22,9 @@ import plyfile
 from csplat.errors import InputError, counted
 from csplat.files import local_file
 from csplat.inputs import File
-from csplat.lint import ColumnMap, Finding, find_columns, refuse
+from csplat.lint import Finding, refuse
 from csplat.model import SplatModel, check_sh_degree
+from csplat.ply.column_names import ColumnMap, find_columns
 from csplat.ply.columns import (
     Rows,
     RowStatistics,
@@ -39,6 +40,13 @@ from csplat.scene import BLOCK, Scene
 from csplat.types import F32, F64
 
 _EMPTY = Finding("empty", 0, "the file holds no splats", "note")
+_FRAME = "delta_vertex_"  # prefix of Brush's elements: differences of later frames from the first
+#: Elements of Apple's ml-sharp (gaussians.py): the camera of its image, and data that only its programs read.
+_SHARP = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space", "version"}
+_COLOUR_SPACE, _SRGB = "color_space", 0
+_BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time: they stay in the cache
+_EARLY_END = "early end-of-file"  # message of plyfile
+_SHOWN = 40  # characters of a word in a message
 
 
 def read_ply(
@@ -51,19 +59,19 @@ def read_ply(
 ) -> SplatModel:
     """Read a PLY of splats: binary of either byte order or ASCII, SH degree 0 to 3.
 
-    Columns that another program names in its own way are found by a table (`csplat.lint`): those of CloudCompare,
-    red, green and blue in place of f_dc, and the filter of Mip-Splatting, which is fused. Each is reported.
+    Columns that other programs name differently are recognised and reported (`csplat.lint`): those of CloudCompare,
+    red, green and blue in place of f_dc, and the filter of Mip-Splatting, which is fused into scales and opacities.
 
-    Opacities go through the sigmoid in float64, rounded once; above a logit of 16 float32 alpha
-    is too close to 1 to keep neighbours apart. Rotations become unit length. Positions in doubles
-    get an `origin`, named by a comment of the file or chosen so that float32 loses nothing.
-    Header comments are kept in `metadata["comments"]`.
+    Opacities go through the sigmoid in float64 and are rounded once; above a logit of 16, float32 alpha is too close
+    to 1 to keep neighbours apart. Rotations are normalised. Positions in doubles get an `origin`, either the one that
+    a comment of the file names or one chosen so that float32 loses nothing. Header comments are kept in
+    `metadata["comments"]`.
 
     Args:
-        file: its path; an open binary file, or the bytes, of which a temporary copy is made.
+        file: its path; or an open binary file or the bytes, which are copied to a temporary file.
         strict: refuse what would be repaired (`csplat.lint` lists it).
         keep_extra: keep columns that splats do not have in `SplatModel.extra`.
-        sh_degree: leave out the SH bands above, also of a file of a higher degree than 3; `None`: keep all.
+        sh_degree: drop the SH bands above it, also from a file of a higher degree than 3; `None`: keep all.
         report: findings are appended to this list, repairs among them.
 
     Examples:
@@ -75,8 +83,8 @@ def read_ply(
         ((1000, 3), dtype('float32'))
 
     Raises:
-        InputError: not a PLY of splats (other splat formats are named, with a converter), or one
-            that cannot be repaired, or under `strict` one that would have to be.
+        InputError: the file is not a PLY of splats (the message names other splat formats and a converter), or it
+            cannot be repaired, or `strict` is set and it would have to be.
         OSError: the file cannot be read.
     """
     findings: list[Finding] = []
@@ -92,187 +100,46 @@ def read_ply(
 
 
 def lint_ply(file: File, *, sh_degree: int | None = None) -> list[Finding]:
-    """Find out what is wrong with a PLY of splats, without refusing it.
+    """List what is wrong with a PLY of splats, without refusing it.
 
     Args:
         file: as in `read_ply`.
         sh_degree: as in `read_ply`.
 
     Returns:
-        Findings in the order of reading; the last one is an error where `read_ply` would refuse.
+        Findings in the order of reading; the last one is an error if `read_ply` would refuse the file.
 
     Raises:
-        InputError: not a PLY at all, or its header cannot be parsed.
+        InputError: the file is not a PLY, or its header cannot be parsed.
         OSError: the file cannot be read.
     """
     findings: list[Finding] = []
     with local_file(file) as path:
-        opened = _opened(path, findings, keep_extra=False, strict=False, sh_degree=sh_degree)
-        if opened is not None:
-            survey = _surveyed(path, opened, findings)
-            if len(opened.rows) == 0:
+        ply = _open(path, findings, keep_extra=False, strict=False, sh_degree=sh_degree)
+        if ply is not None:
+            survey = _survey(ply, findings)
+            if len(ply.rows) == 0:
                 findings.append(_EMPTY)
-            _without_splats(opened, survey)  # a model refuses what no finding is about
-            for _ in _models(path, opened, survey, keep_extra=False):
+            _empty_model(ply, survey)  # a model refuses what no finding is about
+            for _ in _model_blocks(ply, survey, keep_extra=False):
                 pass
     return findings
 
 
 @contextmanager
 def open_ply(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
-    """Open a PLY as `csplat.formats` does; the rest as `read_ply`.
+    """Open a PLY to be read block by block (`csplat.formats.open_scene`); otherwise as `read_ply`.
 
-    What belongs to all splats (how many are kept, an origin for doubles, the thickness of discs) is found first, in a
-    pass of its own.
+    A first pass finds what depends on all splats: how many are kept, an origin for doubles, the thickness of discs.
     """
     findings: list[Finding] = []
-    opened = _opened(path, findings, keep_extra=True, strict=False, sh_degree=sh_degree)
+    ply = _open(path, findings, keep_extra=True, strict=False, sh_degree=sh_degree)
     refuse(findings, strict=False)
-    assert opened is not None, "without an error there are rows"
-    survey = _surveyed(path, opened, findings)
+    assert ply is not None, "without an error there are rows"
+    survey = _survey(ply, findings)
     refuse(findings, strict=False)
-    facts = _without_splats(opened, survey)
-    yield Scene(survey.kept, facts, partial(_models, path, opened, survey, keep_extra=True), findings)
-
-
-_Placed = tuple[F32, tuple[float, float, float], F64 | None]  # means, origin, means in doubles
-
-
-class _Survey(NamedTuple):
-    """Facts about all splats of a file together.
-
-    Attributes:
-        kept: splats without those that are dropped.
-        thinnest: the smallest scale.
-        placed: for positions in doubles, all of them, in their places.
-    """
-
-    kept: int
-    thinnest: float
-    placed: _Placed | None
-
-
-def _surveyed(path: Path, opened: _Opened, findings: list[Finding]) -> _Survey:
-    """Go through all rows, appending what is noticed to `findings`."""
-    counts, total, positions, thinnest, columns = RowStatistics(), 0, [], math.inf, opened.columns
-    for block in row_blocks(path, opened.rows, BLOCK):
-        arrays = gather_arrays([block], len(block), opened.rows.dtype, columns, counts=counts)
-        total += len(arrays.means)
-        thinnest = min(thinnest, float(arrays.scales[:, : len(columns.scales)].min(initial=math.inf)))
-        if columns.double:
-            positions.append(arrays.means)
-    findings += list_findings(counts, len(opened.rows))
-    if not columns.double:
-        return _Survey(total, thinnest, None)
-    placed = split_origin(np.concatenate([np.zeros((0, 3)), *positions]), opened.facts)
-    findings.append(_doubles_finding(opened, total, placed[1]))
-    return _Survey(total, thinnest, placed)
-
-
-def _without_splats(opened: _Opened, survey: _Survey) -> SplatModel:
-    """Everything that is said of the scene."""
-    empty = gather_arrays([], 0, opened.rows.dtype, opened.columns, keep_extra=True)
-    placed = split_origin(empty.means, opened.facts)
-    return _model(empty, placed if survey.placed is None else (placed[0], survey.placed[1], None), opened)
-
-
-def _models(path: Path, opened: _Opened, survey: _Survey, *, keep_extra: bool) -> Iterator[SplatModel]:
-    """The splats that are kept, some at a time."""
-    at = 0
-    for block in row_blocks(path, opened.rows, BLOCK):
-        arrays = gather_arrays(
-            [block], len(block), opened.rows.dtype, opened.columns, keep_extra=keep_extra, thinnest=survey.thinnest
-        )
-        part = slice(at, at + len(arrays.means))
-        if survey.placed is None:
-            placed = split_origin(arrays.means, opened.facts)
-        else:
-            means, origin, doubles = survey.placed
-            placed = means[part], origin, None if doubles is None else doubles[part]
-        at = part.stop
-        if len(arrays.means):
-            yield _model(arrays, placed, opened)
-
-
-@dataclass(frozen=True, eq=False)
-class _Opened:
-    rows: Rows
-    columns: ColumnMap
-    facts: CommentMetadata
-
-
-def _opened(
-    path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool, sh_degree: int | None
-) -> _Opened | None:
-    """Look at all but the rows, appending what is noticed to `findings`; `None` if that holds an error."""
-    check_sh_degree(sh_degree)
-    content = parse_ply(path, findings)
-    if content is None:
-        return None
-    rows = with_half_floats(content.rows, findings)
-    if any(not one.repairable for one in findings):
-        return None
-    columns, more = find_columns(
-        rows.dtype, keep_extra=keep_extra, sh_degree=sh_degree, elements=content.elements
-    )  # fmt: skip
-    findings += more
-    if columns is None:
-        return None
-    refuse(findings, strict=strict)  # before the work
-    columns = with_colour_range(row_blocks(path, rows), columns, findings)
-    facts = parse_comments(content.comments)
-    findings += facts.findings
-    return _Opened(rows, columns, facts)
-
-
-def _load(
-    path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool, sh_degree: int | None
-) -> SplatModel | None:
-    """Read a file, appending what is noticed to `findings`; `None` if that holds an error."""
-    opened = _opened(path, findings, keep_extra=keep_extra, strict=strict, sh_degree=sh_degree)
-    if opened is None:
-        return None
-    rows, columns, counts = opened.rows, opened.columns, RowStatistics()
-    arrays = gather_arrays(row_blocks(path, rows), len(rows), rows.dtype, columns, keep_extra=keep_extra, counts=counts)
-    findings += list_findings(counts, len(rows))
-    if len(rows) == 0:
-        findings.append(_EMPTY)
-    placed = split_origin(arrays.means, opened.facts)
-    if columns.double:
-        findings.append(_doubles_finding(opened, len(arrays.means), placed[1]))
-    return _model(arrays, placed, opened)
-
-
-def _doubles_finding(opened: _Opened, count: int, origin: tuple[float, float, float]) -> Finding:
-    is_float = all(opened.rows.dtype[name].kind == "f" for name in opened.columns.means)
-    text = f"positions are {'in doubles' if is_float else 'integers'}: {count} means are float32 relative to {origin}"
-    return Finding("double-means", count, text, "note")
-
-
-def _model(arrays: SplatArrays, placed: _Placed, opened: _Opened) -> SplatModel:
-    means, origin, doubles = placed
-    facts = opened.facts
-    return SplatModel(
-        means=means,
-        quats=arrays.quats,
-        scales=arrays.scales,
-        opacities=arrays.opacities,
-        sh0=arrays.sh0,
-        shN=arrays.shN,
-        origin=origin,
-        **{**facts.fields(), "flat": facts.flat or len(opened.columns.scales) == 2},
-        extra=arrays.extra,
-        means_double=doubles,
-    )
-
-
-_FRAME = "delta_vertex_"  # prefix of Brush's elements: differences of later frames from the first
-#: Elements of Apple's ml-sharp (gaussians.py): the camera of its image, and data that only its programs read.
-_SHARP = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space", "version"}
-_COLOUR_SPACE, _SRGB = "color_space", 0
-_BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time: they stay in the cache
-_EARLY_END = "early end-of-file"  # message of plyfile
-_SHOWN = 40  # characters of a word in a message
+    metadata = _empty_model(ply, survey)
+    yield Scene(survey.kept_count, metadata, partial(_model_blocks, ply, survey, keep_extra=True), findings)
 
 
 class PlyContent(NamedTuple):
@@ -290,26 +157,26 @@ class PlyContent(NamedTuple):
 
 
 def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
-    """Let plyfile parse a file.
+    """Parse a file with plyfile.
 
     Args:
         path: path of the file.
         findings: anything noticed is appended.
 
     Returns:
-        Its content; `None` if the findings hold an error.
+        The content; `None` if the findings hold an error.
 
     Raises:
-        InputError: not a PLY of splats, or its header cannot be parsed.
-        OSError: it cannot be read.
+        InputError: the file is not a PLY of splats, or its header cannot be parsed.
+        OSError: the file cannot be read.
     """
     header = read_ply_header(path, findings)
     if any(not one.repairable for one in findings):
         return None
-    # Numbers of text beyond their type become infinite, which is found later. NumPy warns of that, and of an empty
+    # Text numbers beyond their type become infinite, which is found later; NumPy warns about them, and about an empty
     # table, which plyfile then refuses.
     quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
-    with _open(path, header) as stream, np.errstate(over="ignore"), quiet:
+    with _open_for_plyfile(path, header) as stream, np.errstate(over="ignore"), quiet:
         try:
             try:
                 parsed = plyfile.PlyData.read(stream)
@@ -325,7 +192,7 @@ def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
         raise InputError(f"{path.name} has no element {SPLAT_ELEMENT!r}: not a PLY of splats")
     others = [element for element in parsed if element.name != SPLAT_ELEMENT]
     findings += _other_findings(others)
-    rows, lists = _scalars(parsed[SPLAT_ELEMENT].data)
+    rows, lists = _scalar_columns(parsed[SPLAT_ELEMENT].data)
     if lists:
         text = f"list properties {', '.join(lists)}: dropped"
         findings.append(Finding("list-columns", len(lists), text, "repair"))
@@ -335,8 +202,148 @@ def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
     return PlyContent(rows, comments, [element.name for element in others])
 
 
+@dataclass(frozen=True, eq=False)
+class _OpenPly:
+    """A parsed file whose columns and comments are understood."""
+
+    path: Path
+    rows: Rows
+    columns: ColumnMap
+    metadata: CommentMetadata
+
+    def blocks(self, max_rows: int | None = None) -> Iterator[Rows]:
+        return _row_blocks(self.path, self.rows, max_rows)
+
+
+def _open(
+    path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool, sh_degree: int | None
+) -> _OpenPly | None:
+    """Parse all but the values of the rows, appending to `findings`; return `None` if these hold an error."""
+    check_sh_degree(sh_degree)
+    content = parse_ply(path, findings)
+    if content is None:
+        return None
+    rows = with_half_floats(content.rows, findings)
+    if any(not one.repairable for one in findings):
+        return None
+    columns, more = find_columns(
+        rows.dtype, keep_extra=keep_extra, sh_degree=sh_degree, elements=content.elements
+    )  # fmt: skip
+    findings += more
+    if columns is None:
+        return None
+    refuse(findings, strict=strict)  # before the work
+    columns = with_colour_range(_row_blocks(path, rows), columns, findings)
+    metadata = parse_comments(content.comments)
+    findings += metadata.findings
+    return _OpenPly(path, rows, columns, metadata)
+
+
+def _load(
+    path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool, sh_degree: int | None
+) -> SplatModel | None:
+    """Read a file in one pass, appending to `findings`; return `None` if these hold an error."""
+    ply = _open(path, findings, keep_extra=keep_extra, strict=strict, sh_degree=sh_degree)
+    if ply is None:
+        return None
+    statistics = RowStatistics()
+    arrays = gather_arrays(
+        ply.blocks(), len(ply.rows), ply.rows.dtype, ply.columns, keep_extra=keep_extra, statistics=statistics
+    )
+    findings += list_findings(statistics, len(ply.rows))
+    if len(ply.rows) == 0:
+        findings.append(_EMPTY)
+    positions = split_origin(arrays.means, ply.metadata)
+    if ply.columns.double:
+        findings.append(_doubles_finding(ply, len(arrays.means), positions[1]))
+    return _build_model(arrays, positions, ply)
+
+
+_Positions = tuple[F32, tuple[float, float, float], F64 | None]  # means, origin, means in doubles
+
+
+class _Survey(NamedTuple):
+    """Properties of all splats of a file together.
+
+    Attributes:
+        kept_count: splats without those that are dropped.
+        thinnest: the smallest scale.
+        positions: the positions of all splats if the file has them in doubles.
+    """
+
+    kept_count: int
+    thinnest: float
+    positions: _Positions | None
+
+
+def _survey(ply: _OpenPly, findings: list[Finding]) -> _Survey:
+    """Go through all rows once, appending to `findings`."""
+    statistics, kept_count, means, thinnest = RowStatistics(), 0, [], math.inf
+    for block in ply.blocks(BLOCK):
+        arrays = gather_arrays([block], len(block), ply.rows.dtype, ply.columns, statistics=statistics)
+        kept_count += len(arrays.means)
+        thinnest = min(thinnest, float(arrays.scales[:, : len(ply.columns.scales)].min(initial=math.inf)))
+        if ply.columns.double:
+            means.append(arrays.means)
+    findings += list_findings(statistics, len(ply.rows))
+    if not ply.columns.double:
+        return _Survey(kept_count, thinnest, None)
+    positions = split_origin(np.concatenate([np.zeros((0, 3)), *means]), ply.metadata)
+    findings.append(_doubles_finding(ply, kept_count, positions[1]))
+    return _Survey(kept_count, thinnest, positions)
+
+
+def _empty_model(ply: _OpenPly, survey: _Survey) -> SplatModel:
+    """Return a model of the metadata alone."""
+    arrays = gather_arrays([], 0, ply.rows.dtype, ply.columns, keep_extra=True)
+    means, origin, doubles = split_origin(arrays.means, ply.metadata)
+    if survey.positions is not None:
+        origin, doubles = survey.positions[1], None
+    return _build_model(arrays, (means, origin, doubles), ply)
+
+
+def _model_blocks(ply: _OpenPly, survey: _Survey, *, keep_extra: bool) -> Iterator[SplatModel]:
+    """Yield the splats that are kept, at most `BLOCK` at a time."""
+    start = 0
+    for block in ply.blocks(BLOCK):
+        arrays = gather_arrays(
+            [block], len(block), ply.rows.dtype, ply.columns, keep_extra=keep_extra, thinnest=survey.thinnest
+        )
+        part = slice(start, start + len(arrays.means))
+        if survey.positions is None:
+            positions = split_origin(arrays.means, ply.metadata)
+        else:
+            means, origin, doubles = survey.positions
+            positions = means[part], origin, None if doubles is None else doubles[part]
+        start = part.stop
+        if len(arrays.means):
+            yield _build_model(arrays, positions, ply)
+
+
+def _doubles_finding(ply: _OpenPly, count: int, origin: tuple[float, float, float]) -> Finding:
+    is_float = all(ply.rows.dtype[name].kind == "f" for name in ply.columns.means)
+    text = f"positions are {'in doubles' if is_float else 'integers'}: {count} means are float32 relative to {origin}"
+    return Finding("double-means", count, text, "note")
+
+
+def _build_model(arrays: SplatArrays, positions: _Positions, ply: _OpenPly) -> SplatModel:
+    means, origin, doubles = positions
+    return SplatModel(
+        means=means,
+        quats=arrays.quats,
+        scales=arrays.scales,
+        opacities=arrays.opacities,
+        sh0=arrays.sh0,
+        shN=arrays.shN,
+        origin=origin,
+        **{**ply.metadata.fields(), "flat": ply.metadata.flat or len(ply.columns.scales) == 2},
+        extra=arrays.extra,
+        means_double=doubles,
+    )
+
+
 def _read_again(path: Path, header: PlyHeader, findings: list[Finding], error: Any) -> Any:
-    """Read a file that plyfile could not read as it is; `None`: it is refused, and the findings give the reason.
+    """Read a file that plyfile refused; return `None` if it stays refused, with the reason in the findings.
 
     Args:
         path: path of the file.
@@ -364,20 +371,20 @@ def _read_again(path: Path, header: PlyHeader, findings: list[Finding], error: A
 
 
 def _row_finding(error: Any, rows: list[list[str]], header: PlyHeader) -> Finding:
-    """Report which value of a row of text is wrong."""
-    name, row, said = error.element.name, error.row or 0, error.message
+    """Report which value of a text row is wrong."""
+    name, row, text = error.element.name, error.row or 0, error.message
     at = [element.name for element in header.elements].index(name)
     element, before = header.elements[at], sum(one.count for one in header.elements[:at])
     if error.prop is not None and not element.has_lists:
         word = rows[before + row][element.properties.index(error.prop.name)]
         kind = np.dtype(error.prop.val_dtype)
-        wanted = "a number" if kind.kind == "f" else f"an integer of type {kind.name}"
-        said = f"{error.prop.name} is {word[:_SHOWN]!r}, expected {wanted}"
-    return Finding("malformed", 1, f"row {row} of {name}: {said}", "error")
+        expected = "a number" if kind.kind == "f" else f"an integer of type {kind.name}"
+        text = f"{error.prop.name} is {word[:_SHOWN]!r}, expected {expected}"
+    return Finding("malformed", 1, f"row {row} of {name}: {text}", "error")
 
 
 def _other_findings(others: list[Any]) -> list[Finding]:
-    """Report what becomes of elements that are no splats."""
+    """Report elements that hold no splats."""
     if not others:
         return []
     names = [element.name for element in others]
@@ -389,15 +396,15 @@ def _other_findings(others: list[Any]) -> list[Finding]:
     findings = [Finding("sharp-elements", len(others), f"{text}; they are the camera of ml-sharp", "note")]
     for element in others:
         values = element.data[_COLOUR_SPACE] if element.name == _COLOUR_SPACE == element.properties[0].name else ()
-        said = [value for value in values if value != _SRGB]
-        if said:
-            text = f"{_COLOUR_SPACE} is {said[0]} (linear RGB), expected {_SRGB} (sRGB): export the scene in sRGB"
+        linear = [value for value in values if value != _SRGB]
+        if linear:
+            text = f"{_COLOUR_SPACE} is {linear[0]} (linear RGB), expected {_SRGB} (sRGB): export the scene in sRGB"
             findings.append(Finding("colour-space", 1, text, "error"))
     return findings
 
 
 def _trailing_findings(path: Path, header: PlyHeader, end: int | None, row_count: int) -> list[Finding]:
-    """Count the bytes after the last row; an ASCII file (`end` is `None`) has a line per row."""
+    """Report bytes after the last row; in an ASCII file (`end` is `None`) each row is a line."""
     if end is not None:
         count = path.stat().st_size - end
         if count and _is_changed_as_text(path, header, count):
@@ -418,7 +425,7 @@ def _trailing_findings(path: Path, header: PlyHeader, end: int | None, row_count
 
 
 def _is_changed_as_text(path: Path, header: PlyHeader, surplus: int) -> bool:
-    """Tell whether a carriage return was inserted before the line feeds of binary rows.
+    """Return True if a carriage return was inserted before each line feed of binary rows.
 
     Args:
         path: path of the file.
@@ -439,8 +446,8 @@ def _is_changed_as_text(path: Path, header: PlyHeader, surplus: int) -> bool:
     return surplus <= feeds
 
 
-def _scalars(data: Rows) -> tuple[Rows, list[str]]:
-    """Take list properties out of rows. Returns contiguous rows and the names taken out."""
+def _scalar_columns(data: Rows) -> tuple[Rows, list[str]]:
+    """Drop the list properties; return contiguous rows and the names of what was dropped."""
     names = data.dtype.names or ()
     lists = [name for name in names if data.dtype[name].hasobject]
     if not lists:
@@ -452,36 +459,36 @@ def _scalars(data: Rows) -> tuple[Rows, list[str]]:
     return rows, lists
 
 
-def row_blocks(path: Path, rows: Rows, most: int | None = None) -> Iterator[Rows]:
-    """Rows in blocks. Those of a memory map are read instead: aligned, and not resident twice.
+def _row_blocks(path: Path, rows: Rows, max_rows: int | None = None) -> Iterator[Rows]:
+    """Yield rows in blocks; rows of a memory map are read from the file instead: aligned, and not resident twice.
 
     Args:
         path: path of the file.
-        rows: as `parse_ply` gives them.
-        most: rows of a block; `None`: the number that stays in the cache.
+        rows: as `parse_ply` returns them.
+        max_rows: rows of a block; `None`: the number that stays in the cache.
     """
-    step = most or max(1, _BLOCK_SIZE // max(1, rows.dtype.itemsize))
+    step = max_rows or max(1, _BLOCK_SIZE // max(1, rows.dtype.itemsize))
     if not isinstance(rows, np.memmap):
         yield from (rows[start : start + step] for start in range(0, len(rows), step))
         return
     with path.open("rb") as stream:
         stream.seek(rows.offset)
         for start in range(0, len(rows), step):
-            want = min(step, len(rows) - start)
-            block = np.fromfile(stream, rows.dtype, want)
-            if len(block) != want:
+            count = min(step, len(rows) - start)
+            block = np.fromfile(stream, rows.dtype, count)
+            if len(block) != count:
                 raise InputError(f"{path.name} became shorter while it was read")
             yield block
 
 
-def _open(path: Path, header: PlyHeader) -> IO[Any]:
-    """Open a PLY for plyfile, behind a byte order mark: as text if it is text, with the header that it takes."""
-    stream = _PlyReader(path, header)
+def _open_for_plyfile(path: Path, header: PlyHeader) -> IO[Any]:
+    """Open a PLY after its byte order mark, as text if it is text, with the header that plyfile accepts."""
+    stream = _StreamWithHeader(path, header)
     return io.TextIOWrapper(stream, encoding="ascii", errors="replace") if header.is_text else stream
 
 
-class _PlyReader(io.BufferedReader):
-    """A file with another header."""
+class _StreamWithHeader(io.BufferedReader):
+    """A file whose first bytes are replaced by another header of the same length."""
 
     def __init__(self, path: Path, header: PlyHeader) -> None:
         super().__init__(io.FileIO(path))
@@ -497,6 +504,6 @@ class _PlyReader(io.BufferedReader):
     def _with_header(self, data: bytes) -> bytes:
         if self._at >= len(self._header):
             return data
-        begin = self._header[self._at : self._at + len(data)]  # a byte at a time: the rest is not to be copied
+        begin = self._header[self._at : self._at + len(data)]  # plyfile reads it a byte at a time: copy no more
         self._at += len(begin)
         return begin + data[len(begin) :]

@@ -1,4 +1,4 @@
-"""Write a model as a PLY in INRIA's layout, which every viewer of splats opens."""
+"""Write a scene as a PLY in INRIA's layout, which every viewer of splats opens."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from csplat.ply.columns import logits_of_alpha
 from csplat.ply.comments import format_comments
 from csplat.scene import Scene
 
-_BLOCK_SIZE = 1 << 20  # bytes of rows that are put together at a time: they stay in the cache
+_BLOCK_SIZE = 1 << 20  # bytes of rows that are built at a time: they stay in the cache
 
 _PLY_TYPES = {
     "i1": "char",
@@ -32,14 +32,14 @@ _PLY_TYPES = {
 def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *, absolute: bool = False) -> None:
     """Write a binary little-endian PLY: INRIA's columns in INRIA's order, normals zero.
 
-    Opacities 0 and 1 become finite logits that lead back to exactly 0 and 1. Extra columns follow
-    the others; cameras, and metadata but comments, licence, training, up and view, are not written.
+    Opacities 0 and 1 become finite logits that lead back to exactly 0 and 1. Extra columns follow the others. Of the
+    metadata, only comments, licence, training, up and view are written; cameras are not.
 
     Args:
-        file: its path, which it takes when it is complete, replacing an older one; or an open binary file.
+        file: its path, where the file appears when it is complete, replacing an older one; or an open binary file.
         model: the scene.
-        absolute: write x, y and z as doubles with the origin added, for programs that take
-            doubles. By default they are floats relative to the origin, which a comment names.
+        absolute: write x, y and z as doubles with the origin added, for programs that read doubles. By default they
+            are floats relative to the origin, which a comment names.
 
     Examples:
         >>> import csplat
@@ -47,7 +47,7 @@ def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *,
         >>> csplat.write_ply("half.ply", model.select(slice(0, None, 2)))
 
     Raises:
-        InputError: an extra column has a name or type that a PLY cannot hold; or the model is none.
+        InputError: an extra column has a name or type that a PLY cannot hold; or `model` is not a `SplatModel`.
         OSError: the file cannot be written.
     """
     check_model("write_ply", model)
@@ -55,7 +55,7 @@ def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *,
 
 
 def write_scene_ply(file: str | os.PathLike[str] | BinaryWriter, scene: Scene, *, absolute: bool = False) -> None:
-    """Write a scene that is read some splats at a time; the rest as `write_ply`."""
+    """Write a scene block by block; otherwise as `write_ply`."""
     dtype = _row_dtype(scene.facts, absolute=absolute)
     step = max(1, _BLOCK_SIZE // dtype.itemsize)
     with opened_for_writing(file) as stream:
@@ -86,7 +86,7 @@ def _row_dtype(model: SplatModel, *, absolute: bool) -> np.dtype[Any]:
 
 
 def _header(model: SplatModel, count: int, *, absolute: bool) -> bytes:
-    # Comments come last: SIBR's viewer expects the element on the third line.
+    # Comments come last because SIBR's viewer expects the element on the third line.
     position = "double" if absolute else "float"
     rest_count = 3 * model.shN.shape[1]
     floats = ["nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -113,7 +113,7 @@ def _ply_type(name: str, dtype: np.dtype[Any]) -> str:
 
 
 def _fill(block: NDArray[Any], model: SplatModel, part: slice, *, absolute: bool) -> None:
-    """Copy splats `part` of a model into rows; the normals are zero already."""
+    """Copy some splats of a model into rows whose normals are zero."""
     if absolute:
         doubles = model.means_double
         block["means"] = model.means[part] + np.array(model.origin) if doubles is None else doubles[part]

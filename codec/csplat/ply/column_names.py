@@ -1,0 +1,295 @@
+"""Find the columns of a splat PLY by their usual names or by those of other programs."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from csplat.errors import counted
+from csplat.lint import Finding, too_many_bands
+from csplat.model import MAX_SH_DEGREE
+
+_MEANS = ("x", "y", "z")
+_NORMALS = ("nx", "ny", "nz")
+_SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+_OPACITY = "opacity"
+_FILTER = "filter_3D"
+_REST = re.compile(r"f_rest_(0|[1-9][0-9]*)")
+_ZEROS = re.compile(r"\Af_rest_0+(?=[0-9])")
+
+#: Prefix of CloudCompare's scalar fields (PlyFilter.cpp), and the one that 3dgsconverter, which prepares files for it,
+#: puts before that.
+_PREFIXES = re.compile(r"(?:scal(?:ar)?_)+")
+#: Colours in place of f_dc: the names of nerfstudio's ns-export, and those that three.js' PLYLoader and Brush accept.
+_COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+#: The value of white, by type of the column.
+_COLOUR_RANGES = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
+#: Columns of scenes that are more than plain splats, and what is lost without them.
+_MEANINGS = {
+    re.compile(r"motion_.*|trbf_.*|omega_.*|scale_t|rot_r_\d"): (
+        "dynamic (4D) splats: their time is lost, and those of all moments are seen at once"
+    ),
+    re.compile(r"f_anchor_feat.*|f_offset.*"): "anchors of Scaffold-GS, of which a network makes the splats",
+    re.compile(r"sg_(axis|sharpness|color).*"): "colours by spherical Gaussians, which are lost",
+}
+_NAMED = 6  # columns that a message names
+_ADVICE = "csplat train makes splats of its images"
+
+
+@dataclass(frozen=True)
+class ColumnMap:
+    """The columns of a PLY by meaning, in the order of the model's last axis.
+
+    Attributes:
+        means, scales, quats, sh0: names of the columns; `scales` has two names for discs.
+        rest: 3 K names, channel by channel: all of red, all of green, all of blue.
+        opacity: name of the column of logits.
+        normals: three names, or none.
+        extra: names of all other columns.
+        double: True if positions have more precision than float32.
+        colour_range: the value of white if `sh0` are red, green and blue; 0 if they are coefficients.
+        filter_3d: name of the column with the standard deviations of Mip-Splatting's 3D filter, or "".
+    """
+
+    means: tuple[str, ...]
+    scales: tuple[str, ...]
+    quats: tuple[str, ...]
+    sh0: tuple[str, ...]
+    rest: tuple[str, ...]
+    opacity: str
+    normals: tuple[str, ...]
+    extra: tuple[str, ...]
+    double: bool
+    colour_range: float = 0.0
+    filter_3d: str = ""
+
+
+def find_columns(
+    dtype: np.dtype[Any], *, keep_extra: bool = False, sh_degree: int | None = None, elements: Sequence[str] = ()
+) -> tuple[ColumnMap | None, list[Finding]]:
+    """Find the columns of a PLY, in any order, by their usual names or those of other programs.
+
+    Args:
+        dtype: structured, one field per scalar property, in the order of the file.
+        keep_extra: extra columns are kept, so they are not reported.
+        sh_degree: highest SH band to read; `None`: all, up to degree 3.
+        elements: names of the other elements of the file, for messages.
+
+    Returns:
+        The columns, or `None` if the findings hold an error; and the findings.
+    """
+    names = _NameIndex(dtype.names or ())
+    findings: list[Finding] = []
+    means, quats = names.find(_MEANS), names.find(_QUATS)
+    scales, sh0, opacity = names.find(_SCALES), names.find(_SH0), names.find((_OPACITY,))
+    flat = [name for name, found in zip(_SCALES, scales, strict=True) if not found] == [_SCALES[2]]
+    if flat:
+        scales = scales[:2]
+        findings.append(Finding("flat-scales", 1, "scale_2 is absent: the splats are discs (2DGS)", "note"))
+    colour_range, coefficients = 0.0, sh0
+    if not any(sh0):
+        colours = next((one for one in _COLOURS if names.has(one)), None)
+        if colours is not None:
+            sh0 = names.find(colours)
+            colour_range, finding = _colour_range(dtype, sh0)
+            findings.append(finding)
+            coefficients = ()
+    required = (*_MEANS, *_SH0, _OPACITY, *(_SCALES[:2] if flat else _SCALES), *_QUATS)
+    missing = [
+        name for name, found in zip(required, (*means, *sh0, *opacity, *scales, *quats), strict=True) if not found
+    ]
+    if missing:
+        findings.append(Finding("missing-columns", len(missing), _describe_absence(names, missing, elements), "error"))
+    every, rest, problem = _find_rest(names, sh_degree)
+    if problem is not None:
+        findings.append(problem)
+    if integers := _integers(dtype, (coefficients, rest, opacity, scales, quats)):
+        findings.append(integers)
+    normals = names.find(_NORMALS) if names.has(_NORMALS) else ()
+    filter_3d = names.find((_FILTER,))[0]
+    if flat and filter_3d:
+        text = f"{filter_3d} is the 3D filter of Mip-Splatting, which is not defined for discs: it is not fused"
+        findings.append(Finding("filter-3d", 1, text, "note"))
+        filter_3d = ""
+    findings += names.findings()
+    if not all(finding.repairable for finding in findings):
+        return None, findings
+
+    usual = (*means, *normals, *sh0, *every, *opacity, *scales, *quats)
+    known = set(usual)
+    extra = tuple(name for name in names.all if name not in known and name != filter_3d)
+    if extra and not keep_extra:
+        findings.append(dropped_columns(extra))
+    in_file = tuple(name for name in names.all if name in known)
+    if in_file != usual:
+        moved = sum(have != want for have, want in zip(in_file, usual, strict=True))
+        text = f"{counted(moved, 'column')} in another place than usual: read by name"
+        findings.append(Finding("shuffled-columns", moved, text, "note"))
+    double = any(dtype[name].kind != "f" or dtype[name].itemsize > 4 for name in means)
+    columns = ColumnMap(
+        means, scales, quats, sh0, rest, opacity[0], normals, extra, double, colour_range, filter_3d
+    )  # fmt: skip
+    return columns, findings
+
+
+def dropped_columns(names: Sequence[str]) -> Finding:
+    """Report columns that splats do not have, which are dropped, and what a scene with them may be."""
+    meaning = _meaning(names)
+    text = f"columns {', '.join(names)} are no property of splats: dropped"
+    text += "" if meaning is None else f"; the file holds {meaning}"
+    return Finding("extra-columns", len(names), text, "repair")
+
+
+def colour_finding(colours: Sequence[str], largest: float, why: str = "") -> Finding:
+    """Report that columns are read as colours, with the value of white and the reason for it."""
+    steps = "" if largest == 1.0 else f", in steps of 1/{largest:.0f}"
+    text = f"{_list_colours(colours)} are read as the colours of SH degree 0{steps}{why}"
+    return Finding("rgb-colours", len(colours), text, "note")
+
+
+def float_columns(names: Sequence[str]) -> list[str]:
+    """Return the columns of a PLY that hold splat attributes other than positions, under any name."""
+    wanted = {*_SH0, *_SCALES, *_QUATS, _OPACITY}
+    return [name for name in names if plain_name(name) in wanted or _REST.fullmatch(plain_name(name))]
+
+
+def plain_name(name: str) -> str:
+    """Return a column's name in lower case, without the prefix of another program and leading zeros of its number."""
+    return _ZEROS.sub("f_rest_", _PREFIXES.sub("", name.lower(), count=1))
+
+
+class _NameIndex:
+    """The columns of a file, found by their usual names."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.all = tuple(names)
+        self.plain: dict[str, list[str]] = {}
+        for name in names:
+            self.plain.setdefault(plain_name(name), []).append(name)
+        self._renamed: dict[str, str] = {}
+        self._second: list[str] = []
+        self._ambiguous: list[str] = []
+
+    def has(self, wanted: Sequence[str]) -> bool:
+        """Return True if each name has a column, under whichever name."""
+        return all(name in self.plain for name in wanted)
+
+    def find(self, wanted: Sequence[str]) -> tuple[str, ...]:
+        """Return the column of each name, or the only one of that meaning under another name, or ""."""
+        return tuple(self._find(name) for name in wanted)
+
+    def _find(self, name: str) -> str:
+        found = self.plain.get(name.lower(), [])
+        if name in found:
+            self._second += [other for other in found if other != name]
+            return name
+        if len(found) > 1:
+            self._ambiguous.append(f"{' and '.join(found)} would both be {name}")
+        elif found:
+            self._renamed[found[0]] = name
+        return found[0] if found else ""
+
+    def findings(self) -> list[Finding]:
+        """Report columns under other names."""
+        found = []
+        if self._ambiguous:
+            text = f"{'; '.join(self._ambiguous[:_NAMED])}: rename one of them"
+            found.append(Finding("ambiguous-columns", len(self._ambiguous), text, "error"))
+        if self._renamed:
+            pairs = _list_some([f"{name} as {self._renamed[name]}" for name in self.all if name in self._renamed])
+            text = f"{counted(len(self._renamed), 'column')} named by another program: {pairs}"
+            found.append(Finding("alias-columns", len(self._renamed), text, "note"))
+        if self._second:
+            text = f"{_list_some(self._second)}: there once more under the usual name, which is read"
+            found.append(Finding("second-columns", len(self._second), text, "note"))
+        return found
+
+
+def _list_some(words: Sequence[str]) -> str:
+    more = len(words) - _NAMED
+    return ", ".join(words[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _colour_range(dtype: np.dtype[Any], colours: Sequence[str]) -> tuple[float, Finding]:
+    """Return the value of white, and the finding about it."""
+    kinds = {dtype[name].str[1:] for name in colours}
+    largest = _COLOUR_RANGES.get(kinds.pop(), 0.0) if len(kinds) == 1 else 0.0
+    if not largest:
+        shown = ", ".join(dtype[name].name for name in colours)
+        text = (
+            f"{_list_colours(colours)} are of type {shown}, expected uint8, uint16 or float: export the scene with f_dc"
+        )
+        return 0.0, Finding("colour-columns", 3, text, "error")
+    return largest, colour_finding(colours, largest)
+
+
+def _list_colours(colours: Sequence[str]) -> str:
+    return f"{', '.join(colours[:2])} and {colours[2]}"
+
+
+def _integers(dtype: np.dtype[Any], groups: Sequence[Sequence[str]]) -> Finding | None:
+    """Report columns of integers, whose meaning is unknown."""
+    found = [name for group in groups for name in group if name and dtype[name].kind != "f"]
+    if not found:
+        return None
+    types = " and ".join(sorted({dtype[name].name for name in found}))
+    colours = groups[0] and set(groups[0]) == set(found)
+    remedy = (
+        "call colours of 0 to 255 red, green and blue" if colours else "export the values before they are quantised"
+    )
+    text = f"{_list_some(found)} {'is' if len(found) == 1 else 'are'} of type {types}, expected float: {remedy}"
+    return Finding("integer-columns", len(found), text, "error")
+
+
+def _describe_absence(names: _NameIndex, missing: Sequence[str], elements: Sequence[str]) -> str:
+    """Describe missing columns and what the file seems to be."""
+    text = f"no column {', '.join(missing)}: not a PLY of Gaussian splats"
+    shown = f"it has {_list_some(names.all)}" if names.all else "it has no columns"
+    if (meaning := _meaning(names.all)) is not None:
+        return f"{text}, but {meaning}: export plain splats"
+    if {*_SCALES, *_QUATS, _OPACITY} <= set(missing):
+        if "face" in elements:
+            return f"{text}, but a mesh ({shown}; and faces): {_ADVICE}"
+        return f"{text}, but a point cloud ({shown}): {_ADVICE}"
+    return f"{text}; {shown}"
+
+
+def _meaning(names: Sequence[str]) -> str | None:
+    plain = [plain_name(name) for name in names]
+    found = (meaning for known, meaning in _MEANINGS.items() if any(map(known.fullmatch, plain)))
+    return next(found, None)
+
+
+def _find_rest(names: _NameIndex, sh_degree: int | None) -> tuple[tuple[str, ...], tuple[str, ...], Finding | None]:
+    """Return the columns of all bands, those of the bands to read, and the finding about them."""
+    numbers = sorted(int(match[1]) for name in names.plain if (match := _REST.fullmatch(name)))
+    count = len(numbers)
+    if numbers != list(range(count)):
+        text = f"the {count} f_rest columns are not numbered from 0 to {count - 1}"
+        return (), (), Finding("sh-columns", count, text, "error")
+    bands = count // 3
+    degree = math.isqrt(bands + 1) - 1
+    if count % 3 or (degree + 1) ** 2 - 1 != bands:
+        wanted = ", ".join(str(3 * (one * one - 1)) for one in range(1, MAX_SH_DEGREE + 1))
+        last = 3 * ((MAX_SH_DEGREE + 1) ** 2 - 1)
+        text = f"{count} f_rest columns are no SH degree, expected {wanted} or {last}"
+        return (), (), Finding("sh-columns", count, text, "error")
+    found = names.find([f"f_rest_{number}" for number in numbers])
+    kept = degree if sh_degree is None else min(degree, sh_degree)
+    if kept > MAX_SH_DEGREE:
+        return found, (), Finding("sh-columns", count, f"{count} f_rest columns are {too_many_bands(degree)}", "error")
+    if kept == degree:
+        return found, found, None
+    wanted_bands = (kept + 1) ** 2 - 1
+    rest = tuple(found[channel * bands + band] for channel in range(3) for band in range(wanted_bands))
+    if degree <= MAX_SH_DEGREE:
+        return found, rest, None
+    text = f"SH degree {degree}: {'all bands' if kept == 0 else f'bands above {kept}'} are left out, as asked"
+    return found, rest, Finding("sh-bands", count - len(rest), text, "note")
