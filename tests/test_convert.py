@@ -12,14 +12,14 @@ from typer.testing import CliRunner
 import csplat
 from csplat import formats
 from csplat.encoder import EncodeOptions
-from csplat.formats import spz, spz_file
+from csplat.formats import spz
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply import read_ply, write_ply
 from csplat.scene import scene_of
 from csplat.turning import in_axes
 from csplat_tools.cli.app import app, command_function
 from csplat_tools.convert_file import Filters, convert_file, find_floaters
-from csplat_tools.encode_file import OutOfCoreOptions, encode_file
+from csplat_tools.encode_file import encode_file
 from csplat_tools.scene_files import open_scenes
 
 
@@ -218,7 +218,7 @@ def test_what_two_formats_call_exact_is_exact_from_one_to_the_other(tmp_path):
 
 
 def keeps_what_both_call_exact(tmp_path, first, second, model):
-    one, other = formats.named(first), formats.named(second)
+    one, other = formats.format_by_name(first), formats.format_by_name(second)
     a, b = tmp_path / f"a{one.suffixes[0]}", tmp_path / f"b{other.suffixes[0]}"
     formats.write(a, model, first)
     converted = convert_file(
@@ -261,16 +261,14 @@ def test_every_command_that_reads_scenes_can_be_told_what_a_file_is(tmp_path, pl
 
 def test_a_packed_scene_that_fits_the_memory_is_unpacked_once(tmp_path, make_model, monkeypatch):
     csplat.write(tmp_path / "a.spz", make_model(50, 1))
-    unpacked = []
+    unpacked, read = [], spz.read_spz_file
 
     def counting(*words, any_degree):
         unpacked.append(words)
-        return spz_file.read_packed(*words, any_degree=any_degree)
+        return read(*words, any_degree=any_degree)
 
-    monkeypatch.setattr(spz, "read_packed", counting)
-    encode_file(
-        str(tmp_path / "a.spz"), str(tmp_path / "a.csplat"), EncodeOptions(), scale=OutOfCoreOptions(by_disk=True)
-    )
+    monkeypatch.setattr(spz, "read_spz_file", counting)
+    encode_file(str(tmp_path / "a.spz"), str(tmp_path / "a.csplat"), EncodeOptions(), scale=Scale(by_disk=True))
     assert 1 == len(unpacked)
     with open_scenes((tmp_path / "a.spz", tmp_path / "a.spz"), 1 << 30) as (one, _):
         assert 50 == one.count

@@ -7,7 +7,7 @@ import pytest
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import format_of, lint, named_by, open_scene
+from csplat.formats import detect_format, format_by_suffix, lint_file, open_scene
 from csplat.ply import read_ply
 from csplat.scene import BLOCK
 
@@ -87,8 +87,12 @@ def test_no_splats_are_a_scene(tmp_path, make_model):
 
 def test_it_is_told_from_a_plain_ply_by_its_words(tmp_path):
     (tmp_path / "a.ply").write_bytes(SMALL)
-    assert "compressed-ply" == format_of(tmp_path / "a.ply").name == named_by(tmp_path / "b.Compressed.ply").name
-    assert "ply" == named_by(tmp_path / "b.ply").name
+    assert (
+        "compressed-ply"
+        == detect_format(tmp_path / "a.ply").name
+        == format_by_suffix(tmp_path / "b.Compressed.ply").name
+    )
+    assert "ply" == format_by_suffix(tmp_path / "b.ply").name
     with pytest.raises(InputError, match=r"a\.ply is compressed PLY.*csplat convert.*csplat\.read"):
         read_ply(tmp_path / "a.ply")
 
@@ -123,7 +127,7 @@ def test_what_does_not_fit_is_refused(tmp_path, data, says):
 def test_bounds_that_were_rounded_apart_are_read(tmp_path):
     above = float(np.nextafter(np.float32(4), np.float32(9)))
     (tmp_path / "a.ply").write_bytes(built([[above, *ROW[1:]]], [WORD]))
-    assert [] == lint(tmp_path / "a.ply")
+    assert [] == lint_file(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])

@@ -12,7 +12,8 @@ from filed import filed
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import formats, gltf_file, lint
+from csplat.formats import formats, lint_file
+from csplat.formats.gltf import gltf_document
 from csplat.model import SplatModel
 from csplat.turning import turned
 
@@ -296,19 +297,19 @@ def test_huge_values_bytes_behind_the_end_and_other_scenes_are_told(tmp_path):
     said, data = document(arrays, scenes=[{"nodes": [0]}, {"name": "roof", "nodes": []}])
     path = tmp_path / "a.glb"
     path.write_bytes(glb(said, data) * 2)
-    found = {one.id: one for one in lint(path)}
+    found = {one.id: one for one in lint_file(path)}
     assert {"huge-values": 2, "trailing-bytes": len(glb(said, data)), "other-scenes": 1} == {
         name: one.count for name, one in found.items()
     }
     assert "scene 0 is read, 1 ('roof') not" in found["other-scenes"].text
     path.write_bytes(glb(said | {"scene": 0}, data))
-    assert ["huge-values"] == [one.id for one in lint(path)]
+    assert ["huge-values"] == [one.id for one in lint_file(path)]
 
 
 def linted(path, said, data):
     """Lint a file; return the findings by id, and its splats along the axes of the file."""
     path.write_bytes(glb(said, data))
-    return {one.id: one for one in lint(path)}, filed(path)
+    return {one.id: one for one in lint_file(path)}, filed(path)
 
 
 def many(count=40, **changed):
@@ -340,7 +341,7 @@ def test_negative_scales_that_are_no_logarithms_are_refused_by_splat_and_value(t
     (tmp_path / "a.glb").write_bytes(glb(*document(many(SCALE=scales))))
     with pytest.raises(InputError, match=rf"SCALE of splat 1 is {values[0]:g}, expected"):
         csplat.read(tmp_path / "a.glb")
-    assert ["error"] == [one.kind for one in lint(tmp_path / "a.glb") if one.id == "negative-scales"]
+    assert ["error"] == [one.kind for one in lint_file(tmp_path / "a.glb") if one.id == "negative-scales"]
 
 
 def test_scales_of_large_splats_are_no_logarithms(tmp_path):
@@ -519,7 +520,7 @@ def test_damage_is_refused_or_read(monkeypatch):
     whole = glb(*document(TWO))
 
     def refused(data):
-        monkeypatch.setattr(gltf_file, "mapped", lambda _path: data)
+        monkeypatch.setattr(gltf_document, "mapped", lambda _path: data)
         try:
             with FORMAT.open(Path("a.glb")) as scene:
                 scene.model()

@@ -7,7 +7,7 @@ import pytest
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import lint, open_scene
+from csplat.formats import lint_file, open_scene
 from csplat.scene import BLOCK
 
 LEVELS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
@@ -153,7 +153,7 @@ def test_forbidden_values_are_told(tmp_path, scale, found):
     table["s"] = scale
     table["q"][2] = 0
     (tmp_path / "a.ksplat").write_bytes(ksplat(1, [section(table, 1, 0)]))
-    findings = {one.id: one.count for one in lint(tmp_path / "a.ksplat")}
+    findings = {one.id: one.count for one in lint_file(tmp_path / "a.ksplat")}
     assert {"zero-quats": 1, found: 5} == findings
     scales = csplat.read(tmp_path / "a.ksplat").scales
     np.testing.assert_allclose(-4 if found == "log-scales" else np.log(0.5), scales, rtol=1e-6)
@@ -161,4 +161,4 @@ def test_forbidden_values_are_told(tmp_path, scale, found):
 
 def test_what_follows_the_last_section_is_told(tmp_path):
     (tmp_path / "a.ksplat").write_bytes(simple(0) + bytes(33))
-    assert [("trailing-bytes", 33)] == [(one.id, one.count) for one in lint(tmp_path / "a.ksplat")]
+    assert [("trailing-bytes", 33)] == [(one.id, one.count) for one in lint_file(tmp_path / "a.ksplat")]

@@ -9,7 +9,7 @@ import pytest
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import format_of, open_scene
+from csplat.formats import detect_format, open_scene
 
 Image = pytest.importorskip("PIL.Image", reason="SOG is pictures")
 
@@ -114,7 +114,7 @@ def test_folder_json_and_zip_are_the_same_scene(tmp_path):
     folder = foldered(tmp_path / "a", files)
     paths = [folder, folder / "meta.json", zipped(tmp_path / "b", files, "inside/", zipfile.ZIP_DEFLATED)]
     models = [csplat.read(path) for path in paths]
-    assert ["sog"] * 3 == [format_of(path).name for path in paths]
+    assert ["sog"] * 3 == [detect_format(path).name for path in paths]
     assert all((one.means == models[0].means).all() and (one.shN == models[0].shN).all() for one in models)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import insisting, lint, open_scene
+from csplat.formats import assume_format, lint_file, open_scene
 from csplat.scene import BLOCK
 
 ROW = struct.pack("<6f8B", 1.5, -2, 3e9, 1, 0.5, 0, 0, 255, 51, 102, 128, 0, 128, 128)
@@ -100,7 +100,7 @@ def test_what_is_hardly_a_splat_file_is_refused_unless_insisted(tmp_path, data, 
     with pytest.raises(InputError, match=says):
         csplat.read(tmp_path / "a.splat")
     if len(data) % 32 == 0 and "web page" not in says:  # which is nothing but that
-        with insisting("splat"), open_scene(tmp_path / "a.splat") as scene:
+        with assume_format("splat"), open_scene(tmp_path / "a.splat") as scene:
             assert "splat" == scene.format
 
 
@@ -123,26 +123,26 @@ def test_forbidden_values_are_told(tmp_path):
     scales = np.full((20, 3), 0.1)
     scales[3, 1] = -0.1
     path.write_bytes(plausible({"scales": scales}))
-    (finding,) = lint(path)
+    (finding,) = lint_file(path)
     assert ("negative-scales", 1, "repair") == (finding.id, finding.count, finding.kind)
     assert "scale of splat 3 is -0.1" in finding.text
     np.testing.assert_allclose(np.log(0.1), csplat.read(path).scales, rtol=1e-6)
     path.write_bytes(plausible({"scales": np.full((20, 3), -3.0)}))
-    assert [("log-scales", 20)] == [(one.id, one.count) for one in lint(path)]
+    assert [("log-scales", 20)] == [(one.id, one.count) for one in lint_file(path)]
     assert (csplat.read(path).scales == -3).all()
     path.write_bytes(plausible({"quats": 128}))
-    assert [("zero-quats", 20)] == [(one.id, one.count) for one in lint(path)]
+    assert [("zero-quats", 20)] == [(one.id, one.count) for one in lint_file(path)]
     clipped = np.clip(np.random.default_rng(0).normal(size=(20, 4)) * 512 + 128, 0, 255)
     path.write_bytes(plausible({"quats": clipped}))
-    assert [] == lint(path)
+    assert [] == lint_file(path)
 
 
 def test_rows_of_zeros_and_huge_values_are_told(tmp_path):
     path = tmp_path / "a.splat"
     path.write_bytes(plausible({}) + bytes(32 * 6))
-    assert [("zero-rows", 6, "note")] == [(one.id, one.count, one.kind) for one in lint(path)]
+    assert [("zero-rows", 6, "note")] == [(one.id, one.count, one.kind) for one in lint_file(path)]
     assert 26 == len(csplat.read(path))
     scales = np.full((20, 3), 0.1)
     scales[4, 1] = 2e38
     path.write_bytes(plausible({"scales": scales}))
-    assert [("huge-values", 1, "note")] == [(one.id, one.count, one.kind) for one in lint(path)]
+    assert [("huge-values", 1, "note")] == [(one.id, one.count, one.kind) for one in lint_file(path)]

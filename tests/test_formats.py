@@ -8,8 +8,8 @@ import pytest
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import formats, insisting, open_scene, write_scene
-from csplat.formats import lint as formats_lint
+from csplat.formats import assume_format, formats, open_scene, write_scene
+from csplat.formats import lint_file as formats_lint
 from csplat.ply import read_ply, write_ply
 from csplat.scene import BLOCK, Scene, scene_of
 
@@ -133,7 +133,7 @@ def test_pointers_of_git_lfs_are_named_whatever_reads_them(tmp_path):
         for read in (csplat.read, read_ply, formats_lint):
             with pytest.raises(InputError, match=says):
                 read(path)
-        with insisting("splat"), pytest.raises(InputError, match=says):
+        with assume_format("splat"), pytest.raises(InputError, match=says):
             csplat.read(path)
     (tmp_path / "meta.json").write_text('{"version": 2, "count": 1}')
     for decode in (csplat.decode, csplat.open):
@@ -169,10 +169,10 @@ def test_insisting_counts_where_the_content_is_that_of_no_format(tmp_path, make_
     (tmp_path / "b").write_bytes((tmp_path / "a.splat").read_bytes())
     with pytest.raises(InputError, match="--from splat reads it"):
         csplat.read(tmp_path / "b")
-    with insisting("splat"):
+    with assume_format("splat"):
         assert (csplat.read(tmp_path / "b").scales == csplat.read(tmp_path / "a.splat").scales).all()
         assert len(csplat.read(tmp_path / "a.ply")) == 9
-    with pytest.raises(InputError, match="the format is 'xyz'"), insisting("xyz"):
+    with pytest.raises(InputError, match="the format is 'xyz'"), assume_format("xyz"):
         pass
 
 

@@ -23,7 +23,7 @@ import csplat
 from csplat import memory, processes, system
 from csplat.errors import InputError
 from csplat.files import atomic_writer
-from csplat.formats.sog_files import Parts
+from csplat.formats.sog.sog_files import SogParts
 from csplat.inputs import LetGo
 from csplat_conformance.answers import Answer
 from csplat_conformance.process import run_program
@@ -169,7 +169,7 @@ def test_of_two_writers_of_one_name_one_fails_without_hard_links(tmp_path):
 def test_paths_of_windows_do_not_lead_out_of_a_folder(tmp_path):
     (tmp_path / "C:x").write_bytes(b"")  # the file x of the current folder of drive C
     with pytest.raises(InputError, match="outside"):
-        Parts(tmp_path, "scene").read("C:x")
+        SogParts(tmp_path, "scene").read("C:x")
     names = {"sub/a.csplat": False, "../a": True, "..\\a": True, "C:a": True, "C:\\a": True, "\\a": True, "/a": True}
     assert names == {name: leads_out(name, PureWindowsPath) for name in names}
 

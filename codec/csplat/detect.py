@@ -1,7 +1,8 @@
-"""Tell what a file is: one table of formats, those that csplat reads and others that users hand over.
+"""Identify files: one table of the kinds that csplat reads and of others that users pass to it by mistake.
 
-The content decides, then the name. `csplat.formats` takes the reader of what is found here, and the refusals of all
-commands name it with what helps. Only the first bytes and the names in a zip are looked at; nothing is parsed.
+The content decides, then the name. `csplat.formats` has the readers, under the names of this table; the table stands
+apart because the PLY reader, which knows no other format, refuses files by it. Only the first bytes and the names in a
+zip are looked at; nothing is parsed.
 """
 
 from __future__ import annotations
@@ -18,17 +19,17 @@ from csplat.archives import folder_refusal, zip_refusal
 from csplat.errors import InputError
 from csplat.inputs import stand_in
 
-#: Bytes of the beginning of a file that are looked at.
+#: Bytes at the beginning of a file that identify it.
 HEAD_SIZE = 512
 
 _SPLAT_TRANSFORM = "splat-transform (npm package @playcanvas/splat-transform)"
 _NOT_READ = "which csplat does not read: convert it to PLY first, with"
 _NO_SPLATS = "no scene of splats"
-_PLY_HEADER_SIZE = 1 << 16  # bytes that hold the words of a compressed PLY
-_KSPLAT_HEAD = 44  # bytes of its header that carry information; the others are 0
+_PLY_HEADER_SIZE = 1 << 16  # bytes within which a compressed PLY declares its packed columns
+_KSPLAT_HEAD = 44  # bytes of .ksplat's header that carry information; the others are 0
 _SPLAT_ROW_SIZE = 32
-_SAFETENSORS_HEAD = 100_000_000  # bytes of its header, which is JSON, at most
-_MANIFESTS = {"meta.json", "lod-meta.json"}  # names of SOG's manifests
+_SAFETENSORS_HEAD = 100_000_000  # largest header of safetensors, bytes of JSON
+_MANIFESTS = {"meta.json", "lod-meta.json"}  # of SOG
 _PLY, _CSPLAT = "ply", "csplat"
 
 
@@ -37,10 +38,10 @@ class FileKind:
     """A kind of file.
 
     Attributes:
-        name: id of the format, as `csplat formats` lists it; for formats that csplat does not read, any other name.
-        title: as people write it: `SPZ 4`.
+        name: id of the kind; for formats that csplat reads, the one that `csplat formats` lists.
+        title: name in prose: `SPZ 4`.
         suffixes: suffixes of file names, the usual one first; with their dots, in lower case.
-        matches: tells from the path and the first bytes (empty for a folder) if a file has this format.
+        matches: returns True if path and first bytes (empty for a folder) are those of this kind.
         remedy: what the user can do, in words that follow the title and a comma; "" if csplat has a reader.
     """
 
@@ -52,19 +53,19 @@ class FileKind:
 
     @property
     def is_scene(self) -> bool:
-        """True if the format holds splats, read by csplat or not."""
+        """True for formats of splats, whether csplat reads them or not."""
         return not self.remedy or self.remedy.startswith(_NOT_READ)
 
 
-def by_content(path: Path, head: bytes) -> FileKind | None:
-    """Find what a file or folder is by its content; `None`: nothing that is known.
+def detect_content(path: Path, head: bytes) -> FileKind | None:
+    """Identify a file or folder by its content; return `None` if it is of no known kind.
 
     Args:
-        path: the file, of which a zip, a folder and a PLY are looked into.
-        head: its first `HEAD_SIZE` bytes, or all of them; none of a folder.
+        path: path of the file; zips, folders and PLYs are looked into.
+        head: the first `HEAD_SIZE` bytes, or all of a shorter file; empty for a folder.
 
     Raises:
-        InputError: it is a pointer of Git LFS, or a web page: no file of any kind.
+        InputError: the content is that of a pointer of Git LFS, or a web page, in place of a file.
     """
     instead = stand_in(head)
     if instead:
@@ -72,15 +73,15 @@ def by_content(path: Path, head: bytes) -> FileKind | None:
     return next((kind for kind in KINDS.values() if kind.matches(path, head)), None)
 
 
-def by_name(path: Path) -> FileKind | None:
-    """Find what a file of that name would be; `None`: nothing that is known."""
+def detect_name(path: Path) -> FileKind | None:
+    """Identify a file by its name; return `None` if the name is of no known kind."""
     name = path.name.lower()
     found = [(len(suffix), kind) for kind in KINDS.values() for suffix in kind.suffixes if name.endswith(suffix)]
     return max(found, key=lambda pair: pair[0])[1] if found else None
 
 
-def head_of(path: Path) -> bytes:
-    """Read what `by_content` looks at.
+def read_head(path: Path) -> bytes:
+    """Read the first bytes of a file, for `detect_content`.
 
     Raises:
         OSError: the file cannot be read.
@@ -92,21 +93,21 @@ def head_of(path: Path) -> bytes:
 
 
 def refusal(path: Path, head: bytes, *, wanted: str = "") -> InputError:
-    """Build the error for a file that a reader does not take: what it is, and what helps.
+    """Return the error for a file of the wrong kind: what the file is, and a remedy.
 
     Args:
         path: path of the file.
-        head: as in `by_content`.
-        wanted: name of the only format that the reader takes; "" if it takes all that csplat reads.
+        head: as in `detect_content`.
+        wanted: name of the only kind that the caller reads; "" if it reads all that csplat does.
     """
-    if path.is_dir() and wanted and not by_content(path, head):
+    if path.is_dir() and wanted and not detect_content(path, head):
         return InputError(f"{path.name} is a folder, wanted a {KINDS[wanted].title}")
     if path.is_dir() and not wanted:
         return InputError(folder_refusal(path))
     if not (head or path.is_dir()):
         return InputError(f"{path.name} is empty" + (f", wanted a {KINDS[wanted].title}" if wanted else ""))
     try:
-        kind = by_content(path, head) or by_name(path)
+        kind = detect_content(path, head) or detect_name(path)
     except InputError as error:
         return error
     if kind is not None and kind.name == "zip":
@@ -118,8 +119,8 @@ def refusal(path: Path, head: bytes, *, wanted: str = "") -> InputError:
         if path.stat().st_size % _SPLAT_ROW_SIZE == 0 and not head[:_SPLAT_ROW_SIZE].isascii():
             tool = "convert it to PLY first, with `csplat convert --from splat`" if wanted else "--from splat reads it"
             begin = f"its size, a multiple of {_SPLAT_ROW_SIZE} bytes, is that of a .splat file: if it is one, {tool}"
-        what = f"not a {KINDS[wanted].title}" if wanted else "in no format that csplat knows"
-        return InputError(f"{path.name} is {what}: {begin}" + ("; wanted one of Gaussian splats" if wanted else ""))
+        state = f"not a {KINDS[wanted].title}" if wanted else "in no format that csplat knows"
+        return InputError(f"{path.name} is {state}: {begin}" + ("; wanted one of Gaussian splats" if wanted else ""))
     if wanted == _CSPLAT:
         title = f"a {kind.title}" if kind.name == _PLY else kind.title
         return InputError(f"{path} is {title}, wanted a .csplat file: `csplat encode` makes a .csplat file of it")
@@ -127,12 +128,12 @@ def refusal(path: Path, head: bytes, *, wanted: str = "") -> InputError:
     return InputError(f"{path.name} is {kind.title}, not a plain PLY: convert it to PLY first, with {tool}")
 
 
-def _begins(*magics: bytes) -> Callable[[Path, bytes], bool]:
+def _starts_with(*magics: bytes) -> Callable[[Path, bytes], bool]:
     return lambda _path, head: head.startswith(magics)
 
 
 def is_ply(head: bytes) -> bool:
-    """Tell whether a file begins as a PLY; a byte order mark, capitals and a space are forgiven."""
+    """Return True if a file begins as a PLY; a byte order mark, capitals and spaces are accepted."""
     head = head.removeprefix(b"\xef\xbb\xbf")
     return head[:3].lower() == b"ply" and head[3:].lstrip(b" \t")[:1] in (b"\n", b"\r")
 
@@ -140,7 +141,7 @@ def is_ply(head: bytes) -> bool:
 def _is_compressed_ply(path: Path, head: bytes) -> bool:
     if not is_ply(head):
         return False
-    if b"end_header" not in head and path.is_file():  # the words come after bounds and comments
+    if b"end_header" not in head and path.is_file():  # the packed columns come after bounds and comments
         with path.open("rb") as stream:
             head = stream.read(_PLY_HEADER_SIZE)
     return b"packed_position" in head.partition(b"end_header")[0]
@@ -156,7 +157,7 @@ def _is_spz(_path: Path, head: bytes) -> bool:
 
 
 def _is_gzip(path: Path, head: bytes) -> bool:
-    return head[:3] == b"\x1f\x8b\x08" and path.suffix.lower() != ".spz"  # its reader reports what is wrong with it
+    return head[:3] == b"\x1f\x8b\x08" and path.suffix.lower() != ".spz"  # that reader reports what is wrong
 
 
 def _is_ksplat(_path: Path, head: bytes) -> bool:
@@ -174,8 +175,8 @@ def _is_sog(path: Path, head: bytes) -> bool:
     return _is_json(path, head) and path.name.lower().endswith("meta.json")
 
 
-def _holds(ending: str) -> Callable[[Path, bytes], bool]:
-    """Recognise a zip by the ending of a name in it."""
+def _zip_with(ending: str) -> Callable[[Path, bytes], bool]:
+    """Match zips that hold a name with this ending."""
 
     def matches(path: Path, head: bytes) -> bool:
         return head[:4] == b"PK\x03\x04" and any(name.endswith(ending) for name in _names_in_zip(path) or ())
@@ -200,7 +201,7 @@ def _is_tileset(path: Path, head: bytes) -> bool:
 
 
 def _is_json(_path: Path, head: bytes) -> bool:
-    """Return True if the content is text that begins as JSON; a lone brace may be a byte of anything."""
+    """Return True if the content is text that begins as JSON; a lone brace may also begin a binary file."""
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     begins = text[:1] == b"[" or (text[:1] == b"{" and text[1:].lstrip()[:1] in (b'"', b"}", b""))
     return begins and not any(byte < 32 and byte not in b"\t\n\r" for byte in text)
@@ -211,16 +212,16 @@ def _is_safetensors(_path: Path, head: bytes) -> bool:
 
 
 def _is_usd(path: Path, head: bytes) -> bool:
-    return head.startswith((b"PXR-USDC", b"#usda")) or _holds(".usdc")(path, head) or _holds(".usda")(path, head)
+    return head.startswith((b"PXR-USDC", b"#usda")) or _zip_with(".usdc")(path, head) or _zip_with(".usda")(path, head)
 
 
-#: All kinds by name. Of several that match a content the first one counts.
+#: All kinds by name. If several match a content, the first one counts.
 KINDS: dict[str, FileKind] = {
     kind.name: kind
     for kind in (
         FileKind("compressed-ply", "compressed PLY", (".compressed.ply",), _is_compressed_ply),
         FileKind(_PLY, "PLY", (".ply",), lambda _path, head: is_ply(head)),
-        FileKind(_CSPLAT, "csplat", (".csplat",), _begins(MAGIC)),
+        FileKind(_CSPLAT, "csplat", (".csplat",), _starts_with(MAGIC)),
         FileKind("spz", "SPZ", (".spz",), _is_spz),
         FileKind("spz4", "SPZ 4", (".v4.spz",)),
         FileKind("splat", ".splat", (".splat",)),
@@ -230,26 +231,30 @@ KINDS: dict[str, FileKind] = {
             "tileset", "a tileset of 3D Tiles", (), _is_tileset, "which csplat does not read: its tiles are .glb files"
         ),
         FileKind("gltf", "glTF", (".glb", ".gltf"), _is_gltf),
-        FileKind("checkpoint", "a checkpoint of gsplat, splatfacto or INRIA", (".pt", ".ckpt"), _holds("/data.pkl")),
-        FileKind("spx", ".spx", (".spx",), _begins(b"spx\1", b"spx\2", b"spx\3"), f"{_NOT_READ} gsbox"),
+        FileKind("checkpoint", "a checkpoint of gsplat, splatfacto or INRIA", (".pt", ".ckpt"), _zip_with("/data.pkl")),
+        FileKind("spx", ".spx", (".spx",), _starts_with(b"spx\1", b"spx\2", b"spx\3"), f"{_NOT_READ} gsbox"),
         FileKind("lcc", "LCC", (".lcc",), remedy=f"{_NOT_READ} {_SPLAT_TRANSFORM}"),
         FileKind(
-            "rad", "RAD of Spark", (".rad",), _begins(b"RAD0"), f"{_NOT_READ} Spark, or take the file it was made of"
+            "rad",
+            "RAD of Spark",
+            (".rad",),
+            _starts_with(b"RAD0"),
+            f"{_NOT_READ} Spark, or take the file it was made of",
         ),
         FileKind("usd", "USD", (".usdz", ".usdc", ".usda", ".usd"), _is_usd, f"{_NOT_READ} the program that wrote it"),
         FileKind(
             "3d-tiles",
             "a tile of 3D Tiles",
             (".b3dm", ".i3dm", ".pnts", ".cmpt"),
-            _begins(b"b3dm", b"i3dm", b"pnts", b"cmpt"),
+            _starts_with(b"b3dm", b"i3dm", b"pnts", b"cmpt"),
             "which csplat does not read: tiles of splats are .glb files",
         ),
         FileKind("gzip", "gzip", (".gz",), _is_gzip, "unpack it first, with gunzip"),
-        FileKind("zip", "zip", (".zip",), _begins(b"PK\x03\x04"), "unzip it first"),
-        FileKind("7z", "7z", (".7z",), _begins(b"7z\xbc\xaf\x27\x1c"), "unpack it first"),
-        FileKind("rar", "RAR", (".rar",), _begins(b"Rar!\x1a\x07"), "unpack it first"),
-        FileKind("zstd", "zstd", (".zst",), _begins(b"\x28\xb5\x2f\xfd"), "unpack it first, with unzstd"),
-        FileKind("xz", "xz", (".xz",), _begins(b"\xfd7zXZ\0"), "unpack it first, with unxz"),
+        FileKind("zip", "zip", (".zip",), _starts_with(b"PK\x03\x04"), "unzip it first"),
+        FileKind("7z", "7z", (".7z",), _starts_with(b"7z\xbc\xaf\x27\x1c"), "unpack it first"),
+        FileKind("rar", "RAR", (".rar",), _starts_with(b"Rar!\x1a\x07"), "unpack it first"),
+        FileKind("zstd", "zstd", (".zst",), _starts_with(b"\x28\xb5\x2f\xfd"), "unpack it first, with unzstd"),
+        FileKind("xz", "xz", (".xz",), _starts_with(b"\xfd7zXZ\0"), "unpack it first, with unxz"),
         FileKind(
             "bzip2",
             "bzip2",
@@ -258,13 +263,13 @@ KINDS: dict[str, FileKind] = {
             "unpack it first, with bunzip2",
         ),
         FileKind("tar", "tar", (".tar",), lambda _path, head: head[257:262] == b"ustar", "unpack it first"),
-        FileKind("png", "a PNG", (".png",), _begins(b"\x89PNG\r\n"), f"an image, {_NO_SPLATS}"),
-        FileKind("jpeg", "a JPEG", (".jpg", ".jpeg"), _begins(b"\xff\xd8\xff"), f"an image, {_NO_SPLATS}"),
-        FileKind("pdf", "a PDF", (".pdf",), _begins(b"%PDF-"), _NO_SPLATS),
-        FileKind("las", "LAS", (".las", ".laz"), _begins(b"LASF"), f"a point cloud, {_NO_SPLATS}"),
-        FileKind("e57", "E57", (".e57",), _begins(b"ASTM-E57"), f"a point cloud, {_NO_SPLATS}"),
+        FileKind("png", "a PNG", (".png",), _starts_with(b"\x89PNG\r\n"), f"an image, {_NO_SPLATS}"),
+        FileKind("jpeg", "a JPEG", (".jpg", ".jpeg"), _starts_with(b"\xff\xd8\xff"), f"an image, {_NO_SPLATS}"),
+        FileKind("pdf", "a PDF", (".pdf",), _starts_with(b"%PDF-"), _NO_SPLATS),
+        FileKind("las", "LAS", (".las", ".laz"), _starts_with(b"LASF"), f"a point cloud, {_NO_SPLATS}"),
+        FileKind("e57", "E57", (".e57",), _starts_with(b"ASTM-E57"), f"a point cloud, {_NO_SPLATS}"),
         FileKind("obj", "OBJ", (".obj",), remedy=f"a mesh, {_NO_SPLATS}"),
-        FileKind("fbx", "FBX", (".fbx",), _begins(b"Kaydara FBX"), f"a mesh, {_NO_SPLATS}"),
+        FileKind("fbx", "FBX", (".fbx",), _starts_with(b"Kaydara FBX"), f"a mesh, {_NO_SPLATS}"),
         FileKind(
             "safetensors",
             "safetensors",
@@ -276,10 +281,10 @@ KINDS: dict[str, FileKind] = {
             "npy",
             "an array of NumPy",
             (".npy",),
-            _begins(b"\x93NUMPY"),
+            _starts_with(b"\x93NUMPY"),
             "no scene: csplat.from_gsplat makes one of arrays under gsplat's names",
         ),
-        FileKind("rtf", "RTF", (".rtf",), _begins(b"{\\rtf"), f"a text, {_NO_SPLATS}"),
+        FileKind("rtf", "RTF", (".rtf",), _starts_with(b"{\\rtf"), f"a text, {_NO_SPLATS}"),
         FileKind("json", "JSON", (), _is_json, _NO_SPLATS),
     )
 }

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from csplat.decoder import Limits, open_tiles
 from csplat.errors import InputError
-from csplat.formats import Format, formats, named, named_by, open_scene
+from csplat.formats import Format, format_by_name, format_by_suffix, formats, open_scene
 from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
 from csplat.model import SplatModel
@@ -257,7 +257,7 @@ def convert_file(
         CsplatError: the source is not whole, the target cannot hold it, or `no_loss` is set and something is lost.
         OSError: a file cannot be read or written.
     """
-    writes = named_by(Path(target)) if write_as is None else named(write_as)
+    writes = format_by_suffix(Path(target)) if write_as is None else format_by_name(write_as)
     if writes.write is None:
         raise InputError(f"{target} would be {writes.title}, which csplat does not write")
     sh_degree = None if filters is None else filters.sh_degree

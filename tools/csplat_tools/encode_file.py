@@ -10,11 +10,12 @@ from typing import Any
 
 from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, encode_with_report
 from csplat.errors import InputError
-from csplat.formats import format_of, open_scene, read_all
+from csplat.formats import detect_format, open_scene, read_all
 from csplat.large import Needs, encode_scene, needs_of
-from csplat.lint import Finding, dropped_columns, refuse
+from csplat.lint import Finding, refuse
 from csplat.memory import default_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel
+from csplat.ply.column_names import dropped_columns
 from csplat.types import Progress
 from csplat_tools.console import note
 from csplat_tools.file_streams import (
@@ -66,7 +67,7 @@ class OutOfCoreOptions:
             return True
         bound = default_bytes() if self.memory_bytes is None else self.memory_bytes
         size = size_on_disk(path)
-        return size > _SMALL and (format_of(path).name != "ply" or size * _FOLDS > bound)
+        return size > _SMALL and (detect_format(path).name != "ply" or size * _FOLDS > bound)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat._spec import MAGIC
-from csplat.detect import HEAD_SIZE, by_content, by_name, head_of, refusal
+from csplat.detect import HEAD_SIZE, detect_content, detect_name, read_head, refusal
 from csplat.errors import CsplatError, InputError
 from csplat.files import atomic_writer, local_file
 from csplat.formats import formats
@@ -130,7 +130,7 @@ def check_name(path: str, wanted: str, writer: str, source: str = "") -> None:
         return
     others = [one for one in formats() if one.write is not None and one.name not in _OURS]
     converts = any(target.name.lower().endswith(one.suffixes) for one in others)
-    kind = None if converts else by_name(target)
+    kind = None if converts else detect_name(target)
     known = None if kind is None or kind.name in _OURS or not kind.is_scene else kind.title
     maker = _MAKERS.get((Path(source).suffix.lower(), suffix)) or _MAKERS.get(("*", suffix)) or converts * "convert"
     if known is None and not maker and suffix not in {kind for pair in _MAKERS for kind in pair} | _OTHERS:
@@ -183,7 +183,7 @@ def source_path(file: File) -> Iterator[Path]:
     """
     with local_path(file) as local:
         if is_csplat(local):
-            _refuse_others(local.name, head_of(local))
+            _refuse_others(local.name, read_head(local))
             raise InputError(
                 f"{local.name} is a .csplat file already: `csplat decode` turns it into a PLY,"
                 " `csplat info` describes it"
@@ -319,7 +319,7 @@ def is_one_way(path: str) -> bool:
 
 def _refuse_others(name: str, data: bytes) -> None:
     head = data[:HEAD_SIZE]
-    kind = by_content(Path(name), head) or by_name(Path(name))
+    kind = detect_content(Path(name), head) or detect_name(Path(name))
     if kind is not None and kind.name != "csplat":
         raise refusal(Path(name), head, wanted="csplat")
 

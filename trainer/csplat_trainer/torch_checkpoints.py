@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from csplat.bridges import from_gsplat
-from csplat.detect import by_content, head_of
+from csplat.detect import detect_content, read_head
 from csplat.errors import InputError, counted, missing
 from csplat.formats import Format
 from csplat.lint import Finding, too_many_bands
@@ -115,9 +115,9 @@ def _parts(path: Path) -> tuple[list[Path], list[Finding]]:
     return paths, [Finding("ranks", len(paths), text, "note")]
 
 
-def _read(path: Path, sh_degree: int | None) -> _CheckpointPart:
-    head = head_of(path)
-    kind = by_content(path, head)
+def _read(path: Path, sh_degree: int | None) -> _Part:
+    head = read_head(path)
+    kind = detect_content(path, head)
     if not head.startswith(_MAGICS):
         reason = "it begins with" if kind is None else f"it is {kind.title}, and begins with"
         raise InputError(f"{path.name} is no checkpoint of torch: {reason} {head[:8]!r}")

@@ -1,7 +1,8 @@
-"""Files of splats in any format: `read`, `write`, and what each format can carry.
+"""Files of splats in any format: `read`, `write`, and what each format can store.
 
-One module a format; each has a `FORMAT`. What a file is, its content says first, its name second. What a format of
-fixed axes holds is turned to x right, y down, z forward, as a PLY is taken to stand: so all scenes lie alike.
+A module or package per format has a `FORMAT`; `formats` lists them. The content of a file decides its format, its name
+only if the content does not. Scenes of formats with fixed axes are transformed to x right, y down, z forward, the axes
+that PLY is assumed to have, so that all scenes are oriented alike.
 """
 
 from __future__ import annotations
@@ -15,25 +16,26 @@ from importlib import import_module
 from pathlib import Path
 
 from csplat.decoder import decode
-from csplat.detect import by_content, by_name, head_of, refusal
+from csplat.detect import detect_content, detect_name, read_head, refusal
 from csplat.errors import InputError
 from csplat.files import local_file
-from csplat.formats.format import Format
+from csplat.formats.format import ARRAYS, Format
 from csplat.inputs import File
 from csplat.lint import Finding, refuse
 from csplat.model import SplatModel, check_model, check_sh_degree
-from csplat.ply import lint_ply, read_ply
+from csplat.ply import lint_ply, open_ply, read_ply, write_scene_ply
 from csplat.scene import Scene, scene_of, without_bands
 from csplat.turning import USUAL, in_axes
 
 __all__ = [
+    "ARRAYS",
     "Format",
-    "format_of",
+    "assume_format",
+    "detect_format",
+    "format_by_name",
+    "format_by_suffix",
     "formats",
-    "insisting",
-    "lint",
-    "named",
-    "named_by",
+    "lint_file",
     "open_scene",
     "read",
     "read_all",
@@ -41,27 +43,28 @@ __all__ = [
     "write_scene",
 ]
 
-_PLY, _OWN = "ply", "csplat"  # their readers need no second copy where all of a scene is wanted at once
-
-_MODULES = (
-    "csplat.formats.compressed_ply",
-    "csplat.formats.ply",
-    "csplat.formats.own",
-    "csplat.formats.spz",
-    "csplat.formats.spz4",
-    "csplat.formats.splat",
-    "csplat.formats.ksplat",
-    "csplat.formats.sog",
-    "csplat.formats.gltf",
+_PLY, _CSPLAT = "ply", "csplat"  # read at once by readers of their own, which need no second copy of the arrays
+_PLY_FORMAT = Format(
+    name=_PLY,
+    open=open_ply,
+    open_bands=open_ply,
+    write=write_scene_ply,
+    splat_bytes=(68.0, 104.0, 164.0, 248.0),
+    exact=frozenset(ARRAYS),
+    carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "extra", "metadata"}),
 )
-_insisted: ContextVar[str | None] = ContextVar("insisted", default=None)  # a command's --from, for all that it reads
+_assumed: ContextVar[str | None] = ContextVar("assumed", default=None)  # --from of a command, for all files it reads
 #: Of packages that stand on this one, by their names: nothing here knows them, and they may be absent.
 _ABOVE = ("csplat_trainer.torch_checkpoints",)
 
 
 def formats() -> tuple[Format, ...]:
-    """All formats that are known, those of this package first."""
-    found = [import_module(name).FORMAT for name in _MODULES]
+    """Return all formats, those of this package first."""
+    # Imported here: libraries of other formats would delay the start of programs that read none.
+    from csplat.formats import compressed_ply, csplat_format, gltf, ksplat, sog, splat, spz
+
+    found = [compressed_ply.FORMAT, _PLY_FORMAT, csplat_format.FORMAT, spz.FORMAT, spz.FORMAT_4]
+    found += [splat.FORMAT, ksplat.FORMAT, sog.FORMAT, gltf.FORMAT]
     for name in _ABOVE:
         with suppress(ModuleNotFoundError):
             found.append(import_module(name).FORMAT)
@@ -80,11 +83,11 @@ def read(
     """Read a scene in any format.
 
     Args:
-        file: its path, also of a folder; an open binary file; or bytes.
-        format: its name, one of `csplat formats`, where its content and its name do not say it.
+        file: its path, also that of a folder; an open binary file; or bytes.
+        format: name of the format as `csplat formats` lists it, if neither content nor name identify it.
         strict: refuse what would be repaired.
         keep_extra: keep columns that splats do not have.
-        sh_degree: leave out the SH bands above, 0 to 3, also of a file of a higher degree than 3; `None`: keep all.
+        sh_degree: drop the SH bands above it, 0 to 3, also from a file of a higher degree than 3; `None`: keep all.
         report: findings are appended to this list, repairs among them.
 
     Examples:
@@ -93,25 +96,25 @@ def read(
         SplatModel(1000 splats, sh_degree=3)
 
     Raises:
-        InputError: the file is in no format that is read, or not whole.
+        InputError: csplat reads no such format, or the file is incomplete.
         FormatError: it is a .csplat file that breaks a clause.
         OSError: it cannot be read.
     """
     with local_file(file) as path:
-        found = _readable(path, format)
+        found = _readable_format(path, format)
         if found.name == _PLY:
             return read_ply(path, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=report)
-        if found.name == _OWN:
+        if found.name == _CSPLAT:
             model = decode(path, sh_degree=sh_degree)
             return model if keep_extra or not model.extra else replace(model, extra={})
-        with _opened(found, path, sh_degree=sh_degree) as scene:
+        with _open(found, path, sh_degree=sh_degree) as scene:
             return read_all(scene, strict=strict, keep_extra=keep_extra, report=report)
 
 
 def read_all(
     scene: Scene, *, strict: bool = False, keep_extra: bool = False, report: list[Finding] | None = None
 ) -> SplatModel:
-    """Read all splats of a scene that is open; the rest as `read`."""
+    """Read all splats of an open scene; otherwise as `read`."""
     model = scene.model()
     if report is not None:
         report += scene.findings
@@ -120,65 +123,65 @@ def read_all(
 
 
 @contextmanager
-def insisting(format: str | None) -> Iterator[None]:
-    """Take files for this format, as long as the context lasts, where their content is that of no format that is read.
+def assume_format(format: str | None) -> Iterator[None]:
+    """Read files as this format, until the context ends, if their content identifies no other format.
 
     Args:
-        format: its name; `None`: their names decide, as usual.
+        format: name of the format; `None`: file names decide, as usual.
 
     Raises:
-        InputError: no format that is read has that name.
+        InputError: csplat reads no format of that name.
     """
-    if format is not None and named(format).open is None:
+    if format is not None and format_by_name(format).open is None:
         raise InputError(f"the format is {format}, which csplat does not read")
-    token = _insisted.set(format)
+    token = _assumed.set(format)
     try:
         yield
     finally:
-        _insisted.reset(token)
+        _assumed.reset(token)
 
 
 @contextmanager
 def open_scene(
     file: File, format: str | None = None, *, level: int = 0, sh_degree: int | None = None
 ) -> Iterator[Scene]:
-    """Open a scene in any format, to be read some splats at a time.
+    """Open a scene in any format, to be read block by block.
 
     Args:
-        file: as of `read`.
-        format: as of `read`.
-        level: of a file that has the scene several times; 0 is the finest.
-        sh_degree: as of `read`.
+        file: as in `read`.
+        format: as in `read`.
+        level: level of detail, if the file has several; 0 is the finest.
+        sh_degree: as in `read`.
 
     Yields:
-        The scene; its blocks can be read as long as the context lasts.
+        The scene; its blocks can be read until the context ends.
 
     Raises:
-        InputError: the file is in no format that is read, or not whole. Blocks raise it, too.
-        OSError: it cannot be read.
+        InputError: csplat reads no such format, or the file is incomplete. Blocks raise it, too.
+        OSError: the file cannot be read.
     """
-    with local_file(file) as path, _opened(_readable(path, format), path, level, sh_degree) as scene:
+    with local_file(file) as path, _open(_readable_format(path, format), path, level, sh_degree) as scene:
         yield scene
 
 
-def lint(path: Path, *, sh_degree: int | None = None) -> list[Finding]:
-    """Find out what is wrong with a file of any format, without refusing it.
+def lint_file(path: Path, *, sh_degree: int | None = None) -> list[Finding]:
+    """List what is wrong with a file of any format, without refusing it.
 
     Args:
-        path: of it.
-        sh_degree: as of `read`.
+        path: path of the file.
+        sh_degree: as in `read`.
 
     Returns:
-        Findings in the order of reading; the last one is an error where `read` would refuse.
+        Findings in the order of reading; the last one is an error if `read` would refuse the file.
 
     Raises:
-        InputError: it is in no format that is read, or its header cannot be understood.
-        OSError: it cannot be read.
+        InputError: csplat reads no such format, or the header cannot be understood.
+        OSError: the file cannot be read.
     """
-    found = _readable(path, None)
+    found = _readable_format(path, None)
     if found.name == _PLY:
         return lint_ply(path, sh_degree=sh_degree)
-    with _opened(found, path, sh_degree=sh_degree, lenient=True) as scene:
+    with _open(found, path, sh_degree=sh_degree, lenient=True) as scene:
         if all(one.repairable for one in scene.findings):
             try:
                 for _ in scene.blocks():
@@ -192,16 +195,16 @@ def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = 
     """Write a scene in any format.
 
     Args:
-        path: of the file, which it takes when it is complete, replacing an older one.
+        path: path of the file, which appears when it is complete, replacing an older one.
         model: the scene.
-        format: its name, where that of the file does not say it.
+        format: name of the format, if the suffix of the path does not identify it.
 
     Examples:
         >>> import csplat
         >>> csplat.write("copy.ply", csplat.read("scene.ply"))
 
     Raises:
-        InputError: no format that is written has that name, or it cannot hold the scene.
+        InputError: csplat writes no such format, or it cannot store the scene.
         OSError: the file cannot be written.
     """
     check_model("write", model)
@@ -209,30 +212,30 @@ def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = 
 
 
 def write_scene(path: str | os.PathLike[str], scene: Scene, format: str | None = None) -> None:
-    """Write a scene that is read some splats at a time; the rest as of `write`."""
+    """Write a scene block by block; otherwise as `write`."""
     target = Path(path)
-    found = named_by(target) if format is None else named(format)
+    found = format_by_suffix(target) if format is None else format_by_name(format)
     if found.write is None:
         raise InputError(f"{target.name} would be {found.title}, which csplat does not write")
     found.write(target, scene)
 
 
-def format_of(path: Path) -> Format:
-    """Find the format of a file or folder, by its content, else by its name.
+def detect_format(path: Path) -> Format:
+    """Identify the format of a file or folder by its content, otherwise by its name.
 
     Raises:
-        InputError: it is in none that is read, or its content makes that of its name hardly possible; the message says
-            what it may be, and what converts it.
-        OSError: it cannot be read.
+        InputError: csplat reads no such format, or the content makes the format of its name unlikely; the message says
+            what the file may be, and what converts it.
+        OSError: the file cannot be read.
     """
-    head, insisted = head_of(path), _insisted.get()
+    head, assumed = read_head(path), _assumed.get()
     known = {one.name: one for one in formats()}
-    kind = by_content(path, head)
+    kind = detect_content(path, head)
     if kind is not None and kind.name in known:
         return known[kind.name]
-    if insisted is not None:
-        return known[insisted]
-    kind = kind or (by_name(path) if head or path.is_dir() else None)
+    if assumed is not None:
+        return known[assumed]
+    kind = kind or (detect_name(path) if head or path.is_dir() else None)
     if kind is None or kind.remedy:
         raise refusal(path, head)
     if kind.name not in known:
@@ -240,35 +243,47 @@ def format_of(path: Path) -> Format:
     doubt = known[kind.name].doubt(path)
     if doubt:
         raise InputError(f"{path.name} is hardly {kind.title}: {doubt}; if it is one, read it with --from {kind.name}")
-    return known[kind.name]  # its reader says what is wrong
+    return known[kind.name]  # its reader reports what is wrong
 
 
-def named_by(path: Path) -> Format:
-    """The format that a file of that name is in.
+def format_by_suffix(path: Path) -> Format:
+    """Return the format that a file of that name has.
 
     Raises:
-        InputError: none.
+        InputError: no format has its suffix.
     """
-    name = path.name.lower()
-    found = [(len(suffix), one) for one in formats() for suffix in one.suffixes if name.endswith(suffix)]
-    if not found:
-        endings = ", ".join(one.suffixes[0] for one in formats() if one.write is not None)
+    known = {one.name: one for one in formats()}
+    kind = detect_name(path)
+    if kind is None or kind.name not in known:
+        endings = ", ".join(one.suffixes[0] for one in known.values() if one.write is not None)
         raise InputError(f"{path.name}: no format has that ending, wanted one of {endings}")
-    return max(found, key=lambda pair: pair[0])[1]
+    return known[kind.name]
 
 
-def _readable(path: Path, format: str | None) -> Format:
-    found = format_of(path) if format is None else named(format)
+def format_by_name(name: str) -> Format:
+    """Return the format of that name.
+
+    Raises:
+        InputError: there is none.
+    """
+    known = {one.name: one for one in formats()}
+    if name not in known:
+        raise InputError(f"the format is {name!r}, wanted one of {', '.join(known)}")
+    return known[name]
+
+
+def _readable_format(path: Path, format: str | None) -> Format:
+    found = detect_format(path) if format is None else format_by_name(format)
     if found.open is None:
         raise InputError(f"{path.name} is {found.title}, which csplat does not read")
     return found
 
 
 @contextmanager
-def _opened(
+def _open(
     found: Format, path: Path, level: int = 0, sh_degree: int | None = None, *, lenient: bool = False
 ) -> Iterator[Scene]:
-    """Open a scene along the usual axes; one with findings that are errors only if `lenient`."""
+    """Open a scene along the usual axes, even with findings that are errors if `lenient`."""
     assert found.open is not None
     check_sh_degree(sh_degree)
     if level and found.open_level is None:
@@ -279,14 +294,13 @@ def _opened(
         opened = found.open_bands(path, sh_degree)
     else:
         opened = found.open(path)
-    with opened as every_band:
-        refuse([] if lenient else every_band.findings, strict=False)
-        scene = every_band if sh_degree is None else _without_bands(every_band, sh_degree)
-        placed = in_axes(scene, USUAL) if found.axes else scene
-        yield replace(placed, format=found.name)
+    with opened as all_bands:
+        refuse([] if lenient else all_bands.findings, strict=False)
+        scene = all_bands if sh_degree is None else _with_fewer_bands(all_bands, sh_degree)
+        yield replace(in_axes(scene, USUAL) if found.axes else scene, format=found.name)
 
 
-def _without_bands(scene: Scene, sh_degree: int) -> Scene:
+def _with_fewer_bands(scene: Scene, sh_degree: int) -> Scene:
     if sh_degree >= scene.facts.sh_degree:
         return scene
     return replace(
@@ -294,15 +308,3 @@ def _without_bands(scene: Scene, sh_degree: int) -> Scene:
         facts=without_bands(scene.facts, sh_degree),
         blocks=lambda: (without_bands(model, sh_degree) for model in scene.blocks()),
     )
-
-
-def named(name: str) -> Format:
-    """The format of that name.
-
-    Raises:
-        InputError: there is none.
-    """
-    for one in formats():
-        if one.name == name:
-            return one
-    raise InputError(f"the format is {name!r}, wanted one of {', '.join(one.name for one in formats())}")

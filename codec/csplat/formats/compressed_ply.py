@@ -1,7 +1,7 @@
-"""PlayCanvas' compressed PLY: a PLY of packed words, each in the bounds of its 256 splats.
+"""PlayCanvas' compressed PLY: packed words, scaled to the bounds of chunks of 256 splats.
 
-Read in the sources of splat-transform (MIT), `decompress-ply.ts` and `compressed-chunk.ts`. Facts beyond the splats
-stand in the comments of its header, as those of a plain PLY do.
+Follows the sources of splat-transform (MIT), `decompress-ply.ts` and `compressed-chunk.ts`. Metadata is in the comments
+of the header, as in a plain PLY.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat.files import atomic_writer
-from csplat.formats.curve import along_curve
+from csplat.formats.common import crossed_bounds, decode_smallest_three, encode_smallest_three, sorted_along_curve
 from csplat.formats.format import Format
-from csplat.formats.packing import all_three, crossed, smallest_three
 from csplat.lint import Finding, too_many_bands, trailing_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.ply.comments import format_comments, parse_comments
@@ -29,9 +28,9 @@ from csplat.types import F32, U8, U32
 
 _CHUNK = 256  # splats that share bounds
 _SH_C0 = 0.28209479177387814
-_LARGEST_LOG = 20.0  # log scales beyond are no splat's, and would take all steps of their chunk
-_LARGEST_BOUND = 9e37  # largest colour; its coefficient is 3.5 times that, and float32 ends at 3.4e38
-_BANDS = (9, 24, 45, 72)  # columns of SH, of degrees 1 to 4
+_LARGEST_LOG = 20.0  # log scales are clipped to it: larger ones would take all steps of their chunk
+_LARGEST_BOUND = 9e37  # largest colour bound: a coefficient is 3.5 times that, and float32 ends at 3.4e38
+_BANDS = (9, 24, 45, 72)  # number of SH columns, degrees 1 to 4
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
@@ -39,12 +38,12 @@ _TYPES = {
 }  # fmt: skip
 _BOUNDS = [f"{end}_{kind}{axis}" for kind in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
 _COLOUR_BOUNDS = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
-_WORDS = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
+_PACKED_COLUMNS = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
 @dataclass(frozen=True)
 class _Element:
-    """Rows of one kind: where they begin, how many there are and what they hold."""
+    """The rows of an element: their offset in the file, number and type."""
 
     offset: int
     count: int
@@ -61,11 +60,11 @@ class _Element:
 
 @contextmanager
 def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
-    elements, comments, findings = _header(path)
+    elements, comments, findings = _parse_header(path)
     chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
     if chunk is None or vertex is None:
         raise InputError(f"{path.name} has no element {'chunk' if chunk is None else 'vertex'}: no compressed PLY")
-    _check_columns(path, "vertex", vertex, _WORDS, "<u4")
+    _check_columns(path, "vertex", vertex, _PACKED_COLUMNS, "<u4")
     coloured = "min_r" in (chunk.dtype.names or ())
     names = _BOUNDS + (_COLOUR_BOUNDS if coloured else [])
     _check_columns(path, "chunk", chunk, names, "<f4")
@@ -74,7 +73,7 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
             f"{path.name}: {counted(chunk.count, 'chunk')} for {counted(vertex.count, 'splat')},"
             f" wanted one for each {_CHUNK}"
         )
-    kept = 0  # coefficients of a channel
+    kept = 0  # coefficients per channel
     if sh is not None:
         rest = len(sh.dtype.names or ())
         if sh.count != vertex.count or rest not in _BANDS:
@@ -98,17 +97,17 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
     if len(bad):
         row, kind, end, axis = bad[0]
         raise InputError(f"{path.name}: chunk {row} has no finite {names[kind * 6 + end * 3 + axis]}")
-    bad = np.argwhere(crossed(bounds[:, :, 0], bounds[:, :, 1]))
+    bad = np.argwhere(crossed_bounds(bounds[:, :, 0], bounds[:, :, 1]))
     if len(bad):
         row, kind, axis = bad[0]
         low, high = (f"{names[kind * 6 + end * 3 + axis]} {bounds[row, kind, end, axis]:.6g}" for end in (0, 1))
         raise InputError(f"{path.name}: chunk {row} has {low} above {high}, expected at most that")
     try:
-        said = parse_comments(comments)
+        metadata = parse_comments(comments)
         facts = SplatModel(
-            **_unpacked(np.zeros(0, vertex.dtype), bounds[:0], None, kept),
-            origin=said.origin or (0.0, 0.0, 0.0),
-            **said.fields(),
+            **_unpack(np.zeros(0, vertex.dtype), bounds[:0], None, kept),
+            origin=metadata.origin or (0.0, 0.0, 0.0),
+            **metadata.fields(),
         )
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
@@ -118,14 +117,14 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
             stop = min(start + BLOCK, vertex.count)
             coefficients = None if sh is None else sh.read(path, start, stop)
             words = vertex.read(path, start, stop)
-            own = bounds[start // _CHUNK : -(-stop // _CHUNK)]
-            yield replace(facts, **_unpacked(words, own, coefficients, kept))
+            chunk_bounds = bounds[start // _CHUNK : -(-stop // _CHUNK)]
+            yield replace(facts, **_unpack(words, chunk_bounds, coefficients, kept))
 
-    yield Scene(vertex.count, facts, blocks, [*findings, *said.findings])
+    yield Scene(vertex.count, facts, blocks, [*findings, *metadata.findings])
 
 
-def _header(path: Path) -> tuple[dict[str, _Element], list[str], list[Finding]]:
-    """The elements, whose rows are all there; the comments; and what is unusual."""
+def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Finding]]:
+    """Return the elements, all of whose rows are present, the comments and findings."""
     findings: list[Finding] = []
     header = read_ply_header(path, findings, "compressed-ply")
     findings = [one for one in findings if one.repairable]  # numbers of rows are checked below
@@ -165,23 +164,27 @@ def _check_columns(path: Path, name: str, element: _Element, wanted: list[str], 
             raise InputError(f"{path.name}: {name} has no {np.dtype(kind).name} {column}: no compressed PLY")
 
 
-def _unpacked(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None, kept: int) -> dict[str, Any]:
-    """The arrays of a model of packed words, the bounds of their chunks [C, 2 or 3, 2, 3], and the rows of SH.
+def _unpack(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None, kept: int) -> dict[str, Any]:
+    """Decode the arrays of a model.
 
-    Of the coefficients of each channel the first `kept` are taken.
+    Args:
+        words: packed words of the splats.
+        bounds: [C, 2 or 3, 2, 3], bounds of their chunks: means, scales and perhaps colours; low and high.
+        sh: rows of SH coefficients; `None`: there are none.
+        kept: number of coefficients per channel to decode.
     """
     count = len(words)
 
-    def placed(parts: NDArray[np.float64], kind: int) -> NDArray[np.float64]:
+    def between(fractions: NDArray[np.float64], kind: int) -> NDArray[np.float64]:
         low, high = (np.repeat(bounds[:, kind, end], _CHUNK, 0)[:count] for end in (0, 1))
-        placed: NDArray[np.float64] = low * (1.0 - parts) + high * parts
-        return placed
+        values: NDArray[np.float64] = low * (1.0 - fractions) + high * fractions
+        return values
 
     rotation, colour = (words[name] for name in ("packed_rotation", "packed_color"))
     three = np.stack([(rotation >> shift & 1023) for shift in (20, 10, 0)], 1).astype(np.float32)
     channels = np.stack([colour >> shift & 255 for shift in (24, 16, 8)], 1) / 255.0
     if bounds.shape[1] == 3:
-        channels = placed(channels, 2)
+        channels = between(channels, 2)
     shN = np.zeros((count, kept, 3), np.float32)
     if sh is not None and kept:
         names = sh.dtype.names or ()
@@ -190,16 +193,19 @@ def _unpacked(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None
         places = [names.index(f"f_rest_{channel * each + index}") for channel in range(3) for index in range(kept)]
         shN = _sh_values()[codes[:, places].reshape(count, 3, -1).transpose(0, 2, 1)]
     return {
-        "means": placed(_thirds(words["packed_position"]), 0).astype(np.float32),
-        "scales": placed(_thirds(words["packed_scale"]), 1).astype(np.float32),
-        "quats": all_three(rotation >> 30, (three / np.float32(1023) - np.float32(0.5)) * np.float32(2**0.5)),
+        "means": between(_split_words(words["packed_position"]), 0).astype(np.float32),
+        "scales": between(_split_words(words["packed_scale"]), 1).astype(np.float32),
+        "quats": decode_smallest_three(
+            rotation >> 30, (three / np.float32(1023) - np.float32(0.5)) * np.float32(2**0.5)
+        ),
         "opacities": ((colour & 255) / 255.0).astype(np.float32),
         "sh0": ((channels - 0.5) / _SH_C0).astype(np.float32),
         "shN": np.ascontiguousarray(shN),
     }
 
 
-def _thirds(words: U32) -> NDArray[np.float64]:
+def _split_words(words: U32) -> NDArray[np.float64]:
+    """Return fields of 11, 10 and 11 bits as fractions [N, 3]."""
     return np.stack([(words >> 21) / 2047.0, (words >> 11 & 1023) / 1023.0, (words & 2047) / 2047.0], 1)
 
 
@@ -210,23 +216,23 @@ def _sh_values() -> F32:
 
 
 def _write(path: Path, scene: Scene) -> None:
-    """Write all of a scene along a Z curve."""
+    """Write a scene sorted along a Z curve."""
     rest = 3 * scene.facts.shN.shape[1]
-    header = _written_header(scene.facts, scene.count, rest)
-    sizes = 4 * len(_BOUNDS + _COLOUR_BOUNDS) * -(-scene.count // _CHUNK), 4 * len(_WORDS) * scene.count
+    header = _build_header(scene.facts, scene.count, rest)
+    sizes = 4 * len(_BOUNDS + _COLOUR_BOUNDS) * -(-scene.count // _CHUNK), 4 * len(_PACKED_COLUMNS) * scene.count
     places = [len(header), len(header) + sizes[0], len(header) + sum(sizes)]
-    with atomic_writer(path) as stream, along_curve(scene, path.parent) as ordered:
+    with atomic_writer(path) as stream, sorted_along_curve(scene, path.parent) as ordered:
         stream.write(header)
         for model in ordered.blocks():
-            bounds, words = _words(model)
+            bounds, words = _pack_words(model)
             for index, part in enumerate((bounds.astype("<f4"), words, _sh_codes(model))):
                 stream.seek(places[index])
                 places[index] += stream.write(part.tobytes())
 
 
-def _words(model: SplatModel) -> tuple[F32, U32]:
-    """The bounds of the chunks of a block [C, 18] and the words of its splats [N, 4]."""
-    largest, three = smallest_three(model.quats)
+def _pack_words(model: SplatModel) -> tuple[F32, U32]:
+    """Return the bounds of the chunks of a block [C, 18] and the words of its splats [N, 4]."""
+    largest, three = encode_smallest_three(model.quats)
     steps = np.clip(np.rint((three / np.float32(2**0.5) + np.float32(0.5)) * 1023), 0, 1023).astype(np.int64)
     words = np.empty((len(model), 4), "<u4")
     words[:, 1] = largest << 30 | steps[:, 0] << 20 | steps[:, 1] << 10 | steps[:, 2]
@@ -236,7 +242,7 @@ def _words(model: SplatModel) -> tuple[F32, U32]:
         (2, np.clip(model.scales, -_LARGEST_LOG, _LARGEST_LOG), (11, 10, 11)),
         (3, (model.sh0 * _SH_C0 + 0.5).astype(np.float32), (8, 8, 8)),
     ):
-        words[:, column], low, high = _packed(values, bits)
+        words[:, column], low, high = _pack(values, bits)
         bounds += [low, high]
     words[:, 3] |= np.rint(model.opacities * np.float32(255)).astype(np.uint32)
     return np.concatenate(bounds, 1), words
@@ -247,8 +253,8 @@ def _sh_codes(model: SplatModel) -> U8:
     return codes
 
 
-def _packed(values: F32, bits: tuple[int, int, int]) -> tuple[U32, F32, F32]:
-    """Pack three columns into the upper bits of words. Also the least and the largest of each chunk, [C, 3]."""
+def _pack(values: F32, bits: tuple[int, int, int]) -> tuple[U32, F32, F32]:
+    """Pack three columns into the upper bits of words; return also the bounds of each chunk, [C, 3] each."""
     count = len(values)
     starts = np.arange(0, count, _CHUNK)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
@@ -264,14 +270,14 @@ def _packed(values: F32, bits: tuple[int, int, int]) -> tuple[U32, F32, F32]:
     return words, low, high
 
 
-def _written_header(facts: SplatModel, count: int, rest: int) -> bytes:
+def _build_header(facts: SplatModel, count: int, rest: int) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         *(f"comment {line}" for line in format_comments(facts, absolute=False)),
     ]
     lines += [f"element chunk {-(-count // _CHUNK)}", *(f"property float {name}" for name in _BOUNDS + _COLOUR_BOUNDS)]
-    lines += [f"element vertex {count}", *(f"property uint {name}" for name in _WORDS)]
+    lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED_COLUMNS)]
     if rest:
         lines += [f"element sh {count}", *(f"property uchar f_rest_{index}" for index in range(rest))]
     return "\n".join([*lines, "end_header\n"]).encode("ascii")

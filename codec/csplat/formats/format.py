@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from csplat.detect import KINDS
 from csplat.model import UNSPECIFIED, SplatModel
@@ -15,47 +15,14 @@ from csplat.scene import Scene
 #: Splat attributes of every format.
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
-
-class Reader(Protocol):
-    """Opens a file."""
-
-    def __call__(self, path: Path, /) -> AbstractContextManager[Scene]:
-        """Give the scene, whose blocks can be read as long as the context lasts.
-
-        Raises:
-            InputError: the file is not whole, or none of this format. Blocks raise it, too.
-            OSError: it cannot be read.
-        """
-        ...
-
-
-class LevelReader(Protocol):
-    """Opens a file of a scene that it has several times."""
-
-    def __call__(self, path: Path, level: int, /) -> AbstractContextManager[Scene]:
-        """As `Reader`: 0 is the finest level, that of `Reader`, and 1 the next coarser one."""
-        ...
-
-
-class BandReader(Protocol):
-    """Opens a file without its higher SH bands."""
-
-    def __call__(self, path: Path, sh_degree: int, /) -> AbstractContextManager[Scene]:
-        """As `Reader`, without the bands above a degree; the file may have more than models have."""
-        ...
-
-
-class Writer(Protocol):
-    """Writes a file, or the files of a folder."""
-
-    def __call__(self, path: Path, scene: Scene, /) -> None:
-        """Write all of a scene; `path` takes its name when it is complete.
-
-        Raises:
-            InputError: the format cannot hold it at all: too many splats, positions out of its reach.
-            OSError: it cannot be written.
-        """
-        ...
+# Opening a file raises InputError if it is incomplete or not of the format, OSError if it cannot be read; so do the
+# blocks of the scene, which can be read until the context ends.
+OpenScene = Callable[[Path], AbstractContextManager[Scene]]
+OpenLevel = Callable[[Path, int], AbstractContextManager[Scene]]  # level of detail, 0 is the finest
+OpenBands = Callable[[Path, int], AbstractContextManager[Scene]]  # highest SH degree to read; the file may have more
+# Writing raises InputError if the format cannot hold the scene (too many splats, positions out of range), OSError if
+# the file cannot be written. The path appears when the file is complete.
+WriteScene = Callable[[Path, Scene], None]
 
 
 @dataclass(frozen=True)
@@ -63,26 +30,26 @@ class Format:
     """A format of files.
 
     Attributes:
-        name: as `csplat formats` and `--from` have it, a key of `csplat.detect.KINDS`: `spz`.
-        open: reads it; `None`: it is not read.
-        open_level: reads a level of it; `None`: scenes have one level.
-        open_bands: reads it without the SH bands above a degree; `None`: `open` reads all bands that a model may have.
-        write: writes it; `None`: it is not written.
-        doubt: for formats known by the file name alone: why a file is hardly of this format, "" if it may well be.
-        degree: highest SH degree that it holds.
-        axes: directions of +x, +y and +z in every file of this format; "" if a file may specify nothing or anything.
-            `open` gives the scene along them.
-        exact: names of the arrays of a model that come back bit for bit; opacities kept as logits within an ulp.
-        splat_bytes: about how many bytes a splat takes at SH degrees 0 to 3; empty if that depends on the scene.
-        carries: those of `antialiased`, `origin`, `extra`, `metadata`, `coordinate_system`, `unit_metres`, `flat`,
-            `cameras` that it can store.
+        name: the name in `csplat formats` and `--from`, a key of `csplat.detect.KINDS`: `spz`.
+        open: opens a file; `None`: csplat does not read the format.
+        open_level: opens a level of detail; `None`: scenes have one level.
+        open_bands: opens a file without the SH bands above a degree; `None`: `open` reads all bands of a model.
+        write: writes a file; `None`: csplat does not write the format.
+        doubt: for formats known by the file name alone, returns why a file is hardly of this format; "" if it may be.
+        degree: highest SH degree that the format stores.
+        axes: directions of +x, +y and +z in all files of this format, along which `open` returns scenes; "" if files
+            name their axes or leave them open.
+        exact: names of the arrays that come back bit for bit; opacities stored as logits come back within an ulp.
+        splat_bytes: approximate bytes of a splat at SH degrees 0 to 3; empty if that depends on the scene.
+        carries: which of `antialiased`, `origin`, `extra`, `metadata`, `coordinate_system`, `unit_metres`, `flat` and
+            `cameras` the format stores.
     """
 
     name: str
-    open: Reader | None = None
-    open_level: LevelReader | None = None
-    open_bands: BandReader | None = None
-    write: Writer | None = None
+    open: OpenScene | None = None
+    open_level: OpenLevel | None = None
+    open_bands: OpenBands | None = None
+    write: WriteScene | None = None
     doubt: Callable[[Path], str] = lambda _path: ""
     degree: int = 3
     axes: str = ""
@@ -92,20 +59,20 @@ class Format:
 
     @property
     def title(self) -> str:
-        """As people write it: `SPZ 4`."""
+        """The name in prose: `SPZ 4`."""
         return KINDS[self.name].title
 
     @property
     def suffixes(self) -> tuple[str, ...]:
-        """Endings of file names, the usual one first; with their dots, in small letters."""
+        """Endings of file names, the usual one first; with their dots, in lower case."""
         return KINDS[self.name].suffixes
 
     def expected_bytes(self, facts: SplatModel, count: int) -> int | None:
-        """About how large a file gets; `None` if that depends on the scene."""
+        """Return the approximate size of a file; `None` if it depends on the scene."""
         return round(count * self.splat_bytes[min(facts.sh_degree, self.degree)]) if self.splat_bytes else None
 
     def losses(self, facts: SplatModel) -> tuple[str, ...]:
-        """List the parts of a scene that this format cannot store, a few words each; precision is not among them.
+        """List the parts of a scene that this format cannot store, a few words each; precision is not one of them.
 
         Args:
             facts: `facts` of a `Scene`, or a model.

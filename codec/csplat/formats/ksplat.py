@@ -1,7 +1,7 @@
-""".ksplat 0.1 of mkkellogg/GaussianSplats3D: sections of rows, in floats or in smaller numbers around bucket centres.
+""".ksplat 0.1 of mkkellogg/GaussianSplats3D: rows of floats or of smaller types around bucket centres.
 
-Level 0 has float32 throughout. Levels 1 and 2 have positions of 16 bits in a block around the centre of a bucket of
-splats, everything else as float16, but SH as bytes at level 2. SH go up to degree 2. No file specifies which way is up.
+Level 0 is float32 throughout. Levels 1 and 2 have 16-bit positions in a block around the centre of a bucket of splats
+and float16 for the rest, except SH in bytes at level 2. SH go up to degree 2. Files do not specify which way is up.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
+from csplat.formats.common import finite_scene, sh0_from_bytes
 from csplat.formats.format import Format
-from csplat.formats.rows import colours_of_bytes, finite_scene
 from csplat.inputs import mapped
 from csplat.lint import trailing_bytes
 from csplat.model import SplatModel, normalise_quats
@@ -31,21 +31,21 @@ Rows = NDArray[Any]
 _HEADER = struct.Struct("<BBxxIIIIHxx12xff")
 _SECTION = struct.Struct("<IIIIfHxxIIIIH")
 _HEADER_SIZE, _SECTION_SIZE = 4096, 1024
-_TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))  # by level: positions, others, SH
+_TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))  # per level: positions, others, SH
 _COEFFICIENTS = (0, 9, 24)  # number of SH coefficients, by degree
 _CENTRE_SIZE = 12
-_USUAL_RANGE = 32767  # units of a position from the centre of its block to its face
-_USUAL_SH = 1.5  # bytes of SH reach from -1.5 to 1.5
-_LARGEST = 1e38  # any farther leaves float32
+_DEFAULT_SPAN = 32767  # units of a position from the centre of a block to its faces
+_DEFAULT_SH = 1.5  # SH bytes represent -1.5 to 1.5
+_LARGEST = 1e38  # larger values leave float32
 
 
 @dataclass(frozen=True, eq=False)
 class _Section:
-    """Splats whose rows are of one type.
+    """Splats whose rows have one type.
 
     Attributes:
-        ends: [buckets] the splat at which each ends.
-        corners: [buckets, 3] what a position of 0 means in each.
+        ends: [buckets] index of the splat after the last one of each.
+        corners: [buckets, 3] the place of position 0 in each, scene units.
         step: scene units per unit of a position.
     """
 
@@ -59,15 +59,15 @@ class _SectionHead(NamedTuple):
     """The header of a section.
 
     Attributes:
-        room: for how many splats there are bytes.
-        bucket: splats of a full bucket.
+        capacity: number of splats that the section has bytes for.
+        bucket: number of splats in a full bucket.
         block: length of the block around a bucket's centre, scene units.
-        span: units of a position from there to a face; 0: the usual.
-        full, partial: number of buckets that are full, and of those that are not.
+        span: units of a position from the centre to a face; 0: `_DEFAULT_SPAN`.
+        full, partial: number of full and of other buckets.
     """
 
     splats: int
-    room: int
+    capacity: int
     bucket: int
     buckets: int
     block: float
@@ -89,7 +89,7 @@ def _open(path: Path) -> Iterator[Scene]:
         raise InputError(f"{path.name} is .ksplat of version {major}.{minor}, wanted 0.1")
     if level >= len(_TYPES):
         raise InputError(f"{path.name} has compression level {level}, wanted at most {len(_TYPES) - 1}")
-    low, high = low or -_USUAL_SH, high or _USUAL_SH
+    low, high = low or -_DEFAULT_SH, high or _DEFAULT_SH
     if not (abs(low) < _LARGEST and abs(high) < _LARGEST and low <= high):
         raise InputError(f"{path.name} has SH from {low} to {high}, wanted numbers, the larger one last")
     sections, end = _sections(path.name, data, level, most)
@@ -100,21 +100,21 @@ def _open(path: Path) -> Iterator[Scene]:
 
     def blocks() -> Iterator[tuple[Rows, ...]]:
         for section in sections:
-            yield from _placed(section)
+            yield from _section_blocks(section)
 
-    def decoded(scales: F32, rows: Rows, corners: F64, steps: F64) -> SplatModel:
+    def decode(scales: F32, rows: Rows, corners: F64, steps: F64) -> SplatModel:
         return SplatModel(
             means=(rows["means"] * steps + corners).astype(np.float32),
             quats=normalise_quats(rows["quats"].astype(np.float32)),
             scales=scales,
             opacities=np.divide(rows["colours"][:, 3], 255, dtype=np.float32),
-            sh0=colours_of_bytes(rows["colours"][:, :3]),
-            shN=_rest(rows["shN"], widest, low, high),
+            sh0=sh0_from_bytes(rows["colours"][:, :3]),
+            shN=_decode_sh(rows["shN"], widest, low, high),
         )
 
-    nothing = np.empty(0, _row_type(level, 0))
-    facts = decoded(np.zeros((0, 3), np.float32), nothing, np.zeros((0, 3)), np.zeros((0, 1)))
-    scene = finite_scene(blocks, decoded, facts)
+    no_rows = np.empty(0, _row_type(level, 0))
+    facts = decode(np.zeros((0, 3), np.float32), no_rows, np.zeros((0, 3)), np.zeros((0, 1)))
+    scene = finite_scene(blocks, decode, facts)
     scene.findings.extend(trailing_bytes(len(data) - end))
     yield scene
 
@@ -133,7 +133,7 @@ def _row_type(level: int, degree: int) -> np.dtype[Any]:
 
 
 def _sections(name: str, data: Any, level: int, most: int) -> tuple[list[_Section], int]:
-    """Return the sections, and the byte behind the last one."""
+    """Return the sections and the offset of the end of the last one."""
     found: list[_Section] = []
     at = _HEADER_SIZE + most * _SECTION_SIZE
     if at > len(data):
@@ -146,11 +146,11 @@ def _sections(name: str, data: Any, level: int, most: int) -> tuple[list[_Sectio
         row = _row_type(level, head.degree)
         centres = at + 4 * head.partial
         start = centres + head.centre_size * head.buckets
-        at = start + row.itemsize * head.room
+        at = start + row.itemsize * head.capacity
         if at > len(data):
             raise InputError(f"{where} ends at byte {at:,}, and the file at {len(data):,}")
-        if head.splats > head.room:
-            raise InputError(f"{where}: {head.splats:,} splats in room for {head.room:,}")
+        if head.splats > head.capacity:
+            raise InputError(f"{where}: {head.splats:,} splats in room for {head.capacity:,}")
         rows = np.frombuffer(data, row, head.splats, start)
         if level and head.splats:
             found.append(_Section(rows, *_buckets(where, data, head, centres)))
@@ -160,9 +160,7 @@ def _sections(name: str, data: Any, level: int, most: int) -> tuple[list[_Sectio
 
 
 def _buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[NDArray[np.int64], F64, float]:
-    """Return the buckets' ends and corners, and the step, as in `_Section`. Buckets that are not full have their
-    lengths before the centres of all.
-    """
+    """Return the buckets' ends and corners and the step, as in `_Section`; partial buckets list their lengths first."""
     if head.centre_size != _CENTRE_SIZE or head.full + head.partial > head.buckets:
         raise InputError(f"{where}: {head.full:,} full buckets and {head.partial:,} others, of {head.buckets:,}")
     lengths = np.frombuffer(data, "<u4", head.partial, centres - 4 * head.partial)
@@ -170,7 +168,7 @@ def _buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[N
     if not len(ends) or ends[-1] < head.splats:
         raise InputError(f"{where}: its buckets hold fewer than its {head.splats:,} splats")
     middles = np.frombuffer(data, "<f4", 3 * head.buckets, centres).reshape(-1, 3).astype(np.float64)
-    span = head.span or _USUAL_RANGE
+    span = head.span or _DEFAULT_SPAN
     if head.block < 0:
         raise InputError(f"{where}: its blocks are {head.block:g} long, wanted at least 0")
     step = head.block / 2 / span
@@ -179,15 +177,15 @@ def _buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[N
     return ends, middles - span * step, step
 
 
-def _placed(section: _Section) -> Iterator[tuple[Rows, ...]]:
+def _section_blocks(section: _Section) -> Iterator[tuple[Rows, ...]]:
     for start in range(0, len(section.rows), BLOCK):
         rows = section.rows[start : start + BLOCK]
         bucket = np.searchsorted(section.ends, np.arange(start, start + len(rows)), side="right")
         yield rows, section.corners[bucket], np.full((len(rows), 1), section.step)
 
 
-def _rest(coded: Rows, widest: int, low: float, high: float) -> F32:
-    """SH, which lie band by band, then channel by channel."""
+def _decode_sh(coded: Rows, widest: int, low: float, high: float) -> F32:
+    """Decode SH, which are stored band by band, then channel by channel."""
     width = coded.shape[1]
     bands = [np.arange(start, end).reshape(3, -1).T for start, end in pairwise(_COEFFICIENTS) if end <= width]
     values = coded[:, np.concatenate([np.zeros(0, np.int64), *(band.ravel() for band in bands)])].astype(np.float32)

@@ -1,6 +1,7 @@
-""".splat of antimatter15/splat: 32 bytes a splat and nothing else: no SH, no axes, no word of what it is.
+""".splat of antimatter15/splat: 32 bytes per splat and nothing else: no header, no SH, no axes.
 
-Position and standard deviations are floats; colour, opacity and rotation bytes. Its name alone tells it apart.
+Positions and standard deviations are floats; colours, opacities and rotations are bytes. Only the file name identifies
+the format.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
 from csplat.files import atomic_writer
+from csplat.formats.common import finite_scene, sh0_from_bytes
 from csplat.formats.format import Format
-from csplat.formats.rows import colours_of_bytes, finite_scene
 from csplat.inputs import mapped
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply.columns import SH_C0
@@ -25,11 +26,11 @@ from csplat.types import F32
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colours", "u1", 4), ("quats", "u1", 4)])
 _LARGEST_LOG = np.float32(88.0)  # float32 holds its exponential
-_QUAT_ZERO = 128  # byte of a component of 0; that of 1 would be 256
-_SAMPLE = 4096  # splats that are looked at for a doubt
-_PLACES = (1e-12, 1e12)  # largest coordinate other than 0, scene units; of any 12 bytes a quarter lies there
-_LONGEST_QUAT = 250  # units of 1/128; four bytes of 0 are 256 long, and 255 in three is what clipped ones have
-_MOST_IS_TEXT = 0.95  # share of printable bytes
+_QUAT_ZERO = 128  # byte of a component of 0; 1 would be 256
+_SAMPLE = 4096  # splats that `_doubt` looks at
+_PLACES = (1e-12, 1e12)  # scene units; range of the largest coordinate unless 0; a quarter of random bytes lies there
+_LONGEST_QUAT = 250  # units of 1/128; four bytes of 0 are 256 long
+_MOST_IS_TEXT = 0.95  # smallest share of printable bytes in a text
 _PRINTABLE = np.array([32 <= byte < 127 or byte in b"\t\n\r" for byte in range(256)])
 
 
@@ -44,14 +45,14 @@ def _open(path: Path) -> Iterator[Scene]:
         for start in range(0, len(rows), BLOCK):
             yield (rows[start : start + BLOCK],)
 
-    yield finite_scene(blocks, _decoded, _decoded(np.zeros((0, 3), np.float32), rows[:0]), zero_quat=_QUAT_ZERO)
+    yield finite_scene(blocks, _decode_rows, _decode_rows(np.zeros((0, 3), np.float32), rows[:0]), zero_quat=_QUAT_ZERO)
 
 
 def _doubt(path: Path) -> str:
-    """Say why a file has hardly splats in its rows: as `Format.doubt`. Half of a sample has to look like splats."""
+    """Return why a file hardly consists of splats (`Format.doubt`): half of a sample has to look like splats."""
     data = mapped(path)
     if len(data) % _ROW.itemsize or not len(data):
-        return ""  # its reader says what is wrong
+        return ""  # the reader reports what is wrong
     rows = np.frombuffer(data, _ROW)
     step = max(1, len(rows) // _SAMPLE)
     sample = rows[::step]
@@ -61,29 +62,29 @@ def _doubt(path: Path) -> str:
     far = np.abs(sample["means"]).max(axis=1)  # NaN where there is one
     placed = (far == 0) | ((far > _PLACES[0]) & (far < _PLACES[1]))
     lengths = np.linalg.norm(np.subtract(sample["quats"], _QUAT_ZERO, dtype=np.float32), axis=1)
-    turned = lengths < _LONGEST_QUAT
-    of_two_signs = (sample["scales"] < 0).any(axis=1) & (sample["scales"] > 0).any(axis=1)  # neither lengths nor logs
-    finite = np.isfinite(far)  # a finding reports the others
-    good = ~finite | (placed & turned & ~of_two_signs)
+    rotated = lengths < _LONGEST_QUAT
+    has_both_signs = (sample["scales"] < 0).any(axis=1) & (sample["scales"] > 0).any(axis=1)  # neither lengths nor logs
+    finite = np.isfinite(far)  # findings report the others
+    good = ~finite | (placed & rotated & ~has_both_signs)
     if 2 * np.count_nonzero(~good) <= np.count_nonzero(finite):
         return ""
     worst = int(np.argmin(good))
-    name, what = ("means", "lies at")
+    name, verb = ("means", "lies at")
     if placed[worst]:
-        name, what = ("scales", "has scales of") if turned[worst] else ("quats", "has a rotation of the bytes")
-    said = ", ".join(f"{value:.3g}" for value in sample[name][worst].tolist())
+        name, verb = ("scales", "has scales of") if rotated[worst] else ("quats", "has a rotation of the bytes")
+    values = ", ".join(f"{value:.3g}" for value in sample[name][worst].tolist())
     share = np.count_nonzero(~good) / np.count_nonzero(finite)
     at = worst * step * _ROW.itemsize
-    return f"{share:.0%} of {counted(len(good), 'row')} are no splats; that at byte {at:,} {what} {said}"
+    return f"{share:.0%} of {counted(len(good), 'row')} are no splats; that at byte {at:,} {verb} {values}"
 
 
-def _decoded(scales: F32, rows: NDArray[Any]) -> SplatModel:
+def _decode_rows(scales: F32, rows: NDArray[Any]) -> SplatModel:
     return SplatModel(
         means=rows["means"].astype(np.float32),
         quats=normalise_quats(np.subtract(rows["quats"], _QUAT_ZERO, dtype=np.float32)),
         scales=scales,
         opacities=np.divide(rows["colours"][:, 3], 255, dtype=np.float32),
-        sh0=colours_of_bytes(rows["colours"][:, :3]),
+        sh0=sh0_from_bytes(rows["colours"][:, :3]),
     )
 
 
@@ -100,7 +101,7 @@ def _write(path: Path, scene: Scene) -> None:
 
 
 def _with_negative_largest(quats: F32) -> F32:
-    """The same rotations: -1 has a byte and 1 has none, and some viewers do not normalise."""
+    """Make the largest component negative: -1 has a byte, 1 has none, and some viewers do not normalise."""
     largest = np.take_along_axis(quats, np.abs(quats).argmax(axis=1)[:, None], axis=1)
     return np.where(largest > 0, -quats, quats)
 

@@ -1,76 +1,300 @@
-"""SPZ of Niantic and Adobe, versions 1 to 4: positions in fixed point, all else in bytes, attribute by attribute.
+"""SPZ of Niantic and Adobe, versions 1 to 4: fixed-point positions, bytes for the rest, one attribute after the other.
 
-Its axes are right, up, back (https://github.com/nianticlabs/spz), unless an extension names others; some converters
-put scenes into it as they stand, and no file says so.
+Versions 1 to 3 are one gzip stream, version 4 has a Zstandard stream per attribute. The axes are right, up, back
+(https://github.com/nianticlabs/spz) unless an extension names others; some converters store scenes along other axes
+without saying so.
 
-Written is version 3, which more programs read than 4. Coefficients of SH get 6 bits each, where the owner's library
-keeps 5 of band 1 and 4 of the others: on three scenes 36 to 38 % more bytes and 9 to 10 dB more; a seventh bit would be
-18 % more for 2 to 4 dB, an eighth 16 % for 1. Positions get the usual 12 bits of fraction, more where splats are that
-fine (all that fit would be up to 9 % more bytes, for 0.3 dB at best), fewer where the scene would not fit.
+The writer makes version 3, which more programs read, or version 4. SH coefficients get 6 bits each; the owner's library
+keeps 5 for band 1 and 4 for the others. On three scenes 6 bits cost 36 to 38 % more bytes and gain 9 to 10 dB; a
+seventh would cost 18 % more for 2 to 4 dB, an eighth 16 % for 1 dB. Positions get the usual 12 fractional bits, more
+for fine splats (all that fit would cost up to 9 % more bytes, for 0.3 dB at best), fewer if the scene would not fit.
 """
 
 from __future__ import annotations
 
+import gzip
 import math
+import struct
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
+from typing import Any, BinaryIO, cast
 
+import deflate
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
+from csplat.files import atomic_writer
+from csplat.formats.common import decode_smallest_three, encode_smallest_three
 from csplat.formats.format import Format
-from csplat.formats.packing import all_three, smallest_three
-from csplat.formats.spz_file import ANTIALIASED, AXES, MOST_BITS, Packed, read_packed, write_packed
-from csplat.model import SplatModel, normalise_quats
+from csplat.lint import Finding, too_many_bands, trailing_bytes
+from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats
 from csplat.scene import BLOCK, Scene
 from csplat.turning import in_axes
 from csplat.types import F32, U8
 
-_COLOUR = np.float32(0.15)  # what a coefficient is multiplied by, of the 256 levels
+#: Directions of +x, +y and +z: right, up, back.
+SPZ_AXES = "RUB"
+
+#: Bit of `SpzArrays.flags`.
+ANTIALIASED = 0x01
+
+#: Largest number of fractional bits: readers compute 1 << bits in 32 bits.
+MAX_FRACTION_BITS = 30
+
+_MAGIC = b"NGSP"
+_GZIP = b"\x1f\x8b"
+_HEADER = struct.Struct("<4sIIBBBB")
+_HEADER_REST = struct.Struct("<I12x")  # version 4: offset of the table of streams
+_STREAM = struct.Struct("<QQ")  # entry of that table: bytes packed, bytes unpacked
+_RECORD = struct.Struct("<II")  # head of an extension: type, bytes of its value
+_EXTENDED, _LEVELS = 0x02, 0x80
+_COORDINATE_SYSTEM = 0xADBE0003  # the extension SPZ_ADOBE_coordinate_system
+_SYSTEMS = "RUBLDBRDBLUBRUBLDFRDFLUFRUFLFDRFDLFURFULBDRBDLBURBU"  # three letters per number; 0 is unspecified
+_EXTENSION_BYTES = 1 << 20  # largest size of all extensions together
+_RATIO = 1032  # largest expansion by deflate; programs of the format refuse more from Zstandard, too
+_MAX_DEGREE = 4  # largest SH degree since version 4 of the format
+_GZIP_LEVEL, _ZSTD_LEVEL = 9, 12
+_PIECE = 1 << 18
+
+
+@dataclass(eq=False)
+class SpzArrays:
+    """The header and the arrays of bytes of a file.
+
+    Attributes:
+        name: name of the file, for messages.
+        version: 1 to 4.
+        count: N.
+        degree: SH degree, 0 to 4.
+        bits: fractional bits of positions.
+        flags: `ANTIALIASED` and others.
+        streams: number of streams that a header of version 4 declares.
+        axes: three letters, as in `SplatModel`.
+        parts: [N, bytes] each: positions, alphas, colours, scales, rotations, SH.
+        findings: what is unusual about the file.
+    """
+
+    name: str
+    version: int
+    count: int
+    degree: int
+    bits: int
+    flags: int
+    streams: int = 0
+    axes: str = SPZ_AXES
+    parts: list[U8] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Bytes per splat of each attribute."""
+        rest = 3 * ((self.degree + 1) ** 2 - 1)
+        return 6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version > 2 else 3, rest
+
+    def allocate(self) -> U8:
+        """Allocate the parts after space for the header, as in versions 1 to 3, and return all of it."""
+        ends = _HEADER.size + np.cumsum((0, *self.widths)) * self.count
+        data = np.empty(ends[-1], np.uint8)
+        self.parts = [
+            data[start:end].reshape(self.count, width)
+            for (start, end), width in zip(pairwise(ends), self.widths, strict=True)
+        ]
+        return data
+
+    @property
+    def means_half(self) -> NDArray[np.float16]:
+        """Positions of version 1."""
+        return self.parts[0].view("<f2")
+
+
+def read_spz_file(file: BinaryIO, name: str, size: int, *, any_degree: bool = False) -> SpzArrays:
+    """Check and unpack a file.
+
+    Args:
+        file: the file, positioned at its beginning.
+        name: name of the file, for messages.
+        size: bytes of the file.
+        any_degree: accept SH of a higher degree than that of models, up to 4.
+
+    Raises:
+        InputError: the file is incomplete, or csplat does not read its version.
+        OSError: the file cannot be read.
+    """
+    zipped = file.read(2) == _GZIP
+    file.seek(0)
+    try:
+        with cast(BinaryIO, gzip.open(file)) if zipped else nullcontext(file) as stream:
+            packed = _parse_header(name, size, stream, any_degree=any_degree)
+            (_read_streams if packed.version == 4 else _read_arrays)(packed, size, stream)
+    except (EOFError, zlib.error, zstandard.ZstdError, gzip.BadGzipFile) as error:
+        raise InputError(f"{name} is damaged: {str(error) or 'it ends too early'}") from None
+    if packed.version == 1 and not np.isfinite(packed.means_half).all():
+        raise InputError(f"{name} has positions that are NaN or infinite")
+    return packed
+
+
+def _parse_header(name: str, size: int, stream: BinaryIO, *, any_degree: bool) -> SpzArrays:
+    magic, version, count, degree, bits, flags, streams = _HEADER.unpack(_read_exactly(name, stream, _HEADER.size))
+    if magic != _MAGIC:
+        raise InputError(f"{name} is no SPZ: it begins with {magic!r}, wanted {_MAGIC!r}")
+    if not 1 <= version <= 4 or (version == 4 and isinstance(stream, gzip.GzipFile)):
+        raise InputError(f"{name} is SPZ of version {version}, wanted 1 to 4 (4 not inside of gzip)")
+    if degree > _MAX_DEGREE:
+        raise InputError(f"{name} has SH degree {degree}, wanted at most {_MAX_DEGREE}")
+    if degree > MAX_SH_DEGREE and not any_degree:
+        raise InputError(f"{name} has {too_many_bands(degree)}")
+    if version > 1 and bits > MAX_FRACTION_BITS:
+        raise InputError(f"{name} has {bits} fractional bits, wanted at most {MAX_FRACTION_BITS}")
+    if flags & _LEVELS:
+        raise InputError(f"{name} holds levels of detail of Spark in one list, which csplat does not read")
+    packed = SpzArrays(name, version, count, degree, bits, flags, streams)
+    unpacked = count * sum(packed.widths)
+    if unpacked > _RATIO * size:
+        raise InputError(f"{name} says it has {count:,} splats, more than its {size:,} bytes can hold")
+    return packed
+
+
+def _read_arrays(packed: SpzArrays, _size: int, stream: BinaryIO) -> None:
+    """Read versions 1 to 3: one attribute after the other, then extensions."""
+    _fill(packed.name, stream, packed.allocate()[_HEADER.size :])
+    tail = stream.read(_EXTENSION_BYTES + 1)  # to the end: gzip checks its checksum there
+    if len(tail) > _EXTENSION_BYTES:
+        raise InputError(f"{packed.name} goes on after its last splat")
+    packed.findings += trailing_bytes(len(tail) - _read_extensions(packed, tail))
+
+
+def _read_streams(packed: SpzArrays, size: int, stream: BinaryIO) -> None:
+    """Read version 4: extensions, a table, then a stream per attribute that has any bytes."""
+    (table,) = _HEADER_REST.unpack(_read_exactly(packed.name, stream, _HEADER_REST.size))
+    start = _HEADER.size + _HEADER_REST.size
+    if not start <= table <= start + _EXTENSION_BYTES:
+        raise InputError(f"{packed.name} has its table of streams at byte {table}, wanted {start} or a little more")
+    _read_extensions(packed, _read_exactly(packed.name, stream, table - start))
+    sizes = [packed.count * width for width in packed.widths]
+    unpacked = [size for size in sizes if size]
+    rows = [_STREAM.unpack(_read_exactly(packed.name, stream, _STREAM.size)) for _ in range(packed.streams)]
+    if [row[1] for row in rows] != unpacked:
+        raise InputError(f"{packed.name} has streams of {[row[1] for row in rows]} bytes, wanted {unpacked}")
+    found = table + _STREAM.size * len(rows) + sum(row[0] for row in rows)
+    if found != size:
+        raise InputError(f"{packed.name} has {size:,} bytes, and its table says {found:,}")
+    each = iter(rows)
+    for part_size, width in zip(sizes, packed.widths, strict=True):
+        data = np.empty(part_size, np.uint8)
+        if part_size:
+            whole = _read_exactly(packed.name, stream, next(each)[0])
+            with zstandard.ZstdDecompressor().stream_reader(whole, read_across_frames=True) as reader:
+                _fill(packed.name, reader, data)
+                if reader.read(1):
+                    raise InputError(f"{packed.name} has a stream that unpacks to more than {part_size:,} bytes")
+        packed.parts.append(data.reshape(packed.count, width))
+
+
+def _read_extensions(packed: SpzArrays, data: bytes) -> int:
+    """Read the axes, skipping other extensions; return the number of bytes that extensions take."""
+    at = 0
+    while packed.flags & _EXTENDED and at + _RECORD.size <= len(data):
+        kind, size = _RECORD.unpack_from(data, at)
+        value = data[at + _RECORD.size : at + _RECORD.size + size]
+        at += _RECORD.size + size
+        if kind == _COORDINATE_SYSTEM and len(value) == 4:
+            number = int.from_bytes(value, "little")
+            packed.axes = _SYSTEMS[3 * number : 3 * number + 3]
+            if not packed.axes:
+                raise InputError(f"{packed.name} has axes number {number}, wanted at most {len(_SYSTEMS) // 3 - 1}")
+    return at
+
+
+def _read_exactly(name: str, stream: BinaryIO, size: int) -> bytes:
+    data = stream.read(size)
+    if len(data) < size:
+        raise InputError(f"{name} is no SPZ, or ends too early")
+    return data
+
+
+def _fill(name: str, stream: Any, data: U8) -> None:
+    at = 0
+    while at < len(data):
+        got = stream.readinto(data[at : at + _PIECE])  # in pieces: gzip copies what it reads at once
+        if not got:
+            raise InputError(f"{name} ends too early: {at:,} of {len(data):,} bytes are there")
+        at += got
+
+
+def write_spz_file(path: Path, packed: SpzArrays, data: U8) -> None:
+    """Write version 3 or 4, without extensions.
+
+    Args:
+        path: path of the file.
+        packed: header and filled parts.
+        data: result of `packed.allocate()`, which gets the header, too.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    parts = [part for part in packed.parts if part.size] if packed.version > 3 else []
+    head = _HEADER.pack(_MAGIC, packed.version, packed.count, packed.degree, packed.bits, packed.flags, len(parts))
+    with atomic_writer(path) as stream:
+        if packed.version < 4:
+            data[: len(head)] = np.frombuffer(head, np.uint8)
+            stream.write(deflate.gzip_compress(data, _GZIP_LEVEL))
+            return
+        streams = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(part.data) for part in parts]
+        rows = [_STREAM.pack(len(small), part.size) for small, part in zip(streams, parts, strict=True)]
+        stream.writelines([head, _HEADER_REST.pack(_HEADER.size + _HEADER_REST.size), *rows, *streams])
+
+
+_COLOUR = np.float32(0.15)  # factor of coefficients, in units of the 256 levels
 _PART = np.sqrt(np.float32(0.5)) / np.float32(511)  # step of a component of a rotation
 _LARGEST_POSITION = (1 << 23) - 1
 _USUAL_BITS = 12
-_STEPS = 32  # of positions, in the median of the standard deviations
-_SH_STEP = 4  # of 256 levels
+_STEPS = 32  # steps of positions within the median standard deviation, at least
+_SH_STEP = 4  # step of SH coefficients, in units of the 256 levels
 
 
 @contextmanager
 def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
     with path.open("rb") as file:
-        packed = read_packed(file, path.name, path.stat().st_size, any_degree=sh_degree is not None)
+        packed = read_spz_file(file, path.name, path.stat().st_size, any_degree=sh_degree is not None)
     degree = packed.degree if sh_degree is None else min(packed.degree, sh_degree)
 
     def blocks() -> Iterator[SplatModel]:
         for start in range(0, packed.count, BLOCK):
-            yield decoded(packed, slice(start, start + BLOCK), degree)
+            yield decode_block(packed, slice(start, start + BLOCK), degree)
 
-    yield Scene(packed.count, decoded(packed, slice(0, 0), degree), blocks, packed.findings)
+    yield Scene(packed.count, decode_block(packed, slice(0, 0), degree), blocks, packed.findings)
 
 
 def write_spz(path: Path, scene: Scene, *, version: int) -> None:
-    """Write version 3 or 4; the rest as `csplat.formats.format.Writer`."""
-    scene = in_axes(scene, AXES)
+    """Write version 3 or 4; otherwise as `Format.write`."""
+    scene = in_axes(scene, SPZ_AXES)
     flags = ANTIALIASED if scene.facts.antialiased else 0
-    packed = Packed(path.name, version, scene.count, scene.facts.sh_degree, _fraction(path, scene), flags)
-    room = packed.room()
+    packed = SpzArrays(
+        path.name, version, scene.count, scene.facts.sh_degree, _choose_fraction_bits(path, scene), flags
+    )
+    data = packed.allocate()
     for rows, block in scene.numbered():
-        for part, codes in zip(packed.parts, _encoded(block, packed.bits), strict=True):
+        for part, codes in zip(packed.parts, _encode_block(block, packed.bits), strict=True):
             part[rows] = codes
-    write_packed(path, packed, room)
+    write_spz_file(path, packed, data)
 
 
-def decoded(packed: Packed, rows: slice, degree: int) -> SplatModel:
-    """Decode some splats of a file, along its axes, with its SH up to a degree."""
+def decode_block(packed: SpzArrays, rows: slice, degree: int) -> SplatModel:
+    """Decode some splats along the axes of the file, with SH up to a degree."""
     _, alphas, colours, scales, rotations, rest = (part[rows] for part in packed.parts)
     coefficients = (degree + 1) ** 2 - 1
     shN = np.subtract(rest[:, : 3 * coefficients], 128, dtype=np.float32)
     shN *= np.float32(1 / 128)
     return SplatModel(
-        means=means_of(packed, rows),
-        quats=(_smallest_three if packed.version > 2 else _first_three)(rotations),
+        means=decode_means(packed, rows),
+        quats=(_decode_rotations if packed.version > 2 else _decode_first_three)(rotations),
         scales=np.divide(scales, 16, dtype=np.float32) - np.float32(10),
         opacities=np.divide(alphas[:, 0], 255, dtype=np.float32),
         sh0=(np.divide(colours, 255, dtype=np.float32) - np.float32(0.5)) / _COLOUR,
@@ -80,8 +304,8 @@ def decoded(packed: Packed, rows: slice, degree: int) -> SplatModel:
     )
 
 
-def means_of(packed: Packed, rows: slice) -> F32:
-    """Decode the positions of some splats of a file, along its axes."""
+def decode_means(packed: SpzArrays, rows: slice) -> F32:
+    """Decode the positions of some splats along the axes of the file."""
     if packed.version == 1:
         return packed.means_half[rows].astype(np.float32)
     part = packed.parts[0][rows]
@@ -92,25 +316,25 @@ def means_of(packed: Packed, rows: slice) -> F32:
     return means
 
 
-def _first_three(rotations: U8) -> F32:
-    """In bytes; w follows, and is not negative."""
+def _decode_first_three(rotations: U8) -> F32:
+    """Decode rotations of versions 1 and 2: x, y and z in bytes; w >= 0 follows from them."""
     quats = np.empty((len(rotations), 4), np.float32)
     quats[:, 1:] = np.divide(rotations, 127.5, dtype=np.float32) - np.float32(1)
     quats[:, 0] = np.sqrt(np.maximum(0, 1 - np.einsum("ij,ij->i", quats[:, 1:], quats[:, 1:])))
     return normalise_quats(quats)
 
 
-def _smallest_three(rotations: U8) -> F32:
-    """All but the largest of x y z w in ten bits each, sign and magnitude, the first of them in the highest bits."""
+def _decode_rotations(rotations: U8) -> F32:
+    """Decode all but the largest of x y z w: ten bits each, sign and magnitude, the first in the highest bits."""
     words = rotations.view("<u4")[:, 0]
     fields = (words[:, None] >> np.array([20, 10, 0], np.uint32)).astype(np.int32)
     sizes = fields & 511
-    xyzw = all_three(words >> np.uint32(30), np.where(fields & 512, -sizes, sizes) * _PART)
+    xyzw = decode_smallest_three(words >> np.uint32(30), np.where(fields & 512, -sizes, sizes) * _PART)
     return xyzw[:, [3, 0, 1, 2]]
 
 
-def _fraction(path: Path, scene: Scene) -> int:
-    """Bits for the fraction of positions: as many as the splats are fine, and no more than fit."""
+def _choose_fraction_bits(path: Path, scene: Scene) -> int:
+    """Choose the fractional bits of positions: enough for the median splat, and no more than fit."""
     reach, scales = 0.0, np.zeros(256, np.int64)
     for block in scene.blocks():
         reach = max(reach, float(np.abs(block.means).max(initial=0.0)))
@@ -119,34 +343,34 @@ def _fraction(path: Path, scene: Scene) -> int:
         raise InputError(f"{path.name}: positions reach {reach:,g}, and SPZ holds up to {_LARGEST_POSITION:,}")
     middle = int(np.searchsorted(np.cumsum(scales), scales.sum() / 2))
     fine = math.ceil(math.log2(_STEPS) - (middle / 16 - 10) / math.log(2))
-    fitting = math.floor(math.log2(_LARGEST_POSITION / reach)) if reach > 2**-8 else MOST_BITS
+    fitting = math.floor(math.log2(_LARGEST_POSITION / reach)) if reach > 2**-8 else MAX_FRACTION_BITS
     return min(max(fine, _USUAL_BITS), fitting)
 
 
-def _encoded(model: SplatModel, bits: int) -> tuple[U8, ...]:
+def _encode_block(model: SplatModel, bits: int) -> tuple[U8, ...]:
     fixed = np.rint(model.means * np.float32(2.0**bits)).astype("<i4")
     rest = np.rint(model.shN * np.float32(128 / _SH_STEP)) * np.float32(_SH_STEP) + np.float32(128)
     return (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),
-        _bytes(model.opacities[:, None] * np.float32(255)),
-        _bytes(model.sh0 * (_COLOUR * np.float32(255)) + np.float32(127.5)),
+        _round_to_bytes(model.opacities[:, None] * np.float32(255)),
+        _round_to_bytes(model.sh0 * (_COLOUR * np.float32(255)) + np.float32(127.5)),
         _scale_codes(model.scales),
-        _three_of(model.quats),
-        _bytes(rest).reshape(len(model), 3 * model.shN.shape[1]),
+        _encode_rotations(model.quats),
+        _round_to_bytes(rest).reshape(len(model), 3 * model.shN.shape[1]),
     )
 
 
 def _scale_codes(scales: F32) -> U8:
-    return _bytes(scales * np.float32(16) + np.float32(160))
+    return _round_to_bytes(scales * np.float32(16) + np.float32(160))
 
 
-def _bytes(values: F32) -> U8:
+def _round_to_bytes(values: F32) -> U8:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def _three_of(quats: F32) -> U8:
-    """The inverse of `_smallest_three`."""
-    largest, three = smallest_three(quats[:, [1, 2, 3, 0]])
+def _encode_rotations(quats: F32) -> U8:
+    """Invert `_decode_rotations`."""
+    largest, three = encode_smallest_three(quats[:, [1, 2, 3, 0]])
     steps = np.rint(three / _PART)
     fields = np.minimum(np.abs(steps), 511).astype(np.uint32) | np.where(steps < 0, np.uint32(512), np.uint32(0))
     words: NDArray[np.uint32] = largest.astype("<u4") << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
@@ -158,7 +382,10 @@ FORMAT = Format(
     open=_open,
     open_bands=_open,
     write=partial(write_spz, version=3),
-    axes=AXES,
+    axes=SPZ_AXES,
     splat_bytes=(16.5, 19.3, 23.9, 29.7),
     carries=frozenset({"antialiased"}),
 )
+
+
+FORMAT_4 = replace(FORMAT, name="spz4", write=partial(write_spz, version=4))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
 
-from csplat.detect import KINDS, by_content, head_of, is_ply, refusal
+from csplat.detect import KINDS, detect_content, is_ply, read_head, refusal
 from csplat.errors import InputError, counted
 from csplat.lint import Finding
 
@@ -79,10 +79,10 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         InputError: the file is not such a PLY, or its header has no end.
         OSError: the file cannot be read.
     """
-    head = head_of(path)
+    head = read_head(path)
     if head.startswith(_WIDE_MARKS) and is_ply(head[2:].replace(b"\0", b"")):
         raise InputError(f"{path.name} is a PLY in UTF-16, expected ASCII: save it as UTF-8")
-    if by_content(path, head) not in (KINDS["ply"], KINDS[kind]):
+    if detect_content(path, head) not in (KINDS["ply"], KINDS[kind]):
         raise refusal(path, head, wanted=kind)
     with path.open("rb") as stream:
         start = len(_MARK) if head.startswith(_MARK) else 0

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from csplat.errors import CsplatError
-from csplat.formats import format_of, open_scene
+from csplat.formats import detect_format, open_scene
 from csplat.model import SplatModel
 from csplat.scene import joined
 from csplat.training_record import TrainingRecord
@@ -151,7 +151,7 @@ def write_thumbnail(path: Path, scenes: Sequence[Path]) -> bool:
     for scene in scenes:
         try:
             if scene.is_file():
-                format_of(scene)
+                detect_format(scene)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_bytes(str(path), _jpeg(_read_every_nth(scene)))
                 return True

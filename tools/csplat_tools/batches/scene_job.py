@@ -16,7 +16,7 @@ from urllib.parse import unquote
 from csplat import __version__
 from csplat.encoder import EncodeOptions
 from csplat.errors import CsplatError, StoreError, missing
-from csplat.formats import format_of
+from csplat.formats import detect_format
 from csplat.remote import is_url, store_of
 from csplat_tools.batches.batch_scenes import Task
 from csplat_tools.batches.batch_worker import Worker, WorkerLostError, remove_left
@@ -315,7 +315,7 @@ def inspect_scene(path: Path) -> SceneFile:
     """
     size, content = size_on_disk(path), content_hash(path)
     try:
-        name = format_of(path).name
+        name = detect_format(path).name
         found = estimate_cost(path, EncodeOptions(), OutOfCoreOptions(memory_bytes=_UNBOUNDED))
     except (CsplatError, ValueError, MemoryError):  # no prediction for such a file
         return SceneFile(content, size, None, "")

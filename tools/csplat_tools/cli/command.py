@@ -21,7 +21,7 @@ import typer
 from typer.models import OptionInfo
 
 from csplat.errors import CsplatError, InputError, missing
-from csplat.formats import insisting
+from csplat.formats import assume_format
 from csplat.lint import Finding
 from csplat.types import Progress
 from csplat_tools.console import LONG_WORK_SECONDS, format_estimate, note, print_data, print_json, progress_bar
@@ -421,7 +421,7 @@ def command(
             read_as = given.pop(_READ_AS, None)
             values = parsed(**given)
             quiet = any(isinstance(group, OutputOptions) and group.quiet for group in values.values())
-            with nullcontext() if serves else progress_bar(quiet=quiet), insisting(read_as):
+            with nullcontext() if serves else progress_bar(quiet=quiet), assume_format(read_as):
                 function(**values)
 
         flat += [_keyword(_READ_AS, None, _ReadAs)] * reads

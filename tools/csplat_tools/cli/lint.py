@@ -44,7 +44,7 @@ def lint(
     if fix is not None:
         check_name(fix, ".ply", "--fix", source)
     with source_path(source) as path:
-        findings = formats.lint(path, sh_degree=sh_degree)
+        findings = formats.lint_file(path, sh_degree=sh_degree)
         if keep_extra:
             findings = [one for one in findings if one.id != "extra-columns"]
         errors = any(one.kind == "error" for one in findings)

@@ -20,7 +20,7 @@ from csplat.decoder import (
     read_options,
 )
 from csplat.errors import FormatError
-from csplat.formats import named, open_scene
+from csplat.formats import format_by_name, open_scene
 from csplat.model import SplatModel
 from csplat.training_record import TRAINING, VIEW, TrainingRecord
 from csplat.upright import UP, up_of
@@ -558,7 +558,7 @@ def describe_other_format(source: str) -> tuple[dict[str, Any], str]:
             words["extra"] = ", ".join(f"{name} ({column.dtype})" for name, column in facts.extra.items())
         if facts.metadata:
             words["metadata"] = json.dumps(facts.metadata, sort_keys=True)
-        lines = [f"{named(scene.format).title}, {format_bytes(size)}{average}"]
+        lines = [f"{format_by_name(scene.format).title}, {format_bytes(size)}{average}"]
         lines += [f"{name:12} {value}" for name, value in words.items()]
         lines += [str(one) for one in scene.findings if not one.usual]
     return said, "\n".join(lines)

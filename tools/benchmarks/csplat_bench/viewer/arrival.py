@@ -38,7 +38,7 @@ import typer
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat.formats import named
+from csplat.formats import format_by_name
 from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, WrongWords, listed, run
 from csplat_bench.common.peers import find_splat_transform
 from csplat_bench.common.report import table, tell_machine, write_json
@@ -180,7 +180,7 @@ def main(
             kept: dict[tuple[str, str], list[Any]] = {}
             for turn in range(runs):
                 for viewer, form in pairs:
-                    _, camera = placed_in(named(FORMS[form].axes_of), model)
+                    _, camera = placed_in(format_by_name(FORMS[form].axes_of), model)
                     url = f"{address}{files[form].relative_to(folder)}"
                     found = _watched(page, line, viewer, url, pinhole(camera, model))
                     kept.setdefault((viewer, form), []).append(found)

@@ -27,9 +27,9 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from csplat.formats import named, read, write
+from csplat.formats import format_by_name, read, write
+from csplat.formats.csplat_format import FORMAT as CSPLAT
 from csplat.formats.format import Format
-from csplat.formats.own import FORMAT as CSPLAT
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.turning import USUAL
 from csplat.upright import up_of_axes
@@ -116,7 +116,7 @@ def main(
     with opened_page(chromium, peers, webgpu=webgpu) as (page, folder, address):
         for scene in find_scenes(listed(scenes), cache, extra):
             model, camera = looked_at(scene)
-            forms = [named(name) for name in listed(formats)]
+            forms = [format_by_name(name) for name in listed(formats)]
             if CSPLAT in forms:
                 write(folder / f"{scene.name}.csplat", model, CSPLAT.name)
                 model = read(folder / f"{scene.name}.csplat")

@@ -1,4 +1,4 @@
-"""Find the parts of a SOG, in a folder or in a zip, and read its JSON; neither is trusted."""
+"""Find the files of a SOG in a folder or a zip, and read its JSON; neither is trusted."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from csplat.errors import InputError, missing
 from csplat.inputs import stand_in
 from csplat.lint import Finding
 
-_LARGEST_JSON = 1 << 25
-_LARGEST_PART = 1 << 30
-_LONGEST_NAME = 200
-_ONE, _LEVELS = "meta.json", "lod-meta.json"  # list the parts of one scene, and of a scene in levels
-_OF_MACOS = "__MACOSX"  # folder that macOS adds to zips, with metadata that belongs to no part
+_LARGEST_JSON = 1 << 25  # bytes
+_LARGEST_PART = 1 << 30  # bytes
+_LONGEST_NAME = 200  # characters
+_ONE, _LEVELS = "meta.json", "lod-meta.json"  # manifests of one scene, and of a scene in levels
+_OF_MACOS = "__MACOSX"  # folder with file attributes that macOS adds to zips
 _NAMED = 5  # scenes that a message names
-_EXPANSION = 4  # expansion of a part in a zip, at most: images and short texts do not deflate to less
-_FREE = 1 << 20  # bytes that may come out of a zip regardless of its size
+_EXPANSION = 4  # largest expansion of a member of a zip: images and short texts do not deflate to less
+_FREE = 1 << 20  # bytes of a member that are accepted whatever its expansion
 
 
-class _Zip:
-    """The directory of a zip, read once. Owns the open archive while `held`.
+class _ZipDirectory:
+    """The directory of a zip, read once; owns the open archive within `held`.
 
     Args:
         path: path of the zip.
-        title: name for messages.
+        title: name of the zip for messages.
     """
 
     def __init__(self, path: Path, title: str) -> None:
@@ -44,15 +44,15 @@ class _Zip:
         with self._opened() as archive:
             self.members = archive.infolist()
         self._named: list[dict[str, list[zipfile.ZipInfo]]] = []
-        for same in _SAME:
+        for key in _NAME_KEYS:
             named: dict[str, list[zipfile.ZipInfo]] = {}
             for info in self.members:
-                named.setdefault(same(info.filename), []).append(info)
+                named.setdefault(key(info.filename), []).append(info)
             self._named.append(named)
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep the archive open as long as the context lasts; otherwise each part opens it."""
+        """Keep the archive open until the context ends; otherwise every `read` opens it."""
         with self._opened() as archive:
             self._archive = archive
             try:
@@ -61,14 +61,14 @@ class _Zip:
                 self._archive = None
 
     def find(self, name: str) -> list[zipfile.ZipInfo]:
-        """Find the members of a name: by it, else with the backslashes of Windows, else with capitals or without."""
-        for same, named in zip(_SAME, self._named, strict=True):
-            if same(name) in named:
-                return named[same(name)]
+        """Return the members of a name: exact matches, else with backslashes of Windows, else ignoring case."""
+        for key, named in zip(_NAME_KEYS, self._named, strict=True):
+            if key(name) in named:
+                return named[key(name)]
         return []
 
     def read(self, info: zipfile.ZipInfo) -> bytes:
-        """Unpack a member; one of `DAMAGED` is raised where that fails."""
+        """Unpack a member; raise one of `DAMAGED` if that fails."""
         if self._archive is not None:
             return self._archive.read(info)
         with zipfile.ZipFile(self._path) as archive:
@@ -82,30 +82,27 @@ class _Zip:
             raise InputError(f"{self._title}: a damaged zip: {reason}") from None
 
 
-def with_slashes(name: str) -> str:
-    """Return a name with slashes where Windows has backslashes."""
+def use_slashes(name: str) -> str:
+    """Return a name with slashes in place of the backslashes of Windows."""
     return name.replace("\\", "/")
 
 
-def _in_small_letters(name: str) -> str:
-    return with_slashes(name).casefold()
+def _ignore_case(name: str) -> str:
+    return use_slashes(name).casefold()
 
 
-_SAME: tuple[Callable[[str], str], ...] = (
-    str,
-    with_slashes,
-    _in_small_letters,
-)  # keys by which names count as the same
+#: Functions of names; names with the same result count as equal, tried in this order.
+_NAME_KEYS: tuple[Callable[[str], str], ...] = (str, use_slashes, _ignore_case)
 
 
 @dataclass(frozen=True)
-class Parts:
-    """The parts of one SOG, by name.
+class SogParts:
+    """The files of one SOG, called parts, by name.
 
     Attributes:
         path: the folder, or the zip.
         title: name for messages.
-        folder: folder inside the zip; `None`: there is none.
+        folder: folder inside the zip; `None`: there is no zip.
         zip: the zip; `None`: the parts are files of a folder.
         findings: what is unusual about the names in the zip.
     """
@@ -113,38 +110,38 @@ class Parts:
     path: Path
     title: str
     folder: PurePosixPath | None = None
-    zip: _Zip | None = None
+    zip: _ZipDirectory | None = None
     findings: tuple[Finding, ...] = ()
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep a zip open as long as the context lasts: its directory is not read again for each part."""
+        """Keep a zip open until the context ends, so that its directory is not read for every part."""
         if self.zip is None:
             yield
             return
         with self.zip.held():
             yield
 
-    def inner(self, name: str) -> tuple[Parts, str]:
-        """Find the parts of a SOG that is a part of this one, and the name of its JSON, as `parts_at` does.
+    def inner(self, name: str) -> tuple[SogParts, str]:
+        """Return the parts of a SOG inside of this one and the name of its JSON, as `find_parts` does.
 
         Raises:
-            InputError: it is not there, or its name leads out of the folder.
+            InputError: it does not exist, or its name leads out of the folder.
             OSError: it cannot be read.
         """
         title = f"{self.title}: {name[:80]}"
         if self.folder is None:
-            return parts_at(self.file(name), title)
+            return find_parts(self.file(name), title)
         place = self._inside(name)
         if place.suffix.lower() != ".json":
             self.refuse(f"{name[:80]} is a zip inside of a zip: unpack {self.title} and name its {_LEVELS}")
-        return Parts(self.path, title, self.folder / place.parent, self.zip), place.name
+        return SogParts(self.path, title, self.folder / place.parent, self.zip), place.name
 
     def read(self, name: str, most: int = _LARGEST_PART) -> bytes:
-        """The bytes of a part.
+        """Read a part.
 
         Raises:
-            InputError: it is not there, too large, damaged, or its name leads out of the folder.
+            InputError: it does not exist, is too large or damaged, or its name leads out of the folder.
             OSError: it cannot be read.
         """
         if self.folder is not None:
@@ -159,7 +156,7 @@ class Parts:
         return data
 
     def file(self, name: str) -> Path:
-        """Return the path of a part in a folder; otherwise as `read`."""
+        """Return the path of a part in a folder; raises as `read`."""
         path = self.path / self._inside(name)
         if self.folder is not None or not path.is_file():
             self.refuse(f"there is no {name[:80]}")
@@ -186,58 +183,58 @@ class Parts:
         except DAMAGED as error:
             self.refuse(f"{name[:80]}: {' '.join(str(error).split())[:120] or type(error).__name__}")
 
-    def json(self, name: str) -> Json:
-        """Parse a part that holds JSON."""
+    def json(self, name: str) -> JsonValue:
+        """Read and parse a part that holds JSON."""
         data = self.read(name, _LARGEST_JSON)
         try:
             value = json.loads(data)
         except (ValueError, RecursionError) as error:
             reason = "too many brackets" if isinstance(error, RecursionError) else " ".join(str(error).split())[:80]
             self.refuse(f"{name[:80]} is not JSON: {reason}")
-        return Json(self, name, value)
+        return JsonValue(self, name, value)
 
     def refuse(self, reason: str) -> NoReturn:
-        """Raise the `InputError` that describes the problem."""
+        """Raise the `InputError` for a reason."""
         raise InputError(f"{self.title}: {reason}")
 
 
 @dataclass(frozen=True)
-class Json:
-    """A JSON value and its place; using it as another type raises an `InputError`."""
+class JsonValue:
+    """A JSON value and its place; methods raise `InputError` if it has another type."""
 
-    parts: Parts
+    parts: SogParts
     place: str
     value: Any
 
     def __contains__(self, name: str) -> bool:
         return isinstance(self.value, dict) and self.value.get(name) is not None
 
-    def __getitem__(self, name: str) -> Json:
-        inside = Json(self.parts, f"{self.place} {name}", None)
+    def __getitem__(self, name: str) -> JsonValue:
+        inside = JsonValue(self.parts, f"{self.place} {name}", None)
         if name not in self:
             self.parts.refuse(f"{inside.place} is missing")
-        return Json(self.parts, inside.place, self.value[name])
+        return JsonValue(self.parts, inside.place, self.value[name])
 
-    def list(self) -> list[Json]:
-        """Its values."""
+    def list(self) -> list[JsonValue]:
+        """Return the values of a list."""
         if not isinstance(self.value, list):
             self.parts.refuse(f"{self.place} is no list")
-        return [Json(self.parts, self.place, one) for one in self.value]
+        return [JsonValue(self.parts, self.place, one) for one in self.value]
 
     def text(self) -> str:
-        """A string."""
+        """Return a string."""
         if not isinstance(self.value, str):
             self.parts.refuse(f"{self.place} is no text")
         return self.value
 
     def whole(self, most: int) -> int:
-        """An integer from 0 to `most`."""
+        """Return an integer from 0 to `most`."""
         if type(self.value) is not int or not 0 <= self.value <= most:
             self.parts.refuse(f"{self.place} is {str(self.value)[:40]}, wanted an integer from 0 to {most:,}")
         return int(self.value)
 
     def numbers(self, least: int, most: int) -> NDArray[np.float64]:
-        """Return `least` to `most` finite numbers; a single one may come without brackets."""
+        """Return `least` to `most` finite numbers; a single one may be without brackets."""
         values = self.value if isinstance(self.value, list) else [self.value]
         if not least <= len(values) <= most:
             self.parts.refuse(f"{self.place} has {len(values)} numbers, wanted {least if least == most else most}")
@@ -247,50 +244,50 @@ class Json:
         return np.array(values, np.float64)
 
 
-def parts_at(path: Path, title: str | None = None) -> tuple[Parts, str]:
-    """Return the parts of a SOG, and the name of the one that lists the others.
+def find_parts(path: Path, title: str | None = None) -> tuple[SogParts, str]:
+    """Return the parts of a SOG and the name of its JSON.
 
     Args:
-        path: path of a folder, of a zip, or of the meta.json of a folder.
+        path: path of a folder, of a zip, or of the meta.json in a folder.
         title: name for messages; `None`: the name of the path.
 
     Raises:
-        InputError: there are no such parts.
-        OSError: it cannot be read.
+        InputError: there is no SOG, or more than one scene.
+        OSError: the path cannot be read.
     """
     title = title or path.name
     if path.is_dir():
         found = [PurePosixPath(name) for name in (_ONE, _LEVELS) if (path / name).is_file()]
         if not found:
-            Parts(path, title).refuse(f"a folder without {_ONE}, no SOG")
-        return Parts(path, title), str(_only_scene(Parts(path, title), found))
+            SogParts(path, title).refuse(f"a folder without {_ONE}, no SOG")
+        return SogParts(path, title), str(_only_scene(SogParts(path, title), found))
     with path.open("rb") as stream:
         zipped = stream.read(2) == b"PK"
     if not zipped:
-        return Parts(path.parent, title), path.name
-    whole = _Zip(path, title)
+        return SogParts(path.parent, title), path.name
+    whole = _ZipDirectory(path, title)
     names = [info.filename for info in whole.members]
-    found = [one for one in map(PurePosixPath, map(with_slashes, names)) if _is_manifest(one)]
+    found = [one for one in map(PurePosixPath, map(use_slashes, names)) if _is_manifest(one)]
     if not found:
-        Parts(path, title).refuse(f"a zip without {_ONE}, no SOG")
-    parts = Parts(path, title, PurePosixPath(), whole)
+        SogParts(path, title).refuse(f"a zip without {_ONE}, no SOG")
+    parts = SogParts(path, title, PurePosixPath(), whole)
     only = _only_scene(parts, found)
     oddities = ["backslashes in the names of the zip, read as slashes"] if any("\\" in name for name in names) else []
     oddities += [f"{only.name} is read as {only.name.lower()}"] if only.name != only.name.lower() else []
     findings = [Finding("zip-names", 1, "; ".join(oddities), "note")] if oddities else []
-    findings += _others(parts, only, names)
-    return Parts(path, title, only.parent, whole, tuple(findings)), only.name
+    findings += _report_others(parts, only, names)
+    return SogParts(path, title, only.parent, whole, tuple(findings)), only.name
 
 
-def _others(parts: Parts, only: PurePosixPath, names: Sequence[str]) -> list[Finding]:
-    """Report scenes of other formats beside the SOG of a zip; outside of its folder nothing says which one is meant."""
-    places = [place for place in map(PurePosixPath, map(with_slashes, names)) if _OF_MACOS not in place.parts]
+def _report_others(parts: SogParts, only: PurePosixPath, names: Sequence[str]) -> list[Finding]:
+    """Report scenes of other formats in the folder of the SOG; refuse a zip with scenes elsewhere."""
+    places = [place for place in map(PurePosixPath, map(use_slashes, names)) if _OF_MACOS not in place.parts]
     others = [PurePosixPath(one) for one in scenes_of(map(str, places))]
     if not others:
         return []
     if not all(one.is_relative_to(only.parent) for one in others):
         _refuse_several(parts, [only, *others])
-    text = f"the zip also holds {_listed(others)}: not read"
+    text = f"the zip also holds {_list_places(others)}: not read"
     return [Finding("other-scenes", len(others), text, "note")]
 
 
@@ -298,46 +295,46 @@ def _is_manifest(place: PurePosixPath) -> bool:
     return place.name.lower() in (_ONE, _LEVELS) and _OF_MACOS not in place.parts
 
 
-def _only_scene(parts: Parts, found: Sequence[PurePosixPath]) -> PurePosixPath:
-    """Choose the JSON of the scene: the one that is no part of another, of which there has to be one alone.
+def _only_scene(parts: SogParts, found: Sequence[PurePosixPath]) -> PurePosixPath:
+    """Return the only JSON that is no part of another scene.
 
     Args:
         parts: the folder, or all of the zip.
-        found: each `meta.json` and `lod-meta.json`, by its place there.
+        found: places of all `meta.json` and `lod-meta.json`.
     """
     inside: set[PurePosixPath] = set()
     for one in found if len(found) > 1 else ():
         if one.name.lower() == _LEVELS:
-            said = parts.json(str(one)).value
-            named = said.get("filenames") if isinstance(said, dict) else None
-            names = [*named, said.get("environment")] if isinstance(named, list) else []
-            inside |= {one.parent / with_slashes(name) for name in names if isinstance(name, str)}
+            meta = parts.json(str(one)).value
+            files = meta.get("filenames") if isinstance(meta, dict) else None
+            names = [*files, meta.get("environment")] if isinstance(files, list) else []
+            inside |= {one.parent / use_slashes(name) for name in names if isinstance(name, str)}
     scenes = [one for one in found if one not in inside]
     if len(scenes) != 1:
         _refuse_several(parts, scenes)
     return scenes[0]
 
 
-def _refuse_several(parts: Parts, scenes: Sequence[PurePosixPath]) -> NoReturn:
+def _refuse_several(parts: SogParts, scenes: Sequence[PurePosixPath]) -> NoReturn:
     remedy = "name one of these files" if parts.folder is None else "unpack it and name one of these files"
-    parts.refuse(f"it holds {len(scenes)} scenes, expected one ({_listed(scenes)}): {remedy}")
+    parts.refuse(f"it holds {len(scenes)} scenes, expected one ({_list_places(scenes)}): {remedy}")
 
 
-def _listed(places: Sequence[PurePosixPath]) -> str:
+def _list_places(places: Sequence[PurePosixPath]) -> str:
     return ", ".join(str(one)[:80] for one in sorted(places)[:_NAMED]) + (", ..." if len(places) > _NAMED else "")
 
 
-def picture_of(parts: Parts, name: str, data: bytes, fits: Any) -> NDArray[np.uint8]:
-    """The pixels of a WebP, [H, W, 4].
+def decode_webp(parts: SogParts, name: str, data: bytes, fits: Any) -> NDArray[np.uint8]:
+    """Decode the pixels of a lossless WebP, [H, W, 4].
 
     Args:
-        parts: the SOG that it is from.
-        name: name of the part, for messages.
-        data: its bytes.
-        fits: called with width and height before pixels are decoded; True if the size is acceptable.
+        parts: the SOG of the image.
+        name: name of the image, for messages.
+        data: bytes of the image.
+        fits: called with width and height before pixels are decoded; returns True if the size is acceptable.
 
     Raises:
-        InputError: it is damaged, of another size, or compressed with loss; or Pillow is absent.
+        InputError: the image is damaged, lossy or of another size; or Pillow is absent.
     """
     try:
         from PIL.Image import DecompressionBombError
@@ -358,7 +355,7 @@ def picture_of(parts: Parts, name: str, data: bytes, fits: Any) -> NDArray[np.ui
 
 
 def _is_lossy(data: bytes) -> bool:
-    """Return whether a WebP has a chunk of lossy pixels (RFC 9649, 2.5)."""
+    """Return True if a WebP has a chunk of lossy pixels (RFC 9649, 2.5)."""
     at = 12
     while len(data) >= at + 8:
         if data[at : at + 4] == b"VP8 ":

@@ -1,14 +1,14 @@
 """glTF 2.0 with the extension KHR_gaussian_splatting (ratified in 2026): .glb, and .gltf with its buffers.
 
-glTF says that y is up, that z is where a model looks, and that its right hand is at -x: LUF. What it has no place for
-stands in `asset.extras.csplat`, in the lines that a PLY has as comments. An origin is the translation of the node.
+glTF specifies that y is up, that models face z, and that x points to their left: LUF. Metadata without a place in glTF
+is in `asset.extras.csplat`, as the comment lines that a PLY has. An origin is the translation of the node.
 """
 
 from __future__ import annotations
 
 from csplat.formats.format import Format
-from csplat.formats.gltf_read import AXES, open_gltf
-from csplat.formats.gltf_write import write_gltf
+from csplat.formats.gltf.gltf_reader import AXES, open_gltf
+from csplat.formats.gltf.gltf_writer import write_gltf
 
 FORMAT = Format(
     name="gltf",

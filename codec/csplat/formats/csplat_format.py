@@ -1,4 +1,4 @@
-"""The format of this project."""
+""".csplat, the format of this project."""
 
 from __future__ import annotations
 

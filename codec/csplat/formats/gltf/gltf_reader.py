@@ -1,10 +1,14 @@
-"""Read splats of glTF: as accessors of KHR_gaussian_splatting, or as SPZ inside of it, by whichever name.
+"""Read splats of glTF: accessors of KHR_gaussian_splatting, or SPZ inside of it under any name of that extension.
 
-What else a file has, meshes, materials and what packs them, means nothing for splats and refuses nothing, required or
-not: only what the splats themselves use has to be understood.
+Everything else in a file (meshes, materials, their compression) is ignored, even required extensions: only what the
+splats use has to be understood.
 
-The extension's text unpacks SPZ along LUF; CesiumJS and the tilesets for it take positions as they are stored.
-The bounds of POSITION, which every glTF has, tell the two apart.
+The text of the SPZ extension unpacks positions along LUF; CesiumJS and the tilesets for it take them as stored. The
+bounds of POSITION, which every glTF has, tell the two apart.
+
+Colours in linear light are fitted to sRGB. A polynomial of directions is no longer one after the transfer function of
+sRGB (IEC 61966-2-1): the nearest SH of the same degree are found by least squares. Without SH they are exact except for
+negative light. Splats blended in linear light look different from splats blended in sRGB, which no colours correct.
 """
 
 from __future__ import annotations
@@ -22,25 +26,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
-from csplat.formats.activations import Spread, read_opacities_as, read_scales_as
-from csplat.formats.gltf_file import Accessor, GltfFile, Place, Placed, opened
-from csplat.formats.linear_colours import srgb_error, srgb_of_linear
-from csplat.formats.spz import decoded, means_of
-from csplat.formats.spz_file import ANTIALIASED, Packed, read_packed
+from csplat.formats.common import RangeStatistics, classify_opacities, classify_scales
+from csplat.formats.gltf.gltf_document import Accessor, GltfDocument, JsonPath, PlacedPrimitive, open_document
+from csplat.formats.spz import ANTIALIASED, SpzArrays, decode_block, decode_means, read_spz_file
 from csplat.lint import Finding, too_many_bands, trailing_bytes
 from csplat.model import SplatModel, normalise_quats
-from csplat.ply.columns import RowStatistics, alpha_of_logits, count_huge_rows, list_findings
+from csplat.ply.columns import SH_C0, RowStatistics, alpha_of_logits, count_huge_rows, list_findings
 from csplat.ply.comments import CommentMetadata, parse_comments
 from csplat.scene import BLOCK, Scene
-from csplat.turning import axes_rotation, stretched, turned
-from csplat.types import F64
+from csplat.turning import axes_rotation, sh_bands, sphere_lattice, stretched, turned
+from csplat.types import F32, F64
 
-#: Left, up, front.
+#: Directions of +x, +y and +z: left, up, front.
 AXES = "LUF"
 EXTENSION = "KHR_gaussian_splatting"
 COLOURS = "srgb_rec709_display"
 _LINEAR = "lin_rec709_display"
-#: Names of the extension that packs splats as SPZ, and of those that came before it.
+#: Names of the extension that packs splats as SPZ, and of its predecessors.
 _SPZ = (
     "KHR_gaussian_splatting_compression_spz_2",
     "KHR_gaussian_splatting_compression_spz",
@@ -48,66 +50,68 @@ _SPZ = (
     "KHR_spz_compression",
 )
 _WROTE_LOGS = re.compile(r"splat-transform v?([01]\.|2\.[0-3](\.|$))")  # mended in its pull request 268
-#: Extensions of primitives that do not affect splats: materials, and numbers of features.
+#: Extensions of primitives that do not affect splats: materials and feature ids.
 _HARMLESS = {"KHR_materials_variants", "EXT_mesh_features", "EXT_structural_metadata", "KHR_mesh_quantization"}
-_THINNEST = np.float32(np.finfo(np.float32).tiny)  # value that a scale of 0 is read as: its logarithm is finite
-_LARGE = 1e6  # from here on it is worth while to look for huge values
-_FAR = 4096.0  # a translation as large as that stays an origin: float32 would have less than half a thousandth left
+_THINNEST = np.float32(np.finfo(np.float32).tiny)  # replaces a scale of 0, so that its logarithm is finite
+_LARGE = 1e6  # only primitives with larger values are searched for huge ones
+_FAR = 4096.0  # scene units; a larger translation becomes an origin: float32 would resolve it to 0.0005 at best
 _ALIKE = 0.1  # fraction of the extent of a scene by which equivalent bounds may differ
-_SAMPLE = 4096  # splats whose colours are measured
-_UNPACKED_RATIO = 1032  # expansion by deflate, at most: several views may name the same bytes
+_SAMPLE = 4096  # splats whose fitted colours are measured
+_UNPACKED_RATIO = 1032  # largest expansion by deflate; several views may name the same bytes
 
 
 @dataclass(frozen=True)
-class _Part:
+class _Instance:
     """Splats of a primitive as a node shows them.
 
     Attributes:
-        block: makes a model of some of them, along the axes of the primitive; its SH may have fewer bands than the
+        decode: makes a model of some splats, along the axes of the primitive and maybe with fewer SH bands than the
             scene.
         count: N.
-        linear: linear part of the node's transform, for directions and lengths, [3, 3].
-        translation: position of the node, [3].
+        linear: [3, 3], linear part of the node's transform.
+        translation: [3], position of the node.
     """
 
-    block: Callable[[slice], SplatModel]
+    decode: Callable[[slice], SplatModel]
     count: int
     linear: F64
     translation: F64
 
 
 @dataclass
-class _Reading:
-    """State of reading a file. Owns the unpacked data and the findings to report.
+class _GltfReading:
+    """The state of reading a file: unpacked data, statistics of the rows, findings.
 
     Attributes:
-        scales, opacities: statistics of all primitives, of the rows that are finite.
-        counts: what was noticed in rows.
-        infinite: rows whose opacity is infinite, which is a logit or nothing.
+        required: extensions that the file requires.
         sh_degree: the highest degree to read; `None`: all, up to three bands.
-        are_logs, are_logits: whether scales are logarithms and opacities logits, once that is known.
+        scales, opacities: statistics of the finite rows of all primitives.
+        statistics: what findings report about rows.
+        infinite: number of rows whose opacity is infinite: a logit, or no opacity at all.
+        are_logs, are_logits: scales are logarithms, opacities are logits; known after all primitives.
         antialiased: the flag of each SPZ.
-        light: a sample of each primitive with linear colours.
+        linear_samples: read some splats of each primitive with linear colours.
+        packed: SPZ by index of their views.
     """
 
-    file: GltfFile
+    file: GltfDocument
     required: list[str]
     sh_degree: int | None
     findings: list[Finding] = field(default_factory=list)
-    scales: Spread = field(default_factory=Spread)
-    opacities: Spread = field(default_factory=lambda: Spread(high=1.0))
-    counts: RowStatistics = field(default_factory=RowStatistics)
+    scales: RangeStatistics = field(default_factory=RangeStatistics)
+    opacities: RangeStatistics = field(default_factory=lambda: RangeStatistics(high=1.0))
+    statistics: RowStatistics = field(default_factory=RowStatistics)
     infinite: int = 0
     are_logs: bool = False
     are_logits: bool = False
     antialiased: list[bool] = field(default_factory=list)
-    light: list[Callable[[], SplatModel]] = field(default_factory=list)
-    packed: dict[int, Packed] = field(default_factory=dict)
+    linear_samples: list[Callable[[], SplatModel]] = field(default_factory=list)
+    packed: dict[int, SpzArrays] = field(default_factory=dict)
     count: int = 0
     unpacked_bytes: int = 0
 
-    def parts(self, placed: Placed) -> Iterator[_Part]:
-        """Give the parts of a primitive, one for each instance; none of one without splats."""
+    def instances(self, placed: PlacedPrimitive) -> Iterator[_Instance]:
+        """Yield an instance per node instance of a primitive; none if it has no splats."""
         place = (*placed.place, "extensions")
         extensions = self.file.get(placed.primitive, placed.place, "extensions", dict, {})
         said = self.file.get(extensions, place, EXTENSION, dict, {})
@@ -118,24 +122,24 @@ class _Reading:
         unknown = [name for name in within if name not in _SPZ]
         unknown += [one for one in extensions if one in self.required and one not in {EXTENSION, *_SPZ, *_HARMLESS}]
         if unknown:
-            raise self.file.wrong(place, f"{', '.join(map(str, unknown))} is not understood, and the splats use it")
+            raise self.file.error(place, f"{', '.join(map(str, unknown))} is not understood, and the splats use it")
         self._check(placed, said, (*place, EXTENSION), packed=bool(packed))
         if packed:
             inner = (*place, packed) if packed in extensions else (*place, EXTENSION, "extensions", packed)
             holder = within if packed in within else extensions
-            view = self.file.whole(self.file.get(holder, inner[:-1], packed, dict), inner, "bufferView")
+            view = self.file.integer(self.file.get(holder, inner[:-1], packed, dict), inner, "bufferView")
             block, count = self._packed_block(placed, view, draft="kernel" not in said)
             bad = infinite = 0
         else:
             block, count, (bad, infinite) = self._plain_block(placed)
         if said.get("colorSpace") == _LINEAR:
-            self.light.append(partial(block, slice(0, count, max(1, count // _SAMPLE))))
-            block = partial(_in_srgb, block)
+            self.linear_samples.append(partial(block, slice(0, count, max(1, count // _SAMPLE))))
+            block = partial(_decode_in_srgb, block)
         for matrix in self.file.instances(placed):
             self.count += count
-            self.counts.nonfinite += bad
+            self.statistics.nonfinite += bad
             self.infinite += infinite
-            # Nodes may show one mesh many times.
+            # A small file could show one mesh very many times.
             if self.count > self.file.size() + sum(one.count for one in self.packed.values()):
                 shown = f"shows {counted(self.count, 'splat')} or more, which is more than it has bytes"
                 raise InputError(f"{self.file.path.name} {shown}")
@@ -143,39 +147,39 @@ class _Reading:
             with np.errstate(all="ignore"):
                 lengths = np.linalg.svd(linear)[1] if np.isfinite(matrix).all() else np.zeros(3)
             if not 1e-30 < lengths.max() < 1e30 or lengths.min() < 1e-9 * lengths.max():
-                raise self.file.wrong(placed.place, "the node that shows it flattens it, or leaves float32")
-            yield _Part(block, count, linear, translation)
+                raise self.file.error(placed.place, "the node that shows it flattens it, or leaves float32")
+            yield _Instance(block, count, linear, translation)
 
-    def _say(self, finding: Finding) -> None:
-        """Add a finding, or add to the count of one with the same text about other primitives."""
+    def _report(self, finding: Finding) -> None:
+        """Add a finding, or its count to one of the same text about other primitives."""
         for index, one in enumerate(self.findings):
             if one.text == finding.text:
                 self.findings[index] = replace(one, count=one.count + finding.count)
                 return
         self.findings.append(finding)
 
-    def _check(self, placed: Placed, said: dict[str, Any], place: Place, *, packed: bool) -> None:
-        """Refuse splats of another kernel, colour or projection; drafts with SPZ named none of them."""
+    def _check(self, placed: PlacedPrimitive, said: dict[str, Any], place: JsonPath, *, packed: bool) -> None:
+        """Refuse other kernels, colour spaces and projections; drafts with SPZ name none of them."""
         absent = {None} if packed else set()
         known = {"kernel": {"ellipse"} | absent, "colorSpace": {COLOURS, _LINEAR} | absent}
         attributes = self.file.get(placed.primitive, placed.place, "attributes", dict, {})
         if not packed and "kernel" not in said and f"{EXTENSION}:OPACITY" not in attributes:
             draft = f"an early draft of {EXTENSION} (2025), which has no kernel, and opacities in COLOR_0"
-            raise self.file.wrong(place, f"{draft}: export it again with a newer version of the program")
+            raise self.file.error(place, f"{draft}: export it again with a newer version of the program")
         for key, values in (*known.items(), ("projection", {"perspective", None})):
             found = self.file.get(said, place, key, str)
             if found not in values:
                 wanted = " or ".join(str(one) for one in sorted(one for one in values if one))
-                raise self.file.wrong((*place, key), f"found {found!r}, which is not understood, wanted {wanted}")
+                raise self.file.error((*place, key), f"found {found!r}, which is not understood, wanted {wanted}")
 
-    def _plain_block(self, placed: Placed) -> tuple[Callable[[slice], SplatModel], int, tuple[int, int]]:
+    def _plain_block(self, placed: PlacedPrimitive) -> tuple[Callable[[slice], SplatModel], int, tuple[int, int]]:
         file, place = self.file, (*placed.place, "attributes")
         attributes = file.get(placed.primitive, placed.place, "attributes", dict, {})
 
         def array(name: str, width: int) -> Accessor:
             key = name if name == "POSITION" else f"{EXTENSION}:{name}"
             if key not in attributes:
-                raise file.wrong(place, f"there is no {key}")
+                raise file.error(place, f"there is no {key}")
             return file.accessor(attributes[key], width)
 
         widths = {"POSITION": 3, "ROTATION": 4, "SCALE": 3, "OPACITY": 1, **dict.fromkeys(sh_names(0), 3)}
@@ -187,16 +191,17 @@ class _Reading:
         count = len(arrays["POSITION"].rows)
         for name, accessor in arrays.items():
             if len(accessor.rows) != count:
-                raise file.wrong(place, f"{name} has {len(accessor.rows)} rows, POSITION {count}")
+                raise file.error(place, f"{name} has {len(accessor.rows)} rows, POSITION {count}")
         if any(f"{EXTENSION}:{name}" in attributes for name in sh_names(4)) and self.sh_degree is None:
-            raise file.wrong(place, too_many_bands(4))
-        return partial(_block, self, arrays, degree), count, self._survey(arrays, count)
+            raise file.error(place, too_many_bands(4))
+        return partial(_decode_block, self, arrays, degree), count, self._survey(arrays, count)
 
     def _survey(self, arrays: dict[str, Accessor], count: int) -> tuple[int, int]:
-        """Look at the values that the extension forbids.
+        """Update the statistics with the rows of a primitive.
 
         Returns:
-            Rows with a NaN or an infinity other than an opacity; of the others those with an infinite opacity.
+            Number of rows with NaN or an infinity other than an opacity, and number of other rows with an infinite
+            opacity.
         """
         bad = infinite = 0
         for start in range(0, count, BLOCK):
@@ -213,9 +218,9 @@ class _Reading:
             self.scales.add(values["SCALE"], self.count + start)
             self.opacities.add(values["OPACITY"], self.count + start)
             zero = np.logical_and.reduce([quats[:, part] == 0 for part in range(4)])
-            self.counts.zero_quats += int(np.count_nonzero(zero))
+            self.statistics.zero_quats += int(np.count_nonzero(zero))
             if largest > _LARGE:
-                self.counts.huge += self._huge(arrays, rows, good)
+                self.statistics.huge += self._huge(arrays, rows, good)
         return bad, infinite
 
     def _huge(self, arrays: dict[str, Accessor], rows: slice, good: NDArray[np.bool_] | None) -> int:
@@ -225,12 +230,14 @@ class _Reading:
             scales, *(one.values(rows)[kept] for name, one in arrays.items() if name.startswith("SH_"))
         )
 
-    def _packed_block(self, placed: Placed, view: int, *, draft: bool) -> tuple[Callable[[slice], SplatModel], int]:
+    def _packed_block(
+        self, placed: PlacedPrimitive, view: int, *, draft: bool
+    ) -> tuple[Callable[[slice], SplatModel], int]:
         file = self.file
         if view not in self.packed:
             data, _ = file.view(view)
             name = f"{file.path.name}, bufferViews/{view}"
-            packed = read_packed(io.BytesIO(data), name, len(data), any_degree=self.sh_degree is not None)
+            packed = read_spz_file(io.BytesIO(data), name, len(data), any_degree=self.sh_degree is not None)
             self.unpacked_bytes += sum(one.nbytes for one in packed.parts)
             if self.unpacked_bytes > _UNPACKED_RATIO * file.size():
                 raise InputError(f"{file.path.name}: several SPZ in it share their bytes, and unpack to too many")
@@ -242,28 +249,30 @@ class _Reading:
         said = file.item("accessors", attributes["POSITION"]) if "POSITION" in attributes else {}
         count = said.get("count", packed.count)
         if count != packed.count:
-            raise file.wrong((*placed.place, "attributes", "POSITION"), f"{count} rows, its SPZ has {packed.count}")
+            raise file.error((*placed.place, "attributes", "POSITION"), f"{count} rows, its SPZ has {packed.count}")
         rotation = axes_rotation(packed.axes, AXES)
         stored, by = self._lies_as_stored(packed, said, rotation, draft=draft)
         if stored:
             text = f"SPZ whose positions lie along the axes of glTF as they are stored, {by}: not turned to {AXES}"
-            self._say(Finding("spz-axes", packed.count, text, "note"))
+            self._report(Finding("spz-axes", packed.count, text, "note"))
 
         def block(rows: slice) -> SplatModel:
-            model = decoded(packed, rows, degree)
+            model = decode_block(packed, rows, degree)
             return replace(model if stored else turned(model, rotation), coordinate_system=AXES, antialiased=False)
 
         return block, packed.count
 
-    def _lies_as_stored(self, packed: Packed, said: dict[str, Any], rotation: F64, *, draft: bool) -> tuple[bool, str]:
-        """Return True if positions are stored along glTF's axes, and the source of that answer."""
+    def _lies_as_stored(
+        self, packed: SpzArrays, said: dict[str, Any], rotation: F64, *, draft: bool
+    ) -> tuple[bool, str]:
+        """Return True if positions are stored along glTF's axes; and the evidence."""
         bounds = [said.get(name) for name in ("min", "max")]
         numbers = [one for each in bounds if isinstance(each, list) for one in each]
         if len(numbers) == 6 and packed.count and all(type(one) in (int, float) for one in numbers):
             wanted = np.array(numbers, np.float64).reshape(2, 3)
             low, high = np.full(3, np.inf), np.full(3, -np.inf)
             for start in range(0, packed.count, BLOCK):
-                means = means_of(packed, slice(start, start + BLOCK))
+                means = decode_means(packed, slice(start, start + BLOCK))
                 low, high = np.minimum(low, means.min(axis=0)), np.maximum(high, means.max(axis=0))
             both = np.stack([low, high])
             there = np.sort(both @ rotation.T, axis=0)
@@ -275,67 +284,70 @@ class _Reading:
 
 @contextmanager
 def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
-    """Open a file as `csplat.formats.format.Reader` and `BandReader` do."""
-    file = opened(path)
-    reading = _Reading(file, [str(one) for one in file.get(file.root, (), "extensionsRequired", list, [])], sh_degree)
-    parts = [part for placed in file.placed() for part in reading.parts(placed)]
-    if not parts:
+    """Open a file (`Format.open`, `Format.open_bands`)."""
+    file = open_document(path)
+    reading = _GltfReading(
+        file, [str(one) for one in file.get(file.root, (), "extensionsRequired", list, [])], sh_degree
+    )
+    instances = [one for placed in file.placed_primitives() for one in reading.instances(placed)]
+    if not instances:
         raise InputError(f"{path.name} shows no splats: no mesh of its scene has {EXTENSION}")
     _conclude(reading)
     try:
-        said = _said(file)
-        origin = np.array(said.origin or (0.0, 0.0, 0.0))
-        if said.origin is None and np.abs(parts[0].translation).max() >= _FAR:
-            origin = parts[0].translation
+        metadata = _read_metadata(file)
+        origin = np.array(metadata.origin or (0.0, 0.0, 0.0))
+        if metadata.origin is None and np.abs(instances[0].translation).max() >= _FAR:
+            origin = instances[0].translation
         x, y, z = origin.tolist()
-        degree = max(part.block(slice(0, 0)).sh_degree for part in parts)
-        nothing = _with_bands(parts[0].block(slice(0, 0)), degree)
-        fields = {**said.fields(), "coordinate_system": AXES}
+        degree = max(one.decode(slice(0, 0)).sh_degree for one in instances)
+        empty = _pad_bands(instances[0].decode(slice(0, 0)), degree)
+        fields = {**metadata.fields(), "coordinate_system": AXES}
         if reading.antialiased and all(reading.antialiased):
             fields["antialiased"] = True
-        facts = replace(nothing, origin=(x, y, z), **fields)
+        facts = replace(empty, origin=(x, y, z), **fields)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
 
     def blocks() -> Iterator[SplatModel]:
-        for part in parts:
-            for start in range(0, part.count, BLOCK):
-                rows = slice(start, min(start + BLOCK, part.count))
+        for one in instances:
+            for start in range(0, one.count, BLOCK):
+                rows = slice(start, min(start + BLOCK, one.count))
                 try:
-                    block = part.block(rows)
+                    block = one.decode(rows)
                     if len(block):
-                        yield _placed(_with_bands(block, degree), part, facts)
+                        yield _place_block(_pad_bands(block, degree), one, facts)
                 except InputError as error:
                     raise InputError(f"{path.name}, splats {rows.start} to {rows.stop - 1}: {error}") from None
 
-    yield Scene(reading.count - reading.counts.nonfinite, facts, blocks, reading.findings)
+    yield Scene(reading.count - reading.statistics.nonfinite, facts, blocks, reading.findings)
 
 
-def _conclude(reading: _Reading) -> None:
-    """Decide what the values of all primitives are, and add the findings about them."""
+def _conclude(reading: _GltfReading) -> None:
+    """Classify the values of all primitives, and add the findings about them."""
     generator = reading.file.root["asset"].get("generator")
     writer = generator[:60] if isinstance(generator, str) else ""
-    reading.are_logs, found = read_scales_as(reading.scales, "SCALE", strict=True, writer=writer)
+    reading.are_logs, found = classify_scales(reading.scales, "SCALE", strict=True, writer=writer)
     written = _WROTE_LOGS.match(writer)
     if written and not reading.are_logs and not found:
         text = f"SCALE: {writer} wrote logarithms, and none is negative: read as standard deviations, as glTF has them"
         found = [Finding("unclear-scales", reading.count, text, "note")]
-    reading.are_logits, more = read_opacities_as(reading.opacities, "OPACITY")
+    reading.are_logits, more = classify_opacities(reading.opacities, "OPACITY")
     for index, length in reading.file.short.items():
         text = f"buffers/{index}: {length}; all that the splats use is there"
         reading.findings.append(Finding("short-buffer", 1, text, "note"))
     if reading.are_logits:
-        reading.counts.infinite_logits = reading.infinite
+        reading.statistics.infinite_logits = reading.infinite
     else:
-        reading.counts.nonfinite += reading.infinite
-    reading.findings += [*found, *more, *list_findings(reading.counts, reading.count)]
+        reading.statistics.nonfinite += reading.infinite
+    reading.findings += [*found, *more, *list_findings(reading.statistics, reading.count)]
     reading.findings += trailing_bytes(reading.file.tail)
     if others := reading.file.other_scenes():
         reading.findings.append(Finding("other-scenes", len(reading.file.root["scenes"]) - 1, others, "note"))
-    if reading.light and all(one.repairable for one in reading.findings):
+    if reading.linear_samples and all(one.repairable for one in reading.findings):
         try:
             error = max(
-                (srgb_error(model) for model in (sample() for sample in reading.light) if len(model)), default=0.0
+                (measure_srgb_error(model) for model in (sample() for sample in reading.linear_samples) if len(model)),
+                default=0.0,
             )
         except InputError as wrong:
             raise InputError(f"{reading.file.path.name}: {wrong}") from None
@@ -345,7 +357,7 @@ def _conclude(reading: _Reading) -> None:
 
 
 def sh_names(degree: int) -> list[str]:
-    """Name the coefficients of a band, as attributes have them behind the prefix."""
+    """Return the attributes of a band, without the prefix."""
     return [f"SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
 
 
@@ -353,8 +365,8 @@ def _finite_rows(arrays: dict[str, Accessor], rows: slice) -> tuple[NDArray[np.b
     """Find the rows without NaN and infinities; an opacity may be infinite.
 
     Returns:
-        [n] True where a row is finite; `None`: all are, opacities too. And the largest of all magnitudes but of
-        positions, NaN or infinite if not all are finite.
+        [n] True for finite rows, or `None` if all values are finite; and the largest magnitude of all values but
+        positions, infinite if there are rows that are not finite.
     """
     largest, odd = 0.0, []
     for name, accessor in arrays.items():
@@ -374,10 +386,10 @@ def _finite_rows(arrays: dict[str, Accessor], rows: slice) -> tuple[NDArray[np.b
     return good, np.inf
 
 
-def _block(reading: _Reading, arrays: dict[str, Accessor], degree: int, rows: slice) -> SplatModel:
-    """Make a model of some splats as their primitive has them."""
+def _decode_block(reading: _GltfReading, arrays: dict[str, Accessor], degree: int, rows: slice) -> SplatModel:
+    """Make a model of some splats along the axes of their primitive."""
     values = {name: accessor.values(rows) for name, accessor in arrays.items()}
-    good, _ = _finite_rows(arrays, rows) if reading.counts.nonfinite else (None, 0.0)
+    good, _ = _finite_rows(arrays, rows) if reading.statistics.nonfinite else (None, 0.0)
     if good is not None:
         if not reading.are_logits:
             good &= np.isfinite(values["OPACITY"][:, 0])
@@ -400,21 +412,21 @@ def _block(reading: _Reading, arrays: dict[str, Accessor], degree: int, rows: sl
     )
 
 
-def _in_srgb(block: Callable[[slice], SplatModel], rows: slice) -> SplatModel:
-    return srgb_of_linear(block(rows))
+def _decode_in_srgb(block: Callable[[slice], SplatModel], rows: slice) -> SplatModel:
+    return fit_srgb(block(rows))
 
 
-def _with_bands(block: SplatModel, degree: int) -> SplatModel:
+def _pad_bands(block: SplatModel, degree: int) -> SplatModel:
     """Add zeros for the bands up to a degree."""
     missing = (degree + 1) ** 2 - 1 - block.shN.shape[1]
     return replace(block, shN=np.pad(block.shN, ((0, 0), (0, missing), (0, 0)))) if missing else block
 
 
-def _placed(block: SplatModel, part: _Part, facts: SplatModel) -> SplatModel:
-    """Move some splats to their place in the scene."""
-    if not np.array_equal(part.linear, np.eye(3)):
-        block = stretched(block, part.linear)
-    offset = part.translation - np.array(facts.origin)
+def _place_block(block: SplatModel, instance: _Instance, facts: SplatModel) -> SplatModel:
+    """Transform some splats to their place in the scene."""
+    if not np.array_equal(instance.linear, np.eye(3)):
+        block = stretched(block, instance.linear)
+    offset = instance.translation - np.array(facts.origin)
     if offset.any():
         with np.errstate(over="ignore"):
             block = replace(block, means=(block.means.astype(np.float64) + offset).astype(np.float32))
@@ -422,14 +434,58 @@ def _placed(block: SplatModel, part: _Part, facts: SplatModel) -> SplatModel:
     return replace(block, **{name: getattr(facts, name) for name in fields})
 
 
-def _said(file: GltfFile) -> CommentMetadata:
-    """Read the file's metadata about the scene beyond its splats."""
+def _read_metadata(file: GltfDocument) -> CommentMetadata:
+    """Read the metadata of the scene."""
     extras = file.root["asset"].get("extras")
     lines = extras.get("csplat", []) if isinstance(extras, dict) else []
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
         raise InputError("asset/extras/csplat: wanted lines of text")
-    said = parse_comments(lines)
+    metadata = parse_comments(lines)
     holder = file.root["asset"].get("copyright")
     if isinstance(holder, str):
-        said.metadata.setdefault("licence", holder)
-    return said
+        metadata.metadata.setdefault("licence", holder)
+    return metadata
+
+
+_DIRECTIONS = 96  # six per coefficient of degree 3; with 1,000 the colours of a scene differ by 0.01 of 255 steps
+_ROWS = 4096  # splats whose colours are fitted at a time
+#: Factor of the basis functions of each band, degrees 1 to 3.
+_FACTORS = (0.4886025119029199, 0.5462742152960396, 0.5900435899266435)
+
+
+def fit_srgb(model: SplatModel) -> SplatModel:
+    """Fit SH of sRGB to SH of linear light."""
+    fitted = [coefficients for coefficients, _, _ in _fit_blocks(model)]
+    both = np.concatenate([np.zeros((0, model.shN.shape[1] + 1, 3), np.float32), *fitted])
+    return replace(model, sh0=np.ascontiguousarray(both[:, 0]), shN=np.ascontiguousarray(both[:, 1:]))
+
+
+def measure_srgb_error(model: SplatModel) -> float:
+    """Return the error of `fit_srgb`: rms over splats, directions and channels, in steps of 1/255."""
+    squares, count = 0.0, 0
+    for _, found, wanted in _fit_blocks(model):
+        squares += float(np.square(np.clip(found, 0, 1) - np.clip(wanted, 0, 1), dtype=np.float64).sum())
+        count += found.size
+    return 255.0 * float(np.sqrt(squares / count)) if count else 0.0
+
+
+def _fit_blocks(model: SplatModel) -> Iterator[tuple[F32, F32, F32]]:
+    """Yield coefficients [n, K, 3] of some splats, with their fitted and their exact colours [n, D, 3]."""
+    directions = sphere_lattice(_DIRECTIONS)
+    bands = [factor * band for factor, band in zip(_FACTORS, sh_bands(directions), strict=True)]
+    wide = np.concatenate([np.full((len(directions), 1), np.float64(SH_C0)), *bands[: model.sh_degree]], axis=1)
+    inverse, basis = np.linalg.pinv(wide).astype(np.float32), wide.astype(np.float32)
+    for start in range(0, len(model), _ROWS):
+        rows = slice(start, start + _ROWS)
+        with np.errstate(over="ignore", invalid="ignore"):  # a model refuses what leaves float32
+            linear = basis @ np.concatenate([model.sh0[rows, None], model.shN[rows]], axis=1) + np.float32(0.5)
+            wanted = _srgb(np.maximum(linear, 0))
+            coefficients = inverse @ (wanted - np.float32(0.5))
+            fitted = basis @ coefficients + np.float32(0.5)
+        yield coefficients, fitted, wanted
+
+
+def _srgb(linear: F32) -> F32:
+    high = np.float32(1.055) * linear ** np.float32(1 / 2.4) - np.float32(0.055)
+    colours: F32 = np.where(linear <= np.float32(0.0031308), np.float32(12.92) * linear, high)
+    return colours

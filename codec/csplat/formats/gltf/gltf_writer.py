@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.files import atomic_writer
-from csplat.formats.gltf_file import BIN, GLB_HEAD, JSON, MAGIC
-from csplat.formats.gltf_read import AXES, COLOURS, EXTENSION, sh_names
+from csplat.formats.gltf.gltf_document import BIN, GLB_HEAD, JSON, MAGIC
+from csplat.formats.gltf.gltf_reader import AXES, COLOURS, EXTENSION, sh_names
 from csplat.model import SplatModel
 from csplat.ply.comments import format_comments
 from csplat.scene import Scene
@@ -28,7 +28,7 @@ _LARGEST_FILE = (1 << 32) - 1  # bytes of a .glb: its length is a u32
 
 
 def write_gltf(path: Path, scene: Scene) -> None:
-    """Write a scene as `csplat.formats.format.Writer` does."""
+    """Write a scene (`Format.write`)."""
     if path.suffix.lower() == ".gltf":
         raise InputError(f"{path.name}: glTF is written as one file, name it {path.with_suffix('.glb').name}")
     if not scene.count:
@@ -40,13 +40,13 @@ def write_gltf(path: Path, scene: Scene) -> None:
             scene.count, scaled(scene.facts, metres), lambda: (scaled(one, metres) for one in before.blocks())
         )
     scene = in_axes(scene, AXES)
-    columns = _columns(scene.facts.sh_degree)
+    attributes = _list_attributes(scene.facts.sh_degree)
     lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
     for block in scene.blocks():
         lowest = np.minimum(lowest, block.means.min(axis=0, initial=np.inf))
         highest = np.maximum(highest, block.means.max(axis=0, initial=-np.inf))
-    offsets = np.cumsum([0, *(column.row_size * scene.count for column in columns)]).tolist()
-    text = json.dumps(_json(scene, columns, offsets, (lowest, highest)), ensure_ascii=False).encode()
+    offsets = np.cumsum([0, *(attribute.row_size * scene.count for attribute in attributes)]).tolist()
+    text = json.dumps(_build_json(scene, attributes, offsets, (lowest, highest)), ensure_ascii=False).encode()
     text += b" " * (-len(text) % 4)
     start = GLB_HEAD.size + 8 + len(text) + 8
     if start + offsets[-1] > _LARGEST_FILE:
@@ -59,16 +59,16 @@ def write_gltf(path: Path, scene: Scene) -> None:
         stream.write(struct.pack("<I4s", offsets[-1], BIN))
         done = 0
         for block in scene.blocks():
-            rows = _rows(block)
-            for column, offset in zip(columns, offsets, strict=False):
-                stream.seek(start + offset + done * column.row_size)
-                stream.write(np.ascontiguousarray(rows[column.name]).view(np.uint8).data)
+            rows = _attributes(block)
+            for attribute, offset in zip(attributes, offsets, strict=False):
+                stream.seek(start + offset + done * attribute.row_size)
+                stream.write(np.ascontiguousarray(rows[attribute.name]).view(np.uint8).data)
             done += len(block)
 
 
 @dataclass(frozen=True)
-class _Column:
-    """One attribute as it is written."""
+class _Attribute:
+    """An attribute of the file."""
 
     name: str
     width: int
@@ -79,14 +79,14 @@ class _Column:
         return self.width * (4 if self.component == _FLOAT else 1)
 
 
-def _columns(degree: int) -> list[_Column]:
+def _list_attributes(degree: int) -> list[_Attribute]:
     names = [name for band in range(degree + 1) for name in sh_names(band)]
-    first = [_Column("POSITION", 3), _Column("ROTATION", 4), _Column("SCALE", 3), _Column("OPACITY", 1)]
-    return [*first, _Column("COLOR_0", 4, _BYTE), *(_Column(name, 3) for name in names)]
+    first = [_Attribute("POSITION", 3), _Attribute("ROTATION", 4), _Attribute("SCALE", 3), _Attribute("OPACITY", 1)]
+    return [*first, _Attribute("COLOR_0", 4, _BYTE), *(_Attribute(name, 3) for name in names)]
 
 
-def _rows(model: SplatModel) -> dict[str, NDArray[Any]]:
-    """All attributes of some splats."""
+def _attributes(model: SplatModel) -> dict[str, NDArray[Any]]:
+    """Return all attributes of some splats."""
     with np.errstate(over="ignore", under="ignore"):
         scales = np.exp(model.scales.astype(np.float64))
     names = [name for band in range(1, model.sh_degree + 1) for name in sh_names(band)]
@@ -102,13 +102,15 @@ def _rows(model: SplatModel) -> dict[str, NDArray[Any]]:
 
 
 def _point_colours(model: SplatModel) -> NDArray[np.uint8]:
-    """Return the colours for programs that only draw points: linear RGB and alpha, [N, 4] bytes."""
+    """Return colours for programs that draw points only: linear RGB and alpha, [N, 4] bytes."""
     srgb = np.clip(model.sh0 * np.float32(_SH_C0) + np.float32(0.5), 0.0, 1.0)
     linear: F32 = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.rint(255.0 * np.concatenate([linear, model.opacities[:, None]], axis=1)).astype(np.uint8)
 
 
-def _json(scene: Scene, columns: list[_Column], offsets: list[int], bounds: tuple[F64, F64]) -> dict[str, Any]:
+def _build_json(
+    scene: Scene, attributes: list[_Attribute], offsets: list[int], bounds: tuple[F64, F64]
+) -> dict[str, Any]:
     facts = scene.facts
     asset: dict[str, Any] = {"version": "2.0", "generator": "csplat"}
     lines = format_comments(facts, absolute=False)
@@ -117,15 +119,20 @@ def _json(scene: Scene, columns: list[_Column], offsets: list[int], bounds: tupl
         asset["copyright"] = licence
     kinds = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
     accessors: list[dict[str, Any]] = [
-        {"bufferView": index, "componentType": column.component, "count": scene.count, "type": kinds[column.width]}
-        for index, column in enumerate(columns)
+        {
+            "bufferView": index,
+            "componentType": attribute.component,
+            "count": scene.count,
+            "type": kinds[attribute.width],
+        }
+        for index, attribute in enumerate(attributes)
     ]
     accessors[0] |= {"min": bounds[0].tolist(), "max": bounds[1].tolist()}
     plain = ("POSITION", "COLOR_0")
-    for index, column in enumerate(columns):
-        if column.component == _BYTE:
+    for index, attribute in enumerate(attributes):
+        if attribute.component == _BYTE:
             accessors[index]["normalized"] = True
-    names = [column.name if column.name in plain else f"{EXTENSION}:{column.name}" for column in columns]
+    names = [attribute.name if attribute.name in plain else f"{EXTENSION}:{attribute.name}" for attribute in attributes]
     splats = {"kernel": "ellipse", "colorSpace": COLOURS}
     primitive = {
         "attributes": {name: index for index, name in enumerate(names)},

@@ -1,4 +1,4 @@
-"""Write SOG, version 2: the same bytes for the same scene, rounded where others cut off."""
+"""Write SOG, version 2: the same bytes for the same scene; codes are rounded, not truncated."""
 
 from __future__ import annotations
 
@@ -18,70 +18,69 @@ from numpy.typing import NDArray
 from csplat.encoder.kmeans import assign, cluster
 from csplat.errors import InputError, missing
 from csplat.files import atomic_writer
-from csplat.formats.curve import along_curve
-from csplat.formats.packing import smallest_three
-from csplat.formats.sog_read import ENTRIES, LEAST_TAG
+from csplat.formats.common import encode_smallest_three, sorted_along_curve
+from csplat.formats.sog.sog_reader import ENTRIES, LEAST_TAG
 from csplat.model import SplatModel
 from csplat.scene import Scene, joined
 from csplat.types import F32, F64, U8, U32
 
-_LEAST_WEIGHT = 1e-3
+_LEAST_WEIGHT = 1e-3  # relative to a splat of opacity 1 and median area
 _LARGEST_SIDE = 16383  # pixels of a WebP
 _CODES = 256
 _LLOYD_STEPS = 40
-_DATE = (1980, 1, 1, 0, 0, 0)  # date of the parts of a zip: fixed, so the same scene gives the same bytes
-_NORM = 1000  # lattice steps of a long vector of SH: searches are exact up to twice that
+_DATE = (1980, 1, 1, 0, 0, 0)  # date of the members of a zip: fixed, so the same scene gives the same bytes
+_NORM = 1000  # lattice steps of a long SH vector; searches are exact up to twice that
 _NEAR = 4  # groups of palette entries that are searched, out of 181 for 60,000 splats
-_ITERATIONS = 2  # more gain 0.03 dB, in three times the time
+_ITERATIONS = 2  # of k-means; more gain 0.03 dB in three times the time
 _LARGEST_PALETTE = 1 << 16
-_PIXELS_AT_ONCE = 1 << 23  # pixels of WebPs that are written in parallel, each taking 70 bytes a pixel
-_SAMPLE = 1 << 20  # splats that codebooks and palette are computed from
+_PIXELS_AT_ONCE = 1 << 23  # pixels of the images that are compressed in parallel, 70 bytes of memory per pixel
+_SAMPLE = 1 << 20  # splats from which codebooks and palette are computed
 _CHANNELS = {"means_l.webp": 3, "means_u.webp": 3, "quats.webp": 4, "scales.webp": 3, "sh0.webp": 4}
 
 
 def write_sog(path: Path, scene: Scene) -> None:
-    """Write a zip; or, for a path that ends in meta.json, the parts next to it in the folder.
+    """Write a zip or, for a path that ends in meta.json, files next to it (`Format.write`).
 
     Raises:
-        InputError: more splats than a picture has pixels; or Pillow is absent.
-        OSError: it cannot be written.
+        InputError: the scene has more splats than an image has pixels; or Pillow is absent.
+        OSError: a file cannot be written.
     """
     if path.name.lower() == "lod-meta.json":
         raise InputError(f"{path.name} would be streamed SOG, which csplat does not write: end it in .sog")
     is_folder = path.name.lower().endswith("meta.json")
     if is_folder:
         path.parent.mkdir(exist_ok=True)
-    with along_curve(scene, path.parent) as ordered:
+    with sorted_along_curve(scene, path.parent) as ordered:
         if is_folder:
-            for name, data in _files(ordered):  # meta.json is the last
+            for name, data in _encode_files(ordered):  # meta.json is the last
                 with atomic_writer(path if name == "meta.json" else path.with_name(name)) as stream:
                     stream.write(data)
             return
         with atomic_writer(path) as stream, zipfile.ZipFile(stream, "w") as archive:
-            for name, data in _files(ordered):
+            for name, data in _encode_files(ordered):
                 archive.writestr(zipfile.ZipInfo(name, _DATE), data)
 
 
-def _files(scene: Scene) -> Iterator[tuple[str, bytes]]:
-    """Each part, by name. Kept are 17 bytes of each splat, 21 with SH."""
+def _encode_files(scene: Scene) -> Iterator[tuple[str, bytes]]:
+    """Yield each file, name and bytes. Memory holds 17 bytes per splat, 21 with SH."""
     count = scene.count
     width = max(1, math.ceil(math.sqrt(count) / 4)) * 4
     height = max(1, math.ceil(count / width / 4)) * 4
     if max(width, height) > _LARGEST_SIDE:
         raise InputError(f"{count:,} splats are more than the pictures of SOG hold")
-    low, high, sample = _sampled(scene)
-    weigh = _Weights(float(np.median(_area(sample))) if count else 0.0)
-    # By their roots: of few values each tail is seen somewhere (donut has 60.6 dB, by the weights themselves 53.1).
-    roots = np.sqrt(weigh(sample))
-    scales, colours = _codebook(sample.scales, roots), _codebook(sample.sh0, roots)
+    low, high, sample = _sample(scene)
+    weights_of = _SplatWeights(float(np.median(_log_area(sample))) if count else 0.0)
+    # Roots of the weights: with few codes, the tails of the values show somewhere (donut: 60.6 dB, without roots 53.1).
+    roots = np.sqrt(weights_of(sample))
+    scales, colours = _build_codebook(sample.scales, roots), _build_codebook(sample.sh0, roots)
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "csplat"}, "count": count}
     if scene.facts.antialiased or scene.facts.flat:
         meta["model"] = "antialiased" if scene.facts.antialiased else "2dgs"
     meta |= {
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
-        "scales": {"codebook": _short(scales), "files": ["scales.webp"]},
+        "scales": {"codebook": _shortest_decimals(scales), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
-        "sh0": {"codebook": _short(colours), "files": ["sh0.webp"]},
+        "sh0": {"codebook": _shortest_decimals(colours), "files": ["sh0.webp"]},
     }
 
     def square(table: NDArray[Any]) -> U8:
@@ -92,36 +91,36 @@ def _files(scene: Scene) -> Iterator[tuple[str, bytes]]:
 
     codes = {name: np.empty((count, channels), np.uint8) for name, channels in _CHANNELS.items()}
     for rows, model in scene.numbered():
-        places = np.rint((_logs(model.means) - low) * (65535 / np.where(high > low, high - low, 1.0)))
-        largest, three = smallest_three(model.quats)
+        places = np.rint((_signed_logs(model.means) - low) * (65535 / np.where(high > low, high - low, 1.0)))
+        largest, three = encode_smallest_three(model.quats)
         codes["means_l.webp"][rows], codes["means_u.webp"][rows] = places % 256, places // 256
         codes["quats.webp"][rows, :3] = np.clip(np.rint((three * np.float32(2**0.5) + 1) * np.float32(127.5)), 0, 255)
         codes["quats.webp"][rows, 3] = largest + LEAST_TAG
-        codes["scales.webp"][rows] = _nearest(scales, model.scales)
-        codes["sh0.webp"][rows, :3] = _nearest(colours, model.sh0)
+        codes["scales.webp"][rows] = _nearest_codes(scales, model.scales)
+        codes["sh0.webp"][rows, :3] = _nearest_codes(colours, model.sh0)
         codes["sh0.webp"][rows, 3] = np.rint(model.opacities * np.float32(255))
     if scene.facts.sh_degree and count:
-        values, entries, labels = _palette(scene, sample, weigh)
+        values, entries, labels = _build_palette(scene, sample, weights_of)
         codes["shN_labels.webp"] = labels[:, None].astype("<u2").view(np.uint8)
         meta["shN"] = {
             "count": len(entries) * ENTRIES,
             "bands": scene.facts.sh_degree,
-            "codebook": _short(values),
+            "codebook": _shortest_decimals(values),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
-        yield "shN_centroids.webp", _webp(entries)
+        yield "shN_centroids.webp", _encode_webp(entries)
     with ThreadPoolExecutor(max(1, min(len(codes), _PIXELS_AT_ONCE // (width * height)))) as pool:
-        yield from zip(codes, pool.map(lambda name: _webp(square(codes[name])), codes), strict=True)
+        yield from zip(codes, pool.map(lambda name: _encode_webp(square(codes[name])), codes), strict=True)
     yield "meta.json", json.dumps(meta, separators=(",", ":")).encode()
 
 
-def _sampled(scene: Scene) -> tuple[F64, F64, SplatModel]:
-    """Bounds of the logarithms of all positions; and splats at equal steps along the curve, or all that are few."""
+def _sample(scene: Scene) -> tuple[F64, F64, SplatModel]:
+    """Return the bounds of the logarithms of all positions, and at most `_SAMPLE` splats at equal steps."""
     step = -(-scene.count // _SAMPLE) or 1
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     taken = []
     for rows, model in scene.numbered():
-        logs = _logs(model.means)
+        logs = _signed_logs(model.means)
         low, high = np.minimum(low, logs.min(0)), np.maximum(high, logs.max(0))
         taken.append(model.select(np.arange(-rows.start % step, len(model), step)))
     if not taken:
@@ -129,36 +128,36 @@ def _sampled(scene: Scene) -> tuple[F64, F64, SplatModel]:
     return low, high, joined(scene.facts, taken)
 
 
-def _logs(means: F32) -> F64:
+def _signed_logs(means: F32) -> F64:
     logs: F64 = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     return logs
 
 
-def _area(model: SplatModel) -> F64:
-    """The logarithm of that of the largest side."""
+def _log_area(model: SplatModel) -> F64:
+    """Return the logarithm of the area of each splat's largest cross-section."""
     area: F64 = np.sort(model.scales, 1)[:, 1:].sum(1, dtype=np.float64)
     return area
 
 
 @dataclass(frozen=True)
-class _Weights:
-    """Weights of splats by their share of a render: opacity times area, which is 1 at the median of the scene."""
+class _SplatWeights:
+    """Weights of splats by their share of a render: opacity times area relative to the scene's median."""
 
     middle: float
 
     def __call__(self, model: SplatModel) -> F32:
-        area = np.exp(_area(model) - self.middle).clip(1e-2, 1e2)
+        area = np.exp(_log_area(model) - self.middle).clip(1e-2, 1e2)
         weights: F32 = (model.opacities * area + _LEAST_WEIGHT).astype(np.float32)
         return weights
 
 
-def _short(values: F32) -> list[float]:
-    """Return the shortest decimals that give the same float32."""
+def _shortest_decimals(values: F32) -> list[float]:
+    """Return the shortest decimals that round to the same float32."""
     return [float(str(one)) for one in values]
 
 
-def _codebook(columns: F32, weights: F32) -> F32:
-    """Return 256 values that represent all, by Lloyd's algorithm on the sorted values: exact, and cheap for any number.
+def _build_codebook(columns: F32, weights: F32) -> F32:
+    """Return 256 values that represent all, by Lloyd's algorithm on sorted values: exact, and cheap for any number.
 
     Args:
         columns: [N, C].
@@ -192,17 +191,17 @@ def _codebook(columns: F32, weights: F32) -> F32:
     return codebook
 
 
-def _nearest(codebook: F32, columns: F32) -> U8:
-    """The code of each value."""
+def _nearest_codes(codebook: F32, columns: F32) -> U8:
+    """Return the code of each value."""
     codes = np.searchsorted((codebook[1:].astype(np.float64) + codebook[:-1]) / 2, columns)
     return codes.astype(np.uint8)
 
 
-def _palette(scene: Scene, sample: SplatModel, weigh: _Weights) -> tuple[F32, U8, U32]:
-    """Return vectors of SH that represent those of all splats.
+def _build_palette(scene: Scene, sample: SplatModel, weights_of: _SplatWeights) -> tuple[F32, U8, U32]:
+    """Cluster the SH vectors of all splats.
 
     Returns:
-        The codebook of their coefficients; the picture of the palette; the label of each splat.
+        The codebook of coefficients, the image of the palette, and the label of each splat.
     """
     coefficients = scene.facts.shN.shape[1]
     lengths = np.sqrt(np.einsum("nkc,nkc->n", sample.shN, sample.shN))
@@ -216,12 +215,14 @@ def _palette(scene: Scene, sample: SplatModel, weigh: _Weights) -> tuple[F32, U8
         return found
 
     size = min(_LARGEST_PALETTE, 1 << max(10, scene.count.bit_length() - 1))  # as splat-transform has it
-    entries, labels = cluster(points(sample), weigh(sample), size, seed=0, iterations=_ITERATIONS, near_groups=_NEAR)
+    entries, labels = cluster(
+        points(sample), weights_of(sample), size, seed=0, iterations=_ITERATIONS, near_groups=_NEAR
+    )
     if len(labels) < scene.count:
         labels = np.concatenate([assign(points(model), entries, near_groups=_NEAR) for model in scene.blocks()])
     total, sums = np.zeros(len(entries)), np.zeros((3 * coefficients, len(entries)))
     for rows, model in scene.numbered():
-        weights = weigh(model)
+        weights = weights_of(model)
         total += np.bincount(labels[rows], weights, len(entries))
         for index, column in enumerate(model.shN.reshape(len(model), -1).T):
             sums[index] += np.bincount(labels[rows], weights * column, len(entries))
@@ -230,20 +231,20 @@ def _palette(scene: Scene, sample: SplatModel, weigh: _Weights) -> tuple[F32, U8
     rank = np.empty(len(order), np.uint32)
     rank[order] = np.arange(len(order))
     columns = centres[order].astype(np.float32)
-    values = _codebook(columns, total[order].astype(np.float32))
+    values = _build_codebook(columns, total[order].astype(np.float32))
     height = -(-len(order) // ENTRIES)
     pixels = np.zeros((height * ENTRIES, coefficients, 4), np.uint8)
     pixels[:, :, 3] = 255
-    pixels[: len(order), :, :3] = _nearest(values, columns).reshape(-1, coefficients, 3)
+    pixels[: len(order), :, :3] = _nearest_codes(values, columns).reshape(-1, coefficients, 3)
     return values, pixels.reshape(height, ENTRIES * coefficients, 4), rank[labels]
 
 
-def _webp(pixels: U8) -> bytes:
+def _encode_webp(pixels: U8) -> bytes:
     try:
         from PIL import Image
     except ModuleNotFoundError as error:
         raise missing(error, "Pillow") from None
     buffer = io.BytesIO()
-    # More effort makes files of splats no smaller: method 6 at 100 took 100 times as long for 0.05 % more bytes.
+    # More effort does not help: method 6 at quality 100 took 100 times as long for 0.05 % more bytes.
     Image.fromarray(pixels).save(buffer, "WEBP", lossless=True, exact=True, quality=75, method=2)
     return buffer.getvalue()

@@ -1,0 +1,420 @@
+"""Read SOG, versions 1 and 2, and levels of streamed SOG.
+
+A byte of an image is an index: between two bounds in version 1, into a codebook in version 2. Follows the sources of
+splat-transform (MIT), `read-sog.ts` and `read-sog-v1.ts`. The axes are those of the PLY that a SOG was made from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.archives import folder_refusal, zip_refusal
+from csplat.errors import counted
+from csplat.formats.common import crossed_bounds, decode_smallest_three
+from csplat.formats.sog.sog_files import JsonValue, SogParts, decode_webp, find_parts, use_slashes
+from csplat.lint import Finding
+from csplat.model import SplatModel
+from csplat.ply.columns import alpha_of_logits
+from csplat.scene import BLOCK, Scene
+from csplat.types import F32, U8, U16
+
+_MAX_OFFSET = 1 << 40  # splats
+#: Keys that the JSON of one scene, or that of levels, has.
+_KEYS = ("means", "quats", "scales", "sh0", "lodLevels", "tree")
+_Range = tuple[int, int, int]  # file index, first splat, end
+
+
+@contextmanager
+def open_sog(path: Path, level: int = 0) -> Iterator[Scene]:
+    """Open a file or folder (`Format.open`, `Format.open_level`)."""
+    parts, name = find_parts(path)
+    with parts.held():
+        yield _open_scene(path, parts, name, level)
+
+
+def _open_scene(path: Path, parts: SogParts, name: str, level: int) -> Scene:
+    meta = parts.json(name)
+    if isinstance(meta.value, dict) and not any(one in meta for one in _KEYS):
+        where = folder_refusal(parts.path) if parts.folder is None else zip_refusal(path)
+        parts.refuse(f"{name} is not that of SOG, which has {', '.join(_KEYS[:4])}; {where}")
+    if "lodLevels" in meta or "tree" in meta:
+        scene = _open_streamed(parts, meta, level)
+        scene.findings.extend(parts.findings)
+        return scene
+    if level:
+        parts.refuse(f"it has no levels, and level {level} is wanted")
+    sog = read_meta(parts, name)
+    images = SogImages.of(sog)
+    degree = COEFFICIENTS.index(images.palette.shape[1])
+    facts = _empty_model(degree, antialiased=sog.antialiased, flat=sog.flat)
+
+    def blocks() -> Iterator[SplatModel]:
+        for arrays in images.blocks(degree):
+            yield replace(facts, **arrays)
+
+    return Scene(sog.count, facts, blocks, [*parts.findings, *_list_findings(images)])
+
+
+def _empty_model(degree: int, *, antialiased: bool, flat: bool) -> SplatModel:
+    three = np.zeros((0, 3), np.float32)
+    return SplatModel(
+        means=three,
+        quats=np.zeros((0, 4), np.float32),
+        scales=three,
+        opacities=np.zeros(0, np.float32),
+        sh0=three,
+        shN=np.zeros((0, COEFFICIENTS[degree], 3), np.float32),
+        antialiased=antialiased,
+        flat=flat,
+    )
+
+
+def _list_findings(images: SogImages) -> list[Finding]:
+    if not images.zeros:
+        return []
+    text = f"{counted(images.zeros, 'rotation')} that none of four components is left out of: the identity"
+    return [Finding("zero-quats", images.zeros, text, "repair")]
+
+
+def _open_streamed(parts: SogParts, meta: JsonValue, level: int) -> Scene:
+    """Open a level of streamed SOG and its environment, which are read one file at a time."""
+    names, leaves = _read_leaves(parts, meta)
+    last = max([max(one) for one in leaves], default=0)
+    if level > last:
+        parts.refuse(f"level {level} is wanted, its levels are 0 to {last}")
+    findings: list[Finding] = []
+    if any("\\" in name for name in names):
+        findings.append(Finding("zip-names", 1, "backslashes in filenames, read as slashes", "note"))
+        names = [use_slashes(name) for name in names]
+    ranges = _collect_ranges(parts, names, [_range_at(one, level) for one in leaves])
+    if "environment" in meta:
+        ranges[use_slashes(meta["environment"].text())] = None
+    metas: list[tuple[SogMeta, list[tuple[int, int]]]] = []
+    for name, wanted in ranges.items():
+        sog = read_meta(*parts.inner(name))
+        taken = [(0, sog.count)] if wanted is None else wanted
+        if taken[-1][1] > sog.count:
+            parts.refuse(f"splats up to {taken[-1][1]:,} of {name} are wanted, it has {sog.count:,}")
+        metas.append((sog, taken))
+    degree = max([read_degree(sog) for sog, _ in metas], default=0)
+    facts = _empty_model(
+        degree,
+        antialiased=bool(metas) and all(sog.antialiased for sog, _ in metas),
+        flat=bool(metas) and all(sog.flat for sog, _ in metas),
+    )
+    seen: set[int] = set()
+
+    def blocks() -> Iterator[SplatModel]:
+        for number, (sog, taken) in enumerate(metas):
+            images = SogImages.of(sog)
+            if number not in seen:
+                seen.add(number)
+                findings.extend(_list_findings(images))
+            keep = np.zeros(sog.count, bool)
+            for start, stop in taken:
+                keep[start:stop] = True
+            at = 0
+            for arrays in images.blocks(degree):
+                model = replace(facts, **arrays)
+                chosen = keep[at : at + len(model)]
+                at += len(model)
+                if chosen.any():
+                    yield model if chosen.all() else model.select(chosen)
+
+    count = sum(stop - start for _, taken in metas for start, stop in taken)
+    inside = [
+        sum(stop - start for _, start, stop in (_range_at(leaf, one) for leaf in leaves)) for one in range(last + 1)
+    ]
+    around = count - inside[level]
+    return Scene(count, facts, blocks, findings, levels=tuple(one + around for one in inside))
+
+
+def _read_leaves(parts: SogParts, meta: JsonValue) -> tuple[list[str], list[dict[int, _Range]]]:
+    """Return the names of the files, and per leaf of the tree the range of splats of each level."""
+    if "version" in meta and meta["version"].whole(1 << 30) != 1:
+        parts.refuse(f"it is of version {meta['version'].value} of streamed SOG, wanted 1")
+    names = [one.text() for one in meta["filenames"].list()]
+    leaves: list[dict[int, _Range]] = []
+    nodes = [meta["tree"]]
+    while nodes:
+        node = nodes.pop()
+        if "lods" not in node:
+            nodes += reversed(node["children"].list()) if "children" in node else []
+            continue
+        lods = node["lods"].value
+        if not isinstance(lods, dict):
+            parts.refuse(f"{node.place} lods is no object")
+        leaf: dict[int, _Range] = {}
+        for level, value in lods.items():
+            reference = JsonValue(parts, f"{node.place} lods", value)
+            file = reference["file"].whole(len(names) - 1)
+            start = reference["offset"].whole(_MAX_OFFSET)
+            if not (level.isdecimal() and level.isascii() and len(level) < 3):
+                parts.refuse(f"{level[:20]!r} is no level")
+            leaf[int(level)] = file, start, start + reference["count"].whole(_MAX_OFFSET)
+        leaves += [leaf] if leaf else []
+    return names, leaves
+
+
+def _range_at(leaf: dict[int, _Range], level: int) -> _Range:
+    """Return the range of a leaf at a level, else at the next coarser level, else at its coarsest."""
+    return leaf[min((one for one in leaf if one >= level), default=max(leaf))]
+
+
+def _collect_ranges(parts: SogParts, names: list[str], wanted: list[_Range]) -> dict[str, list[tuple[int, int]] | None]:
+    """Return the ranges of splats to read from each file, in order and without overlap."""
+    found: dict[str, list[tuple[int, int]] | None] = {}
+    before = (-1, 0, 0)
+    for one in sorted(one for one in wanted if one[2] > one[1]):
+        file, start, stop = one
+        if file == before[0] and start < before[2]:
+            parts.refuse(f"splats {start:,} to {before[2]:,} of {names[file][:80]} are wanted twice")
+        if file != before[0] and names[file] in found:
+            parts.refuse(f"filenames has {names[file][:80]} twice")
+        ranges = found.setdefault(names[file], [])
+        assert ranges is not None, "the environment is added later"
+        ranges.append((start, stop))
+        before = one
+    return found
+
+
+COEFFICIENTS = (0, 3, 8, 15)  #: number of SH coefficients per channel, by degree
+ENTRIES = 64  #: palette entries per row of their image
+LEAST_TAG = 252  #: fourth byte of a rotation without its first component; the next values are the other components
+_MAX_SPLATS = 1 << 28  # no WebP image has more pixels
+_MAX_PALETTE = 1 << 16
+_FREE = 1 << 20  # splats that are accepted for any number of bytes
+_SPLATS_PER_BYTE = 8  # largest number of splats per byte of the images, beyond that
+_LARGEST_LOG = 88.0  # largest logarithm whose exponential is a float32
+_SPARE = 1 << 16  # pixels that an image may have beyond four per splat
+
+
+@dataclass(frozen=True)
+class SogMeta:
+    """The checked JSON of one SOG.
+
+    Attributes:
+        count: N.
+        degree: SH degree; `None` if only the width of an image determines it.
+        antialiased, flat: as in `SplatModel`.
+        bounds: [2, 3] float64, bounds of the signed logarithms of 1 + means.
+        scales, sh0: [3, 256] float32, values by code; NaN beyond the end of a codebook.
+        alpha: [256] float32, values by code.
+        shN: [256] float32, values by code; `None`: no SH.
+        palette: number of entries; `None` if only the height of an image determines it.
+    """
+
+    parts: SogParts
+    meta: JsonValue
+    count: int
+    degree: int | None
+    antialiased: bool
+    flat: bool
+    bounds: NDArray[np.float64]
+    scales: F32
+    sh0: F32
+    alpha: F32
+    shN: F32 | None
+    palette: int | None
+
+
+def read_meta(parts: SogParts, name: str) -> SogMeta:
+    """Read and check the JSON of a SOG.
+
+    Raises:
+        InputError: a value is missing or not as expected.
+        OSError: the file cannot be read.
+    """
+    meta = parts.json(name)
+    version = meta["version"].whole(1 << 30) if "version" in meta else 1
+    if version not in (1, 2):
+        parts.refuse(f"it is of version {version} of SOG, wanted 1 or 2")
+    old = version == 1
+    if old and not meta["means"]["shape"].list():
+        parts.refuse(f"{name} means shape is empty")
+    count = (meta["means"]["shape"].list()[0] if old else meta["count"]).whole(_MAX_SPLATS)
+    shN: F32 | None = None
+    degree: int | None = 0
+    palette: int | None = None
+    if "shN" in meta:
+        sh = meta["shN"]
+        if old:
+            shN, degree = _interpolate(sh, 1)[0], None
+        else:
+            degree, palette = sh["bands"].whole(3), sh["count"].whole(_MAX_PALETTE)
+            shN = _read_codebook(sh) if degree else None
+    model = meta["model"].text() if "model" in meta else ""
+    sh0 = _interpolate(meta["sh0"], 4) if old else np.repeat(_read_codebook(meta["sh0"])[None], 3, 0)
+    return SogMeta(
+        parts=parts,
+        meta=meta,
+        count=count,
+        degree=degree,
+        antialiased=model == "antialiased" or ("antialias" in meta and meta["antialias"].value is True),
+        flat=model == "2dgs",
+        bounds=_read_bounds(meta["means"]),
+        scales=_interpolate(meta["scales"], 3) if old else np.repeat(_read_codebook(meta["scales"])[None], 3, 0),
+        sh0=sh0[:3],
+        alpha=alpha_of_logits(sh0[3]) if old else (np.arange(256) / 255.0).astype(np.float32),
+        shN=shN,
+        palette=palette,
+    )
+
+
+def _read_bounds(means: JsonValue) -> NDArray[np.float64]:
+    bounds = np.stack(_read_ends(means, 3))
+    if np.abs(bounds).max() > _LARGEST_LOG:
+        means.parts.refuse(f"{means.place} reaches beyond what float32 holds")
+    return bounds
+
+
+def _read_ends(section: JsonValue, channels: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    low, high = (section[name].numbers(channels, channels) for name in ("mins", "maxs"))
+    for channel in np.flatnonzero(crossed_bounds(low, high))[:1]:
+        said = f"mins {low[channel]:.6g} above maxs {high[channel]:.6g}, expected at most that"
+        section.parts.refuse(f"{section.place} has {said}")
+    return low, high
+
+
+def _interpolate(section: JsonValue, channels: int) -> F32:
+    low, high = (ends[:, None] for ends in _read_ends(section, channels))
+    return (low + (high - low) * (np.arange(256) / 255.0)).astype(np.float32)
+
+
+def _read_codebook(section: JsonValue) -> F32:
+    values = section["codebook"].value
+    if isinstance(values, list) and len(values) == 256 and values[0] is None:
+        # Early writers lost the first entry; as in PlayCanvas' engine, it is extrapolated.
+        after = JsonValue(section.parts, section.place, values[1:]).numbers(255, 255)
+        section.value["codebook"] = [float(after[0] + (after[0] - after[-1]) / 255), *values[1:]]
+    codebook = np.full(256, np.nan, np.float32)
+    numbers = section["codebook"].numbers(1, 256)
+    codebook[: len(numbers)] = numbers
+    return codebook
+
+
+@dataclass(frozen=True)
+class SogImages:
+    """The codes of all splats, 19 bytes each.
+
+    Attributes:
+        means: [N, 3]; quats: [N, 4]; scales: [N, 3]; sh0: [N, 4]; labels: [N].
+        palette: [P, K, 3] float32, SH coefficients by label.
+        zeros: number of rotations without a valid tag, which become the identity.
+    """
+
+    sog: SogMeta
+    means: U16
+    quats: U8
+    scales: U8
+    sh0: U8
+    labels: U16
+    palette: F32
+    zeros: int
+
+    @classmethod
+    def of(cls, sog: SogMeta) -> SogImages:
+        """Decode all images of a SOG.
+
+        Raises:
+            InputError: an image is damaged, has another size, or codes without a value.
+            OSError: an image cannot be read.
+        """
+        parts, count = sog.parts, sog.count
+        names = [_list_files(sog.meta[name], wanted) for name, wanted in (("means", 2), ("quats", 1), ("scales", 1))]
+        names += [_list_files(sog.meta["sh0"], 1)] + ([_list_files(sog.meta["shN"], 2)] if sog.shN is not None else [])
+        data = {name: parts.read(name) for group in names for name in group}
+        bytes_ = sum(map(len, data.values()))
+        if count > max(_FREE, _SPLATS_PER_BYTE * bytes_):
+            parts.refuse(f"{count:,} splats are declared, the pictures have {bytes_:,} bytes")
+        size: list[tuple[int, int]] = []
+
+        def fits(width: int, height: int) -> bool:
+            size.append((width, height))
+            return size[0] == (width, height) and count <= width * height <= 4 * count + _SPARE
+
+        def codes(name: str, channels: int) -> U8:
+            pixels = decode_webp(parts, name, data.pop(name), fits).reshape(-1, 4)
+            return np.ascontiguousarray(pixels[:count, :channels])
+
+        low, high = (codes(name, 3).astype(np.uint16) for name in names[0])
+        quats, scales, sh0 = codes(names[1][0], 4), codes(names[2][0], 3), codes(names[3][0], 4)
+        labels, palette = np.zeros(count, np.uint16), np.zeros((1, 0, 3), np.float32)
+        if sog.shN is not None:
+            palette = _read_palette(sog, names[4][0], data[names[4][0]])
+            pair = codes(names[4][1], 2).astype(np.uint16)
+            labels = pair[:, 0] | pair[:, 1] << np.uint16(8)
+            if count and labels.max() >= len(palette):
+                worst = int(labels.argmax())
+                parts.refuse(f"splat {worst} has SH {labels[worst]} of a palette of {len(palette):,}")
+        for what, table, used in (("scales", sog.scales, scales), ("sh0", sog.sh0, sh0)):
+            if count and np.isnan(table[0, used[:, :3].max()]):
+                parts.refuse(f"a splat has code {used[:, :3].max()} of {what}, whose codebook is shorter")
+        none = quats[:, 3] < LEAST_TAG
+        return cls(sog, low | high << np.uint16(8), quats, scales, sh0, labels, palette, int(none.sum()))
+
+    def blocks(self, degree: int) -> Iterator[dict[str, Any]]:
+        """Yield the arrays of a model, at most `BLOCK` splats at a time, with zeros for missing SH up to a degree."""
+        sog, missing = self.sog, COEFFICIENTS[degree] - self.palette.shape[1]
+        for start in range(0, sog.count, BLOCK):
+            yield self._block(slice(start, start + BLOCK), missing)
+
+    def _block(self, part: slice, missing: int) -> dict[str, Any]:
+        sog, codes = self.sog, self.quats[part]
+        three = (codes[:, :3].astype(np.float32) / np.float32(255) * 2 - 1) * np.float32(0.5**0.5)
+        quats = decode_smallest_three(codes[:, 3] & 3, three)
+        quats[codes[:, 3] < LEAST_TAG] = 1, 0, 0, 0
+        logs = sog.bounds[0] + (sog.bounds[1] - sog.bounds[0]) * (self.means[part] / 65535.0)
+        shN = np.take(self.palette, self.labels[part], 0)
+        return {
+            "means": (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32),
+            "quats": quats,
+            "scales": _look_up(sog.scales, self.scales[part]),
+            "opacities": sog.alpha[self.sh0[part, 3]],
+            "sh0": _look_up(sog.sh0, self.sh0[part, :3]),
+            "shN": np.pad(shN, ((0, 0), (0, missing), (0, 0))) if missing else shN,
+        }
+
+
+def read_degree(sog: SogMeta) -> int:
+    """Return the SH degree of a SOG from its JSON, otherwise from its palette."""
+    if sog.degree is not None:
+        return sog.degree
+    name = _list_files(sog.meta["shN"], 2)[0]
+    return COEFFICIENTS.index(_read_palette(sog, name, sog.parts.read(name)).shape[1])
+
+
+def _look_up(tables: F32, codes: NDArray[Any]) -> F32:
+    found = np.empty(codes.shape, np.float32)
+    for axis in range(3):
+        found[:, axis] = tables[axis][codes[:, axis]]
+    return found
+
+
+def _list_files(section: JsonValue, count: int) -> list[str]:
+    names = [one.text() for one in section["files"].list()]
+    if len(names) != count or len(set(names)) != count:
+        section.parts.refuse(f"{section.place} files: {len(set(names))} names, wanted {count}")
+    return names
+
+
+def _read_palette(sog: SogMeta, name: str, data: bytes) -> F32:
+    def fits(width: int, height: int) -> bool:
+        wanted = [sog.degree] if sog.degree is not None else [1, 2, 3]
+        rows = 1 if sog.palette is None else -(-sog.palette // ENTRIES)
+        return width in [ENTRIES * COEFFICIENTS[one] for one in wanted] and rows <= height <= _MAX_PALETTE // ENTRIES
+
+    codes = decode_webp(sog.parts, name, data, fits)
+    entries = codes[:, :, :3].reshape(len(codes) * ENTRIES, -1, 3)[: sog.palette]
+    assert sog.shN is not None, "a palette has values"
+    found = sog.shN[entries]
+    if np.isnan(found).any():
+        sog.parts.refuse(f"{name} has codes beyond the codebook of shN")
+    return np.ascontiguousarray(found)
