@@ -19,7 +19,7 @@ from csplat.scene import scene_of
 from csplat.turning import in_axes
 from csplat_tools.cli.app import app, command_function
 from csplat_tools.convert_file import Filters, convert_file, find_floaters
-from csplat_tools.encode_file import encode_file
+from csplat_tools.encode_file import OutOfCoreOptions, encode_file
 from csplat_tools.scene_files import open_scenes
 
 
@@ -268,7 +268,9 @@ def test_a_packed_scene_that_fits_the_memory_is_unpacked_once(tmp_path, make_mod
         return read(*words, any_degree=any_degree)
 
     monkeypatch.setattr(spz, "read_spz_file", counting)
-    encode_file(str(tmp_path / "a.spz"), str(tmp_path / "a.csplat"), EncodeOptions(), scale=Scale(by_disk=True))
+    encode_file(
+        str(tmp_path / "a.spz"), str(tmp_path / "a.csplat"), EncodeOptions(), scale=OutOfCoreOptions(by_disk=True)
+    )
     assert 1 == len(unpacked)
     with open_scenes((tmp_path / "a.spz", tmp_path / "a.spz"), 1 << 30) as (one, _):
         assert 50 == one.count

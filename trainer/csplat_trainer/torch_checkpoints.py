@@ -27,7 +27,7 @@ from csplat.errors import InputError, counted, missing
 from csplat.formats import Format
 from csplat.lint import Finding, too_many_bands
 from csplat.model import MAX_SH_DEGREE, SplatModel
-from csplat.ply.columns import RowStatistics, SplatArrays, choose_thickness, list_findings, survey_arrays
+from csplat.ply.columns import AttributeArrays, RowStatistics, choose_thickness, list_findings, survey_arrays
 from csplat.ply.comments import CommentMetadata, split_origin
 from csplat.scene import Scene, joined, scene_of
 
@@ -82,7 +82,7 @@ class _CheckpointPart(NamedTuple):
     """
 
     model: SplatModel
-    arrays: SplatArrays
+    arrays: AttributeArrays
     scale_count: int
     findings: list[Finding]
 
@@ -115,7 +115,7 @@ def _parts(path: Path) -> tuple[list[Path], list[Finding]]:
     return paths, [Finding("ranks", len(paths), text, "note")]
 
 
-def _read(path: Path, sh_degree: int | None) -> _Part:
+def _read(path: Path, sh_degree: int | None) -> _CheckpointPart:
     head = read_head(path)
     kind = detect_content(path, head)
     if not head.startswith(_MAGICS):
@@ -225,7 +225,7 @@ def _bounded(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> _Ch
         text = f"{_FILTER} of Mip-Splatting is left out, and not fused: save the scene as PLY, of which it is"
         findings.append(Finding("filter-3d", 1, text, "repair"))
     model = replace(from_gsplat(splats), flat=is_flat)
-    arrays = SplatArrays(
+    arrays = AttributeArrays(
         splats["means"], splats["quats"], splats["scales"], splats["opacities"].reshape(-1), model.sh0, model.shN
     )
     return _CheckpointPart(model, arrays, 2 if is_flat else 3, findings)

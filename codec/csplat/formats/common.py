@@ -12,7 +12,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.morton import morton_codes
+from csplat.encoder.entropy import morton_codes
 from csplat.errors import InputError, counted
 from csplat.formats.format import ARRAYS
 from csplat.lint import Finding

@@ -51,7 +51,7 @@ _BYTE_COLOUR = 4.0  # a larger f_dc is brighter than white, 1.77, and may be a c
 
 
 @dataclass(eq=False)
-class SplatArrays:
+class AttributeArrays:
     """The arrays of a `SplatModel` under the same names; `means` is float64 if the file has doubles."""
 
     means: NDArray[Any]
@@ -95,7 +95,7 @@ def gather_arrays(
     keep_extra: bool = False,
     statistics: RowStatistics | None = None,
     thinnest: float = math.inf,
-) -> SplatArrays:
+) -> AttributeArrays:
     """Copy columns into arrays, dropping rows that are not finite and repairing rotations.
 
     Args:
@@ -137,7 +137,7 @@ def choose_thickness(scales: F32, thinnest: float = math.inf) -> np.float32:
     return np.float32(min(scales.min(), np.float32(thinnest)) - np.float32(_FLAT_SCALE_STEP))
 
 
-def survey_arrays(arrays: SplatArrays, scale_count: int, statistics: RowStatistics) -> None:
+def survey_arrays(arrays: AttributeArrays, scale_count: int, statistics: RowStatistics) -> None:
     """Update the statistics with splats that are not rows of a PLY, leaving the arrays unchanged.
 
     Args:
@@ -150,7 +150,7 @@ def survey_arrays(arrays: SplatArrays, scale_count: int, statistics: RowStatisti
     for start in range(0, len(arrays.means), _SAMPLE_ROWS):
         part = _part(arrays, slice(start, start + _SAMPLE_ROWS))
         means, quats, scales = part.means.copy(), part.quats.copy(), part.scales.copy()
-        copy = SplatArrays(means, quats, scales, part.opacities.copy(), part.sh0.copy(), part.shN.copy())
+        copy = AttributeArrays(means, quats, scales, part.opacities.copy(), part.sh0.copy(), part.shN.copy())
         _repair(copy, columns, statistics, None)
 
 
@@ -272,9 +272,9 @@ def logits_of_alpha(alpha: F32) -> F32:
     return logits.astype(np.float32)
 
 
-def _allocate(count: int, dtype: np.dtype[Any], columns: ColumnMap, *, keep_extra: bool) -> SplatArrays:
+def _allocate(count: int, dtype: np.dtype[Any], columns: ColumnMap, *, keep_extra: bool) -> AttributeArrays:
     extra = columns.extra if keep_extra else ()
-    return SplatArrays(
+    return AttributeArrays(
         means=np.empty((count, 3), np.float64 if columns.double else np.float32),
         quats=np.empty((count, 4), np.float32),
         scales=np.empty((count, 3), np.float32),
@@ -285,8 +285,8 @@ def _allocate(count: int, dtype: np.dtype[Any], columns: ColumnMap, *, keep_extr
     )
 
 
-def _part(arrays: SplatArrays, rows: slice) -> SplatArrays:
-    return SplatArrays(
+def _part(arrays: AttributeArrays, rows: slice) -> AttributeArrays:
+    return AttributeArrays(
         arrays.means[rows],
         arrays.quats[rows],
         arrays.scales[rows],
@@ -297,7 +297,7 @@ def _part(arrays: SplatArrays, rows: slice) -> SplatArrays:
     )
 
 
-def _copy(rows: Rows, columns: ColumnMap, part: SplatArrays) -> None:
+def _copy(rows: Rows, columns: ColumnMap, part: AttributeArrays) -> None:
     """Copy all groups of columns of a block; opacities stay logits, rotations keep their lengths."""
     _copy_group(rows, columns.means, part.means)
     _copy_group(rows, columns.quats, part.quats)
@@ -343,7 +343,7 @@ def _count_nonzero_rows(rows: Rows, names: Sequence[str]) -> int:
     return int(np.count_nonzero(nonzero))
 
 
-def _repair(part: SplatArrays, columns: ColumnMap, statistics: RowStatistics, widths: F64 | None) -> int:
+def _repair(part: AttributeArrays, columns: ColumnMap, statistics: RowStatistics, widths: F64 | None) -> int:
     """Repair a block in place, moving the rows that are kept to the front; return their number.
 
     Args:

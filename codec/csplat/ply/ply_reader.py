@@ -26,9 +26,9 @@ from csplat.lint import Finding, refuse
 from csplat.model import SplatModel, check_sh_degree
 from csplat.ply.column_names import ColumnMap, find_columns
 from csplat.ply.columns import (
+    AttributeArrays,
     Rows,
     RowStatistics,
-    SplatArrays,
     gather_arrays,
     list_findings,
     with_colour_range,
@@ -326,7 +326,7 @@ def _doubles_finding(ply: _OpenPly, count: int, origin: tuple[float, float, floa
     return Finding("double-means", count, text, "note")
 
 
-def _build_model(arrays: SplatArrays, positions: _Positions, ply: _OpenPly) -> SplatModel:
+def _build_model(arrays: AttributeArrays, positions: _Positions, ply: _OpenPly) -> SplatModel:
     means, origin, doubles = positions
     return SplatModel(
         means=means,
