@@ -70,7 +70,7 @@ def glanced(monkeypatch):
         return seen["psnr"]
 
     monkeypatch.setattr("csplat_tools.cli.encode.estimate_psnr", glance)
-    monkeypatch.setattr("csplat_tools.cli.encode.seeming_up", lambda _model: None)
+    monkeypatch.setattr("csplat_tools.cli.encode.estimate_up", lambda _model: None)
     return seen
 
 

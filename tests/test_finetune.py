@@ -257,7 +257,7 @@ def test_a_step_moves_values_through_their_quantisers(coarse, views):
     rasteriser, view = Rasteriser(), views.train[0]
     seen, alphas = scene.seen()
     splats = SplatArrays(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
-    wanted = view.picture(BLACK, np.empty((H, W, 3), np.float32))
+    wanted = view.image(BLACK, np.empty((H, W, 3), np.float32))
     _, slope = PhotometricLoss(H, W)(rasteriser.forward(splats, view.camera, background=BLACK).rgb, wanted)
     rates = {"means": 0.0, "quats": 1e-4, "scales": 1e-4, "sizes": 0.0, "logits": 1e-4, "sh0": 1e-4, "shN": 1e-4}
     scene.step(rasteriser.backward(slope), seen, alphas, rates, None)
@@ -512,7 +512,7 @@ def test_renders_that_teach_are_those_of_the_source(source):
         camera = cameras(1)[0]
         wanted = render(model, camera, background=BLACK).rgb
         view = renders_of(model, [camera], BLACK, None)[0]
-        found = view.picture(BLACK, np.empty((H, W, 3), np.float32))
+        found = view.image(BLACK, np.empty((H, W, 3), np.float32))
         assert np.allclose(found, np.clip(wanted, -6e4, 6e4), rtol=6e-4, atol=1e-6)
     with pytest.raises(InputError, match="wanted picture has shape"):
         TuningView(camera, np.zeros((1, 1, 3), np.float32))
@@ -913,7 +913,7 @@ def test_a_trained_scene_loses_less_when_tuned(data_dir):
     def score(scene):
         error = []
         for view in judges:
-            wanted = view.picture(white, np.empty((64, 64, 3), np.float32))
+            wanted = view.image(white, np.empty((64, 64, 3), np.float32))
             picture = np.clip(render(scene, view.camera, background=white).rgb, 0, 1)
             error.append(np.square(picture - wanted).mean())
         return -10.0 * math.log10(float(np.mean(error)))
