@@ -212,19 +212,19 @@ class AnalyticScene:
 
     # by trying everything
 
-    def smallest(self, psnr: float, views: Views = DECIDING, *, keep_all: bool = False) -> float:
+    def smallest(self, psnr: float, views: Views = DECIDING, *, no_prune: bool = False) -> float:
         """Return the size of the smallest file of a PSNR; infinite if there is none."""
-        sizes = [np.where(psnr_of(e) >= psnr, s, np.inf).min() for s, e in self._files(views, keep_all=keep_all)]
+        sizes = [np.where(psnr_of(e) >= psnr, s, np.inf).min() for s, e in self._files(views, no_prune=no_prune)]
         return float(min(sizes))
 
-    def best(self, size_bytes: int, views: Views = DECIDING, *, keep_all: bool = False) -> float:
+    def best(self, size_bytes: int, views: Views = DECIDING, *, no_prune: bool = False) -> float:
         """Return the PSNR of the best file of a size; negative infinity if there is none."""
-        found = [np.where(s <= size_bytes, psnr_of(e), -np.inf).max() for s, e in self._files(views, keep_all=keep_all)]
+        found = [np.where(s <= size_bytes, psnr_of(e), -np.inf).max() for s, e in self._files(views, no_prune=no_prune)]
         return float(max(found))
 
-    def _files(self, views: Views, *, keep_all: bool) -> Iterator[tuple[Any, Any]]:
+    def _files(self, views: Views, *, no_prune: bool) -> Iterator[tuple[Any, Any]]:
         """Yield sizes and errors of all qualities, for every number of splats, coding and degree."""
-        shares = [1.0] if keep_all else np.arange(0.1, 1.001, 0.1)
+        shares = [1.0] if no_prune else np.arange(0.1, 1.001, 0.1)
         for share, coding in itertools.product(shares, ("scalar", "codebook", "none")):
             splats = round(share * self.splats)
             degrees = (0,) if coding == "none" else range(1, self.sh_degree + 1)

@@ -41,7 +41,7 @@ def search(
     scene: AnalyticScene,
     *,
     options: EncodeOptions | None = None,
-    keep_all: bool = False,
+    no_prune: bool = False,
     judging: Views | None = None,
     photo_psnr: float | None = None,
     grades: bool = False,
@@ -54,7 +54,7 @@ def search(
     Args:
         scene: the scene.
         options: knobs of the encoder that the caller fixed.
-        keep_all: no splat may be removed.
+        no_prune: no splat may be removed.
         judging: the test views; by default they see the same as the validation views.
         photo_psnr: PSNR of the source against photographs, dB; photographs decide a loss.
         grades: splats may be sorted by importance.
@@ -63,10 +63,10 @@ def search(
         target: arguments of `Target`.
     """
     encoding, model, asked = options or EncodeOptions(), scene.model(), Target(**target)
-    judge, decider = _Judge(scene, judging or Views()), _Judge(scene, Views())
+    judge, validation_scorer = _Judge(scene, judging or Views()), _Judge(scene, Views())
     photographs = None if photo_psnr is None else _Judge(scene, Views(photo_psnr=photo_psnr))
-    trials = CandidatePool(encoding, judge, decider, photographs, decode=lambda data: data)
-    removal = None if keep_all else analytic_removal(scene, grades=grades, effort=effort)
+    trials = CandidatePool(encoding, judge, validation_scorer, photographs, decode=lambda data: data)
+    removal = None if no_prune else analytic_removal(scene, grades=grades, effort=effort)
     whole = _Splats(scene, model, refits=False, gradable=grades)
     goal = find_goal(asked, model, photographs)
     moves = TargetSearch(PrecisionSearch(trials, goal), CodingSearch(model, encoding, grades), whole, removal)

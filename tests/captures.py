@@ -116,14 +116,14 @@ def crowded():
 def around(source, count=24):
     """Return small virtual views of a scene."""
     views = find_view_set(source, count=count, size=SMALL)
-    judges, decides = ([resized(camera, 48, 36) for camera in part] for part in (views.judges, views.decides))
-    return replace(views, judges=judges, decides=decides)
+    test, validation = ([resized(camera, 48, 36) for camera in part] for part in (views.test, views.validation))
+    return replace(views, test=test, validation=validation)
 
 
 def judged_by(seen_from):
     """Return views of which every fourth judges, and the others teach."""
-    teaches = [camera for number, camera in enumerate(seen_from) if number % 4]
-    return ViewSet("cameras", BLACK, teaches, (), seen_from[::4])
+    training = [camera for number, camera in enumerate(seen_from) if number % 4]
+    return ViewSet("cameras", BLACK, training, (), seen_from[::4])
 
 
 def photographed(scene):
@@ -132,15 +132,15 @@ def photographed(scene):
     rng, draw = np.random.default_rng(1), renderer(scene, BLACK)
     noisy = [np.clip(draw(c).rgb + 0.06 * rng.standard_normal((c.H, c.W, 3)), 0, 1) for c in seen_from]
     pictures = [PosedImage(c, np.rint(255.0 * p).astype(np.uint8)) for c, p in zip(seen_from, noisy, strict=True)]
-    teaches = [camera for number, camera in enumerate(seen_from) if number % 8]
-    return ViewSet("made", BLACK, teaches, (), seen_from[::8], pictures)
+    training = [camera for number, camera in enumerate(seen_from) if number % 8]
+    return ViewSet("made", BLACK, training, (), seen_from[::8], pictures)
 
 
-def found_within(source, views=None, encoding=None, *, keep_all=False, importance=None, refit=True, **goal):
+def found_within(source, views=None, encoding=None, *, no_prune=False, importance=None, refit=True, **goal):
     """Return the file on a target, by a brief search in small views: those of forty cameras unless others are given."""
     views = views or judged_by(cameras(40))
     # Fits of larger pictures take fewer steps; these are small all the same, unless virtual ones are to be added.
     size = SMALL if views.virtual else (960, 720)
     simplifying = SimplifyOptions(effort=1, rounds=2, view_size=size, refit=refit)
-    chosen = {"keep_all": keep_all, "importance": importance, "simplifying": simplifying}
+    chosen = {"no_prune": no_prune, "importance": importance, "simplifying": simplifying}
     return encode_to(source, views=views, options=encoding, **chosen, **goal)

@@ -187,7 +187,7 @@ def search_at_size(once):
 @pytest.fixture(scope="session")
 def search_at_loss(once):
     """The smallest file of `captures.crowded()` that loses 0.5 dB against photographs of it: `Optimised`."""
-    return _searched(once, "loss", loss=0.5)
+    return _searched(once, "loss", max_psnr_drop=0.5)
 
 
 def _searched(once, name: str, **goal: float):

@@ -30,6 +30,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_tools.__main__ import main
 from csplat_tools.cli.app import app
+from csplat_tools.cli.command import RENAMED_OPTIONS
 from csplat_tools.cli.encode import encode as encode_command
 from csplat_tools.file_streams import check_output, write_bytes
 
@@ -278,6 +279,15 @@ def test_knobs_reach_the_encoder(tmp_path, ply):
     }
     assert report["tiles"] >= 4
     assert decode((tmp_path / "out.csplat").read_bytes()).sh_degree == 1
+
+
+def test_old_names_of_options_are_refused_with_the_new_ones(tmp_path, ply):
+    words = {"--keep-all": ("encode",), "--max-loss": ("simplify", "1"), "--aside": ("finetune", "3")}
+    assert RENAMED_OPTIONS.keys() == words.keys()
+    for old, (name, *value) in words.items():
+        line = refused(name, ply, tmp_path / "out", old, *value, status=2)
+        assert line.startswith(f"error: csplat {name}: {old} is called {RENAMED_OPTIONS[old]} now; ")
+        assert RENAMED_OPTIONS[old] in call(name, "--help-all")
 
 
 @pytest.mark.parametrize(

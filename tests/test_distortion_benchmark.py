@@ -204,13 +204,13 @@ def test_what_was_measured_is_not_measured_again(tmp_path):
 def test_an_ablation_takes_away_one_part_at_a_time_and_puts_it_back(tmp_path, monkeypatch, capsys):
     parts = []
 
-    def encode_to(source, *, psnr, options, keep_all, simplifying):
+    def encode_to(source, *, psnr, options, no_prune, simplifying):
         tunes = (
             subsets.quantisation_aware_refit is splat_refit.quantisation_aware_refit
             and target_search.TUNING_GAINS > 0.0
         )
         prices = math.isfinite(splat_refit.rate_exponent(0.05))
-        has = (tunes, prices, options.grades != 1, simplifying.bands, simplifying.refit, not keep_all)
+        has = (tunes, prices, options.grades != 1, simplifying.bands, simplifying.refit, not no_prune)
         parts.append(has)
         report = SearchReport({"psnr": psnr}, 1000, 9, len(source), 3, 1.0, chosen={"psnr": psnr, "splats": 9})
         return SimpleNamespace(data=bytes(1000 + 100 * has.count(False)), report=report)
@@ -238,7 +238,7 @@ def test_measures_whole_and_simplified_files_beside_a_peer_and_goes_on_where_it_
     searches = []
 
     def encode_to(source, *, psnr, views):
-        searches.append((psnr, len(views.teaches), len(views.judges)))
+        searches.append((psnr, len(views.training), len(views.test)))
         return Optimised(None, SearchReport({"psnr": psnr}, 30_000, 900, len(source), 7, 5.0, chosen=chosen))
 
     monkeypatch.setattr(distortion, "encode_to", encode_to)

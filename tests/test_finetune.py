@@ -802,7 +802,7 @@ def test_defects_can_be_refused(capture, source, tmp_path):
 @pytest.mark.slow
 def test_without_held_out_photographs_nothing_is_scored(capture, tmp_path):
     words = ("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "s.csplat", *BRIEF)
-    facts = json.loads(call(*words, "--test-every", 0, "--aside", 2, "--json", "-q").stdout)
+    facts = json.loads(call(*words, "--test-every", 0, "--validation-count", 2, "--json", "-q").stdout)
     assert ({}, None) == (facts["scores"], facts["judged_by"])
     assert (True, 2) == (facts["validation"]["kept_aside"], facts["validation"]["views"])
     assert "photographs" not in call(*words, "--test-every", 0, "--force").stderr
@@ -908,12 +908,12 @@ def test_a_trained_scene_loses_less_when_tuned(data_dir):
     views = split_views([TuningView(picture.camera, picture) for picture in data.train], white)
     frozen = fix_quantisation(EncodePlan.of(model, EncodeOptions(preset="small", attribute_psnr=34.0)))
     tuned = tune(frozen, views, FinetuneOptions(iterations=400))
-    judges = [TuningView(one.camera, one) for one in data.test[::10]]
+    held_out = [TuningView(one.camera, one) for one in data.test[::10]]
 
     def score(scene):
         error = []
-        for view in judges:
-            wanted = view.image(white, np.empty((64, 64, 3), np.float32))
+        for view in held_out:
+            wanted = view.picture(white, np.empty((64, 64, 3), np.float32))
             picture = np.clip(render(scene, view.camera, background=white).rgb, 0, 1)
             error.append(np.square(picture - wanted).mean())
         return -10.0 * math.log10(float(np.mean(error)))

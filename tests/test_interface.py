@@ -264,9 +264,13 @@ class Called(Exception):  # noqa: N818  # no error: it ends a command where the 
     ("words", "name", "given"),
     [
         (["encode", "scene.ply", "o", "--max-error", "means=0.01"], "encode_to", {"errors": {"means": 0.01}}),
-        (["encode", "scene.ply", "o", "--target-psnr", "40"], "encode_to", {"psnr": 40.0, "keep_all": False}),
-        (["encode", "scene.ply", "o", "--target-size", "5kB", "--keep-all"], "encode_to", {"size": 5000}),
-        (["simplify", "scene.ply", "o", "--keep", "0.5"], "simplify", {"keep": 0.5, "psnr": None, "loss": None}),
+        (["encode", "scene.ply", "o", "--target-psnr", "40"], "encode_to", {"psnr": 40.0, "no_prune": False}),
+        (["encode", "scene.ply", "o", "--target-size", "5kB", "--no-prune"], "encode_to", {"size": 5000}),
+        (
+            ["simplify", "scene.ply", "o", "--keep", "0.5"],
+            "simplify",
+            {"keep": 0.5, "psnr": None, "max_psnr_drop": None},
+        ),
         (["compare", "scene.ply", "scene.csplat", "--mode", "fast"], "compare", {"mode": "fast"}),
         (["tradeoff", "scene.ply", "--what", "presets"], "tradeoff", {"say": None}),
     ],

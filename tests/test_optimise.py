@@ -158,8 +158,10 @@ def test_a_psnr_is_reached_by_fewer_splats_and_the_file_says_what_it_is(many, se
     found, views = search_at_psnr, with_validation_views(judged_by(cameras(40)))
     decoded = decode_scene(found.data)
     assert 30.0 <= found.report.psnr <= 31.0  # files of so few splats jump
-    assert found.report.psnr == pytest.approx(views.judge(many).psnr(decoded.model), abs=1e-4)
-    assert found.report.chosen["decided_psnr"] == pytest.approx(views.decider(many).psnr(decoded.model), abs=1e-3)
+    assert found.report.psnr == pytest.approx(views.test_scorer(many).psnr(decoded.model), abs=1e-4)
+    assert found.report.chosen["decided_psnr"] == pytest.approx(
+        views.validation_scorer(many).psnr(decoded.model), abs=1e-3
+    )
     assert (len(found.data), len(decoded.model)) == (found.report.size_bytes, found.report.splats)
     assert found.report.splats < 600
     assert 900 == found.result.report.options["simplified"]["splats"] == decoded.declared_bounds.source_count
@@ -190,11 +192,11 @@ def test_a_size_that_starves_all_splats_is_met_by_fewer(search_at_size):
 @pytest.mark.slow
 def test_a_loss_against_photographs_lets_splats_go(many, photographs, search_at_loss):
     decoded, scores = decode(search_at_loss.data), search_at_loss.report.photographs
-    decider = with_validation_views(photographs).photograph_decider()
+    scorer = with_validation_views(photographs).photograph_validation_scorer()
     assert scores["source"] < 28.0
-    assert scores["file"] == pytest.approx(photographs.photograph_judge().psnr(decoded))
+    assert scores["file"] == pytest.approx(photographs.photograph_test_scorer().psnr(decoded))
     assert scores["file"] >= scores["source"] - 1.0  # other photographs decided:
-    assert decider.psnr(many) - 0.5 <= decider.psnr(decoded) <= decider.psnr(many) - 0.3
+    assert scorer.psnr(many) - 0.5 <= scorer.psnr(decoded) <= scorer.psnr(many) - 0.3
     assert search_at_loss.report.splats < 900
 
 
@@ -258,7 +260,7 @@ def test_extreme_scenes_meet_a_psnr(name, views):
     source = extremes.scene(name)[0]
     find, views = (found_within, around(source)) if views is None else (search, views)
     found = find(source, views, psnr=17.0)
-    assert views.judge(source).psnr(decode(found.data)) >= 17.0
+    assert views.test_scorer(source).psnr(decode(found.data)) >= 17.0
     assert len(decode(found.data)) >= 1
 
 
@@ -297,7 +299,7 @@ def test_shapes_are_clustered_by_what_the_views_say_of_them(kept):
 
 @pytest.mark.slow
 def test_what_is_left_is_fitted_to_what_the_source_looks_like(kept, alike):
-    bare = Scorer.of_source(alike, judged_by(cameras(40)).judges, BLACK).psnr(alike.select(kept.result.source_index))
+    bare = Scorer.of_source(alike, judged_by(cameras(40)).test, BLACK).psnr(alike.select(kept.result.source_index))
     assert kept.report.psnr > bare + 3.0
 
 
@@ -308,7 +310,7 @@ def test_fitting_to_the_quantised_geometry_mends_it(scene):
     bare, views = replace(scene, shN=scene.shN[:, :0]), with_validation_views(judged_by(cameras(40)))
     how = replace(SMALL, effort=3, view_size=(960, 720))
     removal = Pruner(bare, views, how, grades=False, progress=None, psnr=None, left=300)
-    part, judge = removal.fitted(300, None, views.decider(bare).psnr), views.judge(bare)
+    part, judge = removal.fitted(300, None, views.validation_scorer(bare).psnr), views.test_scorer(bare)
     quick, fitted = (part.coded(coarse, graded=False, quick=quick).write().data for quick in (True, False))
     assert judge.psnr(decode(fitted)) > judge.psnr(decode(quick)) + 0.2
 
@@ -334,12 +336,17 @@ def test_two_fits_say_how_fast_errors_grow():
 def test_no_view_that_judges_decides_or_teaches(many, photographs, kind):
     given = {"virtual": around(many), "cameras": judged_by(cameras(40)), "photographs": photographs}[kind]
     views = with_validation_views(given)
-    deciders = [views.decider(many)] + ([views.photograph_decider()] if kind == "photographs" else [])
-    judges, decides = poses(views.judge(many).cameras), set.union(*(poses(one.cameras) for one in deciders))
-    assert judges == poses(given.judges)
-    assert decides
-    assert not judges & decides
-    assert not (judges | decides) & poses(views.teaches)
+    validation_scorers = [views.validation_scorer(many)] + (
+        [views.photograph_validation_scorer()] if kind == "photographs" else []
+    )
+    test, validation = (
+        poses(views.test_scorer(many).cameras),
+        set.union(*(poses(one.cameras) for one in validation_scorers)),
+    )
+    assert test == poses(given.test)
+    assert validation
+    assert not test & validation
+    assert not (test | validation) & poses(views.training)
 
 
 def poses(seen_from):
@@ -350,12 +357,12 @@ def test_cameras_that_see_nothing_are_refused(scene):
     K = intrinsics(48, 40, 60.0)
     away = look_at((40.0, 0.0, 0.0), (80.0, 0.0, 0.0), (0, 0, 1), K, 48, 40)
     with pytest.raises(InputError, match="cameras of this scene"):
-        search(scene, replace(views_of(cameras(12)), judges=[away]), psnr=30.0)
+        search(scene, replace(views_of(cameras(12)), test=[away]), psnr=30.0)
 
 
 def test_a_loss_wants_photographs(scene):
     with pytest.raises(InputError, match="wants photographs"):
-        search(scene, loss=0.5)
+        search(scene, max_psnr_drop=0.5)
 
 
 def test_knobs_that_contradict_a_target_are_refused(scene):
@@ -365,7 +372,7 @@ def test_knobs_that_contradict_a_target_are_refused(scene):
     with pytest.raises(InputError, match="what a target chooses"):
         search(scene, views, EncodeOptions(attribute_psnr=40.0), psnr=30.0)
     with pytest.raises(InputError, match="one of the two"):
-        search(scene, views, keep=0.5, keep_all=True)
+        search(scene, views, keep=0.5, no_prune=True)
 
 
 # surroundings
@@ -383,11 +390,11 @@ def surroundings():
 @pytest.mark.slow
 def test_inside_of_surroundings_placed_views_measure_nothing_and_the_report_warns(surroundings):
     views = replace(judged_by(cameras(40)), virtual=True)
-    views = replace(views, teaches=[resized(camera, 24, 20) for camera in views.teaches])
+    views = replace(views, training=[resized(camera, 24, 20) for camera in views.training])
     fewer = search(surroundings, views, keep=0.8, refit=False).report
     assert "cameras inside of surroundings" in fewer.why[-1]
-    assert "--keep-all" in fewer.why[-1]
-    kept = search(surroundings, views, psnr=22.0, keep_all=True).report
+    assert "--no-prune" in fewer.why[-1]
+    kept = search(surroundings, views, psnr=22.0, no_prune=True).report
     assert (100, 0, 0) == (kept.splats, kept.removal_views, kept.sensitivity_views)
     assert not any("surroundings" in line for line in kept.why)
 
@@ -434,7 +441,7 @@ def test_what_was_measured_grades_splats_and_makes_files_smaller_at_the_same_psn
 def test_a_search_grades_by_what_it_measured_beside_an_importance_that_is_given(unequal):
     few = unequal.select(np.arange(5000))
     weights = np.linspace(1.0, 2.0, len(few))
-    report = search(few, None, None, psnr=34.0, keep_all=True, importance=weights).report
+    report = search(few, None, None, psnr=34.0, no_prune=True, importance=weights).report
     assert {1, 2} == {one["grades"] for one in report.tried}
     assert 26 == report.sensitivity_views
 
@@ -450,7 +457,7 @@ def test_sensitivity_is_measured_where_it_changes_something(scene, unequal, meas
         found, count = complete_importance(source, views, options, importance, inside=inside)
         return found is not None, count
 
-    taught = len(views.teaches)
+    taught = len(views.training)
     assert {
         "SH": (True, taught), "small, without SH": (False, 0), "SH that is left out": (False, 0),
         "preset fast": (False, 0), "inside": (False, 0), "curvatures": (True, 0), "curvatures inside": (True, 0),
@@ -475,12 +482,12 @@ def test_sensitivity_is_measured_where_it_changes_something(scene, unequal, meas
 
 def test_time_is_foretold_by_pictures_and_less_where_all_stay():
     target, options = Target(psnr=30.0), EncodeOptions()
-    assert (520.0, 3000.0) == tuple(expected_renders(options, target, keep_all=keep) for keep in (True, False))
+    assert (520.0, 3000.0) == tuple(expected_renders(options, target, no_prune=keep) for keep in (True, False))
     fast, extra = EncodeOptions(preset="fast"), EncodeOptions(keep_extra=True)
-    assert [520.0, 520.0] == [expected_renders(one, target, keep_all=False) for one in (fast, extra)]
-    assert 520.0 == expected_renders(options, Target(psnr=30.0, max_error={"means": 1.0}), keep_all=False)
-    assert 3000.0 == expected_renders(fast, Target(keep=0.5), keep_all=False)
-    assert 1200.0 == expected_renders(options, target, keep_all=False, simplifying=SimplifyOptions(effort=1))
+    assert [520.0, 520.0] == [expected_renders(one, target, no_prune=False) for one in (fast, extra)]
+    assert 520.0 == expected_renders(options, Target(psnr=30.0, max_error={"means": 1.0}), no_prune=False)
+    assert 3000.0 == expected_renders(fast, Target(keep=0.5), no_prune=False)
+    assert 1200.0 == expected_renders(options, target, no_prune=False, simplifying=SimplifyOptions(effort=1))
 
 
 def test_seconds_of_a_picture_are_measured_without_the_first(scene):

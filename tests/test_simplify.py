@@ -103,7 +103,7 @@ def test_cameras_of_the_user_are_made_smaller_and_every_eighth_is_kept_aside(sou
     assert {(camera.W, camera.H) for camera in small} == {(59, 29)}
     assert small[0].K[0, 0] == pytest.approx(own[0].K[0, 0] * 59 / 200)
     views = views_of(own)
-    assert (len(views.teaches), len(views.decides)) == (15, 2)
+    assert (len(views.training), len(views.validation)) == (15, 2)
     with pytest.raises(InputError, match="2 at least"):
         find_sufficient_views(source, views_of(own[:1]), 0.3)
 
@@ -221,7 +221,7 @@ def test_transparent_and_opaque_splats_stay_within_alpha(source):
 def test_a_target_psnr_is_reached(source, given, goal, refit):
     result = simplify(source, psnr=goal, views=given, options=replace(SMALL, bands=False, refit=refit))
     assert result.report["decided_psnr"] >= goal
-    assert given.decider(source).psnr(result.model) == pytest.approx(result.report["decided_psnr"])
+    assert given.validation_scorer(source).psnr(result.model) == pytest.approx(result.report["decided_psnr"])
     assert len(result.model) < len(source)
 
 
@@ -232,10 +232,10 @@ def test_more_loss_lets_more_splats_go(source):
     noisy = [np.clip(p + 0.05 * rng.standard_normal(p.shape), 0, 1) for p in render_pictures(source, cameras)]
     pictures = [PosedImage(c, np.rint(255.0 * p).astype(np.uint8)) for c, p in zip(cameras, noisy, strict=True)]
     views = views_of(cameras, pictures)
-    judge = photograph_scorer(views.pictures(views.decides), views.background)
+    judge = photograph_scorer(views.pictures(views.validation), views.background)
     sizes = []
     for loss in (0.05, 1.0):
-        result = simplify(source, loss=loss, views=views, options=replace(SMALL, bands=False, refit=False))
+        result = simplify(source, max_psnr_drop=loss, views=views, options=replace(SMALL, bands=False, refit=False))
         assert judge.psnr(result.model) >= judge.psnr(source) - loss
         sizes.append(len(result.model))
     assert sizes[0] > sizes[1]
@@ -243,7 +243,7 @@ def test_more_loss_lets_more_splats_go(source):
 
 def test_a_loss_wants_photographs(source):
     with pytest.raises(InputError, match="name a data set"):
-        simplify(source, loss=0.3, options=SMALL)
+        simplify(source, max_psnr_drop=0.3, options=SMALL)
 
 
 def test_nothing_changes_where_everything_stays(source, given):
@@ -393,7 +393,9 @@ def test_outputs_of_one_place_and_inputs_as_outputs_are_refused(source, tmp_path
     assert {scene, cameras} == set(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("words", [(), ("--keep", "0.5", "--target-psnr", "40"), ("--keep", "2"), ("--max-loss", "x")])
+@pytest.mark.parametrize(
+    "words", [(), ("--keep", "0.5", "--target-psnr", "40"), ("--keep", "2"), ("--max-psnr-drop", "x")]
+)
 def test_a_wrong_target_is_a_wrong_command_line(source, tmp_path, words):
     write_ply(tmp_path / "scene.ply", source)
     assert invoke("simplify", tmp_path / "scene.ply", tmp_path / "out.ply", *words).exit_code == 2

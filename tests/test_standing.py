@@ -58,7 +58,7 @@ def test_pictures_to_look_at_stand_upright_and_the_judges_stay():
     for camera in [*orbit_cameras(model, 4, 64, 48), *display_cameras(model, views)]:
         assert abs(camera.viewmat[0, 1]) < 1e-6
         assert camera.viewmat[1, 1] < 0.0  # down the picture
-    assert all(camera.viewmat[1, 1] > 0.0 for camera in views.judges)  # as in a PLY
+    assert all(camera.viewmat[1, 1] > 0.0 for camera in views.test)  # as in a PLY
 
 
 def test_a_file_says_no_more_than_its_source():

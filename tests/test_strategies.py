@@ -289,7 +289,7 @@ def test_a_distilled_degree_looks_more_like_the_source(shell):
     assert scene.declared_bounds.refitted
     said = scene.options["reduced"]
     assert ("distilled", 21) == (said["sh"], said["views"])
-    judge = Scorer.of_source(shell, views.decides, (0.0, 0.0, 0.0))
+    judge = Scorer.of_source(shell, views.validation, (0.0, 0.0, 0.0))
     before, after = (judge.psnr(decode(one.data)) for one in (truncated, distilled))
     assert said["check_psnr"] == pytest.approx(after, abs=0.5)
     assert after > before + 1.0

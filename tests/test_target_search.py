@@ -39,14 +39,14 @@ WORSE = (2.2, 5.0)  # dB less than the best file that there is, with all splats 
 
 
 @cache
-def found_in(name, *, keep_all, **target):
+def found_in(name, *, no_prune, **target):
     """Return what is found in one of the scenes."""
-    return search(SCENES[name], keep_all=keep_all, **target)
+    return search(SCENES[name], no_prune=no_prune, **target)
 
 
 def failures(check, names=tuple(SCENES)):
     """Return what is wrong, by scene and with all splats or fewer; a check returns a text, empty if all is well."""
-    cases = [(name, keep_all) for name in names for keep_all in (True, False)]
+    cases = [(name, no_prune) for name in names for no_prune in (True, False)]
     texts = {case: check(*case) for case in cases}
     return {case: text for case, text in texts.items() if text}
 
@@ -57,8 +57,8 @@ def failures(check, names=tuple(SCENES)):
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [30.0, 38.0])
 def test_a_psnr_is_reached_and_hardly_exceeded(goal):
-    def check(name, keep_all):
-        above = found_in(name, keep_all=keep_all, psnr=goal).file.psnr() - goal
+    def check(name, no_prune):
+        above = found_in(name, no_prune=no_prune, psnr=goal).file.psnr() - goal
         return "" if 0.0 <= above <= 0.25 + SCENES[name].jump else f"{above:.2f} dB above"
 
     assert {} == failures(check)
@@ -67,9 +67,9 @@ def test_a_psnr_is_reached_and_hardly_exceeded(goal):
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [30.0, 38.0])
 def test_the_file_of_a_psnr_is_hardly_larger_than_the_smallest_that_there_is(goal):
-    def check(name, keep_all):
-        size = len(found_in(name, keep_all=keep_all, psnr=goal).file)
-        larger = size / SCENES[name].smallest(goal, keep_all=keep_all)
+    def check(name, no_prune):
+        size = len(found_in(name, no_prune=no_prune, psnr=goal).file)
+        larger = size / SCENES[name].smallest(goal, no_prune=no_prune)
         return "" if larger <= LARGER else f"{larger:.3f} times as large"
 
     assert {} == failures(check)
@@ -78,8 +78,8 @@ def test_the_file_of_a_psnr_is_hardly_larger_than_the_smallest_that_there_is(goa
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [{"psnr": 38.0}, {"size_bytes": 90_000}])
 def test_a_search_ends_after_few_tries_and_makes_no_file_twice(goal):
-    def check(name, keep_all):
-        found = found_in(name, keep_all=keep_all, **goal)
+    def check(name, no_prune):
+        found = found_in(name, no_prune=no_prune, **goal)
         if len({repr(file.contents) for file in found.tried}) < len(found.tried):
             return "a file was made twice"
         return "" if len(found.tried) <= MOST_TRIES else f"{len(found.tried)} files"
@@ -87,44 +87,44 @@ def test_a_search_ends_after_few_tries_and_makes_no_file_twice(goal):
     assert {} == failures(check)
 
 
-@pytest.mark.parametrize("keep_all", [True, False])
+@pytest.mark.parametrize("no_prune", [True, False])
 @pytest.mark.parametrize("ceiling", [36.0, 97.0])
-def test_a_psnr_that_no_precision_reaches_is_refused_after_few_tries(ceiling, keep_all):
+def test_a_psnr_that_no_precision_reaches_is_refused_after_few_tries(ceiling, no_prune):
     tried = []
     with pytest.raises(InputError, match=r"no file reaches 98.00 dB; the best of those tried has"):
-        search(replace(PLAIN, ceiling=ceiling), psnr=98.0, keep_all=keep_all, tried=tried)
+        search(replace(PLAIN, ceiling=ceiling), psnr=98.0, no_prune=no_prune, tried=tried)
     assert 0 < len(tried) <= MOST_TRIES
 
 
 def test_a_psnr_just_above_what_precision_reaches_is_refused_after_few_tries():
     tried = []
     with pytest.raises(InputError, match=r"no file reaches 38.00 dB; the best of those tried has 36"):
-        search(replace(PLAIN, ceiling=36.0), psnr=38.0, keep_all=True, tried=tried)
+        search(replace(PLAIN, ceiling=36.0), psnr=38.0, no_prune=True, tried=tried)
     assert 0 < len(tried) <= MOST_TRIES
 
 
-@pytest.mark.parametrize("keep_all", [True, False])
-def test_a_psnr_below_all_files_is_exceeded_and_the_report_says_so(keep_all):
-    found = search(PLAIN, psnr=2.0, keep_all=keep_all)
-    assert len(found.file) <= PLAIN.smallest(2.0, keep_all=True)
+@pytest.mark.parametrize("no_prune", [True, False])
+def test_a_psnr_below_all_files_is_exceeded_and_the_report_says_so(no_prune):
+    found = search(PLAIN, psnr=2.0, no_prune=no_prune)
+    assert len(found.file) <= PLAIN.smallest(2.0, no_prune=True)
     assert any("no smaller file of those tried reaches the target" in line for line in found.report.why)
 
 
 def test_a_psnr_that_is_reached_exactly_is_not_said_to_be_exceeded():
-    assert not any("no smaller file" in line for line in found_in("plain", keep_all=True, psnr=38.0).report.why)
+    assert not any("no smaller file" in line for line in found_in("plain", no_prune=True, psnr=38.0).report.why)
 
 
 def test_a_plateau_is_crossed():
     """Between 42 and 55 dB of quality more bytes gain nothing."""
     scene = replace(WITHOUT_SH, plateau=(42.0, 55.0))
-    found = search(scene, psnr=34.0, keep_all=True)
+    found = search(scene, psnr=34.0, no_prune=True)
     assert 34.0 <= found.file.psnr() <= 34.3
-    assert len(found.file) <= LARGER * scene.smallest(34.0, keep_all=True)
+    assert len(found.file) <= LARGER * scene.smallest(34.0, no_prune=True)
 
 
 def test_no_file_that_was_judged_reaches_a_psnr_with_fewer_bytes():
-    def check(name, keep_all):
-        found = found_in(name, keep_all=keep_all, psnr=38.0)
+    def check(name, no_prune):
+        found = found_in(name, no_prune=no_prune, psnr=38.0)
         packed = [file for file in found.judged if file.contents.options.deflate_level is None]
         smallest = min(len(file) for file in packed if file.psnr() >= 38.0)
         return "" if len(found.file) == smallest else f"{len(found.file)} bytes, one has {smallest}"
@@ -134,15 +134,15 @@ def test_no_file_that_was_judged_reaches_a_psnr_with_fewer_bytes():
 
 def test_where_files_jump_a_smaller_one_beside_is_found():
     scene = replace(NO_CODEBOOK, jump=1.5)
-    found = search(scene, psnr=35.1, keep_all=True)
+    found = search(scene, psnr=35.1, no_prune=True)
     assert found.file.psnr() >= 35.1
-    assert len(found.file) <= 1.08 * scene.smallest(35.1, keep_all=True)
+    assert len(found.file) <= 1.08 * scene.smallest(35.1, no_prune=True)
 
 
 def test_what_is_packed_loosely_for_speed_is_not_written():
     """Even if it is smaller: here tighter packing makes files larger."""
     for scene in (NO_CODEBOOK, WITHOUT_SH):
-        found = search(replace(scene, packing=0.97), psnr=38.0, keep_all=True)
+        found = search(replace(scene, packing=0.97), psnr=38.0, no_prune=True)
         assert found.file.contents.options.deflate_level is None
 
 
@@ -152,8 +152,8 @@ def test_what_is_packed_loosely_for_speed_is_not_written():
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [60_000, 90_000])
 def test_a_size_is_filled_and_not_exceeded(goal):
-    def check(name, keep_all):
-        filled = len(found_in(name, keep_all=keep_all, size_bytes=goal).file) / goal
+    def check(name, no_prune):
+        filled = len(found_in(name, no_prune=no_prune, size_bytes=goal).file) / goal
         return "" if 0.95 <= filled <= 1.0 else f"{filled:.3f} of the size"
 
     assert {} == failures(check)
@@ -161,10 +161,10 @@ def test_a_size_is_filled_and_not_exceeded(goal):
 
 @pytest.mark.slow
 def test_the_file_of_a_size_is_hardly_worse_than_the_best_that_there_is():
-    def check(name, keep_all):
-        found = found_in(name, keep_all=keep_all, size_bytes=90_000)
-        less = SCENES[name].best(90_000, keep_all=keep_all) - found.file.psnr()
-        return "" if less <= WORSE[not keep_all] else f"{less:.2f} dB less"
+    def check(name, no_prune):
+        found = found_in(name, no_prune=no_prune, size_bytes=90_000)
+        less = SCENES[name].best(90_000, no_prune=no_prune) - found.file.psnr()
+        return "" if less <= WORSE[not no_prune] else f"{less:.2f} dB less"
 
     assert {} == failures(check)
 
@@ -172,7 +172,7 @@ def test_the_file_of_a_size_is_hardly_worse_than_the_best_that_there_is():
 def test_of_a_size_fewer_splats_are_chosen_where_they_look_better():
     better = {}
     for name in ("plain", "without SH", "many unneeded splats", "no splat to spare"):
-        fewer, all_stay = (found_in(name, keep_all=keep_all, size_bytes=90_000).file for keep_all in (False, True))
+        fewer, all_stay = (found_in(name, no_prune=no_prune, size_bytes=90_000).file for no_prune in (False, True))
         better[name] = round(fewer.psnr() - all_stay.psnr(), 2)
     assert better.pop("no splat to spare") > -0.6
     assert better.pop("many unneeded splats") > 5.0
@@ -180,22 +180,22 @@ def test_of_a_size_fewer_splats_are_chosen_where_they_look_better():
 
 
 def test_more_bytes_are_better_pictures():
-    psnrs = [found_in("plain", keep_all=True, size_bytes=size).file.psnr() for size in (60_000, 90_000, 140_000)]
+    psnrs = [found_in("plain", no_prune=True, size_bytes=size).file.psnr() for size in (60_000, 90_000, 140_000)]
     assert psnrs[1] > psnrs[0] + 3.0
     assert psnrs[2] > psnrs[1] + 3.0
 
 
-@pytest.mark.parametrize(("keep_all", "said"), [(True, "no file with all splats has"), (False, "no file has")])
-def test_a_size_below_all_files_is_refused_after_few_tries(keep_all, said):
+@pytest.mark.parametrize(("no_prune", "said"), [(True, "no file with all splats has"), (False, "no file has")])
+def test_a_size_below_all_files_is_refused_after_few_tries(no_prune, said):
     tried = []
     with pytest.raises(InputError, match=f"{said} 300 bytes or fewer: of those tried one has"):
-        search(PLAIN, size_bytes=300, keep_all=keep_all, tried=tried)
+        search(PLAIN, size_bytes=300, no_prune=no_prune, tried=tried)
     assert 0 < len(tried) <= MOST_TRIES
 
 
 def test_a_size_that_all_splats_exceed_is_met_by_fewer():
     with pytest.raises(InputError, match="no file with all splats has"):
-        search(PLAIN, size_bytes=12_000, keep_all=True)
+        search(PLAIN, size_bytes=12_000, no_prune=True)
     found = search(PLAIN, size_bytes=12_000)
     assert 0.9 * 12_000 <= len(found.file) <= 12_000
     assert found.file.contents.splats < 4000
@@ -209,10 +209,10 @@ def test_a_size_that_all_splats_exceed_is_met_by_fewer():
 def test_a_loss_is_kept_to_and_its_file_hardly_larger_than_the_smallest(loss):
     photographs = Views(photo_psnr=25.0)
 
-    def check(name, keep_all):
-        found = search(SCENES[name], keep_all=keep_all, max_loss=loss, photo_psnr=25.0)
+    def check(name, no_prune):
+        found = search(SCENES[name], no_prune=no_prune, max_psnr_drop=loss, photo_psnr=25.0)
         lost = 25.0 - found.file.psnr(photographs)
-        larger = len(found.file) / SCENES[name].smallest(25.0 - loss, photographs, keep_all=keep_all)
+        larger = len(found.file) / SCENES[name].smallest(25.0 - loss, photographs, no_prune=no_prune)
         right = 0.85 * loss <= lost <= loss and larger <= 1.15
         return "" if right else f"{lost:.3f} dB, {larger:.3f} times as large"
 
@@ -222,7 +222,7 @@ def test_a_loss_is_kept_to_and_its_file_hardly_larger_than_the_smallest(loss):
 def test_a_loss_that_no_file_keeps_to_is_refused():
     """Files err by as much as photographs do, at any precision."""
     with pytest.raises(InputError, match=r"no file reaches 49.50 dB by the photographs that decide; the best has"):
-        search(replace(PLAIN, ceiling=50.0), max_loss=0.5, photo_psnr=50.0)
+        search(replace(PLAIN, ceiling=50.0), max_psnr_drop=0.5, photo_psnr=50.0)
 
 
 # views
@@ -231,10 +231,10 @@ def test_a_loss_that_no_file_keeps_to_is_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize("judging", [Views(1.5), Views(-1.5), Views(0.5, 2.0), Views(-0.5, -2.0)])
 def test_a_psnr_is_reached_where_judging_views_see_other_errors_than_those_that_decide(judging):
-    def check(name, keep_all):
-        found = search(SCENES[name], psnr=38.0, judging=judging, keep_all=keep_all)
+    def check(name, no_prune):
+        found = search(SCENES[name], psnr=38.0, judging=judging, no_prune=no_prune)
         above = found.file.psnr(judging) - 38.0
-        larger = len(found.file) / SCENES[name].smallest(38.0, judging, keep_all=keep_all)
+        larger = len(found.file) / SCENES[name].smallest(38.0, judging, no_prune=no_prune)
         right = 0.0 <= above <= 0.4 and larger <= LARGER
         return "" if right else f"{above:.2f} dB above, {larger:.3f} times as large"
 
@@ -243,12 +243,12 @@ def test_a_psnr_is_reached_where_judging_views_see_other_errors_than_those_that_
 
 @pytest.mark.parametrize("offset", [4.0, 8.0])
 def test_views_that_judge_far_more_harshly_cost_no_more_tries(offset):
-    found = search(PLAIN, psnr=38.0, judging=Views(offset), keep_all=True)
+    found = search(PLAIN, psnr=38.0, judging=Views(offset), no_prune=True)
     assert 0.0 <= found.file.psnr(Views(offset)) - 38.0 <= 0.2
     assert len(found.tried) <= 9
 
 
-@pytest.mark.parametrize("goal", [{"size_bytes": 90_000}, {"max_loss": 0.5, "photo_psnr": 25.0}])
+@pytest.mark.parametrize("goal", [{"size_bytes": 90_000}, {"max_psnr_drop": 0.5, "photo_psnr": 25.0}])
 def test_judging_views_do_not_choose_the_file_of_a_size_or_a_loss(goal):
     one, other = (search(PLAIN, judging=judging, **goal) for judging in (Views(), Views(3.0, 5.0)))
     assert one.file.contents == other.file.contents
@@ -257,7 +257,7 @@ def test_judging_views_do_not_choose_the_file_of_a_size_or_a_loss(goal):
 
 
 def test_of_a_psnr_the_file_is_one_that_judging_views_looked_at_and_they_do_not_look_at_all():
-    found = found_in("plain", keep_all=False, psnr=38.0)
+    found = found_in("plain", no_prune=False, psnr=38.0)
     assert found.file in found.judged
     assert len(set(found.judged)) < len(found.tried)
 
@@ -267,29 +267,29 @@ def test_of_a_psnr_the_file_is_one_that_judging_views_looked_at_and_they_do_not_
 
 def test_codings_are_chosen_where_they_pay():
     scenes = {"plain": PLAIN, "useless codebooks": NO_CODEBOOK, "no SH": WITHOUT_SH, "hardly any SH": HARDLY_ANY_SH}
-    chosen = {name: search(scene, psnr=38.0, keep_all=True).report for name, scene in scenes.items()}
+    chosen = {name: search(scene, psnr=38.0, no_prune=True).report for name, scene in scenes.items()}
     expected = {"plain": "codebook", "useless codebooks": "scalar", "no SH": "none", "hardly any SH": "none"}
     assert expected == {name: report.chosen["sh_coding"] for name, report in chosen.items()}
 
 
 def test_bands_that_hardly_show_are_left_out():
     scene = replace(NO_CODEBOOK, shown=(30.0, 45.0, 50.0))
-    assert 1 == search(scene, psnr=38.0, keep_all=True).report.chosen["sh_degree"]
+    assert 1 == search(scene, psnr=38.0, no_prune=True).report.chosen["sh_degree"]
 
 
 def test_a_coding_that_more_precision_hardly_betters_is_not_chosen():
     """Files of codebooks come within a decibel of the goal, and stay there: nearer than the others are at first."""
     scene = replace(PLAIN, book_psnr=37.2, book_octave=0.05, index_bytes=0.1, entry_bytes=0.1)
-    found = search(scene, psnr=38.0, keep_all=True)
+    found = search(scene, psnr=38.0, no_prune=True)
     assert "scalar" == found.report.chosen["sh_coding"]
     assert len(found.tried) <= MOST_TRIES
 
 
-@pytest.mark.parametrize("keep_all", [True, False])
-def test_a_codebook_grows_until_the_goal_is_reached(keep_all):
+@pytest.mark.parametrize("no_prune", [True, False])
+def test_a_codebook_grows_until_the_goal_is_reached(no_prune):
     """With smaller codebooks no precision reaches the goal."""
     scene, options = replace(PLAIN, book_psnr=32.0), EncodeOptions(sh_coding="codebook")
-    found = search(scene, psnr=38.0, keep_all=keep_all, options=options)
+    found = search(scene, psnr=38.0, no_prune=no_prune, options=options)
     assert found.file.psnr() >= 38.0
     assert found.report.chosen["codebook_size"] >= 1024
 
@@ -297,14 +297,14 @@ def test_a_codebook_grows_until_the_goal_is_reached(keep_all):
 def test_a_codebook_grows_to_an_entry_for_four_splats():
     """With smaller codebooks no precision reaches the goal."""
     scene, options = replace(PLAIN, splats=6000, book_psnr=29.0), EncodeOptions(sh_coding="codebook")
-    found = search(scene, psnr=38.0, keep_all=True, options=options)
+    found = search(scene, psnr=38.0, no_prune=True, options=options)
     assert 2048 == found.report.chosen["codebook_size"]  # 1500, as a power of two
 
 
 def test_grades_are_chosen_where_they_make_files_smaller():
     cheaper = replace(PLAIN, grading=0.9)
     graded, dearer, unknown = (
-        search(scene, psnr=38.0, keep_all=True, grades=grades)
+        search(scene, psnr=38.0, no_prune=True, grades=grades)
         for scene, grades in ((cheaper, True), (replace(PLAIN, grading=1.1), True), (cheaper, False))
     )
     assert [2, 1, 1] == [found.report.chosen["grades"] for found in (graded, dearer, unknown)]
@@ -321,7 +321,7 @@ def test_what_the_caller_fixed_is_not_chosen(fixed):
 
 
 def test_the_preset_fast_tries_no_codebook():
-    found = search(PLAIN, psnr=38.0, keep_all=True, options=EncodeOptions("fast"))
+    found = search(PLAIN, psnr=38.0, no_prune=True, options=EncodeOptions("fast"))
     assert {"scalar", "none"} >= {one["sh_coding"] for one in found.report.tried}
 
 
@@ -329,7 +329,7 @@ def test_the_preset_fast_tries_no_codebook():
 def test_a_preset_whose_own_file_is_smaller_is_chosen(preset, goal):
     scene = replace(NO_CODEBOOK, removal_psnr=2.0)
     usual, saving = (
-        search(replace(scene, preset_saving=(preset, share)), psnr=goal, keep_all=True) for share in (0.0, 0.2)
+        search(replace(scene, preset_saving=(preset, share)), psnr=goal, no_prune=True) for share in (0.0, 0.2)
     )
     assert (preset, None) == (saving.report.chosen["preset"], saving.report.chosen["attribute_psnr"])
     assert any("at the precision of the preset" in line for line in saving.report.why)
@@ -341,7 +341,7 @@ def test_a_preset_whose_own_file_is_smaller_is_chosen(preset, goal):
 
 
 def test_splats_that_nobody_needs_are_left_out_unless_all_are_to_stay():
-    fewer, all_stay = (found_in("many unneeded splats", keep_all=keep_all, psnr=38.0) for keep_all in (False, True))
+    fewer, all_stay = (found_in("many unneeded splats", no_prune=no_prune, psnr=38.0) for no_prune in (False, True))
     assert fewer.file.contents.splats <= 4000
     assert 8000 == all_stay.file.contents.splats
     assert any("left out" in line for line in fewer.report.why)
@@ -350,11 +350,11 @@ def test_splats_that_nobody_needs_are_left_out_unless_all_are_to_stay():
 
 
 def test_splats_that_cannot_be_spared_stay():
-    assert 8000 == found_in("no splat to spare", keep_all=False, psnr=45.0).file.contents.splats
+    assert 8000 == found_in("no splat to spare", no_prune=False, psnr=45.0).file.contents.splats
 
 
 def test_more_splats_stay_for_a_higher_psnr():
-    counts = [found_in("plain", keep_all=False, psnr=goal).file.contents.splats for goal in (30.0, 38.0, 45.0)]
+    counts = [found_in("plain", no_prune=False, psnr=goal).file.contents.splats for goal in (30.0, 38.0, 45.0)]
     assert sorted(set(counts)) == counts
 
 
@@ -381,7 +381,7 @@ def test_where_a_number_of_splats_fails_no_other_codings_of_it_are_tried():
 
 def test_a_brief_search_tries_fewer_files():
     brief = search(PLAIN, psnr=38.0, effort=1)
-    assert len(brief.tried) < len(found_in("plain", keep_all=False, psnr=38.0).tried)
+    assert len(brief.tried) < len(found_in("plain", no_prune=False, psnr=38.0).tried)
     assert 38.0 <= brief.file.psnr() <= 38.4
 
 
@@ -391,13 +391,13 @@ def test_a_brief_search_tries_fewer_files():
 def test_a_file_that_exceeds_a_bound_is_no_result():
     """Errors of means fall with the quality alone: one bound asks for more of it than the goal."""
     with pytest.raises(InputError, match="no file reaches"):
-        search(PLAIN, keep_all=True, psnr=30.0, max_error={"means": 10.0 ** (-60.0 / 20.0)})
-    loose = search(PLAIN, keep_all=True, psnr=30.0, max_error={"means": 10.0 ** (-30.0 / 20.0)})
+        search(PLAIN, no_prune=True, psnr=30.0, max_error={"means": 10.0 ** (-60.0 / 20.0)})
+    loose = search(PLAIN, no_prune=True, psnr=30.0, max_error={"means": 10.0 ** (-30.0 / 20.0)})
     assert 30.0 <= loose.file.psnr() <= 30.3
 
 
 def test_the_report_names_every_file_that_was_tried():
-    found = found_in("plain", keep_all=False, psnr=38.0)
+    found = found_in("plain", no_prune=False, psnr=38.0)
     report = found.report
     assert {"psnr": 38.0} == report.goal
     assert [len(file) for file in found.tried] == [one["size_bytes"] for one in report.tried]

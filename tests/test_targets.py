@@ -79,15 +79,15 @@ def test_other_bounds_are_refused(text, message):
     [
         ({}, "no target"),
         ({"size_bytes": 1000, "psnr": 40.0}, "one of them"),
-        ({"keep": 0.5, "max_loss": 1.0}, "one of them"),
+        ({"keep": 0.5, "max_psnr_drop": 1.0}, "one of them"),
         ({"keep": 0.5, "max_error": {"means": 1.0}}, "no bounds"),
-        ({"max_loss": 0.5, "max_error": {"means": 1.0}}, "no bounds"),
+        ({"max_psnr_drop": 0.5, "max_error": {"means": 1.0}}, "no bounds"),
         ({"size_bytes": 0}, "wanted 1 or more"),
         ({"psnr": 99.5}, "at most 99"),
         ({"psnr": float("nan")}, "above 0"),
-        ({"max_loss": 0.0}, "0.001 to 60"),
-        ({"max_loss": 1e-16}, "0.001 to 60"),
-        ({"max_loss": 4000.0}, "0.001 to 60"),
+        ({"max_psnr_drop": 0.0}, "0.001 to 60"),
+        ({"max_psnr_drop": 1e-16}, "0.001 to 60"),
+        ({"max_psnr_drop": 4000.0}, "0.001 to 60"),
         ({"keep": 1.5}, "at most 1"),
         ({"keep": 0.0}, "above 0"),
         ({"psnr": -1.0}, "above 0"),
@@ -156,7 +156,7 @@ def run(*arguments):
 @pytest.mark.slow
 def test_the_command_meets_a_size_and_says_why(tmp_path, ply):
     out = tmp_path / "scene.csplat"
-    done = run("encode", ply, out, "--target-size", "5kB", "--keep-all", "--views", 16, "--view-size", "48x36")
+    done = run("encode", ply, out, "--target-size", "5kB", "--no-prune", "--views", 16, "--view-size", "48x36")
     assert 0 == done.exit_code, done.output
     assert 4850 <= out.stat().st_size <= 5000
     for said in ("target: 5.0 kB", "chosen: SH degree", "measured on the file itself"):
@@ -192,8 +192,8 @@ def test_the_command_keeps_to_largest_errors(tmp_path, ply):
 @pytest.mark.slow
 def test_the_command_loses_no_more_against_photographs_than_is_allowed(tmp_path):
     folder = photograph(shell(0), tmp_path)  # without SH there is one coding to try
-    words = ("encode", folder / "scene.ply", tmp_path / "s.csplat", "--max-loss", "1dB", "--data", folder)
-    done = run(*words, "--keep-all", "--json")
+    words = ("encode", folder / "scene.ply", tmp_path / "s.csplat", "--max-psnr-drop", "1dB", "--data", folder)
+    done = run(*words, "--no-prune", "--json")
     assert 0 == done.exit_code, done.output
     target = json.loads(done.stdout)["target"]
     scores = target["photographs"]
@@ -216,7 +216,7 @@ def test_the_command_foretells_a_search_before_it_begins(tmp_path, ply, monkeypa
     K = intrinsics(48, 40, 60.0)
     save_cameras(tmp_path / "away.json", [look_at((40.0, 0.0, 0.0), (80.0, 0.0, 0.0), (0, 0, 1), K, 48, 40)])
     words = ("encode", ply, tmp_path / "s.csplat", "--target-psnr", "30", "--cameras", tmp_path / "away.json")
-    done = run(*words, "--keep-all", "--views", 8)
+    done = run(*words, "--no-prune", "--views", 8)
     assert "this takes about 2 to 5 minutes here" in done.stderr
     assert "cameras of this scene?" in done.stderr
 
@@ -234,17 +234,17 @@ REFUSED = [
     (["--view-size", "9x9"], 2, "--view-size says nothing without --target-psnr or"),
     (["--grades", "3"], 2, "--grades says nothing"),
     (["--grades", "9", "--target-size", "5kB"], 2, "grades is 9"),
-    (["--keep-all"], 2, "--keep-all says nothing without --target-psnr or"),
-    (["--keep", "0.5", "--keep-all"], 2, "--keep and --keep-all: give one of them"),
+    (["--no-prune"], 2, "--no-prune says nothing without --target-psnr or"),
+    (["--keep", "0.5", "--no-prune"], 2, "--keep and --no-prune: give one of them"),
     (["--keep", "0.5", "--importance", "w.npy"], 2, "--keep and --importance: give one of them"),
-    (["--max-loss", "1"], 2, "--max-loss says nothing without --data"),
-    (["--max-loss", "1", "--cameras", "c.json"], 2, "--max-loss says nothing without --data"),
+    (["--max-psnr-drop", "1"], 2, "--max-psnr-drop says nothing without --data"),
+    (["--max-psnr-drop", "1", "--cameras", "c.json"], 2, "--max-psnr-drop says nothing without --data"),
     (["--background", "white"], 2, "--background says nothing"),
     (["--background", "white", "--max-error", "means=1"], 2, "--background says nothing"),
     (["--cameras", "c.json"], 2, "--cameras says nothing without --target-psnr or"),
     (["--max-error", "means=1", "--data", "d"], 2, "--data says nothing without --target-psnr or"),
     (["--size", "9x9", "--target-psnr", "30"], 2, "--size says nothing without --data"),
-    (["--target-size", "10", "--keep-all"], 2, "no file"),
+    (["--target-size", "10", "--no-prune"], 2, "no file"),
     (["--target-psnr", "30", "--target-size", "5kB"], 2, "--target-psnr and --target-size: give one of them"),
     (["--kmeans", "16"], 2, "No such option"),
     (["--prune"], 2, "No such option"),

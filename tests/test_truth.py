@@ -81,7 +81,7 @@ def swept(ply, data, _):
 
 
 def targeted(ply, data, folder):
-    words = ("encode", ply, folder / "e.csplat", "--data", data, "--max-loss", 3, "--keep-all", "--preset", "fast")
+    words = ("encode", ply, folder / "e.csplat", "--data", data, "--max-psnr-drop", 3, "--no-prune", "--preset", "fast")
     report = json.loads(call(*words, "--json"))["target"]
     return report["views"], report["photographs"]["source"]
 

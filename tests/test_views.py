@@ -51,7 +51,7 @@ def scene(sets):
 
 
 def poses(views):
-    return [{pose_key(camera) for camera in role} for role in (views.teaches, views.decides, views.judges)]
+    return [{pose_key(camera) for camera in role} for role in (views.training, views.validation, views.test)]
 
 
 def numbers(seen_from):
@@ -66,15 +66,15 @@ def numbers(seen_from):
 @pytest.mark.parametrize("kind", KINDS)
 def test_photographs_have_one_role_each(sets, scene, kind, every, size):
     views = find_view_set(scene, data=DataOptions(str(sets[kind]), size, test_every=every))
-    assert list(range(0, 16, every)) == numbers(views.judges)
+    assert list(range(0, 16, every)) == numbers(views.test)
     roles = poses(views)
     assert sum(map(len, roles)) == len(set.union(*roles)) == 16
-    assert views.teaches
-    assert views.decides
-    assert {size or (W, H)} == {(camera.W, camera.H) for camera in views.judges}
+    assert views.training
+    assert views.validation
+    assert {size or (W, H)} == {(camera.W, camera.H) for camera in views.test}
     assert BLACK == views.background
     assert not views.virtual
-    assert numbers(views.judges) == numbers(views.photograph_judge().cameras)
+    assert numbers(views.test) == numbers(views.photograph_test_scorer().cameras)
 
 
 @pytest.mark.parametrize(
@@ -83,27 +83,27 @@ def test_photographs_have_one_role_each(sets, scene, kind, every, size):
 def test_a_camera_file_is_parted_where_it_holds_enough(scene, tmp_path, count, judging, virtual):
     save_cameras(tmp_path / "cameras.json", cameras(count))
     views = find_view_set(scene, cameras=str(tmp_path / "cameras.json"), count=20)
-    assert (judging, virtual) == (len(views.judges), views.virtual)
-    assert (36, 12) == (len(views.teaches), len(views.decides)) or not virtual
+    assert (judging, virtual) == (len(views.test), views.virtual)
+    assert (36, 12) == (len(views.training), len(views.validation)) or not virtual
     roles = poses(views)
     assert sum(map(len, roles)) == len(set.union(*roles))
     assert virtual or count == sum(map(len, roles))
 
 
 def test_virtual_views_judge_on_black_whatever_is_behind_the_others(scene):
-    views = find_view_set(scene, count=5, aside=2, background=WHITE)
+    views = find_view_set(scene, count=5, validation_count=2, background=WHITE)
     assert (21, 2, 8) == tuple(map(len, poses(views)))
-    assert BLACK == views.judge(scene).background
-    assert WHITE == views.decider(scene).background
+    assert BLACK == views.test_scorer(scene).background
+    assert WHITE == views.validation_scorer(scene).background
 
 
 def test_as_many_decide_as_are_asked_for(sets, scene):
     data = DataOptions(str(sets["rgb"]))
-    assert 0 == len(find_view_set(scene, data=data, aside=0).decides)
-    views = find_view_set(scene, data=data, aside=4)
+    assert 0 == len(find_view_set(scene, data=data, validation_count=0).validation)
+    views = find_view_set(scene, data=data, validation_count=4)
     assert (10, 4, 2) == tuple(map(len, poses(views)))
     with pytest.raises(InputError, match="leave none to learn from"):
-        find_view_set(scene, data=data, aside=14)
+        find_view_set(scene, data=data, validation_count=14)
 
 
 def test_validation_photographs_of_a_set_decide(sets, scene, tmp_path):
@@ -113,12 +113,12 @@ def test_validation_photographs_of_a_set_decide(sets, scene, tmp_path):
         frames = document["frames"][rows]
         (tmp_path / f"transforms_{part}.json").write_text(json.dumps({**document, "frames": frames}))
     data = DataOptions(str(tmp_path))
-    for aside in (None, 0):
-        views = find_view_set(scene, data=data, aside=aside)
+    for validation_count in (None, 0):
+        views = find_view_set(scene, data=data, validation_count=validation_count)
         roles = [list(range(8)), [8, 9, 10, 11], [12, 13, 14, 15]]
-        assert roles == [numbers(role) for role in (views.teaches, views.decides, views.judges)]
-    assert 4 == len(views.photograph_decider().looks)
-    assert (6, 2, 4) == tuple(map(len, poses(find_view_set(scene, data=data, aside=2))))
+        assert roles == [numbers(role) for role in (views.training, views.validation, views.test)]
+    assert 4 == len(views.photograph_validation_scorer().looks)
+    assert (6, 2, 4) == tuple(map(len, poses(find_view_set(scene, data=data, validation_count=2))))
     assert (0, 0, 8) == tuple(map(len, poses(find_view_set(scene, data=data, split="train"))))
 
 
@@ -130,7 +130,7 @@ def test_the_training_judges_alone(sets, scene):
 def test_a_view_of_two_roles_is_refused_in_any_size(scene):
     one, other = cameras(2)
     ViewSet("own", BLACK, [one], [], [other], origin=scene.origin)
-    with pytest.raises(InputError, match="own: a view both teaches and judges"):
+    with pytest.raises(InputError, match="own: a view is both a training and a test view"):
         ViewSet("own", BLACK, [one], [], [other, resized(one, 2 * W, 2 * H)])
 
 
@@ -141,12 +141,12 @@ def test_the_scene_says_how_its_photographs_are_taken(sets, scene):
     said = TrainingRecord((0.0, 1.0, 0.0), 5, (24, 20), 0.05)
     trained = replace(scene, metadata={**scene.metadata, TRAINING: said.as_json()})
     views = find_view_set(trained, data=DataOptions(str(sets["rgba"])))
-    assert [0, 5, 10, 15] == numbers(views.judges)
-    assert ((0.0, 1.0, 0.0), 24, 0.05) == (views.background, views.judges[0].W, views.judges[0].near)
+    assert [0, 5, 10, 15] == numbers(views.test)
+    assert ((0.0, 1.0, 0.0), 24, 0.05) == (views.background, views.test[0].W, views.test[0].near)
     assert not any("trained" in line for line in views.notes)
     asked = DataOptions(str(sets["rgba"]), test_every=10)
     views = find_view_set(trained, data=asked, background=WHITE)
-    assert [0, 10] == numbers(views.judges)
+    assert [0, 10] == numbers(views.test)
     assert [
         "test_every is 10, but the scene was trained with 5",
         "background is white, but the scene was trained on 0,1,0",
@@ -197,15 +197,15 @@ def test_no_command_decides_by_what_judges_and_all_say_the_same_of_the_same_scen
         for views in made:
             roles = poses(views)
             assert sum(map(len, roles)) == len(set.union(*roles)), words
-            for camera in (*views.teaches, *views.decides):
+            for camera in (*views.training, *views.validation):
                 assert camera.image is None or int(camera.image[-6:-4]) % 5, words
-            assert not views.photographs or numbers(views.judges) in ([0, 5, 10, 15], []), words
+            assert not views.photographs or numbers(views.test) in ([0, 5, 10, 15], []), words
         return result
 
     found["compare"] = run("compare", ply, ply)["photographs"]["a"]["psnr"]
     simplified = run("simplify", ply, tmp_path / "half.ply", "--keep", "0.5", "--effort", "1", "--set", "rounds=1")
     found["simplify"] = simplified["photographs"]["source"]
-    run("simplify", ply, tmp_path / "less.ply", "--max-loss", "1", "--set", "rounds=1,refit=no")
+    run("simplify", ply, tmp_path / "less.ply", "--max-psnr-drop", "1", "--set", "rounds=1,refit=no")
     run("sensitivity", ply, tmp_path / "s.npz", "--no-matrices")
     words = ("--iterations", "2", "--set", "sh-coding=none", "--keep", "0.7")
     found["finetune"] = run("finetune", ply, "-o", tmp_path / "s.csplat", *words)["scores"]["source"]["psnr"]
@@ -213,7 +213,7 @@ def test_no_command_decides_by_what_judges_and_all_say_the_same_of_the_same_scen
     model = read_ply(ply)
     views = find_view_set(model, data=DataOptions(str(sets["rgba"]), (24, 20), test_every=5))
     draw = renderer(model, views.background)
-    photographs, behind = views.pictures(views.judges), np.array(views.background, np.float32)
+    photographs, behind = views.pictures(views.test), np.array(views.background, np.float32)
     found["evaluate"] = evaluate(lambda camera: draw(camera).rgb, photographs, behind)["psnr"]
     assert max(found.values()) - min(found.values()) < 0.01, found
     again = run("compare", ply, tmp_path / "half.ply")["photographs"]["b"]["psnr"]
@@ -222,9 +222,11 @@ def test_no_command_decides_by_what_judges_and_all_say_the_same_of_the_same_scen
 
 def test_another_origin_judges_alike(sets, scene):
     moved = replace(scene, means=scene.means - np.float32((10.0, -20.0, 5.0)), origin=(10.0, -20.0, 5.0))
-    judges = [find_view_set(one, data=DataOptions(str(sets["rgb"]))).photograph_judge() for one in (scene, moved)]
-    assert judges[0].psnr(scene) == pytest.approx(judges[1].psnr(moved), abs=0.01)
-    assert judges[0].psnr(scene) == pytest.approx(judges[0].psnr(moved), abs=0.01)
+    scorers = [
+        find_view_set(one, data=DataOptions(str(sets["rgb"]))).photograph_test_scorer() for one in (scene, moved)
+    ]
+    assert scorers[0].psnr(scene) == pytest.approx(scorers[1].psnr(moved), abs=0.01)
+    assert scorers[0].psnr(scene) == pytest.approx(scorers[0].psnr(moved), abs=0.01)
 
 
 def test_a_set_in_coordinates_of_a_map_judges_alike(sets, scene, tmp_path):
@@ -238,12 +240,12 @@ def test_a_set_in_coordinates_of_a_map_judges_alike(sets, scene, tmp_path):
         frame["transform_matrix"] = pose.tolist()
     (tmp_path / "set" / "transforms.json").write_text(json.dumps(document))
     far = replace(scene, origin=tuple(place))
-    wanted = find_view_set(scene, data=DataOptions(str(sets["rgb"]))).photograph_judge().psnr(scene)
-    judge = find_view_set(far, data=DataOptions(str(tmp_path / "set"))).photograph_judge()
+    wanted = find_view_set(scene, data=DataOptions(str(sets["rgb"]))).photograph_test_scorer().psnr(scene)
+    judge = find_view_set(far, data=DataOptions(str(tmp_path / "set"))).photograph_test_scorer()
     assert wanted == pytest.approx(judge.psnr(far), abs=0.01)
     own = cameras(3)
     save_cameras(tmp_path / "own.json", own)
     save_cameras(tmp_path / "far.json", [relative_to(-place, one) for one in own])
     one, other = (find_view_set(far, cameras=str(tmp_path / f"{name}.json")) for name in ("own", "far"))
-    assert all(np.allclose(a.viewmat, b.viewmat) for a, b in zip(one.judges, other.judges, strict=True))
+    assert all(np.allclose(a.viewmat, b.viewmat) for a, b in zip(one.test, other.test, strict=True))
     assert [False, True] == [any("stand around the scene's origin" in line for line in v.notes) for v in (one, other)]

@@ -94,7 +94,7 @@ def measure(peers: Path) -> dict[str, Any]:
         presets[name] = {**_scored(judge, runs[0][0]), "seconds": round(min(one.wall for _, one in runs), 2)}
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        whole = [_target(judge, folder, psnr, "--keep-all") for psnr in _WHOLE]
+        whole = [_target(judge, folder, psnr, "--no-prune") for psnr in _WHOLE]
         fewer = [_target(judge, folder, psnr) for psnr in _FEWER]
         command, version = find_splat_transform(peers)
         if command is None:
@@ -131,7 +131,7 @@ def draw_curves(measured: Mapping[str, Any]) -> None:
         axis = figure.subplots()
         axis.set_xscale("log")
         for name, colour, label in (
-            ("keep_all", _OURS, "csplat --target-psnr --keep-all"),
+            ("keep_all", _OURS, "csplat --target-psnr --no-prune"),
             ("fitted", _FITTED, "csplat --target-psnr: fewer splats, fitted anew"),
         ):
             rows = sorted(measured[name], key=lambda row: row["bytes"])

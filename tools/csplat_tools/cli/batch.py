@@ -33,32 +33,36 @@ def batch(
     out: OutputOptions,
     line: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[-- COMMAND OPTIONS]", help="Which takes IN and OUT: encode by default."),
+        typer.Argument(metavar="[-- COMMAND OPTIONS]", help="A command that takes IN and OUT. Default: encode."),
     ] = None,
     ending: Annotated[
-        str | None, typer.Option(metavar=".spz", help="Of outputs, where the command does not say it.")
+        str | None, typer.Option(metavar=".spz", help="File name ending of outputs. Default: that of the command.")
     ] = None,
-    match: Annotated[str, typer.Option(metavar="'*.ply'", help="Which files of a folder.")] = "*",
-    workers: Annotated[int | None, typer.Option(metavar="N", min=1, help="Scenes at a time; one per core.")] = None,
+    match: Annotated[str, typer.Option(metavar="'*.ply'", help="Files of a folder to take.")] = "*",
+    workers: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Scenes at a time. Default: one per core.")
+    ] = None,
     memory: Annotated[
-        str | None, typer.Option(metavar="8GB", help="Of all scenes at a time; else most of what is free.")
+        str | None, typer.Option(metavar="8GB", help="Memory of all scenes at a time. Default: most of what is free.")
     ] = None,
     dask: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="Work on a Dask cluster that sees these files: tcp://host:8786."),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would be done, time and memory.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="List the work, its time and memory, and do nothing.")
+    ] = False,
     thumbnails: Annotated[
-        bool, typer.Option("--thumbnails/--no-thumbnails", help="Small pictures on the page (extra render).")
+        bool, typer.Option("--thumbnails/--no-thumbnails", help="Small renders on the page (extra render).")
     ] = True,
 ) -> None:
     """Do the same with many scenes: encode, decode, convert, ...
 
-    Each line of OUT/batch.jsonl says what became of a scene, OUT/index.html
-    shows all. What is done already is not done again, whatever ended the last
-    run: the same content, command and version, and an output as it was left.
-    Scenes that fail are listed, tried again in the next run, and make the
-    status 1; the others are done all the same.
+    Each line of OUT/batch.jsonl reports on a scene; OUT/index.html shows all.
+    Finished work is not repeated, whatever ended the last run: the same content,
+    command and version, and an unchanged output. Scenes that fail are listed,
+    tried again in the next run, and make the status 1; the others are processed
+    all the same.
 
     Examples:
       csplat batch scenes encoded

@@ -28,7 +28,7 @@ from csplat.system import interrupt_main_thread
 from csplat_tools.batches.batch_page import prepare_thumbnails, write_thumbnail
 from csplat_tools.batches.scene_job import inspect_scene
 from csplat_tools.cli.app import app, command_function
-from csplat_tools.cli.command import EXIT_FAILED, UsageError
+from csplat_tools.cli.command import EXIT_FAILED, UsageError, usage_message
 
 _ERROR = "error: "
 _CODE = re.compile(r"\b(E_[A-Z0-9_]+)\b|\((E[A-Z]+)\)$")
@@ -102,7 +102,7 @@ def _check(words: Sequence[str]) -> dict[str, Any]:
             given = [one for one in context.params if _is_given(context, one)]
             command.invoke(context)
     except UsageError as error:
-        return {"wrong": f"csplat {name}: " + " ".join(error.format_message().split())}  # type: ignore[attr-defined]
+        return {"wrong": f"csplat {name}: {usage_message(error)}"}
     except (typer.Exit, SystemExit):
         return {"wrong": f"csplat {name}: what is no option for work, as --help, says nothing here"}
     taken = [one for one in given if one in (*_OWN, *_FILES)]

@@ -65,6 +65,9 @@ _OS_ADVICE = {
 UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 _SAYS_NOTHING = re.compile(r"^Invalid value: |(?<=: )Value error, |\.$")  # empty phrases of typer's messages
 
+#: Options with their new names; the old ones are refused for one version.
+RENAMED_OPTIONS = {"--keep-all": "--no-prune", "--max-loss": "--max-psnr-drop", "--aside": "--validation-count"}
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -99,9 +102,17 @@ def report_errors(command: Callable[P, T]) -> Callable[P, T]:
     return run
 
 
+def usage_message(error: Any) -> str:
+    """Return in one line what is wrong with a command line; an option that was renamed is named with its new name."""
+    renamed = RENAMED_OPTIONS.get(getattr(error, "option_name", None) or "")
+    if renamed is not None:
+        return f"{error.option_name} is called {renamed} now"
+    return " ".join(_SAYS_NOTHING.sub("", error.format_message()).split())
+
+
 def refuse_command_line(error: Any) -> NoReturn:
     """Print in one line what is wrong with a command line, in the form of other errors, and exit with status 2."""
-    message = " ".join(_SAYS_NOTHING.sub("", error.format_message()).split())
+    message = usage_message(error)
     if message:  # empty for a command line without arguments: help is printed already
         of = error.ctx.command_path if error.ctx is not None else "csplat"
         helps = f"`{of} --help`" if error.ctx is not None else "`csplat COMMAND --help`"

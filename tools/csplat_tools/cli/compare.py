@@ -43,37 +43,39 @@ _WORDS = {
 
 @command(reads=True, needs={"split": ("data",), "amplify": ("pictures",)})
 def compare(
-    a: Annotated[str, typer.Argument(metavar="A", help="The source: a PLY or .csplat file.")],
-    b: Annotated[str, typer.Argument(metavar="B", help="What became of it: a PLY or .csplat file.")],
+    a: Annotated[str, typer.Argument(metavar="A", help="The source, in any format.")],
+    b: Annotated[str, typer.Argument(metavar="B", help="The scene that was made from it.")],
     views: ViewOptions,
     out: OutputOptions,
     split: SplitOption = "test",
     source_index: Annotated[
-        str | None, typer.Option(metavar="FILE.npy", help="What `encode --source-index` wrote: which splat is which.")
+        str | None, typer.Option(metavar="FILE.npy", help="The file of `encode --source-index`: pairs of splats.")
     ] = None,
     pictures: Annotated[
         str | None, typer.Option(metavar="FOLDER", help="Write A, B and their difference, side by side, for each view.")
     ] = None,
-    amplify: Annotated[float, typer.Option(metavar="FACTOR", min=0.0, help="Of the differences shown.")] = 10.0,
+    amplify: Annotated[
+        float, typer.Option(metavar="FACTOR", min=0.0, help="Factor of the differences shown. Default: 10.")
+    ] = 10.0,
     lpips: Lpips = None,
     mode: ModeWord = "standard",
     memory: Annotated[
-        str | None, typer.Option(metavar="2GB", help="What it may take; else half of what is free.")
+        str | None, typer.Option(metavar="2GB", help="Memory to use. Default: half of what is free.")
     ] = None,
 ) -> None:
-    """Compare a scene with its source: sizes, errors of the splats, and pictures.
+    """Compare a scene with its source: sizes, errors of the splats, and renders.
 
     `psnr` is that of the squared error pooled over all pixels and channels of
     eight 640x480 views around A in front of black, or of the views given; 99
     at most. The same error scores 10 dB more from four times as far away:
     compare only numbers from the same cameras and background; white flatters
-    all of them. With --data the held-out photographs judge A and B as well.
-    Needs the packages of the render extra.
+    all of them. With --data A and B are also scored against the held-out photographs.
+    Requires the packages of the render extra.
 
     Scenes of any size: those that do not fit the memory together are drawn by
     way of a file in the folder for temporary ones (TMPDIR), as large as the
-    splats; errors of splats then want --source-index, but of scenes whose
-    splats have the same order.
+    splats; errors of splats then require --source-index, unless the splats of
+    both have the same order.
 
     Examples:
       csplat compare scene.ply scene.csplat
@@ -104,7 +106,7 @@ def compare(
             from csplat_tools.views.view_sets import total_render_seconds
 
             out.foretell(
-                lambda: 2 * total_render_seconds(model, around.judges, mode=mode), "--mode standard takes seconds"
+                lambda: 2 * total_render_seconds(model, around.test, mode=mode), "--mode standard takes seconds"
             )
         compared = csplat_tools.compare(
             source, other, views=around, source_index=rows, lpips=lpips, pictures=pictures, amplification=amplify,

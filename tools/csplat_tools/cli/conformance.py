@@ -128,7 +128,7 @@ def decoder(
     """Run a decoder over the vectors: csplat's own, or the one that --cmd starts.
 
     L1: header and refusals. L2: integers. L3: floats, bit for bit, or near
-    enough for --class renderer. L4: pictures of a renderer. Another decoder
+    enough for --class renderer. L4: images of a renderer. Another decoder
     writes what it decodes into {outdir}, or exits with status 1 and the error
     code in a line of JSON: conformance/IMPLEMENTERS.md says how.
 
@@ -166,7 +166,7 @@ def encoder(
         float,
         typer.Option(
             metavar="DB",
-            help="That pictures must keep at L4, some 2 more or less; choose it by your preset.",
+            help="Least PSNR of renders at L4, dB; choose it by your preset.",
         ),
     ] = PSNR_MIN,
     keep: Annotated[
@@ -183,8 +183,8 @@ def encoder(
 
     L1: it ends as it should, the file breaks no clause, and a second run gives
     the same bytes. L2: every splat of the source is there once, or counted as
-    left out. L3: the stated errors hold. L4: pictures keep --min-psnr; needs
-    the packages of the render extra; judged, too, where L3 proves nothing.
+    left out. L3: the stated errors hold. L4: renders keep --min-psnr; requires
+    the packages of the render extra; also checked if L3 proves nothing.
     An encoder exits with 0 and a file, or with 1, a line that says why, and
     no file; ordinary inputs it must take. The line is the last one on standard
     error or, where nothing is there, on standard output. It starts in an empty

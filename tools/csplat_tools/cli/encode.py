@@ -46,9 +46,9 @@ if TYPE_CHECKING:
     from csplat_tools.optimise.targets import Target
 
 
-_TARGET = "Targets (one of the first four, which want the render extra)"
+_TARGET = "Targets (one of the first four, which require the render extra)"
 _ROOM = "Large scenes"
-_RENDERED = ("target_psnr", "target_size", "max_loss", "keep")
+_RENDERED = ("target_psnr", "target_size", "max_psnr_drop", "keep")
 _WHOLE = (*_RENDERED, "max_error", "importance", "source_index")  # options that need the scene in memory
 
 
@@ -56,10 +56,10 @@ _WHOLE = (*_RENDERED, "max_error", "importance", "source_index")  # options that
 class TargetOptions(OptionGroup):
     """Options of the target that the file is to meet."""
 
-    one_of: ClassVar[Sequence[tuple[str, ...]]] = (_RENDERED, ("keep", "keep_all"), ("effort", "keep_all"))
+    one_of: ClassVar[Sequence[tuple[str, ...]]] = (_RENDERED, ("keep", "no_prune"), ("effort", "no_prune"))
     needs: ClassVar[Mapping[str, tuple[str, ...]]] = {
-        "max_loss": ("data",),
-        "keep_all": ("target_psnr", "target_size", "max_loss", "max_error"),
+        "max_psnr_drop": ("data",),
+        "no_prune": ("target_psnr", "target_size", "max_psnr_drop", "max_error"),
     }
 
     target_psnr: Annotated[
@@ -68,26 +68,28 @@ class TargetOptions(OptionGroup):
     ] = None
     target_size: Annotated[
         str | None,
-        typer.Option(metavar="5MB", rich_help_panel=_TARGET, help="The best picture in so many bytes."),
+        typer.Option(
+            metavar="5MB", rich_help_panel=_TARGET, help="Largest size of the file, filled as well as possible."
+        ),
     ] = None
-    max_loss: Annotated[
+    max_psnr_drop: Annotated[
         str | None,
-        typer.Option(metavar="DB", rich_help_panel=_TARGET, help="PSNR that --data's pictures may lose."),
+        typer.Option(metavar="DB", rich_help_panel=_TARGET, help="Largest drop of the PSNR against --data."),
     ] = None
     keep: Annotated[
         float | None,
-        typer.Option(metavar="SHARE", rich_help_panel=_TARGET, help="Share of splats that stay, refitted."),
+        typer.Option(metavar="SHARE", rich_help_panel=_TARGET, help="Share of the splats to keep, refitted."),
     ] = None
     max_error: Annotated[
         str | None,
         typer.Option(
             metavar="means=0.001,...",
             rich_help_panel=_TARGET,
-            help="No splat errs by more than this.",
+            help="Largest error of a splat, by measure.",
         ),
     ] = None
-    keep_all: Annotated[
-        bool, typer.Option("--keep-all", rich_help_panel=_TARGET, help="Remove and refit no splat: sooner.")
+    no_prune: Annotated[
+        bool, typer.Option("--no-prune", rich_help_panel=_TARGET, help="Prune and refit no splat: faster.")
     ] = False
     effort: Annotated[int, typer.Option(rich_help_panel=_TARGET, **EFFORT)] = 3
 
@@ -110,7 +112,7 @@ class TargetOptions(OptionGroup):
         from csplat_tools.optimise.targets import Target, parse_max_error  # imports names of the renderer
 
         size = parse_bytes(self.target_size)
-        loss = None if self.max_loss is None else parse_decibels(self.max_loss)
+        loss = None if self.max_psnr_drop is None else parse_decibels(self.max_psnr_drop)
         bounds = {} if self.max_error is None else parse_max_error(self.max_error, unit_metres)
         psnr = None if self.target_psnr is None else parse_decibels(self.target_psnr)
         return Target(psnr, size, loss, self.keep, bounds)
@@ -123,17 +125,20 @@ class LargeSceneOptions(OptionGroup):
     memory: Annotated[
         str | None,
         typer.Option(
-            metavar="2GB", rich_help_panel=_ROOM, hidden=True, help="Of all processes; else half of what is free."
+            metavar="2GB",
+            rich_help_panel=_ROOM,
+            hidden=True,
+            help="Memory of all processes. Default: half of what is free.",
         ),
     ] = None
     work: Annotated[
         str | None,
         typer.Option(
-            metavar="FOLDER", rich_help_panel=_ROOM, hidden=True, help="Where splats wait on the disk; else OUT.work."
+            metavar="FOLDER", rich_help_panel=_ROOM, hidden=True, help="Working folder on the disk. Default: OUT.work."
         ),
     ] = None
     resume: Annotated[
-        bool, typer.Option("--resume", rich_help_panel=_ROOM, hidden=True, help="Go on with an interrupted encoding.")
+        bool, typer.Option("--resume", rich_help_panel=_ROOM, hidden=True, help="Continue an interrupted encoding.")
     ] = False
     dask: Annotated[
         str | None,
@@ -141,13 +146,13 @@ class LargeSceneOptions(OptionGroup):
             metavar="ADDRESS",
             rich_help_panel=_ROOM,
             hidden=True,
-            help="Let the workers of a Dask cluster code, which see the --work folder under the same name.",
+            help="Use the workers of a Dask cluster, which have the --work folder under the same name.",
         ),
     ] = None
     dry_run: Annotated[
         bool,
         typer.Option(
-            "--dry-run", rich_help_panel=_ROOM, hidden=True, help="Only say what memory, disk and time it takes."
+            "--dry-run", rich_help_panel=_ROOM, hidden=True, help="Estimate memory, disk and time, and encode nothing."
         ),
     ] = False
 
@@ -166,7 +171,7 @@ class LargeSceneOptions(OptionGroup):
     one_of=(
         ("prune_unseen", *_RENDERED),
         ("prune_unseen", "max_error"),
-        ("attribute_psnr", "target_psnr", "target_size", "max_loss"),
+        ("attribute_psnr", "target_psnr", "target_size", "max_psnr_drop"),
         ("keep", "importance"),
         *((name, other) for name in ("memory", "work", "resume", "dask", "dry_run") for other in _WHOLE),
     ),
@@ -182,8 +187,8 @@ class LargeSceneOptions(OptionGroup):
     settings=(ENCODER_SETTINGS,),
 )
 def encode(
-    source: Annotated[str, typer.Argument(metavar="IN.ply", help="A PLY, other `csplat formats`, or -.")],
-    output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="What to write, or -; else IN.csplat.")],
+    source: Annotated[str, typer.Argument(metavar="IN.ply", help="A PLY, another of `csplat formats`, or -.")],
+    output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="File to write, or -. Default: IN.csplat.")],
     encoding: EncodingOptions,
     goal: TargetOptions,
     facts: SourceOptions,
@@ -194,41 +199,41 @@ def encode(
     settings: LibrarySettings,
     importance: Importance = None,
     prune_unseen: Annotated[
-        bool, typer.Option("--prune-unseen", hidden=True, help="Leave out splats that no view of --importance saw.")
+        bool, typer.Option("--prune-unseen", hidden=True, help="Prune splats that no view of --importance saw.")
     ] = False,
     source_index: SourceIndex = None,
 ) -> None:
     """Compress a trained 3DGS scene.
 
-    Repairs what is safe to repair, says so, and states in the file how far
-    its splats lie from the source. A target chooses everything itself, also
-    which splats go: that takes minutes.
+    Repairs what is safe to repair, with a remark, and declares in the file how
+    far its splats are from the source. A target chooses all options itself, and
+    the splats to prune: that takes minutes.
 
     --preset, of 60,000 splats of SH degree 3, 14.9 MB, on one core:
-      fast      719 kB, 42.9 dB, 0.4 s: to look at soon, and to try things
-      balanced  645 kB, 42.7 dB, 4 s: to keep and to publish
-      small     529 kB, 38.6 dB, 4 s: where bytes count more than precision
+      fast      719 kB, 42.9 dB, 0.4 s: for previews and experiments
+      balanced  645 kB, 42.7 dB, 4 s: for archives and publication
+      small     529 kB, 38.6 dB, 4 s: if bytes matter more than precision
 
     Examples:
       csplat encode scene.ply scene.csplat
       csplat encode scene.ply scene.csplat --preset small --sh-degree 2
       csplat encode scene.ply scene.csplat --target-psnr 40
-      csplat encode scene.ply scene.csplat --target-size 5MB --keep-all
+      csplat encode scene.ply scene.csplat --target-size 5MB --no-prune
     ---
-    Splats are fitted in views that teach, files compared in views that decide,
-    and the result is scored in views that judge; for --target-psnr these say
-    how precise it has to be. --preset fast and --max-error leave all splats as
-    they are, as --keep-all does. --max-error bounds means, covariance
-    (relative), opacities, sh0, sh1, sh2, sh3; a length may have a unit, as mm,
-    where the scene's is known.
+    Splats are fitted to training views, files are compared by validation views,
+    and the result is scored by test views, which also decide if it reaches
+    --target-psnr. --preset fast and --max-error keep all splats as they are, as
+    --no-prune does. --max-error bounds means, covariance (relative), opacities,
+    sh0, sh1, sh2, sh3; a length may have a unit, such as mm, if the scene's is
+    known.
 
     A scene that does not fit the memory is sorted into buckets on the disk, in
     OUT.csplat.work, and coded by --threads processes. The bytes are the same.
-    What an interrupt leaves there --resume goes on with.
+    --resume continues after an interrupt.
 
     More examples:
       csplat encode scene.ply scene.csplat --keep 0.5
-      csplat encode scene.ply scene.csplat --max-loss 0.3dB --data photographs
+      csplat encode scene.ply scene.csplat --max-psnr-drop 0.3dB --data photographs
       csplat encode scene.ply scene.csplat --max-error means=0.001,sh0=0.02
       csplat encode scene.ply scene.csplat --set position-bits=12,sh-coding=scalar
       csplat sensitivity scene.ply scene.npz --data photographs
@@ -321,17 +326,17 @@ def _reach(
         given = virtual.given()
         simplifying = SimplifyOptions(effort=goal.effort, view_size=given.get("size"))
         around = views.find(model, out, **given)
-        if len(model) and around.judges:
-            may_keep_all = not goal.keep_all and goal.keep is None
+        if len(model) and around.test:
+            may_prune = not goal.no_prune and goal.keep is None
             out.foretell(
                 partial(
-                    expected_seconds, model, encoding, target, around, keep_all=goal.keep_all, simplifying=simplifying
+                    expected_seconds, model, encoding, target, around, no_prune=goal.no_prune, simplifying=simplifying
                 ),
-                "--keep-all takes a sixth of that, a preset seconds" if may_keep_all else "a preset takes seconds",
+                "--no-prune takes a sixth of that, a preset seconds" if may_prune else "a preset takes seconds",
             )
     made = csplat_tools.encode_to(
-        model, psnr=target.psnr, size=target.size_bytes, loss=target.max_loss, keep=target.keep,
-        errors=target.max_error, views=around, options=encoding, keep_all=goal.keep_all, importance=weights,
+        model, psnr=target.psnr, size=target.size_bytes, max_psnr_drop=target.max_psnr_drop, keep=target.keep,
+        errors=target.max_error, views=around, options=encoding, no_prune=goal.no_prune, importance=weights,
         simplifying=simplifying, progress=progress,
     )  # fmt: skip
     return EncoderOutcome(made.result, "target", made.report.as_json(), made.report.lines())

@@ -55,63 +55,64 @@ def finetune(
     out: OutputOptions,
     settings: LibrarySettings,
     itself: Annotated[
-        bool, typer.Option("--self", help="It is to look like the scene's own renders, from all around.")
+        bool, typer.Option("--self", help="Tune by the scene's own renders instead of photographs.")
     ] = False,
     keep: Annotated[
         float | None,
-        typer.Option(metavar="SHARE", help="First leave only this share of the splats, those that pictures need most."),
+        typer.Option(metavar="SHARE", help="Share of the splats to keep; the others are pruned first."),
     ] = None,
     target_size: Annotated[
         str | None,
-        typer.Option(metavar="5MB", help="So many bytes at most: as many splats stay as there is room for."),
+        typer.Option(metavar="5MB", help="Largest size of the file; splats are pruned to reach it."),
     ] = None,
     target_psnr: Annotated[
         str | None,
-        typer.Option(metavar="dB", help="The smallest file found that has it on the views that decide; tunes several."),
+        typer.Option(metavar="dB", help="Least PSNR of the validation views; several files are tuned."),
     ] = None,
     prune_unseen: Annotated[
         bool | None,
         typer.Option(
             "--prune-unseen/--keep-unseen",
             hidden=True,
-            help="Whether splats go that no view shows; by default with --data.",
+            help="Prune splats that no view shows. Default: only with --data.",
         ),
     ] = None,
     importance: Importance = None,
     near: Near = None,
-    aside: Annotated[
+    validation_count: Annotated[
         int,
         typer.Option(
             metavar="N",
             min=0,
             hidden=True,
-            help="Views that decide which step was best, and do not teach; 0: with --data its validation photographs or"
-            " some that teach, with --self a few others.",
+            help="Validation views, which choose the best step; 0: those of the data set or of the training.",
         ),
     ] = 0,
-    iterations: Annotated[int, typer.Option(metavar="N", min=1, help="Steps at most, one picture each.")] = 1_000,
+    iterations: Annotated[int, typer.Option(metavar="N", min=1, help="Steps at most, each with one image.")] = 1_000,
     byte_cost: ByteCost = None,
     lr_factor: Annotated[
         float | None,
-        typer.Option(metavar="FACTOR", hidden=True, help="Of all learning rates; by default 1, with --self 0.03."),
+        typer.Option(
+            metavar="FACTOR", hidden=True, help="Factor of all learning rates. Default: 1; with --self, 0.03."
+        ),
     ] = None,
     lpips: Lpips = None,
     page: Annotated[
-        str | None, typer.Option(metavar="FILE.html", help="Write a page about it: scores, curve, pictures.")
+        str | None, typer.Option(metavar="FILE.html", help="Write an HTML report: scores, curve, renders.")
     ] = None,
     source_index: SourceIndex = None,
     checkpoint: Checkpoint = None,
     checkpoint_every: CheckpointEvery = 0,
     resume: Resume = None,
 ) -> None:
-    """Compress a scene, and tune what the file holds until it looks right.
+    """Compress a scene, and tune the values in the file by photographs or renders.
 
-    How much the views depend on each splat is measured; by that the encoder
-    decides lattices, tiles and codebooks, once. Then the values move, seen
-    through the encoder's own quantisers, until pictures of what a decoder
-    will see look like the photographs; without photographs, like the scene
-    itself. What looks best for its bytes is written. Needs the packages of
-    the render extra.
+    The sensitivity of the views to each splat is measured, by which the encoder
+    chooses lattices, tiles and codebooks, once. Then the values are tuned through
+    the encoder's quantisers until renders of the decoded scene match the
+    photographs, or without photographs the renders of the scene itself. The
+    step with the best renders for its bytes is written. Requires the packages
+    of the render extra.
 
     Examples:
       csplat finetune scene.ply scene.csplat --data capture --preset small
@@ -158,8 +159,10 @@ def finetune(
     read = read_source(source, facts.read(), strict=facts.strict, keep_extra=facts.keep_extra, sh_degree=degree)
     out.findings(read.findings)
     given = {"count": tuning.VIEWS, "size": tuning.VIEW_SIZE, **virtual.given()}
-    aside_count = aside or tuning.default_validation_count(given["count"], cameras=views.cameras, data=views.data)
-    around = views.find(read.model, out, near=near, aside=aside_count, **given)
+    aside_count = validation_count or tuning.default_validation_count(
+        given["count"], cameras=views.cameras, data=views.data
+    )
+    around = views.find(read.model, out, near=near, validation_count=aside_count, **given)
     around.read()
     report = tuning.run_finetuning(
         read.model, around, output, encoder, options, Outputs(checkpoint, checkpoint_every, resume=resume), keep=keep,

@@ -33,22 +33,22 @@ from csplat_tools.optional_packages import prepare_renderer, require_images
 def info(
     source: Annotated[str, typer.Argument(metavar="SCENE", help="A .csplat file; or any other of `csplat formats`.")],
     out: OutputOptions,
-    page: Annotated[str | None, typer.Option(metavar="FILE.html", help="Write a page about it.")] = None,
+    page: Annotated[str | None, typer.Option(metavar="FILE.html", help="Write an HTML report.")] = None,
     beside: Annotated[
         str | None,
         typer.Option(
             "--source",
             metavar="SCENE",
-            help="What it was made from, PLY or .csplat: the page shows where they differ. Wants the render extra.",
+            help="The source: the report shows where they differ. Requires the render extra.",
         ),
     ] = None,
 ) -> None:
-    """Say what is in a file: scene, sizes, options, stated errors.
+    """Describe a file: scene, sizes, options, declared errors.
 
     Reads the header, the index and the heads of the blocks: a large file
-    takes hardly longer than a small one. Nothing is decoded: whether the
-    file is intact is what `csplat verify` tells. --page writes the same as
-    one HTML page that opens from a disk, with words for all of it.
+    takes hardly longer than a small one. Nothing is decoded: `csplat verify`
+    checks if the file is intact. --page writes the same as one HTML page with
+    explanations, which opens from a disk.
 
     Examples:
       csplat info scene.csplat
@@ -124,7 +124,7 @@ def _stated_errors(stated: DeclaredBounds) -> str:
     source = f"{counted(stated.source_count, 'splat')}, SH degree {stated.source_sh_degree}"
     lines = [f"stands for a source of {source}; {stated.pruned_count} pruned"]
     if stated.refitted:
-        lines.append("attributes were fitted anew: renders are the judge of those without an error here")
+        lines.append("attributes were refitted: those without an error here are checked by renders only")
     if stated.records:
         rows = [(one.measure, f"{one.max:.6g}", f"{one.rms:.6g}") for one in stated.records]
         lines.append(format_table(("stated error", "max", "rms"), rows))

@@ -41,34 +41,32 @@ class _RenderViewOptions(ViewOptions):
     cameras: Annotated[
         str | None, typer.Option(metavar="FILE.json", help="Cameras: a list of {K, viewmat, W, H, near, image}.")
     ] = None
-    data: Annotated[str | None, typer.Option(metavar="DATA", help="Where the pictures of a data set were taken.")] = (
-        None
-    )
+    data: Annotated[str | None, typer.Option(metavar="DATA", help="Cameras of the photographs of a data set.")] = None
     background: Annotated[
         str | None,
-        typer.Option(metavar="R,G,B", help="Colour behind the scene, 0 to 1, or black, or white; else as in training."),
+        typer.Option(metavar="R,G,B", help="Background, 0 to 1, or black, or white. Default: as in training."),
     ] = None
-    size: Annotated[str | None, typer.Option(metavar="WxH", help="Of the pictures: the cameras' own, or 640x480.")] = (
-        None
-    )
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Size of renders. Default: that of the cameras, or 640x480.")
+    ] = None
 
 
 @command(reads=True, needs={"up": ("orbit",), "axes": ("orbit",)})
 def render(
     source: SceneArgument,
     output: Annotated[
-        str, typer.Argument(metavar="OUT", help="A folder for pictures; or NAME.mp4, .webp, .gif, .png: a film.")
+        str, typer.Argument(metavar="OUT", help="A folder for PNG files; or NAME.mp4, .webp, .gif, .png: a film.")
     ],
     views: _RenderViewOptions,
     upright: OrientationOptions,
     out: OutputOptions,
     orbit: Annotated[
         int | None,
-        typer.Option(metavar="N", min=1, help="N cameras all around, or along those of --cameras or --data."),
+        typer.Option(metavar="N", min=1, help="N cameras around the scene, or along those of --cameras or --data."),
     ] = None,
     split: SplitOption = "test",
     fps: Annotated[
-        float, typer.Option(metavar="RATE", min=0.1, max=MAX_FPS, help="Pictures per second of a film.")
+        float, typer.Option(metavar="RATE", min=0.1, max=MAX_FPS, help="Frames per second of a film.")
     ] = DEFAULT_FPS,
     mode: ModeWord = "standard",
     sh_degree: ShDegree = None,
@@ -77,16 +75,16 @@ def render(
 ) -> None:
     """Render a scene to PNG files, or to a film: MP4, or an animated WebP, GIF or PNG.
 
-    Each picture takes the name of its camera's photograph, or a number. A
-    film repeats for ever; WebP loses a little, GIF has 256 colours, PNG loses
-    nothing. MP4 is H.264 and wants the film extra. Cameras stand relative to
-    the scene's origin, or around it where it is far from 0; those of a data set
-    where its pictures were taken.
+    A render is named after its camera's photograph, or by a number. A film
+    repeats for ever; WebP loses a little, GIF has 256 colours, PNG is lossless.
+    MP4 is H.264 and requires the film extra. Cameras are relative to the scene's
+    origin, or around it if it is far from 0; those of a data set are where its
+    photographs were taken.
     Camera files are our own, INRIA's cameras.json, camera paths of nerfstudio,
     and transforms.json.
-    An orbit shows an object whole; inside of a room it goes where fine splats
-    are to be seen, or beside the cameras that you name. Needs the packages of
-    the render extra.
+    An orbit shows the whole of an object; inside a room it goes where fine splats
+    are visible, or along the cameras that you give. Requires the packages of the
+    render extra.
 
     Examples:
       csplat render scene.csplat --orbit 120 turn.mp4
@@ -128,7 +126,7 @@ def render(
     if rendered.ignored_count:
         note(f"{counted(rendered.ignored_count, 'splat')} with NaN or infinities, not drawn")
     out.remark(
-        f"{counted(len(cameras), 'picture')} in {output}"
+        f"{counted(len(cameras), 'frame')} in {output}"
         if film
         else f"{counted(len(rendered.files), 'file')} in {output}"
     )

@@ -31,17 +31,17 @@ def sensitivity(
         bool,
         typer.Option(
             "--matrices/--no-matrices",
-            help="Store how errors of SH add up, which codebooks are chosen by: 240 bytes per splat.",
+            help="Store the Gauss–Newton blocks of SH, 240 bytes per splat.",
         ),
     ] = True,
     seed: Seed = 0,
     threads: Threads = None,
 ) -> None:
-    """Measure how much pictures depend on each splat, attribute by attribute.
+    """Measure how much renders depend on each splat, attribute by attribute.
 
-    The file goes to `csplat encode --importance`, which then spends bytes where
-    they show. It belongs to this scene alone. Training views say most; without
-    them virtual ones are made, as many as it takes until they agree. Needs the
+    `csplat encode --importance` takes the file, and spends bytes where they
+    show. It is valid for this scene only. Training photographs give the best
+    result; without them virtual views are added until they agree. Requires the
     packages of the render extra.
 
     Examples:
@@ -60,9 +60,11 @@ def sensitivity(
     looked_for = views.data is None and views.cameras is None  # virtual ones
     prepare_renderer(quiet=out.quiet, simplify=looked_for)
     count = {"count": 0} if views.cameras is not None else {}
-    around = views.find(model, out, seed=seed, aside=None if views.data is None else 0, **virtual.given() | count)
+    around = views.find(
+        model, out, seed=seed, validation_count=None if views.data is None else 0, **virtual.given() | count
+    )
     out.foretell(
-        lambda: _PASSES * total_render_seconds(model, around.teaches or around.judges),
+        lambda: _PASSES * total_render_seconds(model, around.training or around.test),
         "fewer or smaller views take less: --help-all",
     )
     with out.bar() as progress:
@@ -77,7 +79,7 @@ def _lines(facts: Mapping[str, Any]) -> list[str]:
     unseen = f"no view saw {facts['unseen']} of them ({100.0 * facts['unseen_share']:.2f} %)"
     lines = [f"{counted(facts['splats'], 'splat')} from {counted(facts['views'], facts['source'] + ' view')}; {unseen}"]
     if facts["missed_share"] is not None:
-        lines.append(f"views that were kept aside saw {100.0 * facts['missed_share']:.2f} % more of the splats")
+        lines.append(f"held-out views saw {100.0 * facts['missed_share']:.2f} % more of the splats")
     rows = [
         (label, *(f"{facts['quantiles'][name][q]:.3g}" for q in ("0.5", "0.9", "0.99", "1.0")))
         for name, label in _SHOWN.items()

@@ -22,9 +22,9 @@ from csplat_tools.scene_files import MetadataOverrides
 from csplat_tools.views import VIRTUAL, DataOptions, Split, ViewSet, find_view_set
 
 _NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-_SCENE = "What the PLY may not say"
-_DATA = "Photographs of --data (by default as the scene was trained)"
-_VIEWS = "Views (virtual ones by default)"
+_SCENE = "Metadata that a PLY may lack"
+_DATA = "Photographs of --data (default: as in training)"
+_VIEWS = "Views (default: virtual ones)"
 
 #: The dataclass whose fields `--set` takes for the encoder, as `module:name`.
 ENCODER_SETTINGS = "csplat.encoder.encode_options:EncodeOptions"
@@ -34,48 +34,63 @@ SceneArgument = Annotated[
 ]
 
 
-Seed = Annotated[int, typer.Option(min=0, hidden=True, help="Of all random choices.")]
+Seed = Annotated[int, typer.Option(min=0, hidden=True, help="Seed of all random choices. Default: 0.")]
 #: Arguments of `typer.Option` for --effort; commands add a panel.
 EFFORT: dict[str, Any] = {
-    "metavar": "1..9", "min": 1, "max": 9, "show_default": False, "help": "Work for fewer bytes, usually 3."
+    "metavar": "1..9", "min": 1, "max": 9, "show_default": False, "help": "Work for fewer bytes. Default: 3."
 }  # fmt: skip
 Threads = Annotated[
-    int | None, typer.Option(min=1, hidden=True, help="One per core by default; the result stays the same.")
+    int | None, typer.Option(min=1, hidden=True, help="Threads, which do not change the result. Default: one per core.")
 ]
-ModeWord = Annotated[Mode, typer.Option(metavar="exact|standard|fast", help="Of the renderer: speed for accuracy.")]
+ModeWord = Annotated[
+    Mode, typer.Option(metavar="exact|standard|fast", help="Accuracy of the renderer against its speed.")
+]
 Lpips = Annotated[
     str | None, typer.Option(metavar="WEIGHTS.npz", help="Compute LPIPS (Alex) with these weights, or with `auto`.")
 ]
 ShDegree = Annotated[int | None, typer.Option(metavar="0..3", min=0, max=3, help="Leave out SH bands above this one.")]
 SourceIndex = Annotated[
     str | None,
-    typer.Option(metavar="FILE.npy", hidden=True, help="Write which splat of the source each one of the result is."),
+    typer.Option(
+        metavar="FILE.npy", hidden=True, help="Write the index of the source splat of each splat of the result."
+    ),
 ]
 Importance = Annotated[
     str | None,
     typer.Option(
         metavar="FILE",
         hidden=True,
-        help="How much each splat matters: what `csplat sensitivity` wrote, or weights (.npy) without dropped rows.",
+        help="Importance of each splat: a file of `csplat sensitivity`, or weights (.npy) of the splats as read.",
     ),
 ]
-Checkpoint = Annotated[str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Where checkpoints go.")]
-CheckpointEvery = Annotated[int, typer.Option(metavar="N", min=0, hidden=True, help="Steps; 0: at the end alone.")]
-Resume = Annotated[str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Go on from this checkpoint.")]
+Checkpoint = Annotated[
+    str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Write checkpoints to this file.")
+]
+CheckpointEvery = Annotated[
+    int,
+    typer.Option(
+        metavar="N", min=0, hidden=True, help="Steps from one checkpoint to the next; 0: only at the end. Default: 0."
+    ),
+]
+Resume = Annotated[str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Continue from this checkpoint.")]
 ByteCost = Annotated[
     float | None,
     typer.Option(
         "--lambda",
         metavar="COST",
-        help="Of a bit per splat in the loss of the tuning, usually 1e-4; targets find their own.",
+        help="Weight of a bit per splat in the loss. Default: 1e-4; a target finds its own.",
     ),
 ]
 
 
 Preset = Annotated[PresetName, typer.Option(metavar="|".join(PRESETS), help="Speed against size.")]
-SplitOption = Annotated[Split, typer.Option(metavar="test|train", rich_help_panel=_DATA, help="Which of them judge.")]
+SplitOption = Annotated[
+    Split,
+    typer.Option(metavar="test|train", rich_help_panel=_DATA, help="Photographs to use as test views. Default: test."),
+]
 Near = Annotated[
-    float | None, typer.Option(metavar="UNITS", rich_help_panel=_DATA, hidden=True, help="Their near plane.")
+    float | None,
+    typer.Option(metavar="UNITS", rich_help_panel=_DATA, hidden=True, help="Near plane of the cameras, scene units."),
 ]
 
 
@@ -83,7 +98,7 @@ Near = Annotated[
 class OrientationOptions(OptionGroup):
     """Options of the scene's orientation, which override what the scene declares."""
 
-    up: Annotated[str | None, typer.Option(metavar="-y|X,Y,Z", help="Which way is up.")] = None
+    up: Annotated[str | None, typer.Option(metavar="-y|X,Y,Z", help="Direction that is up.")] = None
     axes: Annotated[
         str | None, typer.Option(metavar="RDF", hidden=True, help="Directions of +x, +y, +z: R/L, U/D, F/B.")
     ] = None
@@ -127,7 +142,7 @@ class ViewOptions(OptionGroup):
         typer.Option(
             metavar="FILE.json",
             rich_help_panel=_VIEWS,
-            help="Cameras that judge; of 40 or more most teach and decide.",
+            help="Test views; 40 or more are split into three roles.",
         ),
     ] = None
     data: Annotated[
@@ -135,7 +150,7 @@ class ViewOptions(OptionGroup):
         typer.Option(
             metavar="DATA",
             rich_help_panel=_VIEWS,
-            help="Photographs: training ones teach, held-out ones judge.",
+            help="Photographs: training views, held-out ones test views.",
         ),
     ] = None
     background: Annotated[
@@ -144,11 +159,12 @@ class ViewOptions(OptionGroup):
             metavar="R,G,B",
             rich_help_panel=_VIEWS,
             hidden=True,
-            help="Behind the scene: black, but with --data or --cameras as in training.",
+            help="Background colour. Default: black; with --data or --cameras, that of training.",
         ),
     ] = None
     size: Annotated[
-        str | None, typer.Option(metavar="WxH", rich_help_panel=_DATA, hidden=True, help="Scale them to this size.")
+        str | None,
+        typer.Option(metavar="WxH", rich_help_panel=_DATA, hidden=True, help="Scale photographs to this size, pixels."),
     ] = None
     images: Annotated[
         str | None,
@@ -157,7 +173,10 @@ class ViewOptions(OptionGroup):
     test_every: Annotated[
         int | None,
         typer.Option(
-            metavar="N", rich_help_panel=_DATA, hidden=True, help="Every Nth was held out; 8 if nothing says it."
+            metavar="N",
+            rich_help_panel=_DATA,
+            hidden=True,
+            help="Every Nth photograph was held out. Default: as in training, or 8.",
         ),
     ] = None
 
@@ -215,14 +234,12 @@ class VirtualViewOptions(OptionGroup):
 
     views: Annotated[
         int | None,
-        typer.Option(
-            metavar="N", min=1, hidden=True, rich_help_panel=_VIEWS, help="Virtual views that teach, at most."
-        ),
+        typer.Option(metavar="N", min=1, hidden=True, rich_help_panel=_VIEWS, help="Virtual training views, at most."),
     ] = None
     view_size: Annotated[
         str | None,
         typer.Option(
-            metavar="WxH", hidden=True, rich_help_panel=_VIEWS, help="About how large pictures that teach are."
+            metavar="WxH", hidden=True, rich_help_panel=_VIEWS, help="Approximate size of training renders, pixels."
         ),
     ] = None
 
@@ -257,7 +274,7 @@ class SourceOptions(OrientationOptions):
         ),
     ] = None
     licence: Annotated[
-        str | None, typer.Option(metavar="TEXT", rich_help_panel=_SCENE, hidden=True, help="Into the metadata.")
+        str | None, typer.Option(metavar="TEXT", rich_help_panel=_SCENE, hidden=True, help="Licence, for the metadata.")
     ] = None
 
     def read(self) -> MetadataOverrides:
@@ -272,7 +289,7 @@ class EncodingOptions(OptionGroup):
     preset: Preset = "balanced"
     attribute_psnr: Annotated[
         float | None,
-        typer.Option(metavar="DB", help="PSNR of each attribute alone; of pictures 5 to 12 less."),
+        typer.Option(metavar="DB", help="PSNR of each attribute; renders have 5 to 12 dB less."),
     ] = None
     sh_degree: Annotated[int | None, typer.Option(metavar="0..3", help="Leave out SH bands above this one.")] = None
     grades: Annotated[
@@ -280,17 +297,16 @@ class EncodingOptions(OptionGroup):
         typer.Option(
             metavar="1..5",
             hidden=True,
-            help="Sort splats into so many grades at most, each with steps of its own, by what pictures lose: a target"
-            " measures it, or --importance says it. 1 for one precision throughout.",
+            help="Quantisation classes at most, into which a target or --importance sorts splats; 1: one precision.",
         ),
     ] = None
     deflate_level: Annotated[
-        int | None, typer.Option(metavar="1..12", hidden=True, help="How hard DEFLATE tries; zlib stops at 9.")
+        int | None, typer.Option(metavar="1..12", hidden=True, help="Level of DEFLATE; zlib has 9 at most.")
     ] = None
-    seed: Annotated[int, typer.Option(min=0, hidden=True, help="Seed of the clustering.")] = 0
+    seed: Annotated[int, typer.Option(min=0, hidden=True, help="Seed of the clustering. Default: 0.")] = 0
     threads: Annotated[
         int | None,
-        typer.Option(min=1, hidden=True, help="Threads, one per core by default; the bytes stay the same."),
+        typer.Option(min=1, hidden=True, help="Threads, which do not change the bytes. Default: one per core."),
     ] = None
 
     def options(self, facts: SourceOptions, settings: LibrarySettings) -> EncodeOptions:

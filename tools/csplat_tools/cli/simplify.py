@@ -33,7 +33,12 @@ _PASSES = (20.0, 45.0)
 _OPTIONS = "csplat_tools.optimise.pruning_order:SimplifyOptions"
 
 
-@command(reads=True, one_of=(("keep", "target_psnr", "max_loss"),), needs={"max_loss": ("data",)}, settings=(_OPTIONS,))
+@command(
+    reads=True,
+    one_of=(("keep", "target_psnr", "max_psnr_drop"),),
+    needs={"max_psnr_drop": ("data",)},
+    settings=(_OPTIONS,),
+)
 def simplify(
     source: SceneArgument,
     output: Annotated[str, typer.Argument(metavar="OUT.ply", help="The PLY to write, or -.")],
@@ -43,18 +48,18 @@ def simplify(
     out: OutputOptions,
     settings: LibrarySettings,
     keep: Annotated[
-        float | None, typer.Option(metavar="SHARE", rich_help_panel=_TARGET, help="Share of the splats that stay.")
+        float | None, typer.Option(metavar="SHARE", rich_help_panel=_TARGET, help="Share of the splats to keep.")
     ] = None,
     target_psnr: Annotated[
         str | None,
         typer.Option(
-            metavar="DB", rich_help_panel=_TARGET, help="PSNR against the source's renders, by the views that decide."
+            metavar="DB", rich_help_panel=_TARGET, help="Least PSNR of the validation views against source renders."
         ),
     ] = None,
-    max_loss: Annotated[
+    max_psnr_drop: Annotated[
         str | None,
         typer.Option(
-            metavar="DB", rich_help_panel=_TARGET, help="How far PSNR against the photographs of --data may fall."
+            metavar="DB", rich_help_panel=_TARGET, help="Largest drop of the PSNR against the photographs of --data."
         ),
     ] = None,
     effort: Annotated[int, typer.Option(**EFFORT)] = 3,
@@ -62,20 +67,20 @@ def simplify(
     threads: Threads = None,
     source_index: SourceIndex = None,
 ) -> None:
-    """Remove splats that no picture needs, and fit the others to what is to be seen.
+    """Prune splats that no render needs, and refit the others.
 
-    What the removal of each splat would change is measured exactly, in many
-    small views from all around, again and again as splats go. Then colours,
-    opacities, scales and rotations of the others are fitted to what the source
-    looks like in views that teach. Other views decide how much may go, and others
-    again judge the result. Only --max-loss wants photographs. `csplat encode`
-    with a target does all this for the file that it writes. Needs the packages
-    of the render extra.
+    The error that pruning each splat causes is measured exactly, in many small
+    views from all around, and again as splats are pruned. Then colours, opacities,
+    scales and rotations of the others are fitted to the source's renders in the
+    training views. Validation views decide how many splats are kept, and test
+    views score the result. Only --max-psnr-drop requires photographs. `csplat
+    encode` with a target does all this for the file that it writes. Requires the
+    packages of the render extra.
 
     Examples:
       csplat simplify scene.ply half.ply --keep 0.5
       csplat simplify scene.ply small.ply --target-psnr 40 --report small.json
-      csplat simplify scene.ply small.ply --max-loss 0.3dB --data capture
+      csplat simplify scene.ply small.ply --max-psnr-drop 0.3dB --data capture
     """
     require_renderer()
     import csplat_tools
@@ -84,9 +89,9 @@ def simplify(
     from csplat_tools.views import shrink_cameras
     from csplat_tools.views.view_sets import total_render_seconds
 
-    loss = None if max_loss is None else parse_decibels(max_loss)
+    drop = None if max_psnr_drop is None else parse_decibels(max_psnr_drop)
     psnr = None if target_psnr is None else parse_decibels(target_psnr)
-    chosen(Target, psnr=psnr, max_loss=loss, keep=keep)  # before anything is read
+    chosen(Target, psnr=psnr, max_psnr_drop=drop, keep=keep)  # before anything is read
     options = chosen(SimplifyOptions, **settings.of(SimplifyOptions), effort=effort, seed=seed, threads=threads)
     out.check(output, inputs=(source, *views.inputs), named={"--source-index": source_index})
     check_name(output, ".ply", "simplify", source)
@@ -99,12 +104,12 @@ def simplify(
     options = replace(options, view_size=given.get("size"))
     passes = _PASSES[keep is None] * (0.5 + 0.5 * options.work)
     out.foretell(
-        lambda: passes * total_render_seconds(model, shrink_cameras(around.teaches, options.pictures(len(model))[1])),
+        lambda: passes * total_render_seconds(model, shrink_cameras(around.training, options.pictures(len(model))[1])),
         "fewer or smaller views take less: --help-all",
     )
     with out.bar() as progress:
         result = csplat_tools.simplify(
-            model, keep=keep, psnr=psnr, loss=loss, views=around, options=options, progress=progress
+            model, keep=keep, psnr=psnr, max_psnr_drop=drop, views=around, options=options, progress=progress
         )
     write_model(output, result.model, absolute=False)
     if source_index is not None:
@@ -116,22 +121,22 @@ def simplify(
 def _lines(report: Mapping[str, Any]) -> list[str]:
     removed, views = report["removed"], report["views"]
     before, after = report["splats_before"], report["splats"]
-    gone = (
+    pruned = (
         f"{removed['invisible']} too faint to be drawn, {removed['unseen']} unseen,"
-        f" {removed['least_error']} that pictures need least"
+        f" {removed['least_error']} that renders need least"
     )
     size = f"{views['size'][0]}x{views['size'][1]}"
     unseen = f"{100.0 * report['unseen_share']:.1f} % of the splats were seen by none"
     lines = [
-        f"{before:,} -> {counted(after, 'splat')} ({100.0 * after / before:.1f} %); gone: {gone}",
+        f"{before:,} -> {counted(after, 'splat')} ({100.0 * after / before:.1f} %); pruned: {pruned}",
         f"measured in {counted(views['used'], 'view')} of {size}, checked in {views['check']} others; {unseen}",
     ]
     rows = [("the other views, before the fit", f"{report['check_psnr_pruned']:.2f}")]
     rows.append(("the other views, fitted", f"{report['check_psnr']:.2f}"))
     if "decided_psnr" in report:
-        rows.append(("the views that decide", f"{report['decided_psnr']:.2f}"))
+        rows.append(("validation views", f"{report['decided_psnr']:.2f}"))
     if "psnr" in report:
-        rows.append((f"the {report['judged_by']['views']} views that judge", f"{report['psnr']:.2f}"))
+        rows.append((f"{report['judged_by']['views']} test views", f"{report['psnr']:.2f}"))
     if "photographs" in report:
         scores = report["photographs"]
         rows.append(("held-out photographs, source", f"{scores['source']:.2f}"))

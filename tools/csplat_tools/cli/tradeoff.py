@@ -22,7 +22,8 @@ def tradeoff(
     views: ViewOptions,
     out: OutputOptions,
     page: Annotated[
-        str | None, typer.Option("--output", "-o", metavar="PAGE.html", help="Write a page with plots and pictures.")
+        str | None,
+        typer.Option("--output", "-o", metavar="PAGE.html", help="Write an HTML report with plots and renders."),
     ] = None,
     plots: Annotated[str | None, typer.Option(metavar="FOLDER", help="Write the plots as SVG files.")] = None,
     what: Annotated[
@@ -45,15 +46,15 @@ def tradeoff(
     lpips: Lpips = None,
     threads: Threads = None,
 ) -> None:
-    """Show what a scene costs and what it keeps, over everything that can be chosen.
+    """Measure size against quality for all that can be chosen when a scene is encoded.
 
-    Encodes the scene in many ways, measures bytes, pictures and seconds of
-    each, and marks those that no other one beats: presets, values of
-    --attribute-psnr, targets (the slowest: they remove and refit splats),
-    shares of the splats, fewer SH bands, and simple strategies. A small scene
-    takes minutes. PSNR is against the source's own renders, as `psnr` of
-    `csplat compare`; photographs judge beside it. The page has the command
-    that makes each file, and pictures of where it differs most. Needs the
+    Encodes the scene in many ways, measures bytes, quality and seconds of each,
+    and marks those that no other one beats: presets, values of --attribute-psnr,
+    targets (the slowest: they prune and refit splats), shares of the splats,
+    fewer SH bands, and simple strategies. A small scene takes minutes. PSNR is
+    against the source's own renders, as `psnr` of `csplat compare`, and next to
+    it against photographs if there are any. The report has the command that
+    makes each file, and renders of the place where it differs most. Requires the
     packages of the render extra.
 
     Examples:

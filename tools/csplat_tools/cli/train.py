@@ -37,52 +37,47 @@ _KEEP = 0.8  # default fraction of the trained splats that OUT.csplat keeps: som
     settings=("csplat_trainer.training_options:TrainOptions",),
 )
 def train(
-    source: Annotated[str, typer.Argument(metavar="DATA", help="A folder or transforms.json of posed pictures.")],
+    source: Annotated[str, typer.Argument(metavar="DATA", help="A folder or transforms.json of posed images.")],
     output: Annotated[
-        str, typer.Argument(metavar="OUT.ply|OUT.csplat", help="The scene to write, or a file that was tuned, too.")
+        str, typer.Argument(metavar="OUT.ply|OUT.csplat", help="The scene to write, or a file that is tuned as well.")
     ],
     upright: OrientationOptions,
     out: OutputOptions,
     settings: LibrarySettings,
     max_splats: Annotated[
         int | None,
-        typer.Option(
-            metavar="N", help="No more splats than this; by default 20,000, with a target as many as it has room for."
-        ),
+        typer.Option(metavar="N", help="Splats at most. Default: 20,000; with a target, as many as it allows."),
     ] = None,
-    sh_degree: Annotated[
-        int, typer.Option(metavar="0..3", help="How colour depends on direction.")
-    ] = _DEFAULT.sh_degree,
+    sh_degree: Annotated[int, typer.Option(metavar="0..3", help="SH degree of the colours.")] = _DEFAULT.sh_degree,
     iterations: Annotated[int, typer.Option(metavar="N", help="Training steps.")] = _DEFAULT.iterations,
     preset: Annotated[
         PresetName | None,
-        typer.Option(metavar="|".join(PRESETS), help="Of OUT.csplat: speed against size; by default small."),
+        typer.Option(metavar="|".join(PRESETS), help="Preset of OUT.csplat: speed against size. Default: small."),
     ] = None,
     keep: Annotated[
         float | None,
-        typer.Option(
-            metavar="SHARE", help="Of the splats that are trained, how many OUT.csplat holds; by default 0.8."
-        ),
+        typer.Option(metavar="SHARE", help="Share of the trained splats that OUT.csplat keeps. Default: 0.8."),
     ] = None,
     target_size: Annotated[
-        str | None, typer.Option(metavar="1.4MB", help="OUT.csplat has so many bytes at most; not with --keep.")
+        str | None, typer.Option(metavar="1.4MB", help="Largest size of OUT.csplat; not with --keep.")
     ] = None,
     target_psnr: Annotated[
         str | None,
-        typer.Option(metavar="dB", help="OUT.csplat is the smallest found that has it on photographs that decide."),
+        typer.Option(metavar="dB", help="Least PSNR of OUT.csplat against validation photographs."),
     ] = None,
     byte_cost: ByteCost = None,
-    size: Annotated[str | None, typer.Option(metavar="WxH", help="Scale the pictures to this size.")] = None,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Scale the images to this size.")] = None,
     images: Annotated[str | None, typer.Option(metavar="NAME", help="Folder of images, such as images_4.")] = None,
-    test_every: Annotated[int, typer.Option(metavar="N", help="Hold out every Nth picture; 0: none.")] = 8,
+    test_every: Annotated[int, typer.Option(metavar="N", help="Hold out every Nth image; 0: none. Default: 8.")] = 8,
     background: Annotated[
         str, typer.Option(metavar="|".join(BACKGROUNDS), help="auto: white behind RGBA, else black.")
     ] = _DEFAULT.background,
     device: Annotated[
-        str, typer.Option(metavar="|".join(DEVICES), help="cuda wants a GPU and gsplat, and never ran on one.")
+        str, typer.Option(metavar="|".join(DEVICES), help="cuda requires a GPU, torch and gsplat.")
     ] = "cpu",
     near: Annotated[
-        float | None, typer.Option(metavar="UNITS", hidden=True, help="Near plane; else one that suits.")
+        float | None,
+        typer.Option(metavar="UNITS", hidden=True, help="Near plane, scene units. Default: one that suits the set."),
     ] = None,
     seed: Seed = _DEFAULT.seed,
     threads: Threads = None,
@@ -92,42 +87,46 @@ def train(
     lpips_weights: Annotated[
         str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Weights of LPIPS-Alex.")
     ] = None,
-    plot: Annotated[str | None, typer.Option(metavar="FILE.png", hidden=True, help="The loss over the steps.")] = None,
+    plot: Annotated[
+        str | None, typer.Option(metavar="FILE.png", hidden=True, help="Plot the loss over the steps.")
+    ] = None,
     page: Annotated[
-        str | None, typer.Option(metavar="FILE.html", help="Write a page about it: scores, curves, pictures.")
+        str | None, typer.Option(metavar="FILE.html", help="Write an HTML report: scores, curves, renders.")
     ] = None,
     previews: Annotated[
-        str | None, typer.Option(metavar="FOLDER", hidden=True, help="Early pictures, beside the photograph.")
+        str | None, typer.Option(metavar="FOLDER", hidden=True, help="Write early renders next to the photograph.")
     ] = None,
     preview_every: Annotated[
-        int, typer.Option(metavar="N", min=0, hidden=True, help="Steps; 0: after 100, 200, 400, ...")
+        int,
+        typer.Option(
+            metavar="N", min=0, hidden=True, help="Steps from one preview to the next; 0: after 100, 200, 400, ..."
+        ),
     ] = 0,
     checkpoint: Checkpoint = None,
     checkpoint_every: CheckpointEvery = 0,
     resume: Resume = None,
 ) -> None:
-    """Train a scene from posed pictures, on a CPU.
+    """Train a scene from posed images, on a CPU.
 
     DATA is a NeRF-synthetic folder, an instant-ngp transforms.json or its
-    folder, or a COLMAP folder with its pictures. Test pictures are held out:
-    those that the data set names, or every eighth. Where masks are black
-    (`mask_path`, or a folder `masks` beside COLMAP's pictures), nothing is
-    learnt and nothing judged.
+    folder, or a COLMAP folder with its images. Test images are held out: those
+    that the data set names, or every eighth. Black areas of masks (`mask_path`,
+    or a folder `masks` next to COLMAP's images) are neither learnt nor scored.
 
-    What is behind the splats is white where pictures have an alpha channel
-    and black where they have none. A comment in OUT.ply says so, and which
-    pictures were held out, their size and the near plane: other commands read
-    it and judge the scene alike; encode and decode keep it. Another says which
-    way is up, by the kind of set or by how its cameras were held.
+    The background is white if images have an alpha channel, else black. OUT.ply
+    records it in a comment, with the held-out images, their size and the near
+    plane: other commands read it and score the scene alike; encode and decode
+    keep it. Another comment records the up direction, from the kind of set or
+    from how its cameras were held.
 
-    For OUT.csplat splats that pictures hardly need go while others still learn
-    to stand in for them. Then `csplat finetune --data DATA` follows: values
-    move, seen through the encoder's quantisers, until the photographs look
-    right. Photographs that a set names for validation, or some that teach, say
-    which step was best. With --target-size bytes cost as much in the loss as
-    keeps the file to it. --target-psnr tunes files of several sizes, until the
-    smallest has it. --checkpoint and --resume cover training and tuning: from
-    one training files of several sizes can be made.
+    For OUT.csplat, splats that renders hardly need are pruned while others can
+    still learn to replace them. Then `csplat finetune --data DATA` follows: the
+    values are tuned through the encoder's quantisers. Validation photographs of
+    the set, or some training photographs, choose the best step. --target-size
+    weighs bytes in the loss so that the file keeps to it. --target-psnr tunes
+    files of several sizes, until the smallest reaches it. --checkpoint and
+    --resume cover training and tuning: one training can make files of several
+    sizes.
 
     Examples:
       csplat train lego -o lego.ply --max-splats 10000

@@ -284,23 +284,23 @@ def compare(
     distance = None if lpips is None else load_lpips(None if lpips == AUTO_WEIGHTS else lpips)
     with open_scenes((a, b), memory_bytes) as (source, other):
         views = views or _views(source, background, progress)
-        if not views.judges:
+        if not views.test:
             raise InputError(f"{views.name} has no {views.split} pictures")
-        by_photographs = views.photograph_judge(mode=mode) if views.photographs else None
+        by_photographs = views.photograph_test_scorer(mode=mode) if views.photographs else None
         viewers: list[OnView] = []
         if pictures is not None:
-            names = image_names([camera.image for camera in views.judges])
+            names = image_names([camera.image for camera in views.test])
             viewers.append(_ImageWriter(os.fspath(pictures), names, by_photographs, amplification, force=force))
-        first, second, errors = _measured(source, other, views.judges, source_index, progress)
+        first, second, errors = _measured(source, other, views.test, source_index, progress)
         if prepare is not None:
             prepare()
-        judges = None if by_photographs is None else _PhotographScores(by_photographs, distance)
-        viewers += [] if judges is None else [judges]
-        judge = views.judge(first, mode=mode, background=background, progress=progress)
+        photograph_scores = None if by_photographs is None else _PhotographScores(by_photographs, distance)
+        viewers += [] if photograph_scores is None else [photograph_scores]
+        judge = views.test_scorer(first, mode=mode, background=background, progress=progress)
         quality = judge.scores(second, lpips=distance, on_view=_all_of(viewers), progress=progress)
         return Comparison(
             source, other, errors, quality, judge.look(0).ignored, views.name,
-            None if judges is None else {"split": views.split, **judges.as_json()},
+            None if photograph_scores is None else {"split": views.split, **photograph_scores.as_json()},
             views.background, mode, views.notes, time.perf_counter() - start,
         )  # fmt: skip
 

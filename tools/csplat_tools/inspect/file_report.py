@@ -120,8 +120,8 @@ def _compared(data: bytes | mmap, source: str, progress: Progress | None) -> _So
     loaded, model = load_model(source), decode(data)
     views = find_view_set(loaded.model, count=0)
     hardest, shown = HardestPlaceSearch(), display_cameras(loaded.model, views)
-    scores = views.judge(loaded.model).scores(model, progress=progress)
-    showing = Scorer.of_source(loaded.model, shown, views.judging_background)
+    scores = views.test_scorer(loaded.model).scores(model, progress=progress)
+    showing = Scorer.of_source(loaded.model, shown, views.test_background)
     showing.scores(model, ssim=False, on_view=hardest.look)
     place = hardest.found()
     assert place is not None

@@ -233,7 +233,7 @@ class CandidatePool:
     Attributes:
         encoding: the caller's options, which no choice overrides.
         judge: scorer by the source's renders in the test views, on which a PSNR target is measured; it chooses nothing.
-        decider: scorer by those in the validation views, on which files are compared.
+        validation_scorer: scorer by those in the validation views, on which files are compared.
         photographs: scorer by validation photographs, if the target is a loss against photographs.
         made: all files, in order.
         progress: progress callback, called with each file that is made.
@@ -242,7 +242,7 @@ class CandidatePool:
 
     encoding: EncodeOptions
     judge: Scorer
-    decider: Scorer
+    validation_scorer: Scorer
     photographs: Scorer | None = None
     made: list[Candidate] = field(default_factory=list)
     progress: Progress | None = None
@@ -252,7 +252,7 @@ class CandidatePool:
     @property
     def renders(self) -> int:
         """Number of renders made of the files."""
-        return sum(len(self.decider.cameras) + one.is_judged * len(self.judge.cameras) for one in self.made)
+        return sum(len(self.validation_scorer.cameras) + one.is_judged * len(self.judge.cameras) for one in self.made)
 
     def judged_psnr(self, part: Subset) -> float:
         """Return the PSNR of a part before quantisation on the test views, dB: the error that pruning takes."""
@@ -294,7 +294,7 @@ class CandidatePool:
         coded = part.coded(options, graded=coding.graded, quick=quick)
         result = coded.write(part.said(None))
         model = self.decode(result.data)
-        decided_psnr = self.decider.psnr(model)
+        decided_psnr = self.validation_scorer.psnr(model)
         photo_psnr = math.nan if self.photographs is None else self.photographs.psnr(model)
         trial = Candidate(
             part, coding, quality, options, careful, result, self.judge, decided_psnr, photo_psnr, self.decode

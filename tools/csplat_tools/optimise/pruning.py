@@ -161,20 +161,20 @@ def simplify(
     *,
     keep: float | None = None,
     psnr: float | None = None,
-    loss: float | None = None,
+    max_psnr_drop: float | None = None,
     views: ViewSet | None = None,
     options: SimplifyOptions | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Simplified:
     """Prune splats to a target, refit the others, and leave out SH bands, as `csplat simplify` does.
 
-    Give one of `keep`, `psnr` and `loss`. Requires the packages of the render extra.
+    Give one of `keep`, `psnr` and `max_psnr_drop`. Requires the packages of the render extra.
 
     Args:
         scene: a model, or a file in any format.
         keep: fraction of the splats to keep, above 0, at most 1.
         psnr: least PSNR against the source's renders on the validation views, dB; as few splats as possible are kept.
-        loss: dB that the PSNR against the photographs of `views` may fall.
+        max_psnr_drop: dB that the PSNR against the photographs of `views` may fall.
         views: the kept splats are fitted to training views, and validation views determine how many may be pruned.
             `None`: virtual views, as many as it takes.
         options: options of the simplification.
@@ -196,12 +196,12 @@ def simplify(
         OSError: the file cannot be read.
     """
     require_renderer()
-    target = Target(psnr, None, loss, keep)
+    target = Target(psnr, None, max_psnr_drop, keep)
     source = load_model(scene).model
     options = options or SimplifyOptions()
     if not len(source):
         raise InputError("a scene without splats cannot be simplified")
-    if target.max_loss is not None and (views is None or not views.photographs):
+    if target.max_psnr_drop is not None and (views is None or not views.photographs):
         raise InputError("a loss against photographs wants photographs: name a data set")
     left = None if target.keep is None else target.count(len(source))
     session = prepare_pruning(source, views, left, options, progress)
@@ -223,23 +223,23 @@ def find_scorer(session: PruningSession, target: Target) -> tuple[Scorer, float]
         target: the target.
     """
     around, threads = session.around, session.options.threads
-    if target.max_loss is not None:
-        decider = around.photograph_decider(threads=threads)
-        return decider, decider.psnr(session.source) - target.max_loss
-    return around.decider(session.source, threads=threads), PSNR_CAP if target.psnr is None else target.psnr
+    if target.max_psnr_drop is not None:
+        validation_scorer = around.photograph_validation_scorer(threads=threads)
+        return validation_scorer, validation_scorer.psnr(session.source) - target.max_psnr_drop
+    return around.validation_scorer(session.source, threads=threads), PSNR_CAP if target.psnr is None else target.psnr
 
 
 def _test_scores(session: PruningSession, model: SplatModel) -> dict[str, Any]:
     """Return the scores of the result on the test views, for the report; empty if there are none."""
     around, threads = session.around, session.options.threads
-    if not around.judges:
+    if not around.test:
         return {}
     said: dict[str, Any] = {
-        "psnr": around.judge(session.source, threads=threads).psnr(model),
-        "judged_by": {"cameras": around.name, "views": len(around.judges)},
+        "psnr": around.test_scorer(session.source, threads=threads).psnr(model),
+        "judged_by": {"cameras": around.name, "views": len(around.test)},
     }
     if around.photographs:
-        judge = around.photograph_judge(threads=threads)
+        judge = around.photograph_test_scorer(threads=threads)
         said["photographs"] = {"source": judge.psnr(session.source), "psnr": judge.psnr(model)}
     return said
 

@@ -88,12 +88,12 @@ def measure_scene(
     if not len(model):
         raise InputError(_NOTHING)
     cameras, check, source = (
-        views.teaches or views.judges,
+        views.training or views.test,
         list[Camera](),
         "training" if views.photographs else "cameras",
     )
-    if views.virtual and views.teaches:
-        size = (views.teaches[0].W, views.teaches[0].H)
+    if views.virtual and views.training:
+        size = (views.training[0].W, views.training[0].H)
         found = find_sufficient_views(model, views, _GONE, size=size, threads=threads, progress=progress)
         cameras, check, source = found.used, found.check, "virtual"
     measured = measure_views(model, cameras, views.background, matrices=matrices, threads=threads, progress=progress)
@@ -174,7 +174,7 @@ def importance_views(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
     others; from these views, 41 and 40.
     """
     return evenly_spaced(
-        views.teaches, _VIRTUAL[source.sh_degree > 0][len(source) >= _LARGE] if views.virtual else _GIVEN
+        views.training, _VIRTUAL[source.sh_degree > 0][len(source) >= _LARGE] if views.virtual else _GIVEN
     )
 
 

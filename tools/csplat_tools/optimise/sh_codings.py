@@ -120,7 +120,7 @@ class CodingSearch:
         found: set[int] = set()
         for degree in reversed(range(self._degree)):
             if degree not in self._truncated:
-                self._truncated[degree] = solver.trials.decider.psnr(without_bands(self.source, degree))
+                self._truncated[degree] = solver.trials.validation_scorer.psnr(without_bands(self.source, degree))
             shown = self._truncated[degree]
             if shown <= wanted + _NONE_DROPPED:
                 break  # fewer bands have a lower PSNR

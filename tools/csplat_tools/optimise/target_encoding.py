@@ -29,34 +29,34 @@ def encode_to(
     *,
     psnr: float | None = None,
     size: int | str | None = None,
-    loss: float | None = None,
+    max_psnr_drop: float | None = None,
     keep: float | None = None,
     errors: Mapping[str, float] | None = None,
     views: ViewSet | None = None,
     options: EncodeOptions | None = None,
-    keep_all: bool = False,
+    no_prune: bool = False,
     importance: Weights | None = None,
     simplifying: SimplifyOptions | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Optimised:
     """Encode a scene to a target, as `csplat encode` does if one is given.
 
-    Give one of `psnr`, `size`, `loss` and `keep`, or `errors`, alone or together with one of the first two. All but
-    `errors` alone require rendering, which takes minutes, and the packages of the render extra.
+    Give one of `psnr`, `size`, `max_psnr_drop` and `keep`, or `errors`, alone or together with one of the first two.
+    All but `errors` alone require rendering, which takes minutes, and the packages of the render extra.
 
     Args:
         scene: a model, or a file in any format.
         psnr: least PSNR of the file's renders against the source's, dB, pooled over the test views; the smallest such
             file is searched.
         size: largest size in bytes, or as text such as "5MB"; the file with the best PSNR within it is searched.
-        loss: dB that the PSNR against the photographs of `views` may be below the source's; the smallest such file is
-            searched.
+        max_psnr_drop: dB that the PSNR against the photographs of `views` may be below the source's; the smallest such
+            file is searched.
         keep: fraction of the splats to keep, above 0, at most 1, at the precision of the preset.
         errors: the largest error of any splat, by measure: `means` in scene units, `covariance` relative,
             `opacities`, `sh0`, `sh1`, `sh2`, `sh3`.
         views: training, validation and test views; `None`: virtual ones around the scene (`find_view_set`).
         options: options that are set here are not chosen. The preset "fast" tries no codebooks and keeps all splats.
-        keep_all: keep every splat as it is, which takes a sixth of the time.
+        no_prune: keep every splat as it is, which takes a sixth of the time.
         importance: importance of the splats, as for the encoder.
         simplifying: options of pruning and fitting; the background is that of the views.
         progress: called with the stage and the fraction of it that is done, 0 to 1; `print` will do.
@@ -80,7 +80,9 @@ def encode_to(
         OSError: the file cannot be read.
     """
     start = time.perf_counter()
-    target = Target(psnr, parse_size_bytes(size) if isinstance(size, str) else size, loss, keep, dict(errors or {}))
+    target = Target(
+        psnr, parse_size_bytes(size) if isinstance(size, str) else size, max_psnr_drop, keep, dict(errors or {})
+    )
     source, encoding = load_model(scene).model, options or EncodeOptions()
     if not target.is_rendered:
         bounded = meet_bounds(source, encoding, target.max_error, importance=importance, progress=progress)
@@ -88,13 +90,13 @@ def encode_to(
     require_renderer()
     from csplat_tools.optimise.target_search import check_target, search_target
 
-    check_target(source, target, encoding, keep_all=keep_all)
+    check_target(source, target, encoding, no_prune=no_prune)
     files = 0
     if target.max_error:
         bounded = meet_bounds(source, encoding, target.max_error, importance=importance, progress=progress)
         files, encoding = bounded.encodes, bounded.encoding
     found, report = search_target(
-        source, target, views or find_view_set(source), encoding, keep_all=keep_all, importance=importance,
+        source, target, views or find_view_set(source), encoding, no_prune=no_prune, importance=importance,
         simplifying=simplifying, progress=progress,
     )  # fmt: skip
     seconds = round(time.perf_counter() - start, 3)

@@ -34,7 +34,7 @@ _RENDERS = 520.0
 _RENDERS_WITH_PRUNING = (600.0, 2400.0)
 _INSIDE_REMARK = (
     "virtual views decided which splats go: cameras inside of surroundings may see more of those than these do;"
-    " --data, or --cameras with 40 of them, would decide by yours, --keep-all leaves all"
+    " --data, or --cameras with 40 of them, would decide by yours, --no-prune leaves all"
 )
 
 
@@ -44,7 +44,7 @@ def search_target(
     views: ViewSet,
     encoding: EncodeOptions,
     *,
-    keep_all: bool,
+    no_prune: bool,
     importance: Weights | None,
     simplifying: SimplifyOptions | None,
     progress: Progress | None,
@@ -55,30 +55,30 @@ def search_target(
         source: the scene.
         target: the target, which must not be largest errors alone.
         views: training, validation and test views; they do not overlap.
-        encoding, keep_all, importance, simplifying, progress: as for `encode_to`.
+        encoding, no_prune, importance, simplifying, progress: as for `encode_to`.
 
     Raises:
         InputError: the target is out of reach, no splat shows, or a loss is requested without photographs.
     """
     views = with_validation_views(views)
-    judge = views.judge(source, threads=encoding.threads)
+    judge = views.test_scorer(source, threads=encoding.threads)
     if views.name != VIRTUAL and _is_empty(judge):
         raise InputError("no splat shows in the views given: are these cameras of this scene?")
     inside = views.virtual and scene_frame(source).kind == "surrounding"
     removal = None
-    if not _keeps_all(target, encoding, keep_all=keep_all):
+    if not _keeps_all(target, encoding, no_prune=no_prune):
         how = replace(simplifying or SimplifyOptions(), background=views.background, threads=encoding.threads)
         left = None if target.keep is None else target.count(len(source))
         removal = Pruner(
             source, views, how, grades=not inside, progress=progress, psnr=target.psnr, left=left
         )  # fmt: skip
     photographs = None
-    if target.max_loss is not None:
+    if target.max_psnr_drop is not None:
         if not views.photographs:
             raise InputError("a largest loss wants photographs (--data): it is lost against them")
-        photographs = views.photograph_decider(threads=encoding.threads)
-    decider = views.decider(source, threads=encoding.threads)
-    trials, sensitivity_views = CandidatePool(encoding, judge, decider, photographs, progress=progress), 0
+        photographs = views.photograph_validation_scorer(threads=encoding.threads)
+    validation_scorer = views.validation_scorer(source, threads=encoding.threads)
+    trials, sensitivity_views = CandidatePool(encoding, judge, validation_scorer, photographs, progress=progress), 0
     if removal is not None and removal.left is not None:
         found = TargetSearch.kept(trials, removal, removal.left)
     else:
@@ -108,33 +108,33 @@ def expected_seconds(
     target: Target,
     views: ViewSet,
     *,
-    keep_all: bool,
+    no_prune: bool,
     simplifying: SimplifyOptions | None = None,
 ) -> float:
     """Estimate the seconds that a target takes on this machine.
 
     Renders some test views to measure their time: the search costs about a fixed number of such renders on any machine.
     """
-    pictures = expected_renders(encoding, target, keep_all=keep_all, simplifying=simplifying)
-    return pictures * render_seconds(source, views.judges, threads=encoding.threads)
+    pictures = expected_renders(encoding, target, no_prune=no_prune, simplifying=simplifying)
+    return pictures * render_seconds(source, views.test, threads=encoding.threads)
 
 
 def expected_renders(
-    encoding: EncodeOptions, target: Target, *, keep_all: bool, simplifying: SimplifyOptions | None = None
+    encoding: EncodeOptions, target: Target, *, no_prune: bool, simplifying: SimplifyOptions | None = None
 ) -> float:
     """Return the approximate cost of a target as a number of renders of the test views."""
-    if _keeps_all(target, encoding, keep_all=keep_all):
+    if _keeps_all(target, encoding, no_prune=no_prune):
         return _RENDERS
     return _RENDERS_WITH_PRUNING[0] + _RENDERS_WITH_PRUNING[1] * (simplifying or SimplifyOptions()).work
 
 
-def _keeps_all(target: Target, encoding: EncodeOptions, *, keep_all: bool) -> bool:
-    """Return True if no splat may be pruned: by `keep_all`, bounded errors, extra columns, or the preset `fast`."""
-    blocked = keep_all or bool(target.max_error) or encoding.preset == "fast" or encoding.keep_extra
+def _keeps_all(target: Target, encoding: EncodeOptions, *, no_prune: bool) -> bool:
+    """Return True if no splat may be pruned: by `no_prune`, bounded errors, extra columns, or the preset `fast`."""
+    blocked = no_prune or bool(target.max_error) or encoding.preset == "fast" or encoding.keep_extra
     return target.keep is None and blocked
 
 
-def check_target(source: SplatModel, target: Target, encoding: EncodeOptions, *, keep_all: bool) -> None:
+def check_target(source: SplatModel, target: Target, encoding: EncodeOptions, *, no_prune: bool) -> None:
     """Refuse targets that no search can meet.
 
     Raises:
@@ -144,7 +144,7 @@ def check_target(source: SplatModel, target: Target, encoding: EncodeOptions, *,
         raise InputError("a scene without splats has no size or quality to choose")
     if encoding.attribute_psnr is not None and target.is_rendered and target.keep is None:
         raise InputError("attribute_psnr is what a target chooses: give one of them")
-    if target.keep is not None and keep_all:
+    if target.keep is not None and no_prune:
         raise InputError("a share of the splats is to stay, and all of them: give one of the two")
 
 
@@ -165,7 +165,7 @@ def _psnr_elsewhere(source: SplatModel, found: Candidate, views: ViewSet, thread
 
 def _photograph_psnr(source: SplatModel, found: Candidate, views: ViewSet, threads: int | None) -> dict[str, float]:
     """Return the PSNR of file and source against the test photographs, dB."""
-    judge = views.photograph_judge(threads=threads)
+    judge = views.photograph_test_scorer(threads=threads)
     return {"file": judge.psnr(decode(found.result.data)), "source": judge.psnr(source)}
 
 
@@ -177,12 +177,14 @@ def find_goal(target: Target, source: SplatModel, photographs: Scorer | None) ->
         source: the scene.
         photographs: the scorer by validation photographs, against which a loss is measured.
     """
-    if target.max_loss is None or photographs is None:
+    if target.max_psnr_drop is None or photographs is None:
         return SearchGoal(target.psnr, target.size_bytes, max_error=target.max_error)
     reached = photographs.psnr(source)
     # The source's error against photographs is far larger than the loss: a file's own error is a small part of the sum.
-    slope = 1.0 - 10.0 ** (-target.max_loss / 10.0)
-    return SearchGoal(min(loss_as_psnr(target.max_loss, reached), PSNR_CAP), None, reached - target.max_loss, slope)
+    slope = 1.0 - 10.0 ** (-target.max_psnr_drop / 10.0)
+    return SearchGoal(
+        min(loss_as_psnr(target.max_psnr_drop, reached), PSNR_CAP), None, reached - target.max_psnr_drop, slope
+    )
 
 
 def loss_as_psnr(loss: float, photo_psnr: float) -> float:
@@ -236,7 +238,7 @@ class TargetSearch:
     @staticmethod
     def kept(trials: CandidatePool, removal: Pruner, left: int) -> Candidate:
         """Return the file of `left` splats at the precision of the options."""
-        part = removal.fitted(left, None, trials.decider.psnr)
+        part = removal.fitted(left, None, trials.validation_scorer.psnr)
         return trials.make(part, CodingChoice(None), None, quick=False)
 
     def best(self) -> Candidate:
@@ -295,7 +297,7 @@ class TargetSearch:
     def _removed(self, removal: Pruner, whole: Candidate) -> list[Candidate]:
         """Return files near the goal for several numbers of splats, each predicted from the files before."""
         solver, goal, splats = self.solver, self.solver.goal, len(self.whole.model)
-        slope, found, seen = self._slope_of_counts(whole), list[Candidate](), solver.trials.decider.psnr
+        slope, found, seen = self._slope_of_counts(whole), list[Candidate](), solver.trials.validation_scorer.psnr
         allowed = None if goal.psnr is None else solver.level(self.whole)
         left = self._first_left(removal, whole, slope)
         start = (whole.quality or 0.0) - solver.about(whole) - TUNING_GAINS
@@ -358,13 +360,13 @@ class TargetSearch:
         all_stay = trial.part is self.whole or left > (1.0 - _ALL_BUT) * len(self.whole.model)
         if self.removal is None or self.solver.goal.psnr is None or all_stay:
             return None
-        part = self.removal.fitted(left, self.solver.level(self.whole), self.solver.trials.decider.psnr)
+        part = self.removal.fitted(left, self.solver.level(self.whole), self.solver.trials.validation_scorer.psnr)
         best = self.codings.best(self.solver, part, trial.quality or 0.0)[0]
         return self.solver.on(best.part, best.coding)
 
     def _first_left(self, removal: Pruner, whole: Candidate, slope: float) -> int:
         """Return the number of splats to begin with."""
-        goal, seen = self.solver.goal, self.solver.trials.decider.psnr
+        goal, seen = self.solver.goal, self.solver.trials.validation_scorer.psnr
         if goal.psnr is not None:
             return removal.first_at_psnr(goal.psnr, slope, seen)
         near = None if math.isinf(self.solver.cost(whole)) else (whole.splats, whole.decided_psnr)

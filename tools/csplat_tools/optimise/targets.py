@@ -16,7 +16,7 @@ from csplat_tools.console import NUMBER
 
 _LENGTHS = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}
 _IN_UNITS = "means"  # the one measure that is a length
-_LOSSES = (0.001, 60.0)  # allowed range of `max_loss`, dB
+_LOSSES = (0.001, 60.0)  # allowed range of `max_psnr_drop`, dB
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class Target:
     Attributes:
         psnr: least PSNR of its renders against the source's, dB; the smallest such file is searched.
         size_bytes: largest size; the file with the best PSNR within it is searched.
-        max_loss: dB that its PSNR against photographs may be below the source's, 0.001 to 60; the smallest such file
-            is searched.
+        max_psnr_drop: dB that its PSNR against photographs may be below the source's, 0.001 to 60; the smallest such
+            file is searched.
         keep: fraction of the splats to keep, above 0, at most 1, at the precision of the preset.
         max_error: the largest error of any splat, by measure of the format: means in scene units, covariance relative,
             opacities, sh0, sh1, sh2, sh3.
@@ -38,7 +38,7 @@ class Target:
 
     psnr: float | None = None
     size_bytes: int | None = None
-    max_loss: float | None = None
+    max_psnr_drop: float | None = None
     keep: float | None = None
     max_error: Mapping[str, float] = field(default_factory=dict)
 
@@ -51,14 +51,14 @@ class Target:
             raise InputError("no target, wanted a size, a PSNR, a loss, a share of the splats or largest errors")
         if len(given) > 1:
             raise InputError(f"{' and '.join(given)} are asked for, wanted one of them: the others follow")
-        if self.max_error and (self.keep is not None or self.max_loss is not None):
+        if self.max_error and (self.keep is not None or self.max_psnr_drop is not None):
             raise InputError(f"largest errors and {given[0]}: what is left out or fitted anew has no bounds")
         if self.size_bytes is not None and self.size_bytes < 1:
             raise InputError(f"the target size is {self.size_bytes} bytes, wanted 1 or more")
         if self.psnr is not None and not 0.0 < self.psnr <= PSNR_CAP:
             raise InputError(f"the target PSNR is {self.psnr:g} dB, wanted above 0, at most {PSNR_CAP:g}")
-        if self.max_loss is not None and not _LOSSES[0] <= self.max_loss <= _LOSSES[1]:
-            raise InputError(f"the largest loss is {self.max_loss:g} dB, wanted {_LOSSES[0]:g} to {_LOSSES[1]:g}")
+        if self.max_psnr_drop is not None and not _LOSSES[0] <= self.max_psnr_drop <= _LOSSES[1]:
+            raise InputError(f"the largest loss is {self.max_psnr_drop:g} dB, wanted {_LOSSES[0]:g} to {_LOSSES[1]:g}")
         if self.keep is not None and not 0.0 < self.keep <= 1.0:
             raise InputError(f"the share of the splats is {self.keep:g}, wanted above 0, at most 1")
         for name, bound in self.max_error.items():
@@ -79,11 +79,12 @@ class Target:
 
     def as_json(self) -> dict[str, Any]:
         """Return the values that are set, by name."""
-        said = {name: getattr(self, name) for name in _ASKED if getattr(self, name) is not None}
+        said = {_JSON_KEYS.get(name, name): getattr(self, name) for name in _ASKED if getattr(self, name) is not None}
         return {**said, "max_error": dict(self.max_error)} if self.max_error else said
 
 
-_ASKED = {"psnr": "a PSNR", "size_bytes": "a size", "max_loss": "a loss", "keep": "a share of the splats"}
+_JSON_KEYS = {"max_psnr_drop": "max_loss"}  # key in reports, if it is not the name of the field
+_ASKED = {"psnr": "a PSNR", "size_bytes": "a size", "max_psnr_drop": "a loss", "keep": "a share of the splats"}
 
 
 def parse_max_error(text: str, unit_metres: float | None) -> dict[str, float]:

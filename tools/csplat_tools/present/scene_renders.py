@@ -74,7 +74,7 @@ def find_cameras(
             data if orbit_count is None else replace(data, size=None)
         )  # the cameras' positions are needed, not the size of their photographs
         found = find_view_set(model, data=shots, count=0, split=split)
-        cameras = [*found.judges, *(() if orbit_count is None else (*found.teaches, *found.decides))]
+        cameras = [*found.test, *(() if orbit_count is None else (*found.training, *found.validation))]
         if not cameras:
             raise InputError(f"{data.path} has no {split} pictures")
     if orbit_count is not None:

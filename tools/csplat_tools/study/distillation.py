@@ -60,9 +60,9 @@ class SourceRenders:
         Raises:
             InputError: there are no training or no validation views.
         """
-        if not views.teaches:
+        if not views.training:
             raise InputError("no view is left to learn colours from")
-        used, aside = shrink_cameras(views.teaches), shrink_cameras(views.decides)
+        used, aside = shrink_cameras(views.training), shrink_cameras(views.validation)
         draw = renderer(source, views.background, threads=threads)
         wanted = [draw(camera).rgb for camera in used]
         check = Scorer.of_source(source, aside, views.background, threads=threads)

@@ -150,8 +150,10 @@ def find_renders(source: SplatModel, reduction: Reduction, views: ViewSet | None
     from csplat_tools.study.distillation import SourceRenders  # requires numba; the other strategies do not
 
     if views is None:
-        aside = max(1, reduction.views // _ASIDE)
-        views = find_view_set(source, count=reduction.views - aside, aside=aside, seed=reduction.seed)
+        validation_count = max(1, reduction.views // _ASIDE)
+        views = find_view_set(
+            source, count=reduction.views - validation_count, validation_count=validation_count, seed=reduction.seed
+        )
     return SourceRenders.of_source(source, views, threads=reduction.threads)
 
 

@@ -182,7 +182,7 @@ def read_setting(
     if not len(source.model):
         raise InputError("a scene without splats has nothing to trade")
     views = find_view_set(source.model, cameras=cameras, data=data, background=background)
-    if not views.judges:
+    if not views.test:
         raise InputError(f"{views.name} has no photographs that were held out")
     return SweepSetting(
         path, source.name, source.model, source.size_bytes, source.findings, views, cameras, data, background, distance

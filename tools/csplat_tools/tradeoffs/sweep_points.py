@@ -293,16 +293,16 @@ class Measurer:
     def __init__(self, setting: SweepSetting, modes: Sequence[Mode], threads: int | None) -> None:
         self._setting, self._modes, self._threads = setting, modes, threads
         views = setting.views
-        self._judge = views.judge(setting.source, threads=threads)
+        self._judge = views.test_scorer(setting.source, threads=threads)
         shown = display_cameras(setting.source, views)
         self._showing = (
             None
-            if shown is views.judges
-            else Scorer.of_source(setting.source, shown, views.judging_background, threads=threads)
+            if shown is views.test
+            else Scorer.of_source(setting.source, shown, views.test_background, threads=threads)
         )
-        self._photographs = views.photograph_judge(threads=threads) if views.photographs else None
-        places = evenly_spaced(range(len(views.judges)), TIMED_VIEWS)
-        self._timed = [(views.judges[place], self._judge.look(place).picture) for place in places]
+        self._photographs = views.photograph_test_scorer(threads=threads) if views.photographs else None
+        places = evenly_spaced(range(len(views.test)), TIMED_VIEWS)
+        self._timed = [(views.test[place], self._judge.look(place).picture) for place in places]
         self.source_modes: dict[str, ModeTime] = {mode: self._mode_time(setting.source, mode) for mode in modes}
         self.source_photographs = self._source_scores()
 

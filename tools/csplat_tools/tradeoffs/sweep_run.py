@@ -113,9 +113,9 @@ class Tradeoff:
             },
             "views": {
                 "cameras": setting.views.name,
-                "count": len(setting.views.judges),
-                "sizes": sorted({(camera.W, camera.H) for camera in setting.views.judges}),
-                "background": list(setting.views.judging_background),
+                "count": len(setting.views.test),
+                "sizes": sorted({(camera.W, camera.H) for camera in setting.views.test}),
+                "background": list(setting.views.test_background),
             },
             "machine": self.machine,
             "times": f"single runs; decoding: the median of {DECODE_RUNS}; rendering: the median over views",
@@ -341,10 +341,10 @@ def _tuning_views(setting: SweepSetting) -> ViewSet:
     """Return the views of `csplat finetune`: all photographs that are not test views, or more virtual views."""
     views = setting.views
     if views.photographs:  # which are in memory already
-        judging = {pose_key(camera) for camera in views.judges}
-        teaches = [one.camera for one in views.photographs if pose_key(one.camera) not in judging]
-        return replace(views, teaches=teaches, decides=())
+        judging = {pose_key(camera) for camera in views.test}
+        training = [one.camera for one in views.photographs if pose_key(one.camera) not in judging]
+        return replace(views, training=training, validation=())
     return find_view_set(
         setting.source, cameras=setting.cameras, background=setting.background, count=VIEWS, size=VIEW_SIZE,
-        aside=default_validation_count(VIEWS, cameras=setting.cameras, data=None),
+        validation_count=default_validation_count(VIEWS, cameras=setting.cameras, data=None),
     )  # fmt: skip

@@ -164,7 +164,7 @@ def _measured(tradeoff: Tradeoff) -> str:
         "times": f"single runs on this machine; decoding is the median of {DECODE_RUNS},"
         " rendering the median over views",
         "views": views_line(tradeoff),
-        "background": ", ".join(f"{value:g}" for value in tradeoff.setting.views.judging_background),
+        "background": ", ".join(f"{value:g}" for value in tradeoff.setting.views.test_background),
         "machine": f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads in use,"
         f" {machine['system']}",
         "versions": f"csplat {machine['csplat']}, format {machine['format']}, Python {machine['python']}, "

@@ -122,9 +122,9 @@ def format_tradeoff(tradeoff: Tradeoff) -> str:
 def views_line(tradeoff: Tradeoff) -> str:
     """Describe the test views in a line."""
     setting = tradeoff.setting
-    sizes = sorted({(camera.W, camera.H) for camera in setting.views.judges})
+    sizes = sorted({(camera.W, camera.H) for camera in setting.views.test})
     size = f"{sizes[0][0]}x{sizes[0][1]}" if len(sizes) == 1 else f"{len(sizes)} sizes"
-    return f"judged from {describe_views(len(setting.views.judges), setting.views.name)}, {size}"
+    return f"judged from {describe_views(len(setting.views.test), setting.views.name)}, {size}"
 
 
 def mode_rows(tradeoff: Tradeoff) -> list[tuple[str, ...]]:

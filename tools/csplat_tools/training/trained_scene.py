@@ -66,7 +66,7 @@ def run_training(
     model = (facts or MetadataOverrides()).applied(result.model)
     write_model(output, model, absolute=False)
     if page is not None:
-        views = find_view_set(model, data=data, aside=0)
+        views = find_view_set(model, data=data, validation_count=0)
         write_training_page(page, output, result.log, None, show_views(model, {"trained scene": model}, views, threads))
     if not quiet:
         note(f"{output} says how to compare it with its photographs: {TrainingRecord.of(result.model.metadata)}")
@@ -112,7 +112,7 @@ def run_training_to_file(
         _ = one.pixels, one.mask
     result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (facts or MetadataOverrides()).applied(result.model)
-    views = find_view_set(model, data=data, aside=default_validation_count(0, cameras=None, data=data))
+    views = find_view_set(model, data=data, validation_count=default_validation_count(0, cameras=None, data=data))
     known = None
     if result.metrics is not None and options.eval_views == 0 and options.device == "cpu":
         known = {"source": {**result.metrics, "lpips": None}}

@@ -55,11 +55,15 @@ def show_views(
         views: a few of its test views are shown, evenly spread.
         threads: number of threads; `None` for all.
     """
-    if not views.judges:
+    if not views.test:
         return []
-    places = evenly_spaced(range(len(views.judges)), _VIEWS)
-    views = replace(views, judges=[views.judges[place] for place in places])
-    judge = views.photograph_judge(threads=threads) if views.photographs else views.judge(source, threads=threads)
+    places = evenly_spaced(range(len(views.test)), _VIEWS)
+    views = replace(views, test=[views.test[place] for place in places])
+    judge = (
+        views.photograph_test_scorer(threads=threads)
+        if views.photographs
+        else views.test_scorer(source, threads=threads)
+    )
     wanted = "photograph" if views.photographs else "the source"
     rows: list[dict[str, U8]] = [{} for _ in places]
     for name, model in models.items():

@@ -54,7 +54,7 @@ _MOST_ASIDE = 16  # largest number of them
 
 
 def default_validation_count(count: int, *, cameras: str | None, data: object | None) -> int | None:
-    """Return the default number of validation views, as `aside` for `find_view_set`.
+    """Return the default number of validation views, as `validation_count` for `find_view_set`.
 
     With photographs it is 0, as `training_views` takes some training views; of few virtual views it is few.
 

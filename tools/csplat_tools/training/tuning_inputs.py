@@ -54,8 +54,8 @@ def training_views(source: SplatModel, views: ViewSet, threads: int | None) -> T
             return [TuningView(one.camera, one) for one in views.pictures(cameras)]
         return renders_of(source, cameras, behind, threads)
 
-    teach = looks(views.teaches)
-    return TuningViews(teach, looks(views.decides), behind) if views.decides else split_views(teach, behind)
+    teach = looks(views.training)
+    return TuningViews(teach, looks(views.validation), behind) if views.validation else split_views(teach, behind)
 
 
 def choose_splats(
@@ -83,8 +83,8 @@ def choose_splats(
     Raises:
         InputError: no view shows any splat; or the file is invalid, or belongs to another scene.
     """
-    measuring = views.teaches[:VIEW_COUNT] if views.virtual else views.teaches
-    looking = [*views.teaches, *views.decides]
+    measuring = views.training[:VIEW_COUNT] if views.virtual else views.training
+    looking = [*views.training, *views.validation]
 
     def weighed(model: SplatModel) -> Sensitivity:
         return measure_views(
@@ -105,7 +105,7 @@ def choose_splats(
     rows = np.flatnonzero(seen) if prune else np.arange(len(source))
     model, said = source.select(rows), {"unseen": len(source) - len(rows)}
     if keep is not None:
-        teaching = with_validation_views(replace(views, teaches=measuring, judges=()))
+        teaching = with_validation_views(replace(views, training=measuring, test=()))
         model, kept = _pruned(model, teaching, keep * len(source) / len(rows), threads, progress)
         rows, said = rows[kept], {**said, "simplified_from": len(rows)}
     if given is not None:

@@ -57,10 +57,10 @@ def score_models(
     Returns:
         The scores; `None` without test views.
     """
-    if not views.judges:
+    if not views.test:
         return None
     taken = bool(views.photographs)
-    judge = views.photograph_judge(threads=threads) if taken else views.judge(source, threads=threads)
+    judge = views.photograph_test_scorer(threads=threads) if taken else views.test_scorer(source, threads=threads)
     scores: dict[str, dict[str, float | None]] = {}
     for name, model in models.items():
         if known is not None and name in known:
@@ -68,7 +68,7 @@ def score_models(
         elif taken or model is not source:
             found = judge.scores(model, lpips=lpips)
             scores[name] = {score: getattr(found, score) for score in SCORES}
-    return TestScores("held-out photographs" if taken else "renders of the source", len(views.judges), scores)
+    return TestScores("held-out photographs" if taken else "renders of the source", len(views.test), scores)
 
 
 def make_tuning_report(

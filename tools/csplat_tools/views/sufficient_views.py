@@ -76,10 +76,10 @@ def find_sufficient_views(
             model, cameras, background=views.background, bands=False, threads=threads, progress=progress
         )
 
-    if not views.teaches or not views.decides:
-        found = len(views.teaches) + len(views.decides)
+    if not views.training or not views.validation:
+        found = len(views.training) + len(views.validation)
         raise InputError(f"{found} cameras, wanted 2 at least: one that teaches, one that decides")
-    every, check = shrink_cameras(views.teaches, size), shrink_cameras(views.decides, size)
+    every, check = shrink_cameras(views.training, size), shrink_cameras(views.validation, size)
     if views.virtual:
         # A choice has to be good on other views, too; this is checked on views of the same kind.
         every, check = _parted(every)

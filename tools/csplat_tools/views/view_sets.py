@@ -56,9 +56,9 @@ class ViewSet:
         name: source of the test views: `virtual`, or the name of a camera file or of a data set.
         background: red, green, blue behind training and validation views; behind test views, too, unless they are
             virtual: `psnr` is on black.
-        teaches: training views, to which values are fitted, and from which importance is measured.
-        decides: validation views, by which the number of splats, the best step and the end of a search are chosen.
-        judges: test views, to which the scores in reports refer.
+        training: training views, to which values are fitted, and from which importance is measured.
+        validation: validation views, by which the number of splats, the best step and the end of a search are chosen.
+        test: test views, to which the scores in reports refer.
         photographs: photographs of a data set, in its order; each has its camera, one of those above.
         virtual: training and validation views were placed around the scene by csplat.
         origin: the scene's origin, to which all cameras are relative.
@@ -71,9 +71,9 @@ class ViewSet:
 
     name: str
     background: Colour
-    teaches: Sequence[Camera]
-    decides: Sequence[Camera]
-    judges: Sequence[Camera]
+    training: Sequence[Camera]
+    validation: Sequence[Camera]
+    test: Sequence[Camera]
     photographs: Sequence[PosedImage] = ()
     virtual: bool = False
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -82,18 +82,18 @@ class ViewSet:
 
     def __post_init__(self) -> None:
         seen: dict[bytes, str] = {}
-        for role in ("teaches", "decides", "judges"):
+        for role in ("training", "validation", "test"):
             for camera in getattr(self, role):
                 other = seen.setdefault(pose_key(camera), role)
                 if other != role:
-                    raise InputError(f"{self.name}: a view both {other} and {role}")
+                    raise InputError(f"{self.name}: a view is both a {other} and a {role} view")
 
     @property
-    def judging_background(self) -> Colour:
+    def test_background(self) -> Colour:
         """Background colour of the test views."""
         return BLACK if self.name == VIRTUAL else self.background
 
-    def judge(
+    def test_scorer(
         self,
         source: SplatModel | Renderable,
         *,
@@ -106,39 +106,39 @@ class ViewSet:
 
         Args:
             source: the scene.
-            background: a background colour instead of `judging_background`.
+            background: a background colour instead of `test_background`.
             mode, threads: mode of the renderer, and its number of threads.
             progress: progress callback of rendering the source.
 
         Raises:
             InputError: there are no test views.
         """
-        colour = background or self.judging_background
-        return Scorer.of_source(source, self.judges, colour, mode=mode, threads=threads, progress=progress)
+        colour = background or self.test_background
+        return Scorer.of_source(source, self.test, colour, mode=mode, threads=threads, progress=progress)
 
-    def decider(self, source: SplatModel, *, threads: int | None = None) -> Scorer:
+    def validation_scorer(self, source: SplatModel, *, threads: int | None = None) -> Scorer:
         """Return the scorer by the source's renders in the validation views.
 
         Raises:
             InputError: there are no validation views.
         """
-        return Scorer.of_source(source, self.decides, self.background, threads=threads)
+        return Scorer.of_source(source, self.validation, self.background, threads=threads)
 
-    def photograph_judge(self, *, mode: Mode = "standard", threads: int | None = None) -> Scorer:
+    def photograph_test_scorer(self, *, mode: Mode = "standard", threads: int | None = None) -> Scorer:
         """Return the scorer by the photographs of the test views.
 
         Raises:
             InputError: there are no photographs, or no test views.
         """
-        return self._by_photographs(self.judges, mode, threads)
+        return self._by_photographs(self.test, mode, threads)
 
-    def photograph_decider(self, *, threads: int | None = None) -> Scorer:
+    def photograph_validation_scorer(self, *, threads: int | None = None) -> Scorer:
         """Return the scorer by the photographs of the validation views.
 
         Raises:
             InputError: there are no photographs, or no validation views.
         """
-        return self._by_photographs(self.decides, "standard", threads)
+        return self._by_photographs(self.validation, "standard", threads)
 
     def pictures(self, cameras: Sequence[Camera]) -> list[PosedImage]:
         """Return the photographs that the given cameras took, in the order of the cameras."""
@@ -220,7 +220,7 @@ def find_view_set(
     count: int | None = None,
     size: tuple[int, int] | None = None,
     seed: int = 0,
-    aside: int | None = None,
+    validation_count: int | None = None,
     split: Split = "test",
     every: int = 1,
 ) -> ViewSet:
@@ -235,7 +235,7 @@ def find_view_set(
             virtual training or validation views. `None`: by the number of splats (`default_views`).
         size: width and height of virtual training views, pixels; `None`: by the number of splats.
         seed: seed of virtual training and validation views.
-        aside: number of validation views; `None`: as in the table; 0: none that could be training views.
+        validation_count: number of validation views; `None`: as in the table; 0: none that could be training views.
         split: the photographs of a data set that are test views. With `train`, no view has another role.
         every: the source is every Nth splat of the scene, by which virtual test views are placed; 1: all splats.
 
@@ -250,25 +250,27 @@ def find_view_set(
     usual = default_views(every * len(source))
     count, size = usual[0] if count is None else count, size or usual[1]
     if data is not None:
-        return _of_data(source, data, background, aside, split)
+        return _of_data(source, data, background, validation_count, split)
     if cameras is None:
-        judges = comparison_cameras(source, every)
-        judging = {pose_key(camera) for camera in judges}  # in a scene without splats all views are alike
-        teaches, decides = (_without(judging, part) for part in _virtual(source, count, size, seed, aside))
+        test = comparison_cameras(source, every)
+        judging = {pose_key(camera) for camera in test}  # in a scene without splats all views are alike
+        training, validation = (
+            _without(judging, part) for part in _virtual(source, count, size, seed, validation_count)
+        )
         notes = (
             () if every < 2 else (f"the scene is not in memory: one in {every} of its splats says where views stand",)
         )
         colour = background or BLACK
-        return ViewSet(VIRTUAL, colour, teaches, decides, judges, virtual=True, origin=source.origin, notes=notes)
-    return _of_file(source, cameras, background, (count, size, seed), aside)
+        return ViewSet(VIRTUAL, colour, training, validation, test, virtual=True, origin=source.origin, notes=notes)
+    return _of_file(source, cameras, background, (count, size, seed), validation_count)
 
 
 def with_validation_views(views: ViewSet) -> ViewSet:
     """Return the views; if there are no validation views, every eighth training view becomes one."""
-    if views.decides:
+    if views.validation:
         return views
-    decides, teaches = _apart(views.teaches, None)
-    return replace(views, teaches=teaches, decides=decides)
+    validation, training = _apart(views.training, None)
+    return replace(views, training=training, validation=validation)
 
 
 def _of_file(
@@ -276,7 +278,7 @@ def _of_file(
     path: str,
     background: Colour | None,
     virtual: tuple[int, tuple[int, int], int],
-    aside: int | None,
+    validation_count: int | None,
 ) -> ViewSet:
     report: list[str] = []
     given = list({pose_key(camera): camera for camera in load_cameras(path, report, source.origin)}.values())
@@ -285,20 +287,20 @@ def _of_file(
     few = len(given) < _ENOUGH
     if few:
         judging = {pose_key(camera) for camera in given}
-        judges = given
-        teaches, decides = (_without(judging, part) for part in _virtual(source, *virtual, aside))
+        test = given
+        training, validation = (_without(judging, part) for part in _virtual(source, *virtual, validation_count))
     else:
         every = range(0, len(given), _JUDGE_EVERY)
-        judges, rest = _parted(given, evenly_spaced(every, _MOST_JUDGES))
-        decides, teaches = _apart(rest, aside)
+        test, rest = _parted(given, evenly_spaced(every, _MOST_JUDGES))
+        validation, training = _apart(rest, validation_count)
     return ViewSet(
-        _named_file(path), colour, teaches, decides, judges, virtual=few, origin=source.origin,
+        _named_file(path), colour, training, validation, test, virtual=few, origin=source.origin,
         notes=(*report, *notes),
     )  # fmt: skip
 
 
 def _of_data(
-    source: SplatModel, data: DataOptions, background: Colour | None, aside: int | None, split: Split
+    source: SplatModel, data: DataOptions, background: Colour | None, validation_count: int | None, split: Split
 ) -> ViewSet:
     require_photographs()
     from csplat_trainer.data import load
@@ -317,11 +319,14 @@ def _of_data(
     apart = _without(judging, [one.camera for one in train])
     if len(apart) < len(train):
         more.append(f"{len(train) - len(apart)} training photographs stand where others judge, and are left out")
-    decides, teaches = _without(judging | {pose_key(camera) for camera in apart}, [one.camera for one in val]), apart
-    if aside or not decides:
-        decides, teaches = _apart(apart, aside)
+    validation, training = (
+        _without(judging | {pose_key(camera) for camera in apart}, [one.camera for one in val]),
+        apart,
+    )
+    if validation_count or not validation:
+        validation, training = _apart(apart, validation_count)
     return ViewSet(
-        _named_file(data.path), colour, teaches, decides, [one.camera for one in test], [*train, *val, *test],
+        _named_file(data.path), colour, training, validation, [one.camera for one in test], [*train, *val, *test],
         origin=source.origin, notes=(*found.report, *notes, *more), split=split,
     )  # fmt: skip
 
@@ -369,29 +374,29 @@ def _moved(pictures: Sequence[PosedImage], shift: NDArray[np.float64]) -> list[P
 
 
 def _virtual(
-    source: SplatModel, count: int, size: tuple[int, int], seed: int, aside: int | None
+    source: SplatModel, count: int, size: tuple[int, int], seed: int, validation_count: int | None
 ) -> tuple[list[Camera], list[Camera]]:
     """Return virtual training and validation views; the latter are like the test views of `psnr`, at other places."""
     if count < 1:
         return [], []
     usual, width, height = virtual_views.VIRTUAL_SIZES.deciding
-    kept = usual if aside is None else aside
-    decides = virtual_cameras(source, kept, width, height, seed=_DECIDING_SEED + seed) if kept else []
-    return camera_sequence(source, count + HELD_OUT_COUNT, size, seed=seed), decides
+    kept = usual if validation_count is None else validation_count
+    validation = virtual_cameras(source, kept, width, height, seed=_DECIDING_SEED + seed) if kept else []
+    return camera_sequence(source, count + HELD_OUT_COUNT, size, seed=seed), validation
 
 
-def _apart(cameras: Sequence[Camera], aside: int | None) -> tuple[list[Camera], list[Camera]]:
+def _apart(cameras: Sequence[Camera], validation_count: int | None) -> tuple[list[Camera], list[Camera]]:
     """Split cameras into validation views, evenly spread, and training views without those of the same pose."""
     count = len(cameras)
-    if aside is None:
+    if validation_count is None:
         every = min(_DECIDE_EVERY, count)
         places: Collection[int] = range(every // 2, count, every) if count > 1 else ()
-    elif aside and aside >= count:
-        raise InputError(f"{aside} of {count} views to decide by leave none to learn from")
+    elif validation_count and validation_count >= count:
+        raise InputError(f"{validation_count} of {count} views to decide by leave none to learn from")
     else:
-        places = [(2 * number + 1) * count // (2 * aside) for number in range(aside)]
-    decides, others = _parted(cameras, places)
-    return decides, _without({pose_key(camera) for camera in decides}, others)
+        places = [(2 * number + 1) * count // (2 * validation_count) for number in range(validation_count)]
+    validation, others = _parted(cameras, places)
+    return validation, _without({pose_key(camera) for camera in validation}, others)
 
 
 def _parted(cameras: Sequence[Camera], places: Collection[int]) -> tuple[list[Camera], list[Camera]]:
@@ -459,9 +464,9 @@ def display_cameras(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
         splats with nothing in front of them.
     """
     if views.name != VIRTUAL or not len(source):
-        return views.judges
+        return views.test
     told = with_estimated_up(source)
-    own = views.judges if told is source else ()  # else they would show it lying on its side
+    own = views.test if told is source else ()  # else they would show it lying on its side
     cameras = [*own, *camera_sequence(told, _TRIED, _SIZE, seed=_SEED)]
     cloud, nearest = sample_cloud(source, _POINTS, np.random.default_rng(_SEED)), HIDING * scene_frame(source).extent
     details = np.array([detail(cloud, camera, nearest) for camera in cameras])

@@ -87,8 +87,8 @@ def facts_of(bench: Bench, training: Training) -> Facts:
     return {
         "splats": len(bench.source),
         "sh_degree": bench.source.sh_degree,
-        "train_views": len(bench.looks.teaches),
-        "test_views": len(bench.looks.judges),
+        "train_views": len(bench.looks.training),
+        "test_views": len(bench.looks.test),
         "scores": bench.judge({"source": bench.source})["source"],
         "training": training,
     }
@@ -100,4 +100,4 @@ def warm(bench: Bench) -> None:
     options = EncodeOptions(sh_coding="codebook", codebook_size=16, threads=bench.threads)
     frozen = fix_quantisation(EncodePlan.of(some, options, allow_classes=False))
     tune(frozen, bench.views, FinetuneOptions(iterations=1), threads=bench.threads)
-    measure_sensitivity(some, bench.looks.teaches[:1], metric=True)
+    measure_sensitivity(some, bench.looks.training[:1], metric=True)

@@ -86,8 +86,8 @@ class Bench:
         self.encoding, self.tuning, self._lpips = encoding, tuning, lpips
         self.source = read_ply(ply)
         data = DataOptions(str(scene.data), scene.size)
-        self.looks = find_view_set(self.source, data=data, background=scene.background, aside=0)
-        if not (self.looks.photographs and self.looks.judges):
+        self.looks = find_view_set(self.source, data=data, background=scene.background, validation_count=0)
+        if not (self.looks.photographs and self.looks.test):
             raise InputError(f"{scene.data} holds out no photographs to judge by")
         self._picks: dict[tuple[float | None, bool], Pick] = {}
 
@@ -121,7 +121,7 @@ class Bench:
         clock = Clock()  # it would not have measured what it is not told
         with clock.stage("choosing"):
             removal = measure_pruning_error(
-                chosen.model, self.looks.teaches, background=self.looks.background, threads=self.threads
+                chosen.model, self.looks.training, background=self.looks.background, threads=self.threads
             )
         return replace(chosen, importance=removal.squared_weight), clock.seconds
 

@@ -227,7 +227,7 @@ def _simplified(bench: _Bench, offsets: Sequence[float], psnrs: Sequence[float],
 
 def _reached(bench: _Bench, goal: float, views: int) -> Simplified:
     """The file of a PSNR by the cameras that judge all files here; virtual views teach and decide."""
-    around = replace(find_view_set(bench.source, count=views), judges=bench.judge.cameras)
+    around = replace(find_view_set(bench.source, count=views), test=bench.judge.cameras)
     try:
         found, timing = timed(encode_to, bench.source, psnr=goal, views=around)
     except InputError as error:

@@ -43,14 +43,14 @@ class _Without:
 
     Attributes:
         simplifying, encoding: options that are not the usual ones.
-        keep_all: no splat goes.
+        no_prune: no splat goes.
         instead: replacement of something that the search calls or reads, with its module and name.
         sh: the part is one of scenes with SH alone.
     """
 
     simplifying: Mapping[str, Any] = field(default_factory=dict)
     encoding: Mapping[str, Any] = field(default_factory=dict)
-    keep_all: bool = False
+    no_prune: bool = False
     instead: tuple[tuple[ModuleType, str, object], ...] = ()
     sh: bool = False
 
@@ -69,7 +69,7 @@ _WITHOUT = {
     "grades": _Without(encoding={"grades": 1}),
     "bands by splat": _Without(simplifying={"bands": False}, sh=True),
     "any fit": _Without(simplifying={"refit": False}),
-    "removal": _Without(keep_all=True),
+    "removal": _Without(no_prune=True),
 }
 
 
@@ -113,7 +113,7 @@ def _found(source: SplatModel, goal: float, without: _Without) -> Found:
         for module, name, value in without.instead:
             stands.enter_context(patch.object(module, name, value))
         found = encode_to(
-            source, psnr=goal, options=EncodeOptions(**without.encoding), keep_all=without.keep_all,
+            source, psnr=goal, options=EncodeOptions(**without.encoding), no_prune=without.no_prune,
             simplifying=SimplifyOptions(**without.simplifying),
         )  # fmt: skip
     chosen = found.report.chosen

@@ -54,7 +54,7 @@ def _rows(scene: Scene) -> list[tuple[str, ...]]:
     beside = scene.path.with_suffix(".cameras.json")
     given = load_cameras(beside) if beside.exists() else []
     measures = {"virtual views": importance_views(source, find_view_set(source)), "half of its cameras": given[::2]}
-    judges = {"cameras of `psnr`": cameras_of(scene.name, source), "the other half": given[1::2][:_JUDGES]}
+    view_sets = {"cameras of `psnr`": cameras_of(scene.name, source), "the other half": given[1::2][:_JUDGES]}
     kind, rows = scene_frame(source).kind, []
     even = [_file(source, quality) for quality in _EVEN]
     graded: dict[str, tuple[str, list[bytes]]] = {}
@@ -62,7 +62,7 @@ def _rows(scene: Scene) -> list[tuple[str, ...]]:
         if cameras:
             importance, timing = timed(measure_importance, source, cameras, BLACK, threads=None)
             graded[name] = f"{timing.wall:.1f}", [_file(source, quality, importance) for quality in _GRADED]
-    for judged_by, views in judges.items():
+    for judged_by, views in view_sets.items():
         if views:
             rows += [
                 (scene.name, kind, name, seconds, judged_by, *cells)

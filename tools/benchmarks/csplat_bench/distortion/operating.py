@@ -39,7 +39,7 @@ _POINTS = {
     "thumbnail": ("--target-psnr 30", 30.0, False),
     "web page": ("--target-psnr 38", 38.0, False),
     "balanced": ("--preset balanced", None, True),
-    "archive": ("--target-psnr 50 --keep-all", 50.0, True),
+    "archive": ("--target-psnr 50 --no-prune", 50.0, True),
 }
 _HEAD = ("scene", "for", "kB", "× smaller", "dB", "whole, s", "first picture, kB", "dB", "s", "encoding, s")
 
@@ -97,7 +97,7 @@ def _reached(source: SplatModel, ply_bytes: int, name: str) -> Reached:
 
 
 def _encoded(source: SplatModel, psnr: float | None, *, whole: bool) -> bytes:
-    return encode(source) if psnr is None else encode_to(source, psnr=psnr, keep_all=whole).data
+    return encode(source) if psnr is None else encode_to(source, psnr=psnr, no_prune=whole).data
 
 
 def _cells(one: Reached, rate: float) -> tuple[str, ...]:

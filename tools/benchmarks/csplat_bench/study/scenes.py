@@ -109,8 +109,10 @@ def open_subject(name: str, known: Mapping[str, Capture], out: Path, lpips: Dist
         raise InputError(f"{name}: {scene.data} does not exist")
     ply, training = trained(scene, folder)
     source = read_ply(ply)
-    found = find_view_set(source, data=DataOptions(str(scene.data), scene.size), background=scene.background, aside=0)
-    judge, teachers = found.photograph_judge(), list(found.teaches)
+    found = find_view_set(
+        source, data=DataOptions(str(scene.data), scene.size), background=scene.background, validation_count=0
+    )
+    judge, teachers = found.photograph_test_scorer(), list(found.training)
     if views and views < len(judge.cameras):
         judge = judge.some([number * len(judge.cameras) // views for number in range(views)])
     cameras = list(judge.cameras)

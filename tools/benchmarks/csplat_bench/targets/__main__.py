@@ -96,10 +96,10 @@ def _rows(scene: Scene, psnrs: Sequence[str], sizes: Sequence[str]) -> Iterator[
     for preset in PRESETS:
         yield Row(preset, ["--preset", preset], True)
     for psnr in psnrs:
-        yield Row(f"{float(psnr):g} dB, every splat", ["--target-psnr", psnr, "--keep-all"], True)
+        yield Row(f"{float(psnr):g} dB, every splat", ["--target-psnr", psnr, "--no-prune"], True)
     for size in sizes:
         target = f"{float(size) * scene.splat_count:.0f}"
-        yield Row(f"{float(size):g} B/splat, every splat", ["--target-size", target, "--keep-all"], True)
+        yield Row(f"{float(size):g} B/splat, every splat", ["--target-size", target, "--no-prune"], True)
 
 
 def _removing(rows: Sequence[Row], words: Sequence[str]) -> Iterator[Row]:
@@ -109,7 +109,7 @@ def _removing(rows: Sequence[Row], words: Sequence[str]) -> Iterator[Row]:
     for row in rows:
         name, _, every = row.name.partition(", ")
         if every:
-            yield Row(name, [*words, *(word for word in row.arguments if word != "--keep-all")], False)
+            yield Row(name, [*words, *(word for word in row.arguments if word != "--no-prune")], False)
 
 
 def _measure(scene: Scene, rows: Sequence[Row], kept: Kept, name: str, program: str, *, again: bool) -> None:
