@@ -281,7 +281,8 @@ def test_knobs_reach_the_encoder(tmp_path, ply):
     assert decode((tmp_path / "out.csplat").read_bytes()).sh_degree == 1
 
 
-def test_old_names_of_options_are_refused_with_the_new_ones(tmp_path, ply):
+def test_old_names_of_options_are_refused_with_the_new_ones(tmp_path, ply, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
     words = {"--keep-all": ("encode",), "--max-loss": ("simplify", "1"), "--aside": ("finetune", "3")}
     assert RENAMED_OPTIONS.keys() == words.keys()
     for old, (name, *value) in words.items():

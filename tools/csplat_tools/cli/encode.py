@@ -68,24 +68,22 @@ class TargetOptions(OptionGroup):
     ] = None
     target_size: Annotated[
         str | None,
-        typer.Option(
-            metavar="5MB", rich_help_panel=_TARGET, help="Largest size of the file, filled as well as possible."
-        ),
+        typer.Option(metavar="5MB", rich_help_panel=_TARGET, help="Largest size of the file."),
     ] = None
     max_psnr_drop: Annotated[
         str | None,
-        typer.Option(metavar="DB", rich_help_panel=_TARGET, help="Largest drop of the PSNR against --data."),
+        typer.Option(metavar="DB", rich_help_panel=_TARGET, help="Largest PSNR drop, against --data."),
     ] = None
     keep: Annotated[
         float | None,
-        typer.Option(metavar="SHARE", rich_help_panel=_TARGET, help="Share of the splats to keep, refitted."),
+        typer.Option(metavar="SHARE", rich_help_panel=_TARGET, help="Share of splats to keep, refitted."),
     ] = None
     max_error: Annotated[
         str | None,
         typer.Option(
             metavar="means=0.001,...",
             rich_help_panel=_TARGET,
-            help="Largest error of a splat, by measure.",
+            help="Largest error, by measure.",
         ),
     ] = None
     no_prune: Annotated[
@@ -187,8 +185,8 @@ class LargeSceneOptions(OptionGroup):
     settings=(ENCODER_SETTINGS,),
 )
 def encode(
-    source: Annotated[str, typer.Argument(metavar="IN.ply", help="A PLY, another of `csplat formats`, or -.")],
-    output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="File to write, or -. Default: IN.csplat.")],
+    source: Annotated[str, typer.Argument(metavar="IN.ply", help="A PLY, other `csplat formats`, or -.")],
+    output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="The file to write, or -; else IN.csplat.")],
     encoding: EncodingOptions,
     goal: TargetOptions,
     facts: SourceOptions,
@@ -205,9 +203,8 @@ def encode(
 ) -> None:
     """Compress a trained 3DGS scene.
 
-    Repairs what is safe to repair, with a remark, and declares in the file how
-    far its splats are from the source. A target chooses all options itself, and
-    the splats to prune: that takes minutes.
+    Repairs what is safe to repair, and declares how far the file's splats are
+    from the source. A target chooses all options, and the splats to prune.
 
     --preset, of 60,000 splats of SH degree 3, 14.9 MB, on one core:
       fast      719 kB, 42.9 dB, 0.4 s: for previews and experiments

@@ -142,7 +142,7 @@ class ViewOptions(OptionGroup):
         typer.Option(
             metavar="FILE.json",
             rich_help_panel=_VIEWS,
-            help="Test views; 40 or more are split into three roles.",
+            help="Test views; of 40 or more most are for training.",
         ),
     ] = None
     data: Annotated[
@@ -150,7 +150,7 @@ class ViewOptions(OptionGroup):
         typer.Option(
             metavar="DATA",
             rich_help_panel=_VIEWS,
-            help="Photographs: training views, held-out ones test views.",
+            help="Photographs for training, held-out ones for test.",
         ),
     ] = None
     background: Annotated[
