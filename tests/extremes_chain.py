@@ -18,7 +18,7 @@ from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply import lint_ply
-from csplat_conformance.stated import Proof, Source, prove
+from csplat_conformance.declared_bounds import BoundsVerification, Source, verify_bounds
 from csplat_render import Camera, render
 from csplat_render.conventions import RenderResult
 from csplat_render.virtual_cameras import virtual_cameras
@@ -70,7 +70,7 @@ class Chain:
     refusal: str
     result: EncodeResult
     decoded: SplatModel
-    proof: Proof
+    proof: BoundsVerification
     pictures: tuple[RenderResult, ...]
     learnt: Learnt | None
 
@@ -88,7 +88,7 @@ def chain_of(name: str) -> Chain:
             refusal = str(error)
     result = encode_with_report(source)
     decoded = decode(result.data)
-    proof = prove(
+    proof = verify_bounds(
         Source.of(source), decoded, read_header(result.data), read_declared_bounds(result.data), result.source_index
     )
     (camera,) = virtual_cameras(source, 1, 24, 18)

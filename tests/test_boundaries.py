@@ -11,10 +11,10 @@ from csplat_authoring._rules import CHOICES, RANGES
 from csplat_authoring.boundaries import cases, held
 from csplat_authoring.builder import build
 from csplat_authoring.recipes import sound_recipes
+from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import VECTORS, load
-from csplat_conformance.node import JsDecoder, missing_javascript
-from csplat_conformance.report import Status
 from csplat_conformance.validator import validate
+from csplat_selftest.decoder_processes import JsDecoder, missing_javascript
 from csplat_selftest.mutate import mapped
 
 

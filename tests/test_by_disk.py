@@ -21,8 +21,8 @@ from csplat.files import read_array
 from csplat.ply import write_ply
 from csplat.processes import CAN_COPY
 from csplat.scene import scene_of
-from csplat_conformance.stated import PartSizes, Source, check_source_index, prove, prove_by_disk
-from csplat_conformance.stated.cells import Cells
+from csplat_conformance.declared_bounds import PartSizes, Source, check_source_index, verify_bounds, verify_out_of_core
+from csplat_conformance.declared_bounds.out_of_core_verification import CellTree
 from csplat_tools.cli.app import app
 
 pytestmark = pytest.mark.slow  # two CPU seconds together
@@ -35,8 +35,8 @@ def both(source, data, stated=None, index=None):
     """Return the proofs made in memory and by way of the disk as JSON, with numbers rounded to nine digits."""
     opened = open_tiles(data)
     opened = replace(opened, declared_bounds=stated or opened.declared_bounds)
-    at_once = prove(Source.of(source), decode(data), opened.header, opened.declared_bounds, index)
-    in_parts = prove_by_disk(scene_of(source), opened, index, memory_bytes=1, sizes=PARTS)
+    at_once = verify_bounds(Source.of(source), decode(data), opened.header, opened.declared_bounds, index)
+    in_parts = verify_out_of_core(scene_of(source), opened, index, memory_bytes=1, sizes=PARTS)
     assert at_once.failures == in_parts.failures
     assert at_once.clauses == in_parts.clauses
     return rounded(at_once.as_json()), rounded(in_parts.as_json())
@@ -109,7 +109,7 @@ def test_processes_find_what_one_finds(make_model, monkeypatch):
     far = np.where(np.arange(600) % 50, np.float32(0.04), np.float32(0.5))
     moved = replace(source, means=source.means + far[:, None])
     opened = replace(opened, declared_bounds=states(opened.declared_bounds, means={"max": 0.07}))
-    alone = prove_by_disk(scene_of(moved), opened, memory_bytes=1, sizes=PARTS)
+    alone = verify_out_of_core(scene_of(moved), opened, memory_bytes=1, sizes=PARTS)
     assert alone.failures
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
     memory, sizes, seen = 10**9, replace(PARTS, worth_a_process=1), []
@@ -121,10 +121,10 @@ def test_processes_find_what_one_finds(make_model, monkeypatch):
         for child in multiprocessing.active_children():
             os.kill(child.pid, signal.SIGKILL)
 
-    assert alone == prove_by_disk(scene_of(moved), opened, memory_bytes=memory, sizes=sizes, progress=count)
+    assert alone == verify_out_of_core(scene_of(moved), opened, memory_bytes=memory, sizes=sizes, progress=count)
     assert max(seen) == 3
     with pytest.raises(OSError, match="a worker process was killed"):
-        prove_by_disk(scene_of(moved), opened, memory_bytes=memory, sizes=sizes, progress=kill)
+        verify_out_of_core(scene_of(moved), opened, memory_bytes=memory, sizes=sizes, progress=kill)
 
 
 def test_another_scene_is_told_before_any_splat(make_model):
@@ -153,7 +153,7 @@ def test_splats_of_one_place_are_no_part_that_is_too_large(make_model):
 def test_cells_have_about_as_many_splats(make_model):
     source = make_model(4000, 0)
     opened = open_tiles(encode_with_report(source, OPTIONS).data)
-    places = Cells.of(opened.header, 4000, 500).place(source.means)
+    places = CellTree.of(opened.header, 4000, 500).place(source.means)
     counts = np.bincount(places)
     assert len(counts) == 8
     assert counts.min() > 100

@@ -13,8 +13,8 @@ from chromium import absent
 
 import csplat_conformance
 from csplat_conformance import protocol
-from csplat_conformance.process import Ended
-from csplat_conformance.runner import Choice, run_command
+from csplat_conformance.decoder_suite import DecoderSuiteOptions, run_command
+from csplat_conformance.protocol import ProcessEnd
 
 ROOT = Path(__file__).resolve().parent.parent
 C = ROOT / "codec" / "c"
@@ -73,7 +73,7 @@ def asked(adapter):
             process.stdin.flush()
             line = process.stdout.readline()
             assert line, f"the adapter ended at {places['input']}: status {process.wait()}"
-            return Ended(None, line != "{}\n", line.encode(), b"", 0.0)
+            return ProcessEnd(None, line != "{}\n", line.encode(), b"", 0.0)
 
         monkeypatch.setattr(protocol, "run_program", run_program)
         yield
@@ -87,7 +87,7 @@ in_depth = pytest.mark.area(name="native")
 
 def assert_passes(adapter):
     with asked(adapter):
-        report = run_command("adapter {input} {outdir}", Choice(jobs=1))
+        report = run_command("adapter {input} {outdir}", DecoderSuiteOptions(jobs=1))
     assert report.failures == []
     assert len(report.outcomes) > 1000
     assert not [note for note in report.notes if "unread" in note]
@@ -115,7 +115,7 @@ def test_passes_the_conformance_suite_under_sanitizers(sanitized, tmp_path):
 @pytest.mark.slow
 def test_reads_and_refuses_the_same_streams_by_zlib(decoder, tmp_path):
     with asked(compiled(tmp_path, "adapter", decoder, C / "tools" / "adapter.c")):
-        report = run_command("adapter {input} {outdir}", Choice("*deflate*,valid/rich", jobs=1))
+        report = run_command("adapter {input} {outdir}", DecoderSuiteOptions("*deflate*,valid/rich", jobs=1))
     assert report.failures == []
     assert len(report.outcomes) > 50
 

@@ -11,10 +11,10 @@ from csplat.decoder import Limits, iter_tiles
 from csplat_authoring.builder import build
 from csplat_authoring.repair import repair
 from csplat_authoring.samples import rich_scene
-from csplat_conformance import manifest, runner
+from csplat_conformance import decoder_suite, manifest
+from csplat_conformance.conformance_report import Status
+from csplat_conformance.decoder_suite import DecoderSuiteOptions
 from csplat_conformance.manifest import VECTORS, load, summarise
-from csplat_conformance.report import Status
-from csplat_conformance.runner import Choice
 
 VECTOR_LIST = load()
 VALID = [vector for vector in VECTOR_LIST if not vector.error]
@@ -67,7 +67,7 @@ def test_integers_are_refused_with_the_same_code():
 
 def test_the_built_in_run_passes_every_vector_once_per_level():
     # The vectors named from a to c; a step of the gate, `csplat conformance decoder`, runs all of them.
-    report = runner.run_builtin(Choice(pattern="*/[a-c]*"))
+    report = decoder_suite.run_builtin(DecoderSuiteOptions(pattern="*/[a-c]*"))
     valid, invalid = (
         [one.name for one in vectors if one.name.split("/")[1][0] in "abc"] for vectors in (VALID, INVALID)
     )
@@ -81,7 +81,7 @@ def test_the_built_in_run_passes_every_vector_once_per_level():
 
 def test_the_built_in_run_takes_a_pattern():
     assert {vector.name for vector in VALID if vector.name.startswith("valid/codebook")} == {
-        outcome.name for outcome in runner.run_builtin(Choice(pattern="valid/codebook*")).outcomes
+        outcome.name for outcome in decoder_suite.run_builtin(DecoderSuiteOptions(pattern="valid/codebook*")).outcomes
     }
 
 
@@ -149,9 +149,9 @@ def test_a_wrong_hash_fails_the_run(monkeypatch):
     vector = named("valid/quats")
     digest = vector.expect["floats"]["quats"]
     wrong = vector.expect | {"floats": vector.expect["floats"] | {"quats": [*digest[:2], "0" * 64]}}
-    monkeypatch.setattr(runner, "load", lambda: [dataclasses.replace(vector, expect=wrong)])
+    monkeypatch.setattr(decoder_suite, "load", lambda: [dataclasses.replace(vector, expect=wrong)])
 
-    (failure,) = runner.run_builtin().failures
+    (failure,) = decoder_suite.run_builtin().failures
 
     assert ("L3", Status.FAILED, "floats.quats differs") == (failure.level, failure.status, failure.message)
 
@@ -159,9 +159,9 @@ def test_a_wrong_hash_fails_the_run(monkeypatch):
 def test_an_accepted_broken_file_fails_the_run(monkeypatch):
     vector = named("valid/quats")
     error = {"code": "E_RANGE", "clause": "QUA-2", "offset": 0, "also": [], "optional": ""}
-    monkeypatch.setattr(runner, "load", lambda: [dataclasses.replace(vector, expect={}, error=error)])
+    monkeypatch.setattr(decoder_suite, "load", lambda: [dataclasses.replace(vector, expect={}, error=error)])
 
-    (failure,) = runner.run_builtin().failures
+    (failure,) = decoder_suite.run_builtin().failures
 
     assert (Status.FAILED, "accepted", "QUA-2") == (failure.status, failure.message, failure.clauses[0])
 
@@ -169,14 +169,14 @@ def test_an_accepted_broken_file_fails_the_run(monkeypatch):
 def test_ways_of_decoding_that_differ_fail_the_run(monkeypatch):
     monkeypatch.setattr(csplat.decoder, "decode_integers", csplat.decoder.decode)
 
-    report = runner.run_builtin(Choice(pattern="invalid/quat_radicand"))
+    report = decoder_suite.run_builtin(DecoderSuiteOptions(pattern="invalid/quat_radicand"))
     assert report.passed
 
     def refuse(*_args, **_options):
         raise csplat.FormatError("E_RANGE", 0, "QUA-2")
 
     monkeypatch.setattr(csplat.decoder, "decode_integers", refuse)
-    failure = runner.run_builtin(Choice(pattern="valid/quats")).failures[0]
+    failure = decoder_suite.run_builtin(DecoderSuiteOptions(pattern="valid/quats")).failures[0]
     assert "decode and decode_integers differ: accepted; E_RANGE" in failure.message
 
 

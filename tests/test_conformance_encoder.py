@@ -17,14 +17,13 @@ from wrong_encoders import finding
 from wrong_encoders.mistakes import MISTAKES
 
 import csplat
-import csplat_conformance.report as report_module
+import csplat_conformance.conformance_report as report_module
 from csplat.encoder import PRESETS, encode_with_report
 from csplat.errors import InputError
-from csplat_conformance.encoders import EncoderChoice, all_inputs, run_encoder
-from csplat_conformance.encoders.judge import judge_stream
-from csplat_conformance.encoders.matching import pair
-from csplat_conformance.process import Ended, run_program
-from csplat_conformance.report import Status
+from csplat_conformance.conformance_report import Status
+from csplat_conformance.encoders import EncoderSuiteOptions, all_inputs, run_encoder
+from csplat_conformance.encoders.file_checks import check_stream, pair_splats
+from csplat_conformance.protocol import ProcessEnd, run_program
 from csplat_tools.cli.app import app
 from csplat_tools.encode_file import encode_file
 
@@ -65,7 +64,7 @@ def test_pairs_are_found_however_the_file_is_ordered():
     source = ENCODABLE["ordinary/two_tiles"].source().means.astype(np.float64)
     order = np.random.default_rng(1).permutation(len(source))[:60_000]
     moved = source[order] + np.random.default_rng(2).uniform(-0.01, 0.01, (60_000, 3))
-    found = pair(source, moved, 0.06)
+    found = pair_splats(source, moved, 0.06)
 
     np.testing.assert_array_equal(order, found.source_index)
     assert (0, 0, len(source) - 60_000) == (found.strays, found.surplus, found.missing)
@@ -74,24 +73,24 @@ def test_pairs_are_found_however_the_file_is_ordered():
 def test_strays_and_surplus_are_told_apart():
     source = np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])
     decoded = np.array([[0.1, 0, 0], [0.9, 0, 0], [1.1, 0, 0], [3, 0, 0]])
-    found = pair(source, decoded, 1.0)
+    found = pair_splats(source, decoded, 1.0)
 
     assert (1, 1, 1) == (found.strays, found.surplus, found.missing)
 
 
 def test_duplicates_are_paired_one_by_one():
     source = np.zeros((3, 3))
-    assert {0, 1, 2} == set(pair(source, source + 0.01, 1.0).source_index)
-    assert 1 == pair(source, np.zeros((4, 3)), 1.0).surplus
-    assert 2 == pair(source, np.zeros((1, 3)), 1.0).missing
+    assert {0, 1, 2} == set(pair_splats(source, source + 0.01, 1.0).source_index)
+    assert 1 == pair_splats(source, np.zeros((4, 3)), 1.0).surplus
+    assert 2 == pair_splats(source, np.zeros((1, 3)), 1.0).missing
 
 
 def test_any_centre_can_be_paired():
     wild = np.array([[np.inf, 0, 0], [-1e300, 1e300, 0], [0, 0, 0]])
 
-    assert 2 == pair(np.zeros((1, 3)), wild, 1e-6).strays
-    assert 3 == pair(np.zeros((0, 3)), wild, 1.0).strays
-    assert 5 == pair(np.zeros((5, 3)), np.zeros((0, 3)), 1.0).missing
+    assert 2 == pair_splats(np.zeros((1, 3)), wild, 1e-6).strays
+    assert 3 == pair_splats(np.zeros((0, 3)), wild, 1.0).strays
+    assert 5 == pair_splats(np.zeros((5, 3)), np.zeros((0, 3)), 1.0).missing
 
 
 # Ours ----------------------------------------------------------------------------------------------
@@ -121,10 +120,10 @@ def encoder_here(preset="balanced"):
         ply = Path(places["ply"]).read_bytes()
         made = (made_of if len(ply) > LARGE else made_of.__wrapped__)(ply, preset)
         if isinstance(made, str):
-            return Ended(None, 1, b"", made.encode(), 0.0)
+            return ProcessEnd(None, 1, b"", made.encode(), 0.0)
         for name, data in zip(("out", "index"), made, strict=True):
             Path(places[name]).write_bytes(data)
-        return Ended(None, 0, b"", b"", 0.0)
+        return ProcessEnd(None, 0, b"", b"", 0.0)
 
     return run
 
@@ -147,7 +146,7 @@ PRESET_DEPENDENT = (
 def test_our_encoder_passes_on_every_input():
     # CNF-5, CNF-6, SRC-3
     names = [name for name in INPUTS if name != "ordinary/surfaces"]  # another 3,644 splats like those of "glossy"
-    report = run_encoder(PLACES, EncoderChoice(",".join(names), INTEGRITY, jobs=1), run=encoder_here())
+    report = run_encoder(PLACES, EncoderSuiteOptions(",".join(names), INTEGRITY, jobs=1), run=encoder_here())
 
     assert [] == report.failures
     assert len(report.outcomes) >= 150
@@ -159,7 +158,7 @@ def test_our_encoder_passes_on_every_input():
 @pytest.mark.parametrize("preset", [preset for preset in PRESETS if preset != csplat.EncodeOptions().preset])
 def test_our_encoder_passes_at_other_presets(preset):
     # CNF-5, CNF-6, SRC-3
-    choice = EncoderChoice(",".join(PRESET_DEPENDENT), INTEGRITY, jobs=1)
+    choice = EncoderSuiteOptions(",".join(PRESET_DEPENDENT), INTEGRITY, jobs=1)
     report = run_encoder(PLACES, choice, run=encoder_here(preset))
 
     assert [] == report.failures
@@ -172,8 +171,8 @@ def test_our_encoder_passes_at_other_presets(preset):
 def test_our_encoder_keeps_the_picture(preset, decibels):
     names = ["ordinary/degree_3", "ordinary/needles_and_discs", "ordinary/glossy"]
     names = names if preset == "balanced" else names[:1]
-    choice = EncoderChoice(",".join(names), ("L4",), psnr_min=decibels, jobs=1)
-    report = run_encoder(PLACES, choice, pictures=finding.psnr, run=encoder_here(preset))
+    choice = EncoderSuiteOptions(",".join(names), ("L4",), psnr_min=decibels, jobs=1)
+    report = run_encoder(PLACES, choice, render_score=finding.psnr, run=encoder_here(preset))
 
     assert {*names} == {one.name for one in report.outcomes}
     assert [] == report.failures
@@ -184,8 +183,8 @@ def test_our_encoder_keeps_the_picture(preset, decibels):
 
 def test_who_refuses_everything_passes_only_where_that_is_allowed():
     refuses = program("import sys; sys.exit('error: not today')")
-    report = run_encoder(refuses, EncoderChoice("*/empty,broken/nothing"))
-    ordinary = run_encoder(refuses, EncoderChoice("ordinary/one_splat"))
+    report = run_encoder(refuses, EncoderSuiteOptions("*/empty,broken/nothing"))
+    ordinary = run_encoder(refuses, EncoderSuiteOptions("ordinary/one_splat"))
 
     assert report.passed
     assert {"nasty/empty", "broken/nothing"} == {one.name for one in report.outcomes}
@@ -194,7 +193,7 @@ def test_who_refuses_everything_passes_only_where_that_is_allowed():
 
 
 def test_a_traceback_is_a_crash():
-    report = run_encoder(program("raise ValueError('oh')"), EncoderChoice("nasty/empty"))
+    report = run_encoder(program("raise ValueError('oh')"), EncoderSuiteOptions("nasty/empty"))
 
     assert [(Status.CRASHED, "a traceback; its last line: ValueError: oh")] == [
         (one.status, one.message) for one in report.failures
@@ -202,13 +201,13 @@ def test_a_traceback_is_a_crash():
 
 
 def test_broken_inputs_must_not_be_taken():
-    sound = csplat.encode(ENCODABLE["ordinary/one_splat"].source().model((0.0, 0.0, 0.0)))
+    sound = csplat.encode(ENCODABLE["ordinary/one_splat"].source().to_model((0.0, 0.0, 0.0)))
 
     def take(_command, places, _seconds):
         Path(places["out"]).write_bytes(sound)
-        return Ended(None, 0, b"", b"", 0.0)
+        return ProcessEnd(None, 0, b"", b"", 0.0)
 
-    report = run_encoder(PLACES, EncoderChoice("broken/*"), run=take)
+    report = run_encoder(PLACES, EncoderSuiteOptions("broken/*"), run=take)
 
     messages = [one.message for one in report.failures]
     assert {name for name in INPUTS if name.startswith("broken/")} == {one.name for one in report.failures}
@@ -227,8 +226,8 @@ def test_a_file_that_the_validator_passes_and_the_decoder_refuses_is_a_failure(m
     def refuse(_data):
         raise InputError("no")
 
-    monkeypatch.setattr("csplat_conformance.encoders.judge.decode_scene", refuse)
-    verdict, scene = judge_stream(csplat.encode(ENCODABLE["ordinary/one_splat"].source().model((0.0, 0.0, 0.0))))
+    monkeypatch.setattr("csplat_conformance.encoders.file_checks.decode_scene", refuse)
+    verdict, scene = check_stream(csplat.encode(ENCODABLE["ordinary/one_splat"].source().to_model((0.0, 0.0, 0.0))))
 
     assert (Status.FAILED, None) == (verdict.status, scene)
     assert "csplat's decoder refuses it" in verdict.message

@@ -13,19 +13,21 @@ from tables import failures
 from typer.testing import CliRunner
 
 from csplat.errors import InputError
-from csplat_conformance import adapter, node
-from csplat_conformance.answers import PARTS, Answer, judge, settle
-from csplat_conformance.choosing import matching
-from csplat_conformance.encoders.inputs import all_inputs
-from csplat_conformance.manifest import VECTORS, load
-from csplat_conformance.report import Status
-from csplat_conformance.runner import Choice, parse_levels, run_builtin, run_command
+from csplat_conformance import adapter
+from csplat_conformance.answers import PARTS, Answer, check_payload_consistency, compare_answer
+from csplat_conformance.conformance_report import Status
+from csplat_conformance.decoder_suite import DecoderSuiteOptions, parse_levels, run_builtin, run_command
+from csplat_conformance.encoders.encoder_inputs import all_inputs
+from csplat_conformance.manifest import VECTORS, load, select_names
+from csplat_selftest import decoder_processes
 from csplat_tools.cli.app import app
 
 ROOT = Path(__file__).resolve().parent.parent
 ADAPTER = f"{sys.executable} -m csplat_conformance.adapter {{input}} {{outdir}}"
 JS_ADAPTER = f"node '{ROOT / 'codec' / 'js' / 'test' / 'adapter.mjs'}' {{input}} {{outdir}}"
-needs_node = pytest.mark.skipif(bool(node.missing_javascript()), reason=f"skipped: {node.missing_javascript()}")
+needs_node = pytest.mark.skipif(
+    bool(decoder_processes.missing_javascript()), reason=f"skipped: {decoder_processes.missing_javascript()}"
+)
 
 VECTOR_LIST = load()
 
@@ -124,7 +126,7 @@ def faulty(recorded):
 
 @pytest.mark.slow
 def test_our_decoder_passes_by_the_protocol_with_codes_clauses_and_offsets_and_names_percent_encoded():
-    report = run_command(ADAPTER, Choice(pattern="extreme/extra_names,invalid/transforms_gap", exact=True))
+    report = run_command(ADAPTER, DecoderSuiteOptions(pattern="extreme/extra_names,invalid/transforms_gap", exact=True))
 
     assert [] == report.failures
     assert {"L1", "L2", "L3"} == set(report.levels())
@@ -136,7 +138,7 @@ def test_our_decoder_passes_by_the_protocol_with_codes_clauses_and_offsets_and_n
 def test_the_javascript_decoder_passes_by_the_protocol():
     # One vector for each kind of answer of its adapter; the next test runs all vectors, in one process.
     names = ["extreme/extra_names", "invalid/quat_radicand"]
-    report = run_command(JS_ADAPTER, Choice(pattern=",".join(names), exact=True))
+    report = run_command(JS_ADAPTER, DecoderSuiteOptions(pattern=",".join(names), exact=True))
 
     assert {*names} == {outcome.name for outcome in report.outcomes}
     assert [] == report.failures
@@ -144,11 +146,12 @@ def test_the_javascript_decoder_passes_by_the_protocol():
 
 @needs_node
 @pytest.mark.slow
-@pytest.mark.area(name="suite")  # `node --test codec/js/test/conformance.test.mjs` reads every vector, too
+@pytest.mark.area(name="suite")  # `decoder_processes --test codec/js/test/conformance.test.mjs` reads every vector, too
 def test_the_javascript_decoder_answers_every_vector_as_the_manifest_says():
-    with node.JsDecoder() as decoder:
+    with decoder_processes.JsDecoder() as decoder:
         judged = {
-            vector.name: judge(vector, decoder.ask(vector.data), tuple(PARTS), exact=True) for vector in VECTOR_LIST
+            vector.name: compare_answer(vector, decoder.ask(vector.data), tuple(PARTS), exact=True)
+            for vector in VECTOR_LIST
         }
 
     assert [] == [one for outcomes in judged.values() for one in outcomes if one.status is not Status.PASSED]
@@ -179,7 +182,9 @@ VALID_FAULTS = {
 def test_a_fault_on_a_valid_file_has_an_outcome_of_its_own(faulty):
     def check(fault):
         status, levels, message = VALID_FAULTS[fault]
-        report = run_command(faulty(fault), Choice(pattern="valid/quats", timeout=1.5 if fault == "hang" else 60))
+        report = run_command(
+            faulty(fault), DecoderSuiteOptions(pattern="valid/quats", timeout=1.5 if fault == "hang" else 60)
+        )
         assert levels == tuple(outcome.level for outcome in report.failures)
         assert {status} == {outcome.status for outcome in report.failures}
         assert all(message in outcome.message for outcome in report.failures)
@@ -203,7 +208,7 @@ BROKEN_FAULTS = {
 def test_a_fault_on_a_broken_file_has_an_outcome_of_its_own(faulty):
     def check(fault):
         status, message = BROKEN_FAULTS[fault]
-        (outcome,) = run_command(faulty(fault), Choice(pattern="invalid/quat_radicand")).outcomes
+        (outcome,) = run_command(faulty(fault), DecoderSuiteOptions(pattern="invalid/quat_radicand")).outcomes
         assert (status, "L1", "QUA-2") == (outcome.status, outcome.level, outcome.clauses[0])
         assert message in outcome.message
 
@@ -211,7 +216,7 @@ def test_a_fault_on_a_broken_file_has_an_outcome_of_its_own(faulty):
 
 
 def test_another_code_fails_where_exactness_is_asked_for(faulty):
-    report = run_command(faulty("refusal"), Choice(pattern="invalid/quat_radicand", exact=True))
+    report = run_command(faulty("refusal"), DecoderSuiteOptions(pattern="invalid/quat_radicand", exact=True))
 
     assert [Status.FAILED] == [outcome.status for outcome in report.outcomes]
 
@@ -221,8 +226,8 @@ def test_a_broken_payload_may_be_accepted_by_decoders_that_leave_it_unread(fault
     names = ["json_open", "json_coded_garbage", "json_beyond_budget", "error_counts"]
     pattern = ",".join(f"invalid/{name}" for name in names)
 
-    assert run_command(faulty("silent"), Choice(pattern=pattern)).passed
-    assert len(names) == len(run_command(faulty("silent"), Choice(pattern=pattern, exact=True)).failures)
+    assert run_command(faulty("silent"), DecoderSuiteOptions(pattern=pattern)).passed
+    assert len(names) == len(run_command(faulty("silent"), DecoderSuiteOptions(pattern=pattern, exact=True)).failures)
 
 
 MISTAKE = "each accepted one is a mistake if your decoder reads META (CHK-7)"
@@ -242,7 +247,7 @@ MISTAKE = "each accepted one is a mistake if your decoder reads META (CHK-7)"
 )
 def test_of_each_type_of_chunk_a_decoder_reads_every_payload_or_none(faulty, fault, failed, notes):
     names = ("json_open", "json_surrogate", "json_beyond_budget", "error_counts")
-    report = run_command(faulty(fault), Choice(pattern=",".join(f"invalid/{name}" for name in names)))
+    report = run_command(faulty(fault), DecoderSuiteOptions(pattern=",".join(f"invalid/{name}" for name in names)))
 
     assert failed == [outcome.name for outcome in report.failures]
     assert notes == report.notes
@@ -251,9 +256,11 @@ def test_of_each_type_of_chunk_a_decoder_reads_every_payload_or_none(faulty, fau
 def test_a_larger_budget_for_texts_does_not_show_that_they_are_left_unread():
     vectors = [vector for vector in VECTOR_LIST if vector.error and vector.error["optional"] == "META"]
     answers = {code: Answer(status, code=code) for code, status in (("", Status.PASSED), ("E_JSON", Status.REFUSED))}
-    outcomes = [judge(one, answers["" if one.error["code"] == "E_LIMIT" else "E_JSON"], (1,))[0] for one in vectors]
+    outcomes = [
+        compare_answer(one, answers["" if one.error["code"] == "E_LIMIT" else "E_JSON"], (1,))[0] for one in vectors
+    ]
 
-    assert (outcomes, []) == settle(outcomes)
+    assert (outcomes, []) == check_payload_consistency(outcomes)
 
 
 def test_clauses_on_payloads_have_vectors_for_each_type_that_may_be_left_unread():
@@ -262,7 +269,7 @@ def test_clauses_on_payloads_have_vectors_for_each_type_that_may_be_left_unread(
 
 def test_what_is_wrong_about_the_frame_of_an_unread_chunk_has_to_be_refused(faulty):
     names = ["metadata_crc", "stated_errors_crc", "chunk_flags_differ", "metadata_twice"]
-    report = run_command(faulty("silent"), Choice(pattern=",".join(f"invalid/{name}" for name in names)))
+    report = run_command(faulty("silent"), DecoderSuiteOptions(pattern=",".join(f"invalid/{name}" for name in names)))
 
     assert sorted(f"invalid/{name}" for name in names) == sorted(outcome.name for outcome in report.failures)
 
@@ -285,24 +292,24 @@ def test_other_levels_are_refused(text):
 )
 def test_a_command_that_cannot_be_run_is_refused_at_once(command):
     with pytest.raises(InputError):
-        run_command(command, Choice(pattern="valid/quats"))
+        run_command(command, DecoderSuiteOptions(pattern="valid/quats"))
 
 
 @pytest.mark.parametrize("wrong", [{"levels": ()}, {"levels": (7,)}, {"timeout": 0}, {"jobs": 0}, {"by": "fast"}])
 def test_a_choice_that_makes_no_sense_is_refused(wrong):
     with pytest.raises(InputError):
-        Choice(**wrong)
+        DecoderSuiteOptions(**wrong)
 
 
 def test_levels_decide_what_is_looked_at(faulty):
-    at_1 = run_command(faulty("rounding"), Choice(pattern="valid/quats", levels=(1,)))
-    at_3 = run_command(faulty("rounding"), Choice(pattern="valid/quats", levels=(3,)))
+    at_1 = run_command(faulty("rounding"), DecoderSuiteOptions(pattern="valid/quats", levels=(1,)))
+    at_3 = run_command(faulty("rounding"), DecoderSuiteOptions(pattern="valid/quats", levels=(3,)))
 
     assert (True, False) == (at_1.passed, at_3.passed)
 
 
 def test_vectors_are_chosen_by_clause():
-    names = {outcome.name for outcome in run_builtin(Choice(clause="MOR-*", levels=(1,))).outcomes}
+    names = {outcome.name for outcome in run_builtin(DecoderSuiteOptions(clause="MOR-*", levels=(1,))).outcomes}
 
     assert {
         vector.name for vector in VECTOR_LIST if any(clause.startswith("MOR-") for clause in vector.clauses)
@@ -311,7 +318,7 @@ def test_vectors_are_chosen_by_clause():
 
 def test_a_pattern_may_name_a_chapter_of_clauses():
     def names(clause):
-        return [outcome.name for outcome in run_builtin(Choice(clause=clause, levels=(1,))).outcomes]
+        return [outcome.name for outcome in run_builtin(DecoderSuiteOptions(clause=clause, levels=(1,))).outcomes]
 
     assert names("MOR") == names("MOR-*")
     assert len(names("MOR, COV")) == len({*names("MOR-*"), *names("COV-*")})
@@ -320,9 +327,9 @@ def test_a_pattern_may_name_a_chapter_of_clauses():
 @pytest.mark.parametrize(
     ("choice", "message"),
     [
-        (Choice(pattern="valid/*,nothing"), "no vector matches 'nothing'"),
-        (Choice(pattern="valid/*,"), "no vector matches ''"),
-        (Choice(clause="M"), "no clause of a vector matches 'M'"),
+        (DecoderSuiteOptions(pattern="valid/*,nothing"), "no vector matches 'nothing'"),
+        (DecoderSuiteOptions(pattern="valid/*,"), "no vector matches ''"),
+        (DecoderSuiteOptions(clause="M"), "no clause of a vector matches 'M'"),
     ],
 )
 def test_a_pattern_that_matches_nothing_is_named(choice, message):
@@ -341,14 +348,14 @@ def test_a_pattern_that_matches_nothing_is_named(choice, message):
     ],
 )
 def test_the_class_says_how_near_floats_must_be(faulty, fault, by, message):
-    report = run_command(faulty(fault), Choice(pattern="valid/quats", by=by))
+    report = run_command(faulty(fault), DecoderSuiteOptions(pattern="valid/quats", by=by))
 
     assert [message in outcome.message for outcome in report.failures] == ([True] if message else [])
 
 
 @pytest.mark.parametrize("by", ["renderer", "exact"])
 def test_a_report_names_the_class_that_is_not_exact(by):
-    report = run_builtin(Choice(pattern="valid/quats", by=by))
+    report = run_builtin(DecoderSuiteOptions(pattern="valid/quats", by=by))
 
     assert (["judged as a decoder of the class renderer"] if by == "renderer" else []) == [*report.notes]
 
@@ -419,7 +426,7 @@ def test_what_the_guides_recommend_matches():
     def check(recommended):
         option, word = recommended
         assert word.startswith("'") or "*" not in word
-        assert matching(word.strip("'"), names[option], option)
+        assert select_names(word.strip("'"), names[option], option)
 
     recommended = _recommended()
     assert len(recommended) > 15

@@ -11,11 +11,11 @@ from csplat.errors import InputError
 from csplat_authoring import __main__ as recipes
 from csplat_authoring.recipes.rendered import rendered_recipes
 from csplat_authoring.reference import expected
-from csplat_conformance import views
+from csplat_conformance import reference_renders
+from csplat_conformance.conformance_report import Status
+from csplat_conformance.decoder_suite import DecoderSuiteOptions, run_builtin, run_command
 from csplat_conformance.manifest import VECTORS, load
-from csplat_conformance.pictures import PSNR_CAP, psnr, read_png, write_png
-from csplat_conformance.report import Status
-from csplat_conformance.runner import Choice, run_builtin, run_command
+from csplat_conformance.reference_renders import PSNR_CAP, psnr, read_png, write_png
 
 #: `make test` asks our decoder and rasteriser for these pictures by the command.
 pytestmark = pytest.mark.area(name="suite")
@@ -69,7 +69,7 @@ def test_a_scene_is_seen_by_two_cameras_and_not_dark(vector):
 
 
 def test_our_renderer_comes_near_enough():
-    report = run_builtin(Choice(pattern="render/*", levels=(4,)))
+    report = run_builtin(DecoderSuiteOptions(pattern="render/*", levels=(4,)))
 
     assert report.passed
     assert 6 == len(report.outcomes)
@@ -98,7 +98,7 @@ def test_a_mistaken_renderer_stays_below_what_is_wanted(mistake):
 
     def is_near(number, view):
         reference = read_png((VECTORS / f"{name}.{number}.png").read_bytes())
-        return psnr(reference, views.reference_picture(floats, view.camera, antialiased)) >= view.psnr
+        return psnr(reference, reference_renders.reference_render(floats, view.camera, antialiased)) >= view.psnr
 
     assert not all(is_near(number, view) for number, view in enumerate(recipe.views))
 
@@ -115,15 +115,15 @@ def test_a_mistaken_renderer_stays_below_what_is_wanted(mistake):
     ],
 )
 def test_what_becomes_of_a_renderer(copier, fault, status, message):
-    report = run_command(None, Choice(pattern="render/ellipsoids", levels=(4,)), render=copier(fault))
+    report = run_command(None, DecoderSuiteOptions(pattern="render/ellipsoids", levels=(4,)), render=copier(fault))
 
     assert {status} == {outcome.status for outcome in report.outcomes}
     assert all(message in outcome.message for outcome in report.outcomes)
 
 
 def test_without_a_renderer_pictures_are_skipped_loudly(monkeypatch):
-    monkeypatch.setattr(views, "can_render", lambda: False)
-    (outcome, _) = run_builtin(Choice(pattern="render/ellipsoids", levels=(4,))).outcomes
+    monkeypatch.setattr(reference_renders, "can_render", lambda: False)
+    (outcome, _) = run_builtin(DecoderSuiteOptions(pattern="render/ellipsoids", levels=(4,))).outcomes
 
     assert (Status.SKIPPED, "needs the packages of the extra render") == (outcome.status, outcome.message)
 

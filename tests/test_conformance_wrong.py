@@ -11,12 +11,12 @@ from csplat import _spec
 from csplat.decoder import decode_api
 from csplat.decoder.container import open_chunk
 from csplat_conformance import adapter
+from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import load
-from csplat_conformance.near import EXACT, RENDERER
-from csplat_conformance.node import js_folder, missing_javascript
-from csplat_conformance.report import Status
-from csplat_conformance.single import GPUS
+from csplat_conformance.single_precision import GPUS
+from csplat_conformance.tolerance import EXACT, RENDERER
 from csplat_selftest import wrong
+from csplat_selftest.decoder_processes import js_folder, missing_javascript
 from csplat_selftest.mistakes import reworded
 from csplat_selftest.wrong import MISTAKES
 from csplat_selftest.wrong_js import EDITS, catch_edit, edited

@@ -8,8 +8,8 @@ from tables import failures
 
 from csplat_authoring.deflate import Deflate, deflate_dynamic, deflate_fixed, deflate_stored
 from csplat_authoring.recipes.deflate_streams import broken_streams, sound_streams
-from csplat_conformance.validator.coders import uncoded
 from csplat_conformance.validator.inflate import CodedError, Inflater
+from csplat_conformance.validator.streams import undo_coder
 
 DEFLATE = 1
 SIZE = 2000
@@ -49,7 +49,7 @@ def test_broken_streams_are_refused_for_their_clause():
     def check(case):
         assert "refused" == by_zlib(case.coded, len(case.output))
         with pytest.raises(CodedError) as caught:
-            uncoded(memoryview(case.coded), DEFLATE, len(case.output))
+            undo_coder(memoryview(case.coded), DEFLATE, len(case.output))
         assert case.clause == caught.value.clause
 
     assert [] == failures(broken_streams(), check)

@@ -12,7 +12,7 @@ from csplat.decoder import decode_scene, read_declared_bounds, read_options
 from csplat.encoder import EncodePlan, Origin, encode_tiles, encode_with_report, fix_quantisation
 from csplat.encoder.error_bounds import measure_errors
 from csplat.errors import InputError
-from csplat_conformance.stated import Source, prove
+from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_tools.inspect.file_description import describe_file
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -106,15 +106,17 @@ def test_the_geometry_of_a_refitted_file_is_proved(make_model):
     draft = EncodePlan.of(source.select(rows), origin=Origin(len(source), rows))
     result = encode_tiles(draft.with_colours(draft.scene.sh0 + 1, draft.scene.shN)).write()
     scene = decode_scene(result.data)
-    whole = prove(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index)
+    whole = verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index)
     assert whole.holds
-    assert whole.rms_proved
+    assert whole.rms_verified
     assert ["means", "covariance", "opacities"] == [one.name for one in whole.measures if one.holds]
-    assert ("sh0", "sh1", "sh2", "sh3") == whole.unproved
-    assert prove(Source.of(source), scene.model, scene.header, scene.declared_bounds).holds
+    assert ("sh0", "sh1", "sh2", "sh3") == whole.unverified
+    assert verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds).holds
     moved = replace(source, means=source.means + np.float32(0.1))
-    assert not prove(Source.of(moved), scene.model, scene.header, scene.declared_bounds, result.source_index).holds
-    other = prove(Source.of(source.select(slice(0, 399))), scene.model, scene.header, scene.declared_bounds)
+    assert not verify_bounds(
+        Source.of(moved), scene.model, scene.header, scene.declared_bounds, result.source_index
+    ).holds
+    other = verify_bounds(Source.of(source.select(slice(0, 399))), scene.model, scene.header, scene.declared_bounds)
     assert "source of 400 splats" in other.failures[0]
 
 
@@ -124,10 +126,10 @@ def test_a_file_of_adjusted_shapes_states_its_means_alone(make_model):
     result = encode_with_report(adjusted, origin=Origin(len(source), rows, refitted=True, adjusted=True))
     scene = decode_scene(result.data)
     assert ["means"] == [record.measure for record in scene.declared_bounds.records]
-    assert prove(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index).holds
-    assert prove(Source.of(source), scene.model, scene.header, scene.declared_bounds).holds
+    assert verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index).holds
+    assert verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds).holds
     moved = replace(source, means=source.means + np.float32(0.1))
-    assert not prove(Source.of(moved), scene.model, scene.header, scene.declared_bounds).holds
+    assert not verify_bounds(Source.of(moved), scene.model, scene.header, scene.declared_bounds).holds
 
 
 def test_errors_are_stated_against_a_scene_that_was_not_drafted(make_model):

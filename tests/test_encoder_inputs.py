@@ -15,8 +15,8 @@ from csplat import lint
 from csplat.errors import InputError
 from csplat.ply import lint_ply
 from csplat_conformance import encoders
+from csplat_conformance.declared_bounds import Source
 from csplat_conformance.encoders import all_inputs
-from csplat_conformance.stated import Source
 
 INPUTS = {one.name: one for one in all_inputs()}
 ENCODABLE = {name: one for name, one in INPUTS.items() if one.source is not None}
@@ -141,7 +141,7 @@ def test_inputs_show_what_lint_knows(tmp_path):
 def test_different_splats_keep_their_distance():
     def check(one):
         means = np.unique(one.source().means.astype(np.float64), axis=0)  # sorted by x
-        least = one.apart * (1 - 1e-5)  # the lattice of float32
+        least = one.separation * (1 - 1e-5)  # the lattice of float32
         for step in range(1, len(means)):
             away = means[step:] - means[:-step]
             if away[:, 0].min() >= least:
@@ -166,9 +166,9 @@ def test_broken_inputs_are_broken(tmp_path):
 
 def test_another_quality_moves_what_is_wanted_of_all_pictures():
     assert (30.0, 28.0, 32.0) == tuple(
-        INPUTS[f"ordinary/{name}"].psnr_wanted(30.0) for name in ("degree_3", "needles_and_discs", "surfaces")
+        INPUTS[f"ordinary/{name}"].psnr_required(30.0) for name in ("degree_3", "needles_and_discs", "surfaces")
     )
-    assert (25.0, 27.0) == tuple(INPUTS[f"ordinary/{name}"].psnr_wanted(25.0) for name in ("degree_3", "glossy"))
+    assert (25.0, 27.0) == tuple(INPUTS[f"ordinary/{name}"].psnr_required(25.0) for name in ("degree_3", "glossy"))
 
 
 def test_figures_beside_ones_own_are_those_of_the_inputs():

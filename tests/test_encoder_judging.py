@@ -17,14 +17,13 @@ import csplat
 from csplat.decoder import decode_scene
 from csplat.encoder import PRESETS, quantisation, shape_codebook
 from csplat_conformance import encoders
-from csplat_conformance.encoders import EncoderChoice, all_inputs, run_encoder
-from csplat_conformance.encoders.cut import find_cuts
-from csplat_conformance.encoders.figures import figures_of
-from csplat_conformance.encoders.judge import judge_content
-from csplat_conformance.encoders.proving import judge_errors
-from csplat_conformance.process import Ended
-from csplat_conformance.report import Outcome, Report, Status, to_json, to_junit, to_table
-from csplat_conformance.stated import Source
+from csplat_conformance.conformance_report import ConformanceReport, Outcome, Status, to_json, to_junit, to_table
+from csplat_conformance.declared_bounds import Source
+from csplat_conformance.encoders import EncoderSuiteOptions, all_inputs, run_encoder
+from csplat_conformance.encoders.error_checks import check_errors, find_truncation
+from csplat_conformance.encoders.file_checks import check_content
+from csplat_conformance.encoders.render_checks import peer_figures
+from csplat_conformance.protocol import ProcessEnd
 
 pytestmark = pytest.mark.area(name="suite")
 
@@ -47,8 +46,8 @@ def plain(tmp_path_factory):
 def judged(name, model, change=lambda scene: scene, **options):
     """L2 and L3 of what our encoder writes, and why only pictures can judge the rest."""
     scene = change(decode_scene(csplat.encode(model, csplat.EncodeOptions(**options))))
-    content, pairs = judge_content(INPUTS[name], INPUTS[name].source(), scene, None)
-    return content, *judge_errors(INPUTS[name], scene, pairs)
+    content, pairs = check_content(INPUTS[name], INPUTS[name].source(), scene, None)
+    return content, *check_errors(INPUTS[name], scene, pairs)
 
 
 def stating(**changes):
@@ -97,10 +96,10 @@ def test_centres_in_doubles_are_compared_in_doubles():
     near = one.source()
     far = dataclasses.replace(near, means=near.means.astype(np.float64) + np.array([4e6, -4e6, 0.1]))
     model = dataclasses.replace(
-        csplat.decode(csplat.encode(near.model((0.0, 0.0, 0.0)))), origin=(4e6, -4e6, 0.1), extra={}
+        csplat.decode(csplat.encode(near.to_model((0.0, 0.0, 0.0)))), origin=(4e6, -4e6, 0.1), extra={}
     )
     scene = decode_scene(csplat.encode(model))
-    content, pairs = judge_content(dataclasses.replace(one, source=lambda: far), far, scene, None)
+    content, pairs = check_content(dataclasses.replace(one, source=lambda: far), far, scene, None)
 
     assert (Status.PASSED, 0) == (content.status, pairs.missing)
 
@@ -173,7 +172,7 @@ def test_of_no_splats_there_are_no_errors(tmp_path):
 
 def test_our_coarsest_preset_stays_below_half_of_every_bound(monkeypatch, plain):
     for name in ("MEANS_OF_APART", "COVARIANCE_MAX", "COVARIANCE_RMS", "OPACITIES_MAX", "SH_MAX"):
-        module = "csplat_conformance.encoders.coarse"
+        module = "csplat_conformance.encoders.error_checks"
         monkeypatch.setattr(f"{module}.{name}", 0.5 * getattr(__import__(module, fromlist=[name]), name))
     for preset in PRESETS:
         assert Status.PASSED is judged(PLAIN, plain, preset=preset)[1].status
@@ -203,10 +202,12 @@ def honest(model):
     source = Source.of(model)
 
     def change(scene):
-        from csplat_conformance.encoders.matching import pair
-        from csplat_conformance.stated import measure_pairs
+        from csplat_conformance.declared_bounds import measure_pairs
+        from csplat_conformance.encoders.file_checks import pair_splats
 
-        pairs = pair(source.means.astype(np.float64), scene.model.means.astype(np.float64), INPUTS[PLAIN].apart)
+        pairs = pair_splats(
+            source.means.astype(np.float64), scene.model.means.astype(np.float64), INPUTS[PLAIN].separation
+        )
         measured = measure_pairs(source, scene.model, pairs.source_index)
         return stating(
             records=lambda stated: tuple(
@@ -229,11 +230,11 @@ def test_leaving_much_out_is_warned_of():
     one = INPUTS["ordinary/degree_0"]
     source = one.source()
     for kept, status in ((100, Status.WARNED), (200, Status.PASSED)):
-        model = source.model((0.0, 0.0, 0.0)).select(np.arange(kept))
+        model = source.to_model((0.0, 0.0, 0.0)).select(np.arange(kept))
         scene = stating(source_count=lambda _: 216, pruned_count=lambda _, kept=kept: 216 - kept)(
             decode_scene(csplat.encode(model))
         )
-        content, _ = judge_content(one, source, scene, None)
+        content, _ = check_content(one, source, scene, None)
         assert status is content.status
         assert str(216 - kept) in content.message
 
@@ -265,13 +266,13 @@ def test_values_that_are_cut_are_told_from_rounded_ones(tmp_path, name, cut):
     options = csplat.EncodeOptions(sh_coding="scalar", threads=1)
     with rounding(cut):
         scene = decode_scene(csplat.encode(model, options))
-    _, pairs = judge_content(one, one.source(), scene, None)
+    _, pairs = check_content(one, one.source(), scene, None)
     every = frozenset(("means", "covariance", "opacities", "sh0", "sh1", "sh2", "sh3"))
-    lines = find_cuts(one.source(), scene.model, scene.header, pairs.source_index, every)
+    lines = find_truncation(one.source(), scene.model, scene.header, pairs.source_index, every)
 
     assert ["means", "opacities", "scales", "quats", "sh0"] == [line.partition(":")[0] for line in lines][:5]
     assert all(line.endswith("cut instead of rounded?") for line in lines), lines
-    assert [] == find_cuts(one.source(), scene.model, scene.header, pairs.source_index, frozenset())
+    assert [] == find_truncation(one.source(), scene.model, scene.header, pairs.source_index, frozenset())
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -292,14 +293,20 @@ def altered(monkeypatch, plain):
 
     def run(_command, places, _seconds):
         Path(places["out"]).write_bytes(data)
-        return Ended(None, 0, b"", b"", 0.0)
+        return ProcessEnd(None, 0, b"", b"", 0.0)
 
-    def report(change, levels=L3, pictures=None, name=PLAIN, **fields):
+    def report(change, levels=L3, render_score=None, name=PLAIN, **fields):
         one = dataclasses.replace(INPUTS[name], **fields)
-        monkeypatch.setattr("csplat_conformance.encoders.judge.decode_scene", lambda data: change(decode_scene(data)))
-        monkeypatch.setattr("csplat_conformance.encoders.run.all_inputs", lambda: [one])
+        monkeypatch.setattr(
+            "csplat_conformance.encoders.file_checks.decode_scene", lambda data: change(decode_scene(data))
+        )
+        monkeypatch.setattr("csplat_conformance.encoders.encoder_suite.all_inputs", lambda: [one])
         return run_encoder(
-            "x {ply} {out}", EncoderChoice(name, levels), run=run, pictures=pictures, no_pictures="no numba"
+            "x {ply} {out}",
+            EncoderSuiteOptions(name, levels),
+            run=run,
+            render_score=render_score,
+            no_render_reason="no numba",
         )
 
     return report
@@ -311,13 +318,13 @@ def statuses(report):
 
 @pytest.mark.parametrize(("change", "why"), [(silent, "the file states no errors"), (REFITTED, "sh0, sh1 fitted anew")])
 def test_where_errors_prove_nothing_pictures_judge_whatever_was_asked_for(altered, change, why):
-    seen = altered(change, pictures=lambda *_: 41.0)
+    seen = altered(change, render_score=lambda *_: 41.0)
     assert [("L1", Status.PASSED), ("L2", Status.PASSED), ("L3", Status.NOT_PROVED), ("L4", Status.PASSED)] == (
         statuses(seen)
     )
     assert seen.passed
 
-    bad = altered(change, pictures=lambda *_: 11.0)
+    bad = altered(change, render_score=lambda *_: 11.0)
     assert ("L4", Status.FAILED) == statuses(bad)[-1]
 
     blind = altered(change)
@@ -339,7 +346,7 @@ def test_a_picture_that_is_no_number_is_no_picture(altered):
 
 def test_sizes_and_figures_of_others_stand_next_to_the_picture(altered, monkeypatch):
     def message(table, psnr=41.2, **fields):
-        monkeypatch.setattr("csplat_conformance.encoders.picturing.figures_of", lambda name: table.get(name, {}))
+        monkeypatch.setattr("csplat_conformance.encoders.render_checks.figures_of", lambda name: table.get(name, {}))
         return altered(lambda scene: scene, ("L4",), lambda *_: psnr, **fields).outcomes[0]
 
     ours, spz = {"bytes": 4800, "psnr": 40.9}, {"bytes": 7900, "psnr": 39.1}
@@ -358,8 +365,8 @@ def test_sizes_and_figures_of_others_stand_next_to_the_picture(altered, monkeypa
 def test_figures_are_those_of_the_file_that_the_suite_ships():
     shipped = json.loads((files(encoders) / "figures.json").read_text("utf-8"))
 
-    assert shipped[PLAIN] == figures_of(PLAIN)
-    assert {} == figures_of("no/such")
+    assert shipped[PLAIN] == peer_figures(PLAIN)
+    assert {} == peer_figures("no/such")
 
 
 def test_what_cannot_be_drawn_fails_alone(altered):
@@ -373,7 +380,7 @@ def test_what_cannot_be_drawn_fails_alone(altered):
 
 # Reports -------------------------------------------------------------------------------------------
 
-REPORT = Report(
+REPORT = ConformanceReport(
     "encoder",
     "x",
     [
@@ -396,7 +403,9 @@ def test_warnings_refusals_and_what_is_not_proved_are_counted_and_no_failures():
     assert "level  checks  passed  warned  declined  not proved  failed  skipped" in table
     counts = {"checks": 3, "passed": 1, "warned": 1, "declined": 0, "not proved": 1, "failed": 0, "skipped": 0}
     assert counts == to_json(REPORT)["levels"]["L3"]
-    assert ["checks", "passed", "failed", "skipped"] == list(Report("decoder", "x", REPORT.outcomes[:1]).levels()["L3"])
+    assert ["checks", "passed", "failed", "skipped"] == list(
+        ConformanceReport("decoder", "x", REPORT.outcomes[:1]).levels()["L3"]
+    )
 
 
 def test_junit_says_them_too():

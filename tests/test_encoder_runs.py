@@ -12,12 +12,12 @@ import pytest
 from typer.testing import CliRunner
 
 import csplat
-from csplat_conformance.encoders import EncoderChoice, all_inputs, run_encoder, write_inputs
-from csplat_conformance.encoders.matching import pair
-from csplat_conformance.encoders.trial import AGAIN_SECONDS
-from csplat_conformance.process import Ended, run_program
-from csplat_conformance.report import Status
-from csplat_conformance.stated import prove
+from csplat_conformance.conformance_report import Status
+from csplat_conformance.declared_bounds import verify_bounds
+from csplat_conformance.encoders import EncoderSuiteOptions, all_inputs, run_encoder, write_inputs
+from csplat_conformance.encoders.encoder_run import REPEAT_SECONDS
+from csplat_conformance.encoders.file_checks import pair_splats
+from csplat_conformance.protocol import ProcessEnd, run_program
 from csplat_tools.cli.app import app
 
 pytestmark = pytest.mark.area(name="suite")
@@ -25,8 +25,8 @@ pytestmark = pytest.mark.area(name="suite")
 INPUTS = {one.name: one for one in all_inputs()}
 COMMAND = "encoder {ply} {out} {index}"
 PLAIN = "ordinary/degree_1"
-FILES = EncoderChoice(PLAIN, ("L1",), jobs=1)
-MAPS = EncoderChoice(PLAIN, ("L2",), jobs=1)
+FILES = EncoderSuiteOptions(PLAIN, ("L1",), jobs=1)
+MAPS = EncoderSuiteOptions(PLAIN, ("L2",), jobs=1)
 
 
 def invoke(*words):
@@ -56,7 +56,7 @@ def running(encoded, change):
         at.out.write_bytes(encoded[0])
         np.save(at.index, encoded[1])
         code = change(at) or 0
-        return Ended(None, code, b"", b"error: no" if code else b"", 0.0)
+        return ProcessEnd(None, code, b"", b"error: no" if code else b"", 0.0)
 
     return run
 
@@ -70,7 +70,7 @@ def first(report):
 
 
 def test_ours_passes_in_this_process(encoded):
-    report = run_encoder(COMMAND, EncoderChoice(PLAIN, ("L1", "L2", "L3")), run=running(encoded, lambda _: None))
+    report = run_encoder(COMMAND, EncoderSuiteOptions(PLAIN, ("L1", "L2", "L3")), run=running(encoded, lambda _: None))
 
     assert [Status.PASSED] * 3 == [one.status for one in report.outcomes]
 
@@ -97,7 +97,7 @@ def test_a_refusal_leaves_nothing(encoded, name):
         (at.out.parent / "x.tmp").touch()
         return 1
 
-    report = run_encoder(COMMAND, EncoderChoice(name, ("L1",)), run=running(encoded, refuse))
+    report = run_encoder(COMMAND, EncoderSuiteOptions(name, ("L1",)), run=running(encoded, refuse))
 
     message = "refused, but left out.npy beside the output; refused, but left x.tmp beside the output"
     assert (Status.FAILED, (), message) == first(report)
@@ -110,7 +110,7 @@ def test_the_working_directory_stays_empty():
     assert "empty file" in first(run_encoder(writes, FILES))[2]  # an invalid file needs no further report
     assert (
         "refused, but left log in its working directory"
-        == first(run_encoder(refuses, EncoderChoice("nasty/empty", ("L1",))))[2]
+        == first(run_encoder(refuses, EncoderSuiteOptions("nasty/empty", ("L1",))))[2]
     )
     assert not Path("core").exists()
 
@@ -208,9 +208,9 @@ data = open({str(tmp_path / "sound.csplat")!r}, "rb").read()
 open(sys.argv[2], "wb").write(data + str(int(time.time())).encode() if ".again" in sys.argv[2] else data)
 """
     began = time.monotonic()
-    report = run_encoder(program(code), EncoderChoice(PLAIN, ("L1",), keep=tmp_path / "kept"))
+    report = run_encoder(program(code), EncoderSuiteOptions(PLAIN, ("L1",), keep=tmp_path / "kept"))
 
-    assert time.monotonic() - began >= AGAIN_SECONDS
+    assert time.monotonic() - began >= REPEAT_SECONDS
     assert ("CNF-10",) == first(report)[1]
     # Whoever keeps files finds both.
     assert ["ordinary-degree_1", "ordinary-degree_1.again"] == sorted(
@@ -219,14 +219,14 @@ open(sys.argv[2], "wb").write(data + str(int(time.time())).encode() if ".again" 
 
 
 def test_what_is_not_kept_leaves_nothing_and_what_is_kept_lies_apart(encoded, tmp_path):
-    choice = EncoderChoice(PLAIN, ("L1",), keep=tmp_path)
+    choice = EncoderSuiteOptions(PLAIN, ("L1",), keep=tmp_path)
     for _ in range(2):  # a second time over what the first one left
         assert run_encoder(COMMAND, choice, run=running(encoded, lambda _: None)).passed
         assert ["in.ply", "out.csplat", "out.npy"] == sorted(path.name for path in tmp_path.glob("*/*"))
 
 
 def test_what_an_earlier_run_left_is_no_excuse(encoded, tmp_path):
-    choice = EncoderChoice(PLAIN, ("L1",), keep=tmp_path)
+    choice = EncoderSuiteOptions(PLAIN, ("L1",), keep=tmp_path)
     for _ in range(2):
         report = run_encoder(
             COMMAND, choice, run=running(encoded, lambda at: (at.out.parent / "tmp").write_text("") and None)
@@ -312,24 +312,26 @@ def test_errors_are_proved_by_the_encoders_own_index(monkeypatch, tmp_path):
 
     def seen(*args):
         ran.append(args[-1])
-        return prove(*args)
+        return verify_bounds(*args)
 
-    monkeypatch.setattr("csplat_conformance.encoders.proving.prove", seen)
+    monkeypatch.setattr("csplat_conformance.encoders.error_checks.prove", seen)
     (tmp_path / "in.ply").write_bytes(INPUTS["nasty/duplicates"].make())
     result = csplat.encode(csplat.read_ply(tmp_path / "in.ply"))
 
     def run(_command, places, _seconds):
         Path(places["out"]).write_bytes(result)
         np.save(places["index"], exchanged)
-        return Ended(None, 0, b"", b"", 0.0)
+        return ProcessEnd(None, 0, b"", b"", 0.0)
 
     one = INPUTS["nasty/duplicates"]
-    exchanged = pair(one.source().means.astype(np.float64), csplat.decode(result).means.astype(np.float64), one.apart)
+    exchanged = pair_splats(
+        one.source().means.astype(np.float64), csplat.decode(result).means.astype(np.float64), one.separation
+    )
     exchanged = exchanged.source_index.copy()
     same = np.flatnonzero((one.source().means[exchanged] == one.source().means[exchanged[0]]).all(axis=1))
     exchanged[same] = np.roll(exchanged[same], 1)
 
-    assert run_encoder(COMMAND, EncoderChoice(one.name, ("L3",)), run=run).passed
+    assert run_encoder(COMMAND, EncoderSuiteOptions(one.name, ("L3",)), run=run).passed
     np.testing.assert_array_equal(exchanged, ran[0])
 
 
@@ -338,7 +340,7 @@ def test_errors_are_proved_by_the_encoders_own_index(monkeypatch, tmp_path):
 
 def test_who_refuses_all_that_is_unusual_is_told_so():
     refuses = program("import sys; print('error: unusual'); sys.exit(1)")
-    report = run_encoder(refuses, EncoderChoice("nasty/empty,nasty/outlier,nasty/duplicates,broken/cut", ("L1",)))
+    report = run_encoder(refuses, EncoderSuiteOptions("nasty/empty,nasty/outlier,nasty/duplicates,broken/cut", ("L1",)))
 
     assert report.passed
     assert ["warning: nasty: 3 of 3 declined"] == list(report.notes)
@@ -353,11 +355,11 @@ def test_who_refuses_all_that_is_unusual_is_told_so():
 def test_one_refusal_is_counted():
     def run(_command, places, _seconds):
         if Path(places["ply"]).read_bytes() == INPUTS["nasty/empty"].make():
-            return Ended(None, 1, b"done", b"error: no splats\n", 0.0)
+            return ProcessEnd(None, 1, b"done", b"error: no splats\n", 0.0)
         Path(places["out"]).write_bytes(b"csplat?")
-        return Ended(None, 0, b"", b"", 0.0)
+        return ProcessEnd(None, 0, b"", b"", 0.0)
 
-    report = run_encoder("encoder {ply} {out}", EncoderChoice("nasty/empty*", ("L1",)), run=run)
+    report = run_encoder("encoder {ply} {out}", EncoderSuiteOptions("nasty/empty*", ("L1",)), run=run)
 
     assert ["nasty: 1 of 2 declined"] == list(report.notes)
     assert (Status.DECLINED, (), "refused: error: no splats") == first(report)

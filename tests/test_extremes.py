@@ -31,7 +31,7 @@ from csplat import decode, read_ply, write_ply
 from csplat.decoder import read_declared_bounds, read_header
 from csplat.encoder.error_bounds import measure_errors
 from csplat.errors import LimitError
-from csplat_conformance.stated import Source, prove
+from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.virtual_cameras import virtual_cameras
@@ -66,8 +66,8 @@ def assert_proved(name, result):
     """The stated errors hold, rms and counts too."""
     source, decoded = scene(name)[0], decode(result.data)
     stated = read_declared_bounds(result.data)
-    proof = prove(Source.of(source), decoded, read_header(result.data), stated, result.source_index)
-    assert ((), True) == (proof.failures, proof.rms_proved)
+    proof = verify_bounds(Source.of(source), decoded, read_header(result.data), stated, result.source_index)
+    assert ((), True) == (proof.failures, proof.rms_verified)
     return decoded
 
 
@@ -94,7 +94,7 @@ def test_a_reader_repairs_what_is_safe_and_strict_refuses_it(chains):
 
 def test_decoded_scenes_lie_within_the_stated_errors(chains):
     def check(_, chain):
-        assert ((), True) == (chain.proof.failures, chain.proof.rms_proved)
+        assert ((), True) == (chain.proof.failures, chain.proof.rms_verified)
         assert list(range(len(chain.source))) == sorted(chain.result.source_index.tolist())
         assert chain.source.origin == chain.decoded.origin
 
@@ -107,7 +107,9 @@ def test_the_stated_maxima_are_proved_without_an_index_too(chains):
         if name in DRAWN:
             assert (
                 ()
-                == prove(Source.of(chain.source), chain.decoded, read_header(data), read_declared_bounds(data)).failures
+                == verify_bounds(
+                    Source.of(chain.source), chain.decoded, read_header(data), read_declared_bounds(data)
+                ).failures
             )
 
     assert_each(chains, check)

@@ -34,7 +34,7 @@ from csplat import EncodeOptions, decode, encode
 from csplat.decoder import read_declared_bounds, read_header
 from csplat.encoder import EncodePlan, encode_with_report, fix_quantisation
 from csplat.errors import InputError
-from csplat_conformance.stated import Source, prove
+from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.optimise.pruning import simplify
 from csplat_tools.optimise.target_encoding import encode_to
@@ -88,7 +88,7 @@ def test_a_simplified_file_states_what_holds(name):
     result = encode_to(source, keep=0.5, views=views, simplifying=options).result
     decoded = decode(result.data)
     assert max(1, len(source) // 2) == len(decoded)
-    proof = prove(
+    proof = verify_bounds(
         Source.of(source), decoded, read_header(result.data), read_declared_bounds(result.data), result.source_index
     )
     assert () == proof.failures

@@ -18,10 +18,11 @@ from csplat.errors import FormatError, InputError
 from csplat_authoring.builder import build
 from csplat_authoring.repair import repair
 from csplat_authoring.samples import rich_scene
-from csplat_conformance import node, validator
+from csplat_conformance import validator
 from csplat_conformance.answers import Answer
+from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import VECTORS
-from csplat_conformance.report import Status
+from csplat_selftest import decoder_processes
 from csplat_selftest.fuzzing import plies
 from csplat_selftest.fuzzing.edges import Edges
 from csplat_selftest.fuzzing.plies import PlyTarget
@@ -39,7 +40,9 @@ SPEC.loader.exec_module(fuzz)
 
 BASES = [build(rich_scene())]
 CORPUS = Path(__file__).parent / "corpus"
-needs_node = pytest.mark.skipif(bool(node.missing_javascript()), reason=f"skipped: {node.missing_javascript()}")
+needs_node = pytest.mark.skipif(
+    bool(decoder_processes.missing_javascript()), reason=f"skipped: {decoder_processes.missing_javascript()}"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -219,13 +222,13 @@ def test_a_javascript_process_that_ends_is_a_finding_and_starts_again():
 
 @needs_node
 def test_a_javascript_process_that_hangs_is_a_finding(tmp_path):
-    for path in node.js_folder().glob("*.mjs"):
+    for path in decoder_processes.js_folder().glob("*.mjs"):
         shutil.copy(path, tmp_path)
     (tmp_path / "decoder.mjs").write_text(
         "export class CsplatError extends Error {}\n"
         "export const decode = () => Atomics.wait(new Int32Array(new SharedArrayBuffer(4)), 0, 0);\n"
     )
-    with node.JsDecoder(tmp_path, timeout=1.5) as hanging:
+    with decoder_processes.JsDecoder(tmp_path, timeout=1.5) as hanging:
         assert Status.HUNG == hanging.ask(b"").status
 
 

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from csplat_conformance.encoders.plyfile import Splats, meaning
-from csplat_conformance.stated import Source
+from csplat_conformance.declared_bounds import Source
+from csplat_conformance.encoders.reference_ply import PlyRows, source_of_rows
 
 ROOT = Path(__file__).resolve().parent.parent
 GUIDE = (ROOT / "conformance" / "IMPLEMENTERS.md").read_text(encoding="utf-8").replace("−", "-")
@@ -49,7 +49,7 @@ def source(row) -> Source:
         "sh0": row("f_dc_0 … f_dc_2"),
     }
     arrays = {name: np.array(values, np.float32) for name, values in columns.items()}
-    return meaning(Splats(**arrays, shN=np.zeros((2, 0, 3), np.float32)))
+    return source_of_rows(PlyRows(**arrays, shN=np.zeros((2, 0, 3), np.float32)))
 
 
 @pytest.fixture(scope="module")

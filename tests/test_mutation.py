@@ -8,8 +8,7 @@ from chromium import absent
 
 from csplat.errors import InputError
 from csplat_conformance.manifest import load
-from csplat_conformance.native import missing_c
-from csplat_conformance.node import missing_javascript
+from csplat_selftest.decoder_processes import missing_c, missing_javascript
 from csplat_selftest.mutation import __main__ as command
 from csplat_selftest.mutation import judging
 from csplat_selftest.mutation.javascript import JavaScriptDecoder

@@ -22,7 +22,7 @@ from csplat.encoder import Importance
 from csplat.encoder.error_bounds import measure_errors
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat_conformance.stated import Source, prove
+from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scorer import Scorer
@@ -288,7 +288,7 @@ def test_a_share_of_the_splats_proves_what_it_states(kept, alike):
     assert 180 == kept.report.splats == len(decoded.model) == len(np.unique(index))
     distances = np.linalg.norm(decoded.model.means.astype(np.float64) - alike.means[index], axis=1)
     assert distances.max() <= kept.result.report.errors["means"][0]
-    assert prove(Source.of(alike), decoded.model, decoded.header, decoded.declared_bounds, index).holds
+    assert verify_bounds(Source.of(alike), decoded.model, decoded.header, decoded.declared_bounds, index).holds
     assert decoded.declared_bounds.refitted
 
 

@@ -26,9 +26,9 @@ from csplat.files import atomic_writer
 from csplat.formats.sog.sog_files import SogParts
 from csplat.inputs import LetGo
 from csplat_conformance.answers import Answer
-from csplat_conformance.process import run_program
-from csplat_conformance.report import Status
-from csplat_conformance.serving import Served
+from csplat_conformance.conformance_report import Status
+from csplat_conformance.protocol import run_program
+from csplat_selftest.decoder_processes import DecoderProcess
 from csplat_selftest.mutation import __main__ as mutation
 from csplat_tools.batches.batch_scenes import leads_out
 from csplat_tools.batches.batch_worker import Worker, WorkerLostError
@@ -61,7 +61,6 @@ USERS = {
     "codec/csplat/inputs.py": "advice on pages that were read, if the system takes any",
     "codec/csplat/memory.py": "the size of the memory, if the system tells",
     "codec/csplat/system.py": "the replacements",
-    "conformance/csplat_conformance/serving.py": "waits for pipes, in a thread where it cannot",
     "trainer/csplat_trainer/training_report.py": "peak memory, or none",
 }
 
@@ -219,7 +218,7 @@ def test_a_program_ends_or_is_killed_without_process_groups():
     assert time.monotonic() - begun < 20
 
 
-class _Echo(Served):
+class _Echo(DecoderProcess):
     def ask(self, data: bytes) -> bytes | Answer:
         return self._answered(data)
 

@@ -13,11 +13,11 @@ from csplat.encoder import EncodeOptions, encode, encode_with_report
 from csplat.encoder.error_bounds import measure_errors
 from csplat.errors import CsplatError, InputError
 from csplat.model import normalise_quats
-from csplat_conformance.stated import Source, prove
-from csplat_conformance.stated.matching import UNDECIDED, UNMATCHED
-from csplat_conformance.stated.matching import match as match_source
-from csplat_conformance.stated.pairs import differences as differences_of
-from csplat_conformance.stated.pairs import measure_pairs as measured
+from csplat_conformance.declared_bounds import Source, verify_bounds
+from csplat_conformance.declared_bounds.measurement import measure_pairs as measured
+from csplat_conformance.declared_bounds.measurement import pair_differences as differences_of
+from csplat_conformance.declared_bounds.partners import UNDECIDED, UNMATCHED
+from csplat_conformance.declared_bounds.partners import find_partners as match_source
 from csplat_tools.inspect.file_description import describe_file
 
 
@@ -214,12 +214,12 @@ def test_what_the_encoder_states_is_proved(make_model, preset):
     source = make_model(3000, 3)
     result = encode_with_report(source, EncodeOptions(preset=preset, tile_splats=700))
     scene = decode_scene(result.data)
-    proof = prove(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index)
+    proof = verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index)
     assert proof.failures == ()
-    assert proof.rms_proved
-    proof = prove(Source.of(source), scene.model, scene.header, scene.declared_bounds)
+    assert proof.rms_verified
+    proof = verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds)
     assert proof.failures == ()
-    assert not proof.rms_proved
+    assert not proof.rms_verified
 
 
 def test_a_statement_that_says_too_little_or_too_much_is_not_proved(make_model):
@@ -232,8 +232,8 @@ def test_a_statement_that_says_too_little_or_too_much_is_not_proved(make_model):
         records = list(scene.declared_bounds.records)
         records[number] = replace(record, max=record.max * 0.99)
         stated = replace(scene.declared_bounds, records=tuple(records))
-        assert not prove(Source.of(source), scene.model, scene.header, stated, result.source_index).holds
-        assert not prove(Source.of(source), scene.model, scene.header, stated).holds
+        assert not verify_bounds(Source.of(source), scene.model, scene.header, stated, result.source_index).holds
+        assert not verify_bounds(Source.of(source), scene.model, scene.header, stated).holds
         for wrong in (
             replace(record, rms=record.rms * 0.999),
             replace(record, rms=record.rms * 1.001),
@@ -241,7 +241,7 @@ def test_a_statement_that_says_too_little_or_too_much_is_not_proved(make_model):
         ):
             records[number] = wrong
             stated = replace(scene.declared_bounds, records=tuple(records))
-            assert not prove(Source.of(source), scene.model, scene.header, stated, result.source_index).holds
+            assert not verify_bounds(Source.of(source), scene.model, scene.header, stated, result.source_index).holds
 
 
 def test_what_is_fitted_anew_or_not_stated_is_not_proved(make_model):
@@ -250,13 +250,13 @@ def test_what_is_fitted_anew_or_not_stated_is_not_proved(make_model):
     scene = decode_scene(encode(source))
     assert scene.declared_bounds is not None
     fewer = replace(scene.declared_bounds, records=scene.declared_bounds.records[:2])
-    refitted = prove(Source.of(source), scene.model, scene.header, replace(fewer, refitted=True))
+    refitted = verify_bounds(Source.of(source), scene.model, scene.header, replace(fewer, refitted=True))
     assert refitted.holds
-    assert refitted.unproved == ("opacities", "sh0")
+    assert refitted.unverified == ("opacities", "sh0")
     assert "renders" in refitted.notes[-1]
-    silent = prove(Source.of(source), scene.model, scene.header, fewer)
+    silent = verify_bounds(Source.of(source), scene.model, scene.header, fewer)
     assert silent.failures == ("the file states no error of opacities", "the file states no error of sh0")
-    nothing = prove(Source.of(source), scene.model, scene.header, None)
+    nothing = verify_bounds(Source.of(source), scene.model, scene.header, None)
     assert nothing.failures == ("the file states no errors",)
 
 
@@ -267,8 +267,8 @@ def test_what_a_refitted_file_states_has_to_hold(make_model):
     scene = decode_scene(result.data)
     halved = tuple(replace(one, max=one.max / 2, rms=one.rms / 2) for one in scene.declared_bounds.records)
     stated = replace(scene.declared_bounds, refitted=True, records=halved)
-    assert not prove(Source.of(source), scene.model, scene.header, stated).holds
-    assert not prove(Source.of(source), scene.model, scene.header, stated, result.source_index).holds
+    assert not verify_bounds(Source.of(source), scene.model, scene.header, stated).holds
+    assert not verify_bounds(Source.of(source), scene.model, scene.header, stated, result.source_index).holds
 
 
 @pytest.mark.parametrize("indexed", [True, False])
@@ -280,7 +280,7 @@ def test_a_failure_names_splat_tile_source_and_amount(make_model, indexed):
     sh0[700] += np.float32(5.0)
     index = result.source_index if indexed else None
     decoded = replace(scene.model, sh0=sh0)
-    proof = prove(Source.of(source), decoded, scene.header, scene.declared_bounds, index)
+    proof = verify_bounds(Source.of(source), decoded, scene.header, scene.declared_bounds, index)
     wrong = [one for one in proof.measures if one.holds is False]
 
     assert ["sh0"] == [one.name for one in wrong]
@@ -292,7 +292,7 @@ def test_a_failure_names_splat_tile_source_and_amount(make_model, indexed):
     line = next(line for line in proof.failures if line.startswith("sh0: "))
     assert f"splat 700 (tile {worst.tile})" in line
     assert f"source splat {worst.source_splat}" in line
-    assert f"above the stated {wrong[0].stated_max:.9g}" in line
+    assert f"above the stated {wrong[0].declared_max:.9g}" in line
 
 
 def test_a_statement_of_any_size_is_judged(make_model):
@@ -300,8 +300,10 @@ def test_a_statement_of_any_size_is_judged(make_model):
     scene = decode_scene(encode(source))
     vast = tuple(replace(one, max=1e200, rms=1e200) for one in scene.declared_bounds.records)
     stated = replace(scene.declared_bounds, records=vast)
-    assert prove(Source.of(source), scene.model, scene.header, stated).holds  # nobody knows which splat is which
-    assert not prove(Source.of(source), scene.model, scene.header, stated, np.arange(50)).holds
+    assert verify_bounds(
+        Source.of(source), scene.model, scene.header, stated
+    ).holds  # nobody knows which splat is which
+    assert not verify_bounds(Source.of(source), scene.model, scene.header, stated, np.arange(50)).holds
 
 
 def test_errors_beyond_float64_are_infinite(make_model):
@@ -314,16 +316,16 @@ def test_normals_are_nobodys_business(make_model):
     kept = replace(source, extra={"nx": np.zeros(50, np.float32)})
     result = encode_with_report(kept, EncodeOptions(keep_extra=True))
     scene = decode_scene(result.data)
-    assert prove(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index).holds
+    assert verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index).holds
 
 
 def test_extra_columns_are_part_of_the_proof(make_model):
     source = make_model(50, 0, extra={"label": np.arange(50, dtype=np.int16)})
     result = encode_with_report(source, EncodeOptions(keep_extra=True))
     scene = decode_scene(result.data)
-    assert prove(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index).holds
+    assert verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index).holds
     other = replace(source, extra={"label": np.zeros(50, np.int16)})
-    proof = prove(Source.of(other), scene.model, scene.header, scene.declared_bounds, result.source_index)
+    proof = verify_bounds(Source.of(other), scene.model, scene.header, scene.declared_bounds, result.source_index)
     assert proof.failures == ("the extra column 'label' does not hold what the source's does",)
     assert proof.clauses == ("SRC-3",)
 

@@ -14,8 +14,7 @@ from csplat.decoder.blocks import ColumnBlock, morton_axes
 from csplat.decoder.entropy import _undo_run_length, undo_transforms
 from csplat.decoder.reconstruct import lattice_rows, opacity_table, write_colour, write_lattice, write_quats
 from csplat_authoring.deflate import Deflate
-from csplat_conformance.near import too_far
-from csplat_conformance.room import may_be_stated
+from csplat_conformance.tolerance import describe_deviation, is_valid_bound
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAIN, DELTA, ZIGZAG, PLANES = b"\0\0\0\0", b"\1\0\0\0", b"\2\0\0\0", b"\3\0\0\0"
@@ -196,7 +195,7 @@ def test_nearness(spec, array):
     for step in (-4, -3, -2, -1, 0, 1, 2, 3, 5, 16, 17, -(2**24), 2**31):
         values = (exact.view(np.uint32).astype(np.int64) + step).astype(np.uint32).view(np.float32)
         for y, x in zip(values, exact, strict=True):
-            far = too_far(array, y.tobytes(), np.array([x]))
+            far = describe_deviation(array, y.tobytes(), np.array([x]))
             assert spec.is_near(y, x, array) == (not far), (y, x, far)
 
 
@@ -208,7 +207,7 @@ def test_what_may_be_stated(spec, measure, reach):
         for wide in (0.0, 1e-13, 1e-9, 1.9e-7, 2.1e-7, 1.9e-6, 2.1e-6, 9e-5 * error, 1.1e-4 * error, error):
             for stated in (error - wide, error + wide):
                 allowed = spec.may_be_stated(stated, error, measure, reach)
-                assert allowed == may_be_stated(measure, stated, error, reach)
+                assert allowed == is_valid_bound(measure, stated, error, reach)
                 assert not (allowed and error > 1e-3 and abs(stated - error) > 0.002 * error)
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from csplat.model import SplatModel, normalise_quats
-from csplat_conformance.encoders.plyfile import Splats, is_splat, meaning
-from csplat_conformance.room import may_be_stated, room
-from csplat_conformance.stated import Source, measure_pairs
+from csplat_conformance.declared_bounds import Source, measure_pairs
+from csplat_conformance.encoders.reference_ply import PlyRows, is_splat, source_of_rows
+from csplat_conformance.tolerance import bound_tolerance, is_valid_bound
 
 ORIGIN = (481_250.0, 5_467_100.0, 310.0)
 
@@ -107,7 +107,7 @@ def test_errors_are_those_of_the_slow_twin(degree, doubles):
     assert list(expected) == list(found)
     for name, pair in expected.items():
         for true, measured in zip(pair, found[name][:2], strict=True):
-            assert abs(true - measured) <= room(name, true, reach) / 4, name
+            assert abs(true - measured) <= bound_tolerance(name, true, reach) / 4, name
 
 
 def test_the_worst_splat_is_the_one_with_the_largest_error():
@@ -148,11 +148,11 @@ def test_a_checker_lets_pass_whoever_works_in_binary32(spread):
             nothing[:1], normalise_quats(quats[row : row + 1]), scales[row : row + 1], nothing[0, :1], nothing[:1]
         )
         true = measure_pairs(source, decoded, np.array([row]))["covariance"].max
-        assert may_be_stated("covariance", float(stated[row]), true, 0.0)
+        assert is_valid_bound("covariance", float(stated[row]), true, 0.0)
 
     alpha = np.float32(1) / (np.float32(1) + np.exp(-logits))
-    rows = Splats(nothing, raw, scales, logits, nothing, nothing[:, None, :][:, :0])
-    assert float(np.abs(alpha.astype(np.float64) - meaning(rows).opacities).max()) < 2e-7 / 2
+    rows = PlyRows(nothing, raw, scales, logits, nothing, nothing[:, None, :][:, :0])
+    assert float(np.abs(alpha.astype(np.float64) - source_of_rows(rows).opacities).max()) < 2e-7 / 2
 
 
 # What the source is --------------------------------------------------------------------------------
@@ -160,7 +160,7 @@ def test_a_checker_lets_pass_whoever_works_in_binary32(spread):
 
 def rows_of(count=8):
     rng = np.random.default_rng(0)
-    return Splats(
+    return PlyRows(
         means=rng.normal(0, 1, (count, 3)),
         quats=rng.normal(0, 1, (count, 4)).astype(np.float32),
         scales=rng.normal(-3, 1, (count, 3)).astype(np.float32),
@@ -180,14 +180,14 @@ def test_rows_that_are_no_numbers_are_no_splats():
     rows.shN[6, 2, 1] = np.inf
 
     assert [False, False, False, False, True, True, False, True] == is_splat(rows).tolist()
-    assert [1.0, 0.0] == meaning(rows).opacities[:2].tolist()
+    assert [1.0, 0.0] == source_of_rows(rows).opacities[:2].tolist()
 
 
 def test_a_source_is_alpha_and_unit_quaternions_in_binary32_and_centres_as_they_stand():
     # SRC-2
     rows = rows_of()
     rows.quats[3] = 0
-    source = meaning(rows)
+    source = source_of_rows(rows)
 
     np.testing.assert_array_equal(rows.means, source.means)
     assert source.means.dtype == np.float64
@@ -203,6 +203,6 @@ def test_a_source_about_another_origin_is_the_same():
     near = source.about(ORIGIN)
     ours, theirs = (measure_pairs(one, decoded, index)["means"].max for one in (source, near))
 
-    assert abs(ours - theirs) <= room("means", ours, source.reach(ORIGIN))
+    assert abs(ours - theirs) <= bound_tolerance("means", ours, source.reach(ORIGIN))
     assert source.reach(ORIGIN) == pytest.approx(float(np.abs(source.means).max()), rel=1e-12)
-    assert float(np.abs(near.model(ORIGIN).means).max()) < 20.0
+    assert float(np.abs(near.to_model(ORIGIN).means).max()) < 20.0

@@ -11,7 +11,7 @@ from csplat import EncodeOptions, decode
 from csplat.decoder import decode_scene
 from csplat.encoder.error_bounds import covariance_errors, measure_errors
 from csplat.errors import InputError
-from csplat_conformance.stated import Source, prove
+from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_tools.study import (
     ATTRIBUTES,
     KMeans,
@@ -43,9 +43,9 @@ def shell():
 def stored(source, result):
     """Prove what a file states against the source; return what it decodes to."""
     scene = decode_scene(result.data)
-    proof = prove(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index)
+    proof = verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index)
     assert () == proof.failures
-    assert proof.rms_proved
+    assert proof.rms_verified
     assert (len(source), source.sh_degree) == (
         scene.declared_bounds.source_count,
         scene.declared_bounds.source_sh_degree,

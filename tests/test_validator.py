@@ -18,9 +18,8 @@ from csplat_authoring.samples import attributes, rich_scene, scene, tile
 from csplat_authoring.scene import Attribute, Chunk, StatedErrors
 from csplat_conformance.manifest import load
 from csplat_conformance.validator import validate
-from csplat_conformance.validator.findings import VIOLATIONS_MAX
-from csplat_conformance.validator.jsontext import JsonError, parse
-from csplat_conformance.validator.rules import CODES
+from csplat_conformance.validator.ancillary import JsonError, parse_json
+from csplat_conformance.validator.findings import CODES, VIOLATIONS_MAX
 from csplat_selftest.damage import flip, flips, prefixes
 from csplat_selftest.mutate import mutant
 
@@ -282,7 +281,7 @@ def test_a_text_beyond_the_budget_is_not_read():
     ],
 )
 def test_texts_are_parsed(text, value):
-    found = parse(text)
+    found = parse_json(text)
 
     assert value is None or value == found
 
@@ -297,7 +296,7 @@ def test_texts_are_parsed(text, value):
 )  # fmt: skip
 def test_texts_that_are_no_json_are_refused(text):
     with pytest.raises(JsonError):
-        parse(text)
+        parse_json(text)
 
 
 # Damage --------------------------------------------------------------------------------------------
@@ -407,11 +406,11 @@ def test_the_validator_shares_nothing_with_the_decoder_nor_the_encoder_suite_wit
     by_validator, by_suite = (line.split() for line in done.stdout.splitlines())
     loaded = [name for name in by_validator if name.startswith("csplat")]
 
-    # `csplat.inputs` lets go of memory that was looked at: it knows nothing of what is in it.
-    assert {"csplat", "csplat._spec", "csplat.inputs", "csplat_conformance"} == {
+    # `csplat.inputs` releases memory that was read and `csplat.types` names array types: neither knows the format.
+    assert {"csplat", "csplat._spec", "csplat.inputs", "csplat.types", "csplat_conformance"} == {
         name for name in loaded if not name.startswith("csplat_conformance.")
     }
-    assert {"csplat_conformance.room", "csplat_conformance.validator"} == {
+    assert {"csplat_conformance.tolerance", "csplat_conformance.validator"} == {
         ".".join(name.split(".")[:2]) for name in loaded if name.startswith("csplat_conformance.")
     }
     unwanted = ("csplat.encoder", "csplat.ply", "csplat_tools", "numba", "torch")

@@ -14,8 +14,8 @@ from wrong_encoders.mistake import Harm, Mistake
 from wrong_encoders.mistakes import GROUPS, MISTAKES
 
 import csplat
+from csplat_conformance.conformance_report import Status
 from csplat_conformance.encoders import all_inputs
-from csplat_conformance.report import Status
 
 pytestmark = pytest.mark.usefixtures("small_views")
 

@@ -18,14 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from csplat import _spec
+from csplat_authoring.clauses import clause_map, replace_generated
 from csplat_authoring.example import annex
 from csplat_authoring.recipes import all_recipes
 from csplat_authoring.reference import expected
 from csplat_authoring.samples import Recipe
-from csplat_conformance.clauses import clause_map, replaced
 from csplat_conformance.manifest import VECTORS, Vector, picture_name, summarise, to_json
-from csplat_conformance.pictures import psnr, read_png, write_png
-from csplat_conformance.views import can_render, reference_picture
+from csplat_conformance.reference_renders import can_render, psnr, read_png, reference_render, write_png
 
 #: The text of the specification.
 FORMAT = Path(__file__).parents[2] / "spec" / "format.md"
@@ -73,8 +72,8 @@ def files() -> dict[Path, bytes]:
     result[VECTORS / "manifest.json"] = to_json(vectors).encode()
     if FORMAT.exists():
         text = FORMAT.read_text(encoding="utf-8")
-        text = replaced(text, "worked example", annex())
-        text = replaced(text, "clause map", clause_map(text, vectors))
+        text = replace_generated(text, "worked example", annex())
+        text = replace_generated(text, "clause map", clause_map(text, vectors))
         result[FORMAT] = text.encode()
     return result
 
@@ -128,7 +127,7 @@ def _pictures(recipe: Recipe) -> dict[Path, bytes]:
         if can_render() and recipe.scene is not None:
             made = expected(recipe.scene)
             flags = made.header["scene_flags"]
-            picture = reference_picture(made.floats, view.camera, "antialiased" in flags)
+            picture = reference_render(made.floats, view.camera, "antialiased" in flags)
             if not old or psnr(picture, read_png(old)) < _SAME_PICTURE:
                 old = write_png(picture)
         if not old:

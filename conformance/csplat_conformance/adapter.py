@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.errors import CsplatError, LimitError
 from csplat_conformance.answers import Answer
+from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import load, summarise
-from csplat_conformance.report import Status
 
 if TYPE_CHECKING:
     from csplat.decoder import Limits

@@ -19,16 +19,16 @@ from typing import Any
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat_conformance.conformance_report import Outcome, Status
 from csplat_conformance.manifest import Vector
-from csplat_conformance.near import too_far
-from csplat_conformance.report import Outcome, Status
+from csplat_conformance.tolerance import describe_deviation
 
-#: Levels that `judge` knows, and the parts of a manifest's expectation that each looks at.
+#: Levels that `compare_answer` knows, and the parts of a manifest's expectation that each looks at.
 PARTS = {1: ("header",), 2: ("integers",), 3: ("floats", "extra")}
 LEVELS = (*PARTS, 4)
 
 #: From the name of a vector to its float arrays.
-FloatsOf = Callable[[str], Mapping[str, NDArray[Any]]]
+FloatsByVector = Callable[[str], Mapping[str, NDArray[Any]]]
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ def level_name(level: int) -> str:
     return f"L{level}"
 
 
-def judge(
-    vector: Vector, answer: Answer, levels: tuple[int, ...], *, exact: bool = False, near: FloatsOf | None = None
+def compare_answer(
+    vector: Vector, answer: Answer, levels: tuple[int, ...], *, exact: bool = False, near: FloatsByVector | None = None
 ) -> list[Outcome]:
     """Compare an answer with the manifest: one outcome for each level that applies to the vector.
 
@@ -76,7 +76,7 @@ def judge(
         near: gives the exact floats of a vector, which a decoder of the class renderer need only be near to.
     """
     if vector.error:
-        return [_judge_refusal(vector, answer, exact)] if 1 in levels else []
+        return [_check_refused(vector, answer, exact)] if 1 in levels else []
     result = []
     for level, parts in PARTS.items():
         if level not in levels or not any(vector.expect[part] for part in parts):
@@ -104,7 +104,7 @@ def judge(
 # Refusals ------------------------------------------------------------------------------------------
 
 
-def _judge_refusal(vector: Vector, answer: Answer, exact: bool) -> Outcome:
+def _check_refused(vector: Vector, answer: Answer, exact: bool) -> Outcome:
     wanted = vector.error
     status, message = answer.status, answer.message
     details = {}
@@ -114,33 +114,33 @@ def _judge_refusal(vector: Vector, answer: Answer, exact: bool) -> Outcome:
         optional = wanted["optional"] and not exact
         status, message = (Status.PASSED, "") if optional else (Status.FAILED, "accepted")
     elif status is Status.REFUSED:
-        status, message = _compare_refusal(answer, wanted, exact)
+        status, message = _match_refusal(answer, wanted, exact)
     clauses = tuple(vector.clauses)
     if status not in (Status.PASSED, Status.SKIPPED):
         clauses = (wanted["clause"], *(clause for clause in clauses if clause != wanted["clause"]))
     return Outcome(vector.name, level_name(1), status, clauses, answer.code, message, answer.seconds, details)
 
 
-def _compare_refusal(answer: Answer, wanted: Mapping[str, Any], exact: bool) -> tuple[Status, str]:
+def _match_refusal(answer: Answer, wanted: Mapping[str, Any], exact: bool) -> tuple[Status, str]:
     """A refusal is what counts: another order of checks may find another code first."""
-    found = _words(answer.code, answer.clause, answer.offset)
-    planted = f"planted {_words(wanted['code'], wanted['clause'], wanted['offset'])}, reported {found}"
+    found = _describe_error(answer.code, answer.clause, answer.offset)
+    planted = f"planted {_describe_error(wanted['code'], wanted['clause'], wanted['offset'])}, reported {found}"
     if exact:
         same = (answer.code, answer.clause, answer.offset) == (wanted["code"], wanted["clause"], wanted["offset"])
         return (Status.PASSED, "") if same else (Status.FAILED, planted)
     return Status.PASSED, "" if answer.code in (wanted["code"], *wanted["also"]) else planted
 
 
-def _words(code: str, clause: str | None, offset: int | None) -> str:
+def _describe_error(code: str, clause: str | None, offset: int | None) -> str:
     where = "" if offset is None else f" at byte {offset}"
     return f"{code}{where}" + (f" by {clause}" if clause else "")
 
 
-def settle(outcomes: Iterable[Outcome]) -> tuple[list[Outcome], list[str]]:
+def check_payload_consistency(outcomes: Iterable[Outcome]) -> tuple[list[Outcome], list[str]]:
     """Hold a decoder to CHK-7: of each type of chunk it reads every payload by all clauses, or none (CHK-6).
 
     Args:
-        outcomes: what `judge` returned for all vectors.
+        outcomes: what `compare_answer` returned for all vectors.
 
     Returns:
         The same, but that a broken payload which was accepted is a failure if others of its type were refused; and
@@ -167,7 +167,7 @@ def settle(outcomes: Iterable[Outcome]) -> tuple[list[Outcome], list[str]]:
 # Arrays --------------------------------------------------------------------------------------------
 
 
-def _compare(vector: Vector, answer: Answer, parts: tuple[str, ...], near: FloatsOf | None) -> tuple[Status, str]:
+def _compare(vector: Vector, answer: Answer, parts: tuple[str, ...], near: FloatsByVector | None) -> tuple[Status, str]:
     if not answer.header and not answer.arrays:
         return Status.NO_OUTPUT, "nothing was written"
     if "header" in parts:
@@ -182,10 +182,10 @@ def _compare(vector: Vector, answer: Answer, parts: tuple[str, ...], near: Float
         found += [(Status.FAILED, f"{key}: not asked for") for key in extra]
     if not found:
         return Status.PASSED, ""
-    return max((status for status, _ in found), key=_gravity), "; ".join(text for _, text in found)
+    return max((status for status, _ in found), key=_severity), "; ".join(text for _, text in found)
 
 
-def _gravity(status: Status) -> int:
+def _severity(status: Status) -> int:
     """Rank a failure of the arrays of one vector: of several, the one with the largest rank is reported."""
     return -[Status.WRONG_ANSWER, Status.PARTIAL_OUTPUT, Status.FAILED].index(status)
 
@@ -220,11 +220,11 @@ def _compare_size(key: str, summary: list[Any], found: tuple[int, str] | None) -
     return []
 
 
-def _compare_values(vector: Vector, answer: Answer, key: str, near: FloatsOf | None) -> list[tuple[Status, str]]:
+def _compare_values(vector: Vector, answer: Answer, key: str, near: FloatsByVector | None) -> list[tuple[Status, str]]:
     part, name = key.split(".", 1)
     if answer.arrays[key][1] == vector.expect[part][name][2]:
         return []
     if near and part == "floats" and name in answer.floats:
-        far = too_far(name, answer.floats[name], near(vector.name)[name])
+        far = describe_deviation(name, answer.floats[name], near(vector.name)[name])
         return [(Status.FAILED, f"{key}: {far}")] if far else []
     return [(Status.FAILED, f"{key} differs")]

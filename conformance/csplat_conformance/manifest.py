@@ -1,10 +1,11 @@
-"""The manifest: what each vector is, and what a decoder must make of it."""
+"""The manifest: the vectors, and the result that a decoder must give for each."""
 
 from __future__ import annotations
 
+import fnmatch
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.errors import InputError
 
 #: Folder of the vectors and of manifest.json.
 VECTORS = Path(__file__).parent / "vectors"
@@ -84,3 +86,24 @@ def to_json(vectors: Sequence[Vector]) -> str:
     lines = [json.dumps(entry, ensure_ascii=False, separators=(",", ":")) for entry in entries]
     head = json.dumps({"format": f"csplat {_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}", "licence": "CC0-1.0"})
     return head[:-1] + ', "vectors": [\n' + ",\n".join(lines) + "\n]}\n"
+
+
+def select_names(patterns: str | None, names: Collection[str], what: str) -> set[str]:
+    """Return the names that one of some patterns matches; all of them for None.
+
+    Args:
+        patterns: as in a shell, with commas between them: `valid/sh*,valid/absent_*`. One matches whole names, or the
+            part before a hyphen: `MOR` is `MOR-*`, and so a chapter of clauses.
+        names: to choose from.
+        what: the thing that has the names, for messages.
+
+    Raises:
+        InputError: a pattern matches none of them.
+    """
+    chosen: set[str] = set()
+    for pattern in () if patterns is None else patterns.split(","):
+        found = {*fnmatch.filter(names, pattern.strip()), *fnmatch.filter(names, f"{pattern.strip()}-*")}
+        if not found:
+            raise InputError(f"no {what} matches {pattern.strip()!r}")
+        chosen |= found
+    return set(names) if patterns is None else chosen

@@ -1,30 +1,29 @@
-"""The protocol by which any decoder can be tested: one process for each vector.
-
-    my-decoder INPUT OUTDIR
-
-It exits with status 0 and leaves in OUTDIR `header.json` and a file of raw values for each array, little-endian, in
-C order: `integers.NAME.bin`, `floats.NAME.bin`, `extra.NAME.bin` (NAME of a column percent-encoded). Or it exits
-with status 1, its last line on standard output is JSON, `{"code": "E_CRC"}`, and OUTDIR stays empty.
-"""
+"""The protocol by which any decoder can be tested: one process for each vector."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
+import subprocess
 import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from urllib.parse import unquote
 
+from csplat.errors import InputError
+from csplat.system import kill_group, split_words
 from csplat_conformance.answers import Answer, whole_number
-from csplat_conformance.process import Ended, run_program
-from csplat_conformance.report import Status
+from csplat_conformance.conformance_report import Status
 
-_WORDS_MAX = 200  # characters of a program's own message
+_MESSAGE_MAX = 200  # characters of a program's own message
 _PARTS = ("integers", "floats", "extra")
 
 
-def ask(command: str, path: Path, timeout: float, *, keep_floats: bool = False) -> Answer:
+def ask_decoder(command: str, path: Path, timeout: float, *, keep_floats: bool = False) -> Answer:
     """Let a decoder have one file.
 
     Args:
@@ -37,26 +36,26 @@ def ask(command: str, path: Path, timeout: float, *, keep_floats: bool = False) 
         outdir = Path(folder) / "out"
         outdir.mkdir()
         ended = run_program(command, {"input": str(path), "outdir": str(outdir)}, timeout)
-        return answered(ended, outdir, keep_floats=keep_floats)
+        return read_answer(ended, outdir, keep_floats=keep_floats)
 
 
-def answered(ended: Ended, outdir: Path, *, keep_floats: bool = False) -> Answer:
+def read_answer(ended: ProcessEnd, outdir: Path, *, keep_floats: bool = False) -> Answer:
     """Read what a decoder left.
 
     Args:
         ended: how the process ended.
         outdir: the folder it was given.
-        keep_floats: as for `ask`.
+        keep_floats: as for `ask_decoder`.
     """
     if ended.status is not None:
         return Answer(ended.status, ended.message + last_words(ended), seconds=ended.seconds)
     left = sorted(entry.name for entry in outdir.iterdir())
     if ended.returncode == 1:
-        return _refusal(ended, left)
-    return _decoded(outdir, left, ended.seconds, keep_floats=keep_floats)
+        return _read_refusal(ended, left)
+    return _read_arrays(outdir, left, ended.seconds, keep_floats=keep_floats)
 
 
-def _refusal(ended: Ended, left: list[str]) -> Answer:
+def _read_refusal(ended: ProcessEnd, left: list[str]) -> Answer:
     try:
         facts: dict[str, Any] = dict(json.loads((ended.stdout.splitlines() or [b""])[-1]))
         code, clause, offset = facts["code"], facts.get("clause"), facts.get("offset")
@@ -70,14 +69,14 @@ def _refusal(ended: Ended, left: list[str]) -> Answer:
     return Answer(Status.REFUSED, "refused", code=code, clause=clause, offset=offset, seconds=ended.seconds)
 
 
-def last_words(ended: Ended) -> str:
+def last_words(ended: ProcessEnd) -> str:
     """Return the last line of standard error as the end of a sentence, or nothing."""
     lines = ended.stderr.decode("utf-8", "replace").split("\n")
     words = next((line.strip() for line in reversed(lines) if line.strip()), "")
-    return f": {words[:_WORDS_MAX]}" if words else ""
+    return f": {words[:_MESSAGE_MAX]}" if words else ""
 
 
-def _decoded(outdir: Path, left: list[str], seconds: float, *, keep_floats: bool) -> Answer:
+def _read_arrays(outdir: Path, left: list[str], seconds: float, *, keep_floats: bool) -> Answer:
     header: dict[str, Any] = {}
     arrays, floats = {}, {}
     for name in left:
@@ -100,3 +99,125 @@ def _decoded(outdir: Path, left: list[str], seconds: float, *, keep_floats: bool
         else:
             return Answer(Status.WRONG_ANSWER, f"{name} is no file of the protocol", seconds=seconds)
     return Answer(Status.PASSED, header=header, arrays=arrays, floats=floats, seconds=seconds)
+
+
+_OUTPUT_MAX = 1 << 20  # bytes of each stream that are kept: a program may print for ever
+_SIGKILL = 9  # SIGKILL, which Windows has no name for
+_WINDOWS_EXCEPTION = 0xC0000000  # least exit status of a Windows program that crashed; of others it is at most 255
+
+
+@dataclass(frozen=True)
+class ProcessEnd:
+    """The end of a process.
+
+    Attributes:
+        status: `CRASHED` by a signal, `HUNG`, `WRONG_STATUS` for anything but 0 and 1; `None` for 0 and 1.
+        returncode: exit status, minus the signal's number after a crash.
+        stdout: the end of standard output, a mebibyte at most.
+        stderr: the end of standard error, likewise.
+        seconds: time it ran.
+        message: the meaning of `status` here, in words; empty for `None`.
+    """
+
+    status: Status | None
+    returncode: int
+    stdout: bytes
+    stderr: bytes
+    seconds: float
+    message: str = ""
+
+
+def split_command(command: str, names: tuple[str, ...], optional: tuple[str, ...] = ()) -> list[str]:
+    """Split a command line and see to it that it names what it must.
+
+    Args:
+        command: the line.
+        names: names that must occur in it, in braces.
+        optional: names that may occur.
+
+    Raises:
+        InputError: quotes without an end, no program, a name in braces that is missing or unknown.
+    """
+    try:
+        words = split_words(command)
+        missing = [name for name in names if not any(f"{{{name}}}" in word for word in words)]
+        for word in words:
+            word.format(**dict.fromkeys((*names, *optional), ""))
+    except (ValueError, LookupError, AttributeError) as error:
+        raise InputError(f"the command {command!r} cannot be used: {error}") from None
+    if missing or not words:
+        raise InputError(f"the command {command!r} lacks {', '.join(f'{{{name}}}' for name in missing) or 'a program'}")
+    return words
+
+
+def run_program(
+    command: str, places: Mapping[str, str], timeout_seconds: float, *, cwd: Path | None = None
+) -> ProcessEnd:
+    """Run a command line in a process group of its own; what is left of the group after the time is killed.
+
+    Args:
+        command: with the keys of `places` in braces.
+        places: values to insert, by name.
+        timeout_seconds: wall-clock limit.
+        cwd: working directory. A program with a slash is then still one of this process's own directory, and so are
+            words, or what follows the `=` of an option, that look like a path (a slash, or a suffix) and name
+            something there.
+
+    Raises:
+        InputError: the command line is not one, or there is no such program.
+    """
+    words = split_command(command, tuple(places))
+    if cwd is not None:
+        words = [_absolute_path(words[0]) if _has_separator(words[0]) else words[0], *map(_make_absolute, words[1:])]
+    words = [word.format(**places) for word in words]
+    start = time.perf_counter()
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        try:
+            process = subprocess.Popen(  # noqa: S603 - to run the caller's command is what this is for
+                words, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True, cwd=cwd
+            )
+        except OSError as error:
+            raise InputError(f"{words[0]}: {error.strerror or error}; is it installed, and its name right?") from None
+        status: Status | None = None
+        try:
+            returncode = process.wait(timeout_seconds)
+        except subprocess.TimeoutExpired:
+            status = Status.HUNG
+            returncode = -_SIGKILL
+        finally:
+            kill_group(process)
+        seconds = time.perf_counter() - start
+        message = ""
+        if status is Status.HUNG:
+            message = f"still running after {timeout_seconds:g} s"
+        elif returncode < 0:
+            status, message = Status.CRASHED, f"ended by signal {-returncode}"
+        elif returncode >= _WINDOWS_EXCEPTION:
+            status, message = Status.CRASHED, f"ended by exception {returncode:#x}"
+        elif returncode > 1:
+            status, message = Status.WRONG_STATUS, f"exit status {returncode}"
+        return ProcessEnd(status, returncode, _tail(out), _tail(err), seconds, message)
+
+
+def _make_absolute(word: str) -> str:
+    """Make a word absolute that names something in the working directory."""
+    option, equals, path = word.partition("=") if word.startswith("-") else ("", "", word)
+    like_a_path = _has_separator(path) or bool(Path(path).suffix)
+    # Path.exists() raises for words that are too long to be one.
+    found = like_a_path and os.path.exists(path)  # noqa: PTH110 - see above
+    return option + equals + _absolute_path(path) if found else word
+
+
+def _absolute_path(path: str) -> str:
+    # A link stays one: the program of a virtual environment is known by where it lies.
+    return str(Path(path).absolute()).replace("{", "{{").replace("}", "}}")
+
+
+def _has_separator(path: str) -> bool:
+    return any(separator in path for separator in (os.sep, os.altsep) if separator)
+
+
+def _tail(stream: IO[bytes]) -> bytes:
+    size = stream.seek(0, os.SEEK_END)
+    stream.seek(max(0, size - _OUTPUT_MAX))
+    return stream.read()

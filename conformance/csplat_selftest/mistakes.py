@@ -12,8 +12,8 @@ from typing import Any
 from unittest import mock
 
 from csplat import decoder
-from csplat_conformance.near import EXACT
-from csplat_conformance.report import Outcome
+from csplat_conformance.conformance_report import Outcome
+from csplat_conformance.tolerance import EXACT
 
 #: Takes the right function, then its arguments.
 Wrong = Callable[..., Any]

@@ -19,10 +19,10 @@ from contextlib import ExitStack
 from csplat.errors import InputError
 from csplat_authoring.recipes import exact_floats
 from csplat_conformance.adapter import answer
-from csplat_conformance.answers import PARTS, Answer, judge, settle
+from csplat_conformance.answers import PARTS, Answer, check_payload_consistency, compare_answer
+from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import Vector, load
-from csplat_conformance.near import RENDERER
-from csplat_conformance.report import Status
+from csplat_conformance.tolerance import RENDERER
 from csplat_selftest.mistakes import Caught, Mistake
 from csplat_selftest.wrong_js import catch_all
 from csplat_selftest.wrong_python import MISTAKES as WRONG_PYTHON
@@ -41,8 +41,8 @@ def catch(mistake: Mistake, vectors: Iterable[Vector] | None = None) -> Caught:
         mistake.apply(stack)
         for vector in load() if vectors is None else vectors:
             near = exact_floats if mistake.by == RENDERER else None
-            outcomes += judge(vector, _asked(vector.data), tuple(PARTS), near=near)
-    return Caught("Python", mistake, [one for one in settle(outcomes)[0] if not one.good])
+            outcomes += compare_answer(vector, _asked(vector.data), tuple(PARTS), near=near)
+    return Caught("Python", mistake, [one for one in check_payload_consistency(outcomes)[0] if not one.good])
 
 
 def _asked(data: bytes) -> Answer:

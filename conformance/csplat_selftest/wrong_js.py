@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from csplat_conformance.answers import PARTS, judge, settle
+from csplat_conformance.answers import PARTS, check_payload_consistency, compare_answer
 from csplat_conformance.manifest import Vector, load
-from csplat_conformance.node import JsDecoder, js_folder
+from csplat_selftest.decoder_processes import JsDecoder, js_folder
 from csplat_selftest.mistakes import Caught, Mistake
 
 
@@ -181,5 +181,5 @@ def catch_edit(edit: Edit, vectors: Sequence[Vector] | None = None) -> Caught:
         outcomes = []
         with JsDecoder(folder) as decoder:
             for vector in load() if vectors is None else vectors:
-                outcomes += judge(vector, decoder.ask(vector.data), tuple(PARTS))
-    return Caught("JavaScript", mistake, [one for one in settle(outcomes)[0] if not one.good])
+                outcomes += compare_answer(vector, decoder.ask(vector.data), tuple(PARTS))
+    return Caught("JavaScript", mistake, [one for one in check_payload_consistency(outcomes)[0] if not one.good])

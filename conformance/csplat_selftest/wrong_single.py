@@ -12,14 +12,14 @@ import numpy as np
 from csplat import _spec
 from csplat.decoder import reconstruct
 from csplat.errors import FormatError
-from csplat_conformance.near import RENDERER
-from csplat_conformance.single import GPUS, Gpu, lattice_values, opacities, quats
+from csplat_conformance.single_precision import GPUS, GpuArithmetic, lattice_values, opacities, quats
+from csplat_conformance.tolerance import RENDERER
 from csplat_selftest.mistakes import Mistake, Wrong, nothing, replaced
 
 Apply = Callable[[ExitStack], None]
 
 
-def single_precision(gpu: Gpu) -> Apply:
+def single_precision(gpu: GpuArithmetic) -> Apply:
     """Return what makes the Python decoder compute section 7 as a GPU does, and as CNF-7 allows."""
 
     def lattice(_right: Wrong, integers: Any, step: float, out: Any, **_options: Any) -> None:

@@ -19,9 +19,7 @@ errors (L3; what is only coarse is in `coarse` and `cut`), `picturing` at render
 
 from __future__ import annotations
 
-from csplat_conformance.encoders.inputs import PSNR_MIN, Input, all_inputs
-from csplat_conformance.encoders.levels import LEVELS
-from csplat_conformance.encoders.run import EncoderChoice, run_encoder
-from csplat_conformance.encoders.writing import write_inputs
+from csplat_conformance.encoders.encoder_inputs import PSNR_MIN, EncoderInput, all_inputs
+from csplat_conformance.encoders.encoder_suite import LEVELS, EncoderSuiteOptions, run_encoder, write_inputs
 
-__all__ = ["LEVELS", "PSNR_MIN", "EncoderChoice", "Input", "all_inputs", "run_encoder", "write_inputs"]
+__all__ = ["LEVELS", "PSNR_MIN", "EncoderInput", "EncoderSuiteOptions", "all_inputs", "run_encoder", "write_inputs"]

@@ -13,7 +13,7 @@ that no scene can have. What can no longer be told apart is listed as not looked
 
 from __future__ import annotations
 
-from csplat_conformance.validator.check import validate
 from csplat_conformance.validator.findings import Unread, Validation, Violation
+from csplat_conformance.validator.validation import validate
 
 __all__ = ["Unread", "Validation", "Violation", "validate"]

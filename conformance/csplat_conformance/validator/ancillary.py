@@ -1,22 +1,151 @@
-"""Chunks of the whole file: JSON texts and stated errors (spec 5.4, 5.5)."""
+"""Chunks of the whole file: JSON texts and declared error bounds (spec 5.4, 5.5)."""
 
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
 
 from csplat import _spec
-from csplat_conformance.room import least_true, room
-from csplat_conformance.validator.findings import Findings, Placed
+from csplat_conformance.tolerance import bound_tolerance, least_true_error
+from csplat_conformance.validator.findings import Findings, Payload, PlacedRecord
 from csplat_conformance.validator.index import Index
-from csplat_conformance.validator.jsontext import JsonError, parse
-from csplat_conformance.validator.reading import Payload
 from csplat_conformance.validator.streams import read_stream
 
+_WHITESPACE = re.compile(r"[ \t\n\r]*")
+_NUMBER = re.compile(r"-?(?:0|[1-9][0-9]*)(?:\.[0-9]+)?(?:[eE][+-]?[0-9]+)?")
+_STRING = re.compile(r'"((?:[^"\\\x00-\x1f]|\\(?:["\\/bfnrt]|u[0-9a-fA-F]{4}))*)"')
+_ESCAPE = re.compile(r"\\(u[0-9a-fA-F]{4}|.)")
+_SHORT_ESCAPES = {'"': '"', "\\": "\\", "/": "/", "b": "\b", "f": "\f", "n": "\n", "r": "\r", "t": "\t"}
+_LITERALS = {"true": True, "false": False, "null": None}
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+_SHOWN_MAX = 24  # characters of the text in a message
+
+
+class JsonError(Exception):
+    """The text breaks JSN-1."""
+
+
+def parse_json(data: bytes) -> Any:
+    """Parse a text by JSN-1 and return its value; numbers as float.
+
+    Raises:
+        JsonError: in words.
+    """
+    if data.startswith(_BYTE_ORDER_MARK):
+        raise JsonError("a byte order mark")
+    try:
+        text = data.decode("utf-8", "strict")  # Python refuses surrogates and overlong forms
+    except UnicodeDecodeError as error:
+        raise JsonError(f"byte {error.start} of the text is not UTF-8") from None
+    scanner = _Scanner(text)
+    value = scanner.value(0)
+    scanner.skip()
+    if scanner.at != len(text):
+        raise scanner.error("more than one value")
+    return value
+
+
+class _Scanner:
+    """A place in a text. Recursion is bounded by JSON_DEPTH_MAX."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.at = 0
+
+    def error(self, what: str) -> JsonError:
+        near = ascii(self.text[self.at : self.at + _SHOWN_MAX])
+        return JsonError(f"{what} at character {self.at}, {near}")
+
+    def skip(self) -> None:
+        match = _WHITESPACE.match(self.text, self.at)
+        self.at = match.end() if match else self.at
+
+    def taken(self, character: str) -> bool:
+        self.skip()
+        if self.text.startswith(character, self.at):
+            self.at += len(character)
+            return True
+        return False
+
+    def value(self, depth: int) -> Any:
+        self.skip()
+        first = self.text[self.at : self.at + 1]
+        if first in ("{", "["):
+            if depth == _spec.JSON_DEPTH_MAX:
+                raise self.error(f"more than {_spec.JSON_DEPTH_MAX} levels")
+            self.at += 1
+            return self.object(depth + 1) if first == "{" else self.array(depth + 1)
+        if first == '"':
+            return self.string()
+        for word, value in _LITERALS.items():
+            if self.taken(word):
+                return value
+        return self.number()
+
+    def object(self, depth: int) -> dict[str, Any]:
+        result: dict[str, Any] = {}
+        if self.taken("}"):
+            return result
+        while True:
+            self.skip()
+            start = self.at
+            name = self.string()
+            if name in result:
+                self.at = start
+                raise self.error("a name that the object has already")
+            if not self.taken(":"):
+                raise self.error("no colon")
+            result[name] = self.value(depth)
+            if self.taken("}"):
+                return result
+            if not self.taken(","):
+                raise self.error("neither comma nor end of an object")
+
+    def array(self, depth: int) -> list[Any]:
+        result: list[Any] = []
+        if self.taken("]"):
+            return result
+        while True:
+            result.append(self.value(depth))
+            if self.taken("]"):
+                return result
+            if not self.taken(","):
+                raise self.error("neither comma nor end of an array")
+
+    def string(self) -> str:
+        match = _STRING.match(self.text, self.at)
+        if match is None:
+            raise self.error("no string")
+        units = _ESCAPE.sub(_unescape, match[1])
+        # Halves of a pair that were written as two escapes join; a half that is left is no text.
+        try:
+            value = units.encode("utf-16-le", "surrogatepass").decode("utf-16-le", "strict")
+        except UnicodeDecodeError:
+            raise self.error("half of a surrogate pair") from None
+        self.at = match.end()
+        return value
+
+    def number(self) -> float:
+        match = _NUMBER.match(self.text, self.at)
+        if match is None:
+            raise self.error("no value")
+        value = float(match[0])
+        if math.isinf(value):
+            raise self.error("a number beyond binary64")
+        self.at = match.end()
+        return value
+
+
+def _unescape(match: re.Match[str]) -> str:
+    code = match[1]
+    return chr(int(code[1:], 16)) if len(code) == 5 else _SHORT_ESCAPES[code]
+
+
 _COMPONENTS = {"means": 1, "covariance": 1, "opacities": 1, "sh0": 3, "sh1": 9, "sh2": 15, "sh3": 21}
-_ROOM = 1.0 + 2.0**-20  # SER-2
+_ROUNDING = 1.0 + 2.0**-20  # SER-2
 _CAMERA_KEYS = ("K", "viewmat", "W", "H")
 _TEXT_WIDTH = 1
 
@@ -29,7 +158,7 @@ def read_text(payload: Payload, kind: bytes, bytes_max: int) -> None:
         return
     findings = payload.findings
     try:
-        value = parse(np.asarray(stream.elements, np.uint8).tobytes())
+        value = parse_json(np.asarray(stream.elements, np.uint8).tobytes())
     except JsonError as error:
         findings.add("JSN-1", stream.head.offset, f"{payload.name}/stream", str(error))
         return
@@ -50,7 +179,7 @@ def _remark_cameras(findings: Findings, cameras: list[dict[str, Any]]) -> None:
             return
 
 
-def read_stated_errors(payload: Payload, index: Index) -> None:
+def read_declared_bounds(payload: Payload, index: Index) -> None:
     """Check SERR: SER-1 to SER-4, and of SER-5 what holds whatever the source was."""
     findings = payload.findings
     head = payload.structure(
@@ -79,12 +208,12 @@ def read_stated_errors(payload: Payload, index: Index) -> None:
         elif measure <= last:
             findings.of("SER-1", record, "measure", f"{measure} after {last}, wanted ascending measures")
         last = max(last, measure)
-        if _check_pair(findings, record) and measure in _spec.MEASURE_NAMES:
-            _check_possible(findings, record, index, stated.source_sh_degree)
+        if _check_bound(findings, record) and measure in _spec.MEASURE_NAMES:
+            _check_bound_possible(findings, record, index, stated.source_sh_degree)
     payload.finish()
 
 
-def _check_pair(findings: Findings, record: Placed[_spec.StatedErrorRecord]) -> bool:
+def _check_bound(findings: Findings, record: PlacedRecord[_spec.StatedErrorRecord]) -> bool:
     """SER-2. Whether both are numbers that can be compared."""
     largest, rms = record.record.max, record.record.rms
     wrong = [key for key, value in (("max", largest), ("rms", rms)) if not 0.0 <= value < math.inf]
@@ -93,15 +222,15 @@ def _check_pair(findings: Findings, record: Placed[_spec.StatedErrorRecord]) -> 
     if wrong:
         return False
     components = _COMPONENTS.get(_spec.MEASURE_NAMES.get(record.record.measure, ""))
-    if components is not None and rms > largest * math.sqrt(components) * _ROOM:
+    if components is not None and rms > largest * math.sqrt(components) * _ROUNDING:
         message = f"{largest:.9g}, and rms {rms:.9g} is more than that allows for {components} components"
         findings.of("SER-2", record, "max", message)
         return False
     return True
 
 
-def _check_possible(
-    findings: Findings, record: Placed[_spec.StatedErrorRecord], index: Index, source_degree: int
+def _check_bound_possible(
+    findings: Findings, record: PlacedRecord[_spec.StatedErrorRecord], index: Index, source_degree: int
 ) -> None:
     """SER-5 without the source: no pair of scenes has these errors, or they exceed the true ones by too much.
 
@@ -110,8 +239,8 @@ def _check_possible(
     """
     largest, rms = record.record.max, record.record.rms
     splats, measure = index.head.record.splat_count, _spec.MEASURE_NAMES[record.record.measure]
-    least = least_true(measure, largest)
-    if splats and rms * _ROOM + room(measure, rms, 0.0) < least / math.sqrt(splats):
+    least = least_true_error(measure, largest)
+    if splats and rms * _ROUNDING + bound_tolerance(measure, rms, 0.0) < least / math.sqrt(splats):
         message = f"{rms:.9g} is too small for max {largest:.9g} over {splats} splats"
         findings.of("SER-5", record, "rms", message)
     if measure == "opacities" and least > 1.0:

@@ -6,21 +6,19 @@ import numpy as np
 
 from csplat import _spec
 from csplat.types import I64
-from csplat_conformance.validator.chunks import Chunk
-from csplat_conformance.validator.findings import Findings
-from csplat_conformance.validator.index import CodebookAt, Index
-from csplat_conformance.validator.reading import Payload
+from csplat_conformance.validator.findings import Findings, Payload
+from csplat_conformance.validator.index import Chunk, CodebookAt, Index
 from csplat_conformance.validator.streams import read_stream
 from csplat_conformance.validator.values import Place, check_integers
 
 #: By id and layer the entries, [size, C], of chunks that could be read and are sound.
-Books = dict[tuple[int, int], I64]
+CodebookEntries = dict[tuple[int, int], I64]
 
-_WIDTH_MAX = 4  # STR-2: "4 for codebooks' entries"
+_ENTRY_WIDTH_MAX = 4  # STR-2: "4 for codebooks' entries"
 _ATTRIBUTES = {name: value for value, name in _spec.ATTRIBUTE_NAMES.items()}
 
 
-def _attributes(book: CodebookAt) -> list[int]:
+def codebook_attributes(book: CodebookAt) -> list[int]:
     """The attributes that a codebook serves, in its order."""
     if book.record.kind == _spec.CODEBOOK_KIND_SH:
         return [_spec.ATTRIBUTE_SH0 + band for band in range(book.record.band_first, book.record.band_last + 1)]
@@ -29,13 +27,13 @@ def _attributes(book: CodebookAt) -> list[int]:
 
 def first_attribute(book: CodebookAt) -> int:
     """Return the attribute whose block holds the indices."""
-    return _attributes(book)[0]
+    return codebook_attributes(book)[0]
 
 
 def attribute_columns(book: CodebookAt, attribute: int) -> slice | None:
     """Return an attribute's columns in the entries of its layer; `None` if the codebook does not serve it."""
     first = 0
-    for served in _attributes(book):
+    for served in codebook_attributes(book):
         columns = _spec.ATTRIBUTE_COLUMNS[served]
         if book.record.kind == _spec.CODEBOOK_KIND_SH:
             first = 0  # each band has a chunk of its own
@@ -45,7 +43,7 @@ def attribute_columns(book: CodebookAt, attribute: int) -> slice | None:
     return None
 
 
-def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: Books) -> None:
+def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: CodebookEntries) -> None:
     """Read the payload of a CODB chunk.
 
     Args:
@@ -68,10 +66,10 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: Books) ->
     if book is None or chunk.layer not in layers:
         findings.skip(f"{chunk.name} from byte {payload.at} on", "no sound codebook record asks for it")
         return
-    of_layer = [a for a in _attributes(book) if _spec.ATTRIBUTE_LAYER[a] == chunk.layer]
+    of_layer = [a for a in codebook_attributes(book) if _spec.ATTRIBUTE_LAYER[a] == chunk.layer]
     columns = sum(_spec.ATTRIBUTE_COLUMNS[a] for a in of_layer)
     size = book.record.size
-    stream = read_stream(payload, "entries", size * columns, _WIDTH_MAX, signed=True)
+    stream = read_stream(payload, "entries", size * columns, _ENTRY_WIDTH_MAX, signed=True)
     if stream.elements is not None:
         table = stream.elements.astype(np.int64).reshape(columns, size).T
         where = (stream.head.offset, f"{payload.name}/entries")

@@ -1,11 +1,12 @@
-"""Findings of the validator: one `Violation` for each clause that is broken at a place."""
+"""Findings of the validator, records that it reads from bytes, and the error code of each clause (spec 2 to 8)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
-from csplat_conformance.validator.rules import CODES
+from csplat import _spec
 
 T = TypeVar("T")
 
@@ -79,12 +80,12 @@ class Validation:
         return not self.violations
 
 
-class TooManyError(Exception):
+class TooManyViolationsError(Exception):
     """Raised when there are too many violations for the rest to be worth checking."""
 
 
 @dataclass(frozen=True)
-class Placed(Generic[T]):
+class PlacedRecord(Generic[T]):
     """A structure of the registry, and where it lies.
 
     Attributes:
@@ -128,18 +129,20 @@ class Findings:
             code: error code, if it is not the clause's usual one.
 
         Raises:
-            TooManyError: the list is full.
+            TooManyViolationsError: the list is full.
         """
         self.violations.append(Violation(clause, code or CODES[clause], offset, name, message))
         if len(self.violations) >= VIOLATIONS_MAX:
             self.remarks.append(f"more than {VIOLATIONS_MAX} violations: the rest of the file was not looked at")
-            raise TooManyError
+            raise TooManyViolationsError
 
-    def of(self, clause: str, placed: Placed[Any], key: str, message: str, code: str = "", within: int = 0) -> None:
+    def of(
+        self, clause: str, placed: PlacedRecord[Any], key: str, message: str, code: str = "", within: int = 0
+    ) -> None:
         """Note a violation by a field of a structure; the message gets the field's name."""
         self.add(clause, placed.at(key, within), placed.path(key), message, code)
 
-    def reserved(self, placed: Placed[Any]) -> None:
+    def reserved(self, placed: PlacedRecord[Any]) -> None:
         """RES-1: "A reserved field or bit MUST be 0"."""
         for key in placed.places:
             value = getattr(placed.record, key)
@@ -149,3 +152,176 @@ class Findings:
     def skip(self, name: str, reason: str) -> None:
         """Note that a part is not looked at."""
         self.unread.append(Unread(name, reason))
+
+
+_Unpack = Callable[[memoryview, int], T]
+
+
+class UnreadableError(Exception):
+    """Raised when the place of what follows is unknown: a length or a kind is wrong. The violation has been noted."""
+
+
+def read_record(view: memoryview, unpack: _Unpack[T], places: dict[str, int], at: int, name: str) -> PlacedRecord[T]:
+    """Read a structure that is known to fit."""
+    return PlacedRecord(unpack(view, at), at, name, places)
+
+
+class Payload:
+    """The payload of a chunk, read from its beginning to its end.
+
+    Args:
+        view: the whole file.
+        at: offset of the payload.
+        end: offset of its end.
+        name: name of the chunk, `TILE.0.0`.
+        clause: the clause that requires the payload to end with its last structure.
+        findings: receives the violations.
+    """
+
+    def __init__(self, view: memoryview, at: int, end: int, name: str, clause: str, findings: Findings) -> None:
+        self.view = view
+        self.at = at
+        self.end = end
+        self.name = name
+        self.clause = clause
+        self.findings = findings
+
+    @property
+    def left(self) -> int:
+        """Bytes that were not taken yet."""
+        return self.end - self.at
+
+    def take(self, size: int, what: str) -> int:
+        """Step over `size` bytes and return where they begin.
+
+        Raises:
+            UnreadableError: fewer are left.
+        """
+        at = self.at
+        if size > self.left:
+            self.findings.add(
+                self.clause, at, f"{self.name}/{what}", f"the payload ends here, {self.left} of {size} bytes are left"
+            )
+            raise UnreadableError
+        self.at += size
+        return at
+
+    def structure(self, unpack: _Unpack[T], size: int, places: dict[str, int], what: str) -> PlacedRecord[T]:
+        """Read the next structure and look at its reserved fields; its name is that of the chunk and `what`."""
+        at = self.take(size, what)
+        placed = read_record(self.view, unpack, places, at, f"{self.name}/{what}")
+        self.findings.reserved(placed)
+        return placed
+
+    def finish(self) -> None:
+        """Nothing follows the last structure."""
+        if self.left:
+            self.findings.add(self.clause, self.at, f"{self.name}/tail", f"{self.left} bytes follow the last structure")
+
+
+#: Clause to error code; if the text names two, the one that this table has is the usual one.
+CODES: Final[dict[str, str]] = {
+    "RES-1": _spec.ERROR_RESERVED,
+    "RES-2": _spec.ERROR_UNSUPPORTED,
+    "HDR-1": _spec.ERROR_MAGIC,
+    "HDR-2": _spec.ERROR_VERSION,
+    "HDR-3": _spec.ERROR_CRC,
+    "HDR-4": _spec.ERROR_UNSUPPORTED,
+    "HDR-5": _spec.ERROR_TRUNCATED,
+    "HDR-6": _spec.ERROR_TRAILING,
+    "HDR-7": _spec.ERROR_VALUE,
+    "HDR-11": _spec.ERROR_TRUNCATED,
+    "IDX-1": _spec.ERROR_CRC,
+    "IDX-2": _spec.ERROR_INDEX,
+    "IDX-3": _spec.ERROR_UNSUPPORTED,
+    "IDX-4": _spec.ERROR_VALUE,
+    "IDX-5": _spec.ERROR_VALUE,
+    "IDX-6": _spec.ERROR_VALUE,
+    "IDX-7": _spec.ERROR_INDEX,
+    "IDX-8": _spec.ERROR_VALUE,
+    "ATT-1": _spec.ERROR_INDEX,
+    "ATT-2": _spec.ERROR_VALUE,
+    "ATT-3": _spec.ERROR_VALUE,
+    "ATT-4": _spec.ERROR_VALUE,
+    "ATT-5": _spec.ERROR_RESERVED,
+    "ATT-6": _spec.ERROR_VALUE,
+    "ATT-10": _spec.ERROR_VALUE,
+    "ATT-7": _spec.ERROR_RESERVED,
+    "ATT-8": _spec.ERROR_VALUE,
+    "ATT-9": _spec.ERROR_VALUE,
+    "CBR-1": _spec.ERROR_INDEX,
+    "CBR-2": _spec.ERROR_VALUE,
+    "CBR-4": _spec.ERROR_VALUE,
+    "EXR-1": _spec.ERROR_VALUE,
+    "EXR-2": _spec.ERROR_VALUE,
+    "EXR-3": _spec.ERROR_RESERVED,
+    "DIR-1": _spec.ERROR_VALUE,
+    "DIR-2": _spec.ERROR_UNSUPPORTED,
+    "DIR-6": _spec.ERROR_VALUE,
+    "DIR-4": _spec.ERROR_INDEX,
+    "DIR-5": _spec.ERROR_INDEX,
+    "TIL-1": _spec.ERROR_VALUE,
+    "TIL-2": _spec.ERROR_INDEX,
+    "TIL-3": _spec.ERROR_INDEX,
+    "TIL-5": _spec.ERROR_INDEX,
+    "TIL-6": _spec.ERROR_INDEX,
+    "TIL-7": _spec.ERROR_VALUE,
+    "TIL-8": _spec.ERROR_VALUE,
+    "TIL-9": _spec.ERROR_VALUE,
+    "TIL-10": _spec.ERROR_BOX,
+    "TIL-11": _spec.ERROR_BOX,
+    "COV-1": _spec.ERROR_INDEX,
+    "CHK-1": _spec.ERROR_CRC,
+    "CHK-3": _spec.ERROR_INDEX,
+    "CHK-4": _spec.ERROR_VALUE,
+    "TLE-1": _spec.ERROR_INDEX,
+    "TLE-2": _spec.ERROR_STREAM,
+    "TLE-3": _spec.ERROR_STREAM,
+    "CDB-1": _spec.ERROR_INDEX,
+    "CDB-2": _spec.ERROR_STREAM,
+    "JSN-1": _spec.ERROR_JSON,
+    "JSN-2": _spec.ERROR_STREAM,
+    "SER-1": _spec.ERROR_VALUE,
+    "SER-2": _spec.ERROR_VALUE,
+    "SER-3": _spec.ERROR_STREAM,
+    "SER-4": _spec.ERROR_VALUE,
+    "SER-5": "",  # no decoder can look: what the file alone shows of it has no code
+    "STR-1": _spec.ERROR_STREAM,
+    "STR-2": _spec.ERROR_STREAM,
+    "STR-3": _spec.ERROR_STREAM,
+    "STR-4": _spec.ERROR_STREAM,
+    "STR-5": _spec.ERROR_STREAM,
+    "STR-6": _spec.ERROR_STREAM,
+    "STR-8": _spec.ERROR_LIMIT,
+    "COD-1": _spec.ERROR_CODER,
+    "COD-2": _spec.ERROR_CODER,
+    "COD-5": _spec.ERROR_CODER,
+    "COD-6": _spec.ERROR_CODER,
+    "COD-7": _spec.ERROR_CODER,
+    "COD-8": _spec.ERROR_CODER,
+    "TRF-1": _spec.ERROR_CODER,
+    "BLK-1": _spec.ERROR_VALUE,
+    "LEV-1": _spec.ERROR_RANGE,
+    "MOR-1": _spec.ERROR_VALUE,
+    "MOR-2": _spec.ERROR_RANGE,
+    "AXI-1": _spec.ERROR_RANGE,
+    "LAT-1": _spec.ERROR_VALUE,
+    "LAT-2": _spec.ERROR_VALUE,
+    "LAT-3": _spec.ERROR_VALUE,
+    "LAT-4": _spec.ERROR_RANGE,
+    "LAT-5": _spec.ERROR_RANGE,
+    "CBK-1": _spec.ERROR_CODEBOOK,
+    "CBK-2": _spec.ERROR_CODEBOOK,
+    "CBK-3": _spec.ERROR_CODEBOOK,
+    "CBK-4": _spec.ERROR_CODEBOOK,
+    "CBK-5": _spec.ERROR_STREAM,
+    "SPA-1": _spec.ERROR_VALUE,
+    "SPA-2": _spec.ERROR_RANGE,
+    "SPA-3": _spec.ERROR_RANGE,
+    "RAW-1": _spec.ERROR_STREAM,
+    "RAW-2": _spec.ERROR_STREAM,
+    "MEA-1": _spec.ERROR_RANGE,
+    "QUA-1": _spec.ERROR_RANGE,
+    "QUA-2": _spec.ERROR_RANGE,
+    "LIM-1": _spec.ERROR_LIMIT,
+}

@@ -1,17 +1,19 @@
-"""Index: head, attribute, codebook and extra column records (spec 4.3 to 4.3.3)."""
+"""Index (spec 4.3): head and records, directory, tiles, and the chunks that they name."""
 
 from __future__ import annotations
 
 import math
+import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from typing import Any
 
 from csplat import _spec
-from csplat_conformance.validator.findings import Findings, Placed
-from csplat_conformance.validator.reading import place
+from csplat_conformance.validator.findings import Findings, Payload, PlacedRecord, read_record
 
 #: Bytes of the fields that this version knows.
-_LEAST = {
+_SIZES_MIN = {
     "head": _spec.INDEX_HEAD_SIZE,
     "attribute": _spec.ATTRIBUTE_RECORD_SIZE,
     "codebook": _spec.CODEBOOK_RECORD_SIZE,
@@ -24,11 +26,11 @@ _CRC_SIZE = 4
 _STEP_MIN = Fraction(1, 2**1022)
 _SINGLE_MIN, _SINGLE_MAX = Fraction(1, 2**126), Fraction(2**128 - 2**104)
 _STEP_MAX = Fraction((2**53 - 1) * 2**971)  # the largest finite binary64
-_LINES = {"R": 0, "L": 0, "U": 1, "D": 1, "F": 2, "B": 2}
+_AXIS_OF_DIRECTION = {"R": 0, "L": 0, "U": 1, "D": 1, "F": 2, "B": 2}
 
-Head = Placed[_spec.IndexHead]
-AttributeAt = Placed[_spec.AttributeRecord]
-CodebookAt = Placed[_spec.CodebookRecord]
+Head = PlacedRecord[_spec.IndexHead]
+AttributeAt = PlacedRecord[_spec.AttributeRecord]
+CodebookAt = PlacedRecord[_spec.CodebookRecord]
 
 
 @dataclass
@@ -61,10 +63,10 @@ class Index:
 
     def size_of(self, kind: str) -> int:
         """Return the bytes of the head or of a kind of record, tail included; at least the bytes of its fields."""
-        return max(_LEAST[kind], int(getattr(self.head.record, f"{kind}_size")))
+        return max(_SIZES_MIN[kind], int(getattr(self.head.record, f"{kind}_size")))
 
 
-def scaled(step: float, exponent: int, *, single: bool = False) -> float | None:
+def scaled_step(step: float, exponent: int, *, single: bool = False) -> float | None:
     """Return step × 2^exponent, `None` if it is not finite or subnormal in binary64, or binary32 (TIL-9, LAT-1)."""
     if abs(exponent) > 4096:  # beyond any pair of binary64 values, and not worth such an integer
         return None
@@ -82,7 +84,7 @@ def read_records(view: memoryview, end: int, findings: Findings) -> Index:
         findings: receives the violations.
     """
     start = _spec.HEADER_SIZE
-    head = place(view, _spec.unpack_index_head, _spec.INDEX_HEAD_OFFSETS, start, "index")
+    head = read_record(view, _spec.unpack_index_head, _spec.INDEX_HEAD_OFFSETS, start, "index")
     record = head.record
     index = Index(head, record.sh_degree if record.sh_degree <= _spec.SH_DEGREE_MAX else None)
     kinds = ("attribute", "codebook", "extra", "directory", "tile")
@@ -97,7 +99,7 @@ def read_records(view: memoryview, end: int, findings: Findings) -> Index:
     return index
 
 
-def _fitting(index: Index, at: int, end: int, count: int, size: int) -> int:
+def _count_fitting(index: Index, at: int, end: int, count: int, size: int) -> int:
     """Return how many records of a kind fit into the index; after the first kind that does not fit, none do."""
     fitting = min(count, max(0, (end - at) // size)) if index.complete else 0
     index.complete &= fitting == count
@@ -107,7 +109,7 @@ def _fitting(index: Index, at: int, end: int, count: int, size: int) -> int:
 def _check_head(findings: Findings, head: Head) -> None:
     record = head.record
     findings.reserved(head)
-    for kind, least in _LEAST.items():
+    for kind, least in _SIZES_MIN.items():
         size = getattr(record, f"{kind}_size")
         if size < least:
             findings.of("IDX-8", head, f"{kind}_size", f"{size}, wanted {least} at least")
@@ -117,7 +119,7 @@ def _check_head(findings: Findings, head: Head) -> None:
     if unlisted:
         findings.of("RES-1", head, "scene_flags", f"bits {unlisted:#04x} are reserved")
     letters = [_spec.DIRECTION_LETTER.get(axis) for axis in record.axes]
-    if any(record.axes) and {_LINES.get(letter or "") for letter in letters} != {0, 1, 2}:
+    if any(record.axes) and {_AXIS_OF_DIRECTION.get(letter or "") for letter in letters} != {0, 1, 2}:
         findings.of("IDX-4", head, "axes", f"{list(record.axes)}, wanted zeros or directions along three lines")
     if not 0.0 <= record.unit_metres < math.inf:
         findings.of("IDX-5", head, "unit_metres", f"{record.unit_metres}, wanted 0, or positive and finite")
@@ -137,10 +139,10 @@ def _read_attributes(view: memoryview, at: int, end: int, index: Index, findings
     wanted = [value for value, layer in _spec.ATTRIBUTE_LAYER.items() if layer <= bands]
     if index.degree is not None and count != len(wanted):
         findings.of("ATT-1", index.head, "attribute_count", f"{count}, wanted {len(wanted)} for SH degree {bands}")
-    for i in range(_fitting(index, at, end, count, index.size_of("attribute"))):
+    for i in range(_count_fitting(index, at, end, count, index.size_of("attribute"))):
         attribute = view[at]
         name = f"attribute[{_spec.ATTRIBUTE_NAMES.get(attribute, attribute)}]"
-        placed = place(view, _spec.unpack_attribute_record, _spec.ATTRIBUTE_RECORD_OFFSETS, at, name)
+        placed = read_record(view, _spec.unpack_attribute_record, _spec.ATTRIBUTE_RECORD_OFFSETS, at, name)
         findings.reserved(placed)
         if count == len(wanted) and index.degree is not None and attribute != wanted[i]:
             findings.of("ATT-1", placed, "attribute", f"{attribute}, wanted {wanted[i]} in place {i}")
@@ -205,10 +207,10 @@ def _is_single(step: Fraction) -> bool:
 
 def _read_codebooks(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> int:
     last = -1
-    for _ in range(_fitting(index, at, end, index.head.record.codebook_count, index.size_of("codebook"))):
+    for _ in range(_count_fitting(index, at, end, index.head.record.codebook_count, index.size_of("codebook"))):
         identity = int.from_bytes(view[at : at + 2], "little")
         name = f"codebook[{identity}]"
-        placed = place(view, _spec.unpack_codebook_record, _spec.CODEBOOK_RECORD_OFFSETS, at, name)
+        placed = read_record(view, _spec.unpack_codebook_record, _spec.CODEBOOK_RECORD_OFFSETS, at, name)
         findings.reserved(placed)
         if identity <= last:
             findings.of("CBR-1", placed, "codebook_id", f"{identity} after {last}, wanted ascending ids")
@@ -242,8 +244,8 @@ def _is_sound_codebook(findings: Findings, placed: CodebookAt, index: Index) -> 
 
 def _read_extras(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> int:
     names: set[str] = set()
-    for i in range(_fitting(index, at, end, index.head.record.extra_count, index.size_of("extra"))):
-        placed = place(view, _spec.unpack_extra_record, _spec.EXTRA_RECORD_OFFSETS, at, f"extra[{i}]")
+    for i in range(_count_fitting(index, at, end, index.head.record.extra_count, index.size_of("extra"))):
+        placed = read_record(view, _spec.unpack_extra_record, _spec.EXTRA_RECORD_OFFSETS, at, f"extra[{i}]")
         record = placed.record
         if record.dtype < _spec.ANCILLARY_ID_MIN and record.dtype not in _spec.EXTRA_DTYPE_NAMES:
             findings.of("RES-2", placed, "dtype", f"{record.dtype} is no type of the registry")
@@ -256,7 +258,7 @@ def _read_extras(view: memoryview, at: int, end: int, index: Index, findings: Fi
     return at
 
 
-def _check_name(findings: Findings, placed: Placed[_spec.ExtraRecord], names: set[str]) -> None:
+def _check_name(findings: Findings, placed: PlacedRecord[_spec.ExtraRecord], names: set[str]) -> None:
     raw = placed.record.name[: placed.record.name_size]
     rest = placed.record.name[placed.record.name_size :]
     if any(rest):
@@ -271,3 +273,350 @@ def _check_name(findings: Findings, placed: Placed[_spec.ExtraRecord], names: se
     if name in names:
         findings.of("EXR-2", placed, "name", f"a second column is called {name!r}")
     names.add(name)
+
+
+_SINGLE_CHUNKS = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
+#: The first layer that this version does not have; the order of its chunks is not checked (4.3.6).
+_LAYER_END = max(_spec.LAYER_NAMES) + 1
+
+
+@dataclass
+class Chunk:
+    """A chunk as a record names it.
+
+    Attributes:
+        name: `META`, `CODB.2.0`, `TILE.0.1`.
+        kind: its type.
+        flags: flags of the record, or the flags registered for TILE.
+        record: directory or layer record; both have `size` and `offset`.
+        identity: codebook id, or place of the tile.
+        layer: layer of the record.
+        whole: whether its bytes exist and belong to no other chunk.
+    """
+
+    name: str
+    kind: bytes
+    flags: int
+    record: PlacedRecord[Any]
+    identity: int
+    layer: int
+    whole: bool = False
+
+    @property
+    def offset(self) -> int:
+        """First byte."""
+        return int(self.record.record.offset)
+
+    @property
+    def size(self) -> int:
+        """Bytes, header included."""
+        return int(self.record.record.size)
+
+    @property
+    def rank(self) -> tuple[int, int]:
+        """Place in the order that 4.3.6 recommends: by layer, codebooks before tiles; ancillary chunks first."""
+        if self.kind == _spec.CHUNK_TILE:
+            return (self.layer, 1)
+        return (self.layer, 0) if self.kind == _spec.CHUNK_CODEBOOK else (-1, 0)
+
+
+def registered_flags(kind: bytes) -> int:
+    """Return the flags that a known type has."""
+    return sum(bit for bit, name in _spec.CHUNK_FLAG_NAMES.items() if name in _spec.CHUNK_FLAGS[kind])
+
+
+def check_chunk_size(findings: Findings, chunk: Chunk) -> Chunk:
+    """CHK-3, as far as a record alone shows it: a chunk has a header."""
+    least = _spec.CHUNK_HEADER_SIZE
+    if chunk.size < least:
+        findings.of("CHK-3", chunk.record, "size", f"{chunk.size} bytes, a chunk has {least} at least")
+    return chunk
+
+
+def read_directory(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> list[Chunk]:
+    """Read the directory records that lie within the index; DIR-1 to DIR-6."""
+    start, chunks = at, list[Chunk]()
+    count = index.head.record.directory_count
+    size = index.size_of("directory")
+    for _ in range(min(count, max(0, (end - at) // size))):
+        record = _spec.unpack_directory_record(view, at)
+        name = _chunk_name(record, [chunk.name for chunk in chunks])
+        placed = read_record(
+            view, _spec.unpack_directory_record, _spec.DIRECTORY_RECORD_OFFSETS, at, f"directory[{name}]"
+        )
+        findings.reserved(placed)
+        chunks.append(
+            check_chunk_size(findings, Chunk(name, record.type, record.flags, placed, record.id, record.layer))
+        )
+        _check_type(findings, placed)
+        at += size
+    index.complete &= len(chunks) == count
+    index.end = at
+    _check_single(findings, chunks)
+    if index.complete:
+        _check_codebook_chunks(findings, chunks, index, start)
+    return chunks
+
+
+def _chunk_name(record: _spec.DirectoryRecord, known: list[str]) -> str:
+    """Name a chunk; bytes that are no letters are written as escapes."""
+    kind = ascii(record.type.decode("latin-1"))[1:-1]
+    if record.type == _spec.CHUNK_CODEBOOK:
+        kind = f"CODB.{record.id}.{record.layer}"
+    return kind if kind not in known else f"{kind}#{known.count(kind)}"
+
+
+def _check_type(findings: Findings, placed: PlacedRecord[_spec.DirectoryRecord]) -> None:
+    record = placed.record
+    kind = record.type
+    if kind == _spec.CHUNK_TILE:
+        findings.of("DIR-1", placed, "type", "TILE, which layer records name")
+        return
+    if not all(0x20 <= byte <= 0x7E for byte in kind):
+        findings.of("DIR-1", placed, "type", f"{kind!r}, wanted bytes 0x20 to 0x7E")
+    flags = record.flags & 0x00FF  # the others are ancillary
+    unlisted = flags & ~sum(_spec.CHUNK_FLAG_NAMES)
+    if unlisted:
+        findings.of("RES-1", placed, "flags", f"bits {unlisted:#06x} are reserved")
+    if kind in _spec.CHUNK_NAMES:
+        if flags & ~unlisted != registered_flags(kind):
+            findings.of("CHK-4", placed, "flags", f"{record.flags:#06x}, wanted {registered_flags(kind):#06x}")
+    elif kind == _spec.CHUNK_TREE:
+        findings.of("RES-2", placed, "type", f"{kind.decode()} is reserved")
+    elif flags & _spec.CHUNK_FLAG_CRITICAL:
+        if kind[:1].islower():
+            findings.of("DIR-6", placed, "flags", f"{kind!r} is private and critical")
+        findings.of("DIR-2", placed, "type", f"{kind!r} is critical and not known")
+
+
+def _check_single(findings: Findings, chunks: Sequence[Chunk]) -> None:
+    seen = set()
+    for chunk in chunks:
+        if chunk.kind not in _SINGLE_CHUNKS:
+            continue
+        if chunk.kind in seen:
+            findings.of("DIR-4", chunk.record, "type", f"a second {chunk.kind.decode()}")
+        if chunk.identity or chunk.layer:
+            where = f"id {chunk.identity} and layer {chunk.layer}"
+            findings.of("DIR-4", chunk.record, "type", f"{chunk.kind.decode()} with {where}, wanted 0 and 0")
+        seen.add(chunk.kind)
+
+
+def _check_codebook_chunks(findings: Findings, chunks: Sequence[Chunk], index: Index, start: int) -> None:
+    if len(index.codebooks) != index.head.record.codebook_count:
+        return  # the codebooks that they need are not known: the violations have been noted
+    wanted = {
+        (identity, layer)
+        for identity, book in index.codebooks.items()
+        for layer in range(book.record.band_first, book.record.band_last + 1)
+    }
+    for chunk in chunks:
+        if chunk.kind != _spec.CHUNK_CODEBOOK:
+            continue
+        key = (chunk.identity, chunk.layer)
+        if key not in wanted:
+            findings.of("DIR-5", chunk.record, "type", "no codebook record asks for this chunk, or it is the second")
+        wanted.discard(key)
+    for identity, layer in sorted(wanted):
+        findings.add("DIR-5", start, "directory", f"no CODB chunk for codebook {identity}, layer {layer}")
+
+
+def check_coverage(findings: Findings, chunks: Sequence[Chunk], start: int, file_size: int, data_size: int) -> None:
+    """COV-1; marks the chunks whose bytes can be read, and remarks on another order than 4.3.6 recommends.
+
+    Args:
+        findings: receives the violations.
+        chunks: all of the file.
+        start: end of the index.
+        file_size: size of the file in the header.
+        data_size: size of the data.
+    """
+    ordered = sorted(chunks, key=lambda chunk: (chunk.offset, chunk.size))
+    expected = covered = start
+    for chunk in ordered:
+        if chunk.offset != expected:
+            findings.of("COV-1", chunk.record, "offset", f"{chunk.offset}, the chunk before ends at {expected}")
+        end = chunk.offset + chunk.size
+        # A chunk that begins within another is not read: a file could name the same bytes a million times.
+        chunk.whole = covered <= chunk.offset <= end - _spec.CHUNK_HEADER_SIZE and end <= min(data_size, file_size)
+        if not chunk.whole:
+            findings.skip(chunk.name, "its bytes are not there, or another chunk's")
+        expected = end
+        covered = max(covered, end) if chunk.whole else covered
+    if expected != file_size:
+        findings.add(
+            "COV-1",
+            _spec.HEADER_OFFSETS["file_size"],
+            "header.file_size",
+            f"the last chunk ends at {expected}, the file at {file_size}",
+        )
+    ranks = [chunk.rank for chunk in ordered if chunk.layer < _LAYER_END]
+    if ranks != sorted(ranks):
+        findings.remarks.append("the chunks are not in the order that is recommended (4.3.6)")
+
+
+def check_frame(view: memoryview, chunk: Chunk, clause: str, findings: Findings) -> Payload:
+    """Check header and CRC of a chunk that is whole (CHK-1, CHK-3); return its payload.
+
+    Args:
+        view: the file.
+        chunk: the chunk.
+        clause: the clause that requires the payload to end with its last structure.
+        findings: receives the violations.
+    """
+    at, end = chunk.offset, chunk.offset + chunk.size
+    stored, computed = chunk.record.record.crc, zlib.crc32(view[at:end])
+    if stored != computed:
+        findings.add(
+            "CHK-1", at, chunk.name, f"{chunk.record.path('crc')} is {stored:#010x}, computed {computed:#010x}"
+        )
+    header = read_record(view, _spec.unpack_chunk_header, _spec.CHUNK_HEADER_OFFSETS, at, f"{chunk.name}/header")
+    findings.reserved(header)
+    payload_size = chunk.size - _spec.CHUNK_HEADER_SIZE
+    for key, wanted in (("type", chunk.kind), ("flags", chunk.flags), ("payload_size", payload_size)):
+        found = getattr(header.record, key)
+        if found != wanted:
+            findings.of("CHK-3", header, key, f"{found!r}, its record wants {wanted!r}")
+    # COV-1 has proved the record's size: the payload ends there.
+    return Payload(view, at + _spec.CHUNK_HEADER_SIZE, end, chunk.name, clause, findings)
+
+
+_SH_LAYERS = range(1, _spec.SH_DEGREE_MAX + 1)
+
+
+@dataclass
+class Tile:
+    """A tile record with its layers and tables.
+
+    Attributes:
+        place: in the index, from 0.
+        record: the tile record.
+        chunks: its TILE chunks, in the order of the layer records.
+        tables: ids of the codebooks that it names.
+        box_sound: whether corner, extent and exponent obey TIL-7 to TIL-9, so that they can be compared.
+    """
+
+    place: int
+    record: PlacedRecord[_spec.TileRecord]
+    chunks: list[Chunk] = field(default_factory=list)
+    tables: set[int] = field(default_factory=set)
+    box_sound: bool = True
+
+    @property
+    def count(self) -> int:
+        """Splats."""
+        return self.record.record.splat_count
+
+
+def read_tiles(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> list[Tile]:
+    """Read the tiles, which fill the index up to its CRC (IDX-2), and compare their sum with N (IDX-7).
+
+    Args:
+        view: the file.
+        at: offset of the first.
+        end: offset of the index's CRC.
+        index: the part of the index before them.
+        findings: receives the violations.
+    """
+    tiles: list[Tile] = []
+    head = index.head.record
+    # A count that the index has no room for has been refused already, by IDX-2.
+    told = index.size_of("tile") * head.tile_count > end - at
+    while len(tiles) < head.tile_count:
+        size = _tile_size(view, at, end, index)
+        if size > end - at:
+            if not told:
+                findings.add("IDX-2", at, f"tile[{len(tiles)}]", "the index ends within the tile")
+            findings.skip(f"tile[{len(tiles)}] and those after it", "the index ends before them")
+            return tiles
+        tiles.append(_read_tile(view, at, len(tiles), index, findings))
+        at += size
+    if at != end:
+        findings.add("IDX-2", at, "index.rest", f"{end - at} bytes follow the last tile")
+    total = sum(tile.count for tile in tiles)
+    if total != head.splat_count:
+        findings.of("IDX-7", index.head, "splat_count", f"{head.splat_count}, the tiles have {total} splats")
+    return tiles
+
+
+def _tile_size(view: memoryview, at: int, end: int, index: Index) -> int:
+    size = index.size_of("tile")
+    if end - at < size:
+        return size
+    record = _spec.unpack_tile_record(view, at)
+    return size + record.layer_count * index.size_of("layer") + 2 * record.table_count
+
+
+def _read_tile(view: memoryview, at: int, number: int, index: Index, findings: Findings) -> Tile:
+    placed = read_record(view, _spec.unpack_tile_record, _spec.TILE_RECORD_OFFSETS, at, f"tile[{number}]")
+    findings.reserved(placed)
+    tile = Tile(number, placed)
+    if placed.record.level:
+        findings.of("RES-1", placed, "level", f"{placed.record.level} is reserved, wanted 0")
+    if not 1 <= tile.count <= _spec.TILE_SPLATS_MAX:
+        findings.of("TIL-1", placed, "splat_count", f"{tile.count}, wanted 1 to {_spec.TILE_SPLATS_MAX}")
+    _check_tile_box(findings, tile, index)
+    at += index.size_of("tile")
+    _read_layers(view, at, tile, index, findings)
+    _read_tables(view, at + placed.record.layer_count * index.size_of("layer"), tile, index, findings)
+    return tile
+
+
+def _check_tile_box(findings: Findings, tile: Tile, index: Index) -> None:
+    record, before = tile.record.record, len(findings.violations)
+    for axis, (corner, extent) in enumerate(zip(record.corner, record.extent, strict=True)):
+        if max(abs(corner), abs(corner + extent)) > _spec.INTEGER_MAX:
+            message = f"axis {axis} reaches from {corner} to {corner + extent}, beyond {_spec.INTEGER_MAX}"
+            findings.of("TIL-7", tile.record, "corner", message, within=8 * axis)
+        if extent >= 1 << _spec.AXIS_BITS_MAX:
+            message = f"axis {axis} has {extent}, wanted less than 2^{_spec.AXIS_BITS_MAX}"
+            findings.of("TIL-8", tile.record, "extent", message, within=4 * axis)
+    step = index.steps.get(_spec.ATTRIBUTE_MEANS)
+    if step is not None and scaled_step(step, record.exponent) is None:
+        message = f"{step} x 2^{record.exponent} is not finite and at least 2^-1022"
+        findings.of("TIL-9", tile.record, "exponent", message)
+    tile.box_sound = len(findings.violations) == before
+
+
+def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, findings: Findings) -> None:
+    start, last = at, -1
+    flags = registered_flags(_spec.CHUNK_TILE)
+    for i in range(tile.record.record.layer_count):
+        layer = view[at]
+        name = f"{tile.record.name}.layer[{layer}]"
+        placed = read_record(view, _spec.unpack_layer_record, _spec.LAYER_RECORD_OFFSETS, at, name)
+        findings.reserved(placed)
+        if i == 0 and layer != _spec.LAYER_GEOMETRY:
+            findings.of("TIL-2", placed, "layer", f"the first is {layer}, wanted {_spec.LAYER_GEOMETRY}")
+        elif layer <= last:
+            findings.of("TIL-2", placed, "layer", f"{layer} after {last}, wanted ascending layers")
+        if layer < _spec.ANCILLARY_ID_MIN and layer not in _spec.LAYER_NAMES:
+            findings.of("RES-2", placed, "layer", f"{layer} is no layer that this version uses")
+        if index.degree is not None and layer in _SH_LAYERS and layer > index.degree:
+            findings.of("TIL-3", placed, "layer", f"band {layer} in a scene of degree {index.degree}")
+        chunk = Chunk(f"TILE.{tile.place}.{layer}", _spec.CHUNK_TILE, flags, placed, tile.place, layer)
+        tile.chunks.append(check_chunk_size(findings, chunk))
+        last = max(last, layer)
+        at += index.size_of("layer")
+    if not tile.chunks:
+        findings.add("TIL-2", start, f"{tile.record.name}.layer", "no layer, wanted layer 0")
+        return  # TIL-5 would say nothing more
+    has_extra = any(chunk.layer == _spec.LAYER_EXTRA for chunk in tile.chunks)
+    if has_extra != bool(index.head.record.extra_count):
+        verb = "has" if has_extra else "lacks"
+        message = f"the tile {verb} the extra layer, the scene has {index.head.record.extra_count} extra columns"
+        findings.add("TIL-5", start, f"{tile.record.name}.layer", message)
+
+
+def _read_tables(view: memoryview, at: int, tile: Tile, index: Index, findings: Findings) -> None:
+    last = -1
+    for k in range(tile.record.record.table_count):
+        table = int.from_bytes(view[at : at + 2], "little")
+        name = f"{tile.record.name}.table[{k}]"
+        if table <= last:
+            findings.add("TIL-6", at, name, f"{table} after {last}, wanted ascending ids")
+        elif table not in index.codebook_ids:
+            findings.add("TIL-6", at, name, f"{table} is the id of no codebook")
+        tile.tables.add(table)
+        last = max(last, table)
+        at += 2

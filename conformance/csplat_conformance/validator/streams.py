@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -10,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat_conformance.validator.coders import uncoded
-from csplat_conformance.validator.findings import Findings, Placed
-from csplat_conformance.validator.inflate import CodedError
-from csplat_conformance.validator.reading import Payload, UnreadableError
+from csplat_conformance.validator.findings import Findings, Payload, PlacedRecord, UnreadableError
+from csplat_conformance.validator.inflate import CodedError, Inflater
 
 #: Elements of a stream: int64, or uint64 for RAW, which alone may be eight bytes wide.
 Elements = NDArray[Any]
@@ -31,7 +30,7 @@ class Stream:
         elements: [count], `None` if a violation keeps them from being known.
     """
 
-    head: Placed[_spec.StreamHead]
+    head: PlacedRecord[_spec.StreamHead]
     elements: Elements | None
 
 
@@ -80,7 +79,7 @@ def read_stream(
     if not sound and head.record.packed_size > 3 * width_max * most:
         return Stream(head, None)
     try:
-        packed, spare_bits = uncoded(payload.view[at : at + size], head.record.coder, head.record.packed_size)
+        packed, spare_bits = undo_coder(payload.view[at : at + size], head.record.coder, head.record.packed_size)
     except CodedError as error:
         findings.add(error.clause, at + error.within, f"{payload.name}/{what}.coded", str(error))
         return Stream(head, None)
@@ -89,7 +88,7 @@ def read_stream(
     return Stream(head, _elements(findings, head, packed, at, signed) if sound else None)
 
 
-def _check_counts(findings: Findings, head: Placed[_spec.StreamHead], count: int | None, width_max: int) -> bool:
+def _check_counts(findings: Findings, head: PlacedRecord[_spec.StreamHead], count: int | None, width_max: int) -> bool:
     """STR-1, STR-2."""
     sound = True
     found, width = head.record.count, head.record.width
@@ -103,7 +102,7 @@ def _check_counts(findings: Findings, head: Placed[_spec.StreamHead], count: int
     return sound
 
 
-def _check_transforms(findings: Findings, head: Placed[_spec.StreamHead]) -> bool:
+def _check_transforms(findings: Findings, head: PlacedRecord[_spec.StreamHead]) -> bool:
     """RES-2, STR-3."""
     listed = head.record.transforms
     used = listed.rstrip(b"\0")
@@ -117,7 +116,7 @@ def _check_transforms(findings: Findings, head: Placed[_spec.StreamHead]) -> boo
     return True
 
 
-def _check_packed(findings: Findings, head: Placed[_spec.StreamHead], sound: bool) -> bool:
+def _check_packed(findings: Findings, head: PlacedRecord[_spec.StreamHead], sound: bool) -> bool:
     """STR-4, STR-5; they say something only if count, width and transforms are known."""
     if not sound:
         return False
@@ -134,7 +133,7 @@ def _check_packed(findings: Findings, head: Placed[_spec.StreamHead], sound: boo
     return True
 
 
-def _check_coder(findings: Findings, head: Placed[_spec.StreamHead]) -> bool:
+def _check_coder(findings: Findings, head: PlacedRecord[_spec.StreamHead]) -> bool:
     """RES-2."""
     coder = head.record.coder
     if coder not in _spec.CODER_NAMES:
@@ -147,7 +146,7 @@ def _check_coder(findings: Findings, head: Placed[_spec.StreamHead]) -> bool:
 
 
 def _elements(
-    findings: Findings, head: Placed[_spec.StreamHead], packed: bytes, coded_at: int, signed: bool
+    findings: Findings, head: PlacedRecord[_spec.StreamHead], packed: bytes, coded_at: int, signed: bool
 ) -> Elements | None:
     record = head.record
     data = np.frombuffer(packed, np.uint8)
@@ -181,3 +180,69 @@ def _elements(
 
 def _columns(data: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
     return data.reshape(-1, width).T
+
+
+_RAW_DEFLATE = -15
+
+
+def undo_coder(coded: memoryview, coder: int, size: int) -> tuple[bytes, bool]:
+    """Undo a coder.
+
+    Args:
+        coded: `coded_size` bytes.
+        coder: registry value, a used one.
+        size: `packed_size`.
+
+    Returns:
+        `size` bytes, and whether the unused bits behind a DEFLATE stream are not 0.
+
+    Raises:
+        CodedError: by COD-1, COD-2 or COD-5 to COD-8.
+    """
+    if coder == _spec.CODER_STORED:
+        if len(coded) != size:
+            raise CodedError("COD-1", f"{len(coded)} bytes are stored, packed_size is {size}")
+        return bytes(coded), False
+    return _inflate(coded, size)
+
+
+def _inflate(coded: memoryview, size: int) -> tuple[bytes, bool]:
+    """COD-2, COD-5 to COD-8. The last byte is held back, so that its unused bits can be told from the others."""
+    body, last = coded[:-1], bytes(coded[-1:])
+    inflater = zlib.decompressobj(_RAW_DEFLATE)
+    try:
+        packed = inflater.decompress(body, size + 1)
+        if inflater.eof:
+            left = len(inflater.unused_data) + len(last)
+            raise CodedError("COD-2", f"{left} bytes follow the final block", len(coded) - left)
+        if len(packed) > size:
+            raise CodedError("COD-2", f"more than {size} bytes come out, packed_size is {size}")
+        before = inflater.copy()
+        rest = inflater.decompress(last, size + 1 - len(packed))
+    except zlib.error as error:
+        Inflater(bytes(coded)).inflate(size)  # names the clause
+        raise CodedError("COD-2", f"not a DEFLATE stream: {error}") from None
+    packed += rest
+    if len(packed) != size:
+        amount = f"more than {size}" if len(packed) > size else len(packed)
+        raise CodedError("COD-2", f"{amount} bytes come out, packed_size is {size}")
+    if not inflater.eof:
+        raise CodedError("COD-2", "the DEFLATE stream has no end")
+    return packed, _has_spare_bits(before, last[0], rest)
+
+
+def _has_spare_bits(before: zlib._Decompress, last: int, rest: bytes) -> bool:
+    """Return True if bits of the last byte are set after the end of the final block.
+
+    A byte whose bits from k on are cleared still gives the same end as soon as k is where the block ends; a smaller k
+    does so only if the bits in between were 0 anyway.
+    """
+    for k in range(8):
+        trial = before.copy()
+        try:
+            same = trial.decompress(bytes([last & (1 << k) - 1]), len(rest) + 1) == rest
+        except zlib.error:
+            continue
+        if same and trial.eof:
+            return bool(last >> k)
+    return False

@@ -1,8 +1,7 @@
-"""TILE chunks (spec 5.2) and the codings of their blocks but CODEBOOK (6.4)."""
+"""TILE chunks (spec 5.2) and the codings of their blocks (6.4)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,23 +9,20 @@ import numpy as np
 
 from csplat import _spec
 from csplat.types import I64
-from csplat_conformance.validator.chunks import Chunk
-from csplat_conformance.validator.codebooks import Books
-from csplat_conformance.validator.findings import Findings, Placed
-from csplat_conformance.validator.index import Index, scaled
-from csplat_conformance.validator.reading import Payload, UnreadableError
+from csplat_conformance.validator.codebooks import CodebookEntries, attribute_columns, first_attribute
+from csplat_conformance.validator.findings import Findings, Payload, PlacedRecord, UnreadableError
+from csplat_conformance.validator.index import Chunk, CodebookAt, Index, Tile, scaled_step
 from csplat_conformance.validator.streams import Elements, read_stream
-from csplat_conformance.validator.tile_records import Tile
 from csplat_conformance.validator.values import check_box, check_integers, check_max_scale
 
-BlockHead = Placed[_spec.BlockHead]
+BlockHead = PlacedRecord[_spec.BlockHead]
 
 _SPARSE_WIDTH_MAX = _spec.CODING_WIDTH_MAX[_spec.CODING_SPARSE]
 _MORTON_AXES = 3
 
 
 @dataclass
-class First:
+class CodebookIndices:
     """The tile's first block of a codebook, which holds the indices for all.
 
     Attributes:
@@ -41,7 +37,7 @@ class First:
 
 
 @dataclass
-class TileReader:
+class TileChecker:
     """One tile while its layers are read, from the lowest to the highest.
 
     Attributes:
@@ -50,7 +46,6 @@ class TileReader:
         tile: its record.
         books: entries by codebook id and layer.
         findings: receives the violations.
-        read_coded: reads what follows the head of a block coded CODEBOOK.
         first: by codebook id.
         lost: layers of which blocks are missing, because they could not be told apart.
     """
@@ -58,10 +53,9 @@ class TileReader:
     view: memoryview
     index: Index
     tile: Tile
-    books: Books
+    books: CodebookEntries
     findings: Findings
-    read_coded: Callable[[TileReader, Payload, str, int, int], None]
-    first: dict[int, First] = field(default_factory=dict)
+    first: dict[int, CodebookIndices] = field(default_factory=dict)
     lost: set[int] = field(default_factory=set)
 
     def read_layer(self, payload: Payload, chunk: Chunk) -> None:
@@ -112,7 +106,7 @@ class TileReader:
             self.findings.of("BLK-1", head, "coding", message, code)
             raise UnreadableError
         if coding == _spec.CODING_CODEBOOK:
-            self.read_coded(self, payload, name, attribute, at)
+            _read_codebook_block(self, payload, name, attribute, at)
         elif coding == _spec.CODING_SPARSE:
             self._read_sparse(payload, name, attribute)
         elif coding == _spec.CODING_RAW:
@@ -149,10 +143,10 @@ class TileReader:
             where = (stream.head.offset, f"{payload.name}/{name}.stream")
             check_integers(self.findings, self.index, attribute, rows, exponent, where)
 
-    def check_step(self, params: Placed[Any], exponent: int, attribute: int) -> bool:
+    def check_step(self, params: PlacedRecord[Any], exponent: int, attribute: int) -> bool:
         """Check LAT-1; return True if it holds."""
         step = self.index.steps.get(attribute)
-        if step is None or scaled(step, exponent, single=True) is not None:
+        if step is None or scaled_step(step, exponent, single=True) is not None:
             return True
         self.findings.of(
             "LAT-1", params, "exponent", f"{step} x 2^{exponent} is not finite in binary32 and at least 2^-126"
@@ -230,7 +224,7 @@ def read_block_head(payload: Payload, name: str) -> BlockHead:
 
 
 def read_columns(
-    reader: TileReader, payload: Payload, name: str, attribute: int, coding: int, count: int, *, escape: bool = False
+    reader: TileChecker, payload: Payload, name: str, attribute: int, coding: int, count: int, *, escape: bool = False
 ) -> tuple[I64 | None, int]:
     """Read and check a block coded LEVELS, OFFSET or SIGNED.
 
@@ -255,7 +249,7 @@ def read_columns(
     return (rows if good else None), exponent
 
 
-def read_exponent(reader: TileReader, payload: Payload, name: str, attribute: int, *, fixed: bool) -> tuple[int, bool]:
+def read_exponent(reader: TileChecker, payload: Payload, name: str, attribute: int, *, fixed: bool) -> tuple[int, bool]:
     """Read lattice parameters: the exponent, and whether LAT-1, or LAT-2 if it is fixed, holds."""
     params = payload.structure(
         _spec.unpack_lattice_params, _spec.LATTICE_PARAMS_SIZE, _spec.LATTICE_PARAMS_OFFSETS, name
@@ -286,4 +280,148 @@ def _axes(codes: I64) -> I64:
     for axis in range(_MORTON_AXES):
         for bit in range(_spec.MORTON_BITS_MAX):
             rows[axis] |= (codes >> _MORTON_AXES * bit + axis & 1) << bit
+    return rows
+
+
+_INDEX_WIDTH_MAX = _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK]
+_ESCAPE_CODINGS = (_spec.CODING_OFFSET, _spec.CODING_SIGNED)
+
+_CodebookParams = PlacedRecord[_spec.CodebookParams]
+
+
+def _read_codebook_block(reader: TileChecker, payload: Payload, name: str, attribute: int, at: int) -> None:
+    """Read what follows a block head.
+
+    Args:
+        reader: the tile.
+        payload: stands behind the block head.
+        name: name of the block.
+        attribute: registry value.
+        at: offset of the block head.
+
+    Raises:
+        UnreadableError: the number of streams that follow is not known.
+    """
+    params = payload.structure(
+        _spec.unpack_codebook_params, _spec.CODEBOOK_PARAMS_SIZE, _spec.CODEBOOK_PARAMS_OFFSETS, f"{name}.params"
+    )
+    identity = params.record.codebook_id
+    book, columns = _find_book(reader, params, attribute)
+    if first_attribute(book) == attribute:
+        first = reader.first[identity] = _read_indices(reader, payload, name, book, params)
+    else:
+        first = _find_indices(reader, book, params)
+    summands = None
+    has_summand = attribute == _spec.ATTRIBUTE_SCALES
+    if has_summand:
+        summands = _read_summands(reader, payload, name, attribute)
+    escapes = _read_escapes(reader, payload, name, attribute, params) if params.record.escape_count else None
+    entries = reader.books.get((identity, _spec.ATTRIBUTE_LAYER[attribute]))
+    rows = None if entries is None else _selected_entries(first, entries[:, columns])
+    if rows is None or (has_summand and summands is None) or first.escaped is None:
+        return
+    if summands is not None:
+        rows += summands[~first.escaped]
+    sound = check_integers(reader.findings, reader.index, attribute, rows, 0, (at, f"{payload.name}/{name}"))
+    if sound and has_summand and (escapes is not None or not first.escaped.any()):
+        parts = [part for part in (rows, escapes) if part is not None and part.size]
+        reader.check_scales(max(int(part.max()) for part in parts), 0)
+
+
+def _find_book(reader: TileChecker, params: _CodebookParams, attribute: int) -> tuple[CodebookAt, slice]:
+    """CBK-1."""
+    identity = params.record.codebook_id
+    book = reader.index.codebooks.get(identity)
+    columns = None if book is None else attribute_columns(book, attribute)
+    name = _spec.ATTRIBUTE_NAMES[attribute]
+    if identity not in reader.tile.tables:
+        reader.findings.of("CBK-1", params, "codebook_id", f"{identity} is not among the tile's table ids")
+    elif identity not in reader.index.codebook_ids:
+        reader.findings.of("CBK-1", params, "codebook_id", f"{identity} is the id of no codebook")
+    elif book is not None and columns is None:
+        reader.findings.of("CBK-1", params, "codebook_id", f"codebook {identity} does not serve {name}")
+    if book is None or columns is None:
+        raise UnreadableError
+    return book, columns
+
+
+def _read_indices(
+    reader: TileChecker, payload: Payload, name: str, book: CodebookAt, params: _CodebookParams
+) -> CodebookIndices:
+    """CBK-2, CBK-3."""
+    findings, size = reader.findings, book.record.size
+    stream = read_stream(payload, f"{name}.indices", reader.tile.count, _INDEX_WIDTH_MAX)
+    indices = stream.elements
+    if indices is not None and int(indices.max()) > size:
+        message = f"an index of {int(indices.max())} into {size} entries, wanted {size} at most"
+        findings.add("CBK-2", stream.head.offset, f"{payload.name}/{name}.indices", message)
+        indices = None
+    escaped = None if indices is None else np.asarray(indices == size)
+    count = params.record.escape_count
+    if escaped is not None and int(escaped.sum()) != count:
+        findings.of("CBK-3", params, "escape_count", f"{count}, the indices escape {int(escaped.sum())} splats")
+        escaped = None
+    elif escaped is None and count > reader.tile.count:
+        findings.of("CBK-3", params, "escape_count", f"{count} of a tile of {reader.tile.count} splats")
+    return CodebookIndices(indices, escaped, count)
+
+
+def _find_indices(reader: TileChecker, book: CodebookAt, params: _CodebookParams) -> CodebookIndices:
+    """CBK-4. An unknown one is returned if there is none, or if its block could not be read."""
+    identity, count = params.record.codebook_id, params.record.escape_count
+    first = reader.first.get(identity)
+    opener = first_attribute(book)
+    name = _spec.ATTRIBUTE_NAMES[opener]
+    if first is None:
+        if _spec.ATTRIBUTE_LAYER[opener] not in reader.lost:
+            message = f"codebook {identity}, and no block of {name} before it is coded with it"
+            reader.findings.of("CBK-4", params, "codebook_id", message)
+        return CodebookIndices(None, None, count)
+    if first.escape_count != count:
+        message = f"codebook {identity} with {count} escapes, the block of {name} has {first.escape_count}"
+        reader.findings.of("CBK-4", params, "codebook_id", message)
+        return CodebookIndices(first.indices, None, count)
+    return first
+
+
+def _read_summands(reader: TileChecker, payload: Payload, name: str, attribute: int) -> I64 | None:
+    """The common summand of scales: LAT-2, LAT-3; [n]."""
+    _, sound = read_exponent(reader, payload, f"{name}.summand", attribute, fixed=True)
+    offsets, sane = read_offsets(payload, f"{name}.summand.offset", 1)
+    width_max = _spec.CODING_WIDTH_MAX[_spec.CODING_OFFSET]
+    stream = read_stream(payload, f"{name}.summand.stream", reader.tile.count, width_max)
+    if stream.elements is None or not (sound and sane):
+        return None
+    summands: I64 = stream.elements.astype(np.int64) + offsets[0]
+    return summands
+
+
+def _read_escapes(
+    reader: TileChecker, payload: Payload, name: str, attribute: int, params: _CodebookParams
+) -> I64 | None:
+    """CBK-5, and what the block's coding asks for; [C, escape_count]."""
+    what = f"{name}.escape"
+    head = read_block_head(payload, what)
+    if head.record.attribute != attribute:
+        message = f"{head.record.attribute}, wanted that of its block, {attribute}"
+        reader.findings.of("CBK-5", head, "attribute", message)
+    coding = head.record.coding
+    legal = (_spec.CODING_SIGNED,) if attribute == _spec.ATTRIBUTE_QUATS else _ESCAPE_CODINGS
+    if coding not in _spec.CODING_NAMES:
+        message = f"{coding} is no coding that this version uses"
+        reader.findings.of("BLK-1", head, "coding", message, _spec.ERROR_UNSUPPORTED)
+        raise UnreadableError
+    if coding not in legal:
+        names = " or ".join(_spec.CODING_NAMES[one] for one in legal)
+        reader.findings.of("CBK-5", head, "coding", f"{_spec.CODING_NAMES[coding]}, wanted {names}")
+        raise UnreadableError
+    rows, _ = read_columns(reader, payload, what, attribute, coding, params.record.escape_count, escape=True)
+    return rows
+
+
+def _selected_entries(first: CodebookIndices, entries: I64) -> I64 | None:
+    """The entries of the splats that are not escaped, [C, n]; `None` if something is not known."""
+    if first.indices is None or first.escaped is None:
+        return None
+    rows: I64 = entries[first.indices[~first.escaped].astype(np.intp)].T
     return rows

@@ -10,7 +10,7 @@ import numpy as np
 from csplat import _spec
 from csplat.types import I64
 from csplat_conformance.validator.findings import Findings
-from csplat_conformance.validator.index import Index, scaled
+from csplat_conformance.validator.index import Index, scaled_step
 
 #: Byte of the file and name of what a message is about.
 Place = tuple[int, str]
@@ -73,7 +73,7 @@ def _check_lattice(
             findings.add("LAT-4", *where, message)
             return
     step = index.steps.get(record.attribute)
-    scale = None if step is None else scaled(step, exponent)
+    scale = None if step is None else scaled_step(step, exponent)
     if scale is None:
         return
     if record.mapping == _spec.MAPPING_YCOCG:
@@ -124,7 +124,7 @@ def check_box(
             message = f"axis {axis}: q reaches from {low} to {high}, wanted 0 to the extent {extent}"
             findings.add("TIL-10", *box, message)
     step = index.steps.get(_spec.ATTRIBUTE_MEANS)
-    scale = None if step is None or not sound else scaled(step, record.exponent)
+    scale = None if step is None or not sound else scaled_step(step, record.exponent)
     if scale is None:
         return
     for corner, low, high in zip(record.corner, lows, highs, strict=True):
@@ -137,7 +137,7 @@ def check_box(
 def check_max_scale(findings: Findings, index: Index, largest: int, exponent: int, stored: bytes, where: Place) -> None:
     """TIL-11, bit for bit: NaN differs from everything, and +0 from −0."""
     step = index.steps.get(_spec.ATTRIBUTE_SCALES)
-    scale = None if step is None else scaled(step, exponent)
+    scale = None if step is None else scaled_step(step, exponent)
     if scale is None:
         return
     wanted = value_bits(largest, scale)

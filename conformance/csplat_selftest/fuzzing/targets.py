@@ -18,12 +18,12 @@ from csplat.errors import CsplatError
 from csplat_authoring.builder import Built, build
 from csplat_authoring.recipes import sound_recipes
 from csplat_authoring.repair import repair
-from csplat_conformance import adapter, node
+from csplat_conformance import adapter
 from csplat_conformance.answers import Answer
+from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import VECTORS, load
-from csplat_conformance.native import CDecoder, missing_c
-from csplat_conformance.report import Status
-from csplat_conformance.serving import Served
+from csplat_selftest import decoder_processes
+from csplat_selftest.decoder_processes import CDecoder, DecoderProcess, missing_c
 from csplat_selftest.mutate import mapped, mutant_of
 
 LIMITS = decoder.Limits(splats=100_000, bytes=32_000_000, json_bytes=1_000_000)
@@ -152,7 +152,7 @@ class DecoderTarget:
 
 def missing_others() -> dict[str, str]:
     """Return why other decoders cannot run here, by language."""
-    found = {"JavaScript": node.missing_javascript(), "C": missing_c()}
+    found = {"JavaScript": decoder_processes.missing_javascript(), "C": missing_c()}
     return {name: why for name, why in found.items() if why}
 
 
@@ -180,10 +180,10 @@ class OthersTarget(DecoderTarget):
     ) -> None:
         self._scratch = scratch
         self.memory_bytes = memory_bytes
-        self.decoders: dict[str, Served] = {}
+        self.decoders: dict[str, DecoderProcess] = {}
         here = set(languages) - set(missing_others())
         if "JavaScript" in here:
-            self.decoders["JavaScript"] = node.JsDecoder(limits=JS_LIMITS, coverage=scratch)
+            self.decoders["JavaScript"] = decoder_processes.JsDecoder(limits=JS_LIMITS, coverage=scratch)
         if "C" in here:
             self.decoders["C"] = CDecoder(limits=C_LIMITS)
 
@@ -263,7 +263,7 @@ def compared(ours: Answer, theirs: Answer, name: str) -> tuple[str, str]:
 def js_coverage(folder: Path) -> str:
     """Return the share of the decoder's text that ran, from what Node left in a folder."""
     ran: dict[str, bytearray] = {}
-    home = node.js_folder()
+    home = decoder_processes.js_folder()
     for path in folder.glob("coverage-*.json"):
         for script in json.loads(path.read_text(encoding="utf-8"))["result"]:
             file = Path(script["url"].removeprefix("file://"))

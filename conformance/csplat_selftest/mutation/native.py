@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from csplat.errors import InputError
-from csplat_conformance.native import ADAPTER, SOURCES, CDecoder, c_folder, compile_c
+from csplat_selftest.decoder_processes import C_ADAPTER, C_SOURCES, CDecoder, c_folder, compile_c
 from csplat_selftest.fuzzing.targets import C_LIMITS
 from csplat_selftest.mutation.judging import difference, failing, verdict
 from csplat_selftest.mutation.mutants import Fate, Mutant, Result
@@ -32,7 +32,7 @@ class NativeDecoder:
 
     def __init__(self, files: Sequence[bytes]) -> None:
         self._files = files
-        self.texts = {name: (c_folder() / name).read_text(encoding="utf-8") for name in SOURCES}
+        self.texts = {name: (c_folder() / name).read_text(encoding="utf-8") for name in C_SOURCES}
         self.mutants = [mutant for name, text in self.texts.items() for mutant in c_mutants(name, text)]
         self._objects: dict[str, bytes] = {}
         with CDecoder(limits=C_LIMITS) as right:
@@ -51,7 +51,7 @@ class NativeDecoder:
         """Run the vectors, then the fuzzed files, which have smaller budgets."""
         with tempfile.TemporaryDirectory(prefix="csplat-mutant-") as name:
             program, objects = Path(name) / "adapter", []
-            for other in {str(ADAPTER), *SOURCES} - {mutant.file}:
+            for other in {str(C_ADAPTER), *C_SOURCES} - {mutant.file}:
                 objects.append(Path(name) / f"{Path(other).stem}.o")
                 objects[-1].write_bytes(self._object(other))
             compile_c(program, self._written(mutant, Path(name)), *objects, "-lm")

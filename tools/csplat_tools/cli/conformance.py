@@ -15,12 +15,18 @@ import typer
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat.types import Progress
-from csplat_conformance.encoders import PSNR_MIN, EncoderChoice, run_encoder, write_inputs
-from csplat_conformance.encoders.picturing import PictureJudge
-from csplat_conformance.encoders.run import TIMEOUT_SECONDS as ENCODER_SECONDS
-from csplat_conformance.near import EXACT
-from csplat_conformance.report import Report, to_json, to_junit, to_table
-from csplat_conformance.runner import TIMEOUT_SECONDS, Choice, parse_levels, run_builtin, run_command
+from csplat_conformance.conformance_report import ConformanceReport, to_json, to_junit, to_table
+from csplat_conformance.decoder_suite import (
+    TIMEOUT_SECONDS,
+    DecoderSuiteOptions,
+    parse_levels,
+    run_builtin,
+    run_command,
+)
+from csplat_conformance.encoders import PSNR_MIN, EncoderSuiteOptions, run_encoder, write_inputs
+from csplat_conformance.encoders.encoder_suite import TIMEOUT_SECONDS as ENCODER_SECONDS
+from csplat_conformance.encoders.render_checks import RenderScore
+from csplat_conformance.tolerance import EXACT
 from csplat_tools.cli.command import EXIT_FAILED, OptionGroup, OutputOptions, chosen, command
 from csplat_tools.console import note, print_data
 from csplat_tools.file_streams import STANDARD_STREAM, write_bytes
@@ -62,7 +68,7 @@ class RunOptions(OptionGroup):
             raise typer.BadParameter("--json and --junit - both want standard output")
         out.check(None if to_stdout else self.junit)
 
-    def publish(self, report: Report, out: OutputOptions, nothing: str) -> None:
+    def publish(self, report: ConformanceReport, out: OutputOptions, nothing: str) -> None:
         """Publish the report in every form that was requested, and exit with status 1 if it did not pass.
 
         Args:
@@ -144,7 +150,7 @@ def decoder(
         # A renderer alone is tested at L4 alone.
         levels = chosen(parse_levels, text=level or ("3" if render_program is None else "4"))
         timeout = run.timeout or TIMEOUT_SECONDS
-        choice = Choice(run.pattern, _joined(clause), levels, exact, timeout, run.jobs, by)
+        choice = DecoderSuiteOptions(run.pattern, _joined(clause), levels, exact, timeout, run.jobs, by)
         if program is None and render_program is None:
             report = run_builtin(choice, _moved(bar))
         else:
@@ -204,11 +210,13 @@ def encoder(
         return
     levels = tuple(f"L{number}" for number in chosen(parse_levels, text=level))
     kept = _checked_folder(keep, force=out.force) if keep is not None else None
-    pictures, reason = _picture_judge(levels, quiet=out.quiet)
-    choice = EncoderChoice(run.pattern, levels, run.timeout or ENCODER_SECONDS, min_psnr, run.jobs, kept)
+    render_score, reason = _picture_judge(levels, quiet=out.quiet)
+    choice = EncoderSuiteOptions(run.pattern, levels, run.timeout or ENCODER_SECONDS, min_psnr, run.jobs, kept)
     ours = f"{shlex.quote(sys.executable)} {_OURS}"
     with out.bar() as bar:
-        report = run_encoder(program or ours, choice, pictures=pictures, no_pictures=reason, progress=_moved(bar))
+        report = run_encoder(
+            program or ours, choice, render_score=render_score, no_render_reason=reason, progress=_moved(bar)
+        )
     run.publish(report, out, "no input is chosen")
 
 
@@ -229,7 +237,7 @@ def _checked_folder(name: str, *, force: bool) -> Path:
     return folder
 
 
-def _picture_judge(levels: Sequence[str], *, quiet: bool) -> tuple[PictureJudge | None, str]:
+def _picture_judge(levels: Sequence[str], *, quiet: bool) -> tuple[RenderScore | None, str]:
     """Return a function that measures the PSNR of renders, or `None` and the reason.
 
     Args:

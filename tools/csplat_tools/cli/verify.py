@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from csplat.errors import CsplatError, counted
-from csplat_conformance.stated import MeasureProof, Proof
+from csplat_conformance.declared_bounds import BoundsVerification, MeasureVerification
 from csplat_tools.cli.command import EXIT_FAILED, OutputOptions, command
 from csplat_tools.cli.shared_options import parse_bytes
 from csplat_tools.console import format_table, note
@@ -59,16 +59,16 @@ def verify(
         raise
     out.publish(verified.as_json(), "" if out.quiet else _report(verified))
     if not verified.holds:
-        _say_why(verified, path, unproved=source is not None and verified.proof is None)
+        _say_why(verified, path, unverified=source is not None and verified.proof is None)
         raise typer.Exit(EXIT_FAILED)
 
 
-def _say_why(verified: Verification, path: str, *, unproved: bool) -> None:
+def _say_why(verified: Verification, path: str, *, unverified: bool) -> None:
     violations = verified.validation.violations
     if violations:
         clauses, codes = (", ".join(sorted({getattr(one, name) for one in violations})) for name in ("clause", "code"))
         note(f"error: {path}: {counted(len(violations), 'violation')} of {clauses}; copy or make it again ({codes})")
-    if unproved:
+    if unverified:
         note("error: the stated errors were not looked at")
     for failure in verified.proof.failures if verified.proof is not None else ():
         note(f"error: {failure}")
@@ -86,25 +86,29 @@ def _report(verified: Verification) -> str:
     return "\n".join(lines)
 
 
-def _said(proof: Proof) -> str:
+def _said(proof: BoundsVerification) -> str:
     if not any(one.holds for one in proof.measures):
         return "nothing is stated that could be proved"
-    return "the stated errors hold" if proof.rms_proved else "the stated maxima hold"
+    return "the stated errors hold" if proof.rms_verified else "the stated maxima hold"
 
 
-def _table(proof: Proof) -> str:
-    if proof.rms_proved:
+def _table(proof: BoundsVerification) -> str:
+    if proof.rms_verified:
         header = ("error", "stated max", "found max", "stated rms", "found rms", "")
         rows = [
-            (one.name, *map(_number, (one.stated_max, one.measured_max, one.stated_rms, one.measured_rms)), _word(one))
+            (
+                one.name,
+                *map(_number, (one.declared_max, one.measured_max, one.declared_rms, one.measured_rms)),
+                _word(one),
+            )
             for one in proof.measures
         ]
         return format_table(header, rows)
-    rows = [(one.name, _number(one.stated_max), _word(one)) for one in proof.measures]
+    rows = [(one.name, _number(one.declared_max), _word(one)) for one in proof.measures]
     return format_table(("error", "stated max", ""), rows)
 
 
-def _word(measure: MeasureProof) -> str:
+def _word(measure: MeasureVerification) -> str:
     return "not proved" if measure.holds is None else "holds" if measure.holds else "FAILS"
 
 

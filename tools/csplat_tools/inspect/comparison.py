@@ -19,8 +19,8 @@ from csplat.files import check_room
 from csplat.model import SplatModel
 from csplat.scene import Scene
 from csplat.types import F32, Progress, null_progress
-from csplat_conformance.stated import Source, lattice_radii, match, measure_pairs, prove_by_disk
-from csplat_conformance.stated.pairs import merged
+from csplat_conformance.declared_bounds import Source, find_partners, lattice_radii, measure_pairs, verify_out_of_core
+from csplat_conformance.declared_bounds.measurement import merge_errors
 from csplat_render import Mode
 from csplat_render.camera import Camera, resized
 from csplat_render.lpips import load_lpips
@@ -102,7 +102,7 @@ def attribute_errors(
     bounds = {record.measure: record.max for record in stated.records}
     if not bounds.keys() >= {"means", "opacities", "sh0"}:
         return None
-    found = match(ours, theirs, bounds, lattice_radii(theirs, header), progress=progress)
+    found = find_partners(ours, theirs, bounds, lattice_radii(theirs, header), progress=progress)
     matched = np.flatnonzero(found >= 0)
     if not len(matched):
         return None
@@ -124,7 +124,9 @@ def attribute_errors_out_of_core(
         # For a file that declares no errors and was refitted, all errors are measured.
         nothing = DeclaredBounds(source.count, 0, source.facts.sh_degree, refitted=True, records=())
         opened = replace(open_tiles(other.path), declared_bounds=nothing)
-        proof = prove_by_disk(source.scene, opened, source_index, memory_bytes=source.memory_bytes, progress=progress)
+        proof = verify_out_of_core(
+            source.scene, opened, source_index, memory_bytes=source.memory_bytes, progress=progress
+        )
         found = {one.name: (one.measured_max or 0.0, one.measured_rms or 0.0) for one in proof.measures}
         return AttributeErrors("index", other.count, 0, found)
     if source.count != other.count or not _same_order(source.sample(progress)[0], other.sample(progress)[0]):
@@ -133,7 +135,7 @@ def attribute_errors_out_of_core(
         (start, len(theirs), measure_pairs(Source.of(ours), theirs, np.arange(len(theirs))))
         for start, ours, theirs in _beside(source.scene, other.scene, progress)
     ]
-    found = {name: (one.max, one.rms) for name, one in merged(parts).items()}
+    found = {name: (one.max, one.rms) for name, one in merge_errors(parts).items()}
     return AttributeErrors("order", other.count, 0, found)
 
 

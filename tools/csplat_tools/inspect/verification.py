@@ -13,7 +13,13 @@ from csplat.decoder import decode, open_tiles
 from csplat.files import read_array
 from csplat.model import MAX_SH_DEGREE
 from csplat.types import Progress
-from csplat_conformance.stated import Proof, Source, fits_memory, prove, prove_by_disk
+from csplat_conformance.declared_bounds import (
+    BoundsVerification,
+    Source,
+    fits_memory,
+    verify_bounds,
+    verify_out_of_core,
+)
 from csplat_conformance.validator import Validation, validate
 from csplat_tools.file_streams import mapped_csplat, source_path
 from csplat_tools.scene_files import size_on_disk
@@ -31,7 +37,7 @@ class Verification:
     """
 
     validation: Validation
-    proof: Proof | None
+    proof: BoundsVerification | None
 
     @property
     def holds(self) -> bool:
@@ -91,13 +97,13 @@ def verify_file(
 
 def _proved(
     data: bytes | mmap, source: str, rows: NDArray[Any] | None, memory_bytes: int | None, progress: Progress | None
-) -> Proof:
+) -> BoundsVerification:
     opened = open_tiles(data)
     header, stated = opened.header, opened.declared_bounds
     degree = MAX_SH_DEGREE  # bands above cannot be encoded, and declared errors do not include them
     with source_path(source) as local:
         if fits_memory(opened, stated.source_count if stated else 0, size_on_disk(local), memory_bytes):
             model = formats.read(local, keep_extra=bool(header.extras), sh_degree=degree)
-            return prove(Source.of(model), decode(data), header, stated, rows, progress=progress)
+            return verify_bounds(Source.of(model), decode(data), header, stated, rows, progress=progress)
         with formats.open_scene(local, sh_degree=degree) as scene:
-            return prove_by_disk(scene, opened, rows, memory_bytes=memory_bytes, progress=progress)
+            return verify_out_of_core(scene, opened, rows, memory_bytes=memory_bytes, progress=progress)

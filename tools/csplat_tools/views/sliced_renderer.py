@@ -20,8 +20,8 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.scene import BLOCK, Scene, scene_of
 from csplat.types import F32, F64, Progress
-from csplat_conformance.stated import Source
-from csplat_conformance.stated.spool import Rows, Spool, opened_spool
+from csplat_conformance.declared_bounds import Source
+from csplat_conformance.declared_bounds.splat_spool import RecordLayout, SplatSpool, open_spool
 from csplat_render import Camera, Mode
 from csplat_render.conventions import HasSplats, RenderResult
 
@@ -69,9 +69,9 @@ class SlicedScene:
         return self.scene.count * self.layout.dtype.itemsize
 
     @property
-    def layout(self) -> Rows:
+    def layout(self) -> RecordLayout:
         """Layout of splats on the disk."""
-        return Rows.of(_source(self.scene.facts), ())
+        return RecordLayout.of(_source(self.scene.facts), ())
 
     @property
     def splat_bytes(self) -> float:
@@ -159,7 +159,7 @@ class _SlicedRender:
             limits: limits of the slices, as from `slice_limits`.
             first: True for the first pass over the scene, in which splats are counted.
         """
-        spool = opened_spool(self._layout, count)
+        spool = open_spool(self._layout, count)
         with closing(spool.stream):
             sizes = np.zeros(len(limits) + 1)
             for block in blocks():
@@ -184,7 +184,7 @@ class _SlicedRender:
                     every = -(-number // _LOOKED_AT)
                     self._sort_and_draw(partial(read, BLOCK), number, self._limits(read(BLOCK), every, every, least=2))
 
-    def _read(self, spool: Spool, key: int, most: int) -> Iterator[Source]:
+    def _read(self, spool: SplatSpool, key: int, most: int) -> Iterator[Source]:
         return (source for source, _ in spool.sources(key, most))
 
     def _limits(self, blocks: Iterator[Source], every: int, share: int, *, least: int = 1) -> F32:

@@ -29,9 +29,9 @@ from csplat_bench.common.command import MARKDOWN, PEERS, preset_of, run
 from csplat_bench.common.peers import find_splat_transform, judged, transform
 from csplat_bench.common.report import table, tell_machine
 from csplat_bench.common.scenes import NPM, ROOT, Scene
-from csplat_conformance.choosing import matching
-from csplat_conformance.encoders import Input, all_inputs
-from csplat_conformance.stated import Source
+from csplat_conformance.declared_bounds import Source
+from csplat_conformance.encoders import EncoderInput, all_inputs
+from csplat_conformance.manifest import select_names
 from csplat_render.scorer import Scorer
 from csplat_tools.console import note
 from csplat_tools.views import comparison_cameras
@@ -69,7 +69,7 @@ def main(
     if command is None and write:
         raise InputError(f"without SPZ there are no figures: {remark}")
     tell_machine(SPZ=remark)
-    names = matching("*" if write else scenes, [one.name for one in all_inputs()], "input")
+    names = select_names("*" if write else scenes, [one.name for one in all_inputs()], "input")
     wanted = {one.name: one for one in all_inputs() if one.name in names and not one.must_refuse}
     measured = {}
     for name, one in wanted.items():
@@ -86,7 +86,7 @@ def main(
     print(table(("input, dB", *columns), rows, markdown=markdown))
 
 
-def _measure(one: Input, command: list[str] | None) -> Measured:
+def _measure(one: EncoderInput, command: list[str] | None) -> Measured:
     with TemporaryDirectory(prefix="csplat-inputs-") as folder:
         path = Path(folder) / f"{one.name.replace('/', '-')}.ply"
         path.write_bytes(one.make())
@@ -98,25 +98,25 @@ def _measure(one: Input, command: list[str] | None) -> Measured:
             ours = {}
         spz = None
         if command is not None and source.sh_degree <= MAX_SH_DEGREE:
-            write_ply(path, source.model((0.0, 0.0, 0.0)))
+            write_ply(path, source.to_model((0.0, 0.0, 0.0)))
             spz = _spz(one, source, path, command)
     return Measured(ours, spz)
 
 
-def _ours(one: Input, source: Source, path: Path, preset: str) -> Figures:
+def _ours(one: EncoderInput, source: Source, path: Path, preset: str) -> Figures:
     data = encode(read_ply(path), EncodeOptions(preset=preset_of(preset)))
     decoded = decode(data)
-    return {"bytes": len(data), "psnr": _judge(source.model(decoded.origin)).psnr(decoded) if one.renders else None}
+    return {"bytes": len(data), "psnr": _judge(source.to_model(decoded.origin)).psnr(decoded) if one.renders else None}
 
 
-def _spz(one: Input, source: Source, path: Path, command: list[str]) -> Figures | None:
+def _spz(one: EncoderInput, source: Source, path: Path, command: list[str]) -> Figures | None:
     scene = Scene(path.stem, path, len(source), source.sh_degree)
     peer = transform(command, scene, path.parent)[0]
     if peer.timing is None:
         return None
     if not one.renders:
         return {"bytes": peer.size_bytes, "psnr": None}
-    psnr = judged(command, peer, _judge(source.model(_origin(source))))
+    psnr = judged(command, peer, _judge(source.to_model(_origin(source))))
     return None if isinstance(psnr, str) else {"bytes": peer.size_bytes, "psnr": psnr}
 
 

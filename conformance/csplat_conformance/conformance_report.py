@@ -1,0 +1,250 @@
+"""Report a run of the suite: as a table for people, as JSON for programs, as JUnit XML for CI.
+
+    >>> report = ConformanceReport("decoder", "my-decoder {input} {outdir}", [
+    ...     Outcome("valid/rich", "L2", Status.PASSED, seconds=0.25),
+    ...     Outcome("invalid/index_crc", "L1", Status.FAILED, ("IDX-1",), "E_CRC", "accepted"),
+    ... ])
+    >>> report.passed
+    False
+    >>> print(to_table(report))
+    L1  FAILED  invalid/index_crc  accepted (IDX-1, E_CRC)
+    <BLANKLINE>
+    level  checks  passed  failed  skipped
+    L1          1       0       1        0
+    L2          1       1       0        0
+    all         2       1       1        0
+
+A suite makes one `Outcome` for each check, that is for each vector or input and level. `failed` and everything that a
+process can do instead of an answer (`crashed`, `hung` and so on) count as failures; the statuses differ to help whoever
+mends the program. Statuses that only some suites have are columns of their reports alone (`ConformanceReport.extra`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from html import escape
+from typing import Any
+
+#: Characters that XML 1.0 cannot hold, not even as references.
+_NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+class Status(StrEnum):
+    """The result of a check. The statuses from `FAILED` to `REFUSED` are failures."""
+
+    PASSED = "passed"
+    WARNED = "warned"  #: passed: legal, and far worse than need be
+    DECLINED = "declined"  #: refused an input that may be refused
+    NOT_PROVED = "not proved"  #: nothing contradicts it, nothing shows it
+    FAILED = "failed"  #: the answer is wrong
+    CRASHED = "crashed"  #: ended by a signal
+    HUNG = "hung"  #: did not end in time
+    WRONG_STATUS = "wrong status"  #: an exit status that the protocol does not have
+    WRONG_ANSWER = "wrong answer"  #: the status of the protocol, without the line or the files that go with it
+    NO_OUTPUT = "no output"  #: success is claimed, nothing was written
+    PARTIAL_OUTPUT = "partial output"  #: a file was left that is cut short, or by a run that failed
+    REFUSED = "refused"  #: refused an input that must be accepted
+    SKIPPED = "skipped"  #: not checked; the message gives the reason
+
+
+_GOOD = frozenset((Status.PASSED, Status.WARNED, Status.DECLINED, Status.NOT_PROVED, Status.SKIPPED))
+#: Neither failures nor passes: JUnit calls these skipped.
+_OPEN = frozenset((Status.DECLINED, Status.NOT_PROVED, Status.SKIPPED))
+#: Checks that came to no answer: JUnit calls these errors.
+_ERRORS = frozenset((Status.CRASHED, Status.HUNG, Status.WRONG_STATUS, Status.NO_OUTPUT, Status.WRONG_ANSWER))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One check.
+
+    Attributes:
+        name: the vector or input, with its group, `invalid/index_crc`.
+        level: the level that was checked, `L1`.
+        status: the result.
+        clauses: ids of the broken clauses of the spec or, if they are unknown, of the clauses that the check covers.
+        code: error code that was reported or found, `E_CRC`.
+        message: one line; of a check that passed a remark, if there is one.
+        seconds: time it took.
+        details: JSON-compatible facts for programs, such as measured numbers.
+    """
+
+    name: str
+    level: str
+    status: Status
+    clauses: tuple[str, ...] = ()
+    code: str = ""
+    message: str = ""
+    seconds: float = 0.0
+    details: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def good(self) -> bool:
+        """True if the check did not fail."""
+        return self.status in _GOOD
+
+
+@dataclass(frozen=True)
+class ConformanceReport:
+    """All checks of a run.
+
+    Attributes:
+        suite: `decoder` or `encoder`.
+        subject: what was tested: a command line, or a description.
+        outcomes: in the order of the run.
+        notes: a line each about the run as a whole.
+        extra: statuses that this suite counts in addition to passed, failed and skipped.
+    """
+
+    suite: str
+    subject: str
+    outcomes: Sequence[Outcome]
+    notes: Sequence[str] = ()
+    extra: Sequence[Status] = ()
+
+    @property
+    def failures(self) -> list[Outcome]:
+        """The checks that did not pass."""
+        return [one for one in self.outcomes if not one.good]
+
+    @property
+    def passed(self) -> bool:
+        """True if something was checked and nothing failed."""
+        return bool(self.outcomes) and not self.failures
+
+    def levels(self) -> dict[str, dict[str, int]]:
+        """Return by level how many checks there were, how many passed, failed and were skipped, and so on."""
+        return {level: self.counts(level) for level in _levels(self)}
+
+    def counts(self, level: str | None = None) -> dict[str, int]:
+        """Return the same of one level, or of all."""
+        return _counts((one for one in self.outcomes if level in (None, one.level)), self.extra)
+
+
+def _levels(report: ConformanceReport) -> list[str]:
+    return sorted({one.level for one in report.outcomes})
+
+
+def _counts(outcomes: Iterable[Outcome], extra: Sequence[Status]) -> dict[str, int]:
+    counts = dict.fromkeys(("checks", "passed", *map(str, extra), "failed", "skipped"), 0)
+    for one in outcomes:
+        counts["checks"] += 1
+        counts[str(one.status) if one.good else "failed"] += 1
+    return counts
+
+
+def to_table(report: ConformanceReport, *, verbose: bool = False) -> str:
+    """Return the failures, warnings, skips and remarks, a line each, and the counts by level.
+
+    Args:
+        report: the run.
+        verbose: a line for every check.
+    """
+    shown = [one for one in report.outcomes if verbose or one.message or not one.good]
+    lines = _aligned([(one.level, _word(one.status), one.name, _remark(one)) for one in shown])
+    lines += [""] * bool(lines)
+    lines += [*report.notes]
+    counts = [*report.levels().items(), ("all", report.counts())]
+    header = ("level", *counts[-1][1])
+    rows = [(level, *map(str, count.values())) for level, count in counts]
+    return "\n".join([*lines, *_aligned([header, *rows], right=True)])
+
+
+def _word(status: Status) -> str:
+    """Failures are in capitals, so that the eye and grep find them."""
+    return "ok" if status is Status.PASSED else str(status) if status in _GOOD else str(status).upper()
+
+
+def _remark(one: Outcome) -> str:
+    message = " ".join(one.message.split())  # a line stays a line, whatever a foreign program printed
+    where = ", ".join([*one.clauses, *([one.code] if one.code else [])])
+    if not where or (one.good and not message):
+        return message
+    return f"{message} ({where})" if message else f"({where})"
+
+
+def _aligned(rows: Sequence[Sequence[str]], *, right: bool = False) -> list[str]:
+    """Lay out rows in columns: all but the first to the right if requested, the last never padded."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
+    lines = []
+    for row in rows:
+        cells = [
+            cell.rjust(width) if right and i else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return lines
+
+
+def to_json(report: ConformanceReport) -> dict[str, Any]:
+    """Return the run as JSON-compatible values: `suite`, `subject`, `passed`, `levels`, `notes`, `outcomes`."""
+    return {
+        "suite": report.suite,
+        "subject": report.subject,
+        "passed": report.passed,
+        "levels": report.levels(),
+        "notes": list(report.notes),
+        "outcomes": [_outcome_json(one) for one in report.outcomes],
+    }
+
+
+def _outcome_json(one: Outcome) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "level": one.level,
+        "status": str(one.status),
+        "clauses": list(one.clauses),
+        "code": one.code,
+        "message": one.message,
+        "seconds": round(one.seconds, 4),
+        "details": one.details,
+    }
+
+
+def to_junit(report: ConformanceReport) -> str:
+    """Return the run as JUnit XML: a test suite for each level, a test case for each check."""
+    suites = [_junit_suite(report, level) for level in _levels(report)]
+    head = f'<testsuites name="csplat {_xml(report.suite)}" {_junit_totals(report.outcomes)}>'
+    return "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', head, *suites, "</testsuites>", ""])
+
+
+def _junit_suite(report: ConformanceReport, level: str) -> str:
+    outcomes = [one for one in report.outcomes if one.level == level]
+    name = f"csplat.{report.suite}.{level}"
+    cases = [_junit_case(one, name) for one in outcomes]
+    head = f'  <testsuite name="{_xml(name)}" {_junit_totals(outcomes)}>'
+    facts = [("subject", report.subject), *(("note", note) for note in report.notes)]
+    properties = "".join(f'<property name="{name}" value="{_xml(value)}"/>' for name, value in facts)
+    return "\n".join([head, f"    <properties>{properties}</properties>", *cases, "  </testsuite>"])
+
+
+def _junit_totals(outcomes: Sequence[Outcome]) -> str:
+    errors = sum(one.status in _ERRORS for one in outcomes)
+    failures = sum(not one.good for one in outcomes) - errors
+    skipped = sum(one.status in _OPEN for one in outcomes)
+    seconds = sum(one.seconds for one in outcomes)
+    return f'tests="{len(outcomes)}" failures="{failures}" errors="{errors}" skipped="{skipped}" time="{seconds:.3f}"'
+
+
+def _junit_case(one: Outcome, suite: str) -> str:
+    head = f'    <testcase classname="{_xml(suite)}" name="{_xml(one.name)}" time="{one.seconds:.3f}"'
+    if one.status is Status.PASSED:
+        return head + "/>"
+    if one.status is Status.WARNED:
+        return f"{head}><system-out>{_xml(f'warning: {one.message}')}</system-out></testcase>"
+    if one.status in _OPEN:
+        message = one.message if one.status is Status.SKIPPED else f"{one.status}: {one.message}"
+        return f'{head}><skipped message="{_xml(message)}"/></testcase>'
+    kind = "error" if one.status in _ERRORS else "failure"
+    message = f'message="{_xml(f"{one.status}: {_remark(one)}")}"'
+    return f'{head}><{kind} type="{_xml(one.code or str(one.status))}" {message}/></testcase>'
+
+
+def _xml(text: str) -> str:
+    """Quote for an attribute; what XML has no way to write becomes a question mark."""
+    return (
+        escape(_NOT_XML.sub("?", text), quote=True).replace("\n", "&#10;").replace("\t", "&#9;").replace("\r", "&#13;")
+    )

@@ -1,0 +1,421 @@
+"""Verify the error bounds that a file declares against its source (spec 5.5).
+
+With a source index, maximum, rms and counts are verified. Without one, each splat of the file must have a splat of the
+source within the declared maxima; rms and counts are then not verified.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.decoder import DeclaredBounds, SceneHeader
+from csplat.model import SplatModel
+from csplat.types import I64, Progress
+from csplat_conformance.declared_bounds.measurement import (
+    MeasuredError,
+    Source,
+    check_source_index,
+    find_wrong_extras,
+    measure_names,
+    measure_pairs,
+    pair_differences,
+)
+from csplat_conformance.declared_bounds.partners import UNDECIDED, UNMATCHED, find_partners, lattice_radii
+from csplat_conformance.tolerance import bound_tolerance, is_valid_bound
+
+#: Errors by measure that a file declares: (max, rms).
+_Bounds = dict[str, tuple[float, float]]
+#: The clause and a line about each contradiction.
+_Contradictions = list[tuple[str, str]]
+
+_SEARCHED_MAX, _SEARCHED_MIN = 100, 10  # splats without a partner whose nearest source splats are searched
+_DISTANCES_MAX = 10**8  # distances to compute for all of them, about
+_NEAREST = 8  # source splats to compare with each of them
+_NEEDS_INDEX = "rms and counts are not proved without a source index"
+
+
+@dataclass(frozen=True)
+class WorstSplat:
+    """The splat with the largest error.
+
+    Attributes:
+        splat: index of the splat in the file.
+        tile: index of its tile.
+        source_splat: index of its source splat or, if that is unknown, of the nearest one.
+        found: the error, in the measure's unit.
+    """
+
+    splat: int
+    tile: int
+    source_splat: int
+    found: float
+
+
+@dataclass(frozen=True)
+class MeasureVerification:
+    """The verification of one measure.
+
+    Attributes:
+        name: name in the registry of measures.
+        declared_max, declared_rms: bounds in the file; `None` if it declares none of this measure.
+        measured_max, measured_rms: errors of the pairs; `None` without a source index.
+        holds: whether nothing contradicts the bounds; `None` if there are none, or if it could not be decided.
+        worst: the splat with the largest error. Without a source index, `None` unless a splat has no partner because
+            of this measure.
+    """
+
+    name: str
+    declared_max: float | None
+    declared_rms: float | None
+    measured_max: float | None
+    measured_rms: float | None
+    holds: bool | None
+    worst: WorstSplat | None
+
+
+@dataclass(frozen=True)
+class BoundsVerification:
+    """The result of verifying declared error bounds.
+
+    Attributes:
+        measures: in the order of the registry.
+        failures: a line for each contradiction; empty if the bounds hold.
+        clauses: the clauses of the spec that the failures break.
+        unverified: measures without a declared bound: refitted ones, or all.
+        rms_verified: whether rms and counts were verified, too.
+    """
+
+    measures: tuple[MeasureVerification, ...] = ()
+    failures: tuple[str, ...] = ()
+    clauses: tuple[str, ...] = ()
+    unverified: tuple[str, ...] = ()
+    rms_verified: bool = False
+
+    @property
+    def holds(self) -> bool:
+        """True if everything that could be checked holds."""
+        return not self.failures
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Lines about what could not be verified."""
+        notes = []
+        if self.measures and not self.rms_verified:
+            notes.append(_NEEDS_INDEX)
+        if self.unverified:
+            notes.append(
+                f"not proved: {', '.join(self.unverified)}: no error of them is stated, renders are their judge"
+            )
+        return tuple(notes)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as JSON-compatible values; errors that overflowed are `null`."""
+        return {
+            "rms_and_counts_proved": self.rms_verified and self.holds,
+            "failures": list(self.failures),
+            "not_proved": list(self.unverified),
+            "notes": list(self.notes),
+            "measures": {
+                one.name: {
+                    "stated_max": one.declared_max,
+                    "stated_rms": one.declared_rms,
+                    "measured_max": _finite(one.measured_max),
+                    "measured_rms": _finite(one.measured_rms),
+                    "holds": one.holds,
+                    "worst": None if one.worst is None else {**vars(one.worst), "found": _finite(one.worst.found)},
+                }
+                for one in self.measures
+            },
+        }
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
+
+
+def verify_bounds(
+    source: Source,
+    decoded: SplatModel,
+    header: SceneHeader,
+    stated: DeclaredBounds | None,
+    source_index: NDArray[Any] | None = None,
+    *,
+    progress: Progress | None = None,
+) -> BoundsVerification:
+    """Verify the error bounds of a decoded file against its source.
+
+    Args:
+        source: the encoded scene.
+        decoded: the decoded file.
+        header: the file's header and index.
+        stated: the error bounds of the file; `None` if it declares none.
+        source_index: [N] integers, the source splat of each splat of the file; `None` if unknown.
+        progress: called with the progress of the search for partners.
+
+    Raises:
+        InputError: `source_index` is not one index of a source splat for each splat of the file.
+    """
+    return verify_with(_InMemoryComparison(source, decoded, header, progress), header, stated, source_index)
+
+
+class PairErrors(NamedTuple):
+    """The errors of known pairs of splats.
+
+    Attributes:
+        measured: errors by measure.
+        extras: a line for each extra column that differs.
+        reach: see `bound_tolerance`.
+    """
+
+    measured: dict[str, MeasuredError]
+    extras: list[str]
+    reach: float
+
+
+class SplatComparison(Protocol):
+    """A comparison of the splats of a file with those of their source."""
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the measures, in the order of the registry."""
+        ...
+
+    @property
+    def source_count(self) -> int:
+        """Splats of the source."""
+        ...
+
+    @property
+    def source_degree(self) -> int:
+        """SH degree of the source."""
+        ...
+
+    def pairs(self, source_index: NDArray[Any]) -> PairErrors:
+        """Measure the pairs that a source index names.
+
+        Raises:
+            InputError: `source_index` is not one index of a source splat for each splat of the file.
+        """
+        ...
+
+    def matches(self, bounds: Mapping[str, float]) -> NDArray[Any]:
+        """Return for each splat of the file `UNMATCHED`, `UNDECIDED`, or another number if it has a partner."""
+        ...
+
+    def farthest(self, bounds: Mapping[str, float], rows: I64) -> dict[str, WorstSplat]:
+        """Return by measure the splat that exceeds its bound most, of the given ones, which have no partner."""
+        ...
+
+
+def verify_with(
+    scenes: SplatComparison,
+    header: SceneHeader,
+    stated: DeclaredBounds | None,
+    source_index: NDArray[Any] | None = None,
+) -> BoundsVerification:
+    """Verify error bounds as `verify_bounds` does, by any way of comparing splats."""
+    if stated is None:
+        return BoundsVerification(
+            failures=("the file states no errors",), clauses=("SER-6",), unverified=tuple(scenes.names)
+        )
+    bounds = {record.measure: (record.max, record.rms) for record in stated.records}
+    unverified = tuple(name for name in scenes.names if name not in bounds) if header.splat_count else ()
+    wrong = [("SER-5", line) for line in _different_scenes(scenes, stated)]
+    if not stated.refitted:
+        wrong += [("SER-6", f"the file states no error of {name}") for name in unverified]
+    measures: list[MeasureVerification] = []
+    if not wrong and source_index is not None:
+        measures, wrong = _verify_pairs(scenes, header, bounds, source_index)
+    elif not wrong and "means" in bounds:
+        measures, wrong = _verify_partners(scenes, bounds)
+    elif not wrong:  # there is no bound to search within
+        unverified = tuple(scenes.names) if header.splat_count else ()
+    measures.sort(key=lambda one: scenes.names.index(one.name))
+    clauses = tuple(dict.fromkeys(clause for clause, _ in wrong))
+    verified = source_index is not None and bool(measures)
+    return BoundsVerification(
+        tuple(measures), tuple(line for _, line in wrong), clauses, unverified, rms_verified=verified
+    )
+
+
+def _different_scenes(scenes: SplatComparison, stated: DeclaredBounds) -> Iterator[str]:
+    """Yield differences that rule out a comparison: splat count, SH degree."""
+    count, degree = scenes.source_count, scenes.source_degree
+    if count != stated.source_count:
+        yield f"the file stands for a source of {stated.source_count} splats, this one has {count}"
+    if degree != stated.source_sh_degree:
+        yield f"the file stands for a source of SH degree {stated.source_sh_degree}, this one has {degree}"
+
+
+def _verify_pairs(
+    scenes: SplatComparison, header: SceneHeader, bounds: _Bounds, source_index: NDArray[Any]
+) -> tuple[list[MeasureVerification], _Contradictions]:
+    found_pairs, measures = scenes.pairs(source_index), []
+    failures = [("SRC-3", line) for line in found_pairs.extras]
+    for name, found in found_pairs.measured.items():
+        worst = None
+        if header.splat_count:
+            splat = found.worst
+            worst = WorstSplat(splat, tile_of(header, splat), int(source_index[splat]), found.max)
+        if name not in bounds:
+            measures.append(MeasureVerification(name, None, None, found.max, found.rms, None, worst))
+            continue
+        wrong = find_contradictions(name, found[:2], bounds[name], found_pairs.reach, worst)
+        failures += [("SER-5", line) for line in wrong]
+        measures.append(MeasureVerification(name, *bounds[name], found.max, found.rms, not wrong, worst))
+    return measures, failures
+
+
+def find_contradictions(
+    name: str, found: tuple[float, float], stated: tuple[float, float], reach: float, worst: WorstSplat | None
+) -> list[str]:
+    """Return a line for each declared bound that is below the true error, or above it by more than SER-5 allows.
+
+    Args:
+        name: name of the measure.
+        found: (max, rms) as measured.
+        stated: (max, rms) as declared.
+        reach: see `bound_tolerance`.
+        worst: the splat with the largest error.
+    """
+    lines = []
+    for kind, true, declared in zip(("max", "rms"), found, stated, strict=True):
+        if is_valid_bound(name, declared, true, reach):
+            continue
+        line = f"{name}: {kind} {true:.9g} is {'above' if declared < true else 'well below'} the stated {declared:.9g}"
+        if kind == "max" and worst is not None:
+            line += f": splat {worst.splat} (tile {worst.tile}), source splat {worst.source_splat}"
+        lines.append(line)
+    return lines
+
+
+def tile_of(header: SceneHeader, splat: int) -> int:
+    """Return the index of the tile that holds a splat."""
+    starts = [tile.start for tile in header.tiles]
+    return int(np.searchsorted(starts, splat, "right")) - 1
+
+
+# Without a source index ----------------------------------------------------------------------------
+
+
+def _verify_partners(scenes: SplatComparison, bounds: _Bounds) -> tuple[list[MeasureVerification], _Contradictions]:
+    largest = {name: pair[0] for name, pair in bounds.items()}
+    found = scenes.matches(largest)
+    alone = np.flatnonzero(found == UNMATCHED)
+    undecided = int(np.count_nonzero(found == UNDECIDED))
+    lines = []
+    if undecided:
+        lines.append(f"{undecided} splats have too many equals in the source to tell: give a source index")
+    worst: dict[str, WorstSplat] = {}
+    some = min(_SEARCHED_MAX, max(_SEARCHED_MIN, _DISTANCES_MAX // max(1, scenes.source_count)))
+    if len(alone):
+        worst = scenes.farthest(largest, alone[:some])
+        many = f"{len(alone)} splats of the file have" if len(alone) > 1 else "1 splat of the file has"
+        lines.append(f"{many} no splat of the source within the stated maxima")
+        lines += [
+            f"{name}: {one.found:.9g} is above the stated {largest[name]:.9g}: splat {one.splat} (tile {one.tile}),"
+            f" nearest source splat {one.source_splat}"
+            for name, one in worst.items()
+        ]
+    # Of the splats that were not searched it is unknown which bounds they exceed.
+    undecided_bounds = len(alone) > some
+    measures = [
+        MeasureVerification(
+            name,
+            *bounds[name],
+            None,
+            None,
+            False if name in worst else None if undecided_bounds else True,
+            worst.get(name),
+        )
+        for name in bounds
+    ]
+    return measures, [("SER-5", line) for line in lines]
+
+
+@dataclass(frozen=True, eq=False)
+class _InMemoryComparison:
+    """A `SplatComparison` of scenes that are in memory as a whole."""
+
+    source: Source
+    decoded: SplatModel
+    header: SceneHeader
+    progress: Progress | None
+
+    @property
+    def names(self) -> list[str]:
+        return measure_names(self.source, self.decoded)
+
+    @property
+    def source_count(self) -> int:
+        return len(self.source)
+
+    @property
+    def source_degree(self) -> int:
+        return self.source.sh_degree
+
+    def pairs(self, source_index: NDArray[Any]) -> PairErrors:
+        check_source_index(source_index, len(self.source), len(self.decoded))
+        return PairErrors(
+            measure_pairs(self.source, self.decoded, source_index),
+            find_wrong_extras(self.source, self.decoded, source_index),
+            self.source.reach(self.decoded.origin),
+        )
+
+    def matches(self, bounds: Mapping[str, float]) -> NDArray[Any]:
+        radii = lattice_radii(self.decoded, self.header)
+        return find_partners(self.source, self.decoded, bounds, radii, progress=self.progress)
+
+    def farthest(self, bounds: Mapping[str, float], rows: I64) -> dict[str, WorstSplat]:
+        reach = self.source.reach(self.decoded.origin)
+        return find_worst(self.source, self.decoded, self.header, bounds, rows, reach, self.progress)
+
+
+def find_worst(
+    source: Source,
+    decoded: SplatModel,
+    header: SceneHeader,
+    bounds: Mapping[str, float],
+    rows: I64,
+    reach: float,
+    progress: Progress | None,
+) -> dict[str, WorstSplat]:
+    """Return by measure the splat of `rows` that exceeds its bound most.
+
+    Each is compared with the source splat that breaks the fewest bounds, of those with the nearest centres.
+    """
+    worst: dict[str, WorstSplat] = {}
+    if not len(source):
+        return worst
+    source = source.about(decoded.origin)
+    means = source.means.astype(np.float64)
+    for done, row in enumerate(rows.tolist()):
+        if progress is not None:
+            progress("looking for what is nearest", done / len(rows))
+        near = nearest_points(means, decoded.means[row])
+        errors = pair_differences(source, decoded, near, np.full(len(near), row))
+        largest = {name: np.abs(errors[name]).max(axis=1) for name in bounds if name in errors}
+        beyond = np.stack(
+            [largest[name] > bounds[name] + bound_tolerance(name, bounds[name], reach) for name in largest]
+        )
+        best = int(beyond.sum(axis=0).argmin())
+        for name, is_beyond in zip(largest, beyond[:, best].tolist(), strict=True):
+            error = float(largest[name][best])
+            if is_beyond and (name not in worst or error > worst[name].found):
+                worst[name] = WorstSplat(row, tile_of(header, row), int(near[best]), error)
+    return worst
+
+
+def nearest_points(means: NDArray[np.float64], point: NDArray[np.float32]) -> I64:
+    """Return the indices of the centres nearest to a point, the nearest first."""
+    with np.errstate(over="ignore"):
+        distances = np.square(means - point).sum(axis=1)
+    near = np.argpartition(distances, min(_NEAREST, len(means) - 1))[:_NEAREST]
+    chosen: I64 = near[np.argsort(distances[near], kind="stable")]
+    return chosen

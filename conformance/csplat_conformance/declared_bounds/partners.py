@@ -1,0 +1,206 @@
+"""Find a source splat within given bounds for each decoded splat, if no source index is known.
+
+Source splats are sorted by the cell of a grid over centre, opacity and green. Cells are twice as wide as the bounds, so
+a splat's partner is in its own cell or, along each axis, in the nearer neighbour. Most are found in the first of these
+32 cells. Memory is a few numbers per splat, plus blocks of fixed size.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial, reduce
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.decoder import SceneHeader, Tile
+from csplat.model import SplatModel
+from csplat.types import F64, I64, U64, Progress
+from csplat_conformance.declared_bounds.measurement import Source, pair_differences
+from csplat_conformance.tolerance import bound_tolerance
+
+UNMATCHED = -1  #: no source splat lies within the bounds
+UNDECIDED = -2  #: there are more candidates than were compared
+
+#: The stage that `Progress` is called with.
+STAGE = "matching splats"
+
+_AXES = 5  # x, y, z, alpha, green
+_BLOCK = 1 << 16  # splats per task of a thread
+_FIRST = frozenset(("means", "opacities", "sh0"))  # measures to compare first, the cheap ones
+_PAIR_BLOCK = 4096  # pairs to compare at a time
+_CANDIDATES_MAX = 1000  # splats of one cell to compare; scenes of equal splats would take forever
+_MIX = np.uint64(0x9E3779B97F4A7C15)
+
+
+def find_partners(
+    source: Source,
+    decoded: SplatModel,
+    bounds: Mapping[str, float],
+    radii: F64,
+    *,
+    far: bool = True,
+    reach: float | None = None,
+    candidates_max: int = _CANDIDATES_MAX,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> I64:
+    """Find a source splat within the bounds for each decoded splat.
+
+    Args:
+        source: M splats.
+        decoded: N splats; their origin may differ.
+        bounds: largest error by measure, `means` among them, without the tolerance of SER-7. Other measures are not
+            compared.
+        radii: [N], distance within which the partner's centre is expected.
+        far: continue up to the bound of `means` if there is no partner within the radius.
+        reach: `Source.reach` of the whole scene, if these splats are a part of it.
+        candidates_max: largest number of splats of one cell to compare with one splat.
+        threads: number of threads, one per core by default. The result does not depend on it.
+        progress: called with the share of the splats that have a partner.
+
+    Returns:
+        [N] index of a source splat within the bounds, `UNMATCHED` or `UNDECIDED`.
+    """
+    found = np.full(len(decoded), UNMATCHED, np.int64)
+    if not len(source):
+        return found
+    reach = source.reach(decoded.origin) if reach is None else reach
+    source = source.about(decoded.origin)
+    bounds = {name: bound + bound_tolerance(name, bound, reach) for name, bound in bounds.items()}
+    bounds = {"opacities": math.inf, "sh0": math.inf, **bounds}
+    bound = bounds["means"]
+    levels = _radius_levels(radii, bound)
+    for radius in np.unique(np.append(levels, bound) if far else levels):
+        rows = np.flatnonzero((found == UNMATCHED) & (levels <= radius))
+        if not len(rows):
+            continue
+        search = partial(_search_grid, _Grid(source, float(radius), bounds), source, decoded, bounds, candidates_max)
+        parts = [rows[start : start + _BLOCK] for start in range(0, len(rows), _BLOCK)]
+        with ThreadPoolExecutor(threads) as pool:
+            for part, partners in zip(parts, pool.map(search, parts), strict=True):
+                found[part] = partners
+                if progress is not None:
+                    progress(STAGE, float(np.count_nonzero(found >= 0)) / len(found))
+    return found
+
+
+def _radius_levels(radii: F64, bound: float) -> F64:
+    """Round radii up to powers of two, which limits the number of grids; none exceeds the bound."""
+    with np.errstate(divide="ignore"):
+        exponents = np.ceil(np.log2(radii))
+    rounded: F64 = np.minimum(np.exp2(np.maximum(exponents, -1000.0)), bound)
+    return rounded
+
+
+class _Grid:
+    """The source splats sorted by the hash of their cells."""
+
+    def __init__(self, source: Source, radius: float, bounds: Mapping[str, float]) -> None:
+        margin = 1.0 + 1e-6  # for the rounding of cells
+        self.widths = [2.0 * radius * margin] * 3
+        self.widths += [2.0 * bounds[name] * margin for name in ("opacities", "sh0")]
+        keys = np.empty(len(source), np.uint64)
+        for start in range(0, len(source), _BLOCK):
+            rows = slice(start, start + _BLOCK)
+            cells = self.cells(source, rows)
+            keys[rows] = _hash([own for own, _ in cells])
+        self.order: I64 = np.argsort(keys, kind="stable")
+        self.keys: U64 = keys[self.order]
+
+    def cells(self, model: Source | SplatModel, rows: slice | NDArray[Any]) -> list[tuple[F64, F64]]:
+        """Return for each axis the cell of each splat and the nearer neighbour."""
+        columns = [*model.means[rows].T, model.opacities[rows], model.sh0[rows, 1]]
+        return [_cells(column.astype(np.float64), width) for column, width in zip(columns, self.widths, strict=True)]
+
+
+def _cells(values: F64, width: float) -> tuple[F64, F64]:
+    if width == 0.0:
+        return values, values  # splats match only if they are equal
+    with np.errstate(over="ignore"):
+        scaled = values / width
+    own = np.floor(scaled)
+    with np.errstate(invalid="ignore"):
+        return own, np.where(scaled - own < 0.5, own - 1.0, own + 1.0)
+
+
+def _hash(cells: list[F64]) -> U64:
+    """Mix the bits of the cells. If unequal cells have equal hashes, that costs a comparison only."""
+    mixed = np.zeros(len(cells[0]), np.uint64)
+    for cell in cells:
+        mixed ^= (cell + 0.0).view(np.uint64)  # -0 becomes 0
+        mixed *= _MIX
+        mixed ^= mixed >> np.uint64(29)
+    return mixed
+
+
+def _search_grid(
+    grid: _Grid,
+    source: Source,
+    decoded: SplatModel,
+    bounds: Mapping[str, float],
+    candidates_max: int,
+    rows: I64,
+) -> I64:
+    found = np.full(len(rows), UNMATCHED, np.int64)
+    cells = grid.cells(decoded, rows)
+    for probe in range(1 << _AXES):
+        left = np.flatnonzero(found == UNMATCHED)
+        if not len(left):
+            break
+        keys = _hash([pair[probe >> axis & 1][left] for axis, pair in enumerate(cells)])
+        order = np.argsort(keys)  # halves the time: neighbouring keys lie near each other in memory
+        left, keys = left[order], keys[order]
+        place = np.searchsorted(grid.keys, keys)
+        for nth in range(candidates_max + 1):
+            more = (place < len(grid.keys)) & (grid.keys[np.minimum(place, len(grid.keys) - 1)] == keys)
+            left, keys, place = left[more], keys[more], place[more]
+            if not len(left):
+                break
+            if nth == candidates_max:
+                found[left] = UNDECIDED
+                break
+            candidates = grid.order[place]
+            good = _pairs_within(source, decoded, candidates, rows[left], bounds)
+            found[left[good]] = candidates[good]
+            left, keys, place = left[~good], keys[~good], place[~good] + 1
+    return found
+
+
+def _pairs_within(
+    source: Source, decoded: SplatModel, source_rows: I64, decoded_rows: I64, bounds: Mapping[str, float]
+) -> NDArray[np.bool_]:
+    """Return which pairs are within the bounds; SH and covariance are compared only if the others are."""
+    good = np.ones(len(source_rows), bool)
+    for names in (_FIRST, bounds.keys() - _FIRST):
+        pairs = np.flatnonzero(good)
+        for start in range(0, len(pairs), _PAIR_BLOCK):
+            part = pairs[start : start + _PAIR_BLOCK]
+            errors = pair_differences(source, decoded, source_rows[part], decoded_rows[part], names)
+            for name, values in errors.items():
+                good[part] &= reduce(np.maximum, np.abs(values).T) <= bounds[name]
+    return good
+
+
+def lattice_radii(decoded: SplatModel, header: SceneHeader) -> F64:
+    """Return the distance within which the source of each splat is expected.
+
+    It is half the diagonal of the splat's lattice cell, and the error of rounding to float32.
+    """
+    radii = np.empty(len(decoded))
+    for tile in header.tiles:
+        rows = slice(tile.start, tile.start + tile.splat_count)
+        radii[rows] = tile_radii(decoded.means[rows], header, tile)
+    return radii
+
+
+def tile_radii(means: NDArray[np.float32], header: SceneHeader, tile: Tile) -> F64:
+    """Return `lattice_radii` of the given centres of one tile."""
+    cell = 0.87 * math.ldexp(header.attribute(_spec.ATTRIBUTE_MEANS).step, tile.exponent)
+    x, y, z = np.abs(means.T)  # NumPy is slow along an axis of three
+    radii: F64 = cell + np.maximum(np.maximum(x, y), z).astype(np.float64) * 2.0**-22
+    return radii

@@ -1,0 +1,247 @@
+"""L3: check the error bounds that a file declares."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.decoder import DecodedScene, SceneHeader
+from csplat.model import SplatModel
+from csplat.types import F64, I64
+from csplat_conformance.conformance_report import Status
+from csplat_conformance.declared_bounds import BoundsVerification, MeasureVerification, Source, verify_bounds
+from csplat_conformance.encoders.encoder_inputs import EncoderInput
+from csplat_conformance.encoders.encoder_run import Verdict, join_lines
+from csplat_conformance.encoders.file_checks import SplatPairs
+
+_NOT_PAIRED = "which splat is which is not known"
+_NO_BOUNDS = "the file states no errors"
+
+
+def check_errors(one: EncoderInput, scene: DecodedScene, pairs: SplatPairs) -> tuple[Verdict, str]:
+    """Judge L3: what is stated holds (SER-5); what is not stated is not proved.
+
+    Args:
+        one: the input.
+        scene: the decoded scene.
+        pairs: the source splat of each of its splats.
+
+    Returns:
+        The verdict, and why only pictures can judge the rest; nothing if they need not.
+    """
+    source = one.source() if one.source is not None else None
+    if source is None or pairs.strays or pairs.surplus:
+        return Verdict(Status.SKIPPED, _NOT_PAIRED), ""
+    stated = scene.declared_bounds
+    if stated is None:
+        # An empty scene has no errors.
+        return (
+            (Verdict(Status.NOT_PROVED, _NO_BOUNDS), _NO_BOUNDS) if len(scene.model) else (Verdict(Status.PASSED), "")
+        )
+    proof = verify_bounds(source, scene.model, scene.header, stated, pairs.source_index)
+    details = proof.as_json()["measures"]
+    unverified = f"{', '.join(proof.unverified)}: fitted anew, nothing is stated" if proof.unverified else ""
+    why = f"{', '.join(proof.unverified)} fitted anew" if proof.unverified and stated.refitted else ""
+    if not proof.holds:
+        return Verdict(Status.FAILED, join_lines(proof.failures), proof.clauses, details=details), why
+    coarse = coarse_errors(one, source, proof)
+    warnings = [*coarse.values()]
+    if len(scene.model) and not stated.refitted:  # refitted values differ on purpose
+        names = frozenset(record.measure for record in stated.records) - coarse.keys()
+        warnings += find_truncation(source, scene.model, scene.header, pairs.source_index, names)
+    message = join_lines((unverified,) * bool(unverified) + tuple(warnings))
+    status = Status.NOT_PROVED if unverified else Status.WARNED if warnings else Status.PASSED
+    return Verdict(status, message, details=details), why
+
+
+MEANS_OF_APART = 0.25
+COVARIANCE_MAX, COVARIANCE_RMS = 1.15, 0.65
+OPACITIES_MAX = 0.25
+SH_MAX, SH_OF_LARGEST = 0.3, 0.04
+
+
+def coarse_errors(one: EncoderInput, source: Source, proof: BoundsVerification) -> dict[str, str]:
+    """Return by measure a line for each stated error that is beyond its bound."""
+    lines: dict[str, str] = {}
+    for measure in proof.measures:
+        if measure.declared_max is None or measure.declared_rms is None:
+            continue
+        bound = _coarse_bound(measure, one, source)
+        if measure.declared_max > bound:
+            coarse = "coarse, or a wrong rotation" if measure.name == "covariance" else "coarse"
+            what = f"an error of {measure.declared_max:.3g}, beyond {bound:.3g} is {coarse}{_worst_splat(measure)}"
+        elif measure.name == "covariance" and measure.declared_rms > COVARIANCE_RMS:
+            what = f"an rms of {measure.declared_rms:.3g}, beyond {COVARIANCE_RMS:g} is coarse"
+        else:
+            continue
+        lines[measure.name] = f"{measure.name}: {what}"
+    return lines
+
+
+def _coarse_bound(measure: MeasureVerification, one: EncoderInput, source: Source) -> float:
+    if measure.name == "means":
+        return MEANS_OF_APART * one.separation
+    if measure.name == "covariance":
+        return COVARIANCE_MAX
+    if measure.name == "opacities":
+        return OPACITIES_MAX
+    largest = max(float(np.abs(array).max(initial=0.0)) for array in (source.sh0, source.shN))
+    return max(SH_MAX, SH_OF_LARGEST * largest)
+
+
+def _worst_splat(measure: MeasureVerification) -> str:
+    worst = measure.worst
+    return "" if worst is None else f": splat {worst.splat} (source splat {worst.source_splat})"
+
+
+STEPS_MAX = 0.75  #: lattice steps; rounding leaves 0.5, and 0.71 next to alpha 0 if it looks for the nearest alpha
+ONE_SIDED = 0.95  #: share of the errors with one sign; 40 fair coins are this one-sided once in 10^9 throws
+_TRUNCATED_STEPS_MAX = 1.05  # lattice steps: cutting alone leaves 1 at most
+_VALUES_MIN = 40  # different values
+_ROWS_MAX = 4096  # splats that are looked at: enough to see a habit
+_SAME_ROTATION_MIN = 0.8  # smallest cosine of half the angle between two rotations that count as the same
+_TRUNCATED = "cut instead of rounded?"
+
+
+def find_truncation(
+    source: Source, decoded: SplatModel, header: SceneHeader, index: I64, stated: frozenset[str]
+) -> list[str]:
+    """Look for them.
+
+    Args:
+        source: the encoded scene.
+        decoded: the decoded file.
+        header: header of the file.
+        index: [N] which splat of the source each of the file is.
+        stated: the measures to look at.
+
+    Returns:
+        A line for each attribute that looks cut.
+    """
+    return [line for measure, line in _truncated_attributes(source, decoded, header, index) if measure in stated]
+
+
+def _truncated_attributes(
+    source: Source, decoded: SplatModel, header: SceneHeader, index: I64
+) -> Iterator[tuple[str, str]]:
+    for measure, steps in (
+        ("means", _mean_steps(source, decoded, header, index)),
+        ("opacities", _opacity_steps(source, decoded, header, index)),
+    ):
+        if steps > STEPS_MAX:
+            what = _TRUNCATED if steps < _TRUNCATED_STEPS_MAX else "not rounded to the nearest?"
+            yield measure, f"{measure}: up to {steps:.2f} lattice steps off, rounding leaves 0.5: {what}"
+    rows = np.linspace(0, len(decoded) - 1, min(len(decoded), _ROWS_MAX)).astype(np.int64)
+    theirs = index[rows]
+    # Axes may be permuted; sorted scales are rounded as well as any.
+    yield from _one_sided(
+        "covariance", "scales", *(np.sort(a, axis=1) for a in (source.scales[theirs], decoded.scales[rows]))
+    )
+    yield from _one_sided("covariance", "quats", *_aligned_quats(source.quats[theirs], decoded.quats[rows]))
+    yield from _one_sided(
+        "sh0", "sh0", *_coded_colours(source.sh0[theirs], decoded.sh0[rows], header, _spec.ATTRIBUTE_SH0)
+    )
+    for band in range(1, min(decoded.sh_degree, source.sh_degree) + 1):
+        coefficients = slice(band * band - 1, (band + 1) ** 2 - 1)
+        pair = source.shN[theirs, coefficients], decoded.shN[rows, coefficients]
+        yield from _one_sided(f"sh{band}", f"sh{band}", *_coded_colours(*pair, header, _spec.ATTRIBUTE_SH0 + band))
+
+
+# Steps ---------------------------------------------------------------------------------------------
+
+
+def _mean_steps(source: Source, decoded: SplatModel, header: SceneHeader, index: I64) -> float:
+    """Return the largest error along an axis in steps of the tile's lattice, less what binary32 adds."""
+    step = header.attribute(_spec.ATTRIBUTE_MEANS).step
+    near, reach = source.about(decoded.origin), source.reach(decoded.origin)
+    largest = 0.0
+    for tile in header.tiles:
+        rows = slice(tile.start, tile.start + tile.splat_count)
+        means = decoded.means[rows].astype(np.float64)
+        theirs = near.means[index[rows]].astype(np.float64)
+        rounding = np.abs(means) * 2.0**-23 + reach * 2.0**-50
+        errors = np.abs(means - theirs) - rounding
+        largest = max(largest, float(errors.max(initial=0.0)) / math.ldexp(step, tile.exponent))
+    return largest
+
+
+def _opacity_steps(source: Source, decoded: SplatModel, header: SceneHeader, index: I64) -> float:
+    """Return the largest error of alpha, or of its root if the levels are of roots, in steps."""
+    record = header.attribute(_spec.ATTRIBUTE_OPACITIES)
+    ours, theirs = decoded.opacities.astype(np.float64), source.opacities[index].astype(np.float64)
+    if record.mapping == _spec.MAPPING_SQUARE:
+        ours, theirs = np.sqrt(ours), np.sqrt(theirs)
+    return float(np.abs(ours - theirs).max(initial=0.0)) * record.levels
+
+
+# Sides ---------------------------------------------------------------------------------------------
+
+
+def _one_sided(
+    measure: str, name: str, source: NDArray[np.floating], decoded: NDArray[np.floating]
+) -> Iterator[tuple[str, str]]:
+    """Yield a line if nearly all errors lie on one side."""
+    theirs, ours = source.astype(np.float64).ravel(), decoded.astype(np.float64).ravel()
+    theirs, first = np.unique(theirs, return_index=True)
+    ours = ours[first]
+    kept = (ours != 0.0) & (np.abs(ours - theirs) > 1e-6 * np.abs(theirs))
+    if int(kept.sum()) < _VALUES_MIN:
+        return
+    ours, theirs = ours[kept], theirs[kept]
+    below, towards = float((ours < theirs).mean()), float((np.abs(ours) < np.abs(theirs)).mean())
+    sides = {"below": below, "above": 1.0 - below, "nearer to 0 than": towards, "farther from 0 than": 1.0 - towards}
+    side = max(sides, key=sides.__getitem__)
+    if sides[side] >= ONE_SIDED:
+        yield measure, f"{name}: {100.0 * sides[side]:.0f} % of the values lie {side} the source's: {_TRUNCATED}"
+
+
+def _coded_colours(
+    source: NDArray[np.float32], decoded: NDArray[np.float32], header: SceneHeader, attribute: int
+) -> tuple[F64, F64]:
+    """Return colours as they are rounded: R, G, B, or Co and Cg, for which Y makes up."""
+    theirs, ours = source.astype(np.float64), decoded.astype(np.float64)
+    if header.attribute(attribute).mapping != _spec.MAPPING_YCOCG:
+        return theirs, ours
+    return _chroma(theirs), _chroma(ours)
+
+
+def _chroma(rgb: F64) -> F64:
+    r, g, b = rgb[..., 0], rgb[..., 1], rgb[..., 2]
+    chroma: F64 = np.stack([r - b, g - (r + b) / 2.0])
+    return np.where(np.abs(chroma) > 1e-6 * np.abs(rgb).max(initial=0.0), chroma, 0.0)  # 0 but for rounding
+
+
+def _aligned_quats(source: NDArray[np.float32], decoded: NDArray[np.float32]) -> tuple[F64, F64]:
+    """Return x, y, z of rotations, the source's with the axes in the order and of the signs of the file's.
+
+    Splats that are turned too far to tell are left out.
+    """
+    theirs, ours = source.astype(np.float64), decoded.astype(np.float64)
+    turned = np.einsum("nq,tqp->tnp", theirs, _AXIS_ROTATIONS)  # [24, n, 4]
+    cosines = np.einsum("tnp,np->tn", turned, ours)
+    best = np.abs(cosines).argmax(axis=0)
+    rows = np.arange(len(ours))
+    signs = np.sign(cosines[best, rows])[:, None]
+    near = np.abs(cosines[best, rows]) > _SAME_ROTATION_MIN
+    return (turned[best, rows] * signs)[near, 1:], ours[near, 1:]
+
+
+def _axis_rotations() -> F64:
+    """The rotations that map axes to axes, as matrices to multiply quaternions by on the right, [24, 4, 4]."""
+    halves = [np.array(q, np.float64) for q in itertools.product((-1, 0, 1), repeat=4) if sum(map(abs, q)) in (1, 2, 4)]
+    units = [q / np.sqrt(np.square(q).sum()) for q in halves if q[np.flatnonzero(q)[0]] > 0]  # −q turns as q does
+    return np.stack([_right_factor(q) for q in units])
+
+
+def _right_factor(q: F64) -> F64:
+    """Return M with p·M = p q for quaternions p as rows."""
+    w, x, y, z = q
+    return np.array([[w, x, y, z], [-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])
+
+
+_AXIS_ROTATIONS = _axis_rotations()

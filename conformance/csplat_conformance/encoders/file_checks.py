@@ -1,0 +1,263 @@
+"""Check a file that an encoder wrote: is it valid (L1), and does it hold its source (L2)?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat import _spec
+from csplat.decoder import DecodedScene, decode_scene
+from csplat.errors import CsplatError, InputError
+from csplat.files import read_array
+from csplat.model import UNSPECIFIED, SplatModel
+from csplat.types import F64, I64
+from csplat_conformance.conformance_report import Status
+from csplat_conformance.declared_bounds import Source, check_source_index, find_wrong_extras
+from csplat_conformance.encoders.encoder_inputs import EncoderInput
+from csplat_conformance.encoders.encoder_run import Defect, Verdict, failed_verdict
+from csplat_conformance.validator import validate
+
+_PRUNED_MAX = 0.25  # fraction of the splats; an encoder that prunes more is warned about
+_TRUNCATION = frozenset((_spec.ERROR_TRUNCATED,))
+_VIOLATIONS_MAX = 3
+
+
+def check_stream(data: bytes) -> tuple[Verdict, DecodedScene | None]:
+    """L1: no clause is broken (CNF-1, CNF-5); and the scene, if so."""
+    if not data:
+        return Verdict(Status.PARTIAL_OUTPUT, "an empty file"), None
+    validation = validate(data)
+    found = validation.violations
+    if found:
+        clauses = tuple(dict.fromkeys(one.clause for one in found))
+        cut = {one.code for one in found} <= _TRUNCATION
+        rest = f" and {len(found) - _VIOLATIONS_MAX} more" if len(found) > _VIOLATIONS_MAX else ""
+        message = "; ".join(map(str, found[:_VIOLATIONS_MAX])) + rest
+        status = Status.PARTIAL_OUTPUT if cut else Status.FAILED
+        return Verdict(status, message, clauses, found[0].code), None
+    try:
+        scene = decode_scene(data)
+    except (
+        CsplatError
+    ) as error:  # the validator finds nothing: one of the two is wrong, and this is the place to see it
+        return Verdict(Status.FAILED, f"csplat's decoder refuses it: {error}", (), error.code), None
+    return Verdict(Status.PASSED, "; ".join(validation.remarks), details={"bytes": len(data)}), scene
+
+
+def check_content(
+    one: EncoderInput, source: Source, scene: DecodedScene, index: Path | None
+) -> tuple[Verdict, SplatPairs]:
+    """L2: each splat of the source once, or counted as pruned; facts that the source does not know are not stated.
+
+    Args:
+        one: the input.
+        source: the scene of the input.
+        scene: the decoded scene.
+        index: the encoder's own source index, `None` if none was asked for.
+
+    Returns:
+        The verdict, and which splat of the source each of the file is: by the encoder's own index, if it is right.
+    """
+    decoded = scene.model
+    centres = decoded.means.astype(np.float64) + np.subtract(decoded.origin, source.origin)
+    pairs = pair_splats(source.means.astype(np.float64), centres, one.separation)
+    details = {"splats": len(decoded), "source_splats": len(source), "missing": pairs.missing}
+    wrong = [*_wrong_splats(one, pairs), *_wrong_counts(source, scene, pairs), *_wrong_metadata(source, decoded)]
+    if index is not None:
+        pairs, wrong_numbers = check_index(index, source, len(decoded), pairs)
+        details["source_index"] = not wrong_numbers
+        wrong += wrong_numbers
+    if pairs.strays == pairs.surplus == 0:
+        wrong += [("SRC-3", line) for line in find_wrong_extras(source, decoded, pairs.source_index)]
+    if wrong:
+        return failed_verdict(wrong, details), pairs
+    if pairs.missing > _PRUNED_MAX * len(source):
+        return Verdict(Status.WARNED, f"{pairs.missing} of {len(source)} splats left out", details=details), pairs
+    remark = f"{pairs.missing} splats pruned" if pairs.missing else ""
+    return Verdict(Status.PASSED, remark, details=details), pairs
+
+
+def _wrong_splats(one: EncoderInput, pairs: SplatPairs) -> list[Defect]:
+    wrong = []
+    if pairs.strays:
+        far = f"not within {one.separation / 2.0:g} of a splat of the source"
+        wrong.append(("CNF-6", f"{_count_text(pairs.strays, pairs.examples[0])} {far}"))
+    if pairs.surplus:
+        many = _count_text(pairs.surplus, pairs.examples[1])
+        wrong.append(("CNF-6", f"{many} near a splat of the source that another stands for already"))
+    return wrong
+
+
+def _count_text(count: int, first: int) -> str:
+    return (
+        f"splat {first} of the file is" if count == 1 else f"{count} splats of the file, the first splat {first}, are"
+    )
+
+
+def _wrong_counts(source: Source, scene: DecodedScene, pairs: SplatPairs) -> list[Defect]:
+    stated = scene.declared_bounds
+    if stated is None:
+        text = f"{pairs.missing} splats of the source are missing, and nothing says so"
+        return [("SER-5", text)] if pairs.missing else []
+    wrong = []
+    if stated.source_count != len(source):
+        wrong.append(("SRC-1", f"a source of {stated.source_count} splats is stated, it has {len(source)}"))
+    elif stated.pruned_count != pairs.missing:
+        wrong.append(("SER-5", f"{stated.pruned_count} pruned splats are stated, {pairs.missing} are missing"))
+    if stated.source_sh_degree != source.sh_degree:
+        text = f"a source of SH degree {stated.source_sh_degree} is stated, it has {source.sh_degree}"
+        wrong.append(("SER-5", text))
+    return wrong
+
+
+def _wrong_metadata(source: Source, decoded: SplatModel) -> list[Defect]:
+    """A PLY does not specify axes, unit and filters: an encoder that states them has guessed."""
+    facts = {
+        "axes": (decoded.coordinate_system, UNSPECIFIED),
+        "unit_metres": (decoded.unit_metres, None),
+        "antialiased": (decoded.antialiased, False),
+        "flat": (decoded.flat, False),
+    }
+    wrong = [
+        ("SRC-3", f"{name} is {found}, of which the source says nothing")
+        for name, (found, wanted) in facts.items()
+        if found != wanted
+    ]
+    if decoded.sh_degree > source.sh_degree:
+        wrong.append(("SRC-3", f"SH degree {decoded.sh_degree}, the source has {source.sh_degree}"))
+    return wrong
+
+
+_INDEX_CLAUSE = "SRC-4"
+
+
+def check_index(path: Path, source: Source, count: int, pairs: SplatPairs) -> tuple[SplatPairs, list[Defect]]:
+    """Compare a source index with what lies near.
+
+    Args:
+        path: the .npy file.
+        source: the encoded scene.
+        count: splats of the file.
+        pairs: the source splat near each of them.
+
+    Returns:
+        The pairs with the encoder's own index if it is right, as they are if not; and what is wrong.
+    """
+    if not path.exists():
+        return pairs, [(_INDEX_CLAUSE, "no source index was written")]
+    try:
+        found = read_array(path)
+        check_source_index(found, len(source), count)
+    except (InputError, OSError) as error:
+        return pairs, [(_INDEX_CLAUSE, str(error).replace(str(path), "the source index"))]
+    index = found.astype(np.int64)
+    paired = np.flatnonzero(pairs.source_index >= 0)
+    near = pairs.source_index[paired]
+    # Only the encoder can tell splats with equal centres apart.
+    off = paired[(source.means[index[paired]] != source.means[near]).any(axis=1)]
+    if len(off):
+        text = (
+            f"splat {off[0]} is called splat {index[off[0]]} of the source, nearest is {pairs.source_index[off[0]]}"
+            f" ({len(off)} of {count} numbers of the index are wrong)"
+        )
+        return pairs, [(_INDEX_CLAUSE, text)]
+    return replace(pairs, source_index=index) if len(paired) == count else pairs, []
+
+
+_NONE = -1
+_CELL_MAX = 2.0**40  # centres more cells away from the origin than this share a cell; distance decides anyway
+_MIX = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F), np.uint64(0x165667B19E3779F9))
+
+
+@dataclass(frozen=True)
+class SplatPairs:
+    """Pairs of decoded splats and source splats.
+
+    Attributes:
+        source_index: [N], the source splat of each decoded splat; −1 if none is near.
+        strays: decoded splats without a source.
+        surplus: decoded splats whose source splat is already paired with another.
+        missing: source splats without a decoded splat.
+        examples: index of the first of `strays` and of `surplus`; −1 if there is none.
+    """
+
+    source_index: I64
+    strays: int
+    surplus: int
+    missing: int
+    examples: tuple[int, int] = (_NONE, _NONE)
+
+
+def pair_splats(source: F64, decoded: F64, separation: float) -> SplatPairs:
+    """Pair splats by their centres.
+
+    Args:
+        source: [M, 3] centres. Different ones are at least `separation` apart; equal ones are duplicates, which are
+            paired one by one.
+        decoded: [N, 3] centres.
+        separation: a decoded splat belongs to the source centre that is nearer than half of this distance.
+    """
+    if not len(source) or not len(decoded):
+        first_stray = 0 if len(decoded) else _NONE
+        return SplatPairs(np.full(len(decoded), _NONE, np.int64), len(decoded), 0, len(source), (first_stray, _NONE))
+    centres, member_of, counts = np.unique(source, axis=0, return_inverse=True, return_counts=True)
+    group = _nearest(centres, decoded, separation)
+    members = np.argsort(member_of.reshape(-1), kind="stable")
+    first = np.concatenate([[0], np.cumsum(counts)])
+    index = np.full(len(decoded), _NONE, np.int64)
+    near = np.flatnonzero(group != _NONE)
+    order = near[np.argsort(group[near], kind="stable")]
+    groups = group[order]
+    rank = np.arange(len(order)) - np.searchsorted(groups, groups, "left")
+    taken = rank < counts[groups]
+    index[order[taken]] = members[first[groups[taken]] + rank[taken]]
+    paired = int(taken.sum())
+    examples = _first_index(group == _NONE), _first_index((group != _NONE) & (index == _NONE))
+    return SplatPairs(index, len(decoded) - len(near), len(near) - paired, len(source) - paired, examples)
+
+
+def _first_index(which: NDArray[np.bool_]) -> int:
+    return int(which.argmax()) if which.any() else _NONE
+
+
+def _nearest(centres: F64, decoded: F64, separation: float) -> I64:
+    """Return for each decoded centre the source centre that is nearer than half of `separation`, or −1."""
+    keys = _keys(_cells(centres, separation))
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    own = _cells(decoded, separation)
+    found = np.full(len(decoded), _NONE, np.int64)
+    left = np.arange(len(decoded))
+    # Its own cell first: most need no other one.
+    for step in sorted(product((-1, 0, 1), repeat=3), key=lambda step: sum(map(abs, step))):
+        wanted = _keys(own[left] + np.array(step, np.int64))
+        first, last = np.searchsorted(keys, wanted, "left"), np.searchsorted(keys, wanted, "right")
+        # One cell holds few centres, since its side is their distance.
+        for nth in range(int((last - first).max(initial=0))):
+            more = first + nth < last
+            rows, candidates = left[more], order[first[more] + nth]
+            moved = decoded[rows] - centres[candidates]
+            good = np.sqrt(np.square(moved).sum(axis=1)) < separation / 2.0
+            found[rows[good]] = candidates[good]
+        left = left[found[left] == _NONE]
+    return found
+
+
+def _cells(points: F64, side: float) -> I64:
+    with np.errstate(over="ignore", invalid="ignore"):
+        cells = np.clip(np.floor(points / side), -_CELL_MAX, _CELL_MAX)
+    result: I64 = np.nan_to_num(cells).astype(np.int64)
+    return result
+
+
+def _keys(cells: I64) -> NDArray[np.uint64]:
+    """Mix three numbers into one; equal keys of unequal cells cost a comparison, no more."""
+    keys = np.zeros(len(cells), np.uint64)
+    for axis, factor in enumerate(_MIX):
+        keys ^= cells[:, axis].astype(np.uint64) * factor
+        keys ^= keys >> np.uint64(29)
+    return keys

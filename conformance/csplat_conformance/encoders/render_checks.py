@@ -1,0 +1,99 @@
+"""L4: compare renders of a file with those of its source."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from csplat.decoder import DecodedScene
+from csplat.model import SplatModel
+from csplat_conformance.conformance_report import Status
+from csplat_conformance.declared_bounds import Source
+from csplat_conformance.encoders.encoder_inputs import EncoderInput
+from csplat_conformance.encoders.encoder_run import Verdict
+from csplat_conformance.encoders.file_checks import SplatPairs
+
+#: PSNR in dB of a decoded scene against its source; the source comes first.
+RenderScore = Callable[[SplatModel, SplatModel], float]
+
+
+def check_renders(
+    one: EncoderInput,
+    source: Source,
+    scene: DecodedScene,
+    pairs: SplatPairs,
+    size_bytes: int,
+    render_score: RenderScore,
+    psnr_min: float,
+) -> Verdict:
+    """Judge L4: renders of the file look like those of the source.
+
+    Args:
+        one: the input.
+        source: the scene of the input.
+        scene: the decoded scene.
+        pairs: the source splat of each decoded splat.
+        size_bytes: size of the file.
+        render_score: compares.
+        psnr_min: lowest PSNR to pass, dB; an input shifts it by its own difference from the default.
+    """
+    model, decoded = source.to_model(scene.model.origin), scene.model
+    psnr = render_score(model, decoded)
+    figures, wanted = peer_figures(one.name), one.psnr_required(psnr_min)
+    details = {"psnr": psnr, "wanted": wanted, "bytes": size_bytes, "beside": figures}
+    size = f"in {size_bytes:,} bytes{format_figures(figures)}"
+    if not psnr >= wanted:
+        details["exact"] = exact = _score_exact_attributes(model, decoded, pairs, render_score)
+        cost = ", ".join(f"{name} {value:.1f}" for name, value in exact.items())
+        blame = f"; with the source's {cost}" if cost else ""
+        return Verdict(Status.FAILED, f"{psnr:.2f} dB, wanted {wanted:g} at least, {size}{blame}", details=details)
+    return Verdict(Status.PASSED, f"{psnr:.2f} dB {size}", details=details)
+
+
+def _score_exact_attributes(
+    source: SplatModel, decoded: SplatModel, pairs: SplatPairs, render_score: RenderScore
+) -> dict[str, float]:
+    """Return the PSNR with one attribute as exact as the source has it: what gains most is what costs most."""
+    if pairs.strays or pairs.surplus:
+        return {}
+    theirs = source.select(pairs.source_index)
+    changes: dict[str, dict[str, Any]] = {
+        "means": {"means": theirs.means},
+        "shapes": {"quats": theirs.quats, "scales": theirs.scales},
+        "opacities": {"opacities": theirs.opacities},
+        "colours": {"sh0": theirs.sh0, "shN": theirs.shN},
+    }
+    return {name: render_score(source, replace(decoded, **arrays)) for name, arrays in changes.items()}
+
+
+_FIGURES = Path(__file__).with_name("figures.json")
+_DISPLAY_NAMES = {"spz": "SPZ"}
+
+
+def peer_figures(name: str) -> dict[str, dict[str, Any]]:
+    """Return by encoder `bytes` and `psnr` of an input; nothing if none were measured."""
+    return _all_figures().get(name, {})
+
+
+def format_figures(figures: dict[str, dict[str, Any]]) -> str:
+    """Return them in words, with a blank before: ` (csplat 40.90 in 4,800, SPZ 39.10 in 7,900)`."""
+    words = []
+    for encoder, numbers in figures.items():
+        psnr = f"{numbers['psnr']:.2f}" if numbers.get("psnr") is not None else ""
+        size = f"in {numbers['bytes']:,}" if numbers.get("bytes") is not None else ""
+        words += [" ".join(part for part in (_DISPLAY_NAMES.get(encoder, encoder), psnr, size) if part)] * bool(
+            psnr or size
+        )
+    return f" ({', '.join(words)})" if words else ""
+
+
+@cache
+def _all_figures() -> dict[str, dict[str, dict[str, Any]]]:
+    if not _FIGURES.exists():
+        return {}
+    result: dict[str, dict[str, dict[str, Any]]] = json.loads(_FIGURES.read_text("utf-8"))
+    return result

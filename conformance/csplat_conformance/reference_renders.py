@@ -1,0 +1,219 @@
+"""L4: compare renders with reference images."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import struct
+import tempfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError
+from csplat.types import U8
+from csplat_conformance.conformance_report import Outcome, Status
+from csplat_conformance.manifest import VECTORS, Vector
+from csplat_conformance.protocol import last_words, run_program
+
+_LEVEL = "L4"
+
+
+def can_render() -> bool:
+    """Return True if csplat's renderer can be imported (the extra `render`)."""
+    return importlib.util.find_spec("numba") is not None
+
+
+def quantise_render(rgb: NDArray[Any]) -> U8:
+    """Return a picture's 8-bit values: clipped to 0..1, times 255, rounded."""
+    picture: U8 = np.rint(np.clip(rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
+    return picture
+
+
+def reference_render(floats: Mapping[str, NDArray[Any]], camera: Mapping[str, Any], antialiased: bool) -> U8:
+    """Render the expected arrays of a scene from the equations, in binary64. Needs the extra `render`."""
+    from csplat_render.camera import Camera  # in the extra `render`, which the suite can do without
+    from csplat_render.reference_rasteriser import render_exact
+
+    splats: Any = SimpleNamespace(**floats)
+    return quantise_render(render_exact(splats, Camera.from_json(camera), antialiased=antialiased).rgb)
+
+
+def score_own_renderer(vector: Vector) -> list[Outcome]:
+    """Render a vector's views with csplat's decoder and rasteriser."""
+    from csplat.decoder import decode
+    from csplat_render import render
+    from csplat_render.camera import Camera
+
+    model = decode(vector.data)
+    result = []
+    for number, view in enumerate(vector.views):
+        picture = quantise_render(render(model, Camera.from_json(view["camera"])).rgb)
+        result.append(_compare_render(vector, number, picture, 0.0))
+    return result
+
+
+def score_renderer(vector: Vector, command: str, timeout: float) -> list[Outcome]:
+    """Render a vector's views with the command of another renderer.
+
+    Args:
+        vector: with views.
+        command: command line with `{input}`, `{camera}` and `{out}` or `{outdir}`.
+        timeout: seconds for each picture.
+    """
+    return [_score_view(vector, number, command, timeout) for number in range(len(vector.views))]
+
+
+def skip_views(vector: Vector, why: str) -> list[Outcome]:
+    """Return outcomes that say why nothing was rendered."""
+    return [_outcome(vector, number, Status.SKIPPED, why) for number in range(len(vector.views))]
+
+
+def _score_view(vector: Vector, number: int, command: str, timeout: float) -> Outcome:
+    with tempfile.TemporaryDirectory(prefix="csplat-conformance-") as name:
+        folder = Path(name)
+        outdir, camera = folder / "out", folder / "camera.json"
+        outdir.mkdir()
+        camera.write_text(json.dumps([vector.views[number]["camera"]]), encoding="utf-8")
+        out = {"outdir": outdir} if "{outdir}" in command else {"out": outdir / "0.png"}
+        places = {"input": VECTORS / vector.file, "camera": camera, **out}
+        ended = run_program(command, {key: str(path) for key, path in places.items()}, timeout)
+        seconds = ended.seconds
+        if ended.status is not None:
+            return _outcome(vector, number, ended.status, ended.message + last_words(ended), seconds)
+        if ended.returncode:
+            return _outcome(vector, number, Status.REFUSED, f"exit status 1{last_words(ended)}", seconds)
+        found = sorted(outdir.rglob("*.png"))
+        if len(found) != 1:
+            wrong = Status.WRONG_ANSWER if found else Status.NO_OUTPUT
+            return _outcome(vector, number, wrong, f"{len(found)} PNG files were written, wanted one", seconds)
+        try:
+            return _compare_render(vector, number, read_png(found[0].read_bytes()), seconds)
+        except InputError as error:
+            return _outcome(vector, number, Status.WRONG_ANSWER, str(error), seconds)
+
+
+def _compare_render(vector: Vector, number: int, picture: U8, seconds: float) -> Outcome:
+    view = vector.views[number]
+    found = psnr(read_png((VECTORS / view["picture"]).read_bytes()), picture)
+    passed = found >= view["psnr"]
+    message = "" if passed else f"{found:.1f} dB against {view['picture']}, wanted {view['psnr']:g}"
+    status = Status.PASSED if passed else Status.FAILED
+    return _outcome(vector, number, status, message, seconds, psnr=round(found, 2))
+
+
+def _outcome(
+    vector: Vector, number: int, status: Status, message: str, seconds: float = 0.0, **details: Any
+) -> Outcome:
+    name = f"{vector.name}#{number}"
+    return Outcome(name, _LEVEL, status, tuple(vector.clauses), "", message, seconds, details)
+
+
+#: Score of equal pictures, dB.
+PSNR_CAP = 99.0
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_SIDE_MAX = 4096
+_CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # colour type: grey, RGB, grey and alpha, RGBA
+
+
+def psnr(reference: U8, picture: U8) -> float:
+    """Return the peak signal-to-noise ratio over pixels and channels, in dB, at most `PSNR_CAP`.
+
+    Raises:
+        InputError: the pictures differ in size.
+    """
+    if reference.shape != picture.shape:
+        sizes = [f"{shape[1]}x{shape[0]}" for shape in (picture.shape, reference.shape)]
+        raise InputError(f"the picture has {sizes[0]} pixels, wanted {sizes[1]}")
+    error = float(np.mean((reference.astype(np.float64) - picture.astype(np.float64)) ** 2))
+    return min(PSNR_CAP, 10.0 * math.log10(255.0**2 / error)) if error else PSNR_CAP
+
+
+def write_png(picture: U8) -> bytes:
+    """Return a PNG of [H, W, 3] values."""
+    height, width, _ = picture.shape
+    before = np.zeros_like(picture)
+    before[:, 1:] = picture[:, :-1]
+    # Filter 1, "sub": the difference from the pixel to the left.
+    rows = np.concatenate([np.ones((height, 1), np.uint8), (picture - before).reshape(height, -1)], axis=1)
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(rows.tobytes(), 9)), (b"IEND", b""))
+    return _SIGNATURE + b"".join(_png_chunk(kind, data) for kind, data in chunks)
+
+
+def _png_chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def read_png(data: bytes) -> U8:
+    """Return the [H, W, 3] values of a PNG of 8 bits per channel, not interlaced; alpha is dropped, grey spread.
+
+    Raises:
+        InputError: not such a PNG.
+    """
+    try:
+        return _decode_png(data)
+    except (struct.error, zlib.error, ValueError) as error:
+        raise InputError(f"not a PNG that can be read: {error}") from None
+
+
+def _decode_png(data: bytes) -> U8:
+    if not data.startswith(_SIGNATURE):
+        raise InputError("not a PNG")
+    head, coded, at = b"", b"", len(_SIGNATURE)
+    while at < len(data):
+        size, kind = struct.unpack_from(">I4s", data, at)
+        body = data[at + 8 : at + 8 + size]
+        head = body if kind == b"IHDR" else head
+        coded += body if kind == b"IDAT" else b""
+        at += 12 + size
+    width, height, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", head)
+    if depth != 8 or colour not in _CHANNELS or interlace:
+        raise InputError(f"a PNG of {depth} bits, colour type {colour}: wanted 8 bits, RGB, not interlaced")
+    if not (1 <= width <= _SIDE_MAX and 1 <= height <= _SIDE_MAX):
+        raise InputError(f"a PNG of {width}x{height} pixels")
+    channels = _CHANNELS[colour]
+    raw = zlib.decompressobj().decompress(coded, height * (width * channels + 1))
+    rows = np.frombuffer(raw, np.uint8).reshape(height, width * channels + 1)
+    picture = _undo_filters(rows, channels).reshape(height, width, channels)
+    return np.ascontiguousarray(picture[..., :3] if channels > 2 else np.repeat(picture[..., :1], 3, axis=2))
+
+
+def _undo_filters(rows: U8, channels: int) -> U8:
+    """Undo the filter of each row (PNG, section 9)."""
+    out = np.zeros((len(rows), rows.shape[1] - 1), np.uint8)
+    above = np.zeros(rows.shape[1] - 1, np.uint8)
+    for y, (kind, *_) in enumerate(rows[:, :1].tolist()):
+        line = rows[y, 1:]
+        if kind == 2:
+            out[y] = line + above
+        elif kind == 1:
+            out[y] = np.cumsum(line.reshape(-1, channels), axis=0, dtype=np.uint8).reshape(-1)
+        elif kind in (3, 4):
+            out[y] = _undo_row(line.tolist(), above.tolist(), channels, kind == 4)
+        elif kind == 0:
+            out[y] = line
+        else:
+            raise InputError(f"a PNG whose row {y} has the filter {kind}")
+        above = out[y]
+    return out
+
+
+def _undo_row(line: list[int], above: list[int], channels: int, paeth: bool) -> list[int]:
+    out: list[int] = []
+    for i, value in enumerate(line):
+        left = out[i - channels] if i >= channels else 0
+        corner = above[i - channels] if i >= channels else 0
+        guess = (left + above[i]) // 2
+        if paeth:
+            estimate = left + above[i] - corner
+            guess = min((left, above[i], corner), key=lambda value: abs(estimate - value))
+        out.append((value + guess) % 256)
+    return out

@@ -1,0 +1,247 @@
+"""Validate a file from the first byte to the last: header, index, chunks."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from mmap import mmap
+
+from csplat import _spec
+from csplat.inputs import LetGo
+from csplat.types import null_progress
+from csplat_conformance.validator.ancillary import read_declared_bounds, read_text
+from csplat_conformance.validator.codebooks import CodebookEntries, read_codebook
+from csplat_conformance.validator.findings import (
+    Findings,
+    Payload,
+    PlacedRecord,
+    TooManyViolationsError,
+    UnreadableError,
+    Validation,
+    read_record,
+)
+from csplat_conformance.validator.index import (
+    Chunk,
+    Index,
+    Tile,
+    check_coverage,
+    check_frame,
+    read_directory,
+    read_records,
+    read_tiles,
+)
+from csplat_conformance.validator.tiles import TileChecker
+
+_CRC_SIZE = 4
+_TEXT_CHUNKS = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS)
+#: The clause that requires the payload to end with its last structure.
+_END_CLAUSES = {
+    _spec.CHUNK_CODEBOOK: "CDB-2",
+    _spec.CHUNK_METADATA: "JSN-2",
+    _spec.CHUNK_CAMERAS: "JSN-2",
+    _spec.CHUNK_OPTIONS: "JSN-2",
+    _spec.CHUNK_STATED_ERRORS: "SER-3",
+}
+_STAGE = "validating"
+
+Header = PlacedRecord[_spec.Header]
+
+
+def validate(
+    data: bytes | bytearray | memoryview | mmap,
+    *,
+    json_bytes_max: int = _spec.BUDGET_JSON_BYTES,
+    splats_max: int | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Validation:
+    """Look for every violation of the spec in a file.
+
+    Args:
+        data: all of it, or as much as there is.
+        json_bytes_max: budget for one JSON text (STR-8).
+        splats_max: budget of splats (LIM-1), above which the tiles are not read; `None` for none: one tile lies in
+            memory at a time.
+        progress: called with the share of the file that has been checked.
+
+    Returns:
+        What was found; never raises for what a file holds.
+    """
+    view = memoryview(data).cast("B")
+    findings = Findings()
+    counts = _Counts()
+    with suppress(TooManyViolationsError):  # the last remark says so
+        _check(view, findings, counts, json_bytes_max, splats_max, progress or null_progress)
+    return Validation(
+        tuple(sorted(findings.violations, key=lambda one: one.offset)),
+        tuple(findings.remarks),
+        tuple(findings.unread),
+        counts.splats,
+        counts.tiles,
+        tuple(findings.checks),
+    )
+
+
+class _Counts:
+    """Numbers of splats and tiles, as far as they are known."""
+
+    splats = 0
+    tiles = 0
+
+
+def _check(
+    view: memoryview,
+    findings: Findings,
+    counts: _Counts,
+    json_bytes_max: int,
+    splats_max: int | None,
+    progress: Callable[[str, float], None],
+) -> None:
+    header = _read_header(view, findings)
+    if header is None:
+        findings.skip("everything behind the magic and the version", "this is no file of this version")
+        return
+    _check_length(view, header.record.file_size, findings)
+    end = _index_end(view, header, findings)
+    if end is None:
+        findings.skip("index and chunks", "the index is not whole")
+        return
+    index = read_records(view, end - _CRC_SIZE, findings)
+    counts.splats = index.head.record.splat_count
+    directory = read_directory(view, index.end, end - _CRC_SIZE, index, findings) if index.complete else []
+    tiles: list[Tile] = []
+    if index.complete:
+        tiles = read_tiles(view, index.end, end - _CRC_SIZE, index, findings)
+        index.complete = len(tiles) == index.head.record.tile_count
+    else:
+        findings.skip("directory and tiles", "the records before them leave the index")
+    counts.tiles = len(tiles)
+    chunks = [*directory, *(chunk for tile in tiles for chunk in tile.chunks)]
+    if index.complete:
+        check_coverage(findings, chunks, end, header.record.file_size, len(view))
+    else:
+        findings.skip("the chunks", "the index does not name all of them")
+        return
+    books = _read_directory_chunks(view, directory, index, json_bytes_max, findings)
+    if splats_max is not None and sum(tile.count for tile in tiles) > splats_max:
+        findings.of("LIM-1", index.head, "splat_count", f"{counts.splats} splats, the budget is {splats_max}")
+        findings.skip("the tiles", "there are more splats than the budget allows")
+        return
+    _read_tile_chunks(view, tiles, index, books, findings, progress)
+
+
+# Header --------------------------------------------------------------------------------------------
+
+
+def _read_header(view: memoryview, findings: Findings) -> Header | None:
+    """HDR-1 to HDR-4, HDR-11; `None` if nothing more can be said."""
+    magic = bytes(view[: len(_spec.MAGIC)])
+    if len(view) < _spec.HEADER_SIZE:
+        if _spec.MAGIC.startswith(magic):
+            findings.add("HDR-11", len(view), "header", f"the data ends here, a header has {_spec.HEADER_SIZE} bytes")
+        else:
+            findings.add("HDR-11", 0, "header.magic", f"{magic.hex(' ')} is no magic", _spec.ERROR_MAGIC)
+        return None
+    header = read_record(view, _spec.unpack_header, _spec.HEADER_OFFSETS, 0, "header")
+    record = header.record
+    if magic != _spec.MAGIC:
+        findings.of("HDR-1", header, "magic", f"{magic.hex(' ')}, wanted {_spec.MAGIC.hex(' ')}")
+        return None
+    version = (record.version_major, record.version_minor)
+    wanted = (_spec.VERSION_MAJOR, _spec.VERSION_MINOR)
+    if version != wanted:
+        message = f"{version[0]}.{version[1]}, this validator knows {wanted[0]}.{wanted[1]}"
+        findings.of("HDR-2", header, "version_major", message)
+        return None
+    end = _spec.HEADER_OFFSETS["header_crc"]
+    computed = zlib.crc32(view[:end])
+    if record.header_crc != computed:
+        findings.of("HDR-3", header, "header_crc", f"{record.header_crc:#010x}, computed {computed:#010x}")
+    findings.checks.append("header_crc")
+    if record.profile not in _spec.PROFILE_NAMES:
+        findings.of("HDR-4", header, "profile", f"{record.profile} is no profile that this version uses")
+    findings.reserved(header)
+    return header
+
+
+def _check_length(view: memoryview, size: int, findings: Findings) -> None:
+    """HDR-5, HDR-6."""
+    if len(view) < size:
+        findings.add("HDR-5", len(view), "end of the data", f"{len(view)} bytes, the header states {size}")
+    elif len(view) > size:
+        findings.add("HDR-6", size, "end of the file", f"{len(view) - size} bytes follow the {size} of the file")
+
+
+def _index_end(view: memoryview, header: Header, findings: Findings) -> int | None:
+    """HDR-7, IDX-1; where the index ends, `None` if it has no room for its head or leaves the data."""
+    size, file_size = header.record.index_size, header.record.file_size
+    least = _spec.INDEX_HEAD_SIZE + _CRC_SIZE
+    end = _spec.HEADER_SIZE + size
+    if size < least or end > file_size:
+        message = f"{size}, wanted {least} to {file_size - _spec.HEADER_SIZE}"
+        findings.of("HDR-7", header, "index_size", message)
+    if size < least or end > len(view):
+        return None
+    at = end - _CRC_SIZE
+    stored, computed = int.from_bytes(view[at:end], "little"), zlib.crc32(view[_spec.HEADER_SIZE : at])
+    if stored != computed:
+        findings.add("IDX-1", at, "index.crc", f"{stored:#010x}, computed {computed:#010x}")
+    findings.checks.append("index_crc")
+    return end
+
+
+# Chunks --------------------------------------------------------------------------------------------
+
+
+def _read_directory_chunks(
+    view: memoryview, directory: list[Chunk], index: Index, json_bytes_max: int, findings: Findings
+) -> CodebookEntries:
+    """Read every chunk of the directory, used or not, known or not (CHK-2)."""
+    books: CodebookEntries = {}
+    for chunk in directory:
+        if not chunk.whole:
+            continue
+        payload = check_frame(view, chunk, _END_CLAUSES.get(chunk.kind, "CHK-3"), findings)
+        if chunk.kind in _TEXT_CHUNKS:
+            _read_payload(payload, findings, partial(read_text, payload, chunk.kind, json_bytes_max))
+        elif chunk.kind == _spec.CHUNK_STATED_ERRORS:
+            _read_payload(payload, findings, partial(read_declared_bounds, payload, index))
+        elif chunk.kind == _spec.CHUNK_CODEBOOK:
+            _read_payload(payload, findings, partial(read_codebook, payload, chunk, index, books))
+    return books
+
+
+def _read_tile_chunks(
+    view: memoryview,
+    tiles: list[Tile],
+    index: Index,
+    books: CodebookEntries,
+    findings: Findings,
+    progress: Callable[[str, float], None],
+) -> None:
+    let_go = LetGo(view)
+    for tile in tiles:
+        progress(_STAGE, tile.place / len(tiles))
+        let_go.after(sum(chunk.size for chunk in tile.chunks))
+        reader = TileChecker(view, index, tile, books, findings)
+        for chunk in sorted(tile.chunks, key=lambda chunk: chunk.layer):
+            if not chunk.whole:
+                reader.lost.add(chunk.layer)
+                continue
+            payload = check_frame(view, chunk, "TLE-3", findings)
+            if not _read_payload(payload, findings, partial(reader.read_layer, payload, chunk)):
+                reader.lost.add(chunk.layer)
+    findings.checks.append("all_chunk_crcs")
+    findings.checks.append("all_values")
+    progress(_STAGE, 1.0)
+
+
+def _read_payload(payload: Payload, findings: Findings, read: Callable[[], None]) -> bool:
+    """Read a payload; note the rest of it as not checked if its structure is lost."""
+    try:
+        read()
+    except UnreadableError:
+        findings.skip(f"{payload.name} from byte {payload.at} on", "what it holds cannot be told")
+        return False
+    return True
