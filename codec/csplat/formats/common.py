@@ -203,7 +203,7 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 def crossed_bounds(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return True where a lower bound exceeds the upper one by more than a rounding of float32."""
+    """Return a mask of lower bounds that exceed the upper one by more than a rounding of float32."""
     above: NDArray[np.bool_] = low > np.nextafter(high.astype(np.float32), np.float32(np.inf))
     return above
 

@@ -72,7 +72,7 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
 
     Args:
         path: path of the file.
-        findings: anything noticed is appended.
+        findings: findings are appended to this list.
         kind: name of the expected kind of PLY, a key of `csplat.detect.KINDS`.
 
     Raises:

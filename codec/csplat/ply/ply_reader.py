@@ -161,7 +161,7 @@ def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
 
     Args:
         path: path of the file.
-        findings: anything noticed is appended.
+        findings: findings are appended to this list.
 
     Returns:
         The content; `None` if the findings hold an error.
@@ -348,7 +348,7 @@ def _read_again(path: Path, header: PlyHeader, findings: list[Finding], error: A
     Args:
         path: path of the file.
         header: its header.
-        findings: anything noticed is appended.
+        findings: findings are appended to this list.
         error: the error that plyfile raised.
     """
     if not header.is_text or error.message == _EARLY_END:

@@ -147,16 +147,18 @@ class GltfDocument:
         Raises:
             InputError: it does not exist, has another type, or exceeds its buffer.
         """
-        said = self.item("accessors", index)
+        record = self.item("accessors", index)
         place = ("accessors", _shorten(index))
-        dtype, kind = _DTYPES.get(self.integer(said, place, "componentType")), self.get(said, place, "type", str)
+        dtype, kind = _DTYPES.get(self.integer(record, place, "componentType")), self.get(record, place, "type", str)
         if dtype is None or _WIDTHS.get(kind) != width:
-            raise self.error(place, f"found {_shorten(kind)} of {said['componentType']}, wanted {width} numbers")
-        if "sparse" in said or "bufferView" not in said:
-            what = "sparse accessors are not read" if "sparse" in said else "it has no bufferView: an extension has it"
-            raise self.error(place, what)
-        count, offset = self.integer(said, place, "count"), self.integer(said, place, "byteOffset", 0)
-        data, stride = self.view(said["bufferView"])
+            raise self.error(place, f"found {_shorten(kind)} of {record['componentType']}, wanted {width} numbers")
+        if "sparse" in record or "bufferView" not in record:
+            reason = (
+                "sparse accessors are not read" if "sparse" in record else "it has no bufferView: an extension has it"
+            )
+            raise self.error(place, reason)
+        count, offset = self.integer(record, place, "count"), self.integer(record, place, "byteOffset", 0)
+        data, stride = self.view(record["bufferView"])
         size = np.dtype(dtype).itemsize * width
         stride = stride or size
         if stride < size:
@@ -166,27 +168,27 @@ class GltfDocument:
         rows: NDArray[Any] = np.zeros((0, width), dtype)
         if count:
             rows = np.ndarray((count, width), dtype, data, offset, (stride, size // width))
-        return Accessor(rows, self.get(said, place, "normalized", bool, False))
+        return Accessor(rows, self.get(record, place, "normalized", bool, False))
 
     def view(self, index: object) -> tuple[memoryview, int]:
         """Return the bytes of a buffer view and its stride; 0: rows are adjacent."""
-        said, place = self.item("bufferViews", index), ("bufferViews", _shorten(index))
-        if said.get("extensions"):
+        record, place = self.item("bufferViews", index), ("bufferViews", _shorten(index))
+        if record.get("extensions"):
             raise self.error(
                 (*place, "extensions"),
-                f"{_list_names(said['extensions'])}: packed buffers are not read, gltf-transform unpacks them",
+                f"{_list_names(record['extensions'])}: packed buffers are not read, gltf-transform unpacks them",
             )
-        buffer = self._buffer(self.integer(said, place, "buffer"))
-        start, length = self.integer(said, place, "byteOffset", 0), self.integer(said, place, "byteLength")
+        buffer = self._buffer(self.integer(record, place, "buffer"))
+        start, length = self.integer(record, place, "byteOffset", 0), self.integer(record, place, "byteLength")
         if start + length > len(buffer):
-            short = ": the file is truncated" if said["buffer"] in self.short else ""
+            short = ": the file is truncated" if record["buffer"] in self.short else ""
             raise self.error(place, f"bytes {start} to {start + length} of a buffer of {len(buffer)}{short}")
-        return buffer[start : start + length], self.integer(said, place, "byteStride", 0)
+        return buffer[start : start + length], self.integer(record, place, "byteStride", 0)
 
     def _buffer(self, index: int) -> memoryview:
         if index not in self._buffers:
-            said, place = self.item("buffers", index), ("buffers", index)
-            uri, length = self.get(said, place, "uri", str), self.integer(said, place, "byteLength")
+            record, place = self.item("buffers", index), ("buffers", index)
+            uri, length = self.get(record, place, "uri", str), self.integer(record, place, "byteLength")
             if uri is not None:
                 data = self._read_uri(uri, (*place, "uri"))
             elif index == 0 and self.binary is not None:
@@ -275,17 +277,17 @@ class GltfDocument:
         if not isinstance(scenes, list) or len(scenes) < 2 or "scene" in self.root:
             return ""
         names = [one.get("name") if isinstance(one, dict) else None for one in scenes]
-        said = [f"{index}{f' ({_shorten(name)})' if name else ''}" for index, name in enumerate(names)]
-        shown = ", ".join(said[1:4]) + (", ..." if len(said) > 4 else "")
-        return f"{len(scenes)} scenes and no default: scene {said[0]} is read, {shown} not"
+        labels = [f"{index}{f' ({_shorten(name)})' if name else ''}" for index, name in enumerate(names)]
+        shown = ", ".join(labels[1:4]) + (", ..." if len(labels) > 4 else "")
+        return f"{len(scenes)} scenes and no default: scene {labels[0]} is read, {shown} not"
 
     def instances(self, placed: PlacedPrimitive) -> NDArray[np.float64]:
         """Return the matrices [I, 4, 4] from a primitive to the world: one, or those of EXT_mesh_gpu_instancing."""
-        said = _extension(placed.node, _INSTANCING)
-        if not said:
+        extension = _extension(placed.node, _INSTANCING)
+        if not extension:
             return placed.matrix[None]
         place = (*placed.node_place, "extensions", _INSTANCING)
-        attributes = self.get(said, place, "attributes", dict, {})
+        attributes = self.get(extension, place, "attributes", dict, {})
         widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
         rows = {name: self.accessor(attributes[name], width) for name, width in widths.items() if name in attributes}
         counts = {len(one.rows) for one in rows.values()}
@@ -383,8 +385,8 @@ def _split_chunks(path: Path, data: memoryview) -> tuple[memoryview, memoryview 
 def _extension(holder: dict[str, Any], name: str) -> dict[str, Any]:
     """Return an extension object, empty if there is none."""
     extensions = holder.get("extensions")
-    said = extensions.get(name) if isinstance(extensions, dict) else None
-    return said if isinstance(said, dict) else {}
+    found = extensions.get(name) if isinstance(extensions, dict) else None
+    return found if isinstance(found, dict) else {}
 
 
 def _as_list(value: object) -> list[Any]:

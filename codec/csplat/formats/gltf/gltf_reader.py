@@ -114,8 +114,8 @@ class _GltfReading:
         """Yield an instance per node instance of a primitive; none if it has no splats."""
         place = (*placed.place, "extensions")
         extensions = self.file.get(placed.primitive, placed.place, "extensions", dict, {})
-        said = self.file.get(extensions, place, EXTENSION, dict, {})
-        within = self.file.get(said, (*place, EXTENSION), "extensions", dict, {})
+        extension = self.file.get(extensions, place, EXTENSION, dict, {})
+        within = self.file.get(extension, (*place, EXTENSION), "extensions", dict, {})
         packed = next((one for one in _SPZ if one in within or one in extensions), "")
         if EXTENSION not in extensions and not packed:
             return
@@ -123,16 +123,16 @@ class _GltfReading:
         unknown += [one for one in extensions if one in self.required and one not in {EXTENSION, *_SPZ, *_HARMLESS}]
         if unknown:
             raise self.file.error(place, f"{', '.join(map(str, unknown))} is not understood, and the splats use it")
-        self._check(placed, said, (*place, EXTENSION), packed=bool(packed))
+        self._check(placed, extension, (*place, EXTENSION), packed=bool(packed))
         if packed:
             inner = (*place, packed) if packed in extensions else (*place, EXTENSION, "extensions", packed)
             holder = within if packed in within else extensions
             view = self.file.integer(self.file.get(holder, inner[:-1], packed, dict), inner, "bufferView")
-            block, count = self._packed_block(placed, view, draft="kernel" not in said)
+            block, count = self._packed_block(placed, view, draft="kernel" not in extension)
             bad = infinite = 0
         else:
             block, count, (bad, infinite) = self._plain_block(placed)
-        if said.get("colorSpace") == _LINEAR:
+        if extension.get("colorSpace") == _LINEAR:
             self.linear_samples.append(partial(block, slice(0, count, max(1, count // _SAMPLE))))
             block = partial(_decode_in_srgb, block)
         for matrix in self.file.instances(placed):
@@ -158,16 +158,16 @@ class _GltfReading:
                 return
         self.findings.append(finding)
 
-    def _check(self, placed: PlacedPrimitive, said: dict[str, Any], place: JsonPath, *, packed: bool) -> None:
+    def _check(self, placed: PlacedPrimitive, extension: dict[str, Any], place: JsonPath, *, packed: bool) -> None:
         """Refuse other kernels, colour spaces and projections; drafts with SPZ name none of them."""
         absent = {None} if packed else set()
         known = {"kernel": {"ellipse"} | absent, "colorSpace": {COLOURS, _LINEAR} | absent}
         attributes = self.file.get(placed.primitive, placed.place, "attributes", dict, {})
-        if not packed and "kernel" not in said and f"{EXTENSION}:OPACITY" not in attributes:
+        if not packed and "kernel" not in extension and f"{EXTENSION}:OPACITY" not in attributes:
             draft = f"an early draft of {EXTENSION} (2025), which has no kernel, and opacities in COLOR_0"
             raise self.file.error(place, f"{draft}: export it again with a newer version of the program")
         for key, values in (*known.items(), ("projection", {"perspective", None})):
-            found = self.file.get(said, place, key, str)
+            found = self.file.get(extension, place, key, str)
             if found not in values:
                 wanted = " or ".join(str(one) for one in sorted(one for one in values if one))
                 raise self.file.error((*place, key), f"found {found!r}, which is not understood, wanted {wanted}")
@@ -246,12 +246,12 @@ class _GltfReading:
         packed = self.packed[view]
         degree = packed.degree if self.sh_degree is None else min(packed.degree, self.sh_degree)
         attributes = file.get(placed.primitive, placed.place, "attributes", dict, {})
-        said = file.item("accessors", attributes["POSITION"]) if "POSITION" in attributes else {}
-        count = said.get("count", packed.count)
+        positions = file.item("accessors", attributes["POSITION"]) if "POSITION" in attributes else {}
+        count = positions.get("count", packed.count)
         if count != packed.count:
             raise file.error((*placed.place, "attributes", "POSITION"), f"{count} rows, its SPZ has {packed.count}")
         rotation = axes_rotation(packed.axes, AXES)
-        stored, by = self._lies_as_stored(packed, said, rotation, draft=draft)
+        stored, by = self._lies_as_stored(packed, positions, rotation, draft=draft)
         if stored:
             text = f"SPZ whose positions lie along the axes of glTF as they are stored, {by}: not turned to {AXES}"
             self._report(Finding("spz-axes", packed.count, text, "note"))
@@ -263,10 +263,10 @@ class _GltfReading:
         return block, packed.count
 
     def _lies_as_stored(
-        self, packed: SpzArrays, said: dict[str, Any], rotation: F64, *, draft: bool
+        self, packed: SpzArrays, positions: dict[str, Any], rotation: F64, *, draft: bool
     ) -> tuple[bool, str]:
         """Return True if positions are stored along glTF's axes; and the evidence."""
-        bounds = [said.get(name) for name in ("min", "max")]
+        bounds = [positions.get(name) for name in ("min", "max")]
         numbers = [one for each in bounds if isinstance(each, list) for one in each]
         if len(numbers) == 6 and packed.count and all(type(one) in (int, float) for one in numbers):
             wanted = np.array(numbers, np.float64).reshape(2, 3)
@@ -349,8 +349,8 @@ def _conclude(reading: _GltfReading) -> None:
                 (measure_srgb_error(model) for model in (sample() for sample in reading.linear_samples) if len(model)),
                 default=0.0,
             )
-        except InputError as wrong:
-            raise InputError(f"{reading.file.path.name}: {wrong}") from None
+        except InputError as failure:
+            raise InputError(f"{reading.file.path.name}: {failure}") from None
         text = f"colours are linear ({_LINEAR}): fitted to sRGB, {error:.2f} of 255 steps off (rms)"
         text += "; splats in front of one another blend in linear light there, and in sRGB here"
         reading.findings.append(Finding("linear-colours", reading.count, text, "repair"))

@@ -278,8 +278,8 @@ def _read_bounds(means: JsonValue) -> NDArray[np.float64]:
 def _read_ends(section: JsonValue, channels: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     low, high = (section[name].numbers(channels, channels) for name in ("mins", "maxs"))
     for channel in np.flatnonzero(crossed_bounds(low, high))[:1]:
-        said = f"mins {low[channel]:.6g} above maxs {high[channel]:.6g}, expected at most that"
-        section.parts.refuse(f"{section.place} has {said}")
+        reason = f"mins {low[channel]:.6g} above maxs {high[channel]:.6g}, expected at most that"
+        section.parts.refuse(f"{section.place} has {reason}")
     return low, high
 
 
