@@ -80,7 +80,7 @@ def test_a_file_is_written_twice_with_the_same_splats(make_model):
 
 def test_what_is_said_stands_in_the_options(make_model):
     said = {"simplified": {"why": "a test"}, "more": 7}
-    result = encode_with_report(make_model(50, 0), said=said)
+    result = encode_with_report(make_model(50, 0), metadata=said)
     options = read_options(result.data)
     assert result.report.options == options
     assert said == {name: options[name] for name in said}

@@ -39,7 +39,7 @@ def unequal(model, seed=0, spread=3.0):
 
 
 def important(model, **changes):
-    return Importance(np.ones(len(model)), curvatures=replace(unequal(model), **changes))
+    return Importance(np.ones(len(model)), blocks=replace(unequal(model), **changes))
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ def test_what_rounding_loses_is_foretold():
     options = EncodeOptions(attribute_psnr=58)
     importance = measure_importance(scene, views, (0.0, 0.0, 0.0), threads=None)
     plan = choose_parameters(scene, options, importance_given=True)
-    foretold = rounding_errors(scene, importance.curvatures, plan).sum()
+    foretold = rounding_errors(scene, importance.blocks, plan).sum()
     decoded = csplat.decode(encode_with_report(scene, options).data)
     lost = np.mean([np.mean(np.square(render(decoded, view).rgb - render(scene, view).rgb)) for view in views])
     assert foretold / 1.6 < lost < 1.6 * foretold
@@ -139,7 +139,7 @@ def test_what_matters_more_is_kept_better(model, name):
     if name == "scales":
         decoded = replace(decoded, scales=np.sort(decoded.scales, axis=1))
     errors = np.abs(getattr(decoded, name) - getattr(source, name)[result.source_index]).reshape(COUNT, -1).mean(axis=1)
-    order = np.argsort(importance.curvatures.means[result.source_index])
+    order = np.argsort(importance.blocks.means[result.source_index])
     assert errors[order[-COUNT // 10 :]].mean() < 0.75 * errors[order[: COUNT // 10]].mean()
 
 
@@ -166,7 +166,7 @@ def test_few_splats_are_of_one_grade(make_model):
 
 def test_where_nothing_is_lost_all_is_one_grade(model):
     nothing = GaussNewtonBlocks(np.zeros(COUNT), np.zeros((COUNT, 21)), np.zeros(COUNT), np.zeros(COUNT))
-    result, _ = encoded(model, Importance(np.ones(COUNT), curvatures=nothing))
+    result, _ = encoded(model, Importance(np.ones(COUNT), blocks=nothing))
     assert "grades" not in result.report.options
 
 

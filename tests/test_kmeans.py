@@ -70,11 +70,11 @@ def test_shift_keeps_every_partial_sum_below_the_bound(largest):
     points = np.full((2, 45), largest, np.int32)
     points[1] = -largest - 1
     shift = kmeans._shift(points, points)
-    small = kmeans._shift_right(points, shift)
+    small = kmeans._divide(points, shift)
     norm = float((small**2).sum(1).max())
     assert shift > 0
     assert norm * 1.5 < kmeans._EXACT
-    assert kmeans._shift_right(points, shift - 1).max() ** 2 * 45 * 1.5 > kmeans._EXACT / 4
+    assert kmeans._divide(points, shift - 1).max() ** 2 * 45 * 1.5 > kmeans._EXACT / 4
 
 
 @pytest.mark.parametrize("entry_count", [2, 300])

@@ -449,7 +449,7 @@ def test_a_search_grades_by_what_it_measured_beside_an_importance_that_is_given(
 @pytest.mark.slow
 def test_sensitivity_is_measured_where_it_changes_something(scene, unequal, measured):
     """An importance with curvatures is taken as it is, also inside of surroundings; one without keeps its weights."""
-    given = replace(measured, curvatures=None)
+    given = replace(measured, blocks=None)
     bare = replace(scene, shN=scene.shN[:, :0])
     views, plain = views_of(cameras(12)), EncodeOptions()
 

@@ -248,7 +248,7 @@ def test_a_file_gives_back_what_was_written(stored):
 
 def test_views_say_how_precise_splats_have_to_be(stored):
     path, model, found = stored
-    curvatures = read_sensitivity(path, model).importance().curvatures
+    curvatures = read_sensitivity(path, model).importance().blocks
     np.testing.assert_allclose(curvatures.means, found.means_squares / 3.0, rtol=1e-5)
     np.testing.assert_allclose(curvatures.shapes, found.shape_metric / 3.0, rtol=1e-4, atol=1e-9)
 
@@ -263,9 +263,9 @@ def test_virtual_views_do_not_say_it_inside_of_surroundings(stored):
     inside = replace(model, means=means, scales=np.broadcast_to(scales, (len(model), 3)).astype(np.float32))
     assert scene_frame(inside).kind == "surrounding"
     virtual = replace(read, source="virtual")
-    assert encoder_importance(virtual, inside).curvatures is None
-    assert encoder_importance(read, inside).curvatures is not None
-    assert encoder_importance(virtual, model).curvatures is not None
+    assert encoder_importance(virtual, inside).blocks is None
+    assert encoder_importance(read, inside).blocks is not None
+    assert encoder_importance(virtual, model).blocks is not None
 
 
 def test_a_file_is_refused_for_another_scene(stored):

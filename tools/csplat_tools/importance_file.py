@@ -52,7 +52,7 @@ def encoder_importance(
         return found
     weights = found.importance()
     if found.source == "virtual" and scene_frame(model).kind == "surrounding":
-        return replace(weights, curvatures=None)
+        return replace(weights, blocks=None)
     return weights
 
 
@@ -92,7 +92,7 @@ def encode_by_importance(
     said = {"unseen": len(model) - len(rows), "views": stored.view_count, "source": stored.source}
     result = encode_with_report(
         model.select(rows), options, importance=weights.select(rows) if isinstance(weights, Importance) else None,
-        origin=Origin(len(model), rows), said={"pruned": said}, progress=progress,
+        origin=Origin(len(model), rows), metadata={"pruned": said}, progress=progress,
     )  # fmt: skip
     if stored.missed_share > 0.0:  # False for NaN: no view was held out
         missed = (
@@ -105,7 +105,7 @@ def encode_by_importance(
 
 def _unheeded(options: EncodeOptions, weights: NDArray[Any] | Importance) -> tuple[str, ...]:
     """Return a note if quantisation classes were requested and the importance cannot provide them."""
-    if (options.grades or 1) == 1 or (isinstance(weights, Importance) and weights.curvatures is not None):
+    if (options.grades or 1) == 1 or (isinstance(weights, Importance) and weights.blocks is not None):
         return ()
     return (_ONE_GRADE,)
 

@@ -1,4 +1,10 @@
-"""Lattice steps, levels and codings of a file, chosen from the options and the scene."""
+"""Coding parameters of a file: steps, levels and codings, chosen from options, preset and scene.
+
+One number, the quality in dB, sets all steps. Errors in renders that one step causes differ between scenes by a factor
+of ten; most of that is explained by three statistics. A moved, turned or resized splat is visible as far as its
+neighbours have another colour; a displacement in proportion to the scene's extent on the screen; a rotation in
+proportion to the splat's size on the screen.
+"""
 
 from __future__ import annotations
 
@@ -14,25 +20,34 @@ from csplat import _spec
 from csplat.encoder.encode_options import PRESETS, EncodeOptions
 from csplat.encoder.entropy import DeflateSettings, deflate_library, morton_codes
 from csplat.model import SplatModel
-from csplat.types import F32
+from csplat.types import F32, F64
 
-_EXTENT_SAMPLE = 1 << 16  # splats from which sizes and extents are estimated
-_EDGE = 0.02  # share of splats on either side that does not count as the scene's extent
-_MOST_BITS = 16  # per axis of a tile
-_LEAST_STEP = 1e-250
-_LOOK = 1024  # splats of which few scenes pass for multiples of a power of two
-_FINER = 0.8  # of a step: how fine the source's grid may be, and be worth its bits
-_HALF_DIAGONAL = 3.0**0.5 / 2.0  # of a lattice cell, in steps: no centre is moved farther
+#: Colour of a channel per degree-0 coefficient.
+COLOUR_PER_SH0 = 0.28209479177387814
+
+_EXTENT_SAMPLE = 1 << 16  # splats from which the extent is estimated
+_EDGE = 0.02  # fraction of the splats on either side of an axis that are outside the extent
+_BITS_MAX = 16  # per axis of a tile
+_STEP_MIN = 1e-250  # scene units
+_GRID_TRIAL = 1024  # splats to try first: few scenes that are not on a grid pass
+_GRID_MIN = 0.8  # smallest step of the source's grid that is used, as a multiple of the chosen step
+_HALF_DIAGONAL = 3.0**0.5 / 2.0  # largest displacement of a mean, in steps
+_STATISTICS_SAMPLE = 1 << 16  # splats
+_RUNS = 16  # runs of neighbours among the sampled splats
+_NEIGHBOUR_DISTANCE = 8  # places in Morton order
+_CORE = 0.8  # fraction of the splats within the scene's reach
+_CODE_BITS = 16  # of a Morton code, per axis
+_CELLS_MAX = 1e38  # cells per scene unit, within float32
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """The positions' lattice.
+    """The lattice of the means.
 
     Attributes:
-        step: of the file, scene units, > 0.
-        bits: per axis and tile at most, 1 to 16; a tile whose box needs more is cut or coarsened.
-        finest: tiles use all their bits (a step given in bits) instead of stopping at `step`.
+        step: the file's step, scene units, > 0.
+        bits: maximum per axis and tile, 1 to 16; a tile whose box needs more is cut or coarsened.
+        finest: tiles use all their bits (the step was given in bits) instead of stopping at `step`.
         strict: no tile has a coarser step, however many tiles that takes.
     """
 
@@ -44,7 +59,7 @@ class Lattice:
 
 @dataclass(frozen=True)
 class StepFactors:
-    """By how much the steps of a tile's attributes are coarser than the file's, by choice (grades.py).
+    """Factors by which the steps of a tile are coarser than the file's: those of its quantisation class.
 
     Attributes:
         opacities, quats: integers are multiples of this, >= 1.
@@ -63,22 +78,26 @@ SAME_STEPS = StepFactors()
 
 @dataclass(frozen=True)
 class CodingParameters:
-    """Everything that is decided before the first splat is quantised.
+    """Everything that is chosen before the first splat is quantised.
 
     Attributes:
-        lattice: of the means.
+        lattice: lattice of the means.
         morton: means are coded MORTON and splats are sorted; otherwise AXIS, in the model's order.
-        sh_degree: bands that are kept.
         scale_step, sh0_step, sh_step: lattice steps, rounded to float32.
-        sh_coding: "auto", "codebook", "scalar" or "none"; the SH stage settles "auto".
-        codebook_step: lattice step of the bands 1 to 3 if they get a codebook, whose entries are worth more precision.
+        opacity_levels, quat_levels: M of spec 7.3 and 7.5.
+        chroma_shift: chroma is coarser than luma by 2**chroma_shift.
+        sh_degree: SH degree to keep.
+        codebook_step: lattice step of the bands 1 to 3 with a codebook, whose entries deserve more precision.
         codebook_share: entries per splat.
-        codebook_most: entries at most.
-        escape_fraction: share of the splats that are coded directly.
-        escape_coarse: their values are multiples of 2**escape_coarse steps.
-        deflate: how streams are coded.
-        canonical: rotations and scales are in their gauge, and are to stay as they are, though they may have left it a
-            little: the integers that the tuning of a frozen scene saw are those that are written.
+        codebook_most: maximum number of entries.
+        escape_fraction: fraction of the splats to escape.
+        escape_coarse: values of escapes are multiples of 2**escape_coarse steps.
+        sh_coding: "auto", "codebook", "scalar" or "none"; "auto" until `choose_sh_coding`.
+        adaptive: how much coarser the SH of unimportant splats is, 0 to 1.
+        tile_splats: maximum number of splats per tile.
+        deflate: level and library of DEFLATE.
+        canonical: shapes are in canonical axis order already, and are not to be reordered even if tuning moved them
+            across its boundary: the integers written are those that tuning saw.
     """
 
     lattice: Lattice
@@ -128,15 +147,17 @@ class CodingParameters:
         return records
 
 
-def band_slice(band: int) -> slice:
-    """Return the coefficients of an SH band among those of the bands 1 to 3."""
-    return slice(band * band - 1, (band + 1) ** 2 - 1)
-
-
 def choose_parameters(
     model: SplatModel, options: EncodeOptions, *, importance_given: bool, contrast: float | None = None
 ) -> CodingParameters:
-    """Resolve options, preset and scene, of which `contrast` may be known, into a plan."""
+    """Choose the coding parameters of a scene.
+
+    Args:
+        model: the scene.
+        options: presets and knobs.
+        importance_given: the caller knows the importance of the splats.
+        contrast: contrast of the scene, if the model is a sample of it; see `measure_contrast`.
+    """
     preset = PRESETS[options.preset]
     degree = model.sh_degree if options.sh_degree is None else min(options.sh_degree, model.sh_degree)
     if options.sh_coding == "none":
@@ -173,9 +194,52 @@ def choose_parameters(
     )
 
 
+def band_slice(band: int) -> slice:
+    """Return the coefficients of an SH band among those of the bands 1 to 3."""
+    return slice(band * band - 1, (band + 1) ** 2 - 1)
+
+
+@dataclass(frozen=True)
+class SceneStatistics:
+    """Statistics of a scene.
+
+    Attributes:
+        reach: distance from the median of the means within which 80 % of the splats lie, scene units, >= 0.
+        contrast: rms difference of the colours of neighbours, weighted by their opacities, in [0.02, 1].
+        size: median of the largest standard deviation, as a fraction of the reach, in [1e-4, 1].
+    """
+
+    reach: float
+    contrast: float
+    size: float
+
+
+def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneStatistics:
+    """Measure a sample of a scene; deterministic.
+
+    Args:
+        model: the scene.
+        contrast: see `measure_contrast`, if the model is itself a sample, without neighbours.
+    """
+    if len(model) == 0:
+        return SceneStatistics(0.0, 0.2, 0.01)
+    points, reach = _reach(model.means)
+    largest = np.take(model.scales, _spread(len(model)), axis=0).max(axis=1)
+    size = float(np.exp(np.clip(np.median(largest), -80, 80))) / reach if reach else 1.0
+    if contrast is None:
+        contrast = _rms(*_contrast(model, points, reach))
+    return SceneStatistics(reach, float(np.clip(contrast, 0.02, 1.0)), float(np.clip(size, 1e-4, 1.0)))
+
+
+def measure_contrast(parts: Iterable[SplatModel]) -> float:
+    """Return the contrast of a scene of which these are parts, each with all splats of its region."""
+    sums = [_contrast(part, *_reach(part.means)) for part in parts if len(part)]
+    return _rms(sum(squares for squares, _ in sums), sum(weights for _, weights in sums))
+
+
 @dataclass(frozen=True)
 class _AttributeSteps:
-    """Lattice steps and level counts; `means` is 0 where the scene has no extent."""
+    """Lattice steps and levels; `means` is 0 if the scene has no extent."""
 
     means: float
     scales: float
@@ -188,9 +252,9 @@ class _AttributeSteps:
 def _steps(statistics: SceneStatistics, quality: float, sh_quality: float, *, has_sh: bool) -> _AttributeSteps:
     """Choose the steps at which each attribute alone costs about `quality` dB.
 
-    The factors are the medians over ten scenes of the step that costs 50 dB, divided by the scene's statistics; a
-    quarter to a third of spread remains (2 to 3 dB). Bits are spent best where every dimension errs alike; the
-    differences of quality between attributes are where that was found to lie, with and without SH.
+    The factors are the medians over ten scenes of the step that costs 50 dB, divided by the scene's statistics; they
+    scatter by a quarter to a third (2 to 3 dB). Bytes are fewest if every dimension has the same error; the differences
+    of quality between attributes were found by search, with and without SH.
     """
     contrast = statistics.contrast
     for_quats, for_sh0 = (0.0, -2.0) if has_sh else (-1.5, 2.5)
@@ -214,14 +278,14 @@ def _default_to(chosen: Any, otherwise: Any) -> Any:
     return otherwise if chosen is None else chosen
 
 
-def _lattice(model: SplatModel, options: EncodeOptions, wanted: float) -> Lattice:
-    """Choose the means' step: given, from an error, from bits over the core of the scene, or by the quality."""
+def _lattice(model: SplatModel, options: EncodeOptions, by_quality: float) -> Lattice:
+    """Choose the step of the means: by an option (error, step, bits over the scene's core), or by the quality."""
     if options.position_error is not None:
-        return Lattice(options.position_error / _HALF_DIAGONAL, _MOST_BITS, strict=True)
+        return Lattice(options.position_error / _HALF_DIAGONAL, _BITS_MAX, strict=True)
     if options.position_step is not None:
-        return Lattice(options.position_step, _MOST_BITS)
+        return Lattice(options.position_step, _BITS_MAX)
     if len(model) == 0:
-        return Lattice(1.0, _MOST_BITS)
+        return Lattice(1.0, _BITS_MAX)
     rows = slice(None, None, max(1, len(model) // _EXTENT_SAMPLE))
     points = np.sort(model.means[rows].astype(np.float64), axis=0)
     edge = int(len(points) * _EDGE)
@@ -230,19 +294,25 @@ def _lattice(model: SplatModel, options: EncodeOptions, wanted: float) -> Lattic
     reach = float(np.abs(core).max())
     if options.position_bits is not None:
         return Lattice(_clamp_step(extent / ((1 << options.position_bits) - 2), reach), options.position_bits, True)
-    step = _source_step(model.means, wanted or extent / (1 << _MOST_BITS))
-    return Lattice(_clamp_step(step, reach), _MOST_BITS)
+    step = _source_step(model.means, by_quality or extent / (1 << _BITS_MAX))
+    return Lattice(_clamp_step(step, reach), _BITS_MAX)
+
+
+def _clamp_step(step: float, reach: float) -> float:
+    """Keep the step normal, and no finer than float32 at the border of the scene's core."""
+    step = max(step, reach * 2.0**-40)
+    return step if np.isfinite(step) and step > _STEP_MIN else 1.0
 
 
 def _source_step(values: F32, step: float) -> float:
-    """Return the grid that the values lie on, where none finer is wanted: they come back as they were, in fewer bits.
+    """Return the step of the grid that the values lie on, unless it is too fine: they are exact in fewer bits.
 
-    Centres and log scales of SPZ, and of what was SPZ once, are multiples of a power of two.
+    Means and log scales that come from SPZ are multiples of a power of two.
     """
-    if not (step > _LEAST_STEP and values.any()):
+    if not (step > _STEP_MIN and values.any()):
         return step
-    grid = 2.0 ** math.ceil(math.log2(_FINER * step))
-    if not (_on_grid(values[:_LOOK], grid) and _on_grid(values, grid)):
+    grid = 2.0 ** math.ceil(math.log2(_GRID_MIN * step))
+    if not (_on_grid(values[:_GRID_TRIAL], grid) and _on_grid(values, grid)):
         return step
     while _on_grid(values, 2.0 * grid):
         grid *= 2.0
@@ -254,67 +324,12 @@ def _on_grid(values: F32, grid: float) -> bool:
         return not np.fmod(values, np.float32(grid)).any()
 
 
-def _clamp_step(step: float, reach: float) -> float:
-    """Keep the step normal, and no finer than float32 is at the end of the scene's core."""
-    step = max(step, reach * 2.0**-40)
-    return step if np.isfinite(step) and step > _LEAST_STEP else 1.0
-
-
-#: A channel's colour per coefficient of degree 0.
-COLOUR_PER_SH0 = 0.28209479177387814
-
-_STATISTICS_SAMPLE = 1 << 16  # splats that are sampled
-_RUNS = 16  # runs of neighbours among the sampled splats
-_NEIGHBOUR_DISTANCE = 8  # places in Morton order
-_CORE = 0.8  # share of the splats within the scene's reach
-_BITS = 16
-_LARGEST = 1e38  # largest cells per scene unit, within float32
-
-
-@dataclass(frozen=True)
-class SceneStatistics:
-    """Three numbers of a scene.
-
-    Attributes:
-        reach: distance from the median centre that 80 % of the splats keep, scene units, >= 0.
-        contrast: rms difference of colours of near splats, weighted with their opacities, in [0.02, 1].
-        size: median of the largest standard deviation, as a share of the reach, in [1e-4, 1].
-    """
-
-    reach: float
-    contrast: float
-    size: float
-
-
-def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneStatistics:
-    """Look at a sample of a scene; the same model gives the same numbers.
-
-    Args:
-        model: the scene.
-        contrast: as in `measure_contrast`, if the model is itself a sample, whose splats are no neighbours.
-    """
-    if len(model) == 0:
-        return SceneStatistics(0.0, 0.2, 0.01)
-    points, reach = _reach(model.means)
-    largest = np.take(model.scales, _spread(len(model)), axis=0).max(axis=1)
-    size = float(np.exp(np.clip(np.median(largest), -80, 80))) / reach if reach else 1.0
-    if contrast is None:
-        contrast = _rms(*_contrast(model, points, reach))
-    return SceneStatistics(reach, float(np.clip(contrast, 0.02, 1.0)), float(np.clip(size, 1e-4, 1.0)))
-
-
-def measure_contrast(parts: Iterable[SplatModel]) -> float:
-    """Contrast of a scene of which these are parts, each with all splats of its place."""
-    sums = [_contrast(part, *_reach(part.means)) for part in parts if len(part)]
-    return _rms(sum(squares for squares, _ in sums), sum(weights for _, weights in sums))
-
-
 def _spread(count: int) -> NDArray[np.intp]:
     return np.arange(0, count, max(1, count // _STATISTICS_SAMPLE))
 
 
-def _reach(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
-    """The centres that are looked at, and how far 80 % of them lie from the median one."""
+def _reach(means: F32) -> tuple[F64, float]:
+    """Return sampled means, and the distance from their median within which 80 % of them lie."""
     points = np.take(means, _spread(len(means)), axis=0).astype(np.float64)
     distance = points - np.median(points, axis=0)
     top = float(np.abs(distance).max())
@@ -325,7 +340,7 @@ def _rms(squares: float, weights: float) -> float:
     return COLOUR_PER_SH0 * float(np.sqrt(squares / weights)) if weights else 0.2
 
 
-def _contrast(model: SplatModel, sample: NDArray[np.float64], reach: float) -> tuple[float, float]:
+def _contrast(model: SplatModel, sample: F64, reach: float) -> tuple[float, float]:
     """Return the summed weighted squares of colour differences of splats a few places apart in Morton order."""
     squares = weights = 0.0
     if len(model) <= _NEIGHBOUR_DISTANCE or not reach:
@@ -339,13 +354,13 @@ def _contrast(model: SplatModel, sample: NDArray[np.float64], reach: float) -> t
     return squares, weights
 
 
-def _neighbours(means: NDArray[np.float32], centre: NDArray[Any], reach: float) -> list[NDArray[np.intp]]:
+def _neighbours(means: F32, centre: NDArray[Any], reach: float) -> list[NDArray[np.intp]]:
     """Return runs of splats in Morton order: all of a small scene, some of a large one."""
     codes = np.empty(len(means), np.int64)
-    scale, top = np.float32(min(1.0 / reach, _LARGEST)), (1 << _BITS) - 1
+    scale, top = np.float32(min(1.0 / reach, _CELLS_MAX)), (1 << _CODE_BITS) - 1
     shift = np.float32(0.5) - (centre / reach).astype(np.float32)
     for at in range(0, len(means), _STATISTICS_SAMPLE):
-        with np.errstate(over="ignore"):  # infinity is clipped like all that is out of reach
+        with np.errstate(over="ignore"):  # infinity is clipped like all that is beyond the reach
             place = means[at : at + _STATISTICS_SAMPLE].T * scale + shift[:, None]
         codes[at : at + _STATISTICS_SAMPLE] = morton_codes((np.clip(place, 0, 1) * top).astype(np.int32))
     if len(means) <= 2 * _STATISTICS_SAMPLE:

@@ -1,4 +1,4 @@
-"""Chunks, index and header (spec 4 and 5): the last stage, and the only one that knows offsets."""
+"""Chunks, index and header of a file (spec 4 and 5): the only module that knows offsets."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from csplat.encoder.entropy import DeflateSettings, unsigned_stream
 
 @dataclass(frozen=True)
 class LazyPayload:
-    """A payload that is read when it is written.
+    """A payload that is read when the file is written.
 
     Attributes:
-        size: its bytes.
-        crc: as in `chunk_crc`.
-        read: gives all of it.
+        size: bytes.
+        crc: see `chunk_crc`.
+        read: returns all of it.
     """
 
     size: int
@@ -37,7 +37,7 @@ Payload = bytes | LazyPayload
 
 @dataclass(frozen=True)
 class FileChunk:
-    """A chunk of the whole file: type, payload, and for codebooks id and layer."""
+    """A chunk of the whole file; codebooks have an id and a layer."""
 
     type: bytes
     payload: Payload
@@ -47,7 +47,7 @@ class FileChunk:
 
 @dataclass(frozen=True)
 class FileTile:
-    """A tile as the index describes it, and the payloads of its layers."""
+    """Index record of a tile, and the payloads of its layers."""
 
     splat_count: int
     exponent: int
@@ -60,7 +60,7 @@ class FileTile:
 
 @dataclass(frozen=True)
 class CodebookTable:
-    """A codebook as the index describes it."""
+    """Index record of a codebook."""
 
     id: int
     kind: int
@@ -70,7 +70,7 @@ class CodebookTable:
 
 @dataclass(frozen=True)
 class SceneFields:
-    """Everything that a file stores about the scene as a whole."""
+    """Everything in a file that is not a tile."""
 
     sh_degree: int
     scene_flags: int
@@ -84,23 +84,23 @@ class SceneFields:
 
 
 def json_payload(value: Any, deflate: DeflateSettings) -> bytes:
-    """Return the payload of a JSON chunk (spec 5.4): keys sorted, so that equal content gives equal bytes."""
+    """Return the payload of a JSON chunk (spec 5.4), keys sorted."""
     text = json.dumps(value, ensure_ascii=False, sort_keys=True, allow_nan=False, separators=(",", ":"))
     return unsigned_stream(np.frombuffer(text.encode(), np.uint8), deflate)
 
 
 def tile_payload(layer: int, blocks: Sequence[bytes]) -> bytes:
-    """Return the payload of a TILE chunk (spec 5.2): a head, and blocks in the order of their ids."""
+    """Return the payload of a TILE chunk (spec 5.2): a head, and blocks in the order of their attributes."""
     return _spec.pack_tile_head(_spec.TileHead(layer, len(blocks), 0)) + b"".join(blocks)
 
 
 def write_file(scene: SceneFields, tiles: Sequence[FileTile]) -> bytes:
-    """Lay out a file in memory; see `file_pieces`."""
+    """Return a whole file; see `file_pieces`."""
     return b"".join(file_pieces(scene, tiles))
 
 
 def file_pieces(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[bytes]:
-    """Lay out header, index and chunks in the order the spec recommends (4.3.6), and give the file piece by piece."""
+    """Yield a file piece by piece: header, index, and chunks in the recommended order (spec 4.3.6)."""
     index_size = _index_size(scene, tiles)
     offset = _spec.HEADER_SIZE + index_size
     directory: list[_spec.DirectoryRecord] = []
@@ -144,7 +144,7 @@ def _ordered_chunks(
 
 
 def chunk_crc(kind: bytes, payload: Payload) -> int:
-    """CHK-1: of a chunk's header and payload."""
+    """Return the CRC of a chunk's header and payload (CHK-1)."""
     if not isinstance(payload, bytes):
         return payload.crc
     return zlib.crc32(payload, zlib.crc32(_chunk_head(kind, len(payload))))

@@ -1,4 +1,4 @@
-"""Encoder options, and the presets that set those the caller leaves out."""
+"""Options of the encoder, and the presets that supply their defaults."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ Deflate = Literal["auto", "libdeflate", "zlib"]
 
 @dataclass(frozen=True)
 class EncodeOptions:
-    """Every knob of the encoder. `None` leaves the choice to the preset.
+    """Options of the encoder. `None` leaves the choice to the preset.
 
     Attributes:
         preset: "fast", "balanced" or "small".
-        attribute_psnr: PSNR in dB that each attribute alone is to keep, not the file's, which is 5 to 12 dB lower;
-            overrides the preset's. All steps follow from it.
+        attribute_psnr: PSNR in dB of a scene with one quantised attribute; the file's is 5 to 12 dB lower. All steps
+            follow from it; overrides the preset's.
         position_bits: bits per axis of a tile's box, 2 to 16; overrides the step that follows from the quality.
         position_step: lattice step of the means in scene units, > 0; overrides `position_bits`.
-        position_error: largest displacement of a centre, scene units, > 0; overrides both. The step
-            follows from it, and tiles are cut until none needs a coarser one.
+        position_error: largest displacement of a mean, scene units, > 0; overrides both. The step follows from it, and
+            tiles are cut until none needs a coarser one.
         means_coding: "auto", "morton" or "axis".
         scale_step: step of the log scales, > 0.
         opacity_levels: M, 1 to 65535.
@@ -36,27 +36,26 @@ class EncodeOptions:
         sh0_step: step of the degree-0 colour, > 0.
         sh_step: step of the higher SH bands, > 0.
         chroma_shift: chroma is coarser than luma by 2**chroma_shift, 0 to 16.
-        sh_degree: keep bands up to this one, 0 to 3; `None` keeps all.
+        sh_degree: SH degree to keep, 0 to 3; `None` keeps all bands.
         sh_coding: "auto", "codebook", "scalar" or "none".
         codebook_size: entries of the SH codebook.
-        escape_fraction: share of the splats, those with the largest weighted error, whose SH is coded directly, 0 to 1.
-        shape_codebook_size: entries at most of a codebook of shapes (rotation, and scales up to a common factor); 0,
-            the default: none. It is made only if the file becomes smaller.
-        shape_escape_fraction: fraction of the splats, those with the largest weighted error, that keep shapes of their
-            own; by default those whose error would grow by more than the bits are worth, if an importance holds
-            matrices of shapes, and otherwise a twentieth.
+        escape_fraction: fraction of the splats, with the largest weighted errors, that bypass the SH codebook, 0 to 1.
+        shape_codebook_size: maximum number of entries of a codebook of shapes (rotation, and scales up to a common
+            factor); 0, the default: no codebook. It is used only if the file becomes smaller.
+        shape_escape_fraction: fraction of the splats, with the largest weighted errors, that bypass the shape codebook.
+            Default: those whose error would grow by more than the saved bits are worth, if an importance holds a
+            metric of shapes, otherwise 0.05.
         adaptive: how much coarser the SH of unimportant splats is, 0 (not at all) to 1 (their error grows as their
-            importance falls). By default only if an importance is given.
-        grades: quantisation classes that splats are sorted into, at most, 1 to 5: splats whose errors are equally
-            visible share tiles with steps of their own. Only if an importance holds curvatures; by default one per
-            2,500 splats, one in all with the preset "fast".
-        tile_splats: splats per tile at most, 1 to 65536. Decoders spread tiles over cores: 16384 makes scenes of few
-            tiles 1.2 to 3.6 times as fast to decode on four, at most, for up to 1.2 % more bytes; 4096 costs 3 to 6 %.
-        deflate_level: how hard to compress, 1 to 12: the level of libdeflate; zlib stops at 9.
+            importance falls). Default: 0 unless an importance is given.
+        grades: maximum number of quantisation classes, 1 to 5: splats whose errors are equally visible share steps.
+            Only if an importance holds Gauss-Newton blocks. Default: one per 2,500 splats; 1 with the preset "fast".
+        tile_splats: maximum number of splats per tile, 1 to 65536. Decoders spread tiles over cores: 16384 decodes
+            scenes of few tiles 1.2 to 3.6 times as fast on four cores, for up to 1.2 % more bytes; 4096 costs 3 to 6 %.
+        deflate_level: level of DEFLATE, 1 to 12 for libdeflate, 1 to 9 for zlib.
         deflate: "auto", "libdeflate" or "zlib".
-        keep_extra: carry the model's extra columns.
+        keep_extra: write the model's extra columns.
         seed: seed of the k-means.
-        threads: number to use; `None` takes all cores. The bytes do not depend on it.
+        threads: number of threads; `None`: all cores. The bytes do not depend on it.
 
     Examples:
         >>> import csplat
@@ -67,7 +66,7 @@ class EncodeOptions:
         csplat.errors.InputError: preset is 'tiny', wanted one of fast, balanced, small
 
     Raises:
-        InputError: a word is none of those listed, or a number is out of its range.
+        InputError: a word is not one of those listed, or a number is out of range.
     """
 
     preset: PresetName = "balanced"
@@ -109,7 +108,7 @@ class EncodeOptions:
             if number is None or not low <= number <= high:
                 what = "an integer, " if kind is int else ""
                 raise InputError(f"{name} is {value!r}, wanted {what}{low:g} to {high:g}")
-            object.__setattr__(self, name, number)  # a plain number: NumPy's are no JSON
+            object.__setattr__(self, name, number)  # JSON does not know NumPy's numbers
 
     @property
     def thread_count(self) -> int:
@@ -117,7 +116,7 @@ class EncodeOptions:
         return self.threads or os.cpu_count() or 1
 
     def chosen(self) -> dict[str, Any]:
-        """Return what the caller set, by name, without what cannot change the bytes (`threads`)."""
+        """Return the options that the caller set, without `threads`, which cannot change the bytes."""
         return {
             field.name: getattr(self, field.name)
             for field in fields(self)
@@ -130,10 +129,10 @@ class Preset:
     """Settings of a preset.
 
     Attributes:
-        quality: PSNR in dB that each attribute alone keeps, for scenes with SH and for scenes without; steps
-            follow from it and from the scene (plan.py).
+        quality: `attribute_psnr` for scenes with SH and for scenes without; steps follow from it and from the scene
+            (coding_parameters.py).
         sh_quality: the same for the bands 1 to 3, whose bits are expensive.
-        sh_coding: as in `EncodeOptions`, "auto" included.
+        sh_coding: as in `EncodeOptions`.
         adaptive: as in `EncodeOptions`.
         deflate_level: as in `EncodeOptions`.
         codebook_share: entries of an SH codebook per splat.
@@ -154,7 +153,7 @@ class Preset:
 
 
 PRESETS: dict[PresetName, Preset] = {
-    # 255 entries and the escape are a byte, and found in no time; the escapes make up for how few they are.
+    # 255 entries and the escape fit a byte and are searched fast; escapes make up for the small number.
     "fast": Preset((55.0, 63.5), 44.0, "auto", 0.5, 1, codebook_most=255, escape_fraction=0.2),
     "balanced": Preset((53.5, 53.2), 43.0, "auto", 0.5, 12),
     "small": Preset((48.6, 47.2), 39.0, "auto", 0.5, 12, 1 / 32),
@@ -166,7 +165,7 @@ _WORDS = {
     "sh_coding": get_args(ShCoding),
     "deflate": get_args(Deflate),
 }
-_TINY, _HUGE = 1e-250, 1e250  # a float32 over the one, and the other over a float32, stay within float64
+_TINY, _HUGE = 1e-250, 1e250  # a float32 / _TINY and _HUGE / a float32 are within float64
 _RANGES: dict[str, tuple[type[int | float], float, float]] = {
     "attribute_psnr": (float, 10, 120),
     "position_bits": (int, 2, 16),
@@ -194,7 +193,7 @@ _NEVER_NONE = ("tile_splats", "seed")
 
 
 def _number(value: Any, kind: type[int | float]) -> int | float | None:
-    """Return a Python number of that kind, or None if the value is none."""
+    """Return a Python number of that kind, or None if the value is not one."""
     if kind is int:
         return int(value) if isinstance(value, Integral) else None
     return float(value) if isinstance(value, Real) else None

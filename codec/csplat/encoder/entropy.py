@@ -1,4 +1,4 @@
-"""Coded bytes of integers: transforms, DEFLATE, and the blocks of a tile (spec 6)."""
+"""Integers to coded bytes: Morton codes, transforms, DEFLATE, and the blocks of a tile (spec 6)."""
 
 from __future__ import annotations
 
@@ -17,12 +17,20 @@ from csplat.types import I64
 
 Integers = NDArray[Any]
 
-_FASTEST_LEVEL = 1  # DEFLATE level at which samples decide
-_SHORT_RUN = 1.5  # bytes in the mean run, above which RUN_LENGTH may save more than it costs decoders
-_LONG_RUN = 32  # bytes in the mean run, above which it is tried at that level
+_FASTEST_LEVEL = 1  # DEFLATE level at which samples replace trials
+_SHORT_RUN = 1.5  # bytes, mean length from which RUN_LENGTH may save more than it costs decoders
+_LONG_RUN = 32  # bytes, mean length from which it is tried at the fastest level
 _SAMPLE = 4096  # bytes of each of four samples
 _TRIAL_LEVEL = 6  # DEFLATE level of trials: a tenth of the time of the highest, and rarely a different choice
-_GAIN = 0.98  # fraction of the bytes below which runs are worth the time that they cost decoders
+_GAIN = 0.98  # fraction of the bytes, below which runs are worth their time in decoders
+_MOSTLY = 0.9  # fraction of non-zero splats, above which a mask is not worth its time in decoders
+_SPREAD = (  # shifts and masks that put two zeros between bits
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,20 @@ class DeflateSettings:
             raise InputError(f"the level of DEFLATE is {self.level}, wanted 1 to 12")
 
 
+def deflate_library(wanted: str) -> str:
+    """Resolve "auto" to libdeflate if its package is installed, else zlib.
+
+    Raises:
+        InputError: libdeflate is requested by name and its package is not installed.
+    """
+    present = importlib.util.find_spec("deflate") is not None
+    if wanted == "libdeflate" and not present:
+        raise InputError("deflate: the package 'deflate' is not installed, use auto or zlib")
+    if wanted == "auto":
+        return "libdeflate" if present else "zlib"
+    return wanted
+
+
 def unsigned_stream(
     values: Integers, deflate: DeflateSettings, *, delta: bool = False, signed_delta: bool = False, fixed_width: int = 0
 ) -> bytes:
@@ -52,9 +74,9 @@ def unsigned_stream(
     Args:
         values: [n], n >= 1, integers from 0 to 2**56 - 1 (any unsigned dtype without differences).
         deflate: level and library of DEFLATE.
-        delta: code differences from the element before; pays if values ascend.
-        signed_delta: code differences that fall as well as rise (DELTA, then ZIGZAG).
-        fixed_width: bytes of an element; 0 takes as many as the largest needs.
+        delta: code differences of ascending values.
+        signed_delta: code differences of any values (DELTA, then ZIGZAG).
+        fixed_width: bytes of an element; 0: those that the largest needs.
 
     Returns:
         Head and coded bytes.
@@ -76,7 +98,7 @@ def unsigned_stream(
 def smooth_stream(values: Integers, deflate: DeflateSettings) -> bytes:
     """Write unsigned integers as they are or as differences, whichever is smaller.
 
-    Neighbours in Morton order often have like colours and sizes, but not in every scene.
+    Neighbours in Morton order often have similar colours and sizes, but not in every scene.
 
     Args:
         values: [n], n >= 1, integers from 0 to 2**32 - 1.
@@ -100,179 +122,37 @@ def signed_stream(values: Integers, deflate: DeflateSettings) -> bytes:
     return _make_stream(folded, _width(int(folded.max())), (_spec.TRANSFORM_ZIGZAG,), deflate)
 
 
-def deflate_library(wanted: str) -> str:
-    """Resolve "auto" to the library that is used, libdeflate if its package is installed; the options chunk names it.
-
-    Raises:
-        InputError: libdeflate is requested by name and its package is not installed.
-    """
-    present = importlib.util.find_spec("deflate") is not None
-    if wanted == "libdeflate" and not present:
-        raise InputError("deflate: the package 'deflate' is not installed, use auto or zlib")
-    if wanted == "auto":
-        return "libdeflate" if present else "zlib"
-    return wanted
-
-
-def _entropy(symbols: NDArray[np.uint8]) -> float:
-    """Order-0 entropy, bits per symbol."""
-    shares = np.bincount(symbols, minlength=1) / max(1, len(symbols))
-    shares = shares[shares > 0]
-    return -float((shares * np.log2(shares)).sum())
-
-
-def _width(largest: int) -> int:
-    return max(1, (largest.bit_length() + 7) // 8)
-
-
-def _zigzag(values: Integers) -> Integers:
-    """Fold two's complement into unsigned: 0, -1, 1, -2 become 0, 1, 2, 3."""
-    bits = 8 * values.itemsize
-    if values.dtype == np.int8:  # 2v leaves int8 only where the result, read as unsigned, is right
-        return ((values << 1) ^ (values >> 7)).view(np.uint8)
-    return ((values << 1) ^ (values >> (bits - 1))).view(f"u{values.itemsize}")
-
-
-def _make_stream(values: Integers, width: int, transforms: tuple[int, ...], deflate: DeflateSettings) -> bytes:
-    """Cut into byte planes, choose the coder, and put the head before the bytes."""
-    steps = [step for step in transforms if step != _spec.TRANSFORM_NONE]
-    if width > 1:
-        steps.append(_spec.TRANSFORM_BYTE_PLANES)
-    planes = _byte_planes(values, width)
-    runs = _run_length(planes, _LONG_RUN if deflate.level <= _FASTEST_LEVEL else _SHORT_RUN)
-    packed = planes
-    if runs is not None and _is_smaller(runs, planes, deflate):
-        packed = runs
-        steps.append(_spec.TRANSFORM_RUN_LENGTH)
-    coder, coded = _code(packed, deflate)
-    head = _spec.StreamHead(
-        width=width,
-        coder=coder,
-        transforms=bytes(steps).ljust(_spec.TRANSFORMS_MAX, b"\0"),
-        reserved_0=0,
-        count=len(values),
-        packed_size=len(packed),
-        coded_size=len(coded),
-    )
-    return _spec.pack_stream_head(head) + coded
-
-
-def _is_smaller(runs: NDArray[np.uint8], planes: NDArray[np.uint8], deflate: DeflateSettings) -> bool:
-    """Return True if runs compress to at most `_GAIN` of the planes they replace, by a quick trial to save time."""
-    trial = replace(deflate, level=min(deflate.level, _TRIAL_LEVEL))
-    return len(_code(runs, trial)[1]) <= _GAIN * len(_code(planes, trial)[1])
-
-
-def _byte_planes(values: Integers, width: int) -> NDArray[np.uint8]:
-    """[n] integers to [width * n] bytes, lowest bytes first."""
-    if width == 1:
-        return np.ascontiguousarray(values.astype(np.uint8, copy=False))
-    little = np.ascontiguousarray(values).astype(f"<u{values.itemsize}", copy=False)
-    columns = little.view(np.uint8).reshape(len(values), values.itemsize)
-    return np.ascontiguousarray(columns[:, :width].T).reshape(-1)
-
-
-def _run_length(data: NDArray[np.uint8], least: float) -> NDArray[np.uint8] | None:
-    """Return the runs, or None if their mean length is below `least`, so that they would save nothing.
-
-    DEFLATE's longest match is 258 bytes, so runs beyond some hundreds of bytes are what it cannot code well. Short runs
-    cost it a distance each, and their lengths are mixed with the bytes: as runs, both have Huffman codes of their own.
-    """
-    if len(data) < 64:
-        return None
-    changes = np.flatnonzero(data[1:] != data[:-1])
-    if least * (len(changes) + 1) > len(data):
-        return None
-    starts = np.concatenate([[0], changes + 1])
-    lengths = np.diff(np.append(starts, len(data)))
-    pieces = (lengths + _spec.RUN_MAX - 1) // _spec.RUN_MAX
-    values = np.repeat(data[starts], pieces)
-    sizes = np.full(len(values), _spec.RUN_MAX, np.int64)
-    sizes[np.cumsum(pieces) - 1] = lengths - (pieces - 1) * _spec.RUN_MAX
-    sizes -= 1
-    return np.concatenate([values, sizes.astype(np.uint8), (sizes >> 8).astype(np.uint8)])
-
-
-def _code(packed: NDArray[np.uint8], deflate: DeflateSettings) -> tuple[int, bytes]:
-    """Return the coder with the fewest bytes, and the bytes."""
-    raw = packed.tobytes()
-    best, coded = _spec.CODER_STORED, raw
-    if len(raw) > 3:
-        deflated = _deflate(raw, deflate)
-        if len(deflated) < len(coded):
-            best, coded = _spec.CODER_DEFLATE, deflated
-    return best, coded
-
-
-def _deflate(raw: bytes, deflate: DeflateSettings) -> bytes:
-    if deflate.library == "zlib":
-        return _zlib(raw, min(deflate.level, 9), zlib.Z_DEFAULT_STRATEGY)
-    if deflate.level <= _FASTEST_LEVEL:
-        return _quickest(raw)
-    # If nothing but runs repeats, matches that libdeflate finds by chance cost more than they save.
-    return min(_libdeflate(raw, deflate.level), *(way(raw) for way in _WITHOUT_MATCHES), key=len)
-
-
-def _quickest(raw: bytes) -> bytes:
-    """Do on all what is smallest on samples: a fast search for matches, runs of one byte, Huffman codes alone."""
-    ways: tuple[Callable[[bytes], bytes], ...] = (lambda data: _libdeflate(data, 1), *_WITHOUT_MATCHES)
-    step = max(_SAMPLE, len(raw) // 4)
-    sample = b"".join(raw[at : at + _SAMPLE] for at in range(0, len(raw), step))
-    return min(ways, key=lambda way: len(way(sample)))(raw)
-
-
-def _libdeflate(raw: bytes, level: int) -> bytes:
-    import deflate  # absent where its package has no wheel
-
-    return bytes(deflate.deflate_compress(raw, level))
-
-
-def _zlib(raw: bytes, level: int, strategy: int) -> bytes:
-    coder = zlib.compressobj(level, zlib.DEFLATED, -15, 9, strategy)
-    return coder.compress(raw) + coder.flush()
-
-
-#: Runs of one byte, and Huffman codes alone.
-_WITHOUT_MATCHES: tuple[Callable[[bytes], bytes], ...] = (
-    lambda data: _zlib(data, 1, zlib.Z_RLE),
-    lambda data: _zlib(data, 1, zlib.Z_HUFFMAN_ONLY),
-)
-
-
-_MOSTLY = 0.9  # share of the splats from which on a mask is not worth the time that it takes decoders
-
-
 def levels_block(q: Integers, deflate: DeflateSettings) -> bytes:
-    """Opacities, LEVELS: q [n], 0 to M."""
+    """Return a LEVELS block of opacities q [n], 0 to M."""
     return _block_head(_spec.ATTRIBUTE_OPACITIES, _spec.CODING_LEVELS) + unsigned_stream(q, deflate)
 
 
 def morton_block(codes: I64, bits: int, deflate: DeflateSettings) -> bytes:
-    """Means, MORTON: codes [n], ascending, below 2**(3·bits)."""
+    """Return a MORTON block of means: codes [n], ascending, below 2**(3·bits)."""
     params = _spec.pack_morton_params(_spec.MortonParams(bits, 0, 0))
     head = _block_head(_spec.ATTRIBUTE_MEANS, _spec.CODING_MORTON)
     return head + params + unsigned_stream(codes, deflate, delta=True)
 
 
 def axis_block(q: Integers, deflate: DeflateSettings) -> bytes:
-    """Means, AXIS: q [3, n], 0 to 2**24 - 1, any order."""
+    """Return an AXIS block of means q [3, n], 0 to 2**24 - 1, in any order."""
     stream = unsigned_stream(q.reshape(-1), deflate, signed_delta=True)
     return _block_head(_spec.ATTRIBUTE_MEANS, _spec.CODING_AXIS) + stream
 
 
 def offset_block(attribute: int, integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
-    """OFFSET: integers [C, n], any sign, at most 2**32 - 1 apart in each column."""
+    """Return an OFFSET block of integers [C, n], any sign, at most 2**32 - 1 apart in each column."""
     return _block_head(attribute, _spec.CODING_OFFSET) + _code_offsets(integers, exponent, deflate)
 
 
 def signed_block(attribute: int, integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
-    """SIGNED: integers [C, n] of at most 32 bits."""
+    """Return a SIGNED block of integers [C, n] of at most 32 bits."""
     head = _block_head(attribute, _spec.CODING_SIGNED) + _spec.pack_lattice_params(_spec.LatticeParams(exponent, 0))
     return head + signed_stream(np.ascontiguousarray(integers).reshape(-1), deflate)
 
 
 def sparse_block(attribute: int, integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
-    """SPARSE: integers [C, n] of at most 32 bits, not all of them 0."""
+    """Return a SPARSE block of integers [C, n] of at most 32 bits, not all 0."""
     has = integers.any(axis=0)
     params = _spec.SparseParams(exponent, 0, int(np.count_nonzero(has)))
     mask = unsigned_stream(np.packbits(has, bitorder="little"), deflate, fixed_width=1)
@@ -281,7 +161,7 @@ def sparse_block(attribute: int, integers: Integers, exponent: int, deflate: Def
 
 
 def signed_or_sparse_block(attribute: int, integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
-    """SIGNED or SPARSE, whichever is smaller: integers [C, n] of at most 32 bits, not all of them 0."""
+    """Return the smaller of a SIGNED and a SPARSE block of integers [C, n] of at most 32 bits, not all 0."""
     plain = signed_block(attribute, integers, exponent, deflate)
     if np.count_nonzero(integers.any(axis=0)) > _MOSTLY * integers.shape[1]:
         return plain
@@ -298,16 +178,16 @@ def codebook_block(
     deflate: DeflateSettings,
     summand: Integers | None = None,
 ) -> bytes:
-    """CODEBOOK.
+    """Return a CODEBOOK block.
 
     Args:
         attribute: registry id.
-        codebook_id: which codebook.
-        index: [n]; none for blocks that use that of the codebook's first block.
-        escape_count: splats with the index "escaped".
-        escape: their block, empty where there are none.
-        deflate: how to code the index.
-        summand: [n], for scales of the kind SHAPE: what is added to all three.
+        codebook_id: the codebook's id.
+        index: [n]; None: that of the codebook's first block.
+        escape_count: number of escaped splats.
+        escape: their block; empty if there are none.
+        deflate: level and library of DEFLATE.
+        summand: [n], for scales of the kind SHAPE: added to all three.
     """
     params = _spec.pack_codebook_params(_spec.CodebookParams(codebook_id, 0, escape_count))
     streams = b"" if index is None else unsigned_stream(index, deflate)
@@ -317,31 +197,11 @@ def codebook_block(
 
 
 def raw_block(column: int, values: NDArray[Any], deflate: DeflateSettings) -> bytes:
-    """RAW: the bits of an extra column's values [n]."""
+    """Return a RAW block of the values [n] of an extra column."""
     bits = np.ascontiguousarray(values, values.dtype.newbyteorder("<")).view(f"<u{values.itemsize}")
     params = _spec.pack_raw_params(_spec.RawParams(column, 0))
     stream = unsigned_stream(bits, deflate, fixed_width=values.itemsize)
     return _block_head(_spec.ATTRIBUTE_EXTRA, _spec.CODING_RAW) + params + stream
-
-
-def _code_offsets(integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
-    offsets = integers.min(axis=1).astype("<i4")
-    elements = integers - offsets.astype(integers.dtype)[:, None]
-    stored: bytes = _spec.pack_lattice_params(_spec.LatticeParams(exponent, 0)) + offsets.tobytes()
-    return stored + smooth_stream(elements.reshape(-1), deflate)
-
-
-def _block_head(attribute: int, deflate: int) -> bytes:
-    return _spec.pack_block_head(_spec.BlockHead(attribute, deflate, 0))
-
-
-_SPREAD = (
-    (32, 0x1F00000000FFFF),
-    (16, 0x1F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)
 
 
 def morton_codes(q: NDArray[Any]) -> NDArray[np.int64]:
@@ -365,3 +225,139 @@ def morton_codes(q: NDArray[Any]) -> NDArray[np.int64]:
         np.left_shift(spread, axis, out=spread)
         np.bitwise_or(codes, spread, out=codes)
     return codes
+
+
+def _block_head(attribute: int, deflate: int) -> bytes:
+    return _spec.pack_block_head(_spec.BlockHead(attribute, deflate, 0))
+
+
+def _code_offsets(integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
+    offsets = integers.min(axis=1).astype("<i4")
+    elements = integers - offsets.astype(integers.dtype)[:, None]
+    stored: bytes = _spec.pack_lattice_params(_spec.LatticeParams(exponent, 0)) + offsets.tobytes()
+    return stored + smooth_stream(elements.reshape(-1), deflate)
+
+
+def _make_stream(values: Integers, width: int, transforms: tuple[int, ...], deflate: DeflateSettings) -> bytes:
+    """Cut integers into byte planes, choose the coder, and return head and coded bytes."""
+    steps = [step for step in transforms if step != _spec.TRANSFORM_NONE]
+    if width > 1:
+        steps.append(_spec.TRANSFORM_BYTE_PLANES)
+    planes = _byte_planes(values, width)
+    runs = _run_length(planes, _LONG_RUN if deflate.level <= _FASTEST_LEVEL else _SHORT_RUN)
+    packed = planes
+    if runs is not None and _is_smaller(runs, planes, deflate):
+        packed = runs
+        steps.append(_spec.TRANSFORM_RUN_LENGTH)
+    coder, coded = _code(packed, deflate)
+    head = _spec.StreamHead(
+        width=width,
+        coder=coder,
+        transforms=bytes(steps).ljust(_spec.TRANSFORMS_MAX, b"\0"),
+        reserved_0=0,
+        count=len(values),
+        packed_size=len(packed),
+        coded_size=len(coded),
+    )
+    return _spec.pack_stream_head(head) + coded
+
+
+def _width(largest: int) -> int:
+    return max(1, (largest.bit_length() + 7) // 8)
+
+
+def _zigzag(values: Integers) -> Integers:
+    """Fold two's complement into unsigned: 0, -1, 1, -2 become 0, 1, 2, 3."""
+    bits = 8 * values.itemsize
+    if values.dtype == np.int8:  # 2v leaves int8 only where the result, read as unsigned, is right
+        return ((values << 1) ^ (values >> 7)).view(np.uint8)
+    return ((values << 1) ^ (values >> (bits - 1))).view(f"u{values.itemsize}")
+
+
+def _entropy(symbols: NDArray[np.uint8]) -> float:
+    """Return the order-0 entropy, bits per symbol."""
+    shares = np.bincount(symbols, minlength=1) / max(1, len(symbols))
+    shares = shares[shares > 0]
+    return -float((shares * np.log2(shares)).sum())
+
+
+def _byte_planes(values: Integers, width: int) -> NDArray[np.uint8]:
+    """Return the [width * n] bytes of [n] integers, lowest bytes first."""
+    if width == 1:
+        return np.ascontiguousarray(values.astype(np.uint8, copy=False))
+    little = np.ascontiguousarray(values).astype(f"<u{values.itemsize}", copy=False)
+    columns = little.view(np.uint8).reshape(len(values), values.itemsize)
+    return np.ascontiguousarray(columns[:, :width].T).reshape(-1)
+
+
+def _run_length(data: NDArray[np.uint8], least: float) -> NDArray[np.uint8] | None:
+    """Return the runs, or None if their mean length is below `least`, so that they would save nothing.
+
+    DEFLATE's longest match is 258 bytes, so it codes longer runs poorly. Short runs cost it a distance each, and their
+    lengths share a Huffman code with the bytes; as RUN_LENGTH, each has its own.
+    """
+    if len(data) < 64:
+        return None
+    changes = np.flatnonzero(data[1:] != data[:-1])
+    if least * (len(changes) + 1) > len(data):
+        return None
+    starts = np.concatenate([[0], changes + 1])
+    lengths = np.diff(np.append(starts, len(data)))
+    pieces = (lengths + _spec.RUN_MAX - 1) // _spec.RUN_MAX
+    values = np.repeat(data[starts], pieces)
+    sizes = np.full(len(values), _spec.RUN_MAX, np.int64)
+    sizes[np.cumsum(pieces) - 1] = lengths - (pieces - 1) * _spec.RUN_MAX
+    sizes -= 1
+    return np.concatenate([values, sizes.astype(np.uint8), (sizes >> 8).astype(np.uint8)])
+
+
+def _is_smaller(runs: NDArray[np.uint8], planes: NDArray[np.uint8], deflate: DeflateSettings) -> bool:
+    """Return True if runs compress to at most `_GAIN` of the planes they replace, by a quick trial."""
+    trial = replace(deflate, level=min(deflate.level, _TRIAL_LEVEL))
+    return len(_code(runs, trial)[1]) <= _GAIN * len(_code(planes, trial)[1])
+
+
+def _code(packed: NDArray[np.uint8], deflate: DeflateSettings) -> tuple[int, bytes]:
+    """Return the coder with the fewest bytes, and the bytes."""
+    raw = packed.tobytes()
+    best, coded = _spec.CODER_STORED, raw
+    if len(raw) > 3:
+        deflated = _deflate(raw, deflate)
+        if len(deflated) < len(coded):
+            best, coded = _spec.CODER_DEFLATE, deflated
+    return best, coded
+
+
+def _deflate(raw: bytes, deflate: DeflateSettings) -> bytes:
+    if deflate.library == "zlib":
+        return _zlib(raw, min(deflate.level, 9), zlib.Z_DEFAULT_STRATEGY)
+    if deflate.level <= _FASTEST_LEVEL:
+        return _quickest(raw)
+    # If only runs repeat, matches that libdeflate finds by chance cost more than they save.
+    return min(_libdeflate(raw, deflate.level), *(way(raw) for way in _WITHOUT_MATCHES), key=len)
+
+
+def _quickest(raw: bytes) -> bytes:
+    """Compress in the way that is smallest on samples: fast matches, runs of one byte, or Huffman codes alone."""
+    ways: tuple[Callable[[bytes], bytes], ...] = (lambda data: _libdeflate(data, 1), *_WITHOUT_MATCHES)
+    step = max(_SAMPLE, len(raw) // 4)
+    sample = b"".join(raw[at : at + _SAMPLE] for at in range(0, len(raw), step))
+    return min(ways, key=lambda way: len(way(sample)))(raw)
+
+
+def _libdeflate(raw: bytes, level: int) -> bytes:
+    import deflate  # absent where its package has no wheel
+
+    return bytes(deflate.deflate_compress(raw, level))
+
+
+def _zlib(raw: bytes, level: int, strategy: int) -> bytes:
+    coder = zlib.compressobj(level, zlib.DEFLATED, -15, 9, strategy)
+    return coder.compress(raw) + coder.flush()
+
+
+#: DEFLATE with runs of one byte alone, and with Huffman codes alone.
+_WITHOUT_MATCHES: tuple[Callable[[bytes], bytes], ...] = (
+    lambda data: _zlib(data, 1, zlib.Z_RLE),
+    lambda data: _zlib(data, 1, zlib.Z_HUFFMAN_ONLY),
+)

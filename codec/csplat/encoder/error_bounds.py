@@ -1,6 +1,6 @@
-"""Errors between splats and what became of them: what a file states, and what proves it (spec 5.5).
+"""Errors of decoded splats: the bounds that a file declares, and their verification (spec 5.5).
 
-The functions on columns serve the encoder, tile by tile; `measure_errors` serves whoever has two models.
+The functions on columns measure tile by tile while encoding; `measure_errors` compares two models.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ _ROUNDING = 2.0**-40  # relative
 
 @dataclass(frozen=True)
 class ErrorSums:
-    """Largest error and sum of squares by measure, over a number of splats; they add up."""
+    """Largest error and sum of squares by measure, over `count` splats."""
 
     count: int = 0
     largest: Mapping[str, float] = field(default_factory=dict)
     squares: Mapping[str, float] = field(default_factory=dict)
 
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """Return (max, rms) by measure; rms is over splats, a splat's square the sum over components."""
+        """Return (max, rms) by measure; rms is over splats, the square of a splat is the sum over components."""
         count = max(1, self.count)
         return {name: (self.largest[name], float(np.sqrt(self.squares[name] / count))) for name in self.largest}
 
     def declared(self) -> dict[str, tuple[float, float]]:
-        """Return `bounds()` a hair wider: whoever checks them may round in another order (spec SER-5).
+        """Return `bounds()`, slightly wider, as a verifier may round in another order (spec SER-5).
 
         Raises:
-            InputError: an error that float64 does not hold; a file cannot state it (SER-2).
+            InputError: an error is not finite, which a file cannot declare (SER-2).
         """
         result = {}
         for name, (largest, rms) in self.bounds().items():
@@ -49,13 +49,13 @@ class ErrorSums:
                 raise InputError(
                     f"the error of {name} is too large to be stated: the step is too coarse for the values"
                 )
-            floor = _ROUNDING if name == "covariance" else 0.0  # a ratio, whose rounding does not shrink with it
+            floor = _ROUNDING if name == "covariance" else 0.0  # a ratio, whose rounding does not shrink with its value
             result[name] = (largest * (1.0 + _ROUNDING) + floor, rms * (1.0 + _ROUNDING) + floor)
         return result
 
     @staticmethod
     def total(parts: Iterable[ErrorSums]) -> ErrorSums:
-        """Add up in the order given, so that the sum does not depend on threads."""
+        """Add up in the given order: the sum must not depend on threads."""
         count, largest, squares = 0, dict[str, float](), dict[str, float]()
         for part in parts:
             count += part.count
@@ -66,7 +66,7 @@ class ErrorSums:
 
 
 def take_precise_means(model: SplatModel, rows: NDArray[Any]) -> Floats:
-    """Return the centres of some splats relative to the origin, [n, 3]: float64 where the model has doubles."""
+    """Return means of some splats relative to the origin, [n, 3], in float64 if the model has doubles."""
     if model.means_double is None:
         return np.take(model.means, rows, axis=0)
     relative: F64 = np.take(model.means_double, rows, axis=0) - np.array(model.origin)
@@ -74,7 +74,7 @@ def take_precise_means(model: SplatModel, rows: NDArray[Any]) -> Floats:
 
 
 def distance_errors(source: Floats, decoded: Floats) -> tuple[float, float]:
-    """Return (largest distance, sum of squared distances) of centres in columns, [3, n]."""
+    """Return (largest distance, sum of squared distances) of means in columns, [3, n]."""
     difference = decoded.astype(np.float64)
     difference -= source
     largest = float(np.abs(difference).max(initial=0.0))
@@ -118,9 +118,9 @@ def covariance_errors(
         decoded = np.exp(2.0 * (np.clip(scales[:, part], -SCALE_MOST, SCALE_MOST) - top))
         difference = covariance_entries(quats[:, part], decoded)
         difference -= covariance_entries(source_quats[:, part], variances)
-        with np.errstate(over="ignore"):  # infinity is what `stated` refuses
+        with np.errstate(over="ignore"):  # `declared` refuses infinity
             difference *= difference
-            difference[3:] *= 2.0  # each entry beside the diagonal stands twice
+            difference[3:] *= 2.0  # each entry off the diagonal occurs twice
             error = difference.sum(axis=0)
         error /= (variances * variances).sum(axis=0)
         squares += float(error.sum())
@@ -149,7 +149,7 @@ def measure_errors(
 
 
 def measured_sums(source: SplatModel, decoded: SplatModel, source_index: NDArray[Any]) -> ErrorSums:
-    """Return what `measure_errors` makes its bounds of."""
+    """Return the sums behind `measure_errors`."""
     index = np.asarray(source_index)
     if index.shape != (len(decoded),):
         raise InputError(f"source index has shape {index.shape}, wanted ({len(decoded)},)")
@@ -196,7 +196,7 @@ def rotation_rows(quats: Floats) -> tuple[tuple[F64, F64, F64], ...]:
 
 
 def covariance_entries(quats: Floats, variances: F64) -> F64:
-    """Return Σ's entries xx, yy, zz, xy, xz, yz, [6, n]."""
+    """Return the entries xx, yy, zz, xy, xz, yz of Σ, [6, n]."""
     rows = rotation_rows(quats)
     scaled = [tuple(entry * variance for entry, variance in zip(row, variances, strict=True)) for row in rows]
     result = np.empty((6, quats.shape[1]))

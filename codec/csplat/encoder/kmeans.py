@@ -1,4 +1,12 @@
-"""Weighted k-means over lattice integers."""
+"""Weighted k-means over lattice integers: the same result at any thread count.
+
+Searches are matrix products in float32 over integers and halves, whose partial sums stay below 2**23, so that a value
+depends neither on the order in which a BLAS adds nor on its threads. Centroids are float64 sums in the order of the
+points, rounded to integers. All random numbers come from one seeded generator.
+
+`refine_by_metric` continues from there if every point has its own error metric w · Σ_channels (x − c)ᵀ M (x − c): the
+neighbours of an entry are the candidates of its points, and means become solutions of the summed normal equations.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +29,19 @@ from csplat.encoder.weights import ErrorMetric, doubled_triangles, matrix_produc
 from csplat.errors import InputError
 from csplat.types import F32, F64, I16, I32, I64, U32
 
-_SEED_ROUNDS = 8
+_Find = Callable[[F32, int], tuple[I64, F32]]  # of rows [x, 1] and the number of the first one
+Floats = NDArray[Any]
+
+_SEED_ROUNDS = 8  # in which the first entries are drawn
+_EXACT = 2.0**23  # below it float32 holds every multiple of 1/2
+_PRODUCT_ROWS, _PRODUCT_COLUMNS = 256, 4096  # points and entries of one product: a result of 4 MiB
+_GROUPED_ROWS = 4096  # points that share one sort by group
+_GROUP_ITERATIONS = 4
+_BLAS = threading.Lock()  # the thread count of a BLAS is per process: one search at a time
+_CANDIDATES = 96  # entries tried for a point: its own and that one's neighbours
+_REFINE_ROUNDS = 2  # of assigning points and moving entries
+_METRIC_BLOCK = 1 << 12  # points per block of temporaries
+_RIDGE = 1e-3  # fraction of the mean diagonal: holds an entry in place if its points do not determine it
 
 
 def cluster(
@@ -36,26 +56,25 @@ def cluster(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[I32, U32]:
-    """Find at most `size` entries that stand for the points, and the entry of each point.
+    """Find at most `size` entries that represent the points, and the entry of each point.
 
-    Trains on a weighted sample, then moves the entries twice on all points. Memory beside
-    the arguments: the sample and about 40 bytes per point.
+    Trains on a weighted sample, then moves the entries twice on all points. Needs memory for the sample and about 40
+    bytes per point.
 
     Args:
-        points: [N, D], lattice integers. Set outliers aside first: beyond a norm of about
-            2,300 all points are searched on a lattice coarser by a power of two.
-        weights: [N], finite and >= 0; only ratios matter; all zero means all equal.
-        size: the most entries wanted, > 0.
-        seed: of the sample and of the first entries, >= 0.
+        points: [N, D], lattice integers. Clip outliers first: if a norm is beyond about 2,300, all points are searched
+            on a coarser lattice.
+        weights: [N], finite and >= 0; only ratios matter; all zeros count as all ones.
+        size: maximum number of entries, > 0.
+        seed: seed of the sample and of the first entries, >= 0.
         iterations: k-means steps on the sample.
         sample_per_entry: points of the sample per entry, > 0.
-        near_groups: as in `assign`.
-        threads: as in `assign`.
-        progress: called with steps done and steps in all.
+        near_groups: see `assign`.
+        threads: see `assign`.
+        progress: called with the steps done and the total.
 
     Returns:
-        entries [K, D] int32, K <= size, distinct, each used by a point, in no order of
-        meaning; index [N] uint32.
+        entries [K, D] int32, K <= size, distinct, each used by a point, in arbitrary order; index [N] uint32.
 
     Raises:
         InputError: shapes, dtypes, weights or numbers outside these ranges.
@@ -87,15 +106,14 @@ def cluster(
 
 
 def assign(points: I16 | I32, entries: I32, *, near_groups: int = 0, threads: int | None = None) -> U32:
-    """Find the entry nearest to each point; of equally near ones the first.
+    """Find the entry nearest to each point, the first of equally near ones.
 
     Args:
         points: [N, D], lattice integers.
         entries: [K, D], K > 0.
-        near_groups: 0 searches every entry. Otherwise entries are put into about sqrt(K)
-            groups, and only this many groups, those with the nearest means, are searched:
-            faster for thousands of entries, not always the nearest.
-        threads: worker threads, all processors unless told; no effect on the result.
+        near_groups: 0 searches every entry. Otherwise entries are put into about sqrt(K) groups, and only this number
+            of groups with the nearest means is searched: faster for thousands of entries, not always the nearest.
+        threads: worker threads; `None`: all processors. No effect on the result.
 
     Returns:
         [N] uint32, rows of `entries`.
@@ -128,6 +146,125 @@ def rank_by_frequency(index: U32, entries: I32) -> tuple[U32, I32]:
     return rank[index], entries[order]
 
 
+def search_nearest(
+    points: I16 | I32,
+    entries: I32,
+    near_groups: int = 0,
+    threads: int | None = None,
+    *,
+    other: bool = False,
+) -> tuple[U32, F64]:
+    """Find the entry nearest to each point, and its squared distance.
+
+    Minimises |c|**2 / 2 - x.c: one product of [x, 1] and [c, -|c|**2 / 2].
+
+    Args:
+        points: [N, D], lattice integers. If max|x| max|c| + max|c|**2 / 2 reaches 2**23 (norms of about 2,300), both
+            are first divided by a power of two and rounded.
+        entries: [K, D], K > 0.
+        near_groups: 0, or the number of groups of about sqrt(K) entries to search for a point.
+        threads: worker threads; `None`: all processors.
+        other: point n must not find entry n (the points are the entries; `near_groups` 0).
+
+    Returns:
+        index [N] uint32, the first of equally near entries if all are searched; and the squared distance [N] float64,
+        of the divided integers, in lattice units.
+    """
+    shift = _shift(points, entries)
+    coarse = _divide(entries, shift)
+    index = np.zeros(len(points), np.uint32)
+    error = np.zeros(len(points))
+    width, length = points.shape[1] + 1, _PRODUCT_ROWS
+    find = _every_entry(_matrix(coarse), other)
+    if 0 < near_groups < _group_count(len(entries)):
+        length = _GROUPED_ROWS
+        find = _near_entries(coarse, near_groups, threads)
+
+    def work(starts: range) -> None:
+        x = np.ones((length, width), np.float32)
+        for a in starts:
+            part = slice(a, min(a + length, len(points)))
+            rows = x[: part.stop - a]
+            rows[:, :-1] = points[part] if shift == 0 else _divide(points[part], shift)
+            index[part], best = find(rows, a)
+            norm = np.einsum("nd,nd->n", rows, rows, dtype=np.float64) - 1.0
+            error[part] = (norm - 2.0 * best) * 4.0**shift
+
+    workers = max(1, min(threads or os.cpu_count() or 1, -(-len(points) // length)))
+    jobs = [range(w * length, len(points), workers * length) for w in range(workers)]
+    with one_blas_thread():
+        if workers == 1:  # starting a thread takes longer than a small search
+            work(jobs[0])
+        else:
+            with ThreadPoolExecutor(workers) as pool:
+                list(pool.map(work, jobs))
+    return index, error
+
+
+def reassign_by_metric(
+    points: Floats, metric: ErrorMetric, entries: Floats, index: I64, threads: int, tried: int
+) -> I64:
+    """Assign each point to the best of the entries near its own.
+
+    Args:
+        points: [N, D, C].
+        metric: metric of the points.
+        entries: [K, D, C].
+        index: [N], the entry of each point.
+        threads: number to use; no effect on the result.
+        tried: number of candidates: the point's own entry and its nearest neighbours.
+
+    Returns:
+        The new index, [N].
+    """
+    with one_blas_thread():
+        return _assign_by_metric(points, metric, entries, index, threads, tried)
+
+
+def refine_by_metric(points: Floats, metric: ErrorMetric, entries: I32, index: I64, threads: int) -> tuple[I32, I64]:
+    """Assign each point to the best of the entries near its own, and move the entries; twice.
+
+    Args:
+        points: [N, D, C], in lattice steps.
+        metric: metric of the points.
+        entries: [K, D, C] lattice integers.
+        index: [N], the entry of each point.
+        threads: number to use; no effect on the result.
+
+    Returns:
+        entries [K', D, C], distinct, each used; index [N].
+    """
+    with one_blas_thread():
+        for _ in range(_REFINE_ROUNDS):
+            index = _assign_by_metric(points, metric, entries, index, threads, _CANDIDATES)
+            entries = _solve_entries(points, metric, entries, index)
+        index = _assign_by_metric(points, metric, entries, index, threads, _CANDIDATES)
+    flat, place = np.unique(entries.reshape(len(entries), -1), axis=0, return_inverse=True)
+    index = place.reshape(-1)[index]
+    used, index = np.unique(index, return_inverse=True)
+    return flat[used].reshape(-1, *entries.shape[1:]), index.reshape(-1)
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Run each product on one thread, if NumPy's BLAS is an OpenBLAS whose thread count can be set.
+
+    Our threads already fill the processors. OpenBLAS's threads wait by spinning: next to one other program, these
+    products took 20 times as long.
+    """
+    control = _openblas()
+    if control is None:
+        yield
+        return
+    with _BLAS:
+        before = control[0]()
+        control[1](1)
+        try:
+            yield
+        finally:
+            control[1](before)
+
+
 def _check_points(points: I16 | I32, weights: F32 | None) -> F64:
     if points.ndim != 2 or not points.shape[1] or points.dtype not in (np.int16, np.int32):
         found = f"{points.dtype} {points.shape}"
@@ -138,11 +275,6 @@ def _check_points(points: I16 | I32, weights: F32 | None) -> F64:
         found = f"{weights.shape} for {len(points)} points"
         raise InputError(f"k-means: weights are [N], finite and >= 0, found {found}")
     return weights.astype(np.float64) if weights.any() else np.ones(len(points))
-
-
-def _largest(keys: F64, count: int) -> I64:
-    """Return the rows of the `count` largest keys, ascending."""
-    return np.sort(np.argpartition(keys, len(keys) - count)[len(keys) - count :])
 
 
 def _priority_sample(w: F64, count: int, rng: np.random.Generator) -> tuple[I64, F64]:
@@ -159,8 +291,13 @@ def _priority_sample(w: F64, count: int, rng: np.random.Generator) -> tuple[I64,
     return rows, np.maximum(w[rows], threshold)
 
 
+def _largest(keys: F64, count: int) -> I64:
+    """Return the rows of the `count` largest keys, ascending."""
+    return np.sort(np.argpartition(keys, len(keys) - count)[len(keys) - count :])
+
+
 def _draw_rows(importance: F64, count: int, rng: np.random.Generator) -> I64:
-    """Draw up to `count` different rows with a chance that grows with their importance."""
+    """Draw up to `count` different rows, with a probability that grows with their importance."""
     count = min(count, int(np.count_nonzero(importance)))
     if count == 0:
         return np.empty(0, np.int64)
@@ -172,7 +309,7 @@ def _first_entries(
 ) -> I32:
     """Draw points in rounds by weight times squared distance to those drawn before.
 
-    Bahmani et al., "Scalable k-means++", with as many points drawn as are wanted.
+    Bahmani et al., "Scalable k-means++", drawing exactly `size` points.
     """
     error = np.ones(len(sample))
     entries = np.empty((0, sample.shape[1]), np.int32)
@@ -186,7 +323,7 @@ def _first_entries(
 
 
 def _move_to_means(points: I16 | I32, w: F64, index: U32, entries: I32) -> I32:
-    """Move each entry to the rounded mean of its points; one of no weight stays."""
+    """Move each entry to the rounded mean of its points, unless they have no weight."""
     where = index.astype(np.int64)
     total = np.bincount(where, w, len(entries))
     moved = entries.copy()
@@ -207,11 +344,10 @@ def _relocate(
     rng: np.random.Generator,
     threads: int | None,
 ) -> None:
-    """Move the entries that are missed least, and all of no weight, to where errors are largest.
+    """Move the entries whose loss costs least, and all without weight, to where errors are largest, in place.
 
-    Patane and Russo, "The enhanced LBG algorithm": k-means alone never carries an entry from
-    where there are too many to where there are too few. At most `most` entries of some weight
-    move, in place; losing one costs about its weight times its squared distance to the next.
+    Patane and Russo, "The enhanced LBG algorithm": k-means alone never moves an entry between distant clusters. At
+    most `most` entries with weight move; losing one costs about its weight times its squared distance to the next.
     """
     weight = np.bincount(index, w, len(entries)).astype(np.float64)
     harm = np.bincount(index, w * error, len(entries))
@@ -226,7 +362,7 @@ def _relocate(
         keys = w[rows] * error[rows] / (1.0 - rng.random(len(rows)))
         rows = rows[np.argsort(keys, kind="stable")]
         drawn = np.zeros(len(entries), np.int64)
-        drawn[index[rows]] = rows  # of each entry's points the one with the largest key stays
+        drawn[index[rows]] = rows  # the last one assigned is the point with the largest key
         entries[cheap[:count]] = points[drawn[worst[:count]]]
 
 
@@ -238,70 +374,6 @@ def _distinct(rows: I16 | I32) -> tuple[I32, U32]:
 def _drop_unused(entries: I32, index: U32) -> tuple[I32, U32]:
     used = np.bincount(index, minlength=len(entries)) > 0
     return entries[used], (np.cumsum(used) - 1).astype(np.uint32)[index]
-
-
-_Find = Callable[[F32, int], tuple[I64, F32]]  # rows [x, 1] and the number of the first
-
-_EXACT = 2.0**23  # below it float32 holds every multiple of 1/2
-_PRODUCT_ROWS, _PRODUCT_COLUMNS = 256, 4096  # points and entries of one product: a result of 4 MiB
-_GROUPED_ROWS = 4096  # points that share one sort by group
-_GROUP_ITERATIONS = 4
-_BLAS = threading.Lock()  # its thread count is one for the process: one search at a time
-
-
-def search_nearest(
-    points: I16 | I32,
-    entries: I32,
-    near_groups: int = 0,
-    threads: int | None = None,
-    *,
-    other: bool = False,
-) -> tuple[U32, F64]:
-    """Find the entry nearest to each point, and how far it is.
-
-    Minimises |c|**2 / 2 - x.c: one product of [x, 1] and [c, -|c|**2 / 2].
-
-    Args:
-        points: [N, D], lattice integers. Where max|x| max|c| + max|c|**2 / 2 reaches 2**23
-            (norms of about 2,300) both are first divided by a power of two and rounded.
-        entries: [K, D], K > 0.
-        near_groups: 0, or how many groups of about sqrt(K) entries to search for a point.
-        threads: worker threads, all processors unless told.
-        other: point n may not find entry n (the points are the entries; `near_groups` 0).
-
-    Returns:
-        index [N] uint32, the first of equally near entries when all are searched; and the
-        squared distance [N] float64, of the divided integers, in units of the lattice.
-    """
-    shift = _shift(points, entries)
-    coarse = _shift_right(entries, shift)
-    index = np.zeros(len(points), np.uint32)
-    error = np.zeros(len(points))
-    width, length = points.shape[1] + 1, _PRODUCT_ROWS
-    find = _every_entry(_matrix(coarse), other)
-    if 0 < near_groups < _group_count(len(entries)):
-        length = _GROUPED_ROWS
-        find = _near_entries(coarse, near_groups, threads)
-
-    def work(starts: range) -> None:
-        x = np.ones((length, width), np.float32)
-        for a in starts:
-            part = slice(a, min(a + length, len(points)))
-            rows = x[: part.stop - a]
-            rows[:, :-1] = points[part] if shift == 0 else _shift_right(points[part], shift)
-            index[part], best = find(rows, a)
-            norm = np.einsum("nd,nd->n", rows, rows, dtype=np.float64) - 1.0
-            error[part] = (norm - 2.0 * best) * 4.0**shift
-
-    workers = max(1, min(threads or os.cpu_count() or 1, -(-len(points) // length)))
-    jobs = [range(w * length, len(points), workers * length) for w in range(workers)]
-    with one_blas_thread():
-        if workers == 1:  # to start a thread takes longer than a small search
-            work(jobs[0])
-        else:
-            with ThreadPoolExecutor(workers) as pool:
-                list(pool.map(work, jobs))
-    return index, error
 
 
 def _shift(points: I16 | I32, entries: I32) -> int:
@@ -322,12 +394,12 @@ def _largest_norm(rows: I16 | I32) -> float:
     return math.sqrt(largest)
 
 
-def _shift_right(rows: I16 | I32, shift: int) -> I64:
+def _divide(rows: I16 | I32, shift: int) -> I64:
     return (rows.astype(np.int64) + ((1 << shift) >> 1)) >> shift
 
 
 def _matrix(entries: I64) -> F32:
-    """Return [D + 1, K]: the entries as columns, minus half their squares below."""
+    """Return [D + 1, K]: the entries as columns, and below minus half their squares."""
     half = np.einsum("kd,kd->k", entries, entries) * -0.5
     return np.concatenate([entries.T, half[None]]).astype(np.float32)
 
@@ -351,10 +423,6 @@ def _every_entry(matrix: F32, other: bool) -> _Find:
         return index, best
 
     return find
-
-
-def _group_count(entry_count: int) -> int:
-    return math.isqrt(entry_count)
 
 
 def _near_entries(entries: I64, near: int, threads: int | None) -> _Find:
@@ -386,7 +454,7 @@ def _near_entries(entries: I64, near: int, threads: int | None) -> _Find:
 
 
 def _groups(entries: I64, threads: int | None) -> tuple[I64, U32]:
-    """Put the entries into about sqrt(K) groups by plain k-means; the means of the groups."""
+    """Put the entries into about sqrt(K) groups by plain k-means; return means and labels."""
     count = _group_count(len(entries))
     rows = entries.astype(np.int32)
     centres = rows[np.arange(count) * len(rows) // count]
@@ -400,31 +468,15 @@ def _groups(entries: I64, threads: int | None) -> tuple[I64, U32]:
     return centres.astype(np.int64), label
 
 
-@contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Let each product run on one thread, where NumPy's BLAS is an OpenBLAS that lets us.
-
-    Our threads already fill the processors. OpenBLAS's wait for each other by spinning:
-    with one other program at work these products took 20 times as long.
-    """
-    control = _openblas()
-    if control is None:
-        yield
-        return
-    with _BLAS:
-        before = control[0]()
-        control[1](1)
-        try:
-            yield
-        finally:
-            control[1](before)
+def _group_count(entry_count: int) -> int:
+    return math.isqrt(entry_count)
 
 
 @cache
 def _openblas() -> tuple[Callable[[], int], Callable[[int], object]] | None:
     core = sys.modules.get("numpy._core._multiarray_umath") or sys.modules.get("numpy.core._multiarray_umath")
-    beside = Path(np.__file__).parent.parent / "numpy.libs"
-    paths = [str(getattr(core, "__file__", "")), *map(str, sorted(beside.glob("*openblas*")))]
+    bundled = Path(np.__file__).parent.parent / "numpy.libs"
+    paths = [str(getattr(core, "__file__", "")), *map(str, sorted(bundled.glob("*openblas*")))]
     for path in filter(None, paths):
         try:
             library = ctypes.CDLL(path)
@@ -438,68 +490,20 @@ def _openblas() -> tuple[Callable[[], int], Callable[[int], object]] | None:
     return None
 
 
-Floats = NDArray[Any]
-
-_CANDIDATES = 96  # entries for a point: its own and the nearest to that
-_REFINE_ROUNDS = 2  # how often entries move
-_METRIC_BLOCK = 1 << 12
-_RIDGE = 1e-3  # fraction of the mean diagonal: holds an entry in place if its points do not determine it
-
-
-def reassign_by_metric(
-    points: Floats, metric: ErrorMetric, entries: Floats, index: I64, threads: int, tried: int
-) -> I64:
-    """Give each point the best of the entries near its own.
-
-    Args:
-        points: [N, D, C].
-        metric: metric of the points.
-        entries: [K, D, C].
-        index: [N], the entry of each point.
-        threads: number to use; the result does not depend on it.
-        tried: number of entries to try: its own and that one's nearest neighbours.
-
-    Returns:
-        [N].
-    """
-    with one_blas_thread():
-        return _assign_by_metric(points, metric, entries, index, threads, tried)
-
-
-def refine_by_metric(points: Floats, metric: ErrorMetric, entries: I32, index: I64, threads: int) -> tuple[I32, I64]:
-    """Give each point the best of the entries near its own, and move the entries; twice.
-
-    Args:
-        points: [N, D, C], in lattice steps.
-        metric: metric of the points.
-        entries: [K, D, C] lattice integers.
-        index: [N], the entry of each point.
-        threads: number to use; the result does not depend on it.
-
-    Returns:
-        entries [K', D, C], distinct, each used; index [N].
-    """
-    with one_blas_thread():
-        for _ in range(_REFINE_ROUNDS):
-            index = _assign_by_metric(points, metric, entries, index, threads, _CANDIDATES)
-            entries = _solve_entries(points, metric, entries, index)
-        index = _assign_by_metric(points, metric, entries, index, threads, _CANDIDATES)
-    flat, place = np.unique(entries.reshape(len(entries), -1), axis=0, return_inverse=True)
-    index = place.reshape(-1)[index]
-    used, index = np.unique(index, return_inverse=True)
-    return flat[used].reshape(-1, *entries.shape[1:]), index.reshape(-1)
-
-
 def _assign_by_metric(
     points: Floats, metric: ErrorMetric, entries: Floats, index: I64, threads: int, tried: int
 ) -> I64:
-    """Take the best of the candidates: w xᵀMx falls out, what is left is linear in Mx and M."""
+    """Minimise the error over the candidates: w xᵀMx is constant, the rest is linear in Mx and M."""
     near = _neighbours(entries, tried)
     size, channels = entries.shape[1:]
-    above, beside = np.triu_indices(size)
+    above_diagonal, below_diagonal = np.triu_indices(size)
     wide = entries.astype(np.float64)
     table = np.concatenate(
-        [-2.0 * wide.reshape(len(wide), -1), np.einsum("kpc,kpc->kp", wide[:, above], wide[:, beside])], axis=1
+        [
+            -2.0 * wide.reshape(len(wide), -1),
+            np.einsum("kpc,kpc->kp", wide[:, above_diagonal], wide[:, below_diagonal]),
+        ],
+        axis=1,
     )
     order = np.argsort(index, kind="stable")
     ends = np.searchsorted(index[order], np.arange(len(entries) + 1))
@@ -523,7 +527,7 @@ def _assign_by_metric(
 
 
 def _neighbours(entries: Floats, tried: int) -> I64:
-    """[K, candidates]: each entry itself, and those nearest to it."""
+    """Return each entry and those nearest to it, [K, candidates]."""
     flat = entries.reshape(len(entries), -1).astype(np.float64)
     squares = np.einsum("kd,kd->k", flat, flat)
     count = min(tried, len(flat))
@@ -538,12 +542,12 @@ def _neighbours(entries: Floats, tried: int) -> I64:
 
 
 def _solve_entries(points: Floats, metric: ErrorMetric, entries: I32, index: I64) -> I32:
-    """Return the entries, [K, D, C], that minimise the sums of the points' errors, rounded."""
+    """Return the entries [K, D, C] that minimise the sums of the points' errors, rounded."""
     count, size, channels = entries.shape
-    above, beside = np.triu_indices(size)
+    above_diagonal, below_diagonal = np.triu_indices(size)
     weights = metric.weights.astype(np.float64)
     matrices = np.zeros((count, size, size))
-    for place, (i, j) in enumerate(zip(above, beside, strict=True)):
+    for place, (i, j) in enumerate(zip(above_diagonal, below_diagonal, strict=True)):
         sums = np.bincount(index, weights * metric.triangles[:, place], count)
         matrices[:, i, j] = matrices[:, j, i] = sums
     wanted = np.empty((count, size, channels))

@@ -91,14 +91,14 @@ def encode_with_report(
     *,
     importance: NDArray[Any] | Importance | None = None,
     origin: Origin | None = None,
-    said: Mapping[str, Any] | None = None,
+    metadata: Mapping[str, Any] | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> EncodeResult:
     """Compress a scene, and report choices and errors: `csplat encode` without a target.
 
     Args:
         model, options, importance, origin, progress: see `EncodePlan.of`.
-        said: metadata to record, see `EncodedTiles.write`.
+        metadata: entries to record, see `EncodedTiles.write`.
 
     Examples:
         >>> import csplat
@@ -111,7 +111,7 @@ def encode_with_report(
         InputError: as `encode`; or an importance of another shape, or negative, or not finite.
     """
     plan = EncodePlan.of(model, options, importance=importance, origin=origin, progress=progress)
-    return encode_tiles(plan, progress=progress).write(said)
+    return encode_tiles(plan, progress=progress).write(metadata)
 
 
 @dataclass(frozen=True)

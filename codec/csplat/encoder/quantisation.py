@@ -1,4 +1,7 @@
-"""Values to lattice integers, and back as a decoder reconstructs them (spec 7)."""
+"""Values to lattice integers, and back as a decoder reconstructs them (spec 7).
+
+Arrays are in columns, [C, n], as streams need them; NumPy's inner loops are then long.
+"""
 
 from __future__ import annotations
 
@@ -17,18 +20,21 @@ from csplat.types import F32, I32, I64
 Floats = NDArray[Any]
 Integers = NDArray[Any]
 
-_WIDE = _spec.COLUMN_MAX / 2  # lattice integers of scales and colours stay below, with room for rounding
+_WIDE = _spec.COLUMN_MAX / 2  # bound of the integers of scales and colours, half of LAT-4's because of rounding
 _EXACT32 = 2.0**20  # colours beyond this many steps are quantised in float64
-_ROOT2 = float.fromhex("0x1.6A09E667F3BCDp+0")
+_ROWS = 2048  # splats per block: rows of 45 floats and their columns stay in the second-level cache
+_ROOT2 = float.fromhex("0x1.6A09E667F3BCDp+0")  # spec 7.5
+
+Quaternion = tuple[F32, F32, F32, F32]
 
 
 def lattice_step(step: float, exponent: int) -> float:
-    """Return step × 2**exponent, which LAT-1 and TIL-9 want normal and finite: in binary32, and in binary64."""
+    """Return step × 2**exponent: normal and finite in binary32 (LAT-1) and binary64 (TIL-9)."""
     return math.ldexp(step, exponent)
 
 
 def lattice_exponent(largest: float, step: float) -> int:
-    """Return the smallest exponent >= 0 at which the integers of scales or colours keep LAT-4.
+    """Return the smallest exponent >= 0 at which the integers of scales or colours satisfy LAT-4.
 
     Args:
         largest: largest magnitude of the values, in the unit of `step`.
@@ -39,7 +45,7 @@ def lattice_exponent(largest: float, step: float) -> int:
 
 
 def largest_exact(step: float) -> float:
-    """Return the magnitude from which on `lattice_exponent` is above 0."""
+    """Return the magnitude from which `lattice_exponent` is above 0."""
     return _WIDE * step
 
 
@@ -51,14 +57,14 @@ def lattice_values(n: Integers, step: float) -> F32:
 
 
 def quantise_means(means: F32, step: float) -> I64:
-    """Round centres to the lattice (spec 7.4).
+    """Round means to the lattice (spec 7.4).
 
     Args:
         means: [3, n] float32.
-        step: the tile's step; |mean| / step stays below 2**53 (the tiling sees to it).
+        step: the tile's step; |mean| / step is below 2**53, by `tile_exponent`.
 
     Returns:
-        [3, n] int64. Where rounding up would leave float32, the integer below in magnitude is taken.
+        [3, n] int64. If rounding up would leave float32, the integer of smaller magnitude.
     """
     scaled = means.astype(np.float64)
     scaled /= step
@@ -75,8 +81,8 @@ def opacity_levels(opacities: F32, levels: int, *, square: bool, multiple: int =
     Args:
         opacities: [n] float32, 0 to 1.
         levels: M.
-        square: the square-root domain, whose levels lie closer near 0.
-        multiple: all q but M are multiples of this, >= 1: no other levels, fewer symbols.
+        square: levels are equidistant in the square root of alpha.
+        multiple: all q but M are multiples of this, >= 1: the same levels, fewer symbols.
 
     Returns:
         [n] int32, 0 to M; 0 and M exactly for alpha 0 and 1.
@@ -103,11 +109,11 @@ def quat_levels(rotation: F32, levels: int, multiple: int = 1) -> I32:
     Args:
         rotation: [4, n] float32, unit length, w >= |x|, |y|, |z|.
         levels: M >= 3.
-        multiple: q are multiples of this, 1 to M / 3: no other levels, fewer symbols.
+        multiple: q are multiples of this, 1 to M / 3: the same levels, fewer symbols.
 
     Returns:
-        [3, n] int32 with |q| <= M and q1² + q2² + q3² <= 2 M². Where rounding to the nearest breaks the second
-        bound (about w = 0.5 at small M), all three are rounded towards 0.
+        [3, n] int32 with |q| <= M and q1² + q2² + q3² <= 2 M². If rounding to nearest violates the second bound
+        (about w = 0.5 at small M), all three are rounded towards 0.
     """
     scaled = rotation[1:] * np.float32(levels * _ROOT2 / multiple)
     most = levels // multiple
@@ -136,11 +142,11 @@ def colour_integers(rgb: Floats, shift: int, coarse: I32 | None = None) -> Integ
     Args:
         rgb: [3, ..., n] float32 or float64, in lattice steps, below 2**30 in magnitude.
         shift: Co and Cg are coarser by 2**shift.
-        coarse: [n], splats rounded to multiples of 2**coarse steps: no other lattice, fewer symbols.
+        coarse: [n], splats are rounded to multiples of 2**coarse steps: the same lattice, fewer symbols.
 
     Returns:
-        [3, ..., n] Y, Co, Cg; int32, or int64 where 32 bits would not do. Y is the integer that brings R + G + B
-        nearest to the source's, given the rounded chroma.
+        [3, ..., n] Y, Co, Cg; int32, or int64 if 32 bits are too few. Y is the integer that brings R + G + B
+        closest to the source's, given the rounded chroma.
     """
     wide = float(np.abs(rgb).max(initial=0.0)) >= _EXACT32
     r, g, b = rgb.astype(np.float64) if wide else rgb
@@ -174,14 +180,14 @@ def _round_multiples(values: Floats, kind: type[np.signedinteger[Any]], coarse: 
 
 
 def check_finite(name: str, values: F32) -> None:
-    """Refuse what no lattice integer can bring back into float32."""
+    """Raise InputError if decoded values are beyond float32."""
     if not np.isfinite(values).all():
         raise InputError(f"{name} too large to quantise: values at the end of float32's range")
 
 
 @dataclass(frozen=True)
 class QuantisedColour:
-    """Colours on a lattice: Y, Co, Cg columns, the tile's exponent, and what the decoder will see."""
+    """Y, Co, Cg columns, the tile's exponent, and the decoded colours."""
 
     columns: Integers
     exponent: int
@@ -198,15 +204,15 @@ def quantise_colour(rgb: F32, step: float, shift: int, coarse: int = 0) -> Quant
 
 
 def quantise_sh(source: F32, parameters: CodingParameters, coarse: I32 | None) -> tuple[Integers, int, F32]:
-    """Quantise SH on the plan's lattice, splat by splat.
+    """Quantise SH splat by splat.
 
     Args:
         source: [n, K, 3] float32.
         parameters: step and chroma shift.
-        coarse: [n], as in `colour_integers`, or None.
+        coarse: [n], see `colour_integers`; None: 0.
 
     Returns:
-        Columns [3, K, n], as narrow as they may be; the tile's exponent; [n, K, 3] float32 as decoded.
+        Columns [3, K, n] of the narrowest dtype; the tile's exponent; [n, K, 3] float32 as decoded.
     """
     n, coefficients, _ = source.shape
     largest = max(abs(float(source.max(initial=0.0))), abs(float(source.min(initial=0.0))))
@@ -219,8 +225,8 @@ def quantise_sh(source: F32, parameters: CodingParameters, coarse: I32 | None) -
     for at in range(0, n, _ROWS):
         part = slice(at, at + _ROWS)
         rgb = np.ascontiguousarray(source[part].transpose(2, 1, 0))
-        some = None if coarse is None else coarse[part]
-        quantised = colour_integers(rgb * real(1.0 / step), parameters.chroma_shift, some)
+        multiples = None if coarse is None else coarse[part]
+        quantised = colour_integers(rgb * real(1.0 / step), parameters.chroma_shift, multiples)
         columns[:, :, part] = quantised
         decoded[part] = lattice_values(colour_lifted(quantised, parameters.chroma_shift), step).transpose(2, 1, 0)
     check_finite("shN", decoded)
@@ -231,14 +237,12 @@ def _narrowest(largest: float) -> type[np.signedinteger[Any]]:
     return np.int8 if largest < 127 else np.int16 if largest < 32767 else np.int32
 
 
-_ROWS = 2048  # splats at a time: rows of 45 floats and their columns stay in the second-level cache
-
-
-Columns = tuple[F32, F32, F32, F32]
-
-
 def canonicalise_shape(quats: F32, scales: F32) -> tuple[F32, F32]:
-    """Sort the scales descending and make w the largest component of the rotation.
+    """Bring shapes into canonical axis order: scales descending, w the largest component of the rotation.
+
+    Permuting the axes of an ellipsoid, or half a turn about one of them, changes rotation and scales but not the
+    covariance; so 24 pairs, and two signs of each quaternion, describe the same ellipsoid. This one needs no index of
+    its largest component.
 
     Args:
         quats: [n, 4] float32, w x y z, unit length within 1e-3.
@@ -251,7 +255,7 @@ def canonicalise_shape(quats: F32, scales: F32) -> tuple[F32, F32]:
     w, x, y, z = (np.ascontiguousarray(quats[:, i]) for i in range(4))
     a, b, c = (np.ascontiguousarray(scales[:, i]) for i in range(3))
     # Half turns about (x+y), (y+z), (x+y) exchange two axes and keep the rotation proper. Right products with
-    # (0, 1, 1, 0) and (0, 0, 1, 1); their length, sqrt 2 each, is taken out by the last normalisation.
+    # (0, 1, 1, 0) and (0, 0, 1, 1); their length, sqrt 2 each, is removed by the last normalisation.
     for axes in ((0, 1), (1, 2), (0, 1)):
         first, second = (a, b) if axes == (0, 1) else (b, c)
         swap = first < second
@@ -271,14 +275,14 @@ def canonicalise_shape(quats: F32, scales: F32) -> tuple[F32, F32]:
     return rotation, np.stack([a, b, c])
 
 
-def _exchange_axes(swap: NDArray[np.bool_], turned: Columns, kept: Columns) -> Columns:
-    """The turned rotation, at unit length, where axes are exchanged, and the one that was elsewhere."""
+def _exchange_axes(swap: NDArray[np.bool_], turned: Quaternion, kept: Quaternion) -> Quaternion:
+    """Select the turned rotation, at unit length, if axes are exchanged, and the old one otherwise."""
     root = np.float32(np.sqrt(0.5))
     w, x, y, z = (np.where(swap, new * root, old) for new, old in zip(turned, kept, strict=True))
     return w, x, y, z
 
 
-def _largest_component_first(w: F32, x: F32, y: F32, z: F32) -> Columns:
+def _largest_component_first(w: F32, x: F32, y: F32, z: F32) -> Quaternion:
     """Multiply from the right by 1, i, j or k so that the component of largest magnitude becomes w."""
     aw, ax, ay, az = np.abs(w), np.abs(x), np.abs(y), np.abs(z)
     x_leads = ax > np.maximum(aw, np.maximum(ay, az))

@@ -1,4 +1,9 @@
-"""Shapes."""
+"""Shapes: scales and rotations, coded by themselves or by a codebook if that makes the file smaller (spec 6.4.5).
+
+The covariance divided by its trace is clustered, as in Niedermayr, Stumpfegger and Westermann ("Compressed 3D Gaussian
+Splatting for Accelerated Novel View Synthesis", CVPR 2024); each splat keeps its trace. Means of matrices of trace 1
+have trace 1, so they need no normalisation. `_worth_assigning` weighs bytes against error to find the escapes.
+"""
 
 from __future__ import annotations
 
@@ -29,44 +34,98 @@ from csplat.encoder.quantisation import (
 from csplat.encoder.tiling import TileSplats, quantise_and_sort
 from csplat.encoder.weights import ErrorMetric
 from csplat.model import SplatModel
-from csplat.types import F32, F64, I16, I32, I64, Progress
+from csplat.types import F32, F64, I16, I32, I64, Mask, Progress
 
-Rows = NDArray[np.intp]
+Integers = NDArray[Any]
+Floats = NDArray[Any]
+
+#: Id of the codebook, above those of SH.
+SHAPE_CODEBOOK_ID = _spec.SH_DEGREE_MAX + 1
 
 _TRACE_STEPS = 2048  # lattice steps of a trace: searches are exact up to norms of about 2,300
-_USERS = 6  # splats per entry below which an entry does not pay for itself
-_ROUNDS = 2  # rounds of clustering; from the second on, escaped splats have no influence
-_METRIC_ROUNDS = 2
-_TRIED = 64  # entries tried for a splat, if a metric ranks them
-_MOST_RESIZED = 0.7  # largest summand of the log scales: beyond it, the metric is no longer linear
-_LOG_SIZE_MAX = 30.0  # log sizes are clipped to this: the error is already as large as can be
-_ESCAPES = 0.05  # fraction of the splats, if nothing is known of the cost of an error
+_USERS_MIN = 6  # splats per entry, below which an entry costs more bytes than it saves
+_ROUNDS = 2  # of clustering; escapes of one round have no weight in the next
+_METRIC_ROUNDS = 2  # of assignment under the metric, and moving the entries
+_CANDIDATES = 64  # entries tried for a splat under the metric
+_SUMMAND_MAX = 0.7  # of the log scales: beyond it, the metric is not linear
+_LOG_SIZE_MAX = 30.0  # log sizes are clipped to this, where the error is already enormous
+_ESCAPES = 0.05  # fraction of the splats, if the cost of errors is unknown
 _OFF_DIAGONAL_ROOTS = np.sqrt([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # an entry off the diagonal occurs twice
 _DIMENSIONS = 6  # dimensions of a shape: a bit per splat divides its squared error by 2**(2/6)
-_MOST_STEPS = 2.0**20  # in log scale: above this, its tile may be coarser than the file's lattice
+_STEPS_MAX = 2.0**20  # log scale, in steps, above which a tile's lattice may be coarser than the file's
 _TABLE_ID = 2  # bytes of the table id in a tile's record
-_OVERHEAD = 128  # bytes of records, heads and checksums that come with a codebook
+_OVERHEAD = 128  # bytes of records, heads and checksums of a codebook
+_FLATTEST = 1e-30  # fraction of the trace: rounding may leave an eigenvalue at 0 or below
 
 
 @dataclass(frozen=True, eq=False)
-class _ShapeInput:
-    """Input of the shape stage.
+class ShapeTables:
+    """A shape codebook and its users.
 
     Attributes:
-        covariances: [6, N], over their trace. sizes: [N], half the logarithm of the trace. weights: [N].
-        metric: how the errors of entries weigh together, if known.
-        plain: [N], weighted squared error of the covariance over its trace, coded directly.
-        fits: [N] bool, True if the file's lattice holds the scales; tiles with outliers use a coarser one.
-        bits: cost of a shape that is coded directly, by the entropy of its integers.
+        entries: [6, K] int32, log scales up to a summand, x, y, z of the rotation, on the file's lattices.
+        index: [N] int32, entry of each splat; K means "escaped"; in a tile that is smaller without a codebook, all are.
+        summand: [N] int32, in steps of the scales' lattice; 0 for escaped splats.
     """
 
-    covariances: F64
-    sizes: F64
-    weights: F64
-    metric: ErrorMetric | None
-    plain: F64
-    fits: NDArray[np.bool_]
-    bits: float
+    entries: I32
+    index: I32
+    summand: I32
+
+    @property
+    def size(self) -> int:
+        """Entries of the codebook."""
+        return int(self.entries.shape[1])
+
+    @property
+    def escaped(self) -> Mask:
+        """True for splats that bypass the codebook, [N]."""
+        return np.asarray(self.index == self.size, np.bool_)
+
+    def part(self, rows: NDArray[np.intp]) -> ShapePart | None:
+        """Return the entries of some splats; None if all are escaped."""
+        index, summand = self.index[rows], self.summand[rows]
+        assigned = np.asarray(index < self.size, np.bool_)
+        if not assigned.any():
+            return None
+        entries = np.take(self.entries, index[assigned], axis=1)
+        return ShapePart(index, self.size, assigned, entries[:3] + summand[assigned], entries[3:], summand)
+
+    def select(self, order: NDArray[Any]) -> ShapeTables:
+        """Return the codebook with the users `order`."""
+        return ShapeTables(self.entries, self.index[order], self.summand[order])
+
+
+@dataclass(frozen=True, eq=False)
+class ShapePart:
+    """Codebook entries of the splats of a tile.
+
+    Attributes:
+        index: [n] int32, entry of each splat; `size` means "escaped".
+        size: entries of the codebook.
+        assigned: [n] bool, True for splats that are not escaped.
+        scales: [3, assigned] int32, log scales on the file's lattice.
+        quats: [3, assigned] int32, x, y, z of the rotation.
+        summand: [n] int32, difference of log scales to the entry's; 0 for escaped splats.
+    """
+
+    index: I32
+    size: int
+    assigned: Mask
+    scales: I32
+    quats: I32
+    summand: I32
+
+
+@dataclass(frozen=True)
+class QuantisedShape:
+    """Scales and rotations of a tile in columns: integers, the scales' exponent, and decoded values."""
+
+    scales: Integers
+    exponent: int
+    quats: Integers
+    decoded_scales: F32
+    decoded_quats: F32
 
 
 def choose_shapes(
@@ -76,113 +135,239 @@ def choose_shapes(
     tiles: Sequence[TileSplats],
     parameters: CodingParameters,
     options: EncodeOptions,
-    report: Progress,
+    progress: Progress,
 ) -> ShapeTables | None:
-    """Make the codebook, and find the splats that are assigned to it.
+    """Train a codebook, and assign splats to it.
 
     Args:
         model: the scene.
-        weights: [N], of the squared error of a covariance over its trace; only ratios matter.
-        metric: how errors of xx, yy, zz, √2 xy, √2 xz, √2 yz weigh together; None: each for itself.
-        tiles: how the scene is cut.
-        parameters: the lattices.
+        weights: [N], of the squared error of a covariance divided by its trace; only ratios matter.
+        metric: metric of xx, yy, zz, √2 xy, √2 xz, √2 yz; None: their errors add up.
+        tiles: the scene's tiles.
+        parameters: steps and codings.
         options: `shape_codebook_size`, `shape_escape_fraction`, `seed`.
-        report: progress.
+        progress: called with the stage and the fraction done.
 
     Returns:
         The codebook, or None if the file is not smaller with one.
     """
-    size = min(options.shape_codebook_size or 0, len(model) // _USERS)
+    size = min(options.shape_codebook_size or 0, len(model) // _USERS_MIN)
     if size < 1:
         return None
-    scene = _shape_input(model, weights, metric, parameters)
+    shapes = _shape_input(model, weights, metric, parameters)
     fraction = options.shape_escape_fraction
     if fraction is None and metric is None:
         fraction = _ESCAPES
-    taking = scene.weights * scene.fits
+    training = shapes.weights * shapes.fits
     tables: ShapeTables | None = None
     for step in range(_ROUNDS):
-        report("shapes", step / _ROUNDS)
-        entries, index = _cluster(scene, taking, size, parameters, options.seed, options.thread_count)
-        errors, summand = _assignment_errors(scene, entries, index, parameters)
+        progress("shapes", step / _ROUNDS)
+        entries, index = _cluster(shapes, training, size, parameters, options.seed, options.thread_count)
+        errors, summand = _assignment_errors(shapes, entries, index, parameters)
         if fraction is None:
-            assigned = _worth_it(scene, errors, index, summand)
+            assigned = _worth_assigning(shapes, errors, index, summand)
         else:
-            assigned = _all_but_worst(scene, errors, fraction)
+            assigned = _all_but_worst(shapes, errors, fraction)
         if not assigned.any():
             return None
         tables = _rank_entries(entries, index, summand, assigned)
-        taking = scene.weights * assigned
+        training = shapes.weights * assigned
     assert tables is not None
     tables = _keep_where_smaller(model, tables, tiles, parameters)
-    report("shapes", 1.0)
+    progress("shapes", 1.0)
     return tables
+
+
+def quantise_shape(
+    quats: F32,
+    scales: F32,
+    parameters: CodingParameters,
+    part: ShapePart | None = None,
+    factors: StepFactors = SAME_STEPS,
+) -> QuantisedShape:
+    """Quantise the shapes of a tile in canonical axis order.
+
+    Args:
+        quats: [n, 4], w x y z.
+        scales: [n, 3], log standard deviations.
+        parameters: steps; and whether shapes are in canonical axis order already.
+        part: codebook entries, whose integers assigned splats take.
+        factors: step factors of the tile; not together with a codebook.
+    """
+    rotation, sorted_scales = _canonical(quats, scales, parameters)
+    exponent = max(factors.scales, lattice_exponent(float(np.abs(sorted_scales).max()), parameters.scale_step))
+    step = lattice_step(parameters.scale_step, exponent)
+    n = np.rint(sorted_scales.astype(np.float64) / step).astype(np.int64)
+    q = quat_levels(rotation, parameters.quat_levels, factors.quats)
+    if part is not None:
+        n[:, part.assigned], q[:, part.assigned] = part.scales, part.quats
+    return QuantisedShape(n, exponent, q, lattice_values(n, step), quat_values(q, parameters.quat_levels))
+
+
+def dequantised_shapes(
+    quats: F32,
+    scales: F32,
+    tiles: Sequence[TileSplats],
+    parameters: CodingParameters,
+    shapes: ShapeTables | None = None,
+) -> tuple[F32, F32]:
+    """Return rotations [N, 4] and log scales [N, 3] as decoded."""
+    decoded = np.empty_like(quats), np.empty_like(scales)
+    for tile in tiles:
+        part = None if shapes is None else shapes.part(tile.rows)
+        shape = quantise_shape(quats[tile.rows], scales[tile.rows], parameters, part, tile.factors)
+        decoded[0][tile.rows], decoded[1][tile.rows] = shape.decoded_quats.T, shape.decoded_scales.T
+    return decoded
+
+
+def shape_blocks(
+    scales: Integers, exponent: int, quats: Integers, part: ShapePart | None, deflate: DeflateSettings
+) -> list[bytes]:
+    """Return the blocks of scales and quats [3, n] of a tile, by codebook if there is a part."""
+    if part is None:
+        return [
+            entropy.offset_block(_spec.ATTRIBUTE_SCALES, scales, exponent, deflate),
+            entropy.signed_block(_spec.ATTRIBUTE_QUATS, quats, 0, deflate),
+        ]
+    assert exponent == 0, "a codebook lies on the file's lattice"
+    escaped = ~part.assigned
+    count = int(np.count_nonzero(escaped))
+    own_scales = own_quats = b""
+    if count:
+        own_scales = entropy.offset_block(_spec.ATTRIBUTE_SCALES, scales[:, escaped], 0, deflate)
+        own_quats = entropy.signed_block(_spec.ATTRIBUTE_QUATS, quats[:, escaped], 0, deflate)
+    return [
+        entropy.codebook_block(
+            _spec.ATTRIBUTE_SCALES, SHAPE_CODEBOOK_ID, part.index, count, own_scales, deflate, summand=part.summand
+        ),
+        entropy.codebook_block(_spec.ATTRIBUTE_QUATS, SHAPE_CODEBOOK_ID, None, count, own_quats, deflate),
+    ]
+
+
+def shape_codebook_chunk(tables: ShapeTables, deflate: DeflateSettings) -> tuple[CodebookTable, FileChunk]:
+    """Return index record and chunk of the codebook."""
+    head = _spec.pack_codebook_head(_spec.CodebookHead(SHAPE_CODEBOOK_ID, 0, 0))
+    stream = signed_stream(np.ascontiguousarray(tables.entries).reshape(-1), deflate)
+    record = CodebookTable(SHAPE_CODEBOOK_ID, _spec.CODEBOOK_KIND_SHAPE, (0, 0), tables.size)
+    return record, FileChunk(_spec.CHUNK_CODEBOOK, head + stream, SHAPE_CODEBOOK_ID)
+
+
+def unit_covariances(quats: Floats, scales: Floats) -> tuple[F64, F64]:
+    """Return covariances divided by their trace, and half the logarithm of the trace.
+
+    Args:
+        quats: [4, n], w x y z.
+        scales: [3, n], log standard deviations.
+
+    Returns:
+        [6, n] float64, xx, yy, zz, xy, xz, yz; [n] float64.
+    """
+    wide = scales.astype(np.float64)
+    top = wide.max(axis=0)
+    variances = np.exp(2.0 * (wide - top))
+    trace = variances.sum(axis=0)
+    return covariance_entries(quats, variances / trace), top + 0.5 * np.log(trace)
+
+
+def mean_axes(covariances: F64) -> tuple[F32, F32]:
+    """Return rotations [n, 4] and log standard deviations [n, 3] of covariances [6, n], in any axis order."""
+    xx, yy, zz, xy, xz, yz = covariances
+    matrices = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
+    values, axes = np.linalg.eigh(matrices)
+    axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # a rotation, no reflection
+    scales = 0.5 * np.log(np.maximum(values, _FLATTEST))
+    return _quaternions(axes).astype(np.float32), scales.astype(np.float32)
+
+
+def _canonical(quats: F32, scales: F32, parameters: CodingParameters) -> tuple[F32, F32]:
+    return (quats.T, scales.T) if parameters.canonical else canonicalise_shape(quats, scales)
+
+
+@dataclass(frozen=True, eq=False)
+class _ShapeInput:
+    """Shapes to cluster, and what they cost without a codebook.
+
+    Attributes:
+        covariances: [6, N], divided by their trace.
+        sizes: [N], half the logarithm of the trace.
+        weights: [N], of squared errors.
+        metric: metric of the entries, if known.
+        plain: [N], weighted squared error without a codebook.
+        fits: [N] bool, True if the file's lattice holds the scales; tiles with outliers have a coarser one.
+        bits: entropy of the integers of a shape without a codebook.
+    """
+
+    covariances: F64
+    sizes: F64
+    weights: F64
+    metric: ErrorMetric | None
+    plain: F64
+    fits: Mask
+    bits: float
 
 
 def _shape_input(
     model: SplatModel, weights: F32, metric: ErrorMetric | None, parameters: CodingParameters
 ) -> _ShapeInput:
-    rotation, scales = (
-        (model.quats.T, model.scales.T) if parameters.canonical else canonicalise_shape(model.quats, model.scales)
-    )
+    rotation, scales = _canonical(model.quats, model.scales, parameters)
     covariances, sizes = unit_covariances(rotation, scales)
-    fits = np.abs(scales).max(axis=0) < _MOST_STEPS * parameters.scale_step
+    fits = np.abs(scales).max(axis=0) < _STEPS_MAX * parameters.scale_step
     n = np.rint(np.where(fits, scales, 0.0).astype(np.float64) / parameters.scale_step).astype(np.int64)
     q = quat_levels(rotation, parameters.quat_levels)
-    seen, seen_sizes = unit_covariances(quat_values(q, parameters.quat_levels), n * parameters.scale_step)
+    decoded, decoded_sizes = unit_covariances(quat_values(q, parameters.quat_levels), n * parameters.scale_step)
     bits = sum(_entropy(column[fits]) for column in (*n, *q))
-    plain = _covariance_errors(covariances, seen, seen_sizes - sizes, weights, metric)
+    plain = _covariance_errors(covariances, decoded, decoded_sizes - sizes, weights, metric)
     return _ShapeInput(covariances, sizes, weights.astype(np.float64), metric, plain, fits, bits)
 
 
-def _covariance_errors(wanted: F64, found: F64, larger: F64, weights: NDArray[Any], metric: ErrorMetric | None) -> F64:
-    """[N] weighted squared error of covariances [6, N], `found` · e^(2 · larger) in place of `wanted`."""
-    difference = _vectors(found * np.exp(2.0 * np.clip(larger, -_LOG_SIZE_MAX, _LOG_SIZE_MAX)) - wanted)
+def _covariance_errors(target: F64, found: F64, larger: F64, weights: NDArray[Any], metric: ErrorMetric | None) -> F64:
+    """Return the weighted squared error, [N], of covariances `found` · e^(2 · larger), [6, N]."""
+    difference = _vectors(found * np.exp(2.0 * np.clip(larger, -_LOG_SIZE_MAX, _LOG_SIZE_MAX)) - target)
     if metric is not None:
         return metric.errors(difference[:, :, None], slice(None))
     return np.asarray(np.einsum("ni,ni->n", difference, difference) * weights)
 
 
 def _vectors(covariances: F64) -> F64:
-    """[N, 6] vectors whose distances are those of the matrices."""
+    """Return vectors [N, 6] whose distances are those of the matrices."""
     return np.ascontiguousarray((covariances * _OFF_DIAGONAL_ROOTS[:, None]).T)
 
 
 def _points(covariances: F64) -> I16:
-    """The same on a lattice."""
+    """Return `_vectors` on a lattice."""
     return np.rint(_vectors(covariances) * _TRACE_STEPS).astype(np.int16)
 
 
 def _cluster(
-    scene: _ShapeInput, weights: F64, size: int, parameters: CodingParameters, seed: int, threads: int
+    shapes: _ShapeInput, weights: F64, size: int, parameters: CodingParameters, seed: int, threads: int
 ) -> tuple[I32, I64]:
-    """Train entries [6, K] on the file's lattices, and give each splat its own, [N]."""
-    points = _points(scene.covariances)
+    """Train entries [6, K] on the file's lattices, and return the entry of each splat, [N]."""
+    points = _points(shapes.covariances)
     _, start = cluster(points, weights.astype(np.float32), size, seed=seed, threads=threads)
-    entries, seen = _on_lattices(scene, weights, start.astype(np.int64), parameters)
-    index = search_nearest(points, _points(seen).astype(np.int32), 0, threads)[0].astype(np.int64)
-    if scene.metric is None:
+    entries, decoded = _move_to_means(shapes, weights, start.astype(np.int64), parameters)
+    index = search_nearest(points, _points(decoded).astype(np.int32), 0, threads)[0].astype(np.int64)
+    if shapes.metric is None:
         return entries, index
-    vectors = _vectors(scene.covariances)[:, :, None]
+    vectors = _vectors(shapes.covariances)[:, :, None]
     for step in range(_METRIC_ROUNDS):
         if step:
-            entries, seen = _on_lattices(scene, weights, index, parameters)
-            index = search_nearest(points, _points(seen).astype(np.int32), 0, threads)[0].astype(np.int64)
-        index = reassign_by_metric(vectors, scene.metric, _vectors(seen)[:, :, None], index, threads, _TRIED)
+            entries, decoded = _move_to_means(shapes, weights, index, parameters)
+            index = search_nearest(points, _points(decoded).astype(np.int32), 0, threads)[0].astype(np.int64)
+        index = reassign_by_metric(vectors, shapes.metric, _vectors(decoded)[:, :, None], index, threads, _CANDIDATES)
     return entries, index
 
 
-def _on_lattices(scene: _ShapeInput, weights: F64, index: I64, parameters: CodingParameters) -> tuple[I32, F64]:
-    """[6, K] integers of the weighted mean covariance of each entry's splats; [6, K] what they decode to."""
-    index = np.unique(index, return_inverse=True)[1].reshape(-1)  # entries that serve nobody are gone
+def _move_to_means(shapes: _ShapeInput, weights: F64, index: I64, parameters: CodingParameters) -> tuple[I32, F64]:
+    """Return the integers of the weighted mean covariance of each entry's splats, [6, K], and its decoded values."""
+    index = np.unique(index, return_inverse=True)[1].reshape(-1)  # without unused entries
     count = int(index.max()) + 1
     total = np.bincount(index, weights, count)
-    weights = np.where(total[index] > 0.0, weights, 1.0)  # splats of no weight represent themselves
+    weights = np.where(total[index] > 0.0, weights, 1.0)  # splats without weight count alike
     total = np.bincount(index, weights, count)
-    sums = np.stack([np.bincount(index, weights * entry, count) for entry in scene.covariances])
+    sums = np.stack([np.bincount(index, weights * entry, count) for entry in shapes.covariances])
     rotation, scales = mean_axes(sums / total)
     rotation, scales = canonicalise_shape(rotation, scales)
-    scales = np.maximum(scales, scales[0] - 20.0)  # thinner than this is as good as flat
+    scales = np.maximum(scales, scales[0] - 20.0)  # anything thinner is flat
     n = np.rint(scales.astype(np.float64) / parameters.scale_step).astype(np.int32)
     entries = np.unique(np.concatenate([n - n[:1], quat_levels(rotation, parameters.quat_levels)]), axis=1)
     return entries, unit_covariances(
@@ -190,59 +375,59 @@ def _on_lattices(scene: _ShapeInput, weights: F64, index: I64, parameters: Codin
     )[0]
 
 
-def _assignment_errors(scene: _ShapeInput, entries: I32, index: I64, parameters: CodingParameters) -> tuple[F64, I32]:
-    """[N] weighted squared error of each splat by its entry, and [N] the summand that makes it least."""
-    seen, sizes = unit_covariances(
+def _assignment_errors(shapes: _ShapeInput, entries: I32, index: I64, parameters: CodingParameters) -> tuple[F64, I32]:
+    """Return the weighted squared error of each splat with its entry, [N], and the summand that minimises it, [N]."""
+    decoded, sizes = unit_covariances(
         quat_values(entries[3:], parameters.quat_levels), entries[:3] * parameters.scale_step
     )
-    found = seen[:, index]
-    factor = np.zeros(len(index)) if scene.metric is None else _best_size(scene.covariances, found, scene.metric)
-    steps = (scene.sizes + factor - sizes[index]) / parameters.scale_step
-    summand = np.rint(np.where(scene.fits, steps, 0.0)).astype(np.int32)
-    larger = sizes[index] + summand * parameters.scale_step - scene.sizes
-    return _covariance_errors(scene.covariances, found, larger, scene.weights, scene.metric), summand
+    found = decoded[:, index]
+    factor = np.zeros(len(index)) if shapes.metric is None else _best_size(shapes.covariances, found, shapes.metric)
+    steps = (shapes.sizes + factor - sizes[index]) / parameters.scale_step
+    summand = np.rint(np.where(shapes.fits, steps, 0.0)).astype(np.int32)
+    larger = sizes[index] + summand * parameters.scale_step - shapes.sizes
+    return _covariance_errors(shapes.covariances, found, larger, shapes.weights, shapes.metric), summand
 
 
-def _best_size(wanted: F64, found: F64, metric: ErrorMetric) -> F64:
-    """Return [N], the summand of the log scales that brings `found` [6, N] closest to `wanted`; 0 keeps the trace."""
-    a, b = _vectors(found)[:, :, None], _vectors(wanted)[:, :, None]
+def _best_size(target: F64, found: F64, metric: ErrorMetric) -> F64:
+    """Return [N], the summand of the log scales that brings `found` [6, N] closest to `target`; 0 keeps the trace."""
+    a, b = _vectors(found)[:, :, None], _vectors(target)[:, :, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = metric.products(a, b) / metric.products(a, a)
     usable = np.isfinite(ratio) & (ratio > 0.0)
-    return np.clip(0.5 * np.log(np.where(usable, ratio, 1.0)), -_MOST_RESIZED, _MOST_RESIZED)
+    return np.clip(0.5 * np.log(np.where(usable, ratio, 1.0)), -_SUMMAND_MAX, _SUMMAND_MAX)
 
 
-def _worth_it(scene: _ShapeInput, errors: F64, index: I64, summand: I32) -> NDArray[np.bool_]:
-    """Return True for the splats to assign: those whose error grows by less than the bits that it saves are worth.
+def _worth_assigning(shapes: _ShapeInput, errors: F64, index: I64, summand: I32) -> Mask:
+    """Return True for the splats to assign: those whose error grows by less than the saved bits are worth.
 
-    Bits are worth what they buy elsewhere: at the plan's steps, one more for every splat would remove 2 ln 2 / 6 of
-    their squared error. The cost of a shape is the entropy of its integers, alone or as index and summand.
+    Another bit for every splat would remove 2 ln 2 / 6 of the squared error. The cost of a shape is the entropy of its
+    integers, or of index and summand.
     """
-    fits = scene.fits
+    fits = shapes.fits
     if not fits.any():
         return fits
-    worth = 2.0 * math.log(2.0) / _DIMENSIONS * float(scene.plain[fits].mean())
-    saved = scene.bits - _entropy(index[fits]) - _entropy(summand[fits])
-    return np.asarray(fits & (errors - scene.plain < worth * saved))
+    worth = 2.0 * math.log(2.0) / _DIMENSIONS * float(shapes.plain[fits].mean())
+    saved = shapes.bits - _entropy(index[fits]) - _entropy(summand[fits])
+    return np.asarray(fits & (errors - shapes.plain < worth * saved))
+
+
+def _all_but_worst(shapes: _ShapeInput, errors: F64, fraction: float) -> Mask:
+    """Return True for the splats to assign: all but a fraction of them with the largest weighted error."""
+    assigned = shapes.fits.copy()
+    worst = np.argsort(-np.where(shapes.fits, errors, np.inf), kind="stable")
+    assigned[worst[: int(len(errors) * fraction)]] = False
+    return assigned
 
 
 def _entropy(values: NDArray[Any]) -> float:
-    """Order-0 entropy, bits per value."""
+    """Return the order-0 entropy, bits per value."""
     _, counts = np.unique(values, return_counts=True)
     shares = counts / max(1, counts.sum())
     return -float((shares * np.log2(shares)).sum())
 
 
-def _all_but_worst(scene: _ShapeInput, errors: F64, fraction: float) -> NDArray[np.bool_]:
-    """All but a share of the splats, those with the largest weighted error."""
-    assigned = scene.fits.copy()
-    worst = np.argsort(-np.where(scene.fits, errors, np.inf), kind="stable")
-    assigned[worst[: int(len(errors) * fraction)]] = False
-    return assigned
-
-
-def _rank_entries(entries: I32, index: I64, summand: I32, assigned: NDArray[np.bool_]) -> ShapeTables:
-    """Drop entries that serve nobody, and number the others by how many they serve."""
+def _rank_entries(entries: I32, index: I64, summand: I32, assigned: Mask) -> ShapeTables:
+    """Drop unused entries, and number the others by their number of users."""
     used, place = np.unique(index[assigned], return_inverse=True)
     ranked, order = rank_by_frequency(place.astype(np.uint32), np.ascontiguousarray(entries[:, used].T))
     full = np.full(len(index), len(used), np.int32)
@@ -253,7 +438,7 @@ def _rank_entries(entries: I32, index: I64, summand: I32, assigned: NDArray[np.b
 def _keep_where_smaller(
     model: SplatModel, tables: ShapeTables, tiles: Sequence[TileSplats], parameters: CodingParameters
 ) -> ShapeTables | None:
-    """Keep the codebook for the tiles that are smaller with it, if all of them together are."""
+    """Escape all splats of the tiles that are not smaller with the codebook; None if the file is not."""
     escaped, saved = tables.escaped, 0
     for tile in tiles:
         rows = quantise_and_sort(model, tile, parameters).rows
@@ -282,189 +467,8 @@ def _shape_bytes(shape: QuantisedShape, part: ShapePart | None, parameters: Codi
     )
 
 
-Integers = NDArray[Any]
-
-#: Id of the codebook: above those of the SH stage.
-SHAPE_CODEBOOK_ID = _spec.SH_DEGREE_MAX + 1
-
-
-@dataclass(frozen=True, eq=False)
-class ShapePart:
-    """Codebook entries of the splats of a tile.
-
-    Attributes:
-        index: [n] int32, entry of each splat; `size` means "escaped".
-        size: entries of the codebook.
-        assigned: [n] bool, True for splats that are not escaped.
-        scales: [3, assigned] int32, their log scales on the file's lattice. quats: [3, assigned], their rotations.
-        summand: [n] int32, the part of the scales that is each splat's own; 0 for the escaped.
-    """
-
-    index: I32
-    size: int
-    assigned: NDArray[np.bool_]
-    scales: I32
-    quats: I32
-    summand: I32
-
-
-@dataclass(frozen=True, eq=False)
-class ShapeTables:
-    """Decisions of the shape stage for the whole file.
-
-    Attributes:
-        entries: [6, K] int32, log scales up to a summand on the file's lattice, x, y, z of the rotation.
-        index: [N] int32, entry of each splat; K means "escaped". In a tile that is smaller without, all are.
-        summand: [N] int32, in steps of the scales' lattice; 0 for the escaped.
-    """
-
-    entries: I32
-    index: I32
-    summand: I32
-
-    @property
-    def size(self) -> int:
-        """Entries of the codebook."""
-        return int(self.entries.shape[1])
-
-    @property
-    def escaped(self) -> NDArray[np.bool_]:
-        """[N], which splats have a shape of their own."""
-        return np.asarray(self.index == self.size, np.bool_)
-
-    def part(self, rows: NDArray[np.intp]) -> ShapePart | None:
-        """Return what is said of some splats; None if all are escaped."""
-        index, summand = self.index[rows], self.summand[rows]
-        assigned = np.asarray(index < self.size, np.bool_)
-        if not assigned.any():
-            return None
-        entries = np.take(self.entries, index[assigned], axis=1)
-        return ShapePart(index, self.size, assigned, entries[:3] + summand[assigned], entries[3:], summand)
-
-    def select(self, order: NDArray[Any]) -> ShapeTables:
-        """The same for the splats `order`."""
-        return ShapeTables(self.entries, self.index[order], self.summand[order])
-
-
-def shape_codebook_chunk(tables: ShapeTables, deflate: DeflateSettings) -> tuple[CodebookTable, FileChunk]:
-    """Return the index record and the chunk of the codebook."""
-    head = _spec.pack_codebook_head(_spec.CodebookHead(SHAPE_CODEBOOK_ID, 0, 0))
-    stream = signed_stream(np.ascontiguousarray(tables.entries).reshape(-1), deflate)
-    record = CodebookTable(SHAPE_CODEBOOK_ID, _spec.CODEBOOK_KIND_SHAPE, (0, 0), tables.size)
-    return record, FileChunk(_spec.CHUNK_CODEBOOK, head + stream, SHAPE_CODEBOOK_ID)
-
-
-def shape_blocks(
-    scales: Integers, exponent: int, quats: Integers, part: ShapePart | None, deflate: DeflateSettings
-) -> list[bytes]:
-    """Code scales [3, n] and quats [3, n] of a tile: directly, or by codebook if there is a part."""
-    if part is None:
-        return [
-            entropy.offset_block(_spec.ATTRIBUTE_SCALES, scales, exponent, deflate),
-            entropy.signed_block(_spec.ATTRIBUTE_QUATS, quats, 0, deflate),
-        ]
-    assert exponent == 0, "a codebook lies on the file's lattice"
-    escaped = ~part.assigned
-    count = int(np.count_nonzero(escaped))
-    own_scales = own_quats = b""
-    if count:
-        own_scales = entropy.offset_block(_spec.ATTRIBUTE_SCALES, scales[:, escaped], 0, deflate)
-        own_quats = entropy.signed_block(_spec.ATTRIBUTE_QUATS, quats[:, escaped], 0, deflate)
-    return [
-        entropy.codebook_block(
-            _spec.ATTRIBUTE_SCALES, SHAPE_CODEBOOK_ID, part.index, count, own_scales, deflate, summand=part.summand
-        ),
-        entropy.codebook_block(_spec.ATTRIBUTE_QUATS, SHAPE_CODEBOOK_ID, None, count, own_quats, deflate),
-    ]
-
-
-@dataclass(frozen=True)
-class QuantisedShape:
-    """Rotations and scales of a tile in columns: integers, the scales' exponent, and what the decoder will see."""
-
-    scales: Integers
-    exponent: int
-    quats: Integers
-    decoded_scales: F32
-    decoded_quats: F32
-
-
-def quantise_shape(
-    quats: F32,
-    scales: F32,
-    parameters: CodingParameters,
-    part: ShapePart | None = None,
-    coarse: StepFactors = SAME_STEPS,
-) -> QuantisedShape:
-    """Quantise rotations [n, 4] and log scales [n, 3] of a tile in their gauge, which they may be in already.
-
-    Args:
-        quats: w x y z.
-        scales: logarithms.
-        parameters: the lattices.
-        part: what a codebook says of these splats; those that it serves take its integers.
-        coarse: by how much the tile's steps are coarser, where there is no codebook.
-    """
-    rotation, sorted_scales = (quats.T, scales.T) if parameters.canonical else canonicalise_shape(quats, scales)
-    exponent = max(coarse.scales, lattice_exponent(float(np.abs(sorted_scales).max()), parameters.scale_step))
-    step = lattice_step(parameters.scale_step, exponent)
-    n = np.rint(sorted_scales.astype(np.float64) / step).astype(np.int64)
-    q = quat_levels(rotation, parameters.quat_levels, coarse.quats)
-    if part is not None:
-        n[:, part.assigned], q[:, part.assigned] = part.scales, part.quats
-    return QuantisedShape(n, exponent, q, lattice_values(n, step), quat_values(q, parameters.quat_levels))
-
-
-def dequantised_shapes(
-    quats: F32,
-    scales: F32,
-    tiles: Sequence[TileSplats],
-    parameters: CodingParameters,
-    shapes: ShapeTables | None = None,
-) -> tuple[F32, F32]:
-    """Rotations [N, 4] and log scales [N, 3] as a decoder will see them."""
-    seen = np.empty_like(quats), np.empty_like(scales)
-    for tile in tiles:
-        part = None if shapes is None else shapes.part(tile.rows)
-        shape = quantise_shape(quats[tile.rows], scales[tile.rows], parameters, part, tile.factors)
-        seen[0][tile.rows], seen[1][tile.rows] = shape.decoded_quats.T, shape.decoded_scales.T
-    return seen
-
-
-Floats = NDArray[Any]
-
-_FLATTEST = 1e-30  # of a trace: rounding may leave an eigenvalue at 0 or below
-
-
-def unit_covariances(quats: Floats, scales: Floats) -> tuple[F64, F64]:
-    """Return covariances over their trace, and half the logarithm of the trace.
-
-    Args:
-        quats: [4, n], w x y z.
-        scales: [3, n], log standard deviations.
-
-    Returns:
-        [6, n] float64, xx, yy, zz, xy, xz, yz; [n] float64.
-    """
-    wide = scales.astype(np.float64)
-    top = wide.max(axis=0)
-    variances = np.exp(2.0 * (wide - top))
-    trace = variances.sum(axis=0)
-    return covariance_entries(quats, variances / trace), top + 0.5 * np.log(trace)
-
-
-def mean_axes(covariances: F64) -> tuple[F32, F32]:
-    """Return rotations [n, 4] and log standard deviations [n, 3] of covariances [6, n], in no particular gauge."""
-    xx, yy, zz, xy, xz, yz = covariances
-    matrices = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
-    values, axes = np.linalg.eigh(matrices)
-    axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # a rotation, no reflection
-    scales = 0.5 * np.log(np.maximum(values, _FLATTEST))
-    return _quaternions(axes).astype(np.float32), scales.astype(np.float32)
-
-
 def _quaternions(R: F64) -> F64:
-    """[n, 4] quaternions of rotation matrices [n, 3, 3]: of four formulas the one that divides by the largest."""
+    """Return quaternions [n, 4] of rotation matrices, by the formula that divides by the largest component."""
     xx, yy, zz = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
     x, y, z = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
     xy, xz, yz = R[:, 0, 1] + R[:, 1, 0], R[:, 0, 2] + R[:, 2, 0], R[:, 1, 2] + R[:, 2, 1]

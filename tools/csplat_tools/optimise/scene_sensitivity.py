@@ -202,7 +202,7 @@ def complete_importance(
         they were measured here.
     """
     several = max_class_count(len(source), encoding) > 1
-    if isinstance(importance, Importance) and importance.curvatures is not None:
+    if isinstance(importance, Importance) and importance.blocks is not None:
         return (importance if several else None), 0
     has_sh = source.sh_degree > 0 and encoding.sh_degree != 0 and encoding.sh_coding != "none"
     quick = encoding.preset == "fast" and encoding.grades is None
@@ -214,7 +214,7 @@ def complete_importance(
     except InputError:
         return None, 0  # no splat is visible
     if isinstance(importance, Importance):
-        found = replace(importance, curvatures=found.curvatures)
+        found = replace(importance, blocks=found.blocks)
     elif importance is not None:
         found = replace(found, sh=np.asarray(importance))
     if not encoding.shape_codebook_size:

@@ -417,7 +417,7 @@ class RefittedSubset:
         if graded and max_class_count(len(self.rows), options) > 1 and (self.gradable or options.grades is not None):
             return self._measured
         weights = self._removal.squared_weight
-        return replace(self._measured, curvatures=None) if options.shape_codebook_size else weights
+        return replace(self._measured, blocks=None) if options.shape_codebook_size else weights
 
     @cached_property
     def _removal(self) -> PruningError:
