@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat_render import Camera
-from csplat_render.conventions import Gradients, HasSplats, RenderResult, SplatArrays
+from csplat_render.conventions import Gradients, HasSplats, RenderResult, UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.reference_rasteriser import Decisions, render_exact
 
 Array = NDArray[Any]
 Arrays = dict[str, Array]
 
-#: Groups of parameters, in the order of `SplatArrays`.
+#: Groups of parameters, in the order of `UncheckedSplats`.
 GROUPS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 # A turned camera with an unusual centre, near enough that some splats lie beyond the field of view.
@@ -125,11 +125,11 @@ def finite_differences(
 ) -> tuple[RenderResult, Arrays]:
     """The twin's picture, and the slopes of the sum of its values times weights; comparisons do not change sides."""
     decisions = Decisions()
-    picture = render_exact(SplatArrays(**arrays), view, decisions=decisions, **options)
+    picture = render_exact(UncheckedSplats(**arrays), view, decisions=decisions, **options)
 
     def loss(changed: Mapping[str, Array]) -> float:
         decisions.replay()
-        result = render_exact(SplatArrays(**changed), view, decisions=decisions, **options)
+        result = render_exact(UncheckedSplats(**changed), view, decisions=decisions, **options)
         return float(sum(np.sum(a * b) for a, b in zip((result.rgb, result.alpha, result.depth), weights, strict=True)))
 
     slopes = {}

@@ -178,8 +178,8 @@ def test_a_judge_serves_for_many_and_says_of_some_views_what_all_say_of_them(sce
     errors, scores = judge.errors(other), judge.scores(other)
     assert [one.mse for one in scores.each] == pytest.approx(errors.tolist(), rel=1e-12)
     assert judge.psnr(other) == pytest.approx(scores.psnr, rel=1e-12)
-    assert judge.some([0, 2]).errors(other).tolist() == [errors[0], errors[2]]
-    assert judge.some([1]).psnr(other) == pytest.approx(scores.each[1].psnr)
+    assert judge.subset([0, 2]).errors(other).tolist() == [errors[0], errors[2]]
+    assert judge.subset([1]).psnr(other) == pytest.approx(scores.each[1].psnr)
 
 
 def test_pictures_that_do_not_fit_into_memory_are_made_when_their_turn_comes(scene, cameras):
@@ -188,7 +188,7 @@ def test_pictures_that_do_not_fit_into_memory_are_made_when_their_turn_comes(sce
     other = replace(scene, sh0=scene.sh0 + np.float32(0.3))
     kept = scorer.Scorer.of_source(scene, cameras).scores(other)
     again = scorer.Scorer.of_source(scene, cameras, kept_bytes=0)
-    assert not any(isinstance(look, scorer.ReferenceImage) for look in again.looks)
+    assert not any(isinstance(one, scorer.ReferenceImage) for one in again.references)
     assert kept == again.scores(other)
 
 

@@ -30,7 +30,7 @@ from csplat.encoder import EncodePlan, fix_quantisation
 from csplat.errors import InputError
 from csplat_render import render
 from csplat_render.camera_files import save_cameras
-from csplat_render.conventions import SplatArrays
+from csplat_render.conventions import UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
 from csplat_tools.cli.app import app
 from csplat_tools.cli.finetune import finetune as finetune_command
@@ -162,7 +162,7 @@ def test_the_decoded_file_scores_what_was_scored_while_tuning(coarse, views):
     seen = frozen.dequantise(tuned.held)
     for name in ("means", "shN"):
         assert np.array_equal(getattr(decoded, name)[order], getattr(seen, name)[rows])
-    splats = SplatArrays(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
+    splats = UncheckedSplats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
     for view in views.validation:
         picture = rasteriser.forward(splats, view.camera, background=BLACK).rgb
         error.append(np.square(np.clip(picture, 0, 1) - np.clip(view.wanted, 0, 1)).mean(dtype=np.float64))
@@ -221,7 +221,7 @@ def test_gradients_of_entries_are_those_of_all_their_users(source, views):
     wanted = np.zeros((H, W, 3), np.float32)
 
     def rendered(shN):
-        splats = SplatArrays(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, shN)
+        splats = UncheckedSplats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, shN)
         return rasteriser.forward(splats, view.camera, background=np.ones(3)).rgb
 
     picture = rendered(seen.shN)
@@ -256,8 +256,8 @@ def test_a_step_moves_values_through_their_quantisers(coarse, views):
     before = {name: values.copy() for name, values in scene.parameters.values.items()}
     rasteriser, view = Rasteriser(), views.train[0]
     seen, alphas = scene.seen()
-    splats = SplatArrays(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
-    wanted = view.image(BLACK, np.empty((H, W, 3), np.float32))
+    splats = UncheckedSplats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
+    wanted = view.picture(BLACK, np.empty((H, W, 3), np.float32))
     _, slope = PhotometricLoss(H, W)(rasteriser.forward(splats, view.camera, background=BLACK).rgb, wanted)
     rates = {"means": 0.0, "quats": 1e-4, "scales": 1e-4, "sizes": 0.0, "logits": 1e-4, "sh0": 1e-4, "shN": 1e-4}
     scene.step(rasteriser.backward(slope), seen, alphas, rates, None)
@@ -635,7 +635,7 @@ def test_a_file_that_is_not_what_was_tuned_is_not_written(capture, tmp_path, mon
         model = decode(data)
         return replace(model, sh0=model.sh0 + np.float32(1e-6))
 
-    monkeypatch.setattr("csplat_trainer.tuning.tuned_file.decode", wrong)
+    monkeypatch.setattr("csplat_trainer.tuning.tuned_encoding.decode", wrong)
     out = tmp_path / "s.csplat"
     result = invoke("finetune", capture / "scene.ply", "--data", capture, "-o", out, *BRIEF)
     assert "holds other sh0 than were tuned" in str(result.exception)

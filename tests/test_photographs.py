@@ -167,9 +167,9 @@ def test_a_photograph_is_shown_in_front_of_the_background():
     pixels = np.zeros((1, 2, 4), np.uint8)
     pixels[0, 1] = (255, 0, 0, 51)
     picture = PosedImage(replace(cameras(1)[0], W=2, H=1), pixels)
-    look = photograph_scorer([picture], (0.0, 1.0, 1.0)).look(0)
-    shown = look.picture
-    assert [[False, False]] == look.covered.tolist()
+    reference = photograph_scorer([picture], (0.0, 1.0, 1.0)).reference(0)
+    shown = reference.rgb
+    assert [[False, False]] == reference.covered.tolist()
     assert np.float32 == shown.dtype
     assert np.allclose([[[0, 1, 1], [0.2, 0.8, 0.8]]], shown)
 
@@ -189,7 +189,7 @@ def test_pixels_that_do_not_count_are_not_judged(scene):
     scores = judge.scores(scene)
     assert judge.psnr(scene) == pytest.approx(scores.psnr) == pytest.approx(-10.0 * np.log10(expected), abs=1e-3)
     assert [mask.sum(), H * W] == [one.pixels for one in scores.each]
-    assert judge.some([0]).psnr(scene) == pytest.approx(-10.0 * np.log10(errors[0]), abs=1e-3)
+    assert judge.subset([0]).psnr(scene) == pytest.approx(-10.0 * np.log10(errors[0]), abs=1e-3)
 
 
 def test_an_origin_moves_the_camera_the_other_way():

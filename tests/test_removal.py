@@ -16,7 +16,7 @@ from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import load_cameras
 from csplat_render.contributions import Contributions
-from csplat_render.conventions import SplatArrays
+from csplat_render.conventions import UncheckedSplats
 from csplat_render.pruning_error import measure_pruning_error, pruning_error_exact
 from csplat_render.refit import ColourOperator, fit_colours
 from csplat_render.virtual_cameras import virtual_cameras
@@ -100,7 +100,7 @@ def test_finished_pixels_are_all_that_it_leaves_out():
 def test_the_picture_is_that_of_the_renderer():
     model, seen = scene(count=200), []
     measure_pruning_error(
-        model, views(2), background=(0.1, 0.2, 0.3), on_picture=lambda _n, picture: seen.append(picture)
+        model, views(2), background=(0.1, 0.2, 0.3), on_render=lambda _n, picture: seen.append(picture)
     )
     for camera, picture in zip(views(2), seen, strict=True):
         np.testing.assert_allclose(picture, render(model, camera, background=(0.1, 0.2, 0.3)).rgb, atol=2e-5)
@@ -211,7 +211,7 @@ def assert_finite(arrays, view, *, antialiased=False):
 
 
 @dataclass(frozen=True)
-class Loose(SplatArrays):
+class Loose(UncheckedSplats):
     """The fields of a model that `measure_pruning_error` reads, without validation."""
 
     sh_degree: int
@@ -310,17 +310,17 @@ def test_leaving_out_what_has_no_weight_changes_no_bit(opacity):
     model = scene(count=400)
     model = replace(model, opacities=np.full(400, opacity, np.float32), scales=model.scales + np.float32(0.5))
     drawing, x = Contributions(), coefficients(model)
-    whole = drawing.draw(model, views(1, 70, 50)[0])
+    whole = drawing.project_view(model, views(1, 70, 50)[0])
     active, black, wanted = np.ones((len(whole.rows), 3), bool), np.zeros(3, np.float32), np.float32(0.5)
     reference = np.full((50, 70, 3), wanted, np.float32)
 
     def answer(view, mask):
         sums = np.zeros_like(x), np.zeros(x.shape[:2], np.float32)
-        rgb = drawing.colours(view, x, mask, *sums, offset=0.5, background=black, reference=reference)
+        rgb = drawing.backproject(view, x, mask, *sums, offset=0.5, background=black, reference=reference)
         return rgb, *sums
 
     first = answer(whole, active)
-    less, left = drawing.trimmed(whole)
+    less, left = drawing.trim(whole)
     assert len(less.ids) < len(whole.ids)
     for expected, actual in zip(first, answer(less, active[left]), strict=True):
         np.testing.assert_array_equal(expected, actual)

@@ -11,7 +11,7 @@ from oracle import extreme_splats, facing
 
 from csplat.errors import LimitError
 from csplat_render import rasteriser, render
-from csplat_render.conventions import SplatArrays
+from csplat_render.conventions import UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.warmup import warm_up
 
@@ -27,14 +27,14 @@ def assert_survives(arrays, view, *, antialiased=False):
     weights = rng.standard_normal((view.H, view.W, 3)), *rng.standard_normal((2, view.H, view.W))
     for dtype in (np.float32, np.float64):
         rasteriser = Rasteriser(dtype=dtype)
-        picture = rasteriser.forward(SplatArrays(**arrays), view, antialiased=antialiased)
+        picture = rasteriser.forward(UncheckedSplats(**arrays), view, antialiased=antialiased)
         g = rasteriser.backward(*weights)
         for name in ("rgb", "alpha", "depth"):
             assert np.isfinite(getattr(picture, name)).all(), name
         for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "means2d"):
             assert np.isfinite(getattr(g, name)).all(), name
         found.append((picture, {name: np.array(value, np.float64) for name, value in vars(g).items()}))
-    exact = render(SplatArrays(**arrays), view, mode="exact", antialiased=antialiased)
+    exact = render(UncheckedSplats(**arrays), view, mode="exact", antialiased=antialiased)
     assert np.isfinite(exact.rgb).all()
     for picture, _ in found:
         off = np.abs(picture.rgb - exact.rgb).max(2) > 1 / 255 * max(1.0, np.abs(exact.rgb).max())
@@ -112,7 +112,7 @@ def test_zero_and_huge_quaternions():
     plain = dict(arrays)
     plain["quats"] = arrays["quats"].copy()
     plain["quats"][::3] = [1.0, 0.0, 0.0, 0.0]
-    np.testing.assert_array_equal(found[0][0].rgb, render(SplatArrays(**plain), facing()).rgb)
+    np.testing.assert_array_equal(found[0][0].rgb, render(UncheckedSplats(**plain), facing()).rgb)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -123,15 +123,15 @@ def test_rows_that_hold_nan_are_left_out_and_counted(name, bad):
     arrays[name].reshape(30, -1)[:3, -1] = bad
     found = assert_survives(arrays, facing())
     assert [result.ignored for result, _ in found] == [3, 3]
-    assert render(SplatArrays(**arrays), facing(), mode="exact").ignored == 3
-    np.testing.assert_array_equal(found[0][0].rgb, render(SplatArrays(**clean), facing()).rgb)
+    assert render(UncheckedSplats(**arrays), facing(), mode="exact").ignored == 3
+    np.testing.assert_array_equal(found[0][0].rgb, render(UncheckedSplats(**clean), facing()).rgb)
 
 
 def test_an_empty_scene_shows_the_background():
     for degree in (0, 3):
         arrays = extreme_splats(count=0, degree=degree)
         assert_survives(arrays, facing())
-        picture = render(SplatArrays(**arrays), facing(), background=(0.1, 0.2, 0.3))
+        picture = render(UncheckedSplats(**arrays), facing(), background=(0.1, 0.2, 0.3))
         np.testing.assert_array_equal(picture.rgb, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (H, W, 3)))
 
 
@@ -142,7 +142,7 @@ def test_pictures_of_any_size(width, height):
 
 def test_gradients_beyond_float32_are_clamped():
     rasteriser = Rasteriser()
-    picture = rasteriser.forward(SplatArrays(**extreme_splats(scales=2.0)), facing(focal=1e6))
+    picture = rasteriser.forward(UncheckedSplats(**extreme_splats(scales=2.0)), facing(focal=1e6))
     g = rasteriser.backward(np.full_like(picture.rgb, 1e30))
     assert all(np.isfinite(value).all() for value in vars(g).values())
 
@@ -150,7 +150,7 @@ def test_gradients_beyond_float32_are_clamped():
 def test_too_many_intersections_are_refused(monkeypatch):
     monkeypatch.setattr(rasteriser, "MAX_INTERSECTIONS", 100)
     with pytest.raises(LimitError, match="MAX_INTERSECTIONS"):
-        render(SplatArrays(**extreme_splats(scales=2.0)), facing())
+        render(UncheckedSplats(**extreme_splats(scales=2.0)), facing())
 
 
 def test_warming_up_says_nothing_once_all_is_compiled():

@@ -16,7 +16,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_render import Camera, render
-from csplat_render.conventions import ALPHA_CAP, DILATION, SplatArrays
+from csplat_render.conventions import ALPHA_CAP, DILATION, UncheckedSplats
 from csplat_render.projection import SH_C0
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.reference_rasteriser import render_exact
@@ -207,10 +207,10 @@ def test_slices_of_depth_one_after_the_other_give_the_same_bits(mode):
     model, view, behind = scene(), camera(70, 53), (0.3, 0.6, 0.1)
     rasteriser = Rasteriser(mode, gradients=False)
     wanted = rasteriser.forward(model, view, background=behind)
-    near = rasteriser.seen(model, view).near
+    near = rasteriser.find_visible(model, view).near
     assert wanted.drawn == np.count_nonzero(near)
     limits = np.quantile(near[near > 0], [0.0, 0.1, 0.4, 0.4, 0.9, 1.0])  # one slice is empty
-    state, found = rasteriser.begun(view), wanted
+    state, found = rasteriser.initial_state(view), wanted
     for first, last in itertools.pairwise([*limits[:-1], np.inf]):
         part = model.select((near >= first) & (near < last))
         found = rasteriser.forward(part, view, background=behind, state=state)
@@ -221,17 +221,17 @@ def test_slices_of_depth_one_after_the_other_give_the_same_bits(mode):
 def test_tiles_that_a_splat_may_touch_are_no_fewer_than_it_touches():
     rasteriser = Rasteriser(gradients=False)
     model, view = scene(), camera(70, 53)
-    seen, drawn = rasteriser.seen(model, view), rasteriser.forward(model, view)
+    seen, drawn = rasteriser.find_visible(model, view), rasteriser.forward(model, view)
     assert drawn.intersections <= seen.tiles.sum() <= 2 * drawn.intersections
 
 
 def test_gradients_of_a_slice_are_refused():
     rasteriser = Rasteriser()
     with pytest.raises(InputError, match="slice"):
-        rasteriser.forward(scene(), camera(), state=rasteriser.begun(camera()))
+        rasteriser.forward(scene(), camera(), state=rasteriser.initial_state(camera()))
     rasteriser = Rasteriser(gradients=False)
     with pytest.raises(InputError, match="state"):
-        rasteriser.forward(scene(), camera(), state=rasteriser.begun(camera(width=65)))
+        rasteriser.forward(scene(), camera(), state=rasteriser.initial_state(camera(width=65)))
 
 
 def test_results_belong_to_the_caller():
@@ -245,11 +245,11 @@ def test_results_belong_to_the_caller():
 
 def test_rejects_arrays_that_do_not_fit():
     model = scene(count=5)
-    bad = SplatArrays(model.means, model.quats[:4], model.scales, model.opacities, model.sh0, model.shN)
+    bad = UncheckedSplats(model.means, model.quats[:4], model.scales, model.opacities, model.sh0, model.shN)
     with pytest.raises(InputError, match="quats has shape"):
         Rasteriser().forward(bad, camera())
     with pytest.raises(InputError, match="coefficients"):
-        Rasteriser().forward(SplatArrays(**{**vars(bad), "quats": model.quats, "shN": model.shN[:, :4]}), camera())
+        Rasteriser().forward(UncheckedSplats(**{**vars(bad), "quats": model.quats, "shN": model.shN[:, :4]}), camera())
     with pytest.raises(InputError, match="mode"):
         render(model, camera(), mode="slow")
     with pytest.raises(InputError, match="dtype"):

@@ -24,7 +24,7 @@ from oracle import (
 
 from csplat.ply import read_ply
 from csplat_render import Camera
-from csplat_render.conventions import SplatArrays
+from csplat_render.conventions import UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.virtual_cameras import virtual_cameras
 
@@ -42,7 +42,7 @@ def most(errors):
 def test_gradients_are_the_finite_differences_of_the_twin(degree, antialiased):
     arrays, weights = random_splats(3, degree, seed=degree), random_gradients(VIEW, seed=1)
     options = {"background": (0.2, 0.5, 0.7), "antialiased": antialiased}
-    picture, gradients = gradients_of(SplatArrays(**arrays), VIEW, weights, **options)
+    picture, gradients = gradients_of(UncheckedSplats(**arrays), VIEW, weights, **options)
     exact, differences = finite_differences(arrays, VIEW, weights, **options)
     np.testing.assert_allclose(picture.rgb, exact.rgb, atol=1e-12)
     errors = {group: relative_error(getattr(gradients, group), differences[group]) for group in GROUPS}
@@ -58,7 +58,7 @@ def test_gradients_are_those_of_autograd(degree, antialiased):
 
     arrays, weights = random_splats(20, degree, seed=degree + 10), random_gradients(VIEW, seed=1)
     options = {"background": (0.2, 0.5, 0.7), "antialiased": antialiased}
-    picture, gradients = gradients_of(SplatArrays(**arrays), VIEW, weights, **options)
+    picture, gradients = gradients_of(UncheckedSplats(**arrays), VIEW, weights, **options)
     other, wanted = autograd_gradients(arrays, VIEW, weights, **options)
     np.testing.assert_allclose(picture.rgb, other, atol=1e-12)
     errors = {group: relative_error(getattr(gradients, group), wanted[group]) for group in GROUPS}
@@ -86,7 +86,7 @@ def test_float32_gradients_are_those_of_float64_on_shared_scenes(data_dir, name)
 
 @pytest.mark.parametrize(("name", "case"), [pytest.param(*pair, id=pair[0]) for pair in adversarial()])
 def test_float32_gradients_survive_adversarial_splats(name, case):
-    splats, weights = SplatArrays(**case.arrays), random_gradients(case.view, seed=1)
+    splats, weights = UncheckedSplats(**case.arrays), random_gradients(case.view, seed=1)
     _, found = gradients_of(splats, case.view, weights, np.float32, antialiased=case.antialiased)
     for group in GROUPS:
         assert np.isfinite(getattr(found, group)).all(), (name, group)
@@ -104,7 +104,7 @@ def test_no_gradient_reaches_what_is_clamped_capped_or_out_of_view():
     arrays["opacities"][:] = [1.0, 0.5, 0.5, 0.5]
     arrays["sh0"][0] = [-9.0, 1.0, 1.0]
     rasteriser = Rasteriser(dtype=np.float64)
-    rasteriser.forward(SplatArrays(**arrays), VIEW)
+    rasteriser.forward(UncheckedSplats(**arrays), VIEW)
     g = rasteriser.backward(np.ones((VIEW.H, VIEW.W, 3)))
     assert g.sh0[0, 0] == 0.0
     assert g.sh0[0, 1] > 0.0
@@ -120,7 +120,7 @@ def test_the_gradient_ignores_the_length_of_a_quaternion():
     found = []
     for factor in (1.0, 10.0):
         rasteriser = Rasteriser(dtype=np.float64)
-        rasteriser.forward(SplatArrays(**{**arrays, "quats": arrays["quats"] * factor}), VIEW)
+        rasteriser.forward(UncheckedSplats(**{**arrays, "quats": arrays["quats"] * factor}), VIEW)
         found.append(rasteriser.backward(*weights).quats * factor)
     np.testing.assert_allclose(found[0], found[1], rtol=1e-9, atol=1e-12)
     radial = np.sum(found[0] * arrays["quats"], axis=1)
@@ -130,7 +130,7 @@ def test_the_gradient_ignores_the_length_of_a_quaternion():
 def test_bands_that_were_not_rendered_have_no_gradient():
     arrays = random_splats(6, 3, seed=5)
     rasteriser = Rasteriser(dtype=np.float64)
-    rasteriser.forward(SplatArrays(**arrays), VIEW, sh_degree=1)
+    rasteriser.forward(UncheckedSplats(**arrays), VIEW, sh_degree=1)
     g = rasteriser.backward(np.ones((VIEW.H, VIEW.W, 3)))
     assert np.abs(g.shN[:, :3]).max() > 0.0
     assert (g.shN[:, 3:] == 0.0).all()

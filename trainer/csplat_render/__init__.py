@@ -1,4 +1,4 @@
-"""Rendering of Gaussian splats on the CPU: numba rasteriser with gradients, exact twin, cameras, image metrics."""
+"""Rendering of Gaussian splats on the CPU: numba rasteriser with gradients, exact reference, cameras, image metrics."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ def render(
     sh_degree: int | None = None,
     threads: int | None = None,
 ) -> RenderResult:
-    """Render one picture. For many of one scene, or gradients, keep a `csplat_render.rasteriser.Rasteriser`.
+    """Render one image. For many images of one scene, or gradients, keep a `csplat_render.rasteriser.Rasteriser`.
 
     Args:
         model: a `SplatModel`, or anything with its six arrays. Its origin is not added: cameras
             are relative to it, as `means` are.
-        camera: from where.
+        camera: the camera to render from.
         background: red, green, blue behind everything.
-        mode: `standard`; `fast`, which leaves out what hardly shows; or `exact`, the slow twin, in
-            float64.
-        antialiased: apply the mip-splatting filter; None for what the model says.
-        sh_degree: highest degree of the spherical harmonics; None for all there are.
-        threads: how many; None for all.
+        mode: `standard`; `fast`, which leaves out what hardly shows; or `exact`, the slow reference,
+            in float64.
+        antialiased: apply the mip-splatting filter; None for the model's own setting.
+        sh_degree: highest degree of the spherical harmonics; None for the model's.
+        threads: number of threads; None for all.
 
     Returns:
         `rgb` [H, W, 3] float32, not clipped; `alpha` [H, W]; `depth` [H, W], scene units; and more.
@@ -53,10 +53,10 @@ def render(
         (48, 64, 3)
 
     Raises:
-        InputError: shapes do not fit together, or an option is not one of these; or numba is not installed.
-        LimitError: too many splats are too large: `rasterise.MAX_INTERSECTIONS`.
+        InputError: shapes do not fit together, an option has another value, or numba is not installed.
+        LimitError: too many splats are too large: `rasteriser.MAX_INTERSECTIONS`.
     """
-    # numba takes a second to import: those who want cameras alone do not wait for it.
+    # numba takes a second to import: code that needs only cameras does not wait for it.
     try:
         from csplat_render.rasteriser import Rasteriser
         from csplat_render.reference_rasteriser import render_exact

@@ -1,7 +1,7 @@
-"""One sort of all visible splats by depth, then a counting sort into tiles: the order of blending.
+"""Binning: one sort of all visible splats by depth, then a counting sort into tiles, which is the order of blending.
 
-Nothing here depends on the number of threads: the chunks are fixed, and each writes to places that
-a prefix sum over all of them has set aside.
+No result depends on the number of threads: the chunks are fixed, and each writes to a range that a prefix sum over all
+of them has reserved.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ TILE_BITS = 4
 #: Runs of the depth order that are sorted into tiles independently.
 CHUNKS = 8
 
-_SMALL_BOX = 6  # tiles of a box that is taken as it is, without asking for the ellipse in it
+_SMALL_BOX = 6  # tiles; smaller boxes are used as they are, without the ellipse inside
 _DIGIT = 11  # bits per pass of the radix sort; three passes cover a float32
 
 
 @kernel
 def depth_order(depth: Any, keys: Any, order: Any, keys2: Any, order2: Any) -> int:
-    """Sort what is drawn by float32 depth, then by index (radix sort, stable).
+    """Sort the splats that are drawn by float32 depth, then by index (radix sort, stable).
 
     Args:
-        depth: [N] float32, above 0 for what is drawn.
+        depth: [N] float32, above 0 for splats that are drawn.
         keys: [N] uint32, scratch.
         order: [N] int32, scratch.
         keys2: [N] uint32, scratch.
         order2: [N] int32, written: indices of the splats that are drawn, nearest first.
 
     Returns:
-        How many are drawn.
+        Number of splats that are drawn.
     """
     bits = depth.view(np.uint32)  # positive floats sort like their bits
     buckets = 1 << _DIGIT
@@ -79,7 +79,7 @@ def _scatter(n: int, shift: Any, mask: Any, counts: Any, keys: Any, order: Any, 
 
 @device_function
 def _tile_box(j: int, box: Any) -> tuple[int, int, int, int, bool]:
-    """Columns and rows of the tiles of a box, and whether it is taken as it is: roots cost more than they save."""
+    """Return columns and rows of the tiles of a box, and whether it is small: roots would cost more than they save."""
     first, last = box[j, 0] >> TILE_BITS, ((box[j, 1] - 1) >> TILE_BITS) + 1
     top, bottom = box[j, 2] >> TILE_BITS, ((box[j, 3] - 1) >> TILE_BITS) + 1
     width, height = last - first, bottom - top
@@ -88,13 +88,13 @@ def _tile_box(j: int, box: Any) -> tuple[int, int, int, int, bool]:
 
 @device_function
 def _row_span(tile_y: int, j: int, extent: Any, box: Any, first: int, last: int) -> tuple[int, int]:
-    """First and last + 1 tile of one row of tiles that the ellipse of a splat touches."""
+    """Return first and last + 1 tile of one row of tiles that the ellipse of a splat touches."""
     py = extent[j, 5]
     low = max(tile_y * TILE, box[j, 2]) + 0.5 - py
     high = min(tile_y * TILE + TILE, box[j, 3]) - 0.5 - py
     widest = extent[j, 3]
     slope, half, flat = extent[j, 0], extent[j, 1], extent[j, 2]
-    # The heights within this row of tiles where the ellipse reaches farthest: to the right, to the left.
+    # The heights within this row of tiles where the ellipse extends farthest: to the right, to the left.
     dy = low if widest < low else (high if widest > high else widest)
     t = 1.0 - (dy * flat) * (dy * flat)
     right = dy * slope + half * math.sqrt(t if t > 0.0 else 0.0)
@@ -102,8 +102,8 @@ def _row_span(tile_y: int, j: int, extent: Any, box: Any, first: int, last: int)
     t = 1.0 - (dy * flat) * (dy * flat)
     left = dy * slope - half * math.sqrt(t if t > 0.0 else 0.0)
     if not (left <= right):
-        return first, last  # rounding at the extremes: the box is always right
-    # A tile's first and last pixel centres lie half a pixel inside it; the other half is for rounding.
+        return first, last  # rounding at the extremes: the box is always correct
+    # A tile's first and last pixel centres lie half a pixel inside it; the other half allows for rounding.
     x0, x1 = (extent[j, 4] + left) * (1.0 / TILE), (extent[j, 4] + right) * (1.0 / TILE)
     begin = first if x0 < first else (last if x0 > last else int(x0))
     end = last if x1 > last - 1 else (first if x1 < first else int(x1)) + 1
@@ -114,7 +114,7 @@ def _row_span(tile_y: int, j: int, extent: Any, box: Any, first: int, last: int)
 def gather_by_depth(
     lane: int, lanes: int, order: Any, extent: Any, box: Any, sorted_extent: Any, sorted_box: Any
 ) -> None:
-    """Copy what the sort into tiles reads to the order in which it reads: no waiting for memory there.
+    """Copy extents and boxes into depth order, so that the sort into tiles reads memory sequentially.
 
     Args:
         order: [V] int32, splats that are drawn, nearest first.
@@ -169,10 +169,10 @@ def count_tiles(
 
 @kernel
 def tile_starts(counts: Any, starts: Any) -> int:
-    """Turn counts into places: where each tile begins, and where each chunk writes in it.
+    """Turn counts into offsets: the start of each tile, and the start of each chunk within it.
 
     Args:
-        counts: [CHUNKS, tiles] int32, replaced by the places relative to the tile's start.
+        counts: [CHUNKS, tiles] int32, replaced by the offsets relative to the tile's start.
         starts: [tiles + 1] int64, written.
 
     Returns:

@@ -24,7 +24,7 @@ import numpy as np
 from csplat_render.binning import TILE
 from csplat_render.kernels import ParallelKernel, device_function, fast_exp2, inlined, parallel_kernel
 
-#: Splats of a batch, between two looks at which rows of a tile are finished.
+#: Splats of a batch, after which rows of a tile are checked for being finished.
 BATCH = 16
 
 # Numbers of a splat in a batch: for each row of the tile the constant and the linear coefficient of
@@ -32,21 +32,21 @@ BATCH = 16
 ROW0, ROW1, TAIL = 0, TILE, 2 * TILE
 BATCH_COLUMNS = TAIL + 6
 
-#: From the corner of a tile to its middle.
+#: Distance from the corner of a tile to its middle, pixels.
 HALF_TILE = 0.5 * TILE
 
 _LOG2E = math.log2(math.e)
 _CACHE_LINE = 64  # bytes
 
 # If a splat has alpha >= 1/255, the gradient of its exponent is at most √(2 ln 255 / 0.3) ≈ 6 per
-# pixel, and changes by at most 1/0.3 per pixel: a tile whose centre has more than this shows nothing.
+# pixel, and changes by at most 1/0.3 per pixel: in a tile whose centre exceeds these the splat is invisible.
 _MAX_SLOPE = 1e3
 _MIN_EXPONENT = -1e4
 
 
 @device_function
 def aligned_zeros(size: int, like: Any) -> Any:
-    """Zeros that begin at a cache line, so that 16 float32 never lie in two; `like` has their dtype."""
+    """Return zeros aligned to a cache line, so that no 16 float32 cross one; `like` has their dtype."""
     store = np.zeros(size + _CACHE_LINE // like.itemsize, like.dtype)
     skip = -store.ctypes.data % _CACHE_LINE // like.itemsize
     return store[skip : skip + size]
@@ -54,7 +54,7 @@ def aligned_zeros(size: int, like: Any) -> Any:
 
 @device_function
 def pixel_centres() -> Any:
-    """Positions of the 16 pixels of a row, or of the rows, about the middle of a tile; float64."""
+    """Return the positions of the 16 pixels of a row, or of the rows, about the middle of a tile; float64."""
     ys = np.empty(TILE, np.float64)
     for y in range(TILE):
         ys[y] = y + (0.5 - HALF_TILE)
@@ -63,14 +63,14 @@ def pixel_centres() -> Any:
 
 @device_function
 def tile_extent(tile: int, tiles_x: int, width: int, height: int) -> tuple[int, int, int, int]:
-    """First column and row of a tile, and how many of either lie on the picture."""
+    """Return first column and row of a tile, and the number of columns and rows on the image."""
     X0, Y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
     return X0, Y0, min(TILE, width - X0), min(TILE, height - Y0)
 
 
 @device_function
 def begin_tile(T: Any, columns: int, one: Any) -> None:
-    """Let all light through; columns that are not on the picture are finished from the start.
+    """Initialise transmittances; columns that are not on the image are finished from the start.
 
     Args:
         T: [TILE, TILE or more], transmittances, written; a pixel that is finished has a negative one.
@@ -84,13 +84,13 @@ def begin_tile(T: Any, columns: int, one: Any) -> None:
 
 @device_function
 def load_state(state: Any, X0: int, Y0: int, columns: int, high: int, planes: Any) -> None:
-    """Begin a tile where nearer splats left it.
+    """Load the state of a tile after nearer splats.
 
     Args:
         state: [H, W, 5]: transmittance, negative if a pixel is finished, red, green, blue, and the fifth plane.
         X0, Y0: first column and row of the tile.
         columns, high: number of columns and rows on the image.
-        planes: [TILE, 5 * TILE or more], written on the picture.
+        planes: [TILE, 5 * TILE or more], written on the image.
     """
     for y in range(high):
         for x in range(columns):
@@ -100,7 +100,7 @@ def load_state(state: Any, X0: int, Y0: int, columns: int, high: int, planes: An
 
 @device_function
 def store_state(state: Any, X0: int, Y0: int, columns: int, high: int, planes: Any) -> None:
-    """Keep a tile for farther splats: the opposite of `load_state`."""
+    """Store the state of a tile for farther splats: the inverse of `load_state`."""
     for y in range(high):
         for x in range(columns):
             for k in range(5):
@@ -108,22 +108,22 @@ def store_state(state: Any, X0: int, Y0: int, columns: int, high: int, planes: A
 
 
 @device_function
-def read_planes(picture: Any, X0: int, Y0: int, columns: int, high: int, planes: Any, at: int) -> None:
-    """Copy a tile of a picture, [H, W, 3], into three planes of 16 × 16 that lie one after the other from `at` on."""
+def read_planes(image: Any, X0: int, Y0: int, columns: int, high: int, planes: Any, at: int) -> None:
+    """Copy a tile of an image, [H, W, 3], into three consecutive planes of 16 × 16, from `at` on."""
     for y in range(high):
         row = planes[at + y * TILE :]
         for x in range(columns):
-            row[x] = picture[Y0 + y, X0 + x, 0]
-            row[TILE * TILE + x] = picture[Y0 + y, X0 + x, 1]
-            row[2 * TILE * TILE + x] = picture[Y0 + y, X0 + x, 2]
+            row[x] = image[Y0 + y, X0 + x, 0]
+            row[TILE * TILE + x] = image[Y0 + y, X0 + x, 1]
+            row[2 * TILE * TILE + x] = image[Y0 + y, X0 + x, 2]
 
 
 @device_function
 def tile_polynomial(shape: Any, i: int, x: float, y: float) -> tuple[float, float, float, float, float, float, bool]:
-    """Exponent of a splat around the point (x, y): c0 + cx·dx + cy·dy + cxx·dx² + cxy·dx·dy + cyy·dy².
+    """Return the exponent of a splat around the point (x, y): c0 + cx·dx + cy·dy + cxx·dx² + cxy·dx·dy + cyy·dy².
 
     Returns:
-        c0, cx, cy, cxx, cxy, cyy, and whether anything of the splat can be seen in the tile there.
+        c0, cx, cy, cxx, cxy, cyy, and whether the splat can be visible in the tile there.
     """
     dx, dy = x - shape[i, 0], y - shape[i, 1]
     a, b, c = shape[i, 2], shape[i, 3], shape[i, 4]
@@ -135,7 +135,7 @@ def tile_polynomial(shape: Any, i: int, x: float, y: float) -> tuple[float, floa
 
 @device_function
 def unfinished_rows(T: Any, low: int, high: int) -> tuple[int, int]:
-    """Narrow a range of rows to the rows in which some pixel is not finished."""
+    """Narrow a range of rows to those with a pixel that is not finished."""
     while low < high:
         best = T[low, 0]
         for x in range(1, TILE):
@@ -168,7 +168,7 @@ def gather_batch(
     batch: Any,
     rows: Any,
 ) -> None:
-    """Write the numbers of some splats in a tile that the loop over pixels needs.
+    """Write the coefficients of some splats in a tile that the loop over pixels needs.
 
     Args:
         ids: see `blend`, as shape and box.
@@ -201,11 +201,11 @@ def gather_batch(
 
 @device_function
 def narrow_rows(count: int, batch: Any, rows: Any) -> None:
-    """Narrow the rows of a tile that each splat may touch: its box is generous, at a slant above all.
+    """Narrow the rows of a tile that each splat may touch: the box of a slanted splat is too large.
 
     Args:
         count: splats of the batch.
-        batch: [CHECK, NUMBERS], see `gather_batch`; in place of a depth the exponent of 2 below which nothing is drawn.
+        batch: [CHECK, NUMBERS], see `gather_batch`; the last column is the exponent of 2 below which nothing is drawn.
         rows: [CHECK, 2] int64, changed.
     """
     edge = np.float32(HALF_TILE - 0.5)
@@ -217,7 +217,7 @@ def narrow_rows(count: int, batch: Any, rows: Any) -> None:
         for y in range(TILE):
             at = min(max(one[ROW1 + y] * middle, -edge), edge)
             peak = (a * at + one[ROW1 + y]) * at + one[ROW0 + y]
-            faint = peak < least  # NaN, of a splat without end, is not
+            faint = peak < least  # False for NaN, the peak of an infinitely long splat
             first = min(first, np.int32(TILE) if faint else np.int32(y))
             end = max(end, np.int32(0) if faint else np.int32(y + 1))
         rows[j, 0] = max(rows[j, 0], first)
@@ -234,7 +234,7 @@ def batch_entry(batch: Any, j: int, first: int) -> tuple[Any, ...]:
 
 @inlined
 def alpha_at(x: Any, c0: Any, c1: Any, a: Any, o: Any, alpha_min: Any, alpha_cap: Any, zero: Any) -> tuple[Any, Any]:
-    """Alpha of a splat at a pixel, without cap and floor, and with both.
+    """Return alpha of a splat at a pixel, without and with cap and floor.
 
     Args:
         x: position in the row.
@@ -242,8 +242,8 @@ def alpha_at(x: Any, c0: Any, c1: Any, a: Any, o: Any, alpha_min: Any, alpha_cap
         c1: linear coefficient.
         a: quadratic coefficient.
         o: opacity.
-        alpha_min: smaller values become 0.
-        alpha_cap: larger values become this.
+        alpha_min: floor; smaller values become 0.
+        alpha_cap: cap; larger values become this.
         zero: 0, of the dtype of the pixels.
     """
     full = o * fast_exp2(min((a * x + c1) * x + c0, zero))
@@ -253,9 +253,9 @@ def alpha_at(x: Any, c0: Any, c1: Any, a: Any, o: Any, alpha_min: Any, alpha_cap
 
 @inlined
 def transmit(before: Any, alpha: Any, stop: Any, zero: Any, one: Any) -> tuple[Any, Any, Any]:
-    """Go on behind a splat: whether the pixel does, the splat's share of it, and what is to be kept as transmittance.
+    """Return whether a pixel continues behind a splat, the splat's weight in it, and its new transmittance.
 
-    A pixel whose transmittance would fall below `stop` is finished: it keeps what it had, negative from then on.
+    A pixel whose transmittance would fall below `stop` is finished: its transmittance becomes negative and is kept.
     """
     after = before * (one - alpha)
     going = after >= stop
@@ -263,7 +263,7 @@ def transmit(before: Any, alpha: Any, stop: Any, zero: Any, one: Any) -> tuple[A
 
 
 def _make_blend(counted: bool) -> ParallelKernel[...]:
-    """Make `blend`, or the kernel that notes how far pixels got where `blend` adds up depth."""
+    """Make `blend`, or the kernel that stores how far pixels got instead of depth."""
 
     @parallel_kernel(relaxed=True)
     def blend(
@@ -296,15 +296,15 @@ def _make_blend(counted: bool) -> ParallelKernel[...]:
                 float64, is that of the pixels.
             background: [3].
             rgb: [H, W, 3], written.
-            transmittance: [H, W], written: what the background shines through with.
-            fifth: [H, W], written: the sum of weight · depth; where counted the place, from its tile's start, of the
-                last splat of those whose rows the pixel lies in that came before it was finished, −1 if there is none.
+            transmittance: [H, W], written: weight of the background.
+            fifth: [H, W], written: the sum of weight · depth; if `counted`, the position, from its tile's start, of the
+                last splat before the pixel was finished of those whose rows contain it, −1 if there is none.
             used: [tiles] int64, written: the end of the splats that were blended, per tile.
             state: [H, W, 5], changed: the pixels after nearer splats, see `load_state`; empty if there are none, and
                 then nothing is stored for farther ones.
         """
         height, width = transmittance.shape
-        # One row of memory per row of pixels, so that the compiler sees that nothing overlaps:
+        # One row of memory per row of pixels, so that the compiler sees that they do not overlap:
         # 16 transmittances, then 16 each of red, green, blue, the fifth; and the positions in a row.
         planes = aligned_zeros(TILE * 6 * TILE, limits).reshape((TILE, 6 * TILE))
         ys = pixel_centres()
@@ -316,13 +316,13 @@ def _make_blend(counted: bool) -> ParallelKernel[...]:
         zero, one = alpha_min - alpha_min, alpha_min / alpha_min
         nothing = -one if counted else zero
         for tile in range(lane, len(used), lanes):
-            X0, Y0, columns, on_picture = tile_extent(tile, tiles_x, width, height)
-            low, high = 0, on_picture
+            X0, Y0, columns, on_render = tile_extent(tile, tiles_x, width, height)
+            low, high = 0, on_render
             begin_tile(planes, columns, one)
             planes[:, TILE : 4 * TILE] = zero
             planes[:, 4 * TILE : 5 * TILE] = nothing
             if len(state):
-                load_state(state, X0, Y0, columns, on_picture, planes)
+                load_state(state, X0, Y0, columns, on_render, planes)
             end = starts[tile + 1]
             for begin in range(starts[tile], end, BATCH):
                 low, high = unfinished_rows(planes, low, high)
@@ -353,8 +353,8 @@ def _make_blend(counted: bool) -> ParallelKernel[...]:
                                 row[4 * TILE + x] += weight * d
             used[tile] = end
             if len(state):
-                store_state(state, X0, Y0, columns, on_picture, planes)
-            for y in range(on_picture):
+                store_state(state, X0, Y0, columns, on_render, planes)
+            for y in range(on_render):
                 for x in range(columns):
                     left = abs(planes[y, x])
                     rgb[Y0 + y, X0 + x, 0] = planes[y, TILE + x] + left * background[0]
@@ -366,10 +366,10 @@ def _make_blend(counted: bool) -> ParallelKernel[...]:
     return blend
 
 
-#: A picture, with its depth.
+#: Blend an image and its depth.
 blend = _make_blend(counted=False)
 
-#: A picture, and how far each pixel got.
+#: Blend an image, and store the position of each pixel's last splat.
 blend_counted = _make_blend(counted=True)
 
 
@@ -379,8 +379,8 @@ RECORD = 10
 
 _AREA = TILE * TILE
 
-# Where the planes of a tile begin: transmittance, the gradient's product with what lies behind,
-# gradients, shares of the current splat, positions about the centre of the tile.
+# Offsets of the planes of a tile: transmittance, the gradient's product with all that lies behind,
+# gradients, slope and weight of the current splat, positions about the centre of the tile.
 _BEHIND, _RED, _GREEN, _BLUE, _ALPHA, _DEPTH, _SLOPE, _WEIGHT, _X, _Y = (_AREA * k for k in range(1, 11))
 _PLANES = 11
 
@@ -405,7 +405,7 @@ def blend_backward(
     grad_depth: Any,
     records: Any,
 ) -> None:
-    """Gradients of every splat in every tile; parallel over tiles, vectorised over the 16 pixels of a row.
+    """Compute one record of gradients per splat and tile; parallel over tiles, vectorised over the pixels of a row.
 
     Args:
         lane: which of the threads this is.
@@ -427,7 +427,7 @@ def blend_backward(
         records: [intersections, RECORD], written.
     """
     height, width = transmittance.shape
-    # Planes of 16 × 16, one after the other, in one array: so the compiler sees what overlaps.
+    # Planes of 16 × 16, one after the other, in one array: the compiler sees which parts overlap.
     planes = aligned_zeros(_PLANES * _AREA, limits)
     T = planes[:_AREA].reshape((TILE, TILE))
     ys = pixel_centres()
@@ -476,7 +476,7 @@ def blend_backward(
                         own = weight * (colour + row[_ALPHA + x] + row[_DEPTH + x] * d)
                         behind = row[_BEHIND + x] - own
                         row[_BEHIND + x] = behind
-                        # Colour of this splat against the colour behind; nothing where alpha is capped.
+                        # Colour of this splat against the colour behind; 0 if alpha is capped.
                         slope = own - behind * alpha / (one - alpha)
                         slope = slope if going else zero
                         row[_SLOPE + x] = slope if full < alpha_cap else zero

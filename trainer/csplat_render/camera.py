@@ -16,10 +16,10 @@ from csplat.types import F64, Mask
 #: Distance of the near plane in scene units, if a camera does not specify it.
 DEFAULT_NEAR = 0.2
 
-#: Largest width and height of a picture, in pixels.
+#: Largest width and height of an image, in pixels.
 MAX_IMAGE_SIZE = 1 << 15
 
-_ROTATION_TOLERANCE = 1e-3  # in the entries of R Rᵀ − 1; camera files hold few digits
+_ROTATION_TOLERANCE = 1e-3  # of the entries of R Rᵀ − 1; camera files hold few digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,19 +27,19 @@ class Camera:
     """A pinhole camera: its pose, its intrinsics, and the size of its image.
 
     A point p of the world has camera coordinates c = viewmat · p (x to the right, y down, z
-    forward) and falls on the picture at K · c / c_z, in pixels; the centre of the first pixel lies
+    forward) and falls on the image at K · c / c_z, in pixels; the centre of the first pixel lies
     at (0.5, 0.5). Skew is not supported: K holds focal lengths and principal point alone.
 
     Attributes:
         K: [3, 3] float64, (fx, 0, cx; 0, fy, cy; 0, 0, 1), in pixels, fx and fy above 0.
         viewmat: [4, 4] float64, world to camera, a rotation and a translation.
-        W: width of the picture in pixels.
-        H: height of the picture in pixels.
-        near: splats whose centre is not farther than this along z are not drawn; scene units.
-        image: name of the photograph that was taken here, if there is one.
+        W: width of the image in pixels.
+        H: height of the image in pixels.
+        near: distance of the near plane, scene units; splats whose centre is not beyond it are not drawn.
+        image: name of the view's image file, if there is one.
 
     Raises:
-        InputError: a field does not hold what is said above.
+        InputError: a field has another shape or value than described above.
     """
 
     K: F64
@@ -66,7 +66,7 @@ class Camera:
         return np.asarray(-np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3]), np.float64)
 
     def to_json(self) -> dict[str, Any]:
-        """The camera as one entry of a camera file, a JSON object."""
+        """Return the camera as one entry of a camera file, a JSON object."""
         entry: dict[str, Any] = {
             "K": self.K.tolist(),
             "viewmat": self.viewmat.tolist(),
@@ -80,7 +80,7 @@ class Camera:
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Camera:
-        """Make a camera of one entry of a camera file; keys that are not known are ignored.
+        """Make a camera from one entry of a camera file; unknown keys are ignored.
 
         Args:
             entry: K, viewmat, W, H and, if they are not the defaults, near and image.
@@ -98,11 +98,11 @@ class Camera:
         return cls(entry["K"], entry["viewmat"], entry["W"], entry["H"], near, image)
 
 
-_ROW_TOLERANCE = 1e-5  # of values of the last row; files hold few digits, or are products of matrices
+_ROW_TOLERANCE = 1e-5  # difference of a value of the last row; files hold few digits, or products of matrices
 
 
 def check_last_row(pose: F64, name: str) -> None:
-    """Check that a pose moves points and does nothing else; one that is written by columns is recognised.
+    """Check that a pose is affine; a transposed one is recognised.
 
     Args:
         pose: [4, 4].
@@ -168,20 +168,20 @@ def _check_pose(viewmat: F64) -> None:
         raise InputError("the camera's viewmat does not begin with a rotation (mirrored, scaled or sheared)")
 
 
-_PARALLEL = 1e-6  # the sine of an angle below which two directions count as parallel
-_OUTLIER_DISTANCE = 20.0  # usual distances from the middle beyond which a camera may be an outlier,
-_CONVERGENT = 0.7  # median cosine of `convergence` from which cameras look at one thing
-_OUTLIER_GAP = 4.0  # if it is this many times as far away as the farthest of the others,
-_MOST_OUTLIERS = 1.0 / 3.0  # share of the cameras: more of them are a part of the set
+_PARALLEL = 1e-6  # sine of the angle below which two directions count as parallel
+_OUTLIER_DISTANCE = 20.0  # times the median distance from the middle, beyond which a camera may be an outlier
+_OUTLIER_GAP = 4.0  # times the largest distance of the other cameras, beyond which it is one
+_CONVERGENT = 0.7  # `convergence` from which cameras look at one subject
+_MOST_OUTLIERS = 1.0 / 3.0  # fraction of the cameras; more of them are part of the set
 
 
 def central_camera(cameras: Sequence[Camera]) -> Camera:
-    """The camera that stands and looks most as all do: of a set, the one to begin with.
+    """Return the most typical camera of a set: the one nearest to the mean position and viewing direction.
 
-    It is the nearest one to their mean: places count as shares of the mean distance from it, directions as they are.
+    Positions are measured in units of the mean distance from their mean.
 
     Args:
-        cameras: one at least.
+        cameras: at least one.
     """
     outliers = camera_outliers(np.stack([camera.viewmat for camera in cameras]))
     cameras = [camera for camera, outlier in zip(cameras, outliers, strict=True) if not outlier]
@@ -193,17 +193,17 @@ def central_camera(cameras: Sequence[Camera]) -> Camera:
 
 
 def camera_outliers(viewmats: F64, points: NDArray[np.floating] | None = None) -> Mask:
-    """Find cameras that stand far away from all others, as structure from motion leaves them where it fails.
+    """Find cameras far away from all others, as structure from motion leaves them when it fails.
 
-    What cameras look at counts, too: of a set whose cameras stand close together, one is no outlier that is only as
-    far away as that. Distances that grow little by little (a flight towards a building) belong to the set.
+    The subject of the cameras counts, too: in a set whose cameras are close together, a camera no farther away than
+    the subject is no outlier. Distances that grow gradually (a flight towards a building) belong to the set.
 
     Args:
         viewmats: [N, 4, 4], world to camera, OpenCV axes.
-        points: [P, 3], points of the scene, where they are known.
+        points: [P, 3], points of the scene, if they are known.
 
     Returns:
-        [N], true for outliers: none of fewer than four cameras, a third of all at most.
+        [N], True for outliers: none among fewer than four cameras, at most a third of all.
     """
     positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     middle = np.median(positions, axis=0)
@@ -219,7 +219,7 @@ def camera_outliers(viewmats: F64, points: NDArray[np.floating] | None = None) -
             subject = np.median(points, axis=0)
         else:
             near, axes = positions[others] - middle, viewmats[others, 2, :3]
-            if convergence(near, axes) < _CONVERGENT:  # a tripod, a street: nothing tells how large the scene is
+            if convergence(near, axes) < _CONVERGENT:  # a tripod, a street: the size of the scene is unknown
                 continue
             subject = nearest_point(near, axes) + middle
         if away[first] > _OUTLIER_DISTANCE * float(np.sqrt(np.sum((subject - middle) ** 2))):
@@ -229,14 +229,14 @@ def camera_outliers(viewmats: F64, points: NDArray[np.floating] | None = None) -
 
 
 def convergence(positions: F64, axes: F64) -> float:
-    """Return the median cosine between where cameras look and where the point lies that is nearest to all their lines.
+    """Return the median cosine between viewing directions and directions to the point nearest to all lines of sight.
 
     Args:
-        positions: [N, 3], where cameras stand, relative to a point among them.
-        axes: [N, 3], unit length, where they look.
+        positions: [N, 3], positions of cameras, relative to a point among them.
+        axes: [N, 3], viewing directions, unit length.
 
     Returns:
-        1 for cameras that look at one thing from several sides, -1 for those that look away from their middle.
+        1 for cameras around a subject, -1 for cameras that look away from their middle.
     """
     towards = nearest_point(positions, axes) - positions
     lengths = np.maximum(np.linalg.norm(towards, axis=1), np.finfo(np.float64).tiny)
@@ -247,11 +247,11 @@ def nearest_point(positions: F64, axes: F64) -> F64:
     """Find the point nearest to all lines of sight, by least squares over the distances from the lines.
 
     Args:
-        positions: [N, 3], where cameras stand.
-        axes: [N, 3], unit length, where they look.
+        positions: [N, 3], positions of cameras.
+        axes: [N, 3], viewing directions, unit length.
 
     Returns:
-        [3]. Of lines that are parallel the point nearest to the mean position: it has a little weight.
+        [3]. For parallel lines, the point nearest to the mean position, which has a small weight.
     """
     weight = 1e-6 * len(positions)
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -261,11 +261,11 @@ def nearest_point(positions: F64, axes: F64) -> F64:
 
 
 def relative_to(origin: Sequence[float] | F64, camera: Camera) -> Camera:
-    """The same camera for a scene whose coordinates are relative to an origin.
+    """Return the same camera for a scene whose coordinates are relative to an origin.
 
     Args:
         origin: [3], in the camera's coordinates.
-        camera: where the photograph was taken.
+        camera: the camera to move.
     """
     shift = np.asarray(origin, np.float64)
     if not shift.any():
@@ -276,10 +276,10 @@ def relative_to(origin: Sequence[float] | F64, camera: Camera) -> Camera:
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """Let a camera take the same picture in another size.
+    """Return a camera of the same view with an image of another size.
 
     Raises:
-        InputError: the picture's shape would change by more than the rounding of a pixel.
+        InputError: the aspect ratio would change by more than the rounding of a pixel.
     """
     across, down = width / camera.W, height / camera.H
     if abs(camera.H * across - height) > 1.0 and abs(camera.W * down - width) > 1.0:
@@ -290,12 +290,12 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 
 
 def intrinsics(width: int, height: int, field_of_view: float) -> F64:
-    """K of a camera that looks through the middle of its picture.
+    """Return K of a camera whose principal point is the middle of its image.
 
     Args:
         width: pixels.
         height: pixels.
-        field_of_view: across the width, degrees, above 0 and below 180.
+        field_of_view: horizontal, degrees, above 0 and below 180.
 
     Returns:
         [3, 3] float64.
@@ -316,18 +316,18 @@ def look_at(
     near: float = DEFAULT_NEAR,
     image: str | None = None,
 ) -> Camera:
-    """A camera at one point that looks at another.
+    """Return a camera at one point that looks at another.
 
     Args:
-        position: [3], where it stands.
-        target: [3], what lies in the middle of the picture (at the principal point).
-        up: [3], what points upwards in the picture; where it is parallel to the line of sight, any
-            direction across is taken.
+        position: [3], position of the camera.
+        target: [3], the point shown at the principal point.
+        up: [3], the direction that points upwards in the image; if it is parallel to the line of sight, any
+            direction across is used.
         K: [3, 3], intrinsics.
         width: pixels.
         height: pixels.
         near: near plane, scene units.
-        image: a name.
+        image: name of an image file.
 
     Raises:
         InputError: position and target are the same point.
@@ -346,16 +346,16 @@ def look_at(
     viewmat = np.eye(4)
     for row, axis in enumerate((right, down, forward)):
         viewmat[row, :3] = axis
-        viewmat[row, 3] = -float(np.sum(axis * eye))  # no BLAS: the same on any machine's threads
+        viewmat[row, 3] = -float(np.sum(axis * eye))  # no BLAS: the same for any number of threads
     return Camera(K, viewmat, width, height, near, image)
 
 
 def direction_at(up: ArrayLike, azimuth: float, elevation: float) -> F64:
-    """A unit vector by its angles.
+    """Return the unit vector of an azimuth and an elevation.
 
     Args:
-        up: [3], unit length, which way is up.
-        azimuth: degrees around `up`, to the right-hand side.
+        up: [3], unit length, the up direction.
+        azimuth: degrees around `up`, right-handed.
         elevation: degrees above the horizon.
 
     Returns:
@@ -372,7 +372,7 @@ def direction_at(up: ArrayLike, azimuth: float, elevation: float) -> F64:
 
 
 def _cross(a: F64, b: F64) -> F64:
-    """`np.cross` of two vectors, to the bit, without what that spends on axes: cameras are tried by the hundred."""
+    """Return `np.cross` of two vectors, to the bit, without its overhead: cameras are tried by the hundred."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
@@ -388,13 +388,13 @@ def orbit(
     elevation: float = 20.0,
     near: float = DEFAULT_NEAR,
 ) -> list[Camera]:
-    """Cameras on a full circle around a point, all looking at it.
+    """Return cameras on a full circle around a point, all looking at it.
 
     Args:
-        centre: [3], what they look at.
+        centre: [3], the point they look at.
         distance: from the centre, scene units, above 0.
         up: [3], unit length, the axis of the circle.
-        count: how many; played in a loop they turn evenly.
+        count: number of cameras, evenly spaced.
         K: [3, 3], intrinsics.
         width: pixels.
         height: pixels.

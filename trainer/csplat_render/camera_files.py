@@ -28,14 +28,14 @@ from csplat_render.camera import DEFAULT_NEAR, Camera, check_last_row, relative_
 #: Models of transforms.json that are a pinhole with OpenCV's distortion, or without; "" where none is named.
 PERSPECTIVES = ("", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
-_ORIGIN_FAR = 100.0  # times the distance of cameras from an origin, at least, that the origin is from 0
-_FOCAL_RANGE = (0.05, 500.0)  # focal lengths relative to the image's side: 169 to 0.1 degrees of view (satellites)
-_MOST_UNEQUAL = 3.0  # of focal lengths across and down
-_OFF_CENTRE = 10.0  # sides of the image, up to which the principal point may be away
-_SWAPPED = 0.02  # relative, of a principal point to half of the other side
-_NERFSTUDIO_NEAR = 0.01  # scene units, of nerfstudio's renderer
+_ORIGIN_FAR = 100.0  # distance of an origin from 0, in distances of the cameras from it: map coordinates
+_FOCAL_RANGE = (0.05, 500.0)  # focal length relative to the image's side: 169 to 0.1 degrees of view (satellites)
+_MAX_FOCAL_RATIO = 3.0  # ratio of the focal lengths across and down
+_OFF_CENTRE = 10.0  # largest distance of the principal point, in sides of the image
+_SWAPPED = 0.02  # relative difference of a principal point from half of the other side
+_NERFSTUDIO_NEAR = 0.01  # near plane of nerfstudio's renderer, scene units
 _SCALE_TOLERANCE = 1e-3
-_ANGLES_AGREE = 0.01  # relative, of a focal length with one stated beside it; files hold few digits
+_ANGLE_TOLERANCE = 0.01  # relative difference of a focal length and an angle of view; files hold few digits
 _LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")  # distortion_params
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
@@ -46,16 +46,16 @@ def load_cameras(
     """Read a camera file.
 
     Args:
-        path: a JSON file, see above. Its cameras are relative to the scene's origin. Where that is a hundred times as
-            far from 0 as from the middle of the cameras, they are in coordinates of a map, and it is taken off.
-        report: takes lines on how the file was understood.
-        origin: [3], of the scene.
+        path: a JSON file, see above. Its cameras are relative to the scene's origin, unless that is a hundred times as
+            far from 0 as from the middle of the cameras: then they are in map coordinates, and it is subtracted.
+        report: lines on how the file was understood are appended.
+        origin: [3], origin of the scene.
 
     Returns:
         Its cameras, at least one, relative to the origin.
 
     Raises:
-        InputError: the file is absent, is not JSON, or holds something else than cameras.
+        InputError: the file is absent, is not JSON, or does not hold cameras.
     """
     path, report = Path(path), [] if report is None else report
     entries = read_json(path)
@@ -80,18 +80,18 @@ def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:
 
 
 def parse_foreign_cameras(document: object, where: str, report: list[str]) -> list[Camera] | None:
-    """Read cameras in the words of another program.
+    """Parse a camera file of another program.
 
     Args:
-        document: a JSON file's.
+        document: contents of a JSON file.
         where: the file, for messages.
-        report: takes a line on how the file was understood.
+        report: a line on how the file was understood is appended.
 
     Returns:
-        Its cameras; `None` where it is none of those above.
+        Its cameras; `None` if it has none of the formats above.
 
     Raises:
-        InputError: a field is missing or no number, or a pose is none.
+        InputError: a field is missing or not a number, or a pose is invalid.
     """
     if isinstance(document, list) and document and isinstance(document[0], Mapping) and "rotation" in document[0]:
         cameras = _parse_each(document, where, "camera", _parse_inria)
@@ -117,23 +117,23 @@ def parse_foreign_cameras(document: object, where: str, report: list[str]) -> li
 
 
 def frame_values(document: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
-    """Join what a transforms.json states for all frames with what one of them states: its own counts."""
+    """Return the values of a frame of a transforms.json: its own, else those for all frames."""
     own = {**frame, **_intrinsics_of_matrix(frame)}
     values = {**document, **own}
-    listed = values.get("distortion_params")  # of nerfstudio
+    listed = values.get("distortion_params")  # nerfstudio
     if isinstance(listed, list) and len(listed) == len(_LISTED):
         values |= dict(zip(_LISTED, listed, strict=True))
     for axis in "xy":
         if f"fl_{axis}" in own and f"camera_angle_{axis}" not in own:
             values.pop(f"camera_angle_{axis}", None)
-        degrees = values.get(f"{axis}_fov")  # of instant-ngp
+        degrees = values.get(f"{axis}_fov")  # instant-ngp
         if isinstance(degrees, int | float) and not {f"fl_{axis}", f"camera_angle_{axis}"} & set(values):
             values[f"camera_angle_{axis}"] = math.radians(degrees)
     return values
 
 
 def _intrinsics_of_matrix(frame: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a frame's `intrinsic_matrix` states, as NeuS2 has it, in the words of the others."""
+    """Return the values of a frame's `intrinsic_matrix` (NeuS2) under the names of instant-ngp."""
     if "intrinsic_matrix" not in frame or "fl_x" in frame:
         return {}
     try:
@@ -149,16 +149,16 @@ def _intrinsics_of_matrix(frame: Mapping[str, Any]) -> dict[str, Any]:
 def check_intrinsics(
     focals: tuple[float, float], middle: tuple[float, float], size: tuple[float, float], where: str
 ) -> None:
-    """Check a camera against reason: focal lengths in other units, numbers that are swapped.
+    """Check intrinsics for plausibility: focal lengths in other units, swapped numbers.
 
     Args:
         focals: across and down, pixels.
         middle: the principal point, pixels.
         size: width and height, pixels.
-        where: file and place, for messages; "" where there is none.
+        where: file and place, for messages; "" for none.
 
     Raises:
-        InputError: no camera is like that.
+        InputError: no camera has such intrinsics.
     """
     where = f"{where}: " if where else ""
     (fx, fy), (cx, cy), (width, height) = focals, middle, size
@@ -169,7 +169,7 @@ def check_intrinsics(
                 f"{where}the focal length {name} is {focal:g} for {side:g} pixels, expected {low * side:g} to "
                 f"{high * side:g}: it is in pixels of images of that size, not in millimetres or other units"
             )
-    if not 1.0 / _MOST_UNEQUAL <= fx / fy <= _MOST_UNEQUAL:
+    if not 1.0 / _MAX_FOCAL_RATIO <= fx / fy <= _MAX_FOCAL_RATIO:
         raise InputError(
             f"{where}the focal lengths are {fx:g} across and {fy:g} down, expected about the same: one of them is wrong"
         )
@@ -188,7 +188,7 @@ def finite_number(values: Mapping[str, Any], key: str, where: str, default: floa
     """Look up a finite number.
 
     Raises:
-        InputError: it is missing, and there is no default, or it is something else.
+        InputError: it is missing without a default, or not a finite number.
     """
     value = values.get(key)
     if value is None and default is not None:
@@ -205,20 +205,20 @@ def finite_number(values: Mapping[str, Any], key: str, where: str, default: floa
 def focal_lengths(
     values: Mapping[str, Any], width: float, height: float, where: str, *, fisheye: bool = False
 ) -> tuple[float, float]:
-    """Read focal lengths, or angles of view, as a transforms.json states them.
+    """Return the focal lengths of a transforms.json, which may give angles of view instead.
 
     Args:
         values: fl_x, fl_y, camera_angle_x, camera_angle_y: one at least.
-        width: of the images, pixels.
-        height: the same.
-        where: for messages.
-        fisheye: angles of view are not those of a pinhole: what is stated twice is not compared.
+        width: width of the images, pixels.
+        height: height of the images, pixels.
+        where: file and place, for messages.
+        fisheye: angles of view are not those of a pinhole: they are not compared with focal lengths.
 
     Returns:
-        Across and down, pixels; the same number where one is stated.
+        Across and down, pixels; equal if one is given.
 
     Raises:
-        InputError: none is stated, one is out of range, or two contradict each other.
+        InputError: none is given, one is out of range, or two contradict each other.
     """
     fx = _focal(values, "x", width, where, fisheye=fisheye)
     fy = _focal(values, "y", height, where, fisheye=fisheye)
@@ -231,15 +231,15 @@ def focal_lengths(
 
 
 def viewmat_of_opengl(matrix: Any, name: str, where: str) -> F64:
-    """World to camera with OpenCV axes, from camera to world with OpenGL axes.
+    """Convert camera to world with OpenGL axes into world to camera with OpenCV axes.
 
     Args:
         matrix: [4, 4] or [3, 4], by rows.
-        name: of the field, for messages.
-        where: for messages.
+        name: name of the field, for messages.
+        where: file and place, for messages.
 
     Raises:
-        InputError: it is no rotation, but for one scale of the world, with a translation.
+        InputError: it is not a rotation with a translation, up to one scale.
     """
     try:
         pose = np.array(matrix, np.float64)
@@ -267,10 +267,10 @@ def viewmat_of_opengl(matrix: Any, name: str, where: str) -> F64:
 
 
 def describe_scales(matrices: Sequence[Any], where: str) -> list[str]:
-    """Report poses that hold the scale of the world in their axes, which `viewmat_of_opengl` takes off.
+    """Report poses with a scale in their axes, which `viewmat_of_opengl` removes.
 
     Args:
-        matrices: as that takes them.
+        matrices: the poses, as for `viewmat_of_opengl`.
         where: the file, for messages.
     """
     scales = [float(np.linalg.norm(np.array(matrix, np.float64)[:3, :3], axis=0).mean()) for matrix in matrices]
@@ -300,7 +300,7 @@ def _own_cameras(entries: object, path: Path) -> list[Camera]:
 def _parse_each(
     entries: list[Any], where: str, kind: str, read: Callable[[Mapping[str, Any], str], Camera]
 ) -> list[Camera]:
-    """Read the entries of a list; a fault names its file and its number."""
+    """Parse the entries of a list; errors name the file and the entry."""
     if not entries:
         raise InputError(f"{where} lists no cameras")
     cameras = []
@@ -381,7 +381,7 @@ def _parse_frame(document: Mapping[str, Any], frame: Mapping[str, Any], at: str)
 
 
 def _focal(values: Mapping[str, Any], axis: str, size: float, where: str, *, fisheye: bool) -> float | None:
-    """The focal length along one axis, stated in pixels or by the angle of view; `None` where neither is there."""
+    """Return the focal length along one axis, given in pixels or by the angle of view; `None` if neither is given."""
     length, angle = values.get(f"fl_{axis}"), values.get(f"camera_angle_{axis}")
     by_angle = None
     if angle is not None and not (fisheye and length is not None):
@@ -395,7 +395,7 @@ def _focal(values: Mapping[str, Any], axis: str, size: float, where: str, *, fis
     focal = finite_number(values, f"fl_{axis}", where)
     if focal <= 0.0:
         raise InputError(f"{where}: fl_{axis} is {focal:g}, expected above 0")
-    if by_angle is not None and abs(by_angle / focal - 1.0) > _ANGLES_AGREE:
+    if by_angle is not None and abs(by_angle / focal - 1.0) > _ANGLE_TOLERANCE:
         raise InputError(
             f"{where}: fl_{axis} is {focal:g}, expected {by_angle:.6g} as camera_angle_{axis} = {angle:g} says for "
             f"{size:g} pixels: leave out the one that is wrong"

@@ -33,27 +33,27 @@ from csplat_render.virtual_cameras import (
 )
 
 ELEVATION = 20.0  # degrees above the horizon, for objects
-_MARGIN = 0.08  # fraction of half an image, left free around an object
-_POINTS = 16_000
-_SHOWN = 0.999  # fraction of an object's points that lie inside each image: the rest is haze
-_CELL = 0.1  # extents; a part is separated from others by a gap of at least a cell
-_CELLS = 36  # each way from the centre
-_PART = 0.02  # fraction of the surface: smaller parts are floaters
-_BODY = 0.5  # fraction of the surface: if no parts hold this much, the whole scene is shown
-_TURNS = 24  # directions that are tried
-_HEIGHTS = np.linspace(-0.2, 0.2, 5)  # look-at points that are tried above an object's middle, per its height
+_MARGIN = 0.08  # fraction of half an image that is left free around an object
+_POINTS = 16_000  # points of a cloud for an object
+_SHOWN = 0.999  # fraction of an object's points inside each image; the rest is haze
+_CELL = 0.1  # extents; parts are separated by a gap of at least one cell
+_CELLS = 36  # cells each way from the centre
+_PART = 0.02  # fraction of the surface; smaller parts are floaters
+_BODY = 0.5  # fraction of the surface; if the parts hold less, the whole scene is shown
+_TURNS = 24  # azimuths that are tried
+_HEIGHTS = np.linspace(-0.2, 0.2, 5)  # look-at points above an object's middle that are tried, in object heights
 
-_ARC_POINTS = 12_000
-_ARC_ELEVATIONS = (5.0, 20.0, 40.0)
+_ARC_POINTS = 12_000  # points of a cloud for surroundings
+_ARC_ELEVATIONS = (5.0, 20.0, 40.0)  # degrees
 _ARC_DISTANCES = (1.7, 1.3, 1.0, 0.7, 0.4)  # extents
 _GOOD = 0.85  # fraction of the best view's detail below which an arc ends
 _ARC_MIN = 10.0  # degrees each way
 
-_SWINGS = (30.0, 24.0, 18.0, 13.0, 9.0, 6.0)  # degrees each way, around a view that is known
+_SWINGS = (30.0, 24.0, 18.0, 13.0, 9.0, 6.0)  # degrees each way around a known view, the widest tried first
 _FLATTENED = 0.3  # vertical part of a swing, as a fraction of it
-_NEAREST_MIDDLE = 0.3  # extents; the look-at point is no nearer to a view
+_NEAREST_MIDDLE = 0.3  # extents; least distance of the look-at point from a view
 
-_REACH = 0.35  # fraction of the ellipse's longer half-axis: how far cameras influence the path
+_REACH = 0.35  # fraction of the ellipse's longer half-axis over which cameras influence the path
 _EASE = 0.04  # fraction of the path over which directions are smoothed
 
 
@@ -66,19 +66,19 @@ def orbit_cameras(
     elevation: float = ELEVATION,
     along: Sequence[Camera] = (),
 ) -> list[Camera]:
-    """Cameras on a closed path, for a film.
+    """Return cameras on a closed path, for a film.
 
     Args:
         model: the scene.
         count: number of cameras.
         width: pixels.
         height: pixels.
-        elevation: degrees above the horizon, of an object.
-        along: cameras near which the path is to lead, relative to the scene's origin. Left out: those that surroundings
-            carry, none of an object.
+        elevation: degrees above the horizon, for objects.
+        along: cameras that the path follows, relative to the scene's origin. Default: those that the scene carries,
+            for surroundings; none for an object.
 
     Raises:
-        InputError: `count` is below 1, or a camera of the scene is none.
+        InputError: `count` is below 1, or a camera of the scene is invalid.
     """
     if count < 1:
         raise InputError(f"an orbit of {count} cameras, wanted at least 1")
@@ -105,9 +105,9 @@ def orbit_cameras(
 
 
 def _main_parts(cloud: Cloud, frame: SceneFrame) -> F64:
-    """[M, 3] points of an object without what floats around it: those of its parts that have any size.
+    """Return the points of an object without floaters, [M, 3]: those of its larger parts.
 
-    Parts are cells of a grid that touch. Splats that lie scattered are all of the object.
+    Parts are sets of grid cells that touch. If splats are scattered, all of them belong to the object.
     """
     side = 2 * _CELLS + 1
     with np.errstate(invalid="ignore", over="ignore"):
@@ -127,12 +127,12 @@ def _main_parts(cloud: Cloud, frame: SceneFrame) -> F64:
 
 
 def _touching(first: int, filled: Mask) -> Mask:
-    """Filled cells that are reached from one of them without a gap."""
+    """Return the filled cells that are connected with one of them."""
     found: Mask = np.zeros_like(filled)
     found.flat[first] = True
     while True:
         wider = found
-        for axis in range(3):  # the outermost cells of a grid are empty, or hold what is far away
+        for axis in range(3):  # the outermost cells of a grid are empty, or hold distant points
             wider = wider | np.roll(wider, 1, axis) | np.roll(wider, -1, axis)
         wider = wider & filled
         if (wider == found).all():
@@ -141,7 +141,7 @@ def _touching(first: int, filled: Mask) -> Mask:
 
 
 def _framing(body: F64, frame: SceneFrame, elevation: float, K: F64, width: int, height: int) -> tuple[F64, float]:
-    """Return a point to look at and a distance, so that an object is inside all images around it."""
+    """Return a look-at point and a distance from which an object is inside all images around it."""
     up = frame.up
     first, second = direction_at(up, 0.0, 0.0), direction_at(up, 90.0, 0.0)
     sides = np.stack([_along(body - frame.centre, axis) for axis in (first, second, up)])
@@ -168,7 +168,7 @@ def _framing(body: F64, frame: SceneFrame, elevation: float, K: F64, width: int,
 
 
 def _first_view(model: SplatModel) -> Camera | None:
-    """Return the camera that a scene is shown from first; `None` if it specifies none that is understood."""
+    """Return the camera of a scene's first view; `None` if it specifies none, or an invalid one."""
     try:
         return Camera.from_json(model.metadata[VIEW]) if VIEW in model.metadata else None
     except InputError:
@@ -176,7 +176,7 @@ def _first_view(model: SplatModel) -> Camera | None:
 
 
 def _sway(cloud: Cloud, first: Camera, frame: SceneFrame, count: int, K: F64, width: int, height: int) -> list[Camera]:
-    """Cameras on an ellipse around a known one, as wide as they see what it sees: the middle of the scene stays put."""
+    """Return cameras on an ellipse around a known one, as wide as they see what it sees; the look-at point is fixed."""
     ahead, eye = first.viewmat[2, :3], first.position
     depth = max(float(np.sum((frame.centre - eye) * ahead)), frame.extent * _NEAREST_MIDDLE)
     middle, side, near = eye + depth * ahead, first.viewmat[0, :3], min(frame.near, first.near)
@@ -198,7 +198,7 @@ def _sway(cloud: Cloud, first: Camera, frame: SceneFrame, count: int, K: F64, wi
 
 
 def _arc(cloud: Cloud, frame: SceneFrame, count: int) -> tuple[F64, float, float]:
-    """The longest good arc about the middle of surroundings: azimuths, there and back; elevation, distance."""
+    """Return the longest good arc about the middle of surroundings: azimuths, there and back; elevation, distance."""
     K = intrinsics(640, 480, FIELD_OF_VIEW)
     azimuths = np.arange(_TURNS) * 360.0 / _TURNS
     circles = [(elevation, distance) for distance in _ARC_DISTANCES for elevation in _ARC_ELEVATIONS]
@@ -229,19 +229,19 @@ def _arc(cloud: Cloud, frame: SceneFrame, count: int) -> tuple[F64, float, float
 def _camera_towards(
     frame: SceneFrame, azimuth: float, elevation: float, distance: float, K: F64, width: int, height: int
 ) -> Camera:
-    """A camera that looks at the middle of a scene: angles in degrees, the distance in extents."""
+    """Return a camera that looks at the middle of a scene: angles in degrees, the distance in extents."""
     eye = frame.centre + distance * frame.extent * direction_at(frame.up, azimuth, elevation)
     return look_at(eye, frame.centre, frame.up, K, width, height, frame.near)
 
 
 def _path_along(cameras: Sequence[Camera], count: int, up: Sequence[float] | None) -> tuple[F64, F64, F64]:
-    """Return a path next to the given cameras.
+    """Return a path along the given cameras.
 
-    Its plan is the ellipse that lies as the cameras do. Each of its places moves to the mean of the cameras around it,
-    and looks where they look on the mean.
+    It begins as the ellipse with the covariance of the cameras' positions. Each of its points moves to the weighted
+    mean position of the cameras around it, and looks in their mean direction.
 
     Returns:
-        [count, 3] positions; [count, 3] directions of unit length; [3], which way is up.
+        [count, 3] positions; [count, 3] directions of unit length; [3], the up direction.
     """
     outliers = camera_outliers(np.stack([camera.viewmat for camera in cameras]))
     cameras = [camera for camera, outlier in zip(cameras, outliers, strict=True) if not outlier]
@@ -268,7 +268,7 @@ def _path_along(cameras: Sequence[Camera], count: int, up: Sequence[float] | Non
 
 
 def _smooth(rows: F64) -> F64:
-    """[N, 3] rows of a closed path, each the mean of those around it."""
+    """Smooth the rows of a closed path, [N, 3]: each becomes the weighted mean of those around it."""
     count = len(rows)
     steps = np.arange(count)
     gaps = np.minimum(steps, count - steps) / count
@@ -279,6 +279,6 @@ def _smooth(rows: F64) -> F64:
 
 
 def _along(rows: F64, axis: F64) -> F64:
-    """Return the positions of rows [N, 3] along an axis; no BLAS: the same for any number of threads."""
+    """Return the coordinates of rows [N, 3] along an axis, without BLAS: the same for any number of threads."""
     result: F64 = np.sum(rows * axis, axis=1)
     return result

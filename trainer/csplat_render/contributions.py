@@ -41,28 +41,34 @@ from csplat_render.blending import (
     transmit,
 )
 from csplat_render.camera import Camera
-from csplat_render.conventions import TRANSMITTANCE_MIN, Array, HasSplats, SplatArrays, view_vector
+from csplat_render.conventions import TRANSMITTANCE_MIN, Array, HasSplats, UncheckedSplats, view_vector
 from csplat_render.kernels import device_function, parallel_kernel, thread_count
 from csplat_render.projection import BLOCK, project, sh_basis, view_direction
 from csplat_render.rasteriser import Rasteriser
 
+# Limit on colours: squares of their differences, summed over a tile, stay within float32.
+_MAX_COLOUR = 1e15
+
+# Allowance for rounding of an exponent: far from a splat's centre it is a small difference of large numbers, up to 1e4.
+_EXPONENT_MARGIN = 0.05
+
 
 @dataclass(frozen=True, eq=False)
 class ProjectedView:
-    """One view of fixed geometry: V splats that may be seen in it, in the order of the scene.
+    """One view of fixed geometry: the V splats that may be visible in it, in the order of the scene.
 
     Attributes:
         rows: [V] int32, which splats of the scene they are.
         shape: [V, 10] float64, see `project`, but for the last column: the exponent of 2 below which nothing is drawn.
             Columns 6 to 8 are colours and may be replaced.
         box: [V, 4] int32, see `project`.
-        basis: [V, B] float32, spherical harmonics in the direction of the splat, B = (degree + 1)²; [V, 0] where
-            nothing asks for them.
+        basis: [V, B] float32, spherical harmonics in the direction of the splat, B = (degree + 1)²; [V, 0] if
+            not requested.
         starts: [tiles + 1] int64, where the splats of each tile begin in `ids`.
         ids: [intersections] int32, places in `rows`, tile by tile, nearest first.
         slots: [intersections] int32, the record of each of `ids`.
         first: [V + 1] int64, where the records of each splat begin.
-        width, height: of the picture, pixels.
+        width, height: size of the image, pixels.
     """
 
     rows: Array
@@ -78,7 +84,7 @@ class ProjectedView:
 
     @property
     def size_bytes(self) -> int:
-        """Memory that the arrays take."""
+        """Memory of the arrays."""
         arrays = (self.rows, self.shape, self.box, self.basis, self.starts, self.ids, self.slots, self.first)
         return sum(array.nbytes for array in arrays)
 
@@ -86,38 +92,217 @@ class ProjectedView:
         """Leave out pairs of splat and tile, and splats that have none.
 
         Args:
-            needed: [intersections] bool, which records stay.
+            needed: [intersections] bool, which records are kept.
 
         Returns:
-            The view, and which of the V splats are left.
+            The view, and which of the V splats are kept.
         """
         before = np.zeros(len(needed) + 1, np.int64)
         np.cumsum(needed, out=before[1:])
-        stays = np.take(needed, self.slots)
-        starts = np.zeros(len(stays) + 1, np.int64)
-        np.cumsum(stays, out=starts[1:])
+        kept = np.take(needed, self.slots)
+        starts = np.zeros(len(kept) + 1, np.int64)
+        np.cumsum(kept, out=starts[1:])
         first = before[self.first]
-        left = np.flatnonzero(first[1:] > first[:-1])
+        kept_splats = np.flatnonzero(first[1:] > first[:-1])
         place = np.empty(len(self.rows), np.int32)
-        place[left] = np.arange(len(left), dtype=np.int32)
+        place[kept_splats] = np.arange(len(kept_splats), dtype=np.int32)
         view = ProjectedView(
-            rows=self.rows[left],
-            shape=np.take(self.shape, left, axis=0),
-            box=np.take(self.box, left, axis=0),
-            basis=np.take(self.basis, left, axis=0),
+            rows=self.rows[kept_splats],
+            shape=np.take(self.shape, kept_splats, axis=0),
+            box=np.take(self.box, kept_splats, axis=0),
+            basis=np.take(self.basis, kept_splats, axis=0),
             starts=starts[self.starts],
-            ids=place[self.ids[stays]],
-            slots=before[self.slots[stays]].astype(np.int32),
-            first=np.append(first[left], first[-1]),
+            ids=place[self.ids[kept]],
+            slots=before[self.slots[kept]].astype(np.int32),
+            first=np.append(first[kept_splats], first[-1]),
             width=self.width,
             height=self.height,
         )
-        return view, left
+        return view, kept_splats
+
+
+class Contributions(Rasteriser):
+    """A rasteriser that sums over pixels by splat.
+
+    No result depends on the number of threads: every splat of every tile has a record of its own, and a splat's
+    records are added up in one order.
+
+    Args:
+        dtype: see `Rasteriser`.
+        transmittance_min: transmittance at which a pixel is finished.
+        threads: see `Rasteriser`.
+    """
+
+    def __init__(
+        self,
+        dtype: Any = np.float32,
+        *,
+        transmittance_min: float = TRANSMITTANCE_MIN,
+        threads: int | None = None,
+    ) -> None:
+        super().__init__("standard", dtype, gradients=True, threads=threads)
+        self._limits[2] = transmittance_min
+
+    def project_view(
+        self, splats: HasSplats, camera: Camera, *, antialiased: bool = False, basis: bool = True
+    ) -> ProjectedView:
+        """Project splats, sort them into tiles, and drop those that the view does not show.
+
+        Args:
+            splats: the scene.
+            camera: the view.
+            antialiased: scale opacities by what the dilation added.
+            basis: compute the spherical harmonics in the direction of each splat.
+
+        Raises:
+            LimitError: there are too many pairs of splat and tile.
+        """
+        arrays = UncheckedSplats(
+            *(
+                np.ascontiguousarray(getattr(splats, name), self.dtype)
+                for name in ("means", "quats", "scales", "opacities", "sh0", "shN")
+            )
+        )
+        n, degree = len(arrays.means), sh_degree_of(arrays.shN.shape[1])
+        width, height = camera.W, camera.H
+        tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+        shape, extent = self._buffer("shape", (n, 10), np.float64), self._buffer("extent", (n, 6), np.float64)
+        box, near = self._buffer("box", (n, 4), np.int32), self._buffer("near", (n,), np.float32)
+        view = view_vector(camera)
+        with thread_count(self.threads):
+            project(
+                arrays.means, arrays.quats, arrays.scales, arrays.opacities, arrays.sh0, arrays.shN, degree, view,
+                width, height, antialiased, self.thresholds.alpha_min, shape, extent, box, near,
+                self._buffer("radii", (n,), np.float32), self._buffer("ignored", (-(-n // BLOCK),), np.int64),
+            )  # fmt: skip
+            order = self._depth_order(near)
+            starts, _ = self._sort_into_tiles(order, near, extent, box, tiles_x, tiles_x * tiles_y)
+            # In the order of the scene, not of depth: arrays by splat are then read and written sequentially.
+            rows = np.flatnonzero(near > 0.0).astype(np.int32)
+            harmonics = np.empty((len(rows), (degree + 1) ** 2 if basis else 0), np.float32)
+            evaluate_basis(arrays.means, rows, view, degree, harmonics)
+        offsets, place = self._buffers["offsets"], self._buffer("place", (n,), np.int32)
+        place[rows] = np.arange(len(rows), dtype=np.int32)
+        drawn = np.take(shape, rows, axis=0)
+        np.minimum(drawn[:, 6:9], _MAX_COLOUR, out=drawn[:, 6:9])
+        drawn[:, 9] = np.log2(self.thresholds.alpha_min / drawn[:, 5]) - _EXPONENT_MARGIN
+        return ProjectedView(
+            rows=rows,
+            shape=drawn,
+            box=np.take(box, rows, axis=0),
+            basis=harmonics,
+            starts=starts.copy(),
+            ids=np.take(place, self._buffers["ids"]),
+            slots=self._buffers["slots"].copy(),
+            first=np.append(offsets[rows], offsets[-1]),  # splats that are not drawn have no records
+            width=width,
+            height=height,
+        )
+
+    def measure_pruning(
+        self,
+        drawn: ProjectedView,
+        shN: Array,
+        totals: Array,
+        bands: Array,
+        *,
+        background: Array,
+        reference: Array | None = None,
+    ) -> Array:
+        """Add one view's sums for every splat to the totals of a scene.
+
+        Args:
+            drawn: the view, its shape holding the splats' colours.
+            shN: [N, K, 3] float32, spherical harmonics of all splats beyond the first.
+            totals: [N, 5] float64, added to: squared change of the render if the splat were absent, product of that
+                change with (render − reference), weight, squared weight, and 1 if the splat was seen.
+            bands: [N, d] float64, added to: squared change of the render if its band 1, … d were zero; [N, 0] for
+                views without a basis.
+            background: [3], behind everything.
+            reference: [H, W, 3], the image to compare with; None for this render.
+
+        Returns:
+            [H, W, 3], the render.
+        """
+        size, tiles_x = (drawn.height, drawn.width), -(-drawn.width // TILE)
+        records = self._buffer("sums", (len(drawn.ids), PRUNING_SUMS), self.dtype)
+        transmittance, last = self._buffer("through", size, self.dtype), self._buffer("last", size, self.dtype)
+        rgb = np.empty((*size, 3), self.dtype)
+        behind = np.ascontiguousarray(background, self.dtype)
+        with thread_count(self.threads):
+            blend_counted(
+                drawn.starts, drawn.ids, drawn.shape, drawn.box, tiles_x, self._limits, behind,
+                rgb, transmittance, last, self._buffer("used", (len(drawn.starts) - 1,), np.int64),
+                np.empty((0, 0, 5), self.dtype),
+            )  # fmt: skip
+            error = np.empty((0, 0, 3), self.dtype) if reference is None else rgb - reference
+            sum_pruning(
+                drawn.starts, drawn.ids, drawn.slots, drawn.shape, drawn.box, tiles_x, self._limits, behind,
+                error.astype(self.dtype, copy=False), transmittance, last, records,
+            )  # fmt: skip
+            add_pruning_sums(drawn.rows, drawn.first, records, drawn.basis, shN, totals, bands)
+        return rgb
+
+    def backproject(
+        self,
+        drawn: ProjectedView,
+        coefficients: Array,
+        active: Array,
+        gradient: Array,
+        diagonal: Array,
+        *,
+        offset: float,
+        background: Array,
+        reference: Array | None = None,
+    ) -> Array:
+        """Render with other colours, subtract an image, and take the difference back to the colours.
+
+        A colour is offset + Σ_k Y_k(direction) · coefficient_k if it is active, else 0: linear, not clamped.
+
+        Args:
+            drawn: the view; its colours are overwritten.
+            coefficients: [N, B, 3] float32.
+            active: [V, 3] bool, which colours take part.
+            gradient: [N, B, 3] float32, added to: sum over pixels of w · Y_k · (render − reference).
+            diagonal: [N, B] float32, added to: sum over pixels of (w · Y_k)²; empty if it is not needed.
+            offset: ½ for renders of splats, 0 for differences of such renders.
+            background: [3].
+            reference: [H, W, 3]; None for black.
+
+        Returns:
+            [H, W, 3], the render, before the subtraction.
+        """
+        size, tiles_x = (drawn.height, drawn.width), -(-drawn.width // TILE)
+        records = self._buffer("sums", (len(drawn.ids), COLOUR_SUMS), self.dtype)
+        used = self._buffer("used", (len(drawn.starts) - 1,), np.int64)
+        rgb = np.empty((*size, 3), self.dtype)
+        with thread_count(self.threads):
+            set_colours(drawn.rows, drawn.basis, coefficients, active, offset, drawn.shape)
+            blend(
+                drawn.starts, drawn.ids, drawn.shape, drawn.box, tiles_x, self._limits,
+                np.ascontiguousarray(background, self.dtype), rgb, self._buffer("through", size, self.dtype),
+                self._buffer("depth", size, self.dtype), used, np.empty((0, 0, 5), self.dtype),
+            )  # fmt: skip
+            error = rgb if reference is None else rgb - reference
+            sum_colours(
+                drawn.starts, used, drawn.ids, drawn.slots, drawn.shape, drawn.box, tiles_x, self._limits,
+                error.astype(self.dtype, copy=False), records,
+            )  # fmt: skip
+            add_gradient(drawn.rows, drawn.first, records, drawn.basis, active, gradient, diagonal)
+        return rgb
+
+    def trim(self, drawn: ProjectedView) -> tuple[ProjectedView, Array]:
+        """Leave out splats that had no weight in the last `backproject`, of this view: renders keep their bits.
+
+        Returns:
+            The view, and which of the V splats are kept.
+        """
+        return drawn.with_records(self._buffer("sums", (len(drawn.ids), COLOUR_SUMS), self.dtype)[:, 3] > 0.0)
 
 
 @parallel_kernel()
 def evaluate_basis(lane: int, lanes: int, means: Any, rows: Any, view: Any, degree: int, basis: Any) -> None:
-    """Spherical harmonics in the direction of each splat that is drawn; parallel over blocks of them."""
+    """Evaluate the spherical harmonics in the direction of each drawn splat; parallel over blocks of splats."""
     values = np.empty(16, np.float64)
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
@@ -143,7 +328,7 @@ def set_colours(
 
 @device_function
 def _colour_at(basis: Any, coefficients: Any) -> tuple[float, float, float]:
-    """Red, green, blue of some coefficients, [B, 3], in the direction of a basis, [B]; float64."""
+    """Return red, green, blue of coefficients [B, 3] in the direction of a basis [B]; float64."""
     r, g, b = 0.0, 0.0, 0.0
     for k in range(basis.shape[0]):
         y = np.float64(basis[k])
@@ -157,7 +342,7 @@ def _colour_at(basis: Any, coefficients: Any) -> tuple[float, float, float]:
 def add_pruning_sums(
     lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, shN: Any, totals: Any, bands: Any
 ) -> None:
-    """Add the records of one view up, splat by splat, see `Contributions.removal`; parallel over blocks of splats."""
+    """Add the records of one view to the totals, see `Contributions.measure_pruning`; parallel over blocks."""
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
             i = rows[j]
@@ -184,7 +369,7 @@ def add_pruning_sums(
 def add_gradient(
     lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, active: Any, gradient: Any, diagonal: Any
 ) -> None:
-    """Take the records of one view to the coefficients, see `Contributions.colours`; parallel over blocks of splats."""
+    """Add the gradient of one view to the coefficients, see `Contributions.backproject`; parallel over blocks."""
     with_diagonal = diagonal.shape[0] > 0
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
@@ -214,7 +399,7 @@ PRUNING_SUMS = 4
 _AREA = TILE * TILE
 
 # Where the planes of a tile begin, after transmittance: three colours of what lies behind, how far each pixel got,
-# three differences from the picture that is wanted, what the current splat adds to two sums, its weight, positions.
+# three differences from the reference, the current splat's terms of two sums, its weight, positions.
 _RED, _GREEN, _BLUE, _LAST, _ERR_R, _ERR_G, _ERR_B, _CHANGE, _PRODUCT, _WEIGHT, _X = (_AREA * k for k in range(1, 12))
 _PLANES = 12
 
@@ -249,14 +434,14 @@ def sum_pruning(
         tiles_x: tiles side by side.
         limits: [3].
         background: [3].
-        error: [H, W, 3], the picture less the one that is wanted; [0, 0, 3] where it is the one.
+        error: [H, W, 3], the render minus the reference; [0, 0, 3] if the render is the reference.
         transmittance: [H, W], as `blend_counted` wrote it, as the next.
         last: [H, W].
-        records: [intersections, SUMS], written: sums of |d|², d · error, w and w², d being the change of the pixel if
-            the splat were not there.
+        records: [intersections, SUMS], written: sums of |d|², d · error, w and w², d being the change of the pixel
+            without the splat.
     """
     height, width = transmittance.shape
-    # Planes of 16 × 16, one after the other, in one array: so the compiler sees what overlaps.
+    # Planes of 16 × 16, one after the other, in one array: the compiler sees which parts overlap.
     planes, deepest = aligned_zeros(_PLANES * _AREA, limits), np.zeros(TILE, np.int64)
     ys = pixel_centres()
     for e in range(_AREA):
@@ -268,7 +453,7 @@ def sum_pruning(
     for tile in range(lane, len(starts) - 1, lanes):
         X0, Y0, columns, high = tile_extent(tile, tiles_x, width, height)
         planes[:_LAST] = zero
-        planes[_LAST:_ERR_R] = -one  # pixels beyond the picture got nowhere
+        planes[_LAST:_ERR_R] = -one  # pixels beyond the image have no splat
         planes[_ERR_R:_X] = zero
         if is_wrong:
             read_planes(error, X0, Y0, columns, high, planes, _ERR_R)
@@ -335,11 +520,11 @@ def sum_pruning(
 COLOUR_SUMS = 4
 
 
-# Where the planes of a tile begin, after transmittance: the picture, the current splat's weight, positions.
+# Where the planes of a tile begin, after transmittance: the image, the current splat's weight, positions.
 _COLOUR_RED, _COLOUR_GREEN, _COLOUR_BLUE, _COLOUR_WEIGHT, _COLOUR_X = (_AREA * k for k in range(1, 6))
 _COLOUR_PLANES = 6
 
-# What a splat that finishes a pixel seems to weigh there: nothing beside the smallest weight, 4e-7, but not 0.
+# Weight of a splat that finishes a pixel there: nothing compared with the smallest weight, 4e-7, but not 0.
 _FINISHING_WEIGHT = 1e-12
 
 
@@ -358,7 +543,7 @@ def sum_colours(
     error: Any,
     records: Any,
 ) -> None:
-    """Take a picture back to the splats of every tile; parallel over tiles, vectorised over the 16 pixels of a row.
+    """Take an image back to the splats of every tile; parallel over tiles, vectorised over the 16 pixels of a row.
 
     Args:
         lane: which of the threads this is.
@@ -371,9 +556,9 @@ def sum_colours(
         box: [N, 4] int32.
         tiles_x: tiles side by side.
         limits: [3].
-        error: [H, W, 3], what is taken back.
+        error: [H, W, 3], the image that is taken back.
         records: [intersections, COLOUR_SUMS], written: sums of w · error for red, green, blue, and of w²; the last is
-            0 for what could as well be absent: it neither shows nor finishes a pixel.
+            0 for a splat that neither shows in a pixel nor finishes one.
     """
     height, width = error.shape[:2]
     planes = aligned_zeros(_COLOUR_PLANES * _AREA, limits)
@@ -389,7 +574,7 @@ def sum_colours(
         begin_tile(T, columns, one)
         planes[_COLOUR_RED:_COLOUR_WEIGHT] = zero
         read_planes(error, X0, Y0, columns, high, planes, _COLOUR_RED)
-        # Rows that are finished are gone through: so a sum is added up in one order, whatever lies in front.
+        # Finished rows are processed too, so that the order of a sum does not depend on what lies in front.
         for begin in range(starts[tile], used[tile], BATCH):
             count = min(BATCH, used[tile] - begin)
             gather_batch(ids, begin, begin + count, shape, box, X0, Y0, 0, high, ys, batch, rows)
@@ -418,197 +603,3 @@ def sum_colours(
                 record[0], record[1], record[2], record[3] = m0, m1, m2, m3
         for k in range(used[tile], starts[tile + 1]):
             records[slots[k]] = zero
-
-
-# Colours are taken for no brighter: squares of their differences, summed over a tile, stay within float32.
-_MAX_COLOUR = 1e15
-
-# Allowance for rounding of an exponent: far from a splat's centre it is a small difference of large numbers, up to 1e4.
-_EXPONENT_MARGIN = 0.05
-
-
-class Contributions(Rasteriser):
-    """Draws views and sums over their pixels; arguments as those of `Rasteriser`, and when a pixel is finished.
-
-    No result depends on the number of threads: every splat of every tile has a record of its own, and a splat's
-    records are added up in one order.
-    """
-
-    def __init__(
-        self,
-        dtype: Any = np.float32,
-        *,
-        transmittance_min: float = TRANSMITTANCE_MIN,
-        threads: int | None = None,
-    ) -> None:
-        super().__init__("standard", dtype, gradients=True, threads=threads)
-        self._limits[2] = transmittance_min
-
-    def draw(
-        self, splats: HasSplats, camera: Camera, *, antialiased: bool = False, basis: bool = True
-    ) -> ProjectedView:
-        """Project splats, sort them into the tiles of a picture, and forget what it does not show.
-
-        Args:
-            splats: the scene.
-            camera: the view.
-            antialiased: scale opacities by what the dilation added.
-            basis: True if the view needs spherical harmonics by splat.
-
-        Raises:
-            LimitError: there are too many pairs of splat and tile.
-        """
-        arrays = SplatArrays(
-            *(
-                np.ascontiguousarray(getattr(splats, name), self.dtype)
-                for name in ("means", "quats", "scales", "opacities", "sh0", "shN")
-            )
-        )
-        n, degree = len(arrays.means), sh_degree_of(arrays.shN.shape[1])
-        width, height = camera.W, camera.H
-        tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-        shape, extent = self._buffer("shape", (n, 10), np.float64), self._buffer("extent", (n, 6), np.float64)
-        box, near = self._buffer("box", (n, 4), np.int32), self._buffer("near", (n,), np.float32)
-        view = view_vector(camera)
-        with thread_count(self.threads):
-            project(
-                arrays.means, arrays.quats, arrays.scales, arrays.opacities, arrays.sh0, arrays.shN, degree, view,
-                width, height, antialiased, self.settings.alpha_min, shape, extent, box, near,
-                self._buffer("radii", (n,), np.float32), self._buffer("ignored", (-(-n // BLOCK),), np.int64),
-            )  # fmt: skip
-            order = self._depth_order(near)
-            starts, _ = self._sort_into_tiles(order, near, extent, box, tiles_x, tiles_x * tiles_y)
-            # In the order of the scene, not of depth: what is read and written per splat then lies in a row.
-            rows = np.flatnonzero(near > 0.0).astype(np.int32)
-            harmonics = np.empty((len(rows), (degree + 1) ** 2 if basis else 0), np.float32)
-            evaluate_basis(arrays.means, rows, view, degree, harmonics)
-        offsets, place = self._buffers["offsets"], self._buffer("place", (n,), np.int32)
-        place[rows] = np.arange(len(rows), dtype=np.int32)
-        drawn = np.take(shape, rows, axis=0)
-        np.minimum(drawn[:, 6:9], _MAX_COLOUR, out=drawn[:, 6:9])
-        drawn[:, 9] = np.log2(self.settings.alpha_min / drawn[:, 5]) - _EXPONENT_MARGIN
-        return ProjectedView(
-            rows=rows,
-            shape=drawn,
-            box=np.take(box, rows, axis=0),
-            basis=harmonics,
-            starts=starts.copy(),
-            ids=np.take(place, self._buffers["ids"]),
-            slots=self._buffers["slots"].copy(),
-            first=np.append(offsets[rows], offsets[-1]),  # splats that are not drawn have no records
-            width=width,
-            height=height,
-        )
-
-    def removal(
-        self,
-        drawn: ProjectedView,
-        shN: Array,
-        totals: Array,
-        bands: Array,
-        *,
-        background: Array,
-        reference: Array | None = None,
-    ) -> Array:
-        """Add one view's sums for every splat to the totals of a scene.
-
-        Args:
-            drawn: the view, its shape holding the splats' colours.
-            shN: [N, K, 3] float32, spherical harmonics of all splats beyond the first.
-            totals: [N, 5] float64, added to: squared change of the picture if the splat were not there, product of
-                that change with (picture − reference), weight, squared weight, and 1 if the splat was seen.
-            bands: [N, d] float64, added to: squared change of the picture if its band 1, … d were zero; [N, 0] for
-                views without a basis.
-            background: [3], behind everything.
-            reference: [H, W, 3], the image to compare with; None for this render.
-
-        Returns:
-            [H, W, 3], the picture.
-        """
-        rgb, records = self._removal(drawn, background, reference)
-        with thread_count(self.threads):
-            add_pruning_sums(drawn.rows, drawn.first, records, drawn.basis, shN, totals, bands)
-        return rgb
-
-    def colours(
-        self,
-        drawn: ProjectedView,
-        coefficients: Array,
-        active: Array,
-        gradient: Array,
-        diagonal: Array,
-        *,
-        offset: float,
-        background: Array,
-        reference: Array | None = None,
-    ) -> Array:
-        """Render with other colours, subtract a picture, and take the difference back to the colours.
-
-        A colour is offset + Σ_k Y_k(direction) · coefficient_k if it is active, else 0: linear, not clamped.
-
-        Args:
-            drawn: the view; its colours are overwritten.
-            coefficients: [N, B, 3] float32.
-            active: [V, 3] bool, which colours take part.
-            gradient: [N, B, 3] float32, added to: sum over pixels of w · Y_k · (picture − reference).
-            diagonal: [N, B] float32, added to: sum over pixels of (w · Y_k)²; empty if it is not needed.
-            offset: ½ for pictures of splats, 0 for differences of such pictures.
-            background: [3].
-            reference: [H, W, 3]; None for black.
-
-        Returns:
-            [H, W, 3], the picture, before the subtraction.
-        """
-        with thread_count(self.threads):
-            set_colours(drawn.rows, drawn.basis, coefficients, active, offset, drawn.shape)
-        rgb, records = self._colours(drawn, background, reference)
-        with thread_count(self.threads):
-            add_gradient(drawn.rows, drawn.first, records, drawn.basis, active, gradient, diagonal)
-        return rgb
-
-    def trimmed(self, drawn: ProjectedView) -> tuple[ProjectedView, Array]:
-        """Leave out what the last `colours`, of this view, found without any weight: pictures stay the same to the bit.
-
-        Returns:
-            The view, and which of the V splats are left.
-        """
-        return drawn.with_records(self._buffer("sums", (len(drawn.ids), COLOUR_SUMS), self.dtype)[:, 3] > 0.0)
-
-    def _removal(self, drawn: ProjectedView, background: Array, reference: Array | None) -> tuple[Array, Array]:
-        """Run the loops over pixels, front to back and again back to front: the picture, and the records."""
-        size, tiles_x = (drawn.height, drawn.width), -(-drawn.width // TILE)
-        records = self._buffer("sums", (len(drawn.ids), PRUNING_SUMS), self.dtype)
-        transmittance, last = self._buffer("through", size, self.dtype), self._buffer("last", size, self.dtype)
-        rgb = np.empty((*size, 3), self.dtype)
-        behind = np.ascontiguousarray(background, self.dtype)
-        with thread_count(self.threads):
-            blend_counted(
-                drawn.starts, drawn.ids, drawn.shape, drawn.box, tiles_x, self._limits, behind,
-                rgb, transmittance, last, self._buffer("used", (len(drawn.starts) - 1,), np.int64),
-                np.empty((0, 0, 5), self.dtype),
-            )  # fmt: skip
-            error = np.empty((0, 0, 3), self.dtype) if reference is None else rgb - reference
-            sum_pruning(
-                drawn.starts, drawn.ids, drawn.slots, drawn.shape, drawn.box, tiles_x, self._limits, behind,
-                error.astype(self.dtype, copy=False), transmittance, last, records,
-            )  # fmt: skip
-        return rgb, records
-
-    def _colours(self, drawn: ProjectedView, background: Array, reference: Array | None) -> tuple[Array, Array]:
-        """Run the loops over pixels, front to back twice: the picture, and the records."""
-        size, tiles_x = (drawn.height, drawn.width), -(-drawn.width // TILE)
-        records = self._buffer("sums", (len(drawn.ids), COLOUR_SUMS), self.dtype)
-        used = self._buffer("used", (len(drawn.starts) - 1,), np.int64)
-        rgb = np.empty((*size, 3), self.dtype)
-        with thread_count(self.threads):
-            blend(
-                drawn.starts, drawn.ids, drawn.shape, drawn.box, tiles_x, self._limits,
-                np.ascontiguousarray(background, self.dtype), rgb, self._buffer("through", size, self.dtype),
-                self._buffer("depth", size, self.dtype), used, np.empty((0, 0, 5), self.dtype),
-            )  # fmt: skip
-            error = rgb if reference is None else rgb - reference
-            sum_colours(
-                drawn.starts, used, drawn.ids, drawn.slots, drawn.shape, drawn.box, tiles_x, self._limits,
-                error.astype(self.dtype, copy=False), records,
-            )  # fmt: skip
-        return rgb, records

@@ -29,10 +29,10 @@ ALPHA_MIN = 1.0 / 255.0
 #: A pixel is finished before the splat that would bring its transmittance below this.
 TRANSMITTANCE_MIN = 1e-4
 
-#: The perspective is linearised at most this far outside the picture, in half-widths of it.
+#: The perspective is linearised at most this far outside the image, in half-widths of the image.
 FOV_MARGIN = 0.3
 
-#: Log-scales count as if they lay within this of 0 (a factor of 5e34): all products stay finite.
+#: Log-scales are clamped to this distance from 0 (a factor of 5e34), so that all products are finite.
 LOG_SCALE_LIMIT = 80.0
 
 #: Smallest ratio of determinants from which the antialiased mode computes its compensation.
@@ -52,16 +52,16 @@ class Thresholds:
 
 _THRESHOLDS = {
     "standard": Thresholds(ALPHA_MIN, TRANSMITTANCE_MIN),
-    # A larger smallest alpha shrinks every splat; what shines through with less than 1/255 is left out.
+    # A larger minimum of alpha shrinks every splat; light that passes with less than 1/255 is left out.
     "fast": Thresholds(1.5 * ALPHA_MIN, ALPHA_MIN),
 }
 
 
 def thresholds_of(mode: str) -> Thresholds:
-    """Settings of a mode of the rasteriser.
+    """Return the thresholds of a mode of the rasteriser.
 
     Raises:
-        InputError: there is no such mode, or it is the twin's.
+        InputError: there is no such mode, or it is that of the exact reference.
     """
     if mode not in _THRESHOLDS:
         raise InputError(f"the rasteriser's mode is {mode!r}, wanted one of {', '.join(_THRESHOLDS)}")
@@ -91,7 +91,7 @@ Array = NDArray[Any]
 
 
 class HasSplats(Protocol):
-    """Anything that can be rendered: a `SplatModel`, a `SplatArrays`, or any object with these arrays."""
+    """Anything that can be rendered: a `SplatModel`, `UncheckedSplats`, or any object with these arrays."""
 
     @property
     def means(self) -> Array: ...  # noqa: D102 - as in Splats
@@ -108,8 +108,8 @@ class HasSplats(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class SplatArrays:
-    """The arrays of N splats, unchecked but for their shapes: rows that hold NaN are left out of pictures.
+class UncheckedSplats:
+    """The arrays of N splats, of which only the shapes are checked: rows that hold NaN are not drawn.
 
     Attributes:
         means: [N, 3], centres.
@@ -130,16 +130,16 @@ class SplatArrays:
 
 @dataclass(frozen=True, eq=False)
 class RenderResult:
-    """A picture of splats.
+    """A rendered image.
 
     Attributes:
         rgb: [H, W, 3], not clipped: colours may exceed 1.
         alpha: [H, W], 1 − transmittance.
         depth: [H, W], sum of weight · depth, not divided by alpha.
         radii: [N] float32, 3 standard deviations of each splat along its longest axis, in pixels;
-            0 for what is not drawn.
+            0 for splats that are not drawn.
         drawn: number of splats in view.
-        intersections: pairs of splat and tile; what the time depends on.
+        intersections: number of pairs of splat and tile, to which the time is proportional.
         ignored: number of splats that hold NaN or infinity.
     """
 
@@ -154,11 +154,11 @@ class RenderResult:
 
 @dataclass(frozen=True, eq=False)
 class VisibleSplats:
-    """Splats that a render shows.
+    """Splats that are visible in a render.
 
     Attributes:
         near: [N] float32, depths, by which splats are sorted; 0 for splats that are not drawn.
-        tiles: [N] integers, number of the render's tiles that each may touch; 0 likewise.
+        tiles: [N] integers, number of tiles that each splat may touch; 0 likewise.
         ignored: number of splats that hold NaN or infinity.
     """
 
@@ -178,7 +178,7 @@ class Gradients:
         opacities: [N], towards alpha.
         sh0: [N, 3].
         shN: [N, K, 3]; 0 beyond the degree that was rendered.
-        means2d: [N], length of the gradient towards the centre on the picture, per pixel.
+        means2d: [N], length of the gradient towards the centre on the image, per pixel.
         radii: [N] float32, see `RenderResult`.
     """
 

@@ -1,4 +1,4 @@
-"""numba, with types that a type checker understands, and the options that every kernel shares."""
+"""Decorators that compile kernels with numba, with types for a type checker; threads that run them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from numba.core import event as typed_event
 
 from csplat.errors import InputError
 
-# The types that numba states for itself differ from version to version.
+# numba's own types differ from version to version.
 numba: Any = typed_numba
 extending: Any = typed_extending
 compiler: Any = typed_compiler
@@ -27,10 +27,10 @@ event: Any = typed_event
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Held while threads run a kernel, by the one caller that they have.
+#: Held by the one caller whose kernel the threads run.
 LOCK = threading.RLock()
 
-# Bytes of arrays below which waking threads (80 µs) takes longer than what one of them does alone.
+# Size of the arrays in bytes below which waking threads (80 µs) takes longer than running on one.
 _SERIAL_BYTES = 1 << 17
 
 # Without nnan and ninf: the kernels test for NaN and infinity, and may meet them.
@@ -45,29 +45,29 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def device_function(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a small function that kernels call; it takes on their arithmetic."""
+    """Compile a small function that kernels call; it takes on their arithmetic when LLVM inlines it."""
     compiled: Callable[P, R] = numba.njit(function, inline="never", cache=True, nogil=True, error_model="numpy")
     return compiled
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Copy a few lines into the kernels that call them, before anything is compiled: loops vectorise all the same."""
+    """Inline a few lines into the kernels that call them before compilation, so that loops still vectorise."""
     copied: Callable[P, R] = numba.njit(function, inline="always", nogil=True, error_model="numpy")
     return copied
 
 
 def relaxed_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function of one thread that may reassociate and contract: the inside of a loop over pixels."""
+    """Compile a function of one thread that may reassociate and contract: the body of a loop over pixels."""
     compiled: Callable[P, R] = numba.njit(function, cache=True, nogil=True, error_model="numpy", fastmath=_RELAXED)
     return compiled
 
 
 @dataclass(frozen=True, eq=False)
 class ParallelKernel(Generic[P]):
-    """A function that every thread calls once; callers leave out its first two arguments, lane and number of lanes.
+    """A function that every thread calls once; callers omit its first two arguments, lane and number of lanes.
 
-    Threads of Python run it, not numba's `prange`: that compiles a kernel four times over, as the function that was
-    written, as two wrappers, and as part of their caller. A call costs 10 µs more, and compiling half as much.
+    Python threads run it instead of numba's `prange`, which compiles a kernel four times: as the written function, as
+    two wrappers, and as part of its caller. A call costs 10 µs more, and compilation takes half the time.
 
     Attributes:
         compiled: the kernel; lane, number of lanes, arguments.
@@ -82,14 +82,14 @@ class ParallelKernel(Generic[P]):
         return signatures
 
     def __call__(self, *arguments: P.args, **named: P.kwargs) -> None:
-        """Run it on as many threads as `thread_count` sets, on one if arrays are small; return when all are done."""
+        """Run it on the threads that `thread_count` sets, on one if arrays are small; return when all are done."""
         assert not named
         with LOCK:
             _threads.run(self.compiled, arguments)
 
 
 class _NoAliasCompiler(compiler.Compiler):  # type: ignore[misc]  # numba's types are those of each version
-    """Compiles kernels whose arrays do not overlap: without that many a loop is not vectorised."""
+    """A compiler of kernels whose arrays do not overlap: otherwise many loops are not vectorised."""
 
     def define_pipelines(self) -> Any:
         """Return numba's pipelines for this compilation, with its noalias flag set."""
@@ -100,9 +100,9 @@ class _NoAliasCompiler(compiler.Compiler):  # type: ignore[misc]  # numba's type
 def parallel_kernel(
     *, relaxed: bool = False
 ) -> Callable[[Callable[Concatenate[int, int, P], None]], ParallelKernel[P]]:
-    """Compile a function that does one lane of some work, (lane, lanes, ...), and is run for all lanes at once.
+    """Compile a function that does one lane of the work, (lane, lanes, ...); all lanes run at once.
 
-    No two of the arrays that it is given may overlap.
+    No two of its arrays may overlap.
 
     Args:
         relaxed: reassociate and contract, for the loops over pixels.
@@ -120,7 +120,7 @@ def parallel_kernel(
 
 
 class _FirstCompilation(event.Listener):  # type: ignore[misc]  # numba's types are those of each version
-    """Calls something when the first kernel is compiled. Owns whether that was."""
+    """A listener that calls a function when the first kernel is compiled."""
 
     def __init__(self, call: Callable[[], object]) -> None:
         self._call, self._called = call, False
@@ -131,28 +131,28 @@ class _FirstCompilation(event.Listener):  # type: ignore[misc]  # numba's types 
             self._call()
 
     def on_end(self, event: Any) -> None:
-        """Nothing is to be done."""
+        """Do nothing."""
 
 
 @contextmanager
 def on_compiling(call: Callable[[], object]) -> Iterator[None]:
-    """Call something once if a kernel is compiled meanwhile: not if all of them come from numba's cache."""
+    """Call a function once if a kernel is compiled meanwhile, not if all of them come from numba's cache."""
     with event.install_listener("numba:compile", _FirstCompilation(call)):
         yield
 
 
 def is_cached(kernel: Any) -> bool:
-    """Return True if numba holds the kernel compiled, in this process or in its cache."""
+    """Return True if the kernel is compiled, in this process or in numba's cache."""
     compiled = getattr(kernel, "compiled", kernel)
     if compiled.signatures:
         return True
-    # There is no public name for it: the index of the cache, empty if the source is newer.
+    # The index of the cache has no public name; it is empty if the source is newer.
     load = getattr(getattr(compiled._cache, "_cache_file", None), "_load_index", None)  # noqa: SLF001
     return load is not None and bool(load())
 
 
 def fast_exp2(x: float) -> float:
-    """2**x for x < 128 in kernels: in float32 a polynomial (2e-7) that vectorises, in float64 exact."""
+    """Return 2**x for x < 128 in kernels: by a polynomial (error 2e-7) that vectorises in float32, exact in float64."""
     return math.exp(x * _LN2)
 
 
@@ -184,7 +184,7 @@ extending.overload(fast_exp2, jit_options={"fastmath": _RELAXED}, inline="always
 
 @device_function
 def lane_range(lane: int, lanes: int, count: int) -> tuple[int, int]:
-    """First and last + 1 of a thread's run of `count` things."""
+    """Return first and last + 1 of a thread's share of `count` items."""
     return count * lane // lanes, count * (lane + 1) // lanes
 
 
@@ -201,15 +201,16 @@ def available_threads() -> int:
 
 @contextmanager
 def thread_count(threads: int | None) -> Iterator[int]:
-    """Run kernels on this many threads, one caller at a time: a thread that waits inside for another one that calls a
-    kernel waits for ever.
+    """Run kernels on this many threads, one caller at a time.
+
+    A thread that waits inside the context for another one that calls a kernel waits for ever.
 
     Args:
-        threads: 1 or more, no more than there are, whatever there is to do; None for what was said before, at first
-            nothing: all, but one where arrays are small.
+        threads: number of threads, at least 1, limited to `available_threads`; None for the number set before,
+            at first all, or one if arrays are small.
 
     Yields:
-        The number, at most.
+        The largest number of threads in use.
 
     Raises:
         InputError: `threads` is below 1.
@@ -227,9 +228,9 @@ def thread_count(threads: int | None) -> Iterator[int]:
 
 
 class _HelperThread:
-    """A thread that sleeps until it is given something to call. Owns two locks that take turns.
+    """A thread that sleeps until it has a call to make. Owns two locks that alternate.
 
-    Locks wake a thread in half the time that a queue or a future takes.
+    Locks wake a thread in half the time of a queue or a future.
     """
 
     def __init__(self) -> None:
@@ -259,9 +260,9 @@ class _HelperThread:
             self._job = (None, ())
             try:
                 function(*arguments)
-            except BaseException as error:  # noqa: BLE001  # whatever it is, the caller is to have it
+            except BaseException as error:  # noqa: BLE001  # the caller raises it again
                 self._error = error
-            del function, arguments  # buffers are not to live until the next call
+            del function, arguments  # buffers must not live until the next call
             self._ended.release()
 
 
@@ -290,21 +291,21 @@ class _ThreadPool:
             raise
         except BaseException:
             self._quit(waiting)
-            self.forget()  # an interrupt may have come between a start and its note: new threads the next time
+            self.forget()  # an interrupt may have come between a start and its record: use new threads next time
             raise
 
     def _quit(self, waiting: list[_HelperThread]) -> None:
-        """Wait for lanes that still write into the buffers; what they raise is not the first mistake."""
+        """Wait for lanes that still write into the buffers; their errors are not the first one."""
         try:
             while waiting:
                 with suppress(Exception):
                     waiting.pop().wait()
         except BaseException:
-            self.forget()  # somebody is in a hurry: new threads the next time
+            self.forget()  # a second interrupt: use new threads next time
             raise
 
     def forget(self) -> None:
-        """Leave the threads to themselves."""
+        """Abandon the threads."""
         self._helpers = []
 
 
@@ -314,13 +315,13 @@ def _bytes_of(arguments: tuple[Any, ...]) -> int:
 
 
 def _after_fork() -> None:
-    """A child has no other threads: nobody holds the lock, and there are no helpers."""
-    global LOCK  # noqa: PLW0603  # it may be held for ever by a thread that is not there
+    """Reset the lock and the threads in a child process, which has neither."""
+    global LOCK  # noqa: PLW0603  # a thread that does not exist here may hold it for ever
     LOCK = threading.RLock()
     _threads.wanted = None
     _threads.forget()
 
 
 _threads = _ThreadPool()
-if hasattr(os, "register_at_fork"):  # work at import, because nobody else would tell a child that it has no threads
+if hasattr(os, "register_at_fork"):  # work at import: a child process must learn that it has no threads
     os.register_at_fork(after_in_child=_after_fork)

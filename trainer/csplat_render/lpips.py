@@ -2,11 +2,11 @@
 
 The weights are not part of this package. `load_lpips` looks for them
 
-1. in the file that is named, an .npz with the arrays `AlexNet_0/Conv_{0..4}/kernel` (height, width,
+1. in the given file, an .npz with the arrays `AlexNet_0/Conv_{0..4}/kernel` (height, width,
    in, out), `…/bias`, and `NetLinLayer_{0..4}/Conv_0/kernel`;
-2. in the file that the environment variable CSPLAT_LPIPS names;
+2. in the file named by the environment variable CSPLAT_LPIPS;
 3. in the user's cache, `csplat/lpips_alex.npz` under XDG_CACHE_HOME (else `~/.cache`);
-4. where PyTorch is installed: torchvision's AlexNet in torch's own cache, and the linear heads of an
+4. if PyTorch is installed: torchvision's AlexNet in torch's own cache, and the linear heads of an
    installed `lpips` or `torchmetrics` package. Nothing is downloaded.
 """
 
@@ -27,13 +27,13 @@ from csplat.archives import read_archive
 from csplat.errors import InputError
 from csplat.types import F32
 
-#: Smallest width and height of a picture, pixels: AlexNet has nothing left of a smaller one.
+#: Smallest width and height of an image, pixels: AlexNet's last layer of a smaller one is empty.
 MIN_SIZE = 31
 
-#: Environment variable with the path of the weights, for when no file is named.
+#: Environment variable with the path of the weights, used if no file is given.
 ENVIRONMENT = "CSPLAT_LPIPS"
 
-#: Mean and standard deviation of the network's input, red, green, blue, of pictures in −1 to 1.
+#: Mean and standard deviation of the network's input, red, green, blue, of images in −1 to 1.
 SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 SCALE = np.array([0.458, 0.448, 0.450], np.float32)
 
@@ -52,7 +52,7 @@ _TORCH_INDEX = (0, 3, 6, 8, 10)  # indices of AlexNet's convolutions among torch
 
 @dataclass(frozen=True, eq=False)
 class Lpips:
-    """The weights of the five layers, and the distance that they make.
+    """The weights of the five layers, called with two images for their distance.
 
     Attributes:
         kernels: [height, width, in, out] each, float32.
@@ -79,7 +79,7 @@ class Lpips:
                     raise InputError(f"{self.source}: {name} {i} holds values that are not finite")
 
     def __call__(self, reference: NDArray[Any], image: NDArray[Any]) -> float:
-        """Perceptual distance of two pictures, 0 if they are the same; lower is better.
+        """Return the perceptual distance of two images, 0 if they are the same.
 
         Args:
             reference: [H, W, 3] floating, clipped to [0, 1]; H and W at least `MIN_SIZE`.
@@ -103,10 +103,10 @@ def load_lpips(path: str | Path | None = None) -> Lpips:
     """Find and read the weights, see above.
 
     Args:
-        path: an .npz file; `None`: the usual places.
+        path: an .npz file; `None`: the other places above.
 
     Raises:
-        InputError: the file is no such file, or there are no weights in any of the places.
+        InputError: the file does not hold weights, or none are found.
     """
     if path is not None:
         return _read(Path(path))
@@ -125,7 +125,7 @@ def load_lpips(path: str | Path | None = None) -> Lpips:
 
 
 def save_lpips(path: str | Path, weights: Lpips) -> None:
-    """Write weights as the .npz file that `load_lpips` reads without PyTorch."""
+    """Write weights as an .npz file, which `load_lpips` reads without PyTorch."""
     arrays: dict[str, Any] = {}
     for i in range(len(_LAYERS)):
         arrays[f"AlexNet_0/Conv_{i}/kernel"] = weights.kernels[i]
@@ -155,7 +155,7 @@ def load_torch_lpips(cache: Path | None = None, heads_path: Path | None = None) 
     Torch is imported by name so that nothing of this package depends on it.
 
     Args:
-        cache: folder of torch's cache; `None`: the one that torch names.
+        cache: folder of torch's cache; `None`: torch's own.
         heads_path: file of the linear heads; `None`: that of an installed `lpips` or `torchmetrics` package.
 
     Raises:
@@ -186,7 +186,7 @@ def load_torch_lpips(cache: Path | None = None, heads_path: Path | None = None) 
 
 
 def _heads_path() -> Path | None:
-    """The linear heads that an installed package brings along."""
+    """Return the path of the linear heads in an installed package."""
     for package, inside in (
         ("lpips", "weights/v0.1/alex.pth"),
         ("torchmetrics", "functional/image/lpips_models/alex.pth"),
@@ -197,11 +197,11 @@ def _heads_path() -> Path | None:
     return None
 
 
-def _features(picture: NDArray[Any], weights: Lpips) -> list[F32]:
+def _features(image: NDArray[Any], weights: Lpips) -> list[F32]:
     """Return the features after each of AlexNet's five convolutions, [h, w, channels] each."""
     from csplat_render.metric_kernels import convolve  # numba takes a second to import
 
-    x: F32 = (np.clip(picture.astype(np.float32), 0.0, 1.0) * np.float32(2.0) - np.float32(1.0) - SHIFT) / SCALE
+    x: F32 = (np.clip(image.astype(np.float32), 0.0, 1.0) * np.float32(2.0) - np.float32(1.0) - SHIFT) / SCALE
     features = []
     for (_, stride, padding, pooled), kernel, bias in zip(_LAYERS, weights.kernels, weights.biases, strict=True):
         x = np.maximum(convolve(_pool(x) if pooled else x, kernel, bias, stride, padding), np.float32(0.0))
@@ -210,13 +210,13 @@ def _features(picture: NDArray[Any], weights: Lpips) -> list[F32]:
 
 
 def _unit(x: F32) -> NDArray[np.float64]:
-    """Every pixel's channels scaled to length 1."""
+    """Scale every pixel's channels to length 1."""
     wide = x.astype(np.float64)
     result: NDArray[np.float64] = wide / (np.sqrt(np.sum(wide * wide, axis=2, keepdims=True)) + _EPSILON)
     return result
 
 
 def _pool(x: F32) -> F32:
-    """Maximum over 3×3, every second pixel."""
+    """Return the maximum over 3×3, for every second pixel."""
     result: F32 = sliding_window_view(x, (3, 3), axis=(0, 1))[::2, ::2].max(axis=(3, 4))
     return result

@@ -21,7 +21,7 @@ C1, C2 = 0.01**2, 0.03**2
 #: Pixels from the middle of the window to its edge.
 RADIUS = 5
 
-#: Values of a pixel, which lie beside each other in a row.
+#: Values of a pixel, which are adjacent in a row.
 CHANNELS = 3
 
 _SIGMA = 1.5
@@ -39,7 +39,7 @@ WINDOW = _window()
 
 
 def mean_ssim(x: F64, y: F64) -> float:
-    """Mean SSIM over all pixels and channels.
+    """Return the mean SSIM over all pixels and channels.
 
     Args:
         x: [H, W, 3] float64, C-contiguous.
@@ -124,7 +124,7 @@ def blur_products(lane: int, lanes: int, x: Any, y: Any, taps: Any, across: Any)
 
 @parallel_kernel(relaxed=True)
 def _similarities(lane: int, lanes: int, across: Any, taps: Any, sums: Any) -> None:
-    """Sum of SSIM over each row; parallel over rows, vectorised over the values of a row.
+    """Sum SSIM over each row; parallel over rows, vectorised over the values of a row.
 
     Args:
         across: [5, H + 10, 3·W], from `blur_products`.
@@ -146,14 +146,14 @@ def _similarities(lane: int, lanes: int, across: Any, taps: Any, sums: Any) -> N
 
 
 def mean_ssim_twin(x: F64, y: F64) -> float:
-    """The slow twin of `mean_ssim`: NumPy, one formula after the other."""
+    """Compute `mean_ssim` the slow way: NumPy, one formula after the other."""
     mx, my = blur_twin(x), blur_twin(y)
     xx, yy, xy = blur_twin(x * x) - mx * mx, blur_twin(y * y) - my * my, blur_twin(x * y) - mx * my
     return float(np.mean((2.0 * mx * my + C1) * (2.0 * xy + C2) / ((mx * mx + my * my + C1) * (xx + yy + C2))))
 
 
 def blur_twin(x: F64) -> F64:
-    """The window's weighted mean around each pixel of [H, W, 3]."""
+    """Return the window's weighted mean around each pixel of [H, W, 3]."""
     for axis in (0, 1):
         padded = np.pad(x, [(RADIUS, RADIUS) if i == axis else (0, 0) for i in range(3)])
         x = sum(
@@ -163,27 +163,27 @@ def blur_twin(x: F64) -> F64:
     return x
 
 
-_PIXELS = 4  # of a row, whose sums are made together
+_PIXELS = 4  # pixels of a row whose sums are computed together
 _TAPS = 4  # products that are added to a sum at a time
 
 
 def convolve(x: F32, kernel: F32, bias: F32, stride: int, padding: int) -> F32:
-    """Convolve a picture with zeros around it.
+    """Convolve an image with zeros around it.
 
     Args:
         x: [h, w, in].
         kernel: [height, width, in, out].
         bias: [out].
-        stride: pixels from one place to the next, both ways.
-        padding: zeros on each side.
+        stride: pixels from one output to the next, in both directions.
+        padding: width of the zeros on each side.
 
     Returns:
         [rows, columns, out].
     """
     height, width, inputs, outputs = kernel.shape
     rows, columns = ((size + 2 * padding - k) // stride + 1 for size, k in zip(x.shape, (height, width), strict=False))
-    # A row of the kernel lies in one piece in a row of the picture. Zeros fill it up to a multiple of
-    # the taps, and there are places beyond the last column up to a multiple of the pixels.
+    # A row of the kernel is contiguous in a row of the image. It is padded with zeros to a multiple of
+    # the taps, and the columns of the result to a multiple of the pixels.
     taps, places = -(-width * inputs // _TAPS) * _TAPS, -(-columns // _PIXELS) * _PIXELS
     values = max((x.shape[1] + 2 * padding) * inputs, (places - 1) * stride * inputs + taps)
     flat = np.zeros((x.shape[0] + 2 * padding, values), np.float32)
@@ -198,7 +198,7 @@ def convolve(x: F32, kernel: F32, bias: F32, stride: int, padding: int) -> F32:
 
 @parallel_kernel(relaxed=True)
 def _convolve(lane: int, lanes: int, x: Any, weights: Any, bias: Any, down: int, across: int, result: Any) -> None:
-    """Sums of four pixels at a time; parallel over rows, vectorised over the outputs.
+    """Convolve four pixels at a time; parallel over rows, vectorised over the outputs.
 
     Args:
         x: [h, values] float32, rows of pixels.
@@ -234,7 +234,7 @@ def _convolve(lane: int, lanes: int, x: Any, weights: Any, bias: Any, down: int,
 
 
 def convolve_twin(x: F32, kernel: F32, bias: F32, stride: int, padding: int) -> NDArray[np.float64]:
-    """The slow twin of `convolve`: float64, one product of the sum after the other."""
+    """Compute `convolve` the slow way: float64, one product of the sum after the other."""
     height, width = kernel.shape[:2]
     padded = np.pad(x.astype(np.float64), ((padding, padding), (padding, padding), (0, 0)))
     rows, columns = (padded.shape[0] - height) // stride + 1, (padded.shape[1] - width) // stride + 1

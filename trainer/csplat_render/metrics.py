@@ -45,7 +45,7 @@ class ViewScore:
     """Similarity of two images of one view.
 
     Attributes:
-        image: name of the camera's photograph, if it has one.
+        image: name of the view's image file, if it has one.
         pixels: number of pixels that count.
         mse: mean squared error over these and channels.
         psnr: the same in dB.
@@ -126,37 +126,37 @@ class Scores:
 
 
 def score_view(
-    wanted: NDArray[Any],
-    seen: NDArray[Any],
+    reference: NDArray[Any],
+    render: NDArray[Any],
     covered: NDArray[np.bool_] | None = None,
-    counts: NDArray[np.bool_] | None = None,
+    mask: NDArray[np.bool_] | None = None,
     *,
     image: str | None = None,
     with_ssim: bool = True,
     lpips: Distance | None = None,
 ) -> ViewScore:
-    """Score a picture.
+    """Compare a render with the reference image of its view.
 
     Args:
-        wanted: [H, W, 3], floating: the reference.
-        seen: [H, W, 3], floating: the render.
+        reference: [H, W, 3], floating.
+        render: [H, W, 3], floating.
         covered: [H, W], True for covered pixels of the reference; `None`: not known.
-        counts: [H, W], True for pixels that count, at least one: for the others, SSIM and LPIPS take the render
-            for the reference. `None`: all.
-        image: name of the photograph.
+        mask: [H, W], True for pixels that count, at least one; for the others, SSIM and LPIPS take the render as the
+            reference. `None`: all pixels count.
+        image: name of the view's image file.
         with_ssim: compute SSIM; it takes about as long as rendering.
         lpips: the LPIPS distance, if it is needed.
 
     Raises:
-        InputError: the pictures cannot be compared.
+        InputError: the images cannot be compared.
     """
-    squares = squared_error(wanted, seen)
-    for name, pixels in (("cover", covered), ("mask", counts)):
+    squares = squared_error(reference, render)
+    for name, pixels in (("cover", covered), ("mask", mask)):
         if pixels is not None and pixels.shape != squares.shape[:2]:
             raise InputError(f"the {name} has shape {list(pixels.shape)}, wanted {list(squares.shape[:2])}")
-    if counts is not None:
-        wanted, squares = np.where(counts[..., None], wanted, seen), squares[counts]
-        covered = None if covered is None else covered[counts]
+    if mask is not None:
+        reference, squares = np.where(mask[..., None], reference, render), squares[mask]
+        covered = None if covered is None else covered[mask]
     mse = float(np.mean(squares))
     inside = None if covered is None else squares[covered]
     return ViewScore(
@@ -166,13 +166,13 @@ def score_view(
         psnr=psnr_of_mse(mse),
         covered_mse=float(np.mean(inside)) if inside is not None and len(inside) else None,
         cover=None if covered is None else float(np.mean(covered)),
-        ssim=ssim(wanted, seen) if with_ssim else None,
-        lpips=None if lpips is None else lpips(np.clip(wanted, 0.0, 1.0), np.clip(seen, 0.0, 1.0)),
+        ssim=ssim(reference, render) if with_ssim else None,
+        lpips=None if lpips is None else lpips(np.clip(reference, 0.0, 1.0), np.clip(render, 0.0, 1.0)),
     )
 
 
 def pooled(errors: ArrayLike, pixels: Sequence[int]) -> float:
-    """The mean squared error over all pixels, of those by view.
+    """Return the mean squared error over all pixels, given those of the views.
 
     Args:
         errors: [V] mean squared error by view.
@@ -183,43 +183,43 @@ def pooled(errors: ArrayLike, pixels: Sequence[int]) -> float:
 
 
 def squared_error(reference: NDArray[Any], image: NDArray[Any]) -> F64:
-    """Squared difference of two pictures, [H, W, 3] float64, both clipped to [0, 1]."""
+    """Return the squared difference of two images, [H, W, 3] float64, both clipped to [0, 1]."""
     a, b = _clipped(reference, image)
     result: F64 = (a - b) ** 2
     return result
 
 
 def psnr_of_mse(mean_squared_error: float) -> float:
-    """Decibels of a mean squared error, `PSNR_CAP` at most."""
+    """Return a mean squared error in decibels, `PSNR_CAP` at most."""
     if mean_squared_error <= 0.0:
         return PSNR_CAP
     return min(PSNR_CAP, -10.0 * math.log10(mean_squared_error))
 
 
 def psnr(reference: NDArray[Any], image: NDArray[Any]) -> float:
-    """PSNR of one pair of pictures, [H, W, 3] each, dB."""
+    """Return the PSNR of two images, [H, W, 3] each, dB."""
     return psnr_of_mse(float(np.mean(squared_error(reference, image))))
 
 
 def ssim(reference: NDArray[Any], image: NDArray[Any]) -> float:
-    """SSIM of one pair of images, [H, W, 3] each; 1 if they are the same."""
+    """Return the SSIM of two images, [H, W, 3] each; 1 if they are the same."""
     from csplat_render.metric_kernels import mean_ssim  # numba takes a second to import
 
     return mean_ssim(*_clipped(reference, image))
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    """The mean of what is known; `None` if nothing is."""
+    """Return the mean of the known values; `None` if there are none."""
     known = [value for value in values if value is not None]
     return math.fsum(known) / len(known) if known else None
 
 
 def _clipped(reference: NDArray[Any], image: NDArray[Any]) -> tuple[F64, F64]:
-    for name, picture in (("reference", reference), ("image", image)):
-        if picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
-            raise InputError(f"the {name} has shape {list(picture.shape)}, wanted [H, W, 3]")
-        if picture.dtype.kind != "f":
-            raise InputError(f"the {name} is {picture.dtype}, wanted floating values in 0 to 1")
+    for name, array in (("reference", reference), ("image", image)):
+        if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
+            raise InputError(f"the {name} has shape {list(array.shape)}, wanted [H, W, 3]")
+        if array.dtype.kind != "f":
+            raise InputError(f"the {name} is {array.dtype}, wanted floating values in 0 to 1")
     if reference.shape != image.shape:
         raise InputError(f"pictures of sizes {list(reference.shape)} and {list(image.shape)} cannot be compared")
     a = np.clip(np.ascontiguousarray(reference, np.float64), 0.0, 1.0)
@@ -230,17 +230,17 @@ def _clipped(reference: NDArray[Any], image: NDArray[Any]) -> tuple[F64, F64]:
 
 
 def flip(reference: NDArray[Any], image: NDArray[Any]) -> float:
-    """Mean difference that a viewer notices who flips between two pictures, 0 (none) to 1.
+    """Return the mean FLIP error (Andersson et al. 2020), 0 (none) to 1, by NVIDIA's `flip-evaluator`.
 
-    LDR-FLIP at the package's default distance: 0.7 m from a 0.7 m wide screen of 3840 pixels, 67
-    pixels per degree. The values are taken for sRGB.
+    The package comes with `pip install csplat[flip]`. LDR-FLIP at its default distance: 0.7 m from a 0.7 m wide
+    screen of 3840 pixels, 67 pixels per degree. The values are taken as sRGB.
 
     Args:
         reference: [H, W, 3] floating, clipped to [0, 1].
         image: the same.
 
     Raises:
-        InputError: the pictures differ in shape, or the package is not installed.
+        InputError: the images differ in shape, or the package is not installed.
     """
     if reference.shape != image.shape or reference.ndim != 3 or reference.shape[2] != 3:
         raise InputError(
@@ -250,6 +250,6 @@ def flip(reference: NDArray[Any], image: NDArray[Any]) -> float:
         package: Any = importlib.import_module("flip_evaluator")
     except ImportError as error:
         raise InputError("FLIP needs flip-evaluator: pip install 'csplat[flip]'") from error
-    a, b = (np.ascontiguousarray(np.clip(picture, 0.0, 1.0), np.float32) for picture in (reference, image))
+    a, b = (np.ascontiguousarray(np.clip(array, 0.0, 1.0), np.float32) for array in (reference, image))
     _, mean, _ = package.evaluate(a, b, "LDR", applyMagma=False)
     return float(mean)

@@ -62,11 +62,11 @@ _C30, _C31, _C32, _C33, _C34, _C35, _C36 = (
 
 @device_function
 def sh_basis(degree: int, x: Any, y: Any, z: Any, basis: Any) -> None:
-    """Values of the basis functions in the direction (x, y, z), of unit length, one per coefficient.
+    """Evaluate the basis functions, real, in the order and with the signs of the splatting literature.
 
     Args:
         degree: 0 to 3.
-        x: one number, or an array for many directions at once (the twin).
+        x: direction, of unit length: a number, or an array for many directions at once (the exact reference).
         y: as x.
         z: as x.
         basis: [(degree + 1)**2, ...], written.
@@ -95,7 +95,7 @@ def sh_basis(degree: int, x: Any, y: Any, z: Any, basis: Any) -> None:
 
 @device_function
 def sh_basis_gradient(degree: int, x: float, y: float, z: float, g: Any) -> tuple[float, float, float]:
-    """Gradient with respect to x, y, z of the sum of g[k] · basis[k], as if they were independent.
+    """Return the gradient of the sum of g[k] · basis[k] towards x, y, z, as if they were independent.
 
     Args:
         degree: 0 to 3.
@@ -141,13 +141,13 @@ def sh_basis_gradient(degree: int, x: float, y: float, z: float, g: Any) -> tupl
     return gx, gy, gz
 
 
-#: Splats that one thread takes at a time.
+#: Number of splats that a thread processes at a time.
 BLOCK = 512
 
 
 @device_function
 def rotation_matrix(w: float, x: float, y: float, z: float) -> tuple[float, ...]:
-    """Rotation matrix of a unit quaternion, row by row; its columns are the splat's axes."""
+    """Return the rotation matrix of a unit quaternion, row by row; its columns are the splat's axes."""
     return (
         1.0 - 2.0 * (y * y + z * z),
         2.0 * (x * y - w * z),
@@ -163,7 +163,7 @@ def rotation_matrix(w: float, x: float, y: float, z: float) -> tuple[float, ...]
 
 @device_function
 def unit_quaternion(q: Any) -> tuple[float, float, float, float, float]:
-    """A quaternion at unit length, and 1 / its length; zero is the identity, with 0."""
+    """Return a quaternion at unit length, and 1 / its length; for zero the identity and 0."""
     w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
     squared = w * w + x * x + y * y + z * z
     if squared == 0.0:
@@ -174,13 +174,13 @@ def unit_quaternion(q: Any) -> tuple[float, float, float, float, float]:
 
 @device_function
 def standard_deviation(log_scale: float) -> float:
-    """Standard deviation of a log-scale, which is clamped."""
+    """Return the standard deviation of a log-scale, which is clamped."""
     return math.exp(min(max(np.float64(log_scale), -LOG_SCALE_LIMIT), LOG_SCALE_LIMIT))
 
 
 @device_function
 def perspective_jacobian(view: Any, x: float, y: float, z: float) -> tuple[float, float, float, float, bool, bool]:
-    """Jacobian of the perspective: (j0, 0, j02; 0, j1, j12); and whether x/z and y/z were inside the limits."""
+    """Return j0, j02, j1, j12 of the perspective's Jacobian, and whether x/z and y/z were inside the limits."""
     over = 1.0 / z
     tx, ty = x * over, y * over
     inside_x = view[17] < tx < view[18]
@@ -195,7 +195,7 @@ def perspective_jacobian(view: Any, x: float, y: float, z: float) -> tuple[float
 def jacobian_rows(
     view: Any, j0: float, j02: float, j1: float, j12: float
 ) -> tuple[float, float, float, float, float, float]:
-    """The rows p and q: Jacobian times the camera's rotation."""
+    """Return the rows p and q: Jacobian times the camera's rotation."""
     return (
         j0 * view[0] + j02 * view[6],
         j0 * view[1] + j02 * view[7],
@@ -208,7 +208,7 @@ def jacobian_rows(
 
 @device_function
 def determinants(pq: Any, r: Any, s0: float, s1: float, s2: float, trace: float) -> tuple[float, float]:
-    """Determinant of the projected covariance, without and with the dilation."""
+    """Return the determinant of the projected covariance, without and with the dilation."""
     c0 = pq[1] * pq[5] - pq[2] * pq[4]
     c1 = pq[2] * pq[3] - pq[0] * pq[5]
     c2 = pq[0] * pq[4] - pq[1] * pq[3]
@@ -221,13 +221,13 @@ def determinants(pq: Any, r: Any, s0: float, s1: float, s2: float, trace: float)
 
 @device_function
 def compensation(bare: float, dilated: float) -> float:
-    """Factor of the opacity in the antialiased mode: what the dilation added, taken off again."""
+    """Return the factor of the opacity in the antialiased mode, which compensates the dilation."""
     return math.sqrt(max(bare / dilated, COMPENSATION_MIN))
 
 
 @device_function
 def view_direction(view: Any, mean: Any) -> tuple[float, float, float, float]:
-    """Direction from the camera to a point, of unit length, and 1 / the distance."""
+    """Return the direction from the camera to a point, of unit length, and 1 / the distance."""
     x, y, z = mean[0] - view[21], mean[1] - view[22], mean[2] - view[23]
     inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
     return x * inverse, y * inverse, z * inverse, inverse
@@ -235,7 +235,7 @@ def view_direction(view: Any, mean: Any) -> tuple[float, float, float, float]:
 
 @device_function
 def is_finite_shape(i: int, means: Any, quats: Any, scales: Any, opacities: Any) -> bool:
-    """Return True if everything but the colour of a splat is finite."""
+    """Return True if all values of a splat except its colour are finite."""
     total = opacities[i] - opacities[i]  # NaN or infinity less itself is NaN
     total += (means[i, 0] - means[i, 0]) + (means[i, 1] - means[i, 1]) + (means[i, 2] - means[i, 2])
     total += (scales[i, 0] - scales[i, 0]) + (scales[i, 1] - scales[i, 1]) + (scales[i, 2] - scales[i, 2])
@@ -304,9 +304,9 @@ def project(
             chord moves per row, its half-width at the height of the centre, 1 / its half-height,
             the height at which it reaches farthest to the right; centre x and y.
         box: [N, 4] int32, written: x0, x1, y0, y1 of the pixels that it may touch, x1 and y1 beyond.
-        depth: [N] float32, written: 0 for what is not drawn.
+        depth: [N] float32, written: 0 for splats that are not drawn.
         radii: [N] float32, written: 3 standard deviations along the longest axis; 0 as above.
-        ignored: [ceil(N / BLOCK)] int64, written: how many splats held NaN or infinity.
+        ignored: [ceil(N / BLOCK)] int64, written: number of splats that hold NaN or infinity.
     """
     n = means.shape[0]
     higher = (degree + 1) * (degree + 1) - 1
@@ -337,7 +337,7 @@ def project(
             p0, p1, p2, q0, q1, q2 = pq
             opacity = np.float64(opacities[i])
             reach = 2.0 * math.log(opacity / alpha_min)
-            # No axis of the splat is longer on the picture than its longest standard deviation allows.
+            # The projected axes are no longer than the longest standard deviation allows.
             longest = max(s0, s1, s2)
             longest *= longest
             most_a, most_c = p0 * p0 + p1 * p1 + p2 * p2, q0 * q0 + q1 * q1 + q2 * q2
@@ -366,7 +366,7 @@ def project(
             if not (opacity >= alpha_min and math.isfinite(dilated) and math.isfinite(px) and math.isfinite(py)):
                 bad += not is_finite_colour(i, sh0, shN, higher)
                 continue
-            # opacity · exp(−½ d²) = alpha_min; a little more, so that rounding never takes a pixel away.
+            # opacity · exp(−½ d²) = alpha_min; slightly more, so that rounding never loses a pixel.
             reach = math.sqrt(reach) * (1.0 + 1e-6) + 1e-6
             root_a, root_c = math.sqrt(A), math.sqrt(C)
             rx, ry = reach * root_a, reach * root_c
@@ -404,7 +404,7 @@ def project(
         ignored[block] = bad
 
 
-_MAX_GRADIENT = 1e37  # gradients are clamped to this: they fit float32, whatever they are added to
+_MAX_GRADIENT = 1e37  # gradients are clamped to this, so that sums of them fit float32
 
 
 @device_function
@@ -481,7 +481,7 @@ def project_backward(
     g_shN: Any,
     g_means2d: Any,
 ) -> None:
-    """Gradients of every splat's parameters; parallel over blocks of splats, one splat at a time.
+    """Compute the gradients of every splat's parameters; parallel over blocks of splats, one splat at a time.
 
     Args:
         means: see `project`, as the next six.
@@ -493,7 +493,7 @@ def project_backward(
         view: see `project`.
         antialiased: see `project`.
         shape: see `project`.
-        depth: [N] float32, above 0 for what was drawn.
+        depth: [N] float32, above 0 for splats that were drawn.
         offsets: [N + 1] int64, where the records of each splat begin.
         records: [intersections, RECORD], see `blend_backward`.
         record_tiles: [intersections] int32, the tile of each record.
@@ -504,7 +504,7 @@ def project_backward(
         g_opacities: [N].
         g_sh0: [N, 3].
         g_shN: [N, K, 3].
-        g_means2d: [N], length of the gradient towards the centre on the picture, per pixel.
+        g_means2d: [N], length of the gradient towards the centre on the image, per pixel.
     """
     n = means.shape[0]
     higher = (degree + 1) * (degree + 1) - 1
@@ -520,7 +520,7 @@ def project_backward(
             )
             g_means2d[i] = _clamped(math.sqrt(sx * sx + sy * sy))
 
-            # What `project` computed.
+            # Intermediate values of `project`.
             X, Y, Z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
             x = view[0] * X + view[1] * Y + view[2] * Z + view[9]
             y = view[3] * X + view[4] * Y + view[5] * Z + view[10]
@@ -555,7 +555,7 @@ def project_backward(
                     gB -= g * 2.0 * B * (1.0 - ratio)
             g_opacities[i] = _clamped(s0_ / np.float64(opacities[i]))
 
-            # Half-axes on the picture, then standard deviations, axes, rows of the Jacobian.
+            # Half-axes on the image, then standard deviations, axes, rows of the Jacobian.
             du0, dv0 = 2.0 * gA * u0 + gB * v0, 2.0 * gC * v0 + gB * u0
             du1, dv1 = 2.0 * gA * u1 + gB * v1, 2.0 * gC * v1 + gB * u1
             du2, dv2 = 2.0 * gA * u2 + gB * v2, 2.0 * gC * v2 + gB * u2
@@ -589,7 +589,7 @@ def project_backward(
             g_j1 = gq0 * view[3] + gq1 * view[4] + gq2 * view[5]
             g_j12 = gq0 * view[6] + gq1 * view[7] + gq2 * view[8]
 
-            # Camera coordinates: by the Jacobian, by the centre on the picture, by the depth.
+            # Camera coordinates: by the Jacobian, by the centre on the image, by the depth.
             cx, cy = sx * j0, sy * j1
             cz = far - (sx * j0 * x + sy * j1 * y) / z
             cz -= (g_j0 * j0 + g_j02 * j02 + g_j1 * j1 + g_j12 * j12) / z

@@ -1,8 +1,8 @@
-"""Effect of removing each splat: the exact leave-one-out error of all splats in one pass over views.
+"""Pruning error: the exact leave-one-out error of every splat, in one pass over views.
 
-Exact for each splat alone, with everything else in place. Two things that the rasteriser decides by comparison are held
-fast: a pixel that was finished stays so, though without a splat in front of it it might have shown more of what is
-behind (at most a transmittance of 1e-4, times 1 / (1 − alpha)); and colours beyond 0 and 1 count as they are.
+It is exact for each splat alone, with everything else in place, except for two comparisons of the rasteriser that are
+held fixed: a finished pixel remains finished, although without a splat in front of it more might show of what is behind
+(at most a transmittance of 1e-4, times 1 / (1 − alpha)); and colours beyond 0 and 1 are not clipped.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from csplat_render.reference_rasteriser import render_exact
 
 @dataclass(frozen=True, eq=False)
 class PruningError:
-    """Sums over the pixels, channels and views of a pass; they add up from pass to pass.
+    """Sums over the pixels, channels and views of a pass; the sums of passes add up.
 
     Attributes:
-        error: [N] float64, squared change of the pictures if the splat were not there.
-        squared_weight: [N] float64, the square of the share of a pixel that is the splat's.
+        error: [N] float64, squared change of the renders if the splat were absent.
+        squared_weight: [N] float64, squared weight of the splat in a pixel.
         seen: [N] bool, which splats any view saw.
-        bands: [N, d] float64, squared change of the pictures if the splat's SH band 1, … d were zero; [N, 0] where
-            that was not asked.
-        value_count: pixels times channels of all views.
-        product: [N] float64, the change times the excess of the renders over the references: removal adds
+        bands: [N, d] float64, squared change of the renders if the splat's SH band 1, … d were zero; [N, 0] if
+            not requested.
+        value_count: number of pixels times channels of all views.
+        product: [N] float64, the change times the excess of the renders over the references: pruning adds
             `error + 2 · product` to the squared error. `None` if the renders themselves are the references.
     """
 
@@ -46,7 +46,7 @@ class PruningError:
     product: Array | None = None
 
     def of_rows(self, rows: Array) -> PruningError:
-        """The same of some of the splats."""
+        """Return the sums of some of the splats."""
         return replace(
             self, error=self.error[rows], squared_weight=self.squared_weight[rows], seen=self.seen[rows],
             bands=self.bands[rows], product=None if self.product is None else self.product[rows],
@@ -70,13 +70,13 @@ def measure_pruning_error(
     background: ArrayLike = (0.0, 0.0, 0.0),
     bands: bool = True,
     references: Sequence[Array] | None = None,
-    on_picture: Callable[[int, Array], object] | None = None,
+    on_render: Callable[[int, Array], object] | None = None,
     dtype: Any = np.float32,
     transmittance_min: float = TRANSMITTANCE_MIN,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> PruningError:
-    """Measure what the removal of each splat, alone, would change in pictures of a scene.
+    """Measure how much pruning each splat, alone, would change the renders of a scene.
 
     Args:
         model: the scene.
@@ -84,29 +84,29 @@ def measure_pruning_error(
         background: red, green, blue behind everything.
         bands: measure the effect of SH bands, too.
         references: the reference images, [H, W, 3] each; None for renders of the scene itself.
-        on_picture: called with the number of each render and the render, [H, W, 3].
+        on_render: called with the number of each render and the render, [H, W, 3].
         dtype: dtype of pixels, float32 or float64 (which is for tests).
         transmittance_min: transmittance at which a pixel is finished; 0 for never.
         threads: number of threads; None for all. The result does not depend on it.
         progress: called with the stage and the fraction done.
 
     Raises:
-        InputError: there is no camera, or there are not as many references.
-        LimitError: a picture has more than `rasterise.MAX_INTERSECTIONS`.
+        InputError: there is no camera, or not one reference for each.
+        LimitError: a render has more than `rasteriser.MAX_INTERSECTIONS`.
     """
     if not cameras:
         raise InputError("measuring removal wants a camera at least")
     if references is not None and len(references) != len(cameras):
         raise InputError(f"{len(references)} reference pictures for {len(cameras)} cameras")
-    drawing = Contributions(dtype, transmittance_min=transmittance_min, threads=threads)
+    contributions = Contributions(dtype, transmittance_min=transmittance_min, threads=threads)
     totals, by_band = np.zeros((len(model), 5)), np.zeros((len(model), model.sh_degree if bands else 0))
     behind = np.asarray(background, np.float64)
     for number, camera in enumerate(cameras):
-        drawn = drawing.draw(model, camera, antialiased=model.antialiased, basis=bands)
+        view = contributions.project_view(model, camera, antialiased=model.antialiased, basis=bands)
         reference = None if references is None else references[number]
-        picture = drawing.removal(drawn, model.shN, totals, by_band, background=behind, reference=reference)
-        if on_picture is not None:
-            on_picture(number, picture)
+        render = contributions.measure_pruning(view, model.shN, totals, by_band, background=behind, reference=reference)
+        if on_render is not None:
+            on_render(number, render)
         if progress is not None:
             progress("measuring splats", (number + 1) / len(cameras))
     error, product, squares = (totals[:, k].copy() for k in (0, 1, 3))
@@ -122,29 +122,29 @@ def pruning_error_exact(
     background: ArrayLike = (0.0, 0.0, 0.0),
     transmittance_min: float = TRANSMITTANCE_MIN,
 ) -> Array:
-    """The slow twin of `measure_pruning_error`: take one splat away, render in float64, compare; and so on.
+    """Compute the errors of `measure_pruning_error` the slow way: leave out one splat, render in float64, compare.
 
     Args:
         model: the scene.
         cameras: the views.
         rows: the splats to measure.
         background: red, green, blue behind everything.
-        transmittance_min: transmittance at which a pixel is finished; 0 for never, which is what the pass is exact for.
+        transmittance_min: transmittance at which a pixel is finished; 0 for never, for which the fast pass is exact.
 
     Returns:
-        Squared change of the pictures, one number per row of `rows`, float64.
+        Squared change of the renders, one number per row of `rows`, float64.
     """
     rows = np.asarray(rows, np.int64)
     errors = np.zeros(len(rows))
 
-    def picture(splats: SplatModel, camera: Camera) -> Array:
+    def render(splats: SplatModel, camera: Camera) -> Array:
         return render_exact(
             splats, camera, background=background, antialiased=model.antialiased, transmittance_min=transmittance_min
         ).rgb
 
     for camera in cameras:
-        whole = picture(model, camera)
+        whole = render(model, camera)
         for place, row in enumerate(rows):
             rest = model.select(np.delete(np.arange(len(model)), row))
-            errors[place] += float(np.sum((picture(rest, camera) - whole) ** 2))
+            errors[place] += float(np.sum((render(rest, camera) - whole) ** 2))
     return errors

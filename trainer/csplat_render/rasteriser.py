@@ -1,4 +1,4 @@
-"""`Rasteriser`: splats to pictures, and gradients of pictures back to splats, on all threads of a CPU."""
+"""`Rasteriser`: splats to images, and gradients of images back to splats, on all threads of a CPU."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from csplat_render.conventions import (
     HasSplats,
     Mode,
     RenderResult,
-    SplatArrays,
     Thresholds,
+    UncheckedSplats,
     VisibleSplats,
     thresholds_of,
     view_vector,
@@ -40,7 +40,7 @@ from csplat_render.conventions import (
 from csplat_render.kernels import thread_count
 from csplat_render.projection import BLOCK, project, project_backward
 
-#: Most pairs of splat and tile in one picture; each takes 4 bytes, with gradients 52.
+#: Largest number of pairs of splat and tile in one image; each takes 4 bytes, with gradients 52.
 MAX_INTERSECTIONS = 1 << 28
 
 _CHUNKS_OF_MANY_TILES = 2
@@ -51,7 +51,7 @@ _MANY_TILES = 1 << 16  # tiles
 class _ForwardState:
     """State of the last `forward` that `backward` needs."""
 
-    splats: SplatArrays
+    splats: UncheckedSplats
     view: Array
     degree: int
     antialiased: bool
@@ -65,11 +65,11 @@ class _ForwardState:
 
 
 class Rasteriser:
-    """Renders splats and their gradients; keeps its memory from one picture to the next.
+    """A renderer of splats and their gradients, which keeps its memory from one image to the next.
 
     Args:
-        mode: `standard`, or `fast`: leaves out alpha below 1.5/255 and what shines through with less
-            than 1/255: a sixth of the time, for errors of 40 to 52 dB on trained scenes.
+        mode: `standard`, or `fast`: leaves out alpha below 1.5/255 and light that passes with less than
+            1/255: a sixth of the time, for errors of 40 to 52 dB on trained scenes.
         dtype: dtype of pixels and gradients, float32 or float64 (which is for tests). Projection is in
             float64 in any case.
         gradients: True if `backward` will be called; without it `forward` is a little faster.
@@ -87,13 +87,13 @@ class Rasteriser:
         gradients: bool = True,
         threads: int | None = None,
     ) -> None:
-        self.settings: Thresholds = thresholds_of(mode)
+        self.thresholds: Thresholds = thresholds_of(mode)
         self.dtype = np.dtype(dtype)
         if self.dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
             raise InputError(f"the rasteriser's dtype is {self.dtype}, wanted float32 or float64")
         self.gradients = gradients
         self.threads = threads
-        self._limits = np.array([self.settings.alpha_min, ALPHA_CAP, self.settings.transmittance_min], self.dtype)
+        self._limits = np.array([self.thresholds.alpha_min, ALPHA_CAP, self.thresholds.transmittance_min], self.dtype)
         self._buffers: dict[str, Array] = {}
         self._last: _ForwardState | None = None
 
@@ -107,22 +107,22 @@ class Rasteriser:
         sh_degree: int | None = None,
         state: Array | None = None,
     ) -> RenderResult:
-        """Render a picture.
+        """Render an image.
 
-        Splats may come in slices of depth, nearest first, each with the `state` that the one before it left: the last
-        picture is that of all splats, bit for bit.
+        Splats may be given in slices of depth, nearest first, each with the `state` of the one before it: the last
+        image is that of all splats, bit for bit.
 
         Args:
             splats: the splats to render; arrays of another dtype are converted.
             camera: the camera to render from.
             background: red, green, blue behind everything.
             antialiased: scale opacities by what the dilation of 0.3 pixels added (mip-splatting).
-            sh_degree: highest degree of the spherical harmonics; None for all there are.
-            state: [H, W, 5] of the rasteriser's dtype, from `begun`; changed: what the splats so far left of each
-                pixel. `None`: these are all splats.
+            sh_degree: highest degree of the spherical harmonics; None for that of the splats.
+            state: [H, W, 5] of the rasteriser's dtype, from `initial_state`; changed: the pixels after the splats so
+                far. `None`: these are all splats.
 
         Returns:
-            The picture, in new arrays; of a slice what there is of it so far, and the slice's own counts.
+            The image, in new arrays; for a slice the image so far, and the slice's own counts.
 
         Raises:
             InputError: shapes do not fit together; or `backward` would need all slices.
@@ -156,14 +156,14 @@ class Rasteriser:
             )  # fmt: skip
         return result
 
-    def begun(self, camera: Camera) -> Array:
-        """The `state` of a picture before its first slice: all light comes through."""
+    def initial_state(self, camera: Camera) -> Array:
+        """Return the `state` of an image before its first slice: all light passes."""
         state = np.zeros((camera.H, camera.W, 5), self.dtype)
         state[..., 0] = 1
         return state
 
-    def seen(self, splats: HasSplats, camera: Camera, *, antialiased: bool = False) -> VisibleSplats:
-        """Return the splats that a render would show, and their depths; the arguments are those of `forward`."""
+    def find_visible(self, splats: HasSplats, camera: Camera, *, antialiased: bool = False) -> VisibleSplats:
+        """Find the splats that a render would show, and their depths; the arguments are those of `forward`."""
         arrays = _checked(splats, self.dtype)
         degree = _checked_degree(None, arrays.shN.shape[1])
         with thread_count(self.threads):
@@ -175,15 +175,15 @@ class Rasteriser:
     def backward(
         self, grad_rgb: ArrayLike, grad_alpha: ArrayLike | None = None, grad_depth: ArrayLike | None = None
     ) -> Gradients:
-        """Gradients of a loss towards the splats of the last `forward`.
+        """Compute the gradients of a loss towards the splats of the last `forward`.
 
         Args:
-            grad_rgb: [H, W, 3], gradient of the loss towards the picture.
-            grad_alpha: [H, W], the same for alpha; None for none.
-            grad_depth: [H, W], the same for depth; None for none.
+            grad_rgb: [H, W, 3], gradient of the loss towards the image.
+            grad_alpha: [H, W], gradient towards alpha; None for 0.
+            grad_depth: [H, W], gradient towards depth; None for 0.
 
         Raises:
-            InputError: there was no `forward`, or shapes do not fit its picture.
+            InputError: there was no `forward`, or shapes do not fit its image.
         """
         last = self._last
         if last is None:
@@ -222,14 +222,14 @@ class Rasteriser:
         return result
 
     def _project(
-        self, splats: SplatArrays, camera: Camera, degree: int, *, antialiased: bool
+        self, splats: UncheckedSplats, camera: Camera, degree: int, *, antialiased: bool
     ) -> tuple[Array, Array, int]:
-        """Fill the buffers shape, extent, box and near; return view, radii and how many splats were ignored."""
+        """Fill the buffers shape, extent, box and near; return view, radii and the number of ignored splats."""
         n, view = len(splats.means), view_vector(camera)
         ignored, radii = self._buffer("ignored", (-(-n // BLOCK),), np.int64), np.empty(n, np.float32)
         project(
             splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN, degree, view,
-            camera.W, camera.H, antialiased, self.settings.alpha_min,
+            camera.W, camera.H, antialiased, self.thresholds.alpha_min,
             self._buffer("shape", (n, 10), np.float64), self._buffer("extent", (n, 6), np.float64),
             self._buffer("box", (n, 4), np.int32), self._buffer("near", (n,), np.float32), radii, ignored,
         )  # fmt: skip
@@ -274,7 +274,7 @@ class Rasteriser:
         return starts, total
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: Any) -> Array:
-        """An array of this shape; its memory is kept, and grows by a quarter at least."""
+        """Return an array of this shape; its memory is kept, and grows by a quarter at least."""
         size = math.prod(shape)  # np.prod takes longer than the rest of this function
         store = self._buffers.get(name + "*")
         if store is None or store.size < size or store.dtype != dtype:
@@ -286,7 +286,7 @@ class Rasteriser:
         return view
 
 
-def _checked(splats: HasSplats, dtype: Any) -> SplatArrays:
+def _checked(splats: HasSplats, dtype: Any) -> UncheckedSplats:
     means = np.ascontiguousarray(splats.means, dtype)
     n = len(means) if means.ndim else 0
     wanted: dict[str, tuple[int, ...]] = {
@@ -300,7 +300,7 @@ def _checked(splats: HasSplats, dtype: Any) -> SplatArrays:
     if shN.ndim != 3 or shN.shape[::2] != (n, 3):
         raise InputError(f"shN has shape {list(shN.shape)}, wanted [{n}, K, 3]")
     sh_degree_of(shN.shape[1])
-    return SplatArrays(**arrays)
+    return UncheckedSplats(**arrays)
 
 
 def _checked_degree(sh_degree: int | None, coefficient_count: int) -> int:

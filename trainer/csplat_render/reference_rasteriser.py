@@ -1,9 +1,8 @@
-"""The exact twin: the same pictures straight from the equations, in float64 NumPy, slow.
+"""The exact reference: the same images directly from the equations, in float64 NumPy, slow.
 
-Every splat is evaluated at every pixel. It shares the conventions with the rasteriser and none of
-its means: no tiles, no bounds, no fast exponential. What a comparison decides (too faint, capped,
-finished, clamped, which splat is nearer) can be recorded and held fast, so that a finite difference
-sees a smooth function.
+Every splat is evaluated at every pixel. It shares the conventions of the rasteriser and none of its methods: no tiles,
+no bounds, no fast exponential. Outcomes of comparisons (too faint, capped, finished, clamped, which splat is nearer)
+can be recorded and reused, so that a finite difference sees a smooth function.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ class Decisions:
         return self.masks[self._next - 1]
 
     def replay(self) -> None:
-        """From the first comparison on, answer what was recorded."""
+        """Answer with the recorded outcomes, from the first comparison on."""
         self._next = 0
 
 
@@ -66,19 +65,19 @@ def render_exact(
     transmittance_min: float = TRANSMITTANCE_MIN,
     decisions: Decisions | None = None,
 ) -> RenderResult:
-    """Render a picture as `Rasteriser.forward` does, from the equations.
+    """Render an image as `Rasteriser.forward` does, from the equations.
 
     Args:
         splats: the splats to render.
         camera: the camera to render from.
         background: red, green, blue behind everything.
         antialiased: scale opacities by what the dilation added.
-        sh_degree: highest degree of the spherical harmonics; None for all there are.
-        transmittance_min: when a pixel is finished; 0 for never.
+        sh_degree: highest degree of the spherical harmonics; None for that of the splats.
+        transmittance_min: transmittance at which a pixel is finished; 0 for never.
         decisions: records the outcomes of all comparisons; if it holds some, they are used.
 
     Returns:
-        The picture, float64; `intersections` is 0.
+        The image, float64; `intersections` is 0.
     """
     decisions = Decisions() if decisions is None else decisions
     available = sh_degree_of(splats.shN.shape[1])
@@ -95,7 +94,7 @@ def render_exact(
 def _project(
     splats: HasSplats, camera: Camera, degree: int, antialiased: bool, decisions: Decisions
 ) -> tuple[Array, dict[str, Array], int]:
-    """Centre, inverse covariance, opacity, colour and depth of what is in front, nearest first."""
+    """Return centre, inverse covariance, opacity, colour and depth of the splats in front, nearest first."""
     coefficients = np.concatenate([splats.sh0[:, None], splats.shN[:, : (degree + 1) ** 2 - 1]], 1, dtype=np.float64)
     arrays = [splats.means, splats.quats, splats.scales, splats.opacities[:, None], coefficients]
     finite = np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], axis=0)
@@ -164,7 +163,7 @@ def _unit(quats: Array) -> Array:
 
 
 def _clamp(tangent: Array, focal: float, centre: float, size: int, decisions: Decisions) -> Array:
-    """Limit x/z or y/z to a little more than what the picture shows."""
+    """Clamp x/z or y/z to a little more than the image shows."""
     margin = FOV_MARGIN * 0.5 * size / focal
     low, high = -centre / focal - margin, (size - centre) / focal + margin
     return np.where(decisions.ask(tangent > low), np.where(decisions.ask(tangent < high), tangent, high), low)
@@ -173,7 +172,7 @@ def _clamp(tangent: Array, focal: float, centre: float, size: int, decisions: De
 def _blend(
     drawn: dict[str, Array], camera: Camera, transmittance_min: float, decisions: Decisions
 ) -> tuple[Array, Array, Array]:
-    """Colour, transmittance and depth of every pixel."""
+    """Return colour, transmittance and depth of every pixel."""
     ys, xs = np.mgrid[: camera.H, : camera.W].reshape(2, -1) + 0.5
     before = np.ones(len(xs))
     rgb, depth = np.zeros((len(xs), 3)), np.zeros(len(xs))
@@ -191,7 +190,7 @@ def _blend(
         weight = np.where(seen, alpha * through, 0.0)
         rgb += np.einsum("sp,sc->pc", weight, part["colour"][:, 0])
         depth += (weight * part["depth"]).sum(0)
-        count = seen.sum(0)  # once a pixel is finished it stays so: the last one seen is the count-th
+        count = seen.sum(0)  # a finished pixel remains finished: the last splat seen is the count-th
         before = np.where(count > 0, np.take_along_axis(after, np.maximum(count - 1, 0)[None], 0)[0], before)
         going = seen[-1]
     return rgb.reshape(camera.H, camera.W, 3), before.reshape(camera.H, camera.W), depth.reshape(camera.H, camera.W)

@@ -1,13 +1,13 @@
-"""Colours that fit pictures best, with everything else fixed: ridge least squares in spherical harmonics.
+"""Refit of colours to images with everything else fixed: ridge least squares in spherical harmonics.
 
-With geometry and opacity fixed a pixel is Σ_i w_i · (½ + Y(view)·c_i), linear in the coefficients c, but for the clamp
-of each splat's colour at 0. The clamp is linearised: a colour that is 0 in a view with the coefficients that the fit
-starts from stays 0 there, the others are taken as free. What is minimised is
+With geometry and opacity fixed a pixel is Σ_i w_i · (½ + Y(view)·c_i), linear in the coefficients c, except for the
+clamp of each splat's colour at 0. The clamp is linearised: a colour that is 0 in a view with the initial coefficients
+remains 0 there, the others are free. The fit minimises
 
-    Σ over views, pixels, channels (picture − reference)² + Σ_i r · (c_i − c0_i)²,
+    Σ over views, pixels, channels (image − reference)² + Σ_i r · (c_i − c0_i)²,
 
-with a ridge r that keeps what no view saw where it was. Preconditioned conjugate gradients: the matrix is never built,
-its product with a vector is a picture of the vector's colours taken back to the splats.
+with a ridge r that holds colours that no view sees. It uses preconditioned conjugate gradients: the matrix is never
+built, its product with a vector is a render of the vector's colours taken back to the splats.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from csplat_render.conventions import Array, HasSplats
 
 Floats = NDArray[Any]
 
-#: Memory for views that are drawn once and kept; the others are drawn anew in every step.
+#: Memory in bytes for projected views that are kept; the others are projected again in every step.
 CACHE_BYTES = 2 << 30
 
-#: Squared error per square of a coefficient: some ten pixels at 40 dB for every 0.1 that a coefficient is moved.
+#: Squared error per square of a coefficient: about ten pixels at 40 dB if a coefficient changes by 0.1.
 RIDGE = 0.1
 
 
 class ColourOperator:
-    """The matrix from coefficients to pictures, and its transpose, of fixed geometry. Owns views that are drawn once.
+    """The linear map from coefficients to renders of fixed geometry, and its transpose. Owns a cache of views.
 
     Args:
-        splats: the geometry; `sh0` and `shN` say which colours are clamped.
+        splats: the geometry; `sh0` and `shN` determine which colours are clamped.
         cameras: the views.
         background: red, green, blue behind everything.
         antialiased: see `Rasteriser.forward`.
-        threads: how many; None for all. No result depends on it.
+        threads: number of threads; None for all. No result depends on it.
         cache_bytes: memory for views that are kept.
     """
 
@@ -57,7 +57,7 @@ class ColourOperator:
     ) -> None:
         self.cameras = cameras
         self.antialiased = antialiased
-        self._drawing = Contributions(threads=threads)
+        self._contributions = Contributions(threads=threads)
         self._background = np.asarray(background, np.float32)
         self._black = np.zeros(3, np.float32)
         self._cache_left = cache_bytes
@@ -67,20 +67,20 @@ class ColourOperator:
     def error(
         self, coefficients: F32, references: Sequence[Array], gradient: F32, diagonal: F32 | None = None
     ) -> float:
-        """Squared error of the pictures, and half its gradient.
+        """Return the squared error of the renders, and add half its gradient.
 
         Args:
             coefficients: [N, B, 3].
-            references: the wanted pictures, [H, W, 3] each.
+            references: the reference images, [H, W, 3] each.
             gradient: [N, B, 3], added to.
-            diagonal: [N, B], added to: the diagonal of the matrix transposed times itself; None if it is not wanted.
+            diagonal: [N, B], added to: the diagonal of the matrix transposed times itself; None if it is not needed.
         """
-        unwanted = np.empty((0, coefficients.shape[1]), np.float32)
+        not_needed = np.empty((0, coefficients.shape[1]), np.float32)
         total = 0.0
         for number in range(len(self.cameras)):
             drawn, active = self._view(number)
-            rgb = self._drawing.colours(
-                drawn, coefficients, active, gradient, unwanted if diagonal is None else diagonal,
+            rgb = self._contributions.backproject(
+                drawn, coefficients, active, gradient, not_needed if diagonal is None else diagonal,
                 offset=0.5, background=self._background, reference=references[number],
             )  # fmt: skip
             self._keep(number, drawn, active)
@@ -88,17 +88,19 @@ class ColourOperator:
         return total
 
     def normal(self, vector: Floats, result: Floats) -> float:
-        """Add the matrix, transposed, times itself, times a vector; return the squared length of the pictures.
+        """Add Aᵀ A times a vector, A being the matrix of the map; return the squared length of A times the vector.
 
         Args:
             vector: [N, B, 3] float32.
             result: [N, B, 3] float32, added to.
         """
-        unwanted = np.empty((0, vector.shape[1]), np.float32)
+        not_needed = np.empty((0, vector.shape[1]), np.float32)
         total = 0.0
         for number in range(len(self.cameras)):
             drawn, active = self._view(number)
-            rgb = self._drawing.colours(drawn, vector, active, result, unwanted, offset=0.0, background=self._black)
+            rgb = self._contributions.backproject(
+                drawn, vector, active, result, not_needed, offset=0.0, background=self._black
+            )
             self._keep(number, drawn, active)
             total += float(np.sum(np.square(rgb, dtype=np.float64)))
         return total
@@ -106,17 +108,17 @@ class ColourOperator:
     def _view(self, number: int) -> tuple[ProjectedView, Array]:
         kept = self._kept.get(number)
         if kept is None:
-            drawn = self._drawing.draw(self._splats, self.cameras[number], antialiased=self.antialiased)
+            drawn = self._contributions.project_view(self._splats, self.cameras[number], antialiased=self.antialiased)
             kept = (drawn, drawn.shape[:, 6:9] > 0.0)
         return kept
 
     def _keep(self, number: int, drawn: ProjectedView, active: Array) -> None:
-        """Keep a view whose weights have just been summed, if there is room: what has none is not looked at again."""
+        """Keep a view whose weights have just been summed, without splats of no weight, if the cache has room."""
         if number in self._kept or drawn.size_bytes > self._cache_left:
             return
-        trimmed, left = self._drawing.trimmed(drawn)
+        trimmed, kept = self._contributions.trim(drawn)
         self._cache_left -= trimmed.size_bytes
-        self._kept[number] = (trimmed, active[left])
+        self._kept[number] = (trimmed, active[kept])
 
 
 def fit_colours(
@@ -133,26 +135,26 @@ def fit_colours(
     cache_bytes: int = CACHE_BYTES,
     progress: Progress | None = None,
 ) -> tuple[F32, list[float]]:
-    """Fit the colours of splats to pictures.
+    """Fit the colours of splats to images.
 
     Args:
         splats: geometry, and the colours to start from.
         cameras: the views, relative to the scene's origin.
-        references: the wanted pictures, [H, W, 3] each, as float; they may exceed 1.
-        steps: of conjugate gradients at most.
+        references: the reference images, [H, W, 3] each, as float; they may exceed 1.
+        steps: largest number of steps of conjugate gradients.
         ridge: squared error per square of a coefficient.
-        least_gain: stop when a step takes off less than this share of the error.
+        least_gain: stop when a step reduces the error by less than this fraction.
         background: red, green, blue behind everything.
         antialiased: see `Rasteriser.forward`.
-        threads: how many; None for all. The result does not depend on it.
-        cache_bytes: memory for views that are drawn once and kept.
-        progress: is told how much is done.
+        threads: number of threads; None for all. The result does not depend on it.
+        cache_bytes: memory for views that are kept.
+        progress: called with the stage and the fraction done.
 
     Returns:
-        [N, B, 3] float32, and what is minimised, by the linearised model, before the first and after every step.
+        [N, B, 3] float32, and the minimised sum, by the linearised model, before the first and after every step.
 
     Raises:
-        InputError: there is no camera, or there are not as many references.
+        InputError: there is no camera, or not one reference for each.
     """
     if not cameras or len(references) != len(cameras):
         raise InputError(f"a fit wants cameras and as many pictures, found {len(cameras)} and {len(references)}")
@@ -173,7 +175,7 @@ def fit_colours(
         operator.normal(direction, image)
         curvature = _dot(direction, image)
         if not 0.0 < curvature < np.inf:
-            break  # nothing is seen, or the fit is exact, or colours are beyond all measure
+            break  # no splat is visible, the fit is exact, or colours overflow
         length = product / curvature
         x += np.float32(length) * direction
         residual -= np.float32(length) * image
@@ -189,5 +191,5 @@ def fit_colours(
 
 
 def _dot(a: Floats, b: Floats) -> float:
-    """The sum of products in float64; not BLAS, whose sums depend on threads."""
+    """Sum the products in float64, without BLAS, whose sums depend on threads."""
     return float(np.einsum("ijk,ijk->", a, b, dtype=np.float64))

@@ -1,6 +1,6 @@
-"""`Scorer`: the only scorer of renders, against a source's renders or against photographs.
+"""`Scorer`: scores of scenes against reference images, which are renders of a source or images of a data set.
 
-A `Scorer` holds views and the reference image of each. The definition of PSNR is in `metrics`.
+The definition of PSNR is in `metrics`.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from functools import partial
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import F32, F64
+from csplat.types import F32, F64, Mask, Progress
 from csplat_render import metrics
 from csplat_render.camera import Camera, relative_to
 from csplat_render.conventions import Mode, RenderResult
@@ -25,7 +25,7 @@ OnView = Callable[[int, F32, F32], None]
 
 
 class Renderable(Protocol):
-    """A scene that draws itself, because it is not in memory."""
+    """A scene that renders itself, because it is not in memory."""
 
     @property
     def origin(self) -> tuple[float, float, float]:
@@ -35,7 +35,7 @@ class Renderable(Protocol):
     def renderer(
         self, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
     ) -> Callable[[Camera], RenderResult]:
-        """As `renderer` of this module."""
+        """Return a function that renders, like `renderer` of this module."""
         ...
 
 
@@ -44,16 +44,16 @@ class ReferenceImage:
     """The reference image of a view.
 
     Attributes:
-        picture: [H, W, 3] floats.
+        rgb: [H, W, 3] floats.
         covered: [H, W], True for pixels that show more than the background; `None`: not known.
-        ignored: splats that it does not show because they hold NaN or infinities.
-        counts: [H, W], True for pixels that count; `None`: all of them.
+        ignored: number of splats that are not drawn because they hold NaN or infinities.
+        mask: [H, W], True for pixels that count; `None`: all of them.
     """
 
-    picture: F32
-    covered: NDArray[np.bool_] | None = None
+    rgb: F32
+    covered: Mask | None = None
     ignored: int = 0
-    counts: NDArray[np.bool_] | None = None
+    mask: Mask | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class Scorer:
 
     Attributes:
         cameras: the views, at least one.
-        looks: the reference image of each view, or a function that makes it on demand.
+        references: the reference image of each view, or a function that makes it on demand.
         background: red, green, blue behind everything.
         mode: mode of the renderer.
         threads: number of threads; `None` for all. No score depends on it.
@@ -70,11 +70,11 @@ class Scorer:
         pixels: number of pixels that count in each view; `None`: all of them.
 
     Raises:
-        InputError: there is no view, or not one look for each.
+        InputError: there is no view, or not one reference for each.
     """
 
     cameras: Sequence[Camera]
-    looks: Sequence[ReferenceImage | Callable[[], ReferenceImage]]
+    references: Sequence[ReferenceImage | Callable[[], ReferenceImage]]
     background: ArrayLike = (0.0, 0.0, 0.0)
     mode: Mode = "standard"
     threads: int | None = None
@@ -84,8 +84,8 @@ class Scorer:
     def __post_init__(self) -> None:
         if not self.cameras:
             raise InputError("there is no camera to judge from")
-        if len(self.cameras) != len(self.looks):
-            raise InputError(f"{len(self.cameras)} cameras and {len(self.looks)} pictures do not belong together")
+        if len(self.cameras) != len(self.references):
+            raise InputError(f"{len(self.cameras)} cameras and {len(self.references)} pictures do not belong together")
 
     @classmethod
     def of_source(
@@ -97,67 +97,66 @@ class Scorer:
         mode: Mode = "standard",
         threads: int | None = None,
         kept_bytes: int = 1 << 30,
-        progress: Callable[[str, float], None] | None = None,
+        progress: Progress | None = None,
     ) -> Scorer:
-        """Score against renders of the source.
+        """Make a scorer whose references are renders of a source.
 
         Args:
             source: the scene that others are compared with.
             cameras: cameras of the views, relative to the source's origin.
             background, mode, threads: see above.
-            kept_bytes: limit on the size of the source's renders; larger ones are rendered again for each scene.
-            progress: called with the fraction that is drawn.
+            kept_bytes: limit on the size of the source's renders; if they are larger, they are rendered again for
+                each scene.
+            progress: called with the fraction that is rendered.
         """
-        draw = renderer(source, background, mode=mode, threads=threads)
-        looks: list[ReferenceImage | Callable[[], ReferenceImage]] = [
-            partial(_rendered, draw, camera) for camera in cameras
-        ]
+        render = renderer(source, background, mode=mode, threads=threads)
+        references: list[ReferenceImage | Callable[[], ReferenceImage]]
+        references = [partial(_render_reference, render, camera) for camera in cameras]
         if sum(12 * camera.W * camera.H for camera in cameras) <= kept_bytes:
-            looks = []
+            references = []
             for camera in cameras:
                 if progress is not None:
-                    progress("drawing the source", len(looks) / len(cameras))
-                looks.append(_rendered(draw, camera))
+                    progress("drawing the source", len(references) / len(cameras))
+                references.append(_render_reference(render, camera))
             if progress is not None:
                 progress("drawing the source", 1.0)
-        return cls(cameras, looks, background, mode, threads, source.origin)
+        return cls(cameras, references, background, mode, threads, source.origin)
 
-    def look(self, number: int) -> ReferenceImage:
+    def reference(self, number: int) -> ReferenceImage:
         """Return the reference image of a view."""
-        look = self.looks[number]
-        return look if isinstance(look, ReferenceImage) else look()
+        reference = self.references[number]
+        return reference if isinstance(reference, ReferenceImage) else reference()
 
     def errors(self, model: SplatModel) -> F64:
-        """[V] mean squared error by view."""
-        draw, errors = self._renderer(model), np.empty(len(self.cameras), np.float64)
+        """Return the mean squared error of each view, [V]."""
+        render, errors = self._renderer(model), np.empty(len(self.cameras), np.float64)
         for number, camera in enumerate(self.cameras):
-            look = self.look(number)
-            squares = metrics.squared_error(look.picture, draw(camera).rgb)
-            errors[number] = np.mean(squares if look.counts is None else squares[look.counts])
+            reference = self.reference(number)
+            squares = metrics.squared_error(reference.rgb, render(camera).rgb)
+            errors[number] = np.mean(squares if reference.mask is None else squares[reference.mask])
         return errors
 
     def pooled(self, errors: F64) -> float:
-        """The mean squared error over all pixels, of those by view."""
+        """Return the mean squared error over all pixels, given those of the views."""
         return metrics.pooled(errors, self.pixels or [camera.W * camera.H for camera in self.cameras])
 
     def psnr(self, model: SplatModel) -> float:
-        """PSNR of the error pooled over views, pixels and channels, dB."""
+        """Return the PSNR of the error pooled over views, pixels and channels, dB."""
         return metrics.psnr_of_mse(self.pooled(self.errors(model)))
 
-    def some(self, places: Sequence[int]) -> Scorer:
-        """Return a judge for some of the views."""
-        pixels = None if self.pixels is None else [self.pixels[i] for i in places]
-        cameras, looks = [self.cameras[i] for i in places], [self.looks[i] for i in places]
-        return replace(self, cameras=cameras, looks=looks, pixels=pixels)
+    def subset(self, numbers: Sequence[int]) -> Scorer:
+        """Return a scorer of some of the views."""
+        pixels = None if self.pixels is None else [self.pixels[i] for i in numbers]
+        cameras, references = [self.cameras[i] for i in numbers], [self.references[i] for i in numbers]
+        return replace(self, cameras=cameras, references=references, pixels=pixels)
 
     def score(
-        self, number: int, seen: F32, *, ssim: bool = True, lpips: metrics.Distance | None = None
+        self, number: int, render: F32, *, ssim: bool = True, lpips: metrics.Distance | None = None
     ) -> metrics.ViewScore:
         """Score a render of a view, [H, W, 3], from any renderer."""
-        look = self.look(number)
-        image = self.cameras[number].image
+        reference, image = self.reference(number), self.cameras[number].image
         return metrics.score_view(
-            look.picture, seen, look.covered, look.counts, image=image, with_ssim=ssim, lpips=lpips
+            reference.rgb, render, reference.covered, reference.mask, image=image, with_ssim=ssim, lpips=lpips
         )
 
     def scores(
@@ -167,45 +166,47 @@ class Scorer:
         ssim: bool = True,
         lpips: metrics.Distance | None = None,
         on_view: OnView | None = None,
-        progress: Callable[[str, float], None] | None = None,
+        progress: Progress | None = None,
     ) -> metrics.Scores:
-        """Score a scene in everything.
+        """Score a scene by all metrics.
 
         Args:
-            model: the scene. Its origin may be another one than that of the cameras.
+            model: the scene. Its origin may differ from that of the cameras.
             ssim: compute SSIM; it takes about as long as rendering.
             lpips: the LPIPS distance, if it is needed.
             on_view: called with the images of each view.
             progress: called with the fraction done.
         """
-        draw, each, ignored = self._renderer(model), [], 0
+        render, each, ignored = self._renderer(model), [], 0
         for number, camera in enumerate(self.cameras):
             if progress is not None:
                 progress("comparing", number / len(self.cameras))
-            look, result = self.look(number), draw(camera)
+            reference, result = self.reference(number), render(camera)
             ignored = max(ignored, result.ignored)
-            one = metrics.score_view(
-                look.picture, result.rgb, look.covered, look.counts, image=camera.image, with_ssim=ssim, lpips=lpips
-            )
-            each.append(one)
+            each.append(
+                metrics.score_view(
+                    reference.rgb, result.rgb, reference.covered, reference.mask, image=camera.image, with_ssim=ssim,
+                    lpips=lpips,
+                )
+            )  # fmt: skip
             if on_view is not None:
-                on_view(number, np.clip(look.picture, 0.0, 1.0), np.clip(result.rgb, 0.0, 1.0))
+                on_view(number, np.clip(reference.rgb, 0.0, 1.0), np.clip(result.rgb, 0.0, 1.0))
         if progress is not None:
             progress("comparing", 1.0)
         return metrics.Scores.of(each, ignored)
 
     def _renderer(self, model: SplatModel | Renderable) -> Callable[[Camera], RenderResult]:
-        draw = renderer(model, self.background, mode=self.mode, threads=self.threads)
+        render = renderer(model, self.background, mode=self.mode, threads=self.threads)
         if self.origin is None:
-            return draw
+            return render
         shift = np.subtract(model.origin, self.origin)
-        return lambda camera: draw(relative_to(shift, camera))
+        return lambda camera: render(relative_to(shift, camera))
 
 
 def renderer(
     model: SplatModel | Renderable, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
 ) -> Callable[[Camera], RenderResult]:
-    """Return a function that draws a scene from camera after camera, and keeps its memory in between.
+    """Return a function that renders a scene from camera after camera, and keeps its memory in between.
 
     Args:
         model: the scene. The cameras are relative to its origin.
@@ -225,6 +226,6 @@ def renderer(
     return lambda camera: rasteriser.forward(model, camera, background=background, antialiased=model.antialiased)
 
 
-def _rendered(draw: Callable[[Camera], RenderResult], camera: Camera) -> ReferenceImage:
-    result = draw(camera)
+def _render_reference(render: Callable[[Camera], RenderResult], camera: Camera) -> ReferenceImage:
+    result = render(camera)
     return ReferenceImage(result.rgb, result.alpha >= metrics.COVERED_ALPHA, result.ignored)

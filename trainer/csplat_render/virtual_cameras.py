@@ -34,7 +34,7 @@ from csplat.types import F64, I64
 from csplat.upright import Direction, up_of, with_up
 from csplat_render.camera import DEFAULT_NEAR, Camera, direction_at, intrinsics, look_at, orbit
 
-#: Opacities below this never reach a picture.
+#: Splats of lower opacity are never drawn.
 MIN_OPACITY = 1.0 / 255.0
 
 _MAX_LOG_SCALE = 60.0  # beyond, squares of squares overflow
@@ -47,7 +47,7 @@ class Cloud:
     Attributes:
         points: [P, 3] float64, drawn from the splats' Gaussians, relative to the model's origin.
         masses: [P] float64, optical depth × area that a point represents, square scene units.
-        sizes: [P] float64, square root of the area of the splat it was drawn from, scene units.
+        sizes: [P] float64, square root of the area of the point's splat, scene units.
     """
 
     points: F64
@@ -56,14 +56,14 @@ class Cloud:
 
 
 def visible_opacity(model: SplatModel) -> F64:
-    """Return opacities in float64, 0 for splats that never show; all 1 if none shows at all."""
+    """Return opacities in float64, 0 for splats that are never drawn; all 1 if none is drawn."""
     alpha = model.opacities.astype(np.float64)
     alpha[alpha < MIN_OPACITY] = 0.0
     return alpha if alpha.any() else np.ones_like(alpha)
 
 
 def surface_areas(model: SplatModel) -> F64:
-    """Mean area a splat shows over all directions, [N], square scene units, for a peak of 1.
+    """Return the mean projected area of each splat over all directions, [N], square scene units, for a peak of 1.
 
     The integral of a projected Gaussian is 2π·σa·σb; over all directions the product of the two
     standard deviations is about ((σ0σ1)^p + (σ0σ2)^p + (σ1σ2)^p) / 3)^(1/p), p = 1.6 (Thomsen's
@@ -86,7 +86,7 @@ def sample_cloud(model: SplatModel, count: int, rng: np.random.Generator, every:
         every: number of the scene's splats that each of the model's represents.
 
     Returns:
-        `count` points. Splats are drawn in proportion to the square root of their mass, so that few
+        `count` points. Splats are drawn in proportion to the square root of their mass, so that a few
         large ones do not take all points.
     """
     alpha = visible_opacity(model)
@@ -100,7 +100,7 @@ def sample_cloud(model: SplatModel, count: int, rng: np.random.Generator, every:
     index = np.minimum(np.searchsorted(sums, at, side="right"), last)
     s = np.exp(_clipped_scales(model)[index])
     offsets = _rotate(model.quats[index].astype(np.float64), rng.standard_normal((count, 3)) * s)
-    # Mass over the number of points that a splat expects: chance · sums[-1] / count.
+    # Mass over the expected number of a splat's points: chance · sums[-1] / count.
     return Cloud(
         points=np.asfortranarray(model.means[index].astype(np.float64) + offsets),  # `_project_cloud` takes columns
         masses=chance[index] * (sums[-1] / count) * every,
@@ -122,16 +122,16 @@ def covered_fraction(cloud: Cloud, camera: Camera, cell: int = 10) -> float:
 
 
 def detail(cloud: Cloud, camera: Camera, nearest: float, cell: int = 20, fine: float = 4.0) -> float:
-    """Return the fraction of an image that shows fine splats with nothing before them, 0 to 1.
+    """Return the fraction of an image that shows fine splats with nothing in front, 0 to 1.
 
-    Views that no photograph was taken from show large, smeared splats, or a wall from behind.
+    Views far from the training cameras show large, smeared splats, or a wall from behind.
 
     Args:
         cloud: the scene.
         camera: the camera.
         nearest: distance below which splats hide others without showing detail; scene units.
         cell: side of the coarse image's cells, pixels.
-        fine: splats of this size and less count fully, larger ones in proportion; pixels.
+        fine: splats up to this size count fully, larger ones less in proportion; pixels.
     """
     cells, z, depths, sizes = _project_cloud(cloud, camera, cell)
     if len(cells) == 0:
@@ -147,14 +147,14 @@ def detail(cloud: Cloud, camera: Camera, nearest: float, cell: int = 20, fine: f
 
 
 def share_within(cloud: Cloud, centre: F64, radius: float) -> float:
-    """The share of the scene's surface that lies within `radius` of a point, 0 to 1."""
+    """Return the fraction of the scene's surface within `radius` of a point, 0 to 1."""
     near = np.sum((cloud.points - centre) ** 2, axis=1) < radius**2
     total = float(np.sum(cloud.masses))
     return float(np.sum(cloud.masses[near])) / total if total > 0.0 else 0.0
 
 
 def weighted_quantiles(values: F64, weights: F64, at: tuple[float, ...]) -> F64:
-    """Quantiles of weighted values, linear between neighbours.
+    """Return quantiles of weighted values, linear between neighbours.
 
     Args:
         values: [N], at least one.
@@ -176,11 +176,11 @@ def _cell_count(camera: Camera, cell: int) -> int:
 
 
 def _project_cloud(cloud: Cloud, camera: Camera, cell: int) -> tuple[I64, F64, F64, F64]:
-    """Put the points into the cells of a coarse picture.
+    """Project the points into the cells of a coarse image.
 
     Returns:
-        For the M points that fall into it: the cell's number, row by row; the depth along z; the
-        optical depth that the point adds to its cell; the size of its splat in pixels.
+        For the M points inside it: the cell's number, row by row; the depth along z; the optical
+        depth that the point adds to its cell; the size of its splat in pixels.
     """
     V = camera.viewmat
     x, y, z = (
@@ -193,7 +193,7 @@ def _project_cloud(cloud: Cloud, camera: Camera, cell: int) -> tuple[I64, F64, F
         inside = (z > camera.near) & (u >= 0.0) & (u < camera.W) & (v >= 0.0) & (v < camera.H)
     z = z[inside]
     columns = -(-camera.W // cell)
-    # Integers first: of what is not negative that is the same, and a tenth of the time of `//` of floats.
+    # Integers first: the same for values that are not negative, in a tenth of the time of `//` of floats.
     cells = v[inside].astype(np.int64) // cell * columns + u[inside].astype(np.int64) // cell
     scale = camera.K[0, 0] / z
     return cells, z, cloud.masses[inside] * (scale / cell) ** 2, cloud.sizes[inside] * scale
@@ -216,32 +216,32 @@ Kind = Literal["object", "surrounding"]
 #: Horizontal field of view, degrees.
 FIELD_OF_VIEW = 60.0
 
-#: Distances from the centre of an object that are tried in turn, in extents.
+#: Distances from the centre of an object, in extents, in the order in which they are tried.
 OBJECT_DISTANCES = (1.25, 1.125, 1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)
 
-#: Distances from the centre of surroundings that are tried in turn, in extents.
+#: Distances from the centre of surroundings, in extents, in the order in which they are tried.
 SURROUNDING_DISTANCES = (1.3, 0.8, 0.5)
 
-#: An object covers at least this much of each picture.
+#: Least fraction of each image that an object covers.
 MIN_COVER = 0.5
 
-#: Extents; what is nearer to a camera in surroundings only hides.
+#: Distance in extents below which splats in surroundings hide others without showing detail.
 HIDING = 0.4
 
-_COVER_MARGIN = 0.015  # the estimate of the cover errs by as much
+_COVER_MARGIN = 0.015  # error of the estimated cover
 _OBJECT_ELEVATIONS = (5.0, 25.0, 50.0)
 _SURROUNDING_ELEVATIONS = (3.0, 15.0, 35.0)
-_PROMISING = 4  # directions in which a camera comes nearer to an object
-_TARGET_OFFSET = 0.05  # objects are looked at this far from their centre, at most, in extents
-_CLEAR_RADIUS = 0.32  # fraction of the distance from the centre: hardly anything may be so near to a camera
-_CLEAR_SHARE = 0.01  # fraction of an object's surface that may lie there
+_PROMISING = 4  # number of directions in which nearer cameras are tried
+_TARGET_OFFSET = 0.05  # extents; largest distance of the look-at point from an object's centre
+_CLEAR_RADIUS = 0.32  # fraction of a camera's distance from the centre: radius that has to be clear of an object
+_CLEAR_SHARE = 0.01  # fraction of an object's surface that may lie within it
 _NEAR = 0.05  # near plane in extents, DEFAULT_NEAR at most
-_FAR_REACH = 4.0  # times the distance within which half the opacity lies: no object's surface
-_FAR_SHARE = 0.02  # fraction of the surface; with more than that beyond, a scene is no object
-_FLAT = 0.6  # an extent this much shorter than the next one points up
+_FAR_REACH = 4.0  # times the distance within which half the opacity lies; farther surface belongs to no object
+_FAR_SHARE = 0.02  # fraction of the surface; with more of it beyond, a scene is surroundings
+_FLAT = 0.6  # ratio of the shortest extent to the next, below which the short axis points up
 _GOOD_DETAIL = 0.65  # fraction of the best view's detail
 _AZIMUTH_STEP = 15.0  # degrees
-_POINTS = 60_000
+_POINTS = 60_000  # points of a cloud
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +251,7 @@ class SceneFrame:
     Attributes:
         kind: `"object"` or `"surrounding"`.
         centre: [3] float64, relative to the model's origin.
-        extent: length that all distances are multiples of, scene units, above 0. Objects: half
+        extent: unit of all distances, in scene units, above 0. Objects: half
             the diagonal of the box that holds 5 to 95 % of the opacity along each axis.
             Surroundings: the distance from the centre within which half the opacity lies.
         up: [3] float64, unit length.
@@ -264,7 +264,7 @@ class SceneFrame:
 
     @property
     def near(self) -> float:
-        """Near plane that suits the extent, scene units."""
+        """Near plane for the extent, scene units."""
         return min(DEFAULT_NEAR, _NEAR * self.extent)
 
 
@@ -282,7 +282,7 @@ def scene_frame(model: SplatModel) -> SceneFrame:
     up = _up(model, half)
     distances = np.sqrt(np.sum((means - middle) ** 2, axis=1))
     reach = float(weighted_quantiles(distances, alpha, (0.5,))[0])
-    surface = alpha * np.minimum(areas, (0.5 * reach) ** 2)  # no floater outweighs a scene
+    surface = alpha * np.minimum(areas, (0.5 * reach) ** 2)  # so that no floater outweighs a scene
     if np.sum(surface[distances > _FAR_REACH * reach]) > _FAR_SHARE * np.sum(surface):
         return SceneFrame("surrounding", middle, reach, up)
     extent = float(np.sqrt(np.sum(half**2)))
@@ -292,7 +292,7 @@ def scene_frame(model: SplatModel) -> SceneFrame:
 
 
 def is_clear(frame: SceneFrame, cloud: Cloud, camera: Camera) -> bool:
-    """Return True if hardly any of a scene is so near to a camera that it would show it as fog, or from inside."""
+    """Return True if hardly any surface is so near to a camera that it would show as fog, or from inside."""
     radius = _CLEAR_RADIUS * float(np.linalg.norm(camera.position - frame.centre))
     return share_within(cloud, camera.position, radius) <= _CLEAR_SHARE
 
@@ -300,22 +300,22 @@ def is_clear(frame: SceneFrame, cloud: Cloud, camera: Camera) -> bool:
 def virtual_cameras(
     model: SplatModel, count: int = 8, width: int = 640, height: int = 480, seed: int = 0, every: int = 1
 ) -> list[Camera]:
-    """Cameras around a scene, chosen from the scene alone.
+    """Return cameras around a scene, chosen from the scene alone.
 
     Args:
-        model: the scene. Its training cameras, if it has any, are not looked at.
+        model: the scene. Its training cameras, if it has any, are not used.
         count: number of cameras, at least 1.
         width: pixels.
         height: pixels.
-        seed: decides where around the scene the cameras begin, and what exactly they look at.
+        seed: determines the first azimuth and the exact look-at points.
         every: number of the scene's splats that each of the model's represents.
 
     Returns:
         `count` cameras, the same for the same arguments. An object covers at least half of each
-        picture, as far as coming nearer helps.
+        image, if a nearer camera can achieve it.
 
     Raises:
-        InputError: `count` is below 1 or the size is no picture's.
+        InputError: `count` is below 1 or the size is not that of an image.
     """
     if count < 1:
         raise InputError(f"{count} virtual cameras, wanted at least 1")
@@ -335,7 +335,7 @@ def virtual_cameras(
 
 @dataclass(frozen=True, eq=False)
 class _CameraPlacement:
-    """Makes cameras in terms of a frame: angles in degrees, lengths in extents."""
+    """A scene frame and intrinsics, for cameras given by angles in degrees and lengths in extents."""
 
     frame: SceneFrame
     K: F64
@@ -352,7 +352,7 @@ class _CameraPlacement:
 def _around_object(
     views: _CameraPlacement, cloud: Cloud, count: int, begin: float, rng: np.random.Generator
 ) -> list[Camera]:
-    """One camera in each of `count` equal sectors, from as far away as the object covers enough."""
+    """Place one camera in each of `count` equal sectors, as far away as the object covers enough of the image."""
     width = 360.0 / count
     cameras = []
     for sector in range(count):
@@ -368,13 +368,13 @@ def _around_object(
 
 
 def _object_view(views: _CameraPlacement, cloud: Cloud, angles: list[tuple[float, float]], offset: F64) -> Camera:
-    """The first view that covers enough with nothing close by, the farthest tried first."""
+    """Return the farthest view of which the object covers enough, with nothing close by."""
     needed = MIN_COVER + _COVER_MARGIN
     best, best_rank = views.at(*angles[0], OBJECT_DISTANCES[0], offset), (False, -1.0)
     highest, highest_at = 1.0, OBJECT_DISTANCES[0]
     for distance in OBJECT_DISTANCES:
         if highest * (highest_at / distance) ** 2 < 0.8 * needed:
-            continue  # the cover from farther away shows that this distance does not suffice either
+            continue  # the cover from farther away shows that this distance is not enough either
         covers = []
         for angle in angles:
             camera = views.at(*angle, distance, offset)
@@ -391,7 +391,7 @@ def _object_view(views: _CameraPlacement, cloud: Cloud, angles: list[tuple[float
 
 
 def _in_surroundings(views: _CameraPlacement, cloud: Cloud, count: int, begin: float) -> list[Camera]:
-    """Choose, among the views that show fine detail, those that lie farthest apart."""
+    """Choose, among the views that show fine detail, those with the largest distances from each other."""
     azimuths = begin + np.arange(0.0, 360.0, _AZIMUTH_STEP)
     angles = [(azimuth, elevation) for azimuth in azimuths for elevation in _SURROUNDING_ELEVATIONS]
     cameras = [views.at(*angle, distance) for distance in SURROUNDING_DISTANCES for angle in angles]
@@ -410,7 +410,7 @@ def _in_surroundings(views: _CameraPlacement, cloud: Cloud, count: int, begin: f
 
 
 def farthest_points(points: F64, first: int, count: int) -> list[int]:
-    """Positions of `count` points, each the farthest from those before it."""
+    """Return the indices of `count` points, each the farthest from those before it."""
     chosen = [first]
     gap = np.sum((points - points[first]) ** 2, axis=1)
     while len(chosen) < count:
@@ -421,11 +421,11 @@ def farthest_points(points: F64, first: int, count: int) -> list[int]:
 
 def _up(model: SplatModel, half: F64) -> F64:
     """Return the up direction: the scene's own; else the short axis of a flat scene; else −y, as in a PLY."""
-    said = up_of(model.metadata, model.coordinate_system)
-    if said is not None:
-        named: F64 = np.array(said)
-        named /= np.sqrt(np.sum(named**2))  # six digits are not unit length
-        return named
+    stored = up_of(model.metadata, model.coordinate_system)
+    if stored is not None:
+        direction: F64 = np.array(stored)
+        direction /= np.sqrt(np.sum(direction**2))  # six digits are not exactly unit length
+        return direction
     up = np.zeros(3)
     order = np.argsort(half, kind="stable")
     axis = int(order[0]) if half[order[0]] < _FLAT * half[order[1]] else 1
@@ -433,8 +433,8 @@ def _up(model: SplatModel, half: F64) -> F64:
     return up
 
 
-_UP_CERTAIN = 0.3  # a sum this long is no chance
-_UP_NEAR_AXIS = 0.9  # cosine: programs make one of their axes up
+_UP_CERTAIN = 0.3  # least length of the sum that is not by chance
+_UP_NEAR_AXIS = 0.9  # least cosine with an axis: programs make one of their axes up
 _UP_POINTS, _UP_DIRECTIONS, _UP_IMAGE_SIZE = 10_000, 32, 320
 _UP_DISTANCE = 2.0  # extents
 _UP_CELL, _UP_FINE = 20, 2.0  # pixels
@@ -448,8 +448,7 @@ def estimate_up(model: SplatModel, every: int = 1) -> Direction | None:
         every: number of the scene's splats that each of the model's represents.
 
     Returns:
-        `None` if the scene or the cameras that it carries determine which way is up, if nothing tells it, and inside
-        surroundings.
+        `None` if the scene or its cameras determine the up axis, if the estimate is uncertain, and for surroundings.
     """
     if len(model) == 0 or model.cameras or up_of(model.metadata, model.coordinate_system) is not None:
         return None
@@ -481,5 +480,5 @@ def estimate_up(model: SplatModel, every: int = 1) -> Direction | None:
 
 
 def with_estimated_up(model: SplatModel) -> SplatModel:
-    """Return the scene for viewing: if it does not specify its up direction, with the estimate of it."""
+    """Return the scene for viewing: with the estimated up direction if it does not specify its own."""
     return with_up(model, estimate_up(model))

@@ -1,4 +1,4 @@
-"""Compile kernels ahead of their first call, which would take seconds, and announce it."""
+"""Compilation of kernels ahead of their first call, which would take seconds, and its announcement."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from csplat_render.blending import blend
 from csplat_render.camera import Camera
-from csplat_render.conventions import Array, SplatArrays
+from csplat_render.conventions import Array, UncheckedSplats
 from csplat_render.kernels import is_cached, on_compiling
 from csplat_render.projection import project
 from csplat_render.rasteriser import Rasteriser
 
-_IMAGE_SIZE = 16  # pixels on each side of what is rendered
+_IMAGE_SIZE = 16  # width and height of the render, pixels
 
 
 def warm_up(
@@ -28,19 +28,19 @@ def warm_up(
     others: Sequence[Callable[[], object]] = (),
     dtype: Any = np.float32,
 ) -> float:
-    """Compile kernels, or load them from numba's cache, by putting them to a single splat.
+    """Compile kernels, or load them from numba's cache, by running them on a single splat.
 
     Args:
-        announce: called with one line if anything has to be compiled, and with another at its end.
+        announce: called with a line if anything has to be compiled, and with another at the end.
         gradients: compile the renderer's backward pass too.
         simplify: compile the kernels of `measure_pruning_error`.
         ssim: compile the kernels of `metrics.ssim`.
         lpips: compile the kernels of `lpips.Lpips`.
-        others: functions to call; each compiles kernels that are not the renderer's.
+        others: functions that compile further kernels.
         dtype: dtype of pixels and gradients, see `Rasteriser`; the other groups have one each.
 
     Returns:
-        Seconds that it took.
+        Duration in seconds.
     """
     started, compiles = time.perf_counter(), False
 
@@ -59,13 +59,13 @@ def warm_up(
             np.array([[8.0, 0.0, 8.0], [0.0, 8.0, 8.0], [0.0, 0.0, 1.0]]), viewmat, _IMAGE_SIZE, _IMAGE_SIZE
         )
         rasteriser = Rasteriser(dtype=dtype, gradients=gradients)
-        picture = rasteriser.forward(_one_splat(dtype), camera)
+        image = rasteriser.forward(_one_splat(dtype), camera)
         if gradients:
-            rasteriser.backward(np.ones_like(picture.rgb))
+            rasteriser.backward(np.ones_like(image.rgb))
         if simplify:
             _warm_up_simplifying(camera)
         if ssim or lpips:
-            _warm_up_metrics(picture.rgb, ssim=ssim, lpips=lpips)
+            _warm_up_metrics(image.rgb, ssim=ssim, lpips=lpips)
         for call in others:
             call()
     seconds = time.perf_counter() - started
@@ -75,7 +75,7 @@ def warm_up(
 
 
 def is_compiled() -> bool:
-    """Return True if renders can start at once: the kernels that project splats and blend them need no compiling."""
+    """Return True if a render can start at once, without compiling the kernels that project and blend splats."""
     return all(map(is_cached, (project, blend)))
 
 
@@ -86,19 +86,19 @@ def _warm_up_simplifying(camera: Camera) -> None:
     measure_pruning_error(SplatModel(**vars(_one_splat(np.float32))), [camera])
 
 
-def _warm_up_metrics(picture: Array, *, ssim: bool, lpips: bool) -> None:
+def _warm_up_metrics(image: Array, *, ssim: bool, lpips: bool) -> None:
     if ssim:
         from csplat_render import metrics
 
-        metrics.ssim(picture, picture)
+        metrics.ssim(image, image)
     if lpips:
         from csplat_render.metric_kernels import convolve
 
         kernel = np.ones((3, 3, 3, 4), np.float32)
-        convolve(picture.astype(np.float32), kernel, np.zeros(4, np.float32), 1, 1)
+        convolve(image.astype(np.float32), kernel, np.zeros(4, np.float32), 1, 1)
 
 
-def _one_splat(dtype: Any) -> SplatArrays:
+def _one_splat(dtype: Any) -> UncheckedSplats:
     quat, shN = np.array([[1.0, 0.0, 0.0, 0.0]], dtype), np.zeros((1, 0, 3), dtype)
     zeros = np.zeros((1, 3), dtype)
-    return SplatArrays(zeros, quat, zeros, np.ones(1, dtype), np.ones((1, 3), dtype), shN)
+    return UncheckedSplats(zeros, quat, zeros, np.ones(1, dtype), np.ones((1, 3), dtype), shN)

@@ -9,7 +9,7 @@ from numpy.random import Generator
 
 from csplat.types import F32
 from csplat_render.camera import Camera
-from csplat_render.conventions import SplatArrays
+from csplat_render.conventions import UncheckedSplats
 from csplat_render.kernels import lane_range, parallel_kernel
 from csplat_render.rasteriser import Rasteriser
 from csplat_trainer.image_gains import ImageGain
@@ -148,7 +148,7 @@ class CpuEngine:
         if len(self._alphas) != len(v["logits"]):
             self._alphas, self._logit_gradient = np.empty_like(v["logits"]), np.empty_like(v["logits"])
         _activate(v["logits"], self._alphas)
-        splats = SplatArrays(v["means"], v["quats"], v["scales"], self._alphas, v["sh0"], v["shN"])
+        splats = UncheckedSplats(v["means"], v["quats"], v["scales"], self._alphas, v["sh0"], v["shN"])
         result = self._rasteriser.forward(
             splats, camera, background=background, antialiased=self._options.antialiased, sh_degree=degree
         )
@@ -164,7 +164,7 @@ class CpuEngine:
 
 
 def _per_half_image(norms: F32, camera: Camera) -> F32:
-    """Gradient norms per pixel as norms per half a image, which thresholds are stated in."""
+    """Gradient norms per pixel as norms per half an image, which thresholds are stated in."""
     return norms * np.float32(0.5 * max(camera.W, camera.H))
 
 

@@ -176,7 +176,7 @@ def _sample_images(images: Sequence[PosedImage], points: F64) -> tuple[NDArray[n
 
 
 def _pixels_at(image: PosedImage, points: F64) -> tuple[NDArray[np.int64], F64]:
-    """The points that fall into a image, and its pixels there, RGBA in 0..1."""
+    """The points that fall into an image, and its pixels there, RGBA in 0..1."""
     camera: Camera = image.camera
     V, K = camera.viewmat, camera.K
     x, y, z = (points @ V[axis, :3] + V[axis, 3] for axis in range(3))

@@ -61,8 +61,8 @@ class PosedImage:
         camera: its camera; W and H are those of the image.
         source: [H, W, 3] or [H, W, 4] uint8, C-contiguous, RGB or RGBA with straight (not
             premultiplied) alpha; or such pixels that are not read yet.
-        masked: [H, W], which pixels count: nobody learns from the others, or is judged by them; or a mask that is not
-            read yet. `None`: all count.
+        masked: [H, W], True for pixels that count in training and scores; or a mask that is not read yet. `None`: all
+            of them count.
 
     Raises:
         InputError: the pixels or the mask have another shape or dtype.
@@ -182,19 +182,19 @@ def photograph_scorer(
     threads: int | None = None,
     origin: Sequence[float] | None = None,
 ) -> Scorer:
-    """Return a judge by photographs; each is composed when its turn comes.
+    """Return a scorer on images of a data set; each is composed when it is needed.
 
     Args:
         images: at least one.
-        background: red, green, blue, behind renders and behind photographs that have an alpha channel.
+        background: red, green, blue, behind renders and behind images that have an alpha channel.
         mode, threads, origin: as in `Scorer`.
     """
     colour = np.asarray(background, np.float32)
     cameras = [image.camera for image in images]
-    looks = [partial(_reference_image, one, colour) for one in images]
+    references = [partial(_reference_image, one, colour) for one in images]
     masked = any(one.masked is not None for one in images)
     return Scorer(
-        cameras, looks, colour, mode, threads, origin, [_pixel_count(one) for one in images] if masked else None
+        cameras, references, colour, mode, threads, origin, [_pixel_count(one) for one in images] if masked else None
     )
 
 
@@ -204,26 +204,26 @@ def evaluate(
     background: F32,
     lpips: Distance | None = None,
 ) -> dict[str, Any]:
-    """Compare renders with photographs.
+    """Compare renders with images of a data set.
 
     Args:
         render: renders a camera's view, [H, W, 3].
         images: at least one.
-        background: [3], behind photographs that have an alpha channel; `render` uses the same.
+        background: [3], behind images that have an alpha channel; `render` uses the same.
         lpips: the perceptual distance, or `None`.
 
     Returns:
         The fields of `csplat_render.metrics.Scores` for all images together.
     """
-    judge = photograph_scorer(images, background)
-    each = [judge.score(number, render(camera), lpips=lpips) for number, camera in enumerate(judge.cameras)]
+    scorer = photograph_scorer(images, background)
+    each = [scorer.score(number, render(camera), lpips=lpips) for number, camera in enumerate(scorer.cameras)]
     return Scores.of(each).as_json()
 
 
 def _reference_image(image: PosedImage, background: F32) -> ReferenceImage:
     shown = compose(image, background, np.empty((image.camera.H, image.camera.W, 3), np.float32))
     covered = image.pixels[..., 3] >= COVERED_ALPHA * 255.0 if image.has_alpha else None
-    return ReferenceImage(shown, covered, counts=image.mask)
+    return ReferenceImage(shown, covered, mask=image.mask)
 
 
 def _pixel_count(image: PosedImage) -> int:

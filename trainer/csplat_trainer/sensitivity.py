@@ -152,7 +152,7 @@ def measure_sensitivity(
 
     Raises:
         InputError: there is no camera.
-        LimitError: a image has more than `rasterise.MAX_INTERSECTIONS`.
+        LimitError: an image has more than `rasterise.MAX_INTERSECTIONS`.
     """
     if not cameras:
         raise InputError("measuring sensitivity wants a camera at least")

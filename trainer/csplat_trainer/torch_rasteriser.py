@@ -13,7 +13,7 @@ from torch.autograd import Function
 
 from csplat.errors import InputError
 from csplat_render.camera import Camera
-from csplat_render.conventions import SplatArrays
+from csplat_render.conventions import UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
 
 _GROUPS = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -72,7 +72,7 @@ class _Render(Function):
         dtype = arrays[0].dtype.type
         ctx.rasteriser = Rasteriser("standard", dtype)
         result = ctx.rasteriser.forward(
-            SplatArrays(*arrays), camera, background=background, antialiased=antialiased, sh_degree=sh_degree
+            UncheckedSplats(*arrays), camera, background=background, antialiased=antialiased, sh_degree=sh_degree
         )
         ctx.shapes = [tensor.shape for tensor in tensors]
         return torch.from_numpy(result.rgb.astype(dtype, copy=True))

@@ -100,7 +100,7 @@ def side_by_side(*images: F32) -> F32:
 
 
 def save_image(path: str | Path, image: F32) -> None:
-    """Write a image, [H, W, 3] float in 0..1 (clipped), as a PNG."""
+    """Write an image, [H, W, 3] float in 0..1 (clipped), as a PNG."""
     from PIL import Image
 
     rounded = np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)

@@ -14,7 +14,7 @@ from csplat.encoder import FixedQuantisation, FreeValues
 from csplat.model import SplatModel
 from csplat.types import F32, Mask, Progress
 from csplat_render import Camera
-from csplat_render.conventions import Gradients, HasSplats, SplatArrays
+from csplat_render.conventions import Gradients, HasSplats, UncheckedSplats
 from csplat_render.metrics import squared_error
 from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_render.rasteriser import Rasteriser
@@ -99,7 +99,7 @@ def quantisation_aware_refit(
 class _FittedValues(Protocol):
     """The values that are fitted, and the splats that are rendered from them."""
 
-    def seen(self) -> SplatArrays: ...
+    def seen(self) -> UncheckedSplats: ...
 
     def step(self, gradients: Gradients, rates: dict[str, float]) -> None: ...
 
@@ -163,9 +163,9 @@ class _FloatValues:
         parameters.beta2 = _BETA2
         return cls(model.means, parameters, free)
 
-    def seen(self) -> SplatArrays:
+    def seen(self) -> UncheckedSplats:
         v = self.parameters.values
-        return SplatArrays(self.means, v["quats"], v["scales"], self.parameters.alphas, v["sh0"], v["shN"])
+        return UncheckedSplats(self.means, v["quats"], v["scales"], self.parameters.alphas, v["sh0"], v["shN"])
 
     def step(self, gradients: Gradients, rates: dict[str, float]) -> None:
         alphas = self.parameters.alphas
@@ -215,11 +215,11 @@ class _QuantisedValues:
     _seen: Any = None
     _costs: RateTerm | None = None
 
-    def seen(self) -> SplatArrays:
+    def seen(self) -> UncheckedSplats:
         self._seen = None  # as large as the scene
         self._seen, self._alphas = self.tuned.seen()
         s = self._seen
-        return SplatArrays(s.means, s.quats, s.scales, s.opacities, s.sh0, s.shN)
+        return UncheckedSplats(s.means, s.quats, s.scales, s.opacities, s.sh0, s.shN)
 
     def step(self, gradients: Gradients, rates: dict[str, float]) -> None:
         assert self._alphas is not None
@@ -281,7 +281,7 @@ def refit_with_bands(
         model,
         cameras[:deciding],
         background=options.background,
-        on_picture=add,
+        on_render=add,
         threads=options.threads,
         progress=progress,
     )

@@ -150,7 +150,7 @@ def check_target(source: SplatModel, target: Target, encoding: EncodeOptions, *,
 
 def _is_empty(judge: Scorer) -> bool:
     """Return True if every test image has a single colour."""
-    pictures = (judge.look(number).picture for number in range(len(judge.cameras)))
+    pictures = (judge.reference(number).rgb for number in range(len(judge.cameras)))
     return all(np.ptp(picture, axis=(0, 1)).max() == 0.0 for picture in pictures)
 
 

@@ -115,7 +115,7 @@ class _SlicedRender:
 
         self._scene, self._camera, self._background = scene, camera, background
         self._rasteriser = Rasteriser(mode, gradients=False, threads=threads)
-        self._state = self._rasteriser.begun(camera)
+        self._state = self._rasteriser.initial_state(camera)
         self._layout, self._splat_bytes = scene.layout, scene.splat_bytes
         self._ignored, self._visible, self._done, self._pairs = 0, 0, 0, 0
         self._last: RenderResult | None = None
@@ -139,7 +139,7 @@ class _SlicedRender:
 
     def _looked(self, splats: HasSplats) -> tuple[F32, F64, int]:
         """Return depths and bytes of memory for drawing, both 0 for invisible splats; and the number of ignored."""
-        seen = self._rasteriser.seen(splats, self._camera, antialiased=self._scene.scene.facts.antialiased)
+        seen = self._rasteriser.find_visible(splats, self._camera, antialiased=self._scene.scene.facts.antialiased)
         return seen.near, np.where(seen.near > 0, self._splat_bytes + _PAIR_BYTES * seen.tiles, 0.0), seen.ignored
 
     def _blocks(self) -> Iterator[Source]:

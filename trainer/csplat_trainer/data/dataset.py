@@ -103,7 +103,7 @@ class DataSet:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A image that is known but not read.
+    """An image that is known but not read.
 
     Attributes:
         name: as the set writes it.
@@ -395,7 +395,7 @@ def _read_mask(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | N
 
 
 def _undistort(pixels: U8, lens: Lens, straight: Lens) -> U8:
-    """Straighten a image, linear between pixels, colours weighted by their alpha."""
+    """Straighten an image, linear between pixels, colours weighted by their alpha."""
     height, width = pixels.shape[:2]
     v, u = np.mgrid[0:height, 0:width] + 0.5
     x, y = distorted(u, v, lens, straight)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from csplat_trainer.tuning.tuned_file import Clock, Finetuned, finetune
+from csplat_trainer.tuning.tuned_encoding import Clock, Finetuned, finetune
 from csplat_trainer.tuning.tuning_loop import FinetuneResult, TuningStep, tune
 from csplat_trainer.tuning.tuning_options import FinetuneOptions, TuningView, TuningViews, renders_of, split_views
 

@@ -23,7 +23,7 @@ from csplat.encoder import DecodedValues, FixedQuantisation, FreeValues
 from csplat.errors import InputError
 from csplat.files import atomic_writer
 from csplat.types import F32
-from csplat_render.conventions import SplatArrays
+from csplat_render.conventions import UncheckedSplats
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.rasteriser import Rasteriser
 from csplat_trainer.image_gains import ImageGain, ImageGains
@@ -266,7 +266,7 @@ class _TuningRun:
         }
 
     def _render(self, seen: DecodedValues, view: TuningView) -> F32:
-        splats = SplatArrays(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
+        splats = UncheckedSplats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
         return self._rasteriser.forward(
             splats, view.camera, background=self._views.background, antialiased=self._antialiased
         ).rgb

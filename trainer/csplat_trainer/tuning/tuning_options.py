@@ -127,7 +127,7 @@ class TuningView:
         wanted: a photograph, or [H, W, 3] float16 or float32: the reference image.
 
     Raises:
-        InputError: a image of another size.
+        InputError: an image of another size.
     """
 
     camera: Camera

@@ -114,9 +114,9 @@ def open_subject(name: str, known: Mapping[str, Capture], out: Path, lpips: Dist
     )
     judge, teachers = found.photograph_test_scorer(), list(found.training)
     if views and views < len(judge.cameras):
-        judge = judge.some([number * len(judge.cameras) // views for number in range(views)])
+        judge = judge.subset([number * len(judge.cameras) // views for number in range(views)])
     cameras = list(judge.cameras)
-    wanted = [judge.look(number).picture for number in range(len(cameras))]
+    wanted = [judge.reference(number).rgb for number in range(len(cameras))]
     by = f"{len(cameras)} photographs of {cameras[0].W}×{cameras[0].H} that were held out"
     judged = Views(cameras, wanted, scene.background, lpips)
     return Subject(name, source, ply, training, judged, teachers, by, found)
