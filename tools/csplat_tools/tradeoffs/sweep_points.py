@@ -301,7 +301,7 @@ class Measurer:
             else Scorer.of_source(setting.source, shown, views.test_background, threads=threads)
         )
         self._photographs = views.photograph_judge(threads=threads) if views.photographs else None
-        places = evenly(range(len(views.judges)), TIMED_VIEWS)
+        places = evenly_spaced(range(len(views.judges)), TIMED_VIEWS)
         self._timed = [(views.judges[place], self._judge.reference(place).rgb) for place in places]
         self.source_modes: dict[str, ModeTime] = {mode: self._mode_time(setting.source, mode) for mode in modes}
         self.source_photographs = self._source_scores()
