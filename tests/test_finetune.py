@@ -257,7 +257,7 @@ def test_a_step_moves_values_through_their_quantisers(coarse, views):
     rasteriser, view = Rasteriser(), views.train[0]
     seen, alphas = scene.seen()
     splats = UncheckedSplats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
-    wanted = view.picture(BLACK, np.empty((H, W, 3), np.float32))
+    wanted = view.image(BLACK, np.empty((H, W, 3), np.float32))
     _, slope = PhotometricLoss(H, W)(rasteriser.forward(splats, view.camera, background=BLACK).rgb, wanted)
     rates = {"means": 0.0, "quats": 1e-4, "scales": 1e-4, "sizes": 0.0, "logits": 1e-4, "sh0": 1e-4, "shN": 1e-4}
     scene.step(rasteriser.backward(slope), seen, alphas, rates, None)

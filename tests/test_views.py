@@ -116,9 +116,9 @@ def test_validation_photographs_of_a_set_decide(sets, scene, tmp_path):
     for validation_count in (None, 0):
         views = find_view_set(scene, data=data, validation_count=validation_count)
         roles = [list(range(8)), [8, 9, 10, 11], [12, 13, 14, 15]]
-        assert roles == [numbers(role) for role in (views.teaches, views.decides, views.judges)]
-    assert 4 == len(views.photograph_decider().references)
-    assert (6, 2, 4) == tuple(map(len, poses(find_view_set(scene, data=data, aside=2))))
+        assert roles == [numbers(role) for role in (views.training, views.validation, views.test)]
+    assert 4 == len(views.photograph_validation_scorer().references)
+    assert (6, 2, 4) == tuple(map(len, poses(find_view_set(scene, data=data, validation_count=2))))
     assert (0, 0, 8) == tuple(map(len, poses(find_view_set(scene, data=data, split="train"))))
 
 

@@ -301,7 +301,7 @@ def compare(
         judge = views.test_scorer(first, mode=mode, background=background, progress=progress)
         quality = judge.scores(second, lpips=distance, on_view=_all_of(viewers), progress=progress)
         return Comparison(
-            source, other, errors, quality, judge.look(0).ignored, views.name,
+            source, other, errors, quality, judge.reference(0).ignored, views.name,
             None if photograph_scores is None else {"split": views.split, **photograph_scores.as_json()},
             views.background, mode, views.notes, time.perf_counter() - start,
         )  # fmt: skip
@@ -366,7 +366,7 @@ class _ImageWriter:
         self._photographs, self._amplification = photographs, amplification
 
     def __call__(self, number: int, a: F32, b: F32) -> None:
-        shown = None if self._photographs is None else self._photographs.look(number).picture
+        shown = None if self._photographs is None else self._photographs.reference(number).rgb
         write_png(self._target / self._files[number], side_by_side(a, b, self._amplification, shown))
 
 

@@ -300,9 +300,9 @@ class Measurer:
             if shown is views.test
             else Scorer.of_source(setting.source, shown, views.test_background, threads=threads)
         )
-        self._photographs = views.photograph_judge(threads=threads) if views.photographs else None
-        places = evenly_spaced(range(len(views.judges)), TIMED_VIEWS)
-        self._timed = [(views.judges[place], self._judge.reference(place).rgb) for place in places]
+        self._photographs = views.photograph_test_scorer(threads=threads) if views.photographs else None
+        places = evenly_spaced(range(len(views.test)), TIMED_VIEWS)
+        self._timed = [(views.test[place], self._judge.reference(place).rgb) for place in places]
         self.source_modes: dict[str, ModeTime] = {mode: self._mode_time(setting.source, mode) for mode in modes}
         self.source_photographs = self._source_scores()
 
