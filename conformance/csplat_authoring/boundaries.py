@@ -14,8 +14,8 @@ from typing import Any, Final
 
 from csplat import _spec
 from csplat_authoring._rules import CHOICES, MASKS, RANGES, Choice, Mask, Range
-from csplat_authoring.broken import patched
 from csplat_authoring.builder import Built, build
+from csplat_authoring.invalid import invalid_recipe
 from csplat_authoring.samples import MEANS, SH0, Recipe, attributes, morton, rich_scene, rows_of, scene, sparse, tile
 
 Rule = Range | Choice | Mask
@@ -133,7 +133,7 @@ def boundary_recipes() -> list[Recipe]:
                 continue
         of = f"_{rule.of.lower().replace(' ', '_')}" if rule.of else ""
         result.append(
-            patched(
+            invalid_recipe(
                 f"{rule.structure}_{rule.field}{of}_{case.suffix}",
                 f"{rule.field} of the structure {rule.structure} is {case.value}",
                 rule.clause,

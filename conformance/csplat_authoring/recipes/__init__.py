@@ -1,31 +1,19 @@
-"""Recipes of all vectors."""
+"""Recipes of all vectors: those that tables declare (`declaration`), and those that code makes."""
 
 from __future__ import annotations
 
+import math
 from functools import cache, lru_cache
 from typing import Any
 
 from numpy.typing import NDArray
 
 from csplat_authoring.boundaries import boundary_recipes
+from csplat_authoring.declaration import declared_recipes
 from csplat_authoring.recipes.deflate_streams import invalid_deflate_recipes, valid_deflate_recipes
 from csplat_authoring.recipes.edges import edge_recipes
-from csplat_authoring.recipes.extreme import extreme_recipes
 from csplat_authoring.recipes.extreme_streams import extreme_stream_recipes
-from csplat_authoring.recipes.growth import invalid_growth_recipes, valid_growth_recipes
-from csplat_authoring.recipes.invalid_alone import alone_recipes
-from csplat_authoring.recipes.invalid_alone_blocks import alone_block_recipes
-from csplat_authoring.recipes.invalid_alone_books import alone_book_recipes
-from csplat_authoring.recipes.invalid_alone_streams import alone_stream_recipes
-from csplat_authoring.recipes.invalid_alone_tiles import alone_tile_recipes
-from csplat_authoring.recipes.invalid_blocks import block_recipes
-from csplat_authoring.recipes.invalid_chunks import chunk_recipes
-from csplat_authoring.recipes.invalid_codebooks import codebook_recipes
-from csplat_authoring.recipes.invalid_header import header_recipes
-from csplat_authoring.recipes.invalid_index import index_recipes
-from csplat_authoring.recipes.invalid_records import record_recipes
-from csplat_authoring.recipes.invalid_streams import stream_recipes
-from csplat_authoring.recipes.invalid_tiles import tile_recipes
+from csplat_authoring.recipes.invalid_bytes import invalid_bytes_recipes
 from csplat_authoring.recipes.rendered import rendered_recipes
 from csplat_authoring.recipes.texts import bad_text_recipes, good_text_recipes
 from csplat_authoring.recipes.valid import valid_recipes
@@ -34,6 +22,7 @@ from csplat_authoring.recipes.valid_streams import valid_stream_recipes
 from csplat_authoring.reference import expected
 from csplat_authoring.samples import Recipe
 from csplat_authoring.scene import Scene
+from csplat_conformance.manifest import load
 
 __all__ = ["all_recipes", "exact_floats", "sound_recipes"]
 
@@ -44,39 +33,26 @@ def sound_recipes() -> list[Recipe]:
         valid_recipes,
         valid_stream_recipes,
         combined_recipes,
-        extreme_recipes,
         extreme_stream_recipes,
         valid_deflate_recipes,
         edge_recipes,
-        valid_growth_recipes,
         good_text_recipes,
         rendered_recipes,
     )
-    return [recipe for make in makers for recipe in make()]
+    return _ordered([*declared_recipes("valid", "extreme"), *(recipe for make in makers for recipe in make())])
 
 
 def all_recipes() -> list[Recipe]:
     """Return every recipe, in the order of the manifest."""
-    makers = (
-        header_recipes,
-        boundary_recipes,
-        index_recipes,
-        record_recipes,
-        tile_recipes,
-        chunk_recipes,
-        stream_recipes,
-        invalid_deflate_recipes,
-        block_recipes,
-        codebook_recipes,
-        alone_recipes,
-        alone_tile_recipes,
-        alone_stream_recipes,
-        alone_block_recipes,
-        alone_book_recipes,
-        invalid_growth_recipes,
-        bad_text_recipes,
-    )
-    return [*sound_recipes(), *(recipe for make in makers for recipe in make())]
+    makers = (boundary_recipes, invalid_deflate_recipes, bad_text_recipes, invalid_bytes_recipes)
+    invalid = [*declared_recipes("invalid"), *(recipe for make in makers for recipe in make())]
+    return _ordered([*sound_recipes(), *invalid])
+
+
+def _ordered(recipes: list[Recipe]) -> list[Recipe]:
+    """Return recipes in the order that the manifest has them in, new ones last: a change to it stays short."""
+    places = {vector.name: place for place, vector in enumerate(load())}
+    return sorted(recipes, key=lambda recipe: places.get(recipe.name, math.inf))
 
 
 @lru_cache(maxsize=8)

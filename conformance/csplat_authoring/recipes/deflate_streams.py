@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from csplat_authoring.broken import whole
 from csplat_authoring.builder import build
 from csplat_authoring.deflate import END_OF_BLOCK, Deflate, flat_lengths
+from csplat_authoring.invalid import invalid_recipe
 from csplat_authoring.samples import MEANS, OPACITIES, QUATS, SCALES, SH0, Recipe, axis, levels, scene, signed, tile
 from csplat_authoring.scene import Scene, Stream
 
@@ -44,7 +44,9 @@ def valid_deflate_recipes() -> list[Recipe]:
 def invalid_deflate_recipes() -> list[Recipe]:
     """Return recipes of streams that a decoder refuses."""
     return [
-        whole(f"deflate_{case.name}", case.why, case.clause, "E_CODER", _scene(case), f"{_place(case)}.coded")
+        invalid_recipe(
+            f"deflate_{case.name}", case.why, case.clause, "E_CODER", _scene(case), at=f"{_place(case)}.coded"
+        )
         for case in broken_streams()
     ]
 

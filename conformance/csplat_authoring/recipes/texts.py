@@ -6,8 +6,8 @@ import math
 from typing import Final
 
 from csplat import _spec
-from csplat_authoring.broken import whole
 from csplat_authoring.builder import build
+from csplat_authoring.invalid import invalid_recipe
 from csplat_authoring.samples import Recipe, scene
 from csplat_authoring.scene import Chunk, Scene, StatedErrors
 
@@ -181,11 +181,11 @@ def _valid(name: str, why: str, clause: str, made: Scene) -> Recipe:
 
 def _bad(name: str, kind: bytes, text: bytes, why: str) -> Recipe:
     made, at = scene(tiles=[], chunks=(Chunk(kind, text),)), f"{kind.decode()}/stream.width"
-    return whole(f"json_{name}", why, "JSN-1", "E_JSON", made, at)
+    return invalid_recipe(f"json_{name}", why, "JSN-1", "E_JSON", made, at=at)
 
 
 def _bad_error(name: str, why: str, measure: str, largest: float, rms: float) -> Recipe:
     ids = {word: value for value, word in _spec.MEASURE_NAMES.items()}
     errors = StatedErrors(2, records=((ids[measure], largest, rms),))
     made = scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=errors),))
-    return whole(name, why, "SER-2", "E_VALUE", made, f"SERR/record[{measure}].max")
+    return invalid_recipe(name, why, "SER-2", "E_VALUE", made, at=f"SERR/record[{measure}].max")
