@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from encoder_faults import run
+from encoder_faults.table import FAULTS
 from typer.testing import CliRunner
-from wrong_encoders import finding
-from wrong_encoders.mistakes import MISTAKES
 
 import csplat
 import csplat_conformance.conformance_report as report_module
@@ -171,8 +171,8 @@ def test_our_encoder_passes_at_other_presets(preset):
 def test_our_encoder_keeps_the_picture(preset, decibels):
     names = ["ordinary/degree_3", "ordinary/needles_and_discs", "ordinary/glossy"]
     names = names if preset == "balanced" else names[:1]
-    choice = EncoderSuiteOptions(",".join(names), ("L4",), psnr_min=decibels, jobs=1)
-    report = run_encoder(PLACES, choice, render_score=finding.psnr, run=encoder_here(preset))
+    choice = EncoderChoice(",".join(names), ("L4",), psnr_min=decibels, jobs=1)
+    report = run_encoder(PLACES, choice, pictures=run.psnr, run=encoder_here(preset))
 
     assert {*names} == {one.name for one in report.outcomes}
     assert [] == report.failures
@@ -258,7 +258,7 @@ def test_reports_are_written_for_people_programs_and_ci(tmp_path):
 
 
 def test_failures_are_shown_with_their_clause(tmp_path):
-    command = copying(tmp_path, "ordinary/degree_1", MISTAKES["max_scale_linear"].data)
+    command = copying(tmp_path, "ordinary/degree_1", FAULTS["max_scale_linear"].data)
     result = invoke("--cmd", command, "--filter", "ordinary/degree_1", "--level", "1", "--junit", "-")
 
     assert 1 == result.exit_code

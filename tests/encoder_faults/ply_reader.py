@@ -1,4 +1,4 @@
-"""Mistakes in reading a PLY: columns, rows, numbers, header."""
+"""Faults in reading a PLY: columns, rows, numbers, header."""
 
 import io
 
@@ -7,9 +7,9 @@ import numpy as np
 from csplat import ply
 from csplat.model import normalise_quats
 from csplat.ply import columns as ply_columns
-from wrong_encoders import plyrows
-from wrong_encoders.mistake import DENSE, Harm, Mistake, changed, floats, replaced
-from wrong_encoders.truth import as_read
+from encoder_faults import source
+from encoder_faults.fault import DENSE, EncoderFault, Harm, changed, floats, replaced
+from encoder_faults.source import as_read
 
 QUATS = "ordinary/quaternions,*/*tiny*quat*,*/*huge*quat*,*/*quat*tiny*,*/*quat*huge*"
 
@@ -103,16 +103,16 @@ def counted_by_size(head, body):
     """Let the size of the file say how many splats there are."""
     if b"format ascii" in head:
         return head, body
-    count, width = len(plyrows.parsed(head + body)), plyrows.parsed(head + body).dtype.itemsize
+    count, width = len(source.parsed(head + body)), source.parsed(head + body).dtype.itemsize
     return head.replace(f"vertex {count}".encode(), f"vertex {len(body) // width}".encode()), body
 
 
 def whole_bands(data):
     """Take as many columns f_rest as make whole bands."""
-    names = [name for name in plyrows.parsed(data).dtype.names if name.startswith("f_rest_")]
+    names = [name for name in source.parsed(data).dtype.names if name.startswith("f_rest_")]
     names.sort(key=lambda name: int(name.removeprefix("f_rest_")))
     for name in names[max(k for k in (0, 9, 24, 45) if k <= len(names)) :]:
-        data = plyrows.without(name)(data)
+        data = source.without(name)(data)
     return data
 
 
@@ -134,22 +134,22 @@ def as_text(read):
 
 
 L3 = ("L3", "SER-5")
-MISTAKES = {
+FAULTS = {
     # columns
-    "channel_order": Mistake(
+    "channel_order": EncoderFault(
         "f_rest holds red, green, blue of one coefficient after the other",
         Harm.PICTURE,
         L3,
         scene=changed(shN=coefficient_major),
     ),
-    "quats_xyzw": Mistake(
+    "quats_xyzw": EncoderFault(
         "w is the last component", Harm.PICTURE, L3, scene=changed(quats=lambda m: np.roll(m.quats, 1, axis=1))
     ),
-    "logit_as_alpha": Mistake("the column opacity holds alpha", Harm.PICTURE, L3, scene=changed(opacities=logits)),
-    "sigmoid_twice": Mistake(
+    "logit_as_alpha": EncoderFault("the column opacity holds alpha", Harm.PICTURE, L3, scene=changed(opacities=logits)),
+    "sigmoid_twice": EncoderFault(
         "a library's opacities are logits, too", Harm.PICTURE, L3, scene=changed(opacities=sigmoid)
     ),
-    "sigmoid_twice_honest": Mistake(
+    "sigmoid_twice_honest": EncoderFault(
         "the same, and errors are measured from the file",
         Harm.PICTURE,
         ("L4", ""),
@@ -157,24 +157,24 @@ MISTAKES = {
         scene=changed(opacities=sigmoid),
         honest=as_read,
     ),
-    "scale_not_log": Mistake(
+    "scale_not_log": EncoderFault(
         "scales are standard deviations", Harm.PICTURE, L3, scene=changed(scales=lambda m: np.exp(m.scales))
     ),
-    "band_sign": Mistake("band 1 has the other sign", Harm.PICTURE, L3, scene=changed(shN=without_band_sign)),
-    "rgb_for_sh0": Mistake(
+    "band_sign": EncoderFault("band 1 has the other sign", Harm.PICTURE, L3, scene=changed(shN=without_band_sign)),
+    "rgb_for_sh0": EncoderFault(
         "f_dc is a colour",
         Harm.PICTURE,
         L3,
         scene=changed(sh0=lambda m: np.float32(0.5) + np.float32(0.28209479) * m.sh0),
     ),
-    "columns_by_place": Mistake(
+    "columns_by_place": EncoderFault(
         "columns stand where they always stand",
         Harm.PICTURE,
         ("L2", "CNF-6"),
         "ordinary/column_order",
-        ply=plyrows.header(columns_by_place),
+        ply=source.header(columns_by_place),
     ),
-    "rest_cut_to_bands": Mistake(
+    "rest_cut_to_bands": EncoderFault(
         "columns f_rest beyond the last whole band do not count",
         Harm.FILES,
         ("L1", ""),
@@ -182,16 +182,16 @@ MISTAKES = {
         ply=whole_bands,
     ),
     # rotations
-    "quats_not_normalised": Mistake(
+    "quats_not_normalised": EncoderFault(
         "quaternions in a PLY are unit length", Harm.PICTURE, L3, scene=changed(quats=not_normalised)
     ),
-    "rotation_conjugated": Mistake(
+    "rotation_conjugated": EncoderFault(
         "a quaternion turns the world, not the splat",
         Harm.PICTURE,
         L3,
         scene=changed(quats=lambda m: m.quats * np.float32([1, -1, -1, -1])),
     ),
-    "rotation_conjugated_honest": Mistake(
+    "rotation_conjugated_honest": EncoderFault(
         "the same, and errors are measured from the file",
         Harm.PICTURE,
         ("L4", ""),
@@ -199,20 +199,20 @@ MISTAKES = {
         scene=changed(quats=lambda m: m.quats * np.float32([1, -1, -1, -1])),
         honest=as_read,
     ),
-    "quats_half_precision": Mistake(
+    "quats_half_precision": EncoderFault(
         "a rotation can be normalised in float16",
         Harm.BOUND,
         L3,
         scene=changed(quats=lambda m: in_half(m.quats)),
     ),
-    "tiny_quats_identity": Mistake(
+    "tiny_quats_identity": EncoderFault(
         "a quaternion whose squares vanish in float32 has length 0",
         Harm.PICTURE,
         L3,
         QUATS,
         stage=identity_where(lambda squared: squared < 1e-30),
     ),
-    "huge_quats_identity": Mistake(
+    "huge_quats_identity": EncoderFault(
         "a quaternion that gives NaN is none",
         Harm.PICTURE,
         L3,
@@ -220,97 +220,97 @@ MISTAKES = {
         stage=identity_where(lambda squared: (squared == 0.0) | ~np.isfinite(squared)),
     ),
     # rows
-    "last_splat_dropped": Mistake(
+    "last_splat_dropped": EncoderFault(
         "the header counts one splat too many",
         Harm.PICTURE,
         ("L2", "SRC-1"),
         scene=lambda model: model.select(slice(0, -1)),
     ),
-    "nan_as_zero": Mistake(
+    "nan_as_zero": EncoderFault(
         "what is not a number is 0",
         Harm.PICTURE,
         ("L2", "SRC-1"),
         "nasty/not_a_number",
-        ply=plyrows.each("", lambda column: np.where(np.isnan(column), 0, column)),
+        ply=source.each("", lambda column: np.where(np.isnan(column), 0, column)),
     ),
-    "zero_quats_dropped": Mistake(
+    "zero_quats_dropped": EncoderFault(
         "a splat without a rotation is none",
         Harm.PICTURE,
         ("L2", "SRC-1"),
         "nasty/zero_quaternion",
-        ply=plyrows.kept(lambda columns: columns["rot_0"] != 0),
+        ply=source.kept(lambda columns: columns["rot_0"] != 0),
     ),
-    "infinite_logits_dropped": Mistake(
+    "infinite_logits_dropped": EncoderFault(
         "whatever is not finite is dropped",
         Harm.PICTURE,
         ("L2", "SRC-1"),
         "nasty/infinite_logits",
-        ply=plyrows.kept(lambda columns: np.isfinite(columns["opacity"])),
+        ply=source.kept(lambda columns: np.isfinite(columns["opacity"])),
     ),
-    "infinite_scales_kept": Mistake(
+    "infinite_scales_kept": EncoderFault(
         "a scale of -inf is the smallest that float32 holds",
         Harm.FACTS,
         ("L2", "SRC-1"),
         "nasty/*inf*scale*,nasty/*scale*inf*,nasty/flat*",
-        ply=plyrows.each("scale_", lambda column: np.maximum(column, -88)),
+        ply=source.each("scale_", lambda column: np.maximum(column, -88)),
     ),
-    "trailing_bytes_read": Mistake(
+    "trailing_bytes_read": EncoderFault(
         "the size of the file says how many splats there are",
         Harm.FACTS,
         ("L2", "CNF-6"),
         "*/*trailing*",
-        ply=plyrows.header(counted_by_size),
+        ply=source.header(counted_by_size),
     ),
     # numbers
-    "big_endian_ignored": Mistake(
+    "big_endian_ignored": EncoderFault(
         "every PLY is little-endian",
         Harm.PICTURE,
         ("L2", "CNF-6"),
         "ordinary/big_endian",
-        ply=plyrows.header(little_endian),
+        ply=source.header(little_endian),
     ),
-    "text_of_five_digits": Mistake(
-        "%g is enough for a float", Harm.BOUND, L3, "ordinary/ascii", ply=plyrows.each("", five_digits)
+    "text_of_five_digits": EncoderFault(
+        "%g is enough for a float", Harm.BOUND, L3, "ordinary/ascii", ply=source.each("", five_digits)
     ),
-    "six_digits": Mistake(
+    "six_digits": EncoderFault(
         "positions can go through a text file",
         Harm.BOUND,
         L3,
         "nasty/far_coordinates",
         stage=replaced(ply, "read_ply", as_text),
     ),
-    "doubles_as_single": Mistake(
+    "doubles_as_single": EncoderFault(
         "all columns are floats",
         Harm.PICTURE,
         ("L2", "CNF-6"),
         "nasty/far_doubles",
         scene=changed(means=absolute_in_single, origin=lambda _: (0.0, 0.0, 0.0)),
     ),
-    "sigmoid_in_single": Mistake(
+    "sigmoid_in_single": EncoderFault(
         "float32 is enough for a logistic function",
         Harm.HARMLESS,
         stage=replaced(ply_columns, "alpha_of_logits", sigmoid_in_single),
     ),
-    "logits_clipped": Mistake(
+    "logits_clipped": EncoderFault(
         "logits beyond 10 look like 10",
         Harm.HARMLESS,
         inputs="ordinary/transparent_and_opaque",
-        ply=plyrows.each("opacity", lambda column: np.clip(column, -10, 10)),
+        ply=source.each("opacity", lambda column: np.clip(column, -10, 10)),
         honest=as_read,
     ),
     # header
-    "crlf_header": Mistake(
+    "crlf_header": EncoderFault(
         "data begin one byte after the word end_header",
         Harm.PICTURE,
         ("L2", "CNF-6"),
         "*/*crlf*",
-        ply=plyrows.header(one_byte_early),
+        ply=source.header(one_byte_early),
     ),
-    "face_element_first": Mistake(
+    "face_element_first": EncoderFault(
         "splats are the first element of a PLY",
         Harm.PICTURE,
         ("L2", "CNF-6"),
         "*/*face*",
-        ply=plyrows.header(faces_forgotten),
+        ply=source.header(faces_forgotten),
     ),
 }

@@ -1,4 +1,4 @@
-"""The type of a mistake, and ways of making one."""
+"""The type of a fault, and ways of making one."""
 
 import contextlib
 import dataclasses
@@ -24,7 +24,7 @@ Bytes = Callable[[bytes], bytes]
 
 
 class Harm(StrEnum):
-    """The harm that a mistake does to users of the file."""
+    """The harm that a fault does to users of the file."""
 
     VALIDITY = "validity"  #: a decoder refuses it, or there is no file
     PICTURE = "picture"  #: it looks wrong
@@ -33,12 +33,12 @@ class Harm(StrEnum):
     DETERMINISM = "determinism"  #: the same input gives other bytes
     FILES = "files"  #: files of the user are changed or left about, or cannot be encoded
     COARSE = "coarse"  #: legal and honest, and far worse than need be, or refused though it need not: worth a warning
-    HARMLESS = "harmless"  #: no mistake at all: a freedom that encoders have, and that the suite must leave them
+    HARMLESS = "harmless"  #: no fault at all: a freedom that encoders have, and that the suite must leave them
 
 
 @dataclass(frozen=True)
-class Mistake:
-    """One mistake.
+class EncoderFault:
+    """One fault.
 
     Attributes:
         why: the author's wrong belief.
@@ -75,7 +75,7 @@ class Mistake:
 
     @property
     def is_late(self) -> bool:
-        """True if the mistake is made after our encoder has finished."""
+        """True if the fault is made after our encoder has finished."""
         early = (self.ply, self.scene, self.keep)
         return all(change is None for change in early) and self.stage is contextlib.nullcontext
 

@@ -1,21 +1,12 @@
-"""Mistakes in what is made of a scene before it is coded: precision, range, choice, frame, facts."""
+"""Faults in what is made of a scene before it is coded: precision, range, choice, frame, facts."""
 
 import os
 
 import numpy as np
 
 from csplat.model import SplatModel
-from wrong_encoders.mistake import (
-    DEGREE_2,
-    DEGREE_3,
-    DENSE,
-    STRONG,
-    Harm,
-    Mistake,
-    changed,
-    floats,
-)
-from wrong_encoders.truth import as_read, in_binary64
+from encoder_faults.fault import DEGREE_2, DEGREE_3, DENSE, STRONG, EncoderFault, Harm, changed, floats
+from encoder_faults.source import as_read, in_binary64
 
 L3 = ("L3", "SER-5")
 FAR, INVENTED = ("L2", "CNF-6"), ("L2", "SRC-3")
@@ -76,27 +67,27 @@ def mirrored(model: SplatModel) -> SplatModel:
     return changed(quats=lambda m: m.quats[:, [1, 0, 3, 2]] * np.float32([-1, 1, -1, 1]))(model)
 
 
-MISTAKES = {
+FAULTS = {
     # precision and range
-    "half_precision": Mistake(
+    "half_precision": EncoderFault(
         "float16 is enough, and errors are measured after it",
         Harm.PICTURE,
         FAR,
         "nasty/far_coordinates",
         scene=half("means"),
     ),
-    "sh_half_precision": Mistake(
+    "sh_half_precision": EncoderFault(
         "float16 is enough for SH, and errors are measured after it", Harm.BOUND, L3, DEGREE_3, scene=half("shN")
     ),
-    "sh_half_precision_honest": Mistake(
+    "sh_half_precision_honest": EncoderFault(
         "the same, and errors are measured from the file",
         Harm.HARMLESS,
         inputs=DEGREE_3,
         scene=half("shN"),
         honest=as_read,
     ),
-    "colours_clipped": Mistake("colours lie within ±2", Harm.PICTURE, L3, STRONG, scene=clipped("sh0", 2)),
-    "colours_clipped_honest": Mistake(
+    "colours_clipped": EncoderFault("colours lie within ±2", Harm.PICTURE, L3, STRONG, scene=clipped("sh0", 2)),
+    "colours_clipped_honest": EncoderFault(
         "colours lie within ±1, and errors say so",
         Harm.PICTURE,
         ("L4", ""),
@@ -104,14 +95,14 @@ MISTAKES = {
         scene=clipped("sh0", 1),
         honest=as_read,
     ),
-    "sh_clipped": Mistake("SH lie within ±1", Harm.PICTURE, L3, STRONG, scene=clipped("shN", 1)),
-    "sh_clipped_honest": Mistake(
+    "sh_clipped": EncoderFault("SH lie within ±1", Harm.PICTURE, L3, STRONG, scene=clipped("shN", 1)),
+    "sh_clipped_honest": EncoderFault(
         "SH lie within ±1, and errors say so", Harm.PICTURE, ("L4", ""), STRONG, scene=clipped("shN", 1), honest=as_read
     ),
-    "scales_clipped": Mistake(
+    "scales_clipped": EncoderFault(
         "scales lie within ±20", Harm.PICTURE, L3, "nasty/huge_scales", scene=clipped("scales", 20)
     ),
-    "needles_thickened_honest": Mistake(
+    "needles_thickened_honest": EncoderFault(
         "no axis need be thinner than a fiftieth of the longest, and errors say so",
         Harm.HARMLESS,
         inputs="ordinary/needles_and_discs",
@@ -119,49 +110,49 @@ MISTAKES = {
         honest=as_read,
     ),
     # choice
-    "duplicates_merged": Mistake(
+    "duplicates_merged": EncoderFault(
         "equal splats are one", Harm.PICTURE, ("L2", "SRC-1"), "nasty/duplicates", scene=merged
     ),
-    "pruned_uncounted": Mistake(
+    "pruned_uncounted": EncoderFault(
         "nobody misses what is nearly transparent",
         Harm.FACTS,
         ("L2", "SRC-1"),
         scene=lambda m: m.select(m.opacities >= 0.1),
     ),
-    "pruned_counted": Mistake(
+    "pruned_counted": EncoderFault(
         "the same, and the file says how many",
         Harm.HARMLESS,
         keep=lambda m: np.flatnonzero(m.opacities >= 0.02),
     ),
-    "pruned_most": Mistake(
+    "pruned_most": EncoderFault(
         "whoever counts what is pruned may prune any",
         Harm.COARSE,
         ("L2", ""),
         keep=lambda m: np.flatnonzero(m.opacities >= np.quantile(m.opacities, 0.6)),
     ),
-    "bands_dropped": Mistake(
+    "bands_dropped": EncoderFault(
         "degree 1 is enough, and errors say so", Harm.COARSE, ("L3", ""), DEGREE_3, options={"sh_degree": 1}
     ),
-    "all_bands_dropped": Mistake(
+    "all_bands_dropped": EncoderFault(
         "colour is sh0, and errors say so", Harm.COARSE, ("L3", ""), DEGREE_2, options={"sh_degree": 0}
     ),
-    "alpha_of_three": Mistake(
+    "alpha_of_three": EncoderFault(
         "three levels of alpha will do, and errors say so", Harm.COARSE, ("L3", ""), options={"opacity_levels": 2}
     ),
-    "coarse": Mistake(
+    "coarse": EncoderFault(
         "honest errors may be of any size",
         Harm.PICTURE,
         ("L4", ""),
         options={"attribute_psnr": 16.0, "sh_coding": "none"},
     ),
     # frame
-    "y_and_z_swapped": Mistake(
+    "y_and_z_swapped": EncoderFault(
         "z points up",
         Harm.PICTURE,
         FAR,
         scene=changed(means=lambda m: np.ascontiguousarray(m.means[:, [0, 2, 1]])),
     ),
-    "rotations_in_another_frame": Mistake(
+    "rotations_in_another_frame": EncoderFault(
         "y and z point the other way, and only rotations notice",
         Harm.PICTURE,
         ("L4", ""),
@@ -169,14 +160,16 @@ MISTAKES = {
         scene=mirrored,
         honest=as_read,
     ),
-    "origin_not_written": Mistake("a viewer centres the scene anyway", Harm.PICTURE, FAR, scene=origin_not_written),
-    "origin_not_subtracted": Mistake(
+    "origin_not_written": EncoderFault(
+        "a viewer centres the scene anyway", Harm.PICTURE, FAR, scene=origin_not_written
+    ),
+    "origin_not_subtracted": EncoderFault(
         "the origin says where the middle is",
         Harm.PICTURE,
         FAR,
         scene=changed(origin=lambda m: tuple((np.array(m.origin) + m.means.mean(axis=0) + 10.0).tolist())),
     ),
-    "own_origin": Mistake(
+    "own_origin": EncoderFault(
         "an encoder chooses the origin",
         Harm.HARMLESS,
         inputs="ordinary/degree_1,nasty/far_doubles",
@@ -184,19 +177,19 @@ MISTAKES = {
         honest=in_binary64,
     ),
     # facts
-    "axes_guessed": Mistake(
+    "axes_guessed": EncoderFault(
         "every scene is right-down-forward", Harm.FACTS, INVENTED, scene=changed(coordinate_system=lambda _: "RDF")
     ),
-    "unit_guessed": Mistake("a unit is a metre", Harm.FACTS, INVENTED, scene=changed(unit_metres=lambda _: 1.0)),
-    "antialiased_guessed": Mistake(
+    "unit_guessed": EncoderFault("a unit is a metre", Harm.FACTS, INVENTED, scene=changed(unit_metres=lambda _: 1.0)),
+    "antialiased_guessed": EncoderFault(
         "trainers filter nowadays", Harm.FACTS, INVENTED, scene=changed(antialiased=lambda _: True)
     ),
-    "flat_guessed": Mistake("discs are faster", Harm.FACTS, INVENTED, scene=changed(flat=lambda _: True)),
-    "degree_always_3": Mistake("every scene has degree 3", Harm.FACTS, INVENTED, scene=of_degree_3),
-    "extra_invented": Mistake(
+    "flat_guessed": EncoderFault("discs are faster", Harm.FACTS, INVENTED, scene=changed(flat=lambda _: True)),
+    "degree_always_3": EncoderFault("every scene has degree 3", Harm.FACTS, INVENTED, scene=of_degree_3),
+    "extra_invented": EncoderFault(
         "a column more does no harm", Harm.FACTS, INVENTED, scene=with_extra, options={"keep_extra": True}
     ),
-    "extra_garbled": Mistake(
+    "extra_garbled": EncoderFault(
         "extra columns need not be sorted with the splats",
         Harm.FACTS,
         INVENTED,
@@ -205,12 +198,14 @@ MISTAKES = {
         options={"keep_extra": True},
     ),
     # chance
-    "order_by_chance": Mistake(
+    "order_by_chance": EncoderFault(
         "the order of splats is nobody's business",
         Harm.DETERMINISM,
         ("L1", ""),
         keep=by_chance,
         options={"means_coding": "axis"},
     ),
-    "temporary_name_kept": Mistake("metadata say what was read", Harm.DETERMINISM, ("L1", ""), scene=from_a_temporary),
+    "temporary_name_kept": EncoderFault(
+        "metadata say what was read", Harm.DETERMINISM, ("L1", ""), scene=from_a_temporary
+    ),
 }

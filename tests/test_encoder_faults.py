@@ -1,4 +1,4 @@
-"""Wrong encoders: each has one mistake, and the suite has to say so; what an encoder is free to do passes."""
+"""Faulty encoders: each has one fault, and the suite has to say so; what an encoder is free to do passes."""
 
 from collections import Counter
 from functools import cache
@@ -6,12 +6,12 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from encoder_faults import file_bytes, run
+from encoder_faults.fault import EncoderFault, Harm
+from encoder_faults.run import encode as encode_wrongly
+from encoder_faults.run import honest
+from encoder_faults.table import FAULTS, GROUPS
 from tables import failures
-from wrong_encoders import finding, serr
-from wrong_encoders.encoding import encode as encode_wrongly
-from wrong_encoders.encoding import honest
-from wrong_encoders.mistake import Harm, Mistake
-from wrong_encoders.mistakes import GROUPS, MISTAKES
 
 import csplat
 from csplat_conformance.conformance_report import Status
@@ -59,82 +59,80 @@ REPRESENTATIVES = (
 
 @pytest.fixture(scope="module")
 def report_of():
-    """Return a function that gives the suite's finding about a mistake."""
-    return cache(finding.find)
+    """Return a function that gives the suite's finding about a fault."""
+    return cache(run.find)
 
 
-def test_there_are_wrong_encoders_of_every_harm():
-    harms = Counter(one.harm for one in MISTAKES.values())
+def test_there_are_faults_of_every_harm():
+    harms = Counter(one.harm for one in FAULTS.values())
 
-    assert set(Harm) == set(harms) == {MISTAKES[name].harm for name in REPRESENTATIVES}
-    assert {"", "L1", "L2", "L3", "L4"} == {MISTAKES[name].caught[0] for name in REPRESENTATIVES}
-    assert len(MISTAKES) - harms[Harm.HARMLESS] >= 55
+    assert set(Harm) == set(harms) == {FAULTS[name].harm for name in REPRESENTATIVES}
+    assert {"", "L1", "L2", "L3", "L4"} == {FAULTS[name].caught[0] for name in REPRESENTATIVES}
+    assert len(FAULTS) - harms[Harm.HARMLESS] >= 55
 
 
-def test_every_mistake_finds_the_functions_that_it_replaces():
-    def check(mistake):
-        with mistake.stage():
-            csplat.EncodeOptions(**mistake.options)
+def test_every_fault_finds_the_functions_that_it_replaces():
+    def check(fault):
+        with fault.stage():
+            csplat.EncodeOptions(**fault.options)
 
-    assert [] == failures(MISTAKES, check)
+    assert [] == failures(FAULTS, check)
 
 
 @in_depth
 @pytest.mark.slow
-def test_mistakes_are_made(tmp_path):
+def test_faults_are_made(tmp_path):
     # One that changes nothing would go unnoticed for no fault of the suite.
-    def check(mistake):
-        names = [one for one in finding.inputs_of(mistake) if one in ENCODABLE]
-        assert not names or any(differs(tmp_path, mistake, one) for one in names)
+    def check(fault):
+        names = [one for one in run.inputs_of(fault) if one in ENCODABLE]
+        assert not names or any(differs(tmp_path, fault, one) for one in names)
 
-    def is_looked_at(mistake):
-        changes = {
-            name: getattr(mistake, name) for name in ("ply", "scene", "keep", "stage", "data", "index", "honest")
-        }
+    def is_looked_at(fault):
+        changes = {name: getattr(fault, name) for name in ("ply", "scene", "keep", "stage", "data", "index", "honest")}
         only_options = all(changes[name] == getattr(NOTHING, name) for name in changes)
-        return mistake.harm is not Harm.HARMLESS and mistake.end is None and not only_options
+        return fault.harm is not Harm.HARMLESS and fault.end is None and not only_options
 
     large = "ordinary/two_tiles"
     assert [] == failures(
-        {name: one for name, one in MISTAKES.items() if is_looked_at(one) and one.inputs != large}, check
+        {name: one for name, one in FAULTS.items() if is_looked_at(one) and one.inputs != large}, check
     )
 
 
-NOTHING = Mistake("nothing", Harm.HARMLESS)
+NOTHING = EncoderFault("nothing", Harm.HARMLESS)
 
 
-def differs(folder, mistake, name):
+def differs(folder, fault, name):
     """Return True if file or index differ from ours."""
     out, index = folder / "out", folder / "index.npy"
-    data, source_index = honest(written(folder, name).read_bytes(), tuple(mistake.options.items()))
-    encode_wrongly(mistake, folder / "in.ply", out, index)
+    data, source_index = honest(written(folder, name).read_bytes(), tuple(fault.options.items()))
+    encode_wrongly(fault, folder / "in.ply", out, index)
     return data != out.read_bytes() or source_index.tobytes() != np.load(index).tobytes()
 
 
 def check_report(name, report):
-    """Assert that the suite reports a mistake as expected."""
-    mistake = MISTAKES[name]
-    level, clause = mistake.caught
-    sign = finding.first_sign(report)
-    if mistake.harm is Harm.HARMLESS:
+    """Assert that the suite reports a fault as expected."""
+    fault = FAULTS[name]
+    level, clause = fault.caught
+    sign = run.first_sign(report)
+    if fault.harm is Harm.HARMLESS:
         assert report.passed
         assert sign is None
         return
     assert sign is not None, "not caught"
-    assert (sign.status is Status.WARNED) == (mistake.harm is Harm.COARSE)
+    assert (sign.status is Status.WARNED) == (fault.harm is Harm.COARSE)
     assert level == sign.level
     assert not clause or clause in sign.clauses
     assert level != "L4" or " dB, wanted " in sign.message
 
 
 def reported(report_of, names):
-    """Return the mistakes that the suite reports differently."""
-    renderable = [name for name in names if HAS_RENDERER or MISTAKES[name].caught[0] != "L4"]
+    """Return the faults that the suite reports differently."""
+    renderable = [name for name in names if HAS_RENDERER or FAULTS[name].caught[0] != "L4"]
     return failures({name: name for name in renderable}, lambda name: check_report(name, report_of(name)))
 
 
 @pytest.mark.slow
-def test_wrong_encoders_of_every_level_are_caught_and_freedoms_are_left(report_of):
+def test_faults_of_every_level_are_caught_and_freedoms_are_left(report_of):
     assert [] == reported(report_of, REPRESENTATIVES)
 
 
@@ -166,10 +164,10 @@ def test_ends_of_processes_are_told_apart(report_of, name, status):
     assert status is report_of(name).failures[0].status
 
 
-def test_our_encoder_without_a_mistake_passes_what_catches_them(tmp_path):
-    # The mistakes are what fails, not the way of making them.
+def test_our_encoder_without_a_fault_passes_what_catches_them(tmp_path):
+    # The faults are what fails, not the way of making them.
     data, _ = honest(written(tmp_path, "ordinary/degree_1").read_bytes())
-    for change in (serr.stated(lambda record: record), serr.counts(0, 0)):
+    for change in (file_bytes.stated(lambda record: record), file_bytes.counts(0, 0)):
         assert data == change(data)
 
 

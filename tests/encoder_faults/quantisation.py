@@ -1,12 +1,12 @@
-"""Mistakes where values become integers. What is stated of them is measured after it: they are honest."""
+"""Faults where values become integers. What is stated of them is measured after it: they are honest."""
 
 import contextlib
 from unittest import mock
 
 import numpy as np
 
-from csplat.encoder import pipeline, quantisation, sh_codebook, shape_codebook, tiling
-from wrong_encoders.mistake import DEGREE_3, DENSE, Harm, Mistake, replaced
+from csplat.encoder import pipeline, quantisation, sh_codebook, shape_codebook
+from encoder_faults.fault import DEGREE_3, DENSE, EncoderFault, Harm, replaced
 
 PICTURE = (Harm.PICTURE, ("L4", ""))
 COARSE = (Harm.COARSE, ("L3", ""))
@@ -78,7 +78,7 @@ def rounding(module, name, rint, where=(quantisation, shape_codebook)):
 
 def truncated(module, name, where=(quantisation, shape_codebook)):
     stage = rounding(module, name, np.trunc, where)
-    return Mistake("a cast rounds", *COARSE, DEGREE_3, stage=stage, options={"sh_coding": "scalar", "threads": 1})
+    return EncoderFault("a cast rounds", *COARSE, DEGREE_3, stage=stage, options={"sh_coding": "scalar", "threads": 1})
 
 
 # Colours --------------------------------------------------------------------------------------------
@@ -117,49 +117,46 @@ def wrapped_opacities(levels):
     return lambda *args, **options: levels(*args, **options) & 255
 
 
-MISTAKES = {
+FAULTS = {
     # rotations and scales
-    "gauge_not_fixed": Mistake(
+    "gauge_not_fixed": EncoderFault(
         "w need not be the largest, and what leaves ±M is clipped",
         *PICTURE,
         DENSE,
         stage=replaced(shape_codebook, "canonicalise_shape", no_gauge),
     ),
-    "w_sign_lost": Mistake(
-        "w is what is left of length 1",
-        *PICTURE,
-        DENSE,
-        stage=replaced(shape_codebook, "canonicalise_shape", sign_of_w_lost),
+    "w_sign_lost": EncoderFault(
+        "w is what is left of length 1", *PICTURE, DENSE, stage=replaced(shape_codebook, "fix_gauge", sign_of_w_lost)
     ),
-    "scales_sorted_alone": Mistake(
+    "scales_sorted_alone": EncoderFault(
         "the order of scales has nothing to do with rotations",
         *PICTURE,
         "ordinary/needles_and_discs",
         stage=replaced(shape_codebook, "canonicalise_shape", sorted_alone),
     ),
     # rounding
-    "means_truncated": truncated(tiling, "quantise_means"),
+    "means_truncated": truncated(pipeline, "quantise_means"),
     "scales_truncated": truncated(pipeline, "quantise_shape", (shape_codebook,)),
     "quats_truncated": truncated(shape_codebook, "quat_levels"),
     "opacities_truncated": truncated(pipeline, "opacity_levels"),
     "sh0_truncated": truncated(pipeline, "quantise_colour"),
-    "sh_truncated": truncated(sh_codebook, "quantise_sh"),
+    "sh_truncated": truncated(sh_codebook, "quantise_rows"),
     "all_truncated": truncated(pipeline, "encode_tile"),
-    "half_away": Mistake(
+    "half_away": EncoderFault(
         "halves are rounded away from zero",
         Harm.HARMLESS,
         stage=rounding(pipeline, "encode_tile", half_away),
         options={"threads": 1},
     ),
     # colours
-    "chroma_exchanged": Mistake(
+    "chroma_exchanged": EncoderFault(
         "Cg comes before Co",
         *PICTURE,
         DEGREE_3,
         stage=replaced(quantisation, "colour_integers", chroma_exchanged),
         options={"sh_coding": "scalar"},
     ),
-    "chroma_by_matrix": Mistake(
+    "chroma_by_matrix": EncoderFault(
         "lifting is the matrix of YCoCg",
         *PICTURE,
         DEGREE_3,
@@ -167,14 +164,14 @@ MISTAKES = {
         options={"sh_coding": "scalar"},
     ),
     # range
-    "means_wrapped": Mistake(
+    "means_wrapped": EncoderFault(
         "16 bits hold every centre",
         Harm.PICTURE,
         ("L2", "CNF-6"),
         "nasty/outlier",
         stage=replaced(tiling, "quantise_means", wrapped_means),
     ),
-    "opacities_wrapped": Mistake(
+    "opacities_wrapped": EncoderFault(
         "256 levels and a byte for them",
         *PICTURE,
         "ordinary/transparent_and_opaque",

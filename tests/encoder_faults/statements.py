@@ -1,4 +1,4 @@
-"""Mistakes in what a file states of its errors, of its source, and of what it leaves out."""
+"""Faults in what a file states of its errors, of its source, and of what it leaves out."""
 
 import contextlib
 from unittest import mock
@@ -7,10 +7,10 @@ import numpy as np
 
 from csplat import _spec, ply
 from csplat.encoder import encode_plan, error_bounds, pipeline
-from wrong_encoders.mistake import DEGREE_3, DENSE, PLAIN, STRONG, Harm, Mistake, changed, replaced
-from wrong_encoders.reading import without_band_sign
-from wrong_encoders.serr import counts, head, refitted, stated
-from wrong_encoders.truth import in_binary64
+from encoder_faults.fault import DEGREE_3, DENSE, PLAIN, STRONG, EncoderFault, Harm, changed, replaced
+from encoder_faults.file_bytes import counts, head, refitted, stated
+from encoder_faults.ply_reader import without_band_sign
+from encoder_faults.source import in_binary64
 
 MEASURES = ("means", "covariance", "opacities", "sh0", "sh1", "sh2", "sh3")
 COMPONENTS = {"sh0": 3, "sh1": 9, "sh2": 15, "sh3": 21}
@@ -127,86 +127,86 @@ def scales_without_bound():
 
 def one_number_less(measure_name, kind):
     words = {"max": "the largest error of a sample is the largest", "rms": "a sample says what the mean is"}
-    return Mistake(words[kind], Harm.BOUND, L3, DEGREE_3, stage=scaled((measure_name,), kind, 0.99))
+    return EncoderFault(words[kind], Harm.BOUND, L3, DEGREE_3, stage=scaled((measure_name,), kind, 0.99))
 
 
-MISTAKES = {
+FAULTS = {
     # a little less, a little more
     **{f"{name}_{kind}_understated": one_number_less(name, kind) for name in MEASURES for kind in ("max", "rms")},
-    "max_overstated": Mistake(
+    "max_overstated": EncoderFault(
         "one percent more is on the safe side", Harm.BOUND, L3, DEGREE_3, stage=scaled(MEASURES, "max", 1.01)
     ),
-    "rms_overstated": Mistake(
+    "rms_overstated": EncoderFault(
         "one percent more is on the safe side", Harm.BOUND, L3, DEGREE_3, stage=scaled(MEASURES, "rms", 1.01)
     ),
-    "rounded_up": Mistake(
+    "rounded_up": EncoderFault(
         "SER-5 leaves one part in ten thousand",
         Harm.HARMLESS,
         inputs=DEGREE_3,
         stage=told(lambda bounds: {name: (most * 1.00009, rms * 1.00009) for name, (most, rms) in bounds.items()}),
     ),
-    "binary64_errors": Mistake(
+    "binary64_errors": EncoderFault(
         "errors are those of alpha and rotations that nobody rounded",
         Harm.HARMLESS,
         inputs=f"{DEGREE_3},ordinary/quaternions,ordinary/transparent_and_opaque",
         honest=in_binary64,
     ),
-    "binary64_errors_fine": Mistake(
+    "binary64_errors_fine": EncoderFault(
         "the same, with as many levels as there may be",
         Harm.HARMLESS,
         inputs=f"{DEGREE_3},ordinary/quaternions,ordinary/transparent_and_opaque",
         honest=in_binary64,
         options={"opacity_levels": _spec.OPACITY_LEVELS_MAX, "quat_levels": _spec.QUAT_LEVELS_MAX, "scale_step": 1e-5},
     ),
-    "max_halved": Mistake(
+    "max_halved": EncoderFault(
         "an error of rounding is half a step",
         Harm.BOUND,
         L3,
         data=stated(lambda r: r._replace(max=r.max / 2, rms=r.rms / 2)),
     ),
-    "rms_too_generous": Mistake(
+    "rms_too_generous": EncoderFault(
         "a bound may be generous", Harm.BOUND, L3, data=stated(lambda r: r._replace(max=r.max * 1.5))
     ),
     # measured otherwise
-    "measured_in_single": Mistake(
+    "measured_in_single": EncoderFault(
         "float32 is enough to measure",
         Harm.BOUND,
         L3,
         f"{DEGREE_3},ordinary/plane",
         stage=replaced(pipeline, "value_errors", in_single),
     ),
-    "stated_in_single": Mistake(
+    "stated_in_single": EncoderFault(
         "an error can be a float32, rounded to the nearest",
         Harm.BOUND,
         L3,
         f"{DEGREE_3},{PLAIN}",
         data=stated(lambda r: r._replace(max=float(np.float32(r.max)), rms=float(np.float32(r.rms)))),
     ),
-    "means_by_axis": Mistake(
+    "means_by_axis": EncoderFault(
         "max is over components, of means too", Harm.BOUND, L3, stage=replaced(pipeline, "distance_errors", by_axis)
     ),
-    "covariance_not_relative": Mistake(
+    "covariance_not_relative": EncoderFault(
         "the error of a covariance is that of its entries",
         Harm.BOUND,
         L3,
         stage=replaced(pipeline, "covariance_errors", not_relative),
     ),
-    "covariance_not_clipped": Mistake(
+    "covariance_not_clipped": EncoderFault(
         "scales need no bound",
         Harm.BOUND,
         L3,
         "nasty/*scale*",
         stage=scales_without_bound,
     ),
-    "covariance_not_normalised": Mistake(
+    "covariance_not_normalised": EncoderFault(
         "w of the source is as good as the decoded one",
         Harm.BOUND,
         L3,
         inputs=f"{DEGREE_3},{STRONG}",
         stage=replaced(pipeline, "covariance_errors", with_w_of_the_source),
     ),
-    "rms_over_components": Mistake("a mean is over all numbers", Harm.BOUND, L3, stage=told(over_components)),
-    "rms_over_source": Mistake(
+    "rms_over_components": EncoderFault("a mean is over all numbers", Harm.BOUND, L3, stage=told(over_components)),
+    "rms_over_source": EncoderFault(
         "a mean is over all splats that there were",
         Harm.BOUND,
         L3,
@@ -214,15 +214,15 @@ MISTAKES = {
         stage=replaced(pipeline, "declared_errors", over_the_source),
     ),
     # statements about the source
-    "pruned_invented": Mistake("counts are decoration", Harm.FACTS, ("L2", "SRC-1"), data=counts(3, 3)),
-    "nan_rows_counted": Mistake(
+    "pruned_invented": EncoderFault("counts are decoration", Harm.FACTS, ("L2", "SRC-1"), data=counts(3, 3)),
+    "nan_rows_counted": EncoderFault(
         "rows with NaN are splats that were pruned",
         Harm.FACTS,
         ("L2", "SRC-1"),
         "nasty/not_a_number",
         stage=dropped_rows_counted,
     ),
-    "degree_of_the_file": Mistake(
+    "degree_of_the_file": EncoderFault(
         "the source's SH degree is the file's",
         Harm.FACTS,
         ("L2", "SER-5"),
@@ -232,13 +232,13 @@ MISTAKES = {
         data=head(source_sh_degree=lambda _: 1),
     ),
     # not stated
-    "refitted_halved": Mistake(
+    "refitted_halved": EncoderFault(
         "of what was fitted anew any error may be stated",
         Harm.BOUND,
         ("L3", "SER-5"),
         data=lambda data: refitted(stated(lambda r: r._replace(max=r.max / 2, rms=r.rms / 2))(data)),
     ),
-    "refitted_claimed": Mistake(
+    "refitted_claimed": EncoderFault(
         "whoever says that colours were fitted anew may write any",
         Harm.PICTURE,
         ("L4", ""),
@@ -246,7 +246,7 @@ MISTAKES = {
         stage=none_of("sh0", "sh1"),
         data=refitted,
     ),
-    "refitted_rotations": Mistake(
+    "refitted_rotations": EncoderFault(
         "the flag is for rotations, too",
         Harm.PICTURE,
         ("L4", ""),
@@ -255,7 +255,7 @@ MISTAKES = {
         stage=none_of("covariance"),
         data=refitted,
     ),
-    "errors_left_out": Mistake(
+    "errors_left_out": EncoderFault(
         "what nothing is stated of may be anything",
         Harm.PICTURE,
         ("L4", ""),
@@ -263,7 +263,7 @@ MISTAKES = {
         scene=changed(shN=without_band_sign),
         stage=replaced(pipeline, "file_chunks", without_chunk),
     ),
-    "some_errors_left_out": Mistake(
+    "some_errors_left_out": EncoderFault(
         "the others are stated",
         Harm.PICTURE,
         ("L3", "SER-6"),

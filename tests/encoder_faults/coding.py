@@ -1,4 +1,4 @@
-"""Mistakes in blocks, streams and chunks, and what an encoder leaves to chance."""
+"""Faults in blocks, streams and chunks, and what an encoder leaves to chance."""
 
 import os
 import random
@@ -7,7 +7,7 @@ import zlib
 
 from csplat import _spec
 from csplat.encoder import container, entropy, pipeline, sh_codebook, tiling
-from wrong_encoders.mistake import DEGREE_3, PLAIN, Harm, Mistake, replaced
+from encoder_faults.fault import DEGREE_3, PLAIN, EncoderFault, Harm, replaced
 
 CHANCE = (Harm.DETERMINISM, ("L1", ""))
 BROKEN = Harm.VALIDITY
@@ -68,8 +68,8 @@ def summed_in_any_order(stated):
     return run
 
 
-MISTAKES = {
-    "no_tile_limit": Mistake(
+FAULTS = {
+    "no_tile_limit": EncoderFault(
         "a tile may have any number of splats",
         BROKEN,
         ("L1", "TIL-1"),
@@ -78,13 +78,13 @@ MISTAKES = {
         options={"means_coding": "axis"},
     ),
     # blocks and streams
-    "morton_axes_reversed": Mistake(
+    "morton_axes_reversed": EncoderFault(
         "bit 0 of a Morton code is that of z",
         BROKEN,
         ("L1", "TIL-10"),
         stage=replaced(tiling, "morton_codes", lambda codes: lambda q: codes(q[::-1])),
     ),
-    "morton_signed_shift": Mistake(
+    "morton_signed_shift": EncoderFault(
         "codes count bits from 1",
         BROKEN,
         ("L1", "MOR-2"),
@@ -92,50 +92,50 @@ MISTAKES = {
             entropy, "morton_block", lambda block: lambda codes, bits, coding: block(codes * 2, bits, coding)
         ),
     ),
-    "blocks_swapped": Mistake(
+    "blocks_swapped": EncoderFault(
         "rotations come before scales",
         BROKEN,
         ("L1", "TLE-2"),
         stage=replaced(pipeline, "tile_payload", swapped_blocks),
     ),
-    "zlib_for_deflate": Mistake(
+    "zlib_for_deflate": EncoderFault(
         "DEFLATE is what zlib.compress gives",
         BROKEN,
         ("L1", "COD-2"),
         DEGREE_3,
         stage=replaced(entropy, "_deflate", with_zlib_header),
     ),
-    "deflate_tail": Mistake(
+    "deflate_tail": EncoderFault(
         "an inflate stops by itself",
         BROKEN,
         ("L1", "COD-2"),
         DEGREE_3,
         stage=replaced(entropy, "_deflate", with_a_tail),
     ),
-    "transforms_reversed": Mistake(
+    "transforms_reversed": EncoderFault(
         "transforms are listed as a decoder needs them",
         BROKEN,
         ("L1", "STR-3"),
         stage=replaced(_spec, "pack_stream_head", reversed_transforms),
     ),
-    "crc_of_payload": Mistake(
+    "crc_of_payload": EncoderFault(
         "a chunk's CRC is that of its payload",
         BROKEN,
         ("L1", "CHK-1"),
         stage=replaced(container, "chunk_crc", payload_crc),
     ),
     # chance
-    "seed_by_chance": Mistake(
+    "seed_by_chance": EncoderFault(
         "any start of a k-means is as good as another",
         *CHANCE,
         DEGREE_3,
         stage=replaced(sh_codebook, "cluster", seeded_by_chance),
         options=OF_CODEBOOK,
     ),
-    "time_in_options": Mistake(
-        "a file says when it was made", *CHANCE, PLAIN, stage=replaced(pipeline, "encoding_settings", with_time)
+    "time_in_options": EncoderFault(
+        "a file says when it was made", *CHANCE, PLAIN, stage=replaced(pipeline, "chosen_settings", with_time)
     ),
-    "sums_in_any_order": Mistake(
+    "sums_in_any_order": EncoderFault(
         "sums of threads may be added as they come",
         *CHANCE,
         PLAIN,

@@ -1,4 +1,4 @@
-"""Mistakes in how the program ends, what it leaves, what it does to the user's files, and its map of splats."""
+"""Faults in how the program ends, what it leaves, what it does to the user's files, and its map of splats."""
 
 import os
 import sys
@@ -9,7 +9,7 @@ import numpy as np
 import plyfile
 
 from csplat_conformance.encoders import all_inputs
-from wrong_encoders.mistake import PLAIN, Harm, Mistake
+from encoder_faults.fault import PLAIN, EncoderFault, Harm
 
 NO_FILE, FILES = Harm.VALIDITY, Harm.FILES
 MAP = (Harm.FACTS, ("L2", "SRC-4"))
@@ -106,36 +106,38 @@ def talks(_ply, out, data):
     out.write_bytes(data)
 
 
-MISTAKES = {
+FAULTS = {
     # ends
-    "half_a_file": Mistake("a full disk says so", NO_FILE, ("L1", "HDR-5"), end=half_and_proud),
-    "leaves_half": Mistake("whoever fails may leave a file", NO_FILE, ("L1", ""), end=leaves_half),
-    "writes_nothing": Mistake("the output's name is not needed", NO_FILE, ("L1", ""), end=lambda *_: None),
-    "crashes": Mistake("memory is never short", NO_FILE, ("L1", ""), end=lambda *_: os.abort(), starts=True),
-    "hangs": Mistake("a loop always ends", NO_FILE, ("L1", ""), end=hangs, starts=True),
-    "status_3": Mistake("3 is a status like any other", NO_FILE, ("L1", ""), end=lambda *_: sys.exit(3)),
-    "silent_refusal": Mistake("status 1 says enough", NO_FILE, ("L1", ""), end=lambda *_: sys.exit(1)),
-    "refuses_the_unusual": Mistake(
+    "half_a_file": EncoderFault("a full disk says so", NO_FILE, ("L1", "HDR-5"), end=half_and_proud),
+    "leaves_half": EncoderFault("whoever fails may leave a file", NO_FILE, ("L1", ""), end=leaves_half),
+    "writes_nothing": EncoderFault("the output's name is not needed", NO_FILE, ("L1", ""), end=lambda *_: None),
+    "crashes": EncoderFault("memory is never short", NO_FILE, ("L1", ""), end=lambda *_: os.abort(), starts=True),
+    "hangs": EncoderFault("a loop always ends", NO_FILE, ("L1", ""), end=hangs, starts=True),
+    "status_3": EncoderFault("3 is a status like any other", NO_FILE, ("L1", ""), end=lambda *_: sys.exit(3)),
+    "silent_refusal": EncoderFault("status 1 says enough", NO_FILE, ("L1", ""), end=lambda *_: sys.exit(1)),
+    "refuses_the_unusual": EncoderFault(
         "whatever is unusual may be refused", Harm.COARSE, ("L1", ""), "nasty/*", end=refuses_the_unusual
     ),
-    "refuses_on_stdout": Mistake(
+    "refuses_on_stdout": EncoderFault(
         "a refusal may be said on either stream", Harm.HARMLESS, inputs="nasty/empty", end=refuses_without_splats
     ),
-    "talks": Mistake("a program may say what it likes", Harm.HARMLESS, end=talks),
+    "talks": EncoderFault("a program may say what it likes", Harm.HARMLESS, end=talks),
     # files of the user
-    "input_resaved": Mistake("normals are of no use to anyone", FILES, ("L1", ""), end=resaved),
-    "input_appended": Mistake("a text ends in a line feed", FILES, ("L1", ""), end=appended),
-    "input_moved_away": Mistake("whoever has the file needs no PLY", FILES, ("L1", ""), end=moved_away),
-    "input_touched": Mistake("the same bytes are the same file", Harm.HARMLESS, end=touched),
-    "temporary_left": Mistake("the system clears up", FILES, ("L1", ""), end=temporary_left),
-    "log_left": Mistake("a log beside the input helps", FILES, ("L1", ""), end=log_left),
-    "written_twice": Mistake("the scene has a name of its own", FILES, ("L1", ""), end=written_twice),
+    "input_resaved": EncoderFault("normals are of no use to anyone", FILES, ("L1", ""), end=resaved),
+    "input_appended": EncoderFault("a text ends in a line feed", FILES, ("L1", ""), end=appended),
+    "input_moved_away": EncoderFault("whoever has the file needs no PLY", FILES, ("L1", ""), end=moved_away),
+    "input_touched": EncoderFault("the same bytes are the same file", Harm.HARMLESS, end=touched),
+    "temporary_left": EncoderFault("the system clears up", FILES, ("L1", ""), end=temporary_left),
+    "log_left": EncoderFault("a log beside the input helps", FILES, ("L1", ""), end=log_left),
+    "written_twice": EncoderFault("the scene has a name of its own", FILES, ("L1", ""), end=written_twice),
     # the map of splats
-    "index_of_the_file": Mistake(
+    "index_of_the_file": EncoderFault(
         "splats come in the order of the file", *MAP, PLAIN, index=lambda index: np.arange(len(index))
     ),
-    "index_inverse": Mistake("the map leads from source to file", *MAP, PLAIN, index=np.argsort),
-    "index_from_one": Mistake("splats are numbered from 1", *MAP, PLAIN, index=lambda index: index + 1),
-    "index_in_floats": Mistake("numbers are numbers", *MAP, PLAIN, index=lambda index: index.astype(np.float64)),
-    "index_too_short": Mistake("the last one follows from the others", *MAP, PLAIN, index=lambda index: index[:-1]),
+    "index_inverse": EncoderFault("the map leads from source to file", *MAP, PLAIN, index=np.argsort),
+    "index_from_one": EncoderFault("splats are numbered from 1", *MAP, PLAIN, index=lambda index: index + 1),
+    "index_in_floats": EncoderFault("numbers are numbers", *MAP, PLAIN, index=lambda index: index.astype(np.float64)),
+    "index_too_short": EncoderFault(
+        "the last one follows from the others", *MAP, PLAIN, index=lambda index: index[:-1]
+    ),
 }

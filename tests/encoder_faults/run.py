@@ -1,0 +1,186 @@
+"""Run an encoder with a planted fault, ours, and the conformance suite on it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import shlex
+import sys
+import tempfile
+import time
+from fnmatch import fnmatch
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+import csplat
+from csplat import ply as ply_files
+from csplat.encoder import Origin, encode_with_report
+from csplat.errors import CsplatError
+from csplat_conformance.encoders import LEVELS, EncoderChoice, all_inputs, run_encoder
+from csplat_conformance.process import Ended
+from csplat_conformance.report import Outcome, Report, Status
+from encoder_faults.fault import EncoderFault
+from encoder_faults.file_bytes import bounded
+from encoder_faults.source import true_errors
+from encoder_faults.table import FAULTS
+
+
+def encode(fault, ply, out, index=None):
+    """Read, encode, write.
+
+    Args:
+        fault: the fault.
+        ply, out: input and output.
+        index: path for the map from splats of the file to those of the source, if requested.
+    """
+    with np.errstate(all="ignore"):  # a faulty encoder may divide by zero
+        data, source_index = _encoded(fault, ply)
+    if fault.honest is not None:
+        data = bounded(true_errors(fault.honest(ply), csplat.decode(data), source_index))(data)
+    if fault.data is not None:
+        data = fault.data(data)
+    if fault.end is None:
+        out.write_bytes(data)
+    else:
+        fault.end(ply, out, data)
+    if index is not None:
+        with Path(index).open("wb") as stream:
+            np.save(stream, source_index if fault.index is None else fault.index(source_index))
+
+
+def _encoded(fault, ply):
+    """Return the file, and which splat of the input each of its splats is."""
+    if fault.is_late:
+        return honest(ply.read_bytes(), tuple(fault.options.items()))
+    with fault.stage():
+        model = _read_input(fault, ply)
+        if fault.scene is not None:
+            model = fault.scene(model)
+        origin = None
+        if fault.keep is not None:
+            rows = fault.keep(model).astype(np.int64)
+            model, origin = model.select(rows), Origin(len(model), rows)
+        result = encode_with_report(model, csplat.EncodeOptions(**fault.options), origin=origin)
+    return result.data, result.source_index
+
+
+@cache
+def honest(content, options=()):
+    """Return what our encoder makes of a PLY: the file, and which splat of the input each of its splats is.
+
+    Args:
+        content: the PLY.
+        options: options of the encoder, (name, value) pairs.
+    """
+    with tempfile.TemporaryDirectory(prefix="csplat-honest-") as folder:
+        path = Path(folder) / "in.ply"
+        path.write_bytes(content)
+        model = ply_files.read_ply(path, keep_extra=bool(dict(options).get("keep_extra")))
+    result = encode_with_report(model, csplat.EncodeOptions(**dict(options)))
+    return result.data, result.source_index
+
+
+def _read_input(fault, ply):
+    keep_extra = bool(fault.options.get("keep_extra"))
+    if fault.ply is None:
+        return ply_files.read_ply(ply, keep_extra=keep_extra)
+    with tempfile.TemporaryDirectory(prefix="csplat-wrong-") as folder:
+        path = Path(folder) / "in.ply"
+        path.write_bytes(fault.ply(ply.read_bytes()))
+        return ply_files.read_ply(path, keep_extra=keep_extra)
+
+
+FOLDER = Path(__file__).parent
+PLACES = "{ply} {out} {index}"
+#: Statuses that are no failures and say something all the same.
+SIGNS = (Status.WARNED, Status.NOT_PROVED)
+
+
+def command_of(name: str) -> str:
+    """The command line that starts a faulty encoder."""
+    return f"{shlex.quote(sys.executable)} {shlex.quote(str(FOLDER))} {name} {PLACES}"
+
+
+def inputs_of(fault: EncoderFault) -> list[str]:
+    """Names of the reference inputs that show a fault; none if there is no such input."""
+    patterns = fault.inputs.split(",")
+    return [one.name for one in all_inputs() if any(fnmatch(one.name, pattern) for pattern in patterns)]
+
+
+def find(name: str, *, names: list[str] | None = None, levels: tuple[str, ...] | None = None) -> Report:
+    """Run the conformance suite over a fault; return its report.
+
+    Args:
+        name: name of the fault.
+        names: names of the inputs; default: the fault's own.
+        levels: levels to check; default: all but renders, which are added if nothing else shows the fault.
+    """
+    fault = FAULTS[name]
+    names = inputs_of(fault) if names is None else names
+    if not names:
+        return Report("encoder", name, [], ("there is no such input",))
+    if levels is None:
+        levels = LEVELS if fault.caught[0] == LEVELS[-1] else LEVELS[:-1]
+    choice = EncoderChoice(",".join(names), levels, 4.0 if name == "hangs" else 60.0, jobs=1)
+    pictures = psnr if LEVELS[-1] in levels else None
+    return run_encoder(command_of(name), choice, pictures=pictures, run=None if fault.starts else run_here)
+
+
+def first_sign(report: Report):
+    """Return the first outcome that reports a defect, or `None`."""
+    signs = report.failures or [one for one in report.outcomes if one.status in SIGNS]
+    signs += [Outcome("", "L1", Status.WARNED, message=note) for note in report.notes if note.startswith("warning: ")]
+    return signs[0] if signs else None
+
+
+def run_here(command, places, _seconds):
+    """Encode as `main` does with this command line, in this process."""
+    began = time.perf_counter()
+    index = places.get("index")
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = status_of(shlex.split(command)[2], places["ply"], places["out"], index)
+    status, message = (Status.WRONG_STATUS, f"exit status {code}") if code > 1 else (None, "")
+    seconds = time.perf_counter() - began
+    return Ended(status, code, out.getvalue().encode(), err.getvalue().encode(), seconds, message)
+
+
+def status_of(name, ply, out, index=None):
+    """Encode and return the exit status."""
+    try:
+        encode(FAULTS[name], Path(ply), Path(out), index)
+    except SystemExit as ended:
+        if not isinstance(ended.code, str):
+            return ended.code or 0
+        sys.stderr.write(ended.code + "\n")
+        return 1
+    except CsplatError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 1
+    return 0
+
+
+#: Views of a picture: how many, and pixels.
+VIEWS = (8, 160, 120)
+
+
+def psnr(source, decoded):
+    """Return the PSNR of small renders; the judge of a source is made once."""
+    key = b"".join(
+        values.tobytes()
+        for values in (source.means, source.quats, source.scales, source.opacities, source.sh0, source.shN)
+    )
+    judge = _judges().get(key)
+    if judge is None:
+        from csplat_render.scorer import Scorer
+        from csplat_render.virtual_cameras import virtual_cameras
+
+        judge = _judges()[key] = Scorer.of_source(source, virtual_cameras(source, *VIEWS, seed=0))
+    return judge.psnr(decoded)
+
+
+@cache
+def _judges():
+    return {}
