@@ -133,7 +133,7 @@ FAULTS = {
         options=OF_CODEBOOK,
     ),
     "time_in_options": EncoderFault(
-        "a file says when it was made", *CHANCE, PLAIN, stage=replaced(pipeline, "chosen_settings", with_time)
+        "a file says when it was made", *CHANCE, PLAIN, stage=replaced(pipeline, "encoding_settings", with_time)
     ),
     "sums_in_any_order": EncoderFault(
         "sums of threads may be added as they come",

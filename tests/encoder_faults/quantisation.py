@@ -5,7 +5,7 @@ from unittest import mock
 
 import numpy as np
 
-from csplat.encoder import pipeline, quantisation, sh_codebook, shape_codebook
+from csplat.encoder import pipeline, quantisation, sh_codebook, shape_codebook, tiling
 from encoder_faults.fault import DEGREE_3, DENSE, EncoderFault, Harm, replaced
 
 PICTURE = (Harm.PICTURE, ("L4", ""))
@@ -126,7 +126,7 @@ FAULTS = {
         stage=replaced(shape_codebook, "canonicalise_shape", no_gauge),
     ),
     "w_sign_lost": EncoderFault(
-        "w is what is left of length 1", *PICTURE, DENSE, stage=replaced(shape_codebook, "fix_gauge", sign_of_w_lost)
+        "w is what is left of length 1", *PICTURE, DENSE, stage=replaced(shape_codebook, "canonicalise_shape", sign_of_w_lost)
     ),
     "scales_sorted_alone": EncoderFault(
         "the order of scales has nothing to do with rotations",
@@ -135,12 +135,12 @@ FAULTS = {
         stage=replaced(shape_codebook, "canonicalise_shape", sorted_alone),
     ),
     # rounding
-    "means_truncated": truncated(pipeline, "quantise_means"),
+    "means_truncated": truncated(tiling, "quantise_means"),
     "scales_truncated": truncated(pipeline, "quantise_shape", (shape_codebook,)),
     "quats_truncated": truncated(shape_codebook, "quat_levels"),
     "opacities_truncated": truncated(pipeline, "opacity_levels"),
     "sh0_truncated": truncated(pipeline, "quantise_colour"),
-    "sh_truncated": truncated(sh_codebook, "quantise_rows"),
+    "sh_truncated": truncated(sh_codebook, "quantise_sh"),
     "all_truncated": truncated(pipeline, "encode_tile"),
     "half_away": EncoderFault(
         "halves are rounded away from zero",
