@@ -37,11 +37,9 @@ import traceback
 from collections import Counter
 from pathlib import Path
 
+from csplat_selftest.fuzzing.decoder_targets import DecoderTarget, OthersTarget, ValidatorTarget, missing_others
 from csplat_selftest.fuzzing.edges import Edges
-from csplat_selftest.fuzzing.foreign import FormatTarget
-from csplat_selftest.fuzzing.plies import PlyTarget
-from csplat_selftest.fuzzing.targets import DecoderTarget, OthersTarget, missing_others
-from csplat_selftest.fuzzing.validating import ValidatorTarget
+from csplat_selftest.fuzzing.file_targets import FormatTarget, PlyTarget
 
 TARGETS = ("decoder", "others", "validator", "ply", "formats")
 REPLAYED_MAX = 20  # files whose fate is printed one by one

@@ -52,7 +52,7 @@ import filelock
 import pytest
 from reach import ROOT, Importers, Map, Project, Tree, file_of, has_kernels, place_of
 
-from csplat_selftest.mutation.mutants import Mutant, Result, sample, table
+from csplat_selftest.mutation.mutants import Mutant, MutantResult, sample, table
 from csplat_selftest.mutation.operators import python_mutants
 
 #: Packages that every map covers, so that one map serves all of them.
@@ -351,7 +351,7 @@ class State:
         counts = [len(self.entries), *(sum(one["fate"] == fate for one in self.entries) for fate in Fate), *caught]
         head = ["package", "mutants", *Fate, *(f"caught by {suite} alone" for suite in suites)]
         rows = [head, ["---", *["---:"] * len(counts)], [self.package.name, *counts]]
-        results = [Result(_mutant(one), Fate(one["fate"]), _by_others(one)) for one in self.entries]
+        results = [MutantResult(_mutant(one), Fate(one["fate"]), _by_others(one)) for one in self.entries]
         shown = table(results, self.package.texts, (Fate.SURVIVED, Fate.UNREACHED), "caught by others")
         return "\n".join([*(f"| {' | '.join(map(str, row))} |" for row in rows), "", shown])
 

@@ -14,8 +14,7 @@ from csplat_authoring.recipes import sound_recipes
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import VECTORS, load
 from csplat_conformance.validator import validate
-from csplat_selftest.decoder_processes import JsDecoder, missing_javascript
-from csplat_selftest.mutate import mapped
+from csplat_selftest.fuzzing.damage import built_from
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +51,7 @@ OF_MANY = {"extreme/codebook_of_65536", "extreme/codebooks_of_many_splats", FULL
 def valid():
     """A function: the valid vectors that have fields of a structure, each with the places of these."""
     builts = [
-        mapped((VECTORS / f"{recipe.name}.csplat").read_bytes()) if recipe.name in OF_MANY else build(recipe.scene)
+        built_from((VECTORS / f"{recipe.name}.csplat").read_bytes()) if recipe.name in OF_MANY else build(recipe.scene)
         for recipe in sound_recipes()
         if recipe.scene is not None
     ]

@@ -8,8 +8,7 @@ from tables import differing, failures
 
 import csplat
 from csplat.decoder import Limits, iter_tiles
-from csplat_authoring.builder import build
-from csplat_authoring.repair import repair
+from csplat_authoring.builder import build, repair
 from csplat_authoring.samples import rich_scene
 from csplat_conformance import decoder_suite, manifest
 from csplat_conformance.conformance_report import Status

@@ -5,8 +5,7 @@ import pytest
 import csplat
 from csplat import _spec
 from csplat.decoder import read_header
-from csplat_authoring.builder import build
-from csplat_authoring.repair import chunk_records, repair
+from csplat_authoring.builder import build, chunk_records, repair
 from csplat_authoring.samples import rich_scene
 from csplat_conformance.manifest import VECTORS
 

@@ -10,8 +10,7 @@ import pytest
 from csplat import _spec
 from csplat.decoder import Limits, decode, decode_integers, read_header
 from csplat.errors import CsplatError, FormatError, LimitError, UnsupportedError
-from csplat_authoring.builder import build
-from csplat_authoring.repair import repair
+from csplat_authoring.builder import build, repair
 from csplat_authoring.samples import rich_scene
 
 BUILT = build(rich_scene())

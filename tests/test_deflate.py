@@ -6,7 +6,7 @@ import zlib
 import pytest
 from tables import failures
 
-from csplat_authoring.deflate import Deflate, deflate_dynamic, deflate_fixed, deflate_stored
+from csplat_authoring.coders import Deflate, deflate_dynamic, deflate_fixed, deflate_stored
 from csplat_authoring.recipes.deflate_streams import broken_streams, sound_streams
 from csplat_conformance.validator.inflate import CodedError, Inflater
 from csplat_conformance.validator.streams import undo_coder

@@ -15,21 +15,25 @@ from tables import failures
 
 from csplat import _spec, decoder
 from csplat.errors import FormatError, InputError
-from csplat_authoring.builder import build
-from csplat_authoring.repair import repair
+from csplat_authoring.builder import build, repair
 from csplat_authoring.samples import rich_scene
 from csplat_conformance import validator
 from csplat_conformance.answers import Answer
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import VECTORS
-from csplat_selftest import decoder_processes
-from csplat_selftest.fuzzing import plies
+from csplat_conformance.report import Status
+from csplat_selftest.fuzzing import file_targets
+from csplat_selftest.fuzzing.damage import built_from, damaged_from
+from csplat_selftest.fuzzing.decoder_targets import (
+    DecoderTarget,
+    OthersTarget,
+    ValidatorTarget,
+    compared,
+    missing_others,
+)
 from csplat_selftest.fuzzing.edges import Edges
-from csplat_selftest.fuzzing.plies import PlyTarget
-from csplat_selftest.fuzzing.ply_mutants import Ply
-from csplat_selftest.fuzzing.targets import DecoderTarget, OthersTarget, compared, missing_others
-from csplat_selftest.fuzzing.validating import ValidatorTarget
-from csplat_selftest.mutate import mapped, mutant_of
+from csplat_selftest.fuzzing.file_targets import PlyTarget
+from csplat_selftest.fuzzing.ply_damage import Ply
 
 pytestmark = pytest.mark.slow  # together: tests of the fuzzer
 
@@ -79,7 +83,7 @@ def test_cases_are_the_same_for_a_seed():
 
 def test_most_mutants_have_sound_checksums():
     base = BASES[0]
-    mutants = [mutant_of(random.Random(number), base, BASES) for number in range(300)]  # noqa: S311 - no secret
+    mutants = [damaged_from(random.Random(number), base, BASES) for number in range(300)]  # noqa: S311 - no secret
 
     assert sum(repaired for _, repaired, _ in mutants) > 240
     assert all(data == repair(data, base.records) for data, repaired, _ in mutants if repaired)
@@ -104,7 +108,7 @@ def test_a_mutant_can_be_mutated_again():
 
 
 def test_a_file_of_any_origin_is_a_base():
-    base = mapped((VECTORS / "valid" / "rich.csplat").read_bytes())
+    base = built_from((VECTORS / "valid" / "rich.csplat").read_bytes())
     names = {attempt(data)[0] for data in cases(DecoderTarget(), 1, 80, [base])}
 
     assert len(names) > 5
@@ -275,7 +279,7 @@ def test_another_exception_of_the_reader_is_a_finding(monkeypatch, ply_target, n
     def broken(*_args, **_options):
         raise wrong
 
-    monkeypatch.setattr(plies, name, broken)
+    monkeypatch.setattr(file_targets, name, broken)
 
     assert type(wrong).__name__ in fuzz.attempt(ply_target, ply_target.seeds([])[0].data)[1]
 
@@ -284,7 +288,7 @@ def test_a_reader_that_disagrees_with_lint_is_a_finding(monkeypatch, ply_target)
     def refuse(*_args, **_options):
         raise InputError("no")
 
-    monkeypatch.setattr(plies, "read_ply", refuse)
+    monkeypatch.setattr(file_targets, "read_ply", refuse)
 
     assert "lint finds nothing wrong" in fuzz.attempt(ply_target, ply_target.seeds([])[0].data)[1]
 
@@ -295,7 +299,7 @@ def test_a_ply_is_made_smaller(monkeypatch, ply_target):
             raise KeyError("scale_1")
         raise InputError("no")
 
-    monkeypatch.setattr(plies, "read_ply", broken)
+    monkeypatch.setattr(file_targets, "read_ply", broken)
     data = ply_target.seeds([])[1].data
     small = fuzz.minimised(ply_target, data, fuzz.attempt(ply_target, data)[1], [])
 

@@ -10,13 +10,12 @@ from csplat.errors import InputError
 from csplat_conformance.manifest import load
 from csplat_selftest.decoder_processes import missing_c, missing_javascript
 from csplat_selftest.mutation import __main__ as command
-from csplat_selftest.mutation import judging
+from csplat_selftest.mutation import mutants
 from csplat_selftest.mutation.javascript import JavaScriptDecoder
-from csplat_selftest.mutation.mutants import Fate, Mutant, Result, sample, score, table
+from csplat_selftest.mutation.mutants import Fate, Mutant, MutantResult, sample, score, table
 from csplat_selftest.mutation.native import NativeDecoder
-from csplat_selftest.mutation.operators import python_mutants
+from csplat_selftest.mutation.operators import c_mutants, python_mutants
 from csplat_selftest.mutation.python import PythonDecoder
-from csplat_selftest.mutation.tokens import c_mutants
 
 pytestmark = pytest.mark.slow  # together: tests of the mutants
 
@@ -32,7 +31,7 @@ def few(monkeypatch):
     """Let these vectors be all there are."""
 
     def chosen(*names):
-        monkeypatch.setattr(judging, "vectors", lambda: [(BY_NAME[name], BY_NAME[name].data) for name in names])
+        monkeypatch.setattr(mutants, "vectors", lambda: [(BY_NAME[name], BY_NAME[name].data) for name in names])
 
     return chosen
 
@@ -134,10 +133,10 @@ def test_a_mutant_that_hangs_is_caught(few):
 
 
 def test_what_another_decoder_may_leave_unread_must_be_refused():
-    judging.vectors.cache_clear()
+    mutants.vectors.cache_clear()
 
     assert any(vector.error["optional"] for vector in load() if vector.error)
-    assert not any(vector.error["optional"] for vector, _ in judging.vectors() if vector.error)
+    assert not any(vector.error["optional"] for vector, _ in mutants.vectors() if vector.error)
 
 
 @in_depth
@@ -155,9 +154,9 @@ def test_the_command_prints_survivors_and_score(few, monkeypatch, capsys):
 def test_survivors_stand_in_a_table_and_the_score_counts_what_can_be_seen():
     text = "x = a |\\\n b; y\nz\n"
     results = [
-        Result(Mutant("a.py", 1, 4, "a |\\\n b", "(a &\\\n b)"), Fate.SAME),
-        Result(Mutant("a.py", 3, 15, "z", "0"), Fate.MISSED, "file 7: refused"),
-        *[Result(Mutant("a.py", 3, 15, "z", "1"), Fate.CAUGHT, "valid/rich")] * 3,
+        MutantResult(Mutant("a.py", 1, 4, "a |\\\n b", "(a &\\\n b)"), Fate.SAME),
+        MutantResult(Mutant("a.py", 3, 15, "z", "0"), Fate.MISSED, "file 7: refused"),
+        *[MutantResult(Mutant("a.py", 3, 15, "z", "1"), Fate.CAUGHT, "valid/rich")] * 3,
     ]
 
     assert 75.0 == score(results)
@@ -184,7 +183,7 @@ def test_javascript_is_changed_by_its_syntax(few):
     assert not {file for file, _, _ in changes} & {"spec.mjs", "reader.mjs"}
     few("valid/one_splat", "invalid/tile_tail")
     (tail,) = (one for one in decoder.mutants if one.old.startswith("throw") and "bytes too many" in one.old)
-    assert Result(tail, Fate.CAUGHT, "invalid/tile_tail") == decoder.attempt(tail)
+    assert MutantResult(tail, Fate.CAUGHT, "invalid/tile_tail") == decoder.attempt(tail)
     few("valid/one_splat")
     assert Fate.SAME is decoder.attempt(tail).fate
 
@@ -220,4 +219,4 @@ def test_c_is_compiled_and_changed(few):
 
     assert decoder.valid(tail)
     assert not decoder.valid(replace(tail, new="("))
-    assert Result(tail, Fate.CAUGHT, "invalid/tile_tail") == decoder.attempt(tail)
+    assert MutantResult(tail, Fate.CAUGHT, "invalid/tile_tail") == decoder.attempt(tail)

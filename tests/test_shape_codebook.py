@@ -22,8 +22,8 @@ from csplat.encoder.shape_codebook import mean_axes, unit_covariances
 from csplat.errors import InputError
 from csplat.model import normalise_quats
 from csplat_conformance.adapter import answer
-from csplat_selftest.decoder_processes import JsDecoder
-from csplat_selftest.fuzzing.targets import compared
+from csplat_conformance.node import JsDecoder
+from csplat_selftest.fuzzing.decoder_targets import compared
 
 
 def few_shapes(make_model, count=2500, kinds=12, seed=0, degree=1, **fields):

@@ -11,17 +11,17 @@ from tables import failures
 
 import csplat
 from csplat import _spec
-from csplat_authoring.builder import build
+from csplat_authoring.builder import build, repair
 from csplat_authoring.recipes import sound_recipes
-from csplat_authoring.repair import repair
 from csplat_authoring.samples import attributes, rich_scene, scene, tile
 from csplat_authoring.scene import Attribute, Chunk, StatedErrors
 from csplat_conformance.manifest import load
 from csplat_conformance.validator import validate
-from csplat_conformance.validator.ancillary import JsonError, parse_json
-from csplat_conformance.validator.findings import CODES, VIOLATIONS_MAX
-from csplat_selftest.damage import flip, flips, prefixes
-from csplat_selftest.mutate import mutant
+from csplat_conformance.validator.findings import VIOLATIONS_MAX
+from csplat_conformance.validator.jsontext import JsonError, parse
+from csplat_conformance.validator.rules import CODES
+from csplat_selftest.fuzzing.bit_flips import flip, flips, prefixes
+from csplat_selftest.fuzzing.damage import damaged_file
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
@@ -321,7 +321,7 @@ def test_every_flipped_bit_of_a_small_file_is_found():
 
 @pytest.mark.slow
 def test_flipped_bits_of_a_real_file_are_found(sample_path):
-    # `python -m csplat_selftest.damage FILE` flips 250, and takes any file.
+    # `python -m csplat_selftest.fuzzing.bit_flips FILE` flips 250, and takes any file.
     data = csplat.encode(csplat.read_ply(sample_path).select(slice(0, 200)))
     plain, repaired = flips(data, 16, seed=5)
 
@@ -344,7 +344,7 @@ def test_the_validator_agrees_with_the_decoder_on_mutants():
     small = {vector.name for vector in VALID if vector.name.startswith("valid/") and len(vector.data) < 3000}
     bases = [build(recipe.scene) for recipe in sound_recipes() if recipe.name in small]
     for number in range(120):
-        data, _ = mutant(random.Random(f"validator {number}"), bases)  # noqa: S311 - repeatable, no secret
+        data, _ = damaged_file(random.Random(f"validator {number}"), bases)  # noqa: S311 - repeatable, no secret
         found = {(one.clause, one.code) for one in validate(data).violations if one.clause != "SER-5"}
         error = error_of(data)
         if error is None or error[0] == "LIM-1":

@@ -15,8 +15,8 @@ from typing import Any, Final
 from csplat import _spec
 from csplat_authoring._rules import CHOICES, MASKS, RANGES, Choice, Mask, Range
 from csplat_authoring.builder import Built, build
-from csplat_authoring.invalid import invalid_recipe
-from csplat_authoring.samples import MEANS, SH0, Recipe, attributes, morton, rich_scene, rows_of, scene, sparse, tile
+from csplat_authoring.recipe import Recipe, invalid_recipe
+from csplat_authoring.samples import MEANS, SH0, attributes, morton, rich_scene, rows_of, scene, sparse, tile
 
 Rule = Range | Choice | Mask
 
@@ -42,7 +42,7 @@ _NO_VECTORS: Final = {("stream_head", "width")}
 
 
 @dataclass(frozen=True)
-class Case:
+class BoundaryCase:
     """A file with one field beyond a rule.
 
     Attributes:
@@ -110,14 +110,14 @@ class Case:
         return self.base.patched(self.changes)
 
 
-def cases() -> Iterator[Case]:
+def cases() -> Iterator[BoundaryCase]:
     """Yield every case: each end of each range, ids around each enum, each bit that is not listed."""
     rules: tuple[Rule, ...] = (*RANGES, *CHOICES, *MASKS)
     for rule in rules:
         base, name = next((b, name) for b in _bases() for name in _places(b, rule) if name not in _TIED)
         for suffix, value in _beyond(rule, base.fields[name].format[-1]):
             now = _holding(base, name)[0]
-            yield Case(rule, base, name, int(now) | int(value) if isinstance(rule, Mask) else value, suffix)
+            yield BoundaryCase(rule, base, name, int(now) | int(value) if isinstance(rule, Mask) else value, suffix)
 
 
 def boundary_recipes() -> list[Recipe]:

@@ -35,8 +35,8 @@ from typing import Any, Final
 
 from csplat import _spec
 from csplat_authoring.builder import Built, build
-from csplat_authoring.invalid import invalid_recipe
-from csplat_authoring.samples import Recipe, attributes, rich_scene, rows_of, scene, tile
+from csplat_authoring.recipe import Recipe, invalid_recipe, valid_recipe
+from csplat_authoring.samples import attributes, rich_scene, rows_of, scene, tile
 from csplat_authoring.scene import (
     PAIRS,
     PLAIN,
@@ -103,7 +103,7 @@ def _recipes(path: Path, groups: Collection[str]) -> Iterator[Recipe]:
             if group == "invalid":
                 yield _invalid(name, table, built_named(named) if named else build(made))
             else:
-                yield _valid(f"{group}/{name}", table, made)
+                yield _valid(group, name, table, made)
 
 
 def _numbers(value: Any) -> Any:
@@ -120,10 +120,10 @@ def _numbers(value: Any) -> Any:
     return (-power if sign else power) + int((more or "0").replace(" ", ""))
 
 
-def _valid(name: str, table: dict[str, Any], made: Scene) -> Recipe:
+def _valid(group: str, name: str, table: dict[str, Any], made: Scene) -> Recipe:
     unknown = {*table} - {*["why", "clauses", "scene", "base"]}
     assert not unknown, f"{name}: {unknown}"
-    return Recipe(name, table["why"], tuple(table["clauses"].split()), lambda: build(made).data, made)
+    return valid_recipe(group, name, table["why"], table["clauses"], made)
 
 
 def _invalid(name: str, table: dict[str, Any], base: Built) -> Recipe:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -32,49 +32,6 @@ OPACITIES, SCALES, QUATS, MEANS, SH0 = (
     _spec.ATTRIBUTE_SH0,
 )
 _LEVELS_OPACITIES, _LEVELS_QUATS = 255, 127
-
-
-@dataclass(frozen=True)
-class View:
-    """A rendering.
-
-    Attributes:
-        camera: K, viewmat, W, H and near, as a camera file has them.
-        psnr: PSNR that a renderer's picture must reach against the reference, dB.
-    """
-
-    camera: dict[str, Any]
-    psnr: float
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """One vector.
-
-    Attributes:
-        name: group and name, `valid/morton`.
-        why: one line: what it shows, why it hurts.
-        clauses: ids that it covers; for invalid files first the one it breaks.
-        data: makes the file.
-        scene: the scene that it must decode to; None if it must be refused.
-        code: error code, if it must be refused.
-        offset: the defect's byte, if a single one is to blame.
-        also: further codes that a decoder may report.
-        optional: type of the chunk in whose payload the defect lies, `META`: decoders that leave it unread (CHK-6)
-            accept the file. Empty if every decoder refuses it.
-        views: reference views, for scenes that are rendered.
-    """
-
-    name: str
-    why: str
-    clauses: tuple[str, ...]
-    data: Callable[[], bytes]
-    scene: Scene | None = None
-    code: str = ""
-    offset: int | None = None
-    also: tuple[str, ...] = ()
-    optional: str = ""
-    views: tuple[View, ...] = ()
 
 
 def integers(seed: int, count: int, low: int, high: int) -> list[int]:

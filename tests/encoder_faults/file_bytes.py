@@ -9,14 +9,16 @@ import zlib
 import numpy as np
 
 from csplat import _spec
-from csplat_selftest.mutate import mapped
+from csplat_selftest.fuzzing.damage import built_from
 from encoder_faults.fault import EncoderFault, Harm
 
 
 def serr_at(data):
     """Return where the payload of the stated errors begins."""
     index = [
-        entry for name, entry in mapped(data).fields.items() if name.startswith("directory[") and name.endswith("type")
+        entry
+        for name, entry in built_from(data).fields.items()
+        if name.startswith("directory[") and name.endswith("type")
     ]
     (record,) = (entry.offset for entry in index if data[entry.offset :].startswith(_spec.CHUNK_STATED_ERRORS))
     return _spec.unpack_directory_record(data, record).offset + _spec.CHUNK_HEADER_SIZE
@@ -26,7 +28,7 @@ def stated(change):
     """Return a change of every record of the stated errors."""
 
     def run(data):
-        built, at, out = mapped(data), serr_at(data), bytearray(data)
+        built, at, out = built_from(data), serr_at(data), bytearray(data)
         count = _spec.unpack_stated_errors_head(data, at).record_count
         for i in range(count):
             place = at + _spec.STATED_ERRORS_HEAD_SIZE + i * _spec.STATED_ERROR_RECORD_SIZE
@@ -41,7 +43,7 @@ def head(**fields):
     """Return a change of the head of the stated errors; each field is made of the one that stands there."""
 
     def run(data):
-        built, at = mapped(data), serr_at(data)
+        built, at = built_from(data), serr_at(data)
         old = _spec.unpack_stated_errors_head(data, at)
         new = old._replace(**{name: make(getattr(old, name)) for name, make in fields.items()})
         packed = _spec.pack_stated_errors_head(new)
@@ -73,7 +75,7 @@ def index_field(name, change):
     """Return a change of one field of the index; checksums are repaired."""
 
     def run(data):
-        built = mapped(data)
+        built = built_from(data)
         entry = built.fields[name]
         values = struct.unpack_from(entry.format, data, entry.offset)
         value = change(values if len(values) > 1 else values[0])
@@ -84,7 +86,7 @@ def index_field(name, change):
 
 def swapped_layers(data):
     """Exchange the records of the first two layers of the first tile, if it has two."""
-    built = mapped(data)
+    built = built_from(data)
     if "tile[0].layer[1].layer" not in built.fields:
         return data
     first, second = (built.fields[f"tile[0].layer[{i}].layer"].offset for i in (0, 1))
@@ -102,7 +104,7 @@ def crc_from_the_start(data):
 
 def relative_offsets(data):
     """Count offsets from the end of the index."""
-    built = mapped(data)
+    built = built_from(data)
     end = _spec.HEADER_SIZE + _spec.unpack_header(data).index_size
     names = [name for name in built.fields if name.startswith(("directory[", "tile[")) and name.endswith(".offset")]
     offsets = {name: int.from_bytes(data[built.fields[name].offset :][:8], "little") - end for name in names}

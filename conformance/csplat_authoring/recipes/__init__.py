@@ -10,17 +10,15 @@ from numpy.typing import NDArray
 
 from csplat_authoring.boundaries import boundary_recipes
 from csplat_authoring.declaration import declared_recipes
+from csplat_authoring.recipe import Recipe
+from csplat_authoring.recipes.combined import combined_recipes
 from csplat_authoring.recipes.deflate_streams import invalid_deflate_recipes, valid_deflate_recipes
-from csplat_authoring.recipes.edges import edge_recipes
-from csplat_authoring.recipes.extreme_streams import extreme_stream_recipes
+from csplat_authoring.recipes.extreme import edge_recipes, extreme_stream_recipes
 from csplat_authoring.recipes.invalid_bytes import invalid_bytes_recipes
 from csplat_authoring.recipes.rendered import rendered_recipes
 from csplat_authoring.recipes.texts import bad_text_recipes, good_text_recipes
-from csplat_authoring.recipes.valid import valid_recipes
-from csplat_authoring.recipes.valid_combined import combined_recipes
-from csplat_authoring.recipes.valid_streams import valid_stream_recipes
+from csplat_authoring.recipes.valid import valid_recipes, valid_stream_recipes
 from csplat_authoring.reference import expected
-from csplat_authoring.samples import Recipe
 from csplat_authoring.scene import Scene
 from csplat_conformance.manifest import load
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from csplat_authoring.builder import build
-from csplat_authoring.deflate import END_OF_BLOCK, Deflate, flat_lengths
-from csplat_authoring.invalid import invalid_recipe
-from csplat_authoring.samples import MEANS, OPACITIES, QUATS, SCALES, SH0, Recipe, axis, levels, scene, signed, tile
+from csplat_authoring.coders import END_OF_BLOCK, Deflate, flat_lengths
+from csplat_authoring.recipe import Recipe, invalid_recipe, valid_recipe
+from csplat_authoring.samples import MEANS, OPACITIES, QUATS, SCALES, SH0, axis, levels, scene, signed, tile
 from csplat_authoring.scene import Scene, Stream
 
 _LENGTH_3 = 257
@@ -18,7 +17,7 @@ _FAR, _FARTHEST = 24577, 32768  # distances of symbol 29; what takes 30 or 31 fo
 
 
 @dataclass(frozen=True)
-class Case:
+class DeflateCase:
     """One stream.
 
     Attributes:
@@ -51,15 +50,15 @@ def invalid_deflate_recipes() -> list[Recipe]:
     ]
 
 
-def _valid(case: Case, made: Scene) -> Recipe:
-    return Recipe(f"extreme/deflate_{case.name}", case.why, (case.clause,), lambda: build(made).data, made)
+def _valid(case: DeflateCase, made: Scene) -> Recipe:
+    return valid_recipe("extreme", f"deflate_{case.name}", case.why, case.clause, made)
 
 
-def _place(case: Case) -> str:
+def _place(case: DeflateCase) -> str:
     return "TILE.0.0/opacities.stream" if len(case.output) < _FAR else "TILE.0.3/sh3.stream"
 
 
-def _scene(case: Case) -> Scene:
+def _scene(case: DeflateCase) -> Scene:
     """Return a scene that has the stream: as opacities, or if it is long as band 3."""
     how = Stream(coder="deflate", coded=case.coded)
     if len(case.output) < _FAR:
@@ -75,14 +74,14 @@ def _scene(case: Case) -> Scene:
     return scene(3, [tile(n=n, degree=3, changes=changes | {_SH3: signed(rows, replace(how, width=_WIDTH))})])
 
 
-def sound_streams() -> list[Case]:
+def sound_streams() -> list[DeflateCase]:
     """Return streams that a decoder reads."""
     crossing = (18, 138, 18, 117, 2, 2, 16, 6)  # 255 zeros, 2, 2, and the 2 six times more
     literals = {7: 1, 8: 2, _LENGTH_3: 15, END_OF_BLOCK: 15} | {9 + i: 3 + i for i in range(12)}
     distances = {i: min(15, 1 + i) for i in range(16)}
 
-    def case(name: str, why: str, clause: str, stream: Deflate, output: bytes) -> Case:
-        return Case(name, why, clause, stream.literals(END_OF_BLOCK).end(), output)
+    def case(name: str, why: str, clause: str, stream: Deflate, output: bytes) -> DeflateCase:
+        return DeflateCase(name, why, clause, stream.literals(END_OF_BLOCK).end(), output)
 
     every = Deflate().dynamic(flat_lengths(range(286)), flat_lengths(range(30)), counts=(286, 30))
     longest = Deflate().dynamic(literals, distances, counts=(258, 16))
@@ -163,7 +162,7 @@ def sound_streams() -> list[Case]:
             Deflate().fixed().literals(7, 284).number(31, 5).distance(0),
             bytes([7] * 259),
         ),
-        Case(
+        DeflateCase(
             "stored_padding",
             "ones before the length of a stored block: ignored",
             "COD-2",
@@ -185,15 +184,15 @@ def _copies() -> tuple[Deflate, bytes]:
     return stream, bytes(output)
 
 
-def broken_streams() -> list[Case]:
+def broken_streams() -> list[DeflateCase]:
     """Return streams that a decoder refuses."""
     return [*_counts(), *_codes(), *_lengths(), *_symbols()]
 
 
-def _counts() -> list[Case]:
-    def case(name: str, why: str, literals: dict[int, int], distances: dict[int, int], *counts: int) -> Case:
+def _counts() -> list[DeflateCase]:
+    def case(name: str, why: str, literals: dict[int, int], distances: dict[int, int], *counts: int) -> DeflateCase:
         stream = Deflate().dynamic(literals, distances, counts=(counts[0], counts[1]))
-        return Case(name, why, "COD-5", stream.literals(7, 8, END_OF_BLOCK).end(), bytes([7, 8]))
+        return DeflateCase(name, why, "COD-5", stream.literals(7, 8, END_OF_BLOCK).end(), bytes([7, 8]))
 
     with_286 = {7: 2, 8: 2, END_OF_BLOCK: 2, 286: 2}
     return [
@@ -206,16 +205,16 @@ def _counts() -> list[Case]:
     ]
 
 
-def _codes() -> list[Case]:
-    def case(name: str, why: str, literals: dict[int, int], distances: dict[int, int], matches: int = 0) -> Case:
+def _codes() -> list[DeflateCase]:
+    def case(name: str, why: str, literals: dict[int, int], distances: dict[int, int], matches: int = 0) -> DeflateCase:
         stream = Deflate().dynamic(literals, distances, counts=(258, 30)).literals(7, 8)
         for _ in range(matches):
             stream.match(3)
-        return Case(name, why, "COD-6", stream.literals(END_OF_BLOCK).end(), bytes([7, 8] + [8] * (3 * matches)))
+        return DeflateCase(name, why, "COD-6", stream.literals(END_OF_BLOCK).end(), bytes([7, 8] + [8] * (3 * matches)))
 
-    def lengths(name: str, why: str, meta: dict[int, int]) -> Case:
+    def lengths(name: str, why: str, meta: dict[int, int]) -> DeflateCase:
         stream = Deflate().dynamic({7: 1, 8: 2, END_OF_BLOCK: 2}, _BOTH, counts=(257, 2), meta=meta)
-        return Case(name, why, "COD-6", stream.literals(7, 8, END_OF_BLOCK).end(), bytes([7, 8]))
+        return DeflateCase(name, why, "COD-6", stream.literals(7, 8, END_OF_BLOCK).end(), bytes([7, 8]))
 
     alone = Deflate().dynamic({END_OF_BLOCK: 2}, _BOTH, 0, counts=(257, 2)).literals(END_OF_BLOCK)
     nearly = {7: 1, 8: 2, END_OF_BLOCK: 3} | {9 + i: 4 + i for i in range(12)}
@@ -224,7 +223,7 @@ def _codes() -> list[Case]:
         case("literals_over", "five literal/length codewords of 2 bits", _TABLE | {9: 2}, _BOTH),
         case("literals_incomplete", "three literal/length codewords of 2 bits", {7: 2, 8: 2, 256: 2}, _BOTH),
         case("literals_nearly", "of the literal/length code one codeword of 15 bits is missing", nearly, _BOTH),
-        Case(
+        DeflateCase(
             "literals_one_of_2_bits",
             "a literal/length code of one codeword of 2 bits: an empty block",
             "COD-6",
@@ -238,17 +237,17 @@ def _codes() -> list[Case]:
         case("distances_one_of_15_bits", "one codeword of 15 bits, without a match", _TABLE, {0: 15}),
         lengths("lengths_over", "an oversubscribed code of code lengths", {0: 1, 1: 2, 2: 2, 3: 2}),
         lengths("lengths_incomplete", "an incomplete code of code lengths", {0: 1, 1: 2, 2: 3}),
-        Case("lengths_one", "a single code length, 9, in one bit", "COD-6", nines.end(), bytes([7, 8])),
+        DeflateCase("lengths_one", "a single code length, 9, in one bit", "COD-6", nines.end(), bytes([7, 8])),
     ]
 
 
-def _lengths() -> list[Case]:
+def _lengths() -> list[DeflateCase]:
     pair = {7: 1, END_OF_BLOCK: 1}
     before = [17, 7, 1, 18, 138, 18, 110, 1]  # the lengths of this pair
 
-    def case(name: str, why: str, header: list[int]) -> Case:
+    def case(name: str, why: str, header: list[int]) -> DeflateCase:
         stream = Deflate().dynamic(pair, {}, header=header).literals(7, 7, END_OF_BLOCK)
-        return Case(name, why, "COD-7", stream.end(), bytes([7, 7]))
+        return DeflateCase(name, why, "COD-7", stream.end(), bytes([7, 7]))
 
     endless = Deflate().dynamic({7: 1, 8: 1}, {}, header=[17, 7, 1, 1, 18, 138, 18, 110, 0]).literals(7, 7)
     nothing = Deflate().dynamic({}, {}, header=[18, 138, 18, 119, 0]).number(0, 3)
@@ -257,14 +256,14 @@ def _lengths() -> list[Case]:
         case("repeat_16_beyond", "code 16 goes on behind the last length", [*before, 16, 3]),
         case("repeat_17_beyond", "code 17 goes on behind the last length", [*before, 17, 3]),
         case("repeat_18_beyond", "code 18 goes on behind the last length", [*before, 18, 138]),
-        Case("no_end", "symbol 256 has no code", "COD-7", endless.end(), bytes([7, 7])),
-        Case("no_literals", "no literal/length symbol has a code", "COD-7", nothing.end(), bytes([7, 7])),
+        DeflateCase("no_end", "symbol 256 has no code", "COD-7", endless.end(), bytes([7, 7])),
+        DeflateCase("no_literals", "no literal/length symbol has a code", "COD-7", nothing.end(), bytes([7, 7])),
     ]
 
 
-def _symbols() -> list[Case]:
-    def case(name: str, why: str, stream: Deflate, output: bytes) -> Case:
-        return Case(name, why, "COD-8", stream.literals(END_OF_BLOCK).end(), output)
+def _symbols() -> list[DeflateCase]:
+    def case(name: str, why: str, stream: Deflate, output: bytes) -> DeflateCase:
+        return DeflateCase(name, why, "COD-8", stream.literals(END_OF_BLOCK).end(), output)
 
     def fixed(*literals: int) -> Deflate:
         return Deflate().fixed().literals(*literals)

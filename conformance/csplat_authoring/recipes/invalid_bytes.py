@@ -6,11 +6,10 @@ from dataclasses import replace
 from functools import cache
 
 from csplat import _spec
-from csplat_authoring.builder import Built, build
-from csplat_authoring.deflate import deflate_fixed
-from csplat_authoring.invalid import invalid_recipe
-from csplat_authoring.repair import seal
-from csplat_authoring.samples import OPACITIES, SCALES, SH0, Recipe, levels, rows_of, scene, signed, tile
+from csplat_authoring.builder import Built, build, seal
+from csplat_authoring.coders import deflate_fixed
+from csplat_authoring.recipe import Recipe, invalid_recipe
+from csplat_authoring.samples import OPACITIES, SCALES, SH0, levels, rows_of, scene, signed, tile
 from csplat_authoring.scene import Block, Chunk, Codebook, Stream
 
 _SPLAT_BYTES = 4 * (3 + 4 + 3 + 1 + 48)  # in the arrays of section 3, at SH degree 3

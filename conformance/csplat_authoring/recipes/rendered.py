@@ -8,14 +8,13 @@ from typing import Any
 
 from csplat import _spec
 from csplat_authoring.builder import build
+from csplat_authoring.recipe import Recipe, View
 from csplat_authoring.samples import (
     MEANS,
     OPACITIES,
     QUATS,
     SCALES,
     SH0,
-    Recipe,
-    View,
     attributes,
     axis,
     integers,

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Final
 
 from csplat import _spec
-from csplat_authoring.builder import build
-from csplat_authoring.invalid import invalid_recipe
-from csplat_authoring.samples import Recipe, scene
-from csplat_authoring.scene import Chunk, Scene, StatedErrors
+from csplat_authoring.recipe import Recipe, invalid_recipe, valid_recipe
+from csplat_authoring.samples import scene
+from csplat_authoring.scene import Chunk, StatedErrors
 
+_valid = partial(valid_recipe, "extreme")
 _META, _CAMS, _OPTS = _spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS
 
 #: Texts that JSN-1 refuses, by the name of the vector: the text and its defect.
@@ -173,10 +174,6 @@ def _good(name: str, why: str, *chunks: Chunk) -> Recipe:
 
 def _stated(name: str, why: str, errors: StatedErrors, clause: str = "SER-2") -> Recipe:
     return _valid(name, why, clause, scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=errors),)))
-
-
-def _valid(name: str, why: str, clause: str, made: Scene) -> Recipe:
-    return Recipe(f"extreme/{name}", why, (clause,), lambda: build(made).data, made)
 
 
 def _bad(name: str, kind: bytes, text: bytes, why: str) -> Recipe:

@@ -23,8 +23,7 @@ from typing import Final
 
 from csplat.errors import InputError
 from csplat_selftest.mutation.javascript import JavaScriptDecoder
-from csplat_selftest.mutation.judging import fuzzed, vectors
-from csplat_selftest.mutation.mutants import Decoder, Fate, Mutant, Result, sample, score, table
+from csplat_selftest.mutation.mutants import Decoder, Fate, Mutant, MutantResult, fuzzed, sample, score, table, vectors
 from csplat_selftest.mutation.native import NativeDecoder
 from csplat_selftest.mutation.python import NO_FORK, PythonDecoder
 
@@ -67,7 +66,7 @@ def main() -> int:
     return 0
 
 
-def _all(mutants: Sequence[Mutant], jobs: int) -> list[Result]:
+def _all(mutants: Sequence[Mutant], jobs: int) -> list[MutantResult]:
     results, began = [], time.monotonic()
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork")) as pool:
         for result in pool.map(_attempt, mutants):
@@ -80,7 +79,7 @@ def _all(mutants: Sequence[Mutant], jobs: int) -> list[Result]:
     return results
 
 
-def _attempt(mutant: Mutant) -> Result:
+def _attempt(mutant: Mutant) -> MutantResult:
     return _decoder.attempt(mutant)
 
 

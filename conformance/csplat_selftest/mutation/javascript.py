@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Final
 
 from csplat.errors import InputError
-from csplat_selftest.decoder_processes import JsDecoder, js_folder
-from csplat_selftest.fuzzing.targets import JS_LIMITS
-from csplat_selftest.mutation.judging import difference, failing, verdict
-from csplat_selftest.mutation.mutants import Fate, Mutant, Result
+from csplat_conformance.node import JsDecoder, js_folder
+from csplat_selftest.fuzzing.decoder_targets import JS_LIMITS
+from csplat_selftest.mutation.mutants import Fate, Mutant, MutantResult, difference, failing, verdict
 
 _SECONDS = 5.0  # for one file: more than a hundred times what the largest takes
 _OPERATORS = Path("test", "operators.mjs")
@@ -70,7 +69,7 @@ class JavaScriptDecoder:
         """Return True: the operators change whole expressions of a parser, so every mutant is a program."""
         return True
 
-    def attempt(self, mutant: Mutant) -> Result:
+    def attempt(self, mutant: Mutant) -> MutantResult:
         """Run the vectors, then the fuzzed files, which have smaller budgets."""
         with tempfile.TemporaryDirectory(prefix="csplat-mutant-") as name:
             folder = Path(name)
@@ -80,10 +79,10 @@ class JavaScriptDecoder:
             with JsDecoder(folder, timeout=_SECONDS) as decoder:
                 caught = failing(decoder.ask)
             if caught:
-                return Result(mutant, Fate.CAUGHT, caught)
+                return MutantResult(mutant, Fate.CAUGHT, caught)
             with JsDecoder(folder, JS_LIMITS, _SECONDS) as decoder:
                 missed = difference(decoder.ask, self._files, self._wanted)
-            return Result(mutant, Fate.MISSED if missed else Fate.SAME, missed)
+            return MutantResult(mutant, Fate.MISSED if missed else Fate.SAME, missed)
 
 
 def _typescript() -> Path:

@@ -1,12 +1,18 @@
-"""One change of a decoder's text, and what became of it."""
+"""Mutants of a decoder, and the verdicts of vectors and damaged files on them."""
 
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Protocol
+from functools import cache
+from typing import Any, Protocol
+
+from csplat_conformance.answers import PARTS, Answer, judge
+from csplat_conformance.manifest import Vector, load
+from csplat_conformance.report import Status
+from csplat_selftest.fuzzing.decoder_targets import DecoderTarget
 
 _SHOWN = 100  # characters of a piece of text
 
@@ -50,7 +56,7 @@ class Fate(StrEnum):
 
 
 @dataclass(frozen=True)
-class Result:
+class MutantResult:
     """A mutant and its fate.
 
     Attributes:
@@ -81,7 +87,7 @@ class Decoder(Protocol):
         """Return True if the mutant is a valid program."""
         ...
 
-    def attempt(self, mutant: Mutant) -> Result:
+    def attempt(self, mutant: Mutant) -> MutantResult:
         """Run the vectors, and if all pass the fuzzed files."""
         ...
 
@@ -99,14 +105,14 @@ def sample(decoder: Decoder, count: int, seed: int) -> list[Mutant]:
     return sorted(chosen, key=lambda mutant: (mutant.file, mutant.start, mutant.new))
 
 
-def score(results: Sequence[Result]) -> float:
+def score(results: Sequence[MutantResult]) -> float:
     """Return the share, in per cent, of caught mutants among those that show a difference at all."""
     counts = [sum(result.fate is fate for result in results) for fate in (Fate.CAUGHT, Fate.MISSED)]
     return 100.0 * counts[0] / max(1, sum(counts))
 
 
 def table(
-    results: Sequence[Result],
+    results: Sequence[MutantResult],
     texts: Mapping[str, str],
     fates: Sequence[StrEnum] = (Fate.MISSED, Fate.SAME),
     seen: str = "seen in",
@@ -133,3 +139,47 @@ def table(
 def _short(text: str) -> str:
     line = " ".join(text.split())
     return line if len(line) <= _SHOWN else f"{line[: _SHOWN - 4]} ..."
+
+
+#: Decodes a file.
+Ask = Callable[[bytes], Answer]
+
+_SHOWN_ANSWER = 100  # characters of an answer that are shown
+
+
+@cache
+def vectors() -> Sequence[tuple[Vector, bytes]]:
+    """Return the vectors with their files. These decoders read every chunk: what another one may accept they refuse."""
+    wanted = [replace(one, error=one.error | {"optional": ""}) if one.error else one for one in load()]
+    return [(vector, vector.data) for vector in wanted]
+
+
+def failing(ask: Ask) -> str:
+    """Return the name of the first vector that fails, or nothing. Of refusals the code does not count."""
+    for vector, data in vectors():
+        outcomes = judge(vector, ask(data), tuple(PARTS))
+        if not all(one.good for one in outcomes):
+            return vector.name
+    return ""
+
+
+def fuzzed(count: int, seed: int) -> list[bytes]:
+    """Return damaged files, most of them with their checksums repaired."""
+    target, rng = DecoderTarget(), random.Random(seed)  # noqa: S311 - repeatable, no secret
+    corpus = target.seeds(())
+    return [target.mutant(rng, corpus).data for _ in range(count)]
+
+
+def verdict(answer: Answer) -> Any:
+    """Return what counts of an answer: why a file is refused does not."""
+    return (answer.status, *((dict(answer.header), dict(answer.arrays)) if answer.status is Status.PASSED else ()))
+
+
+def difference(ask: Ask, files: Sequence[bytes], wanted: Sequence[Any]) -> str:
+    """Return where a decoder first differs from what is wanted, or nothing."""
+    for number, (data, right) in enumerate(zip(files, wanted, strict=True)):
+        answer = ask(data)
+        if verdict(answer) != right:
+            words = f"{answer.status} {answer.code} {answer.message}"[:_SHOWN_ANSWER].strip()
+            return f"file {number}: {words} for {right[0]}"
+    return ""

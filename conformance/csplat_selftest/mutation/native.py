@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from csplat.errors import InputError
-from csplat_selftest.decoder_processes import C_ADAPTER, C_SOURCES, CDecoder, c_folder, compile_c
-from csplat_selftest.fuzzing.targets import C_LIMITS
-from csplat_selftest.mutation.judging import difference, failing, verdict
-from csplat_selftest.mutation.mutants import Fate, Mutant, Result
-from csplat_selftest.mutation.tokens import c_mutants
+from csplat_conformance.native import ADAPTER, SOURCES, CDecoder, c_folder, compile_c
+from csplat_selftest.fuzzing.decoder_targets import C_LIMITS
+from csplat_selftest.mutation.mutants import Fate, Mutant, MutantResult, difference, failing, verdict
+from csplat_selftest.mutation.operators import c_mutants
 
 _SECONDS = 5.0  # for one file: more than a hundred times what the largest takes
 
@@ -47,7 +46,7 @@ class NativeDecoder:
                 return False
         return True
 
-    def attempt(self, mutant: Mutant) -> Result:
+    def attempt(self, mutant: Mutant) -> MutantResult:
         """Run the vectors, then the fuzzed files, which have smaller budgets."""
         with tempfile.TemporaryDirectory(prefix="csplat-mutant-") as name:
             program, objects = Path(name) / "adapter", []
@@ -58,10 +57,10 @@ class NativeDecoder:
             with CDecoder(program, timeout=_SECONDS) as decoder:
                 caught = failing(decoder.ask)
             if caught:
-                return Result(mutant, Fate.CAUGHT, caught)
+                return MutantResult(mutant, Fate.CAUGHT, caught)
             with CDecoder(program, C_LIMITS, _SECONDS) as decoder:
                 missed = difference(decoder.ask, self._files, self._wanted)
-            return Result(mutant, Fate.MISSED if missed else Fate.SAME, missed)
+            return MutantResult(mutant, Fate.MISSED if missed else Fate.SAME, missed)
 
     def _object(self, name: str) -> bytes:
         if name not in self._objects:

@@ -20,10 +20,9 @@ from csplat import decoder
 from csplat.errors import InputError
 from csplat_conformance import adapter
 from csplat_conformance.answers import Answer
-from csplat_conformance.conformance_report import Status
-from csplat_selftest.fuzzing.targets import LIMITS
-from csplat_selftest.mutation.judging import difference, failing, verdict
-from csplat_selftest.mutation.mutants import Fate, Mutant, Result
+from csplat_conformance.report import Status
+from csplat_selftest.fuzzing.decoder_targets import LIMITS
+from csplat_selftest.mutation.mutants import Fate, Mutant, MutantResult, difference, failing, verdict
 from csplat_selftest.mutation.operators import python_mutants
 
 NO_FORK = "this system cannot copy processes, in which mutants run: use Linux or macOS"
@@ -68,7 +67,7 @@ class PythonDecoder:
             return False
         return True
 
-    def attempt(self, mutant: Mutant) -> Result:
+    def attempt(self, mutant: Mutant) -> MutantResult:
         """Run the vectors, then the fuzzed files; what hangs is noticed."""
         if sys.platform == "win32":
             raise InputError(NO_FORK)
@@ -84,9 +83,9 @@ class PythonDecoder:
         try:
             caught = _line(reading, "hangs, or ends the process")
             if caught:
-                return Result(mutant, Fate.CAUGHT, caught)
+                return MutantResult(mutant, Fate.CAUGHT, caught)
             missed = _line(reading, "a file: hangs, or ends the process")
-            return Result(mutant, Fate.MISSED if missed else Fate.SAME, missed)
+            return MutantResult(mutant, Fate.MISSED if missed else Fate.SAME, missed)
         finally:
             os.close(reading)
             os.kill(child, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Targets of the fuzzer: the Python decoder, and the decoders in JavaScript and C compared with it."""
+"""Targets of the fuzzer: the decoders in Python, JavaScript and C, and the validator."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from typing import Any, Protocol
 import csplat
 from csplat import _spec, decoder
 from csplat.errors import CsplatError
-from csplat_authoring.builder import Built, build
+from csplat_authoring.builder import Built, build, repair
 from csplat_authoring.recipes import sound_recipes
-from csplat_authoring.repair import repair
-from csplat_conformance import adapter
+from csplat_conformance import adapter, node, validator
 from csplat_conformance.answers import Answer
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import VECTORS, load
-from csplat_selftest import decoder_processes
-from csplat_selftest.decoder_processes import CDecoder, DecoderProcess, missing_c
-from csplat_selftest.mutate import mapped, mutant_of
+from csplat_conformance.native import CDecoder, missing_c
+from csplat_conformance.report import Status
+from csplat_conformance.serving import Served
+from csplat_selftest.fuzzing.damage import built_from, damaged_from
 
 LIMITS = decoder.Limits(splats=100_000, bytes=32_000_000, json_bytes=1_000_000)
 
@@ -37,7 +37,7 @@ _MEMORY = 700_000_000  # bytes of another process; a heap of 512 MiB, and Node
 
 
 @dataclass(frozen=True)
-class Case:
+class FuzzCase:
     """A mutant.
 
     Attributes:
@@ -51,7 +51,7 @@ class Case:
     notes: tuple[str, ...] = ()
 
 
-class Target(Protocol):
+class FuzzTarget(Protocol):
     """Something that reads files.
 
     Attributes:
@@ -68,7 +68,7 @@ class Target(Protocol):
         """Return what mutants start from, and the given files too."""
         ...
 
-    def mutant(self, rng: random.Random, corpus: Sequence[Any]) -> Case:
+    def mutant(self, rng: random.Random, corpus: Sequence[Any]) -> FuzzCase:
         """Make a case from one or more entries of the corpus."""
         ...
 
@@ -105,14 +105,14 @@ class DecoderTarget:
         # Selected by the size of the vector's file: building all scenes to select small ones takes two seconds.
         small = {vector.name for vector in load() if (VECTORS / vector.file).stat().st_size <= _LARGEST_SEED}
         scenes = [recipe.scene for recipe in sound_recipes() if recipe.scene is not None and recipe.name in small]
-        return [build(scene) for scene in scenes] + [mapped(p.read_bytes()) for p in paths]
+        return [build(scene) for scene in scenes] + [built_from(p.read_bytes()) for p in paths]
 
-    def mutant(self, rng: random.Random, corpus: Sequence[Built]) -> Case:
+    def mutant(self, rng: random.Random, corpus: Sequence[Built]) -> FuzzCase:
         """Damage a file of the corpus."""
         base = rng.choice(corpus)
-        data, repaired, in_place = mutant_of(rng, base, corpus)
-        again = (lambda: Built(data, base.fields, base.spans)) if in_place else (lambda: _mapped(data))
-        return Case(data, again, () if repaired else ("(not repaired)",))
+        data, repaired, in_place = damaged_from(rng, base, corpus)
+        again = (lambda: Built(data, base.fields, base.spans)) if in_place else (lambda: _built(data))
+        return FuzzCase(data, again, () if repaired else ("(not repaired)",))
 
     def attempt(self, data: bytes) -> tuple[str, str]:
         """Decode; now and then in the other ways too, which must find the same."""
@@ -218,10 +218,10 @@ class OthersTarget(DecoderTarget):
         return js_coverage(self._scratch) if self._scratch else ""
 
 
-def _mapped(data: bytes) -> Built | None:
+def _built(data: bytes) -> Built | None:
     """Return a mutant that was laid out anew with its fields, if its index still leads to its chunks."""
     try:
-        found = mapped(data)
+        found = built_from(data)
     except (ValueError, LookupError, struct.error):
         return None
     inside = all(
@@ -279,3 +279,35 @@ def js_coverage(folder: Path) -> str:
     total = sum(map(len, ran.values()))
     covered = sum(sum(marks) for marks in ran.values())
     return f"{100 * covered / total:.1f} % of the text of {len(ran)} modules ran" if total else ""
+
+
+class ValidatorTarget(DecoderTarget):
+    """A file is decoded if and only if the validator finds nothing; of refusals it names the clause, too."""
+
+    name = "validator"
+    watched: Sequence[Path] = (Path(validator.__file__).parent,)
+
+    def attempt(self, data: bytes) -> tuple[str, str]:
+        """Decode and validate."""
+        error: CsplatError | None = None
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                decoder.decode(data, limits=LIMITS, threads=1)
+            except CsplatError as caught:
+                error = caught
+            if error is not None and error.code == _spec.ERROR_LIMIT:  # a budget is no rule of the format
+                return error.code, ""
+            found = validator.validate(data, json_bytes_max=LIMITS.json_bytes, splats_max=LIMITS.splats)
+        clauses = {one.clause for one in found.violations if one.code}  # SER-5 has none: no decoder can judge it
+        if error is None:
+            return (
+                ("finding", f"decoded, but the validator names {', '.join(sorted(clauses))}")
+                if clauses
+                else ("decoded", "")
+            )
+        clause = getattr(error, "clause", "")
+        if not clauses:
+            return "finding", f"refused with {error.code} ({clause}), but the validator finds nothing"
+        # If several clauses are broken, the validator may attribute the same damage to another one.
+        return (error.code if clause in clauses else "another clause"), ""

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import combinations, cycle
 
 from csplat import _spec
-from csplat_authoring.builder import build
+from csplat_authoring.recipe import Recipe, valid_recipe
 from csplat_authoring.samples import (
     MEANS,
     OPACITIES,
     QUATS,
     SCALES,
     SH0,
-    Recipe,
     attributes,
     axis,
     book,
@@ -33,6 +33,7 @@ from csplat_authoring.samples import (
 )
 from csplat_authoring.scene import Block, Chunk, Codebook, Extra, Scene, Stream, Tile
 
+_combined = partial(valid_recipe, "valid")
 _EVERY = (
     _spec.TRANSFORM_DELTA,
     _spec.TRANSFORM_ZIGZAG,
@@ -47,7 +48,7 @@ _N = 4
 def combined_recipes() -> list[Recipe]:
     """Return the recipes of this module."""
     result = [
-        _recipe(
+        _combined(
             f"combined_{coder}",
             f"every coding in every width, streams by {coder} after each of the sixteen transform lists",
             "STR-2 STR-3 STR-4 STR-5 TRF-1",
@@ -57,29 +58,25 @@ def combined_recipes() -> list[Recipe]:
     ]
     return [
         *result,
-        _recipe(
+        _combined(
             "combined_codebooks",
             "codebooks of every kind in one file, escapes of every coding, extras and all known chunks",
             "CBK-1 CBK-3 CBK-4 CBK-5 DIR-5 TIL-6",
             _all_codebooks(),
         ),
-        _recipe(
+        _combined(
             "codebook_sh_1_3_escape",
             "one index for all bands; the second and the last splat are escaped in each",
             "CBK-3 CBK-4 CBK-5",
             _escaped_bands(),
         ),
-        _recipe(
+        _combined(
             "combined_tiles",
             "tiles that differ in everything a tile may choose",
             "TIL-4 TIL-6 TIL-9 LAT-1",
             _different_tiles(),
         ),
     ]
-
-
-def _recipe(name: str, why: str, clauses: str, made: Scene) -> Recipe:
-    return Recipe(f"valid/{name}", why, tuple(clauses.split()), lambda: build(made).data, made)
 
 
 # Streams -------------------------------------------------------------------------------------------

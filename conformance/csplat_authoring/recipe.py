@@ -1,18 +1,73 @@
-"""Recipes of invalid files: a scene that is declared wrongly, or a valid file with fields overwritten."""
+"""Recipes of vectors: a scene, or a file made invalid: a scene declared wrongly, or fields overwritten."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from csplat import _spec
-from csplat_authoring.builder import Built, build
-from csplat_authoring.repair import repair
-from csplat_authoring.samples import Recipe
+from csplat_authoring.builder import Built, build, repair
 from csplat_authoring.scene import Scene
 
 #: CHK-6: chunks whose payload a decoder may leave unread.
 _ANCILLARY = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
+
+
+@dataclass(frozen=True)
+class View:
+    """A rendering.
+
+    Attributes:
+        camera: K, viewmat, W, H and near, as a camera file has them.
+        psnr: PSNR that a renderer's picture must reach against the reference, dB.
+    """
+
+    camera: dict[str, Any]
+    psnr: float
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One vector.
+
+    Attributes:
+        name: group and name, `valid/morton`.
+        why: one line: what it shows, why it hurts.
+        clauses: ids that it covers; for invalid files first the one it breaks.
+        data: makes the file.
+        scene: the scene that it must decode to; None if it must be refused.
+        code: error code, if it must be refused.
+        offset: the defect's byte, if a single one is to blame.
+        also: further codes that a decoder may report.
+        optional: type of the chunk in whose payload the defect lies, `META`: decoders that leave it unread (CHK-6)
+            accept the file. Empty if every decoder refuses it.
+        views: reference views, for scenes that are rendered.
+    """
+
+    name: str
+    why: str
+    clauses: tuple[str, ...]
+    data: Callable[[], bytes]
+    scene: Scene | None = None
+    code: str = ""
+    offset: int | None = None
+    also: tuple[str, ...] = ()
+    optional: str = ""
+    views: tuple[View, ...] = ()
+
+
+def valid_recipe(group: str, name: str, why: str, clauses: str, made: Scene) -> Recipe:
+    """Return the recipe of a file that holds a scene.
+
+    Args:
+        group: `valid`, `extreme` or `render`.
+        name: name of the vector.
+        why: one line.
+        clauses: ids that it covers.
+        made: the scene.
+    """
+    return Recipe(f"{group}/{name}", why, tuple(clauses.split()), lambda: build(made).data, made)
 
 
 def invalid_recipe(

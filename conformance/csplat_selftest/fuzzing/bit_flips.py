@@ -1,8 +1,8 @@
 """Damage a real file bit by bit and byte by byte, and see that the validator finds every damage.
 
 Usage:
-    python -m csplat_selftest.damage scene.csplat ...            # 250 flipped bits each, and 250 prefixes
-    python -m csplat_selftest.damage scene.csplat --flips 1000 --prefixes 0 --seed 7
+    python -m csplat_selftest.fuzzing.bit_flips scene.csplat ...            # 250 flipped bits each, and 250 prefixes
+    python -m csplat_selftest.fuzzing.bit_flips scene.csplat --flips 1000 --prefixes 0 --seed 7
 
 Two rows for the flipped bits: of the file as it is; with all checksums computed anew, so that only structure and
 values can show it. In the latter a flip may give another valid file: a colour that is one step greener breaks no
@@ -19,14 +19,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from csplat_authoring.repair import chunk_records, repair
+from csplat_authoring.builder import chunk_records, repair
 from csplat_conformance.validator import validate
 
 _CLAUSES_SHOWN = 6
 
 
 @dataclass
-class Found:
+class DamageStatistics:
     """Statistics of a number of damaged files.
 
     Attributes:
@@ -62,7 +62,7 @@ def flip(data: bytes, bit: int) -> bytearray:
 
 def flips(
     data: bytes, count: int, seed: int, progress: Callable[[str, int], None] | None = None
-) -> tuple[Found, Found]:
+) -> tuple[DamageStatistics, DamageStatistics]:
     """Flip `count` different bits, one at a time.
 
     Args:
@@ -75,7 +75,7 @@ def flips(
         What was found in the file as it is, and with all checksums repaired.
     """
     chosen = random.Random(seed).sample(range(8 * len(data)), min(count, 8 * len(data)))  # noqa: S311 - repeatable, no secret
-    result = (Found("flipped bits"), Found("all checksums repaired"))
+    result = (DamageStatistics("flipped bits"), DamageStatistics("all checksums repaired"))
     records = chunk_records(data)
     for number, bit in enumerate(chosen):
         damaged = flip(data, bit)
@@ -86,11 +86,11 @@ def flips(
     return result
 
 
-def prefixes(data: bytes, count: int, progress: Callable[[str, int], None] | None = None) -> Found:
+def prefixes(data: bytes, count: int, progress: Callable[[str, int], None] | None = None) -> DamageStatistics:
     """Cut the file at `count` lengths, evenly spread, 0 and all but one byte among them; all if there are fewer."""
     last = len(data) - 1
     lengths = range(len(data)) if count > last else sorted({i * last // max(1, count - 1) for i in range(count)})
-    result = Found("prefixes")
+    result = DamageStatistics("prefixes")
     for number, length in enumerate(lengths):
         result.add(length, data[:length])
         if progress is not None:
@@ -126,7 +126,7 @@ def _tick(stage: str, done: int) -> None:
         sys.stderr.flush()
 
 
-def _line(row: Found) -> str:
+def _line(row: DamageStatistics) -> str:
     often = ", ".join(f"{clause} {count}" for clause, count in row.clauses.most_common(_CLAUSES_SHOWN))
     return f"  {row.what:<24}{row.found:>6} of {row.count:<6} found; {often}\n"
 

@@ -11,9 +11,8 @@ import struct
 from collections.abc import Callable, Sequence
 
 from csplat import _spec
-from csplat_authoring.builder import Built
-from csplat_authoring.deflate import deflate_fixed, deflate_stored
-from csplat_authoring.repair import repair
+from csplat_authoring.builder import Built, repair
+from csplat_authoring.coders import deflate_fixed, deflate_stored
 from csplat_conformance.fields import Field, read_fields
 
 _UNREPAIRED_SHARE = 0.1
@@ -23,18 +22,18 @@ _BOMB = deflate_fixed(bytes(100_000))
 _FLOATS = (0.0, -0.0, 1.0, -1.0, 5e-324, 2.0**-1022, 1e-30, 1e30, 1.7e308, float("inf"), float("-inf"), float("nan"))
 
 
-def mutant(rng: random.Random, bases: Sequence[Built]) -> tuple[bytes, bool]:
+def damaged_file(rng: random.Random, bases: Sequence[Built]) -> tuple[bytes, bool]:
     """Return a damaged file and whether its checksums were repaired.
 
     Args:
         rng: source of all random choices.
         bases: valid files with the places of their fields.
     """
-    data, repaired, _ = mutant_of(rng, rng.choice(bases), bases)
+    data, repaired, _ = damaged_from(rng, rng.choice(bases), bases)
     return data, repaired
 
 
-def mutant_of(rng: random.Random, base: Built, bases: Sequence[Built]) -> tuple[bytes, bool, bool]:
+def damaged_from(rng: random.Random, base: Built, bases: Sequence[Built]) -> tuple[bytes, bool, bool]:
     """Damage a file: the bytes, whether checksums were repaired, whether the fields still lie where they were.
 
     Args:
@@ -57,7 +56,7 @@ def mutant_of(rng: random.Random, base: Built, bases: Sequence[Built]) -> tuple[
     return repair(result, base.records), True, in_place
 
 
-def mapped(data: bytes) -> Built:
+def built_from(data: bytes) -> Built:
     """Return a valid file of any origin with the fields of header, index records and chunk frames."""
     return Built(data, *read_fields(data))
 
