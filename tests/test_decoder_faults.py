@@ -13,11 +13,10 @@ from csplat.decoder.container import open_chunk
 from csplat_conformance import adapter
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import load
-from csplat_conformance.near import EXACT, RENDERER
-from csplat_conformance.node import missing_javascript
-from csplat_conformance.report import Status
-from csplat_conformance.single import GPUS
+from csplat_conformance.single_precision import GPUS
+from csplat_conformance.tolerance import EXACT, RENDERER
 from csplat_selftest.decoder_faults import FAULTS, off_by, single_precision
+from csplat_selftest.decoder_processes import missing_javascript
 from csplat_selftest.faults import DecoderFault, ModuleEdit, edited, edited_module, find, table
 
 needs_javascript = pytest.mark.skipif(bool(missing_javascript()), reason=f"skipped: {missing_javascript()}")

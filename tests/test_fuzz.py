@@ -21,7 +21,6 @@ from csplat_conformance import validator
 from csplat_conformance.answers import Answer
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import VECTORS
-from csplat_conformance.report import Status
 from csplat_selftest.fuzzing import file_targets
 from csplat_selftest.fuzzing.damage import built_from, damaged_from
 from csplat_selftest.fuzzing.decoder_targets import (

@@ -22,7 +22,7 @@ from csplat.encoder.shape_codebook import mean_axes, unit_covariances
 from csplat.errors import InputError
 from csplat.model import normalise_quats
 from csplat_conformance.adapter import answer
-from csplat_conformance.node import JsDecoder
+from csplat_selftest.decoder_processes import JsDecoder
 from csplat_selftest.fuzzing.decoder_targets import compared
 
 

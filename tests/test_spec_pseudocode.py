@@ -14,8 +14,7 @@ from csplat.decoder.blocks import ColumnBlock, morton_axes
 from csplat.decoder.entropy import _undo_run_length, undo_transforms
 from csplat.decoder.reconstruct import lattice_rows, opacity_table, write_colour, write_lattice, write_quats
 from csplat_authoring.coders import Deflate
-from csplat_conformance.near import too_far
-from csplat_conformance.room import may_be_stated
+from csplat_conformance.tolerance import describe_deviation, is_valid_bound
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAIN, DELTA, ZIGZAG, PLANES = b"\0\0\0\0", b"\1\0\0\0", b"\2\0\0\0", b"\3\0\0\0"

@@ -17,9 +17,8 @@ from csplat_authoring.samples import attributes, rich_scene, scene, tile
 from csplat_authoring.scene import Attribute, Chunk, StatedErrors
 from csplat_conformance.manifest import load
 from csplat_conformance.validator import validate
-from csplat_conformance.validator.findings import VIOLATIONS_MAX
-from csplat_conformance.validator.jsontext import JsonError, parse
-from csplat_conformance.validator.rules import CODES
+from csplat_conformance.validator.ancillary import JsonError, parse_json
+from csplat_conformance.validator.findings import CODES, VIOLATIONS_MAX
 from csplat_selftest.fuzzing.bit_flips import flip, flips, prefixes
 from csplat_selftest.fuzzing.damage import damaged_file
 

@@ -23,7 +23,6 @@ from csplat_authoring.example import annex
 from csplat_authoring.recipe import Recipe
 from csplat_authoring.recipes import all_recipes
 from csplat_authoring.reference import expected
-from csplat_conformance.clauses import clause_map, replaced
 from csplat_conformance.manifest import VECTORS, Vector, picture_name, summarise, to_json
 from csplat_conformance.reference_renders import can_render, psnr, read_png, reference_render, write_png
 

@@ -26,8 +26,8 @@ import numpy as np
 from csplat import _spec
 from csplat.decoder import blocks, container, entropy, reconstruct
 from csplat.errors import FormatError, InputError, UnsupportedError
-from csplat_conformance.near import RENDERER
-from csplat_conformance.single import GPUS, Gpu, lattice_values, opacities, quats
+from csplat_conformance.single_precision import GPUS, GpuArithmetic, lattice_values, opacities, quats
+from csplat_conformance.tolerance import RENDERER
 from csplat_conformance.validator.inflate import CodedError, Inflater
 from csplat_selftest.faults import (
     DecoderFault,
@@ -290,7 +290,7 @@ _NFC = "__import__('unicodedata').normalize('NFC', {})"
 # Single precision ----------------------------------------------------------------------------------
 
 
-def single_precision(gpu: Gpu) -> Plant:
+def single_precision(gpu: GpuArithmetic) -> Plant:
     """Return what makes the Python decoder compute section 7 as a GPU does, and as CNF-7 allows."""
 
     def lattice(_right: Wrong, integers: Any, step: float, out: Any, **_options: Any) -> None:

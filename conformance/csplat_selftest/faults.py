@@ -17,11 +17,11 @@ from unittest import mock
 from csplat import _spec, decoder
 from csplat_authoring.recipes import exact_floats
 from csplat_conformance.adapter import answer
-from csplat_conformance.answers import PARTS, Answer, judge, settle
+from csplat_conformance.answers import PARTS, Answer, check_payload_consistency, compare_answer
+from csplat_conformance.conformance_report import Outcome, Status
 from csplat_conformance.manifest import Vector, load
-from csplat_conformance.near import EXACT, RENDERER
-from csplat_conformance.node import JsDecoder, js_folder
-from csplat_conformance.report import Outcome, Status
+from csplat_conformance.tolerance import EXACT, RENDERER
+from csplat_selftest.decoder_processes import JsDecoder, js_folder
 
 #: Takes the right function, then its arguments.
 Wrong = Callable[..., Any]
@@ -107,8 +107,8 @@ def find(fault: DecoderFault, vectors: Iterable[Vector] | None = None) -> Findin
             ask = _answer
         near = exact_floats if fault.by == RENDERER else None
         for vector in load() if vectors is None else vectors:
-            outcomes += judge(vector, ask(vector.data), tuple(PARTS), near=near)
-    return Finding(fault, [one for one in settle(outcomes)[0] if not one.good])
+            outcomes += compare_answer(vector, ask(vector.data), tuple(PARTS), near=near)
+    return Finding(fault, [one for one in check_payload_consistency(outcomes)[0] if not one.good])
 
 
 def _answer(data: bytes) -> Answer:

@@ -126,7 +126,10 @@ FAULTS = {
         stage=replaced(shape_codebook, "canonicalise_shape", no_gauge),
     ),
     "w_sign_lost": EncoderFault(
-        "w is what is left of length 1", *PICTURE, DENSE, stage=replaced(shape_codebook, "canonicalise_shape", sign_of_w_lost)
+        "w is what is left of length 1",
+        *PICTURE,
+        DENSE,
+        stage=replaced(shape_codebook, "canonicalise_shape", sign_of_w_lost),
     ),
     "scales_sorted_alone": EncoderFault(
         "the order of scales has nothing to do with rotations",

@@ -18,9 +18,9 @@ import csplat
 from csplat import ply as ply_files
 from csplat.encoder import Origin, encode_with_report
 from csplat.errors import CsplatError
-from csplat_conformance.encoders import LEVELS, EncoderChoice, all_inputs, run_encoder
-from csplat_conformance.process import Ended
-from csplat_conformance.report import Outcome, Report, Status
+from csplat_conformance.conformance_report import ConformanceReport, Outcome, Status
+from csplat_conformance.encoders import LEVELS, EncoderSuiteOptions, all_inputs, run_encoder
+from csplat_conformance.protocol import ProcessEnd
 from encoder_faults.fault import EncoderFault
 from encoder_faults.file_bytes import bounded
 from encoder_faults.source import true_errors
@@ -109,7 +109,7 @@ def inputs_of(fault: EncoderFault) -> list[str]:
     return [one.name for one in all_inputs() if any(fnmatch(one.name, pattern) for pattern in patterns)]
 
 
-def find(name: str, *, names: list[str] | None = None, levels: tuple[str, ...] | None = None) -> Report:
+def find(name: str, *, names: list[str] | None = None, levels: tuple[str, ...] | None = None) -> ConformanceReport:
     """Run the conformance suite over a fault; return its report.
 
     Args:
@@ -120,15 +120,15 @@ def find(name: str, *, names: list[str] | None = None, levels: tuple[str, ...] |
     fault = FAULTS[name]
     names = inputs_of(fault) if names is None else names
     if not names:
-        return Report("encoder", name, [], ("there is no such input",))
+        return ConformanceReport("encoder", name, [], ("there is no such input",))
     if levels is None:
         levels = LEVELS if fault.caught[0] == LEVELS[-1] else LEVELS[:-1]
-    choice = EncoderChoice(",".join(names), levels, 4.0 if name == "hangs" else 60.0, jobs=1)
+    choice = EncoderSuiteOptions(",".join(names), levels, 4.0 if name == "hangs" else 60.0, jobs=1)
     pictures = psnr if LEVELS[-1] in levels else None
     return run_encoder(command_of(name), choice, pictures=pictures, run=None if fault.starts else run_here)
 
 
-def first_sign(report: Report):
+def first_sign(report: ConformanceReport):
     """Return the first outcome that reports a defect, or `None`."""
     signs = report.failures or [one for one in report.outcomes if one.status in SIGNS]
     signs += [Outcome("", "L1", Status.WARNED, message=note) for note in report.notes if note.startswith("warning: ")]
@@ -144,7 +144,7 @@ def run_here(command, places, _seconds):
         code = status_of(shlex.split(command)[2], places["ply"], places["out"], index)
     status, message = (Status.WRONG_STATUS, f"exit status {code}") if code > 1 else (None, "")
     seconds = time.perf_counter() - began
-    return Ended(status, code, out.getvalue().encode(), err.getvalue().encode(), seconds, message)
+    return ProcessEnd(status, code, out.getvalue().encode(), err.getvalue().encode(), seconds, message)
 
 
 def status_of(name, ply, out, index=None):

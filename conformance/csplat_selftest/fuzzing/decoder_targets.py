@@ -17,13 +17,12 @@ from csplat import _spec, decoder
 from csplat.errors import CsplatError
 from csplat_authoring.builder import Built, build, repair
 from csplat_authoring.recipes import sound_recipes
-from csplat_conformance import adapter, node, validator
+from csplat_conformance import adapter, validator
 from csplat_conformance.answers import Answer
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import VECTORS, load
-from csplat_conformance.native import CDecoder, missing_c
-from csplat_conformance.report import Status
-from csplat_conformance.serving import Served
+from csplat_selftest import decoder_processes
+from csplat_selftest.decoder_processes import CDecoder, DecoderProcess, missing_c
 from csplat_selftest.fuzzing.damage import built_from, damaged_from
 
 LIMITS = decoder.Limits(splats=100_000, bytes=32_000_000, json_bytes=1_000_000)

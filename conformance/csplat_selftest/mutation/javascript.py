@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from csplat.errors import InputError
-from csplat_conformance.node import JsDecoder, js_folder
+from csplat_selftest.decoder_processes import JsDecoder, js_folder
 from csplat_selftest.fuzzing.decoder_targets import JS_LIMITS
 from csplat_selftest.mutation.mutants import Fate, Mutant, MutantResult, difference, failing, verdict
 

@@ -9,9 +9,9 @@ from enum import StrEnum
 from functools import cache
 from typing import Any, Protocol
 
-from csplat_conformance.answers import PARTS, Answer, judge
+from csplat_conformance.answers import PARTS, Answer, compare_answer
+from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import Vector, load
-from csplat_conformance.report import Status
 from csplat_selftest.fuzzing.decoder_targets import DecoderTarget
 
 _SHOWN = 100  # characters of a piece of text
@@ -157,7 +157,7 @@ def vectors() -> Sequence[tuple[Vector, bytes]]:
 def failing(ask: Ask) -> str:
     """Return the name of the first vector that fails, or nothing. Of refusals the code does not count."""
     for vector, data in vectors():
-        outcomes = judge(vector, ask(data), tuple(PARTS))
+        outcomes = compare_answer(vector, ask(data), tuple(PARTS))
         if not all(one.good for one in outcomes):
             return vector.name
     return ""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from csplat.errors import InputError
-from csplat_conformance.native import ADAPTER, SOURCES, CDecoder, c_folder, compile_c
+from csplat_selftest.decoder_processes import C_ADAPTER, C_SOURCES, CDecoder, c_folder, compile_c
 from csplat_selftest.fuzzing.decoder_targets import C_LIMITS
 from csplat_selftest.mutation.mutants import Fate, Mutant, MutantResult, difference, failing, verdict
 from csplat_selftest.mutation.operators import c_mutants

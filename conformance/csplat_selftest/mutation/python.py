@@ -20,7 +20,7 @@ from csplat import decoder
 from csplat.errors import InputError
 from csplat_conformance import adapter
 from csplat_conformance.answers import Answer
-from csplat_conformance.report import Status
+from csplat_conformance.conformance_report import Status
 from csplat_selftest.fuzzing.decoder_targets import LIMITS
 from csplat_selftest.mutation.mutants import Fate, Mutant, MutantResult, difference, failing, verdict
 from csplat_selftest.mutation.operators import python_mutants
