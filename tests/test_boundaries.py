@@ -14,6 +14,7 @@ from csplat_authoring.recipes import sound_recipes
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import VECTORS, load
 from csplat_conformance.validator import validate
+from csplat_selftest.decoder_processes import JsDecoder, missing_javascript
 from csplat_selftest.fuzzing.damage import built_from
 
 

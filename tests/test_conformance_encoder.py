@@ -171,8 +171,8 @@ def test_our_encoder_passes_at_other_presets(preset):
 def test_our_encoder_keeps_the_picture(preset, decibels):
     names = ["ordinary/degree_3", "ordinary/needles_and_discs", "ordinary/glossy"]
     names = names if preset == "balanced" else names[:1]
-    choice = EncoderChoice(",".join(names), ("L4",), psnr_min=decibels, jobs=1)
-    report = run_encoder(PLACES, choice, pictures=run.psnr, run=encoder_here(preset))
+    choice = EncoderSuiteOptions(",".join(names), ("L4",), psnr_min=decibels, jobs=1)
+    report = run_encoder(PLACES, choice, render_score=run.psnr, run=encoder_here(preset))
 
     assert {*names} == {one.name for one in report.outcomes}
     assert [] == report.failures

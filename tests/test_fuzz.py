@@ -21,6 +21,7 @@ from csplat_conformance import validator
 from csplat_conformance.answers import Answer
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import VECTORS
+from csplat_selftest import decoder_processes
 from csplat_selftest.fuzzing import file_targets
 from csplat_selftest.fuzzing.damage import built_from, damaged_from
 from csplat_selftest.fuzzing.decoder_targets import (

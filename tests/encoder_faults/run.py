@@ -124,8 +124,8 @@ def find(name: str, *, names: list[str] | None = None, levels: tuple[str, ...] |
     if levels is None:
         levels = LEVELS if fault.caught[0] == LEVELS[-1] else LEVELS[:-1]
     choice = EncoderSuiteOptions(",".join(names), levels, 4.0 if name == "hangs" else 60.0, jobs=1)
-    pictures = psnr if LEVELS[-1] in levels else None
-    return run_encoder(command_of(name), choice, pictures=pictures, run=None if fault.starts else run_here)
+    render_score = psnr if LEVELS[-1] in levels else None
+    return run_encoder(command_of(name), choice, render_score=render_score, run=None if fault.starts else run_here)
 
 
 def first_sign(report: ConformanceReport):
