@@ -1,8 +1,12 @@
-"""`python -m csplat`: the program `csplat`. The library itself knows nothing of the command line."""
+"""`python -m csplat`: the console script of that name, which belongs to another package."""
 
 from __future__ import annotations
 
-from importlib import import_module
+import sys
+from importlib.metadata import entry_points
 
 if __name__ == "__main__":
-    import_module("csplat_tools.__main__").main()
+    programs = entry_points(group="console_scripts", name="csplat")
+    if not programs:
+        sys.exit("the command line of csplat is not installed: pip install csplat")
+    programs["csplat"].load()()

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
+from csplat.plugins import load_plugins
 from csplat.types import F32, F64
 
 #: Highest spherical-harmonics degree of a model.
@@ -120,11 +120,10 @@ class SplatModel:
         if not len(self):
             return None
         try:
-            # Imported by name: nothing in this package depends on the tools, which depend on it.
-            notebook = import_module("csplat_tools.present.notebook")
+            html = load_plugins("csplat.display").get("html")
         except ModuleNotFoundError:
             return None
-        shown: str = notebook.scene_html(self)
+        shown: str | None = html and html(self)
         return shown
 
     @property

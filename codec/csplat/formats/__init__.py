@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 from csplat.decoder import decode
@@ -23,6 +22,7 @@ from csplat.formats.format import ARRAYS, Format
 from csplat.inputs import File
 from csplat.lint import Finding, refuse
 from csplat.model import SplatModel, check_model, check_sh_degree
+from csplat.plugins import load_plugins
 from csplat.ply import lint_ply, open_ply, read_ply, write_scene_ply
 from csplat.scene import Scene, scene_of, without_bands
 from csplat.turning import USUAL, in_axes
@@ -54,21 +54,11 @@ _PLY_FORMAT = Format(
     carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "extra", "metadata"}),
 )
 _assumed: ContextVar[str | None] = ContextVar("assumed", default=None)  # --from of a command, for all files it reads
-#: Of packages that stand on this one, by their names: nothing here knows them, and they may be absent.
-_ABOVE = ("csplat_trainer.torch_checkpoints",)
 
 
 def formats() -> tuple[Format, ...]:
-    """Return all formats, those of this package first."""
-    # Imported here: libraries of other formats would delay the start of programs that read none.
-    from csplat.formats import compressed_ply, csplat_format, gltf, ksplat, sog, splat, spz
-
-    found = [compressed_ply.FORMAT, _PLY_FORMAT, csplat_format.FORMAT, spz.FORMAT, spz.FORMAT_4]
-    found += [splat.FORMAT, ksplat.FORMAT, sog.FORMAT, gltf.FORMAT]
-    for name in _ABOVE:
-        with suppress(ModuleNotFoundError):
-            found.append(import_module(name).FORMAT)
-    return tuple(found)
+    """Return all formats: those of this package, then those of other packages (`csplat.plugins`)."""
+    return (*_own_formats().values(), *load_plugins("csplat.formats").values())
 
 
 def read(
@@ -229,21 +219,22 @@ def detect_format(path: Path) -> Format:
         OSError: the file cannot be read.
     """
     head, assumed = read_head(path), _assumed.get()
-    known = {one.name: one for one in formats()}
     kind = detect_content(path, head)
-    if kind is not None and kind.name in known:
-        return known[kind.name]
+    found = None if kind is None else _find(kind.name)
+    if found is not None:
+        return found
     if assumed is not None:
-        return known[assumed]
+        return format_by_name(assumed)
     kind = kind or (detect_name(path) if head or path.is_dir() else None)
-    if kind is None or kind.remedy:
+    found = None if kind is None else _find(kind.name)
+    if kind is None or (found is None and kind.remedy):
         raise refusal(path, head)
-    if kind.name not in known:
+    if found is None:
         raise InputError(f"{path.name} is {kind.title}, which csplat reads where csplat_trainer is installed")
-    doubt = known[kind.name].doubt(path)
+    doubt = found.doubt(path)
     if doubt:
         raise InputError(f"{path.name} is hardly {kind.title}: {doubt}; if it is one, read it with --from {kind.name}")
-    return known[kind.name]  # its reader reports what is wrong
+    return found  # its reader reports what is wrong
 
 
 def format_by_suffix(path: Path) -> Format:
@@ -252,12 +243,12 @@ def format_by_suffix(path: Path) -> Format:
     Raises:
         InputError: no format has its suffix.
     """
-    known = {one.name: one for one in formats()}
     kind = detect_name(path)
-    if kind is None or kind.name not in known:
-        endings = ", ".join(one.suffixes[0] for one in known.values() if one.write is not None)
+    found = None if kind is None else _find(kind.name)
+    if found is None:
+        endings = ", ".join(one.suffixes[0] for one in formats() if one.write is not None)
         raise InputError(f"{path.name}: no format has that ending, wanted one of {endings}")
-    return known[kind.name]
+    return found
 
 
 def format_by_name(name: str) -> Format:
@@ -266,10 +257,24 @@ def format_by_name(name: str) -> Format:
     Raises:
         InputError: there is none.
     """
-    known = {one.name: one for one in formats()}
-    if name not in known:
-        raise InputError(f"the format is {name!r}, wanted one of {', '.join(known)}")
-    return known[name]
+    found = _find(name)
+    if found is None:
+        raise InputError(f"the format is {name!r}, wanted one of {', '.join(one.name for one in formats())}")
+    return found
+
+
+def _own_formats() -> dict[str, Format]:
+    # Imported here: libraries of other formats would delay the start of programs that read none.
+    from csplat.formats import compressed_ply, csplat_format, gltf, ksplat, sog, splat, spz
+
+    found = [compressed_ply.FORMAT, _PLY_FORMAT, csplat_format.FORMAT, spz.FORMAT, spz.FORMAT_4]
+    found += [splat.FORMAT, ksplat.FORMAT, sog.FORMAT, gltf.FORMAT]
+    return {one.name: one for one in found}
+
+
+def _find(name: str) -> Format | None:
+    """Return the format of that name, looking for those of other packages only if this one has none."""
+    return _own_formats().get(name) or load_plugins("csplat.formats").get(name)
 
 
 def _readable_format(path: Path, format: str | None) -> Format:
