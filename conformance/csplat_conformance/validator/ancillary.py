@@ -1,4 +1,7 @@
-"""Chunks of the whole file: JSON texts and declared error bounds (spec 5.4, 5.5)."""
+"""Check the chunks of the whole file: JSON texts and declared error bounds (spec 5.4, 5.5).
+
+The JSON parser accepts RFC 8259 and nothing else.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +28,14 @@ _SHOWN_MAX = 24  # characters of the text in a message
 
 
 class JsonError(Exception):
-    """The text breaks JSN-1."""
+    """Raised if a text breaks JSN-1."""
 
 
 def parse_json(data: bytes) -> Any:
-    """Parse a text by JSN-1 and return its value; numbers as float.
+    """Parse a text by JSN-1 and return its value, with numbers as float.
 
     Raises:
-        JsonError: in words.
+        JsonError: the text breaks JSN-1.
     """
     if data.startswith(_BYTE_ORDER_MARK):
         raise JsonError("a byte order mark")
@@ -49,7 +52,7 @@ def parse_json(data: bytes) -> Any:
 
 
 class _Scanner:
-    """A place in a text. Recursion is bounded by JSON_DEPTH_MAX."""
+    """A parser at a place of a text. JSON_DEPTH_MAX bounds the recursion."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -120,7 +123,7 @@ class _Scanner:
         if match is None:
             raise self.error("no string")
         units = _ESCAPE.sub(_unescape, match[1])
-        # Halves of a pair that were written as two escapes join; a half that is left is no text.
+        # Surrogates written as two escapes join to a pair; a lone surrogate is an error.
         try:
             value = units.encode("utf-16-le", "surrogatepass").decode("utf-16-le", "strict")
         except UnicodeDecodeError:
@@ -151,7 +154,7 @@ _TEXT_WIDTH = 1
 
 
 def read_text(payload: Payload, kind: bytes, bytes_max: int) -> None:
-    """Check META, CAMS or OPTS: STR, JSN-1, JSN-2; keys that the spec names and that are missing are remarks."""
+    """Check META, CAMS or OPTS: STR, JSN-1, JSN-2. Missing keys that the spec recommends are remarks."""
     stream = read_stream(payload, "stream", None, _TEXT_WIDTH, count_max=bytes_max)
     payload.finish()
     if stream.elements is None:
@@ -180,7 +183,7 @@ def _remark_cameras(findings: Findings, cameras: list[dict[str, Any]]) -> None:
 
 
 def read_declared_bounds(payload: Payload, index: Index) -> None:
-    """Check SERR: SER-1 to SER-4, and of SER-5 what holds whatever the source was."""
+    """Check SERR: SER-1 to SER-4, and SER-5 as far as it holds for every source."""
     findings = payload.findings
     head = payload.structure(
         _spec.unpack_stated_errors_head, _spec.STATED_ERRORS_HEAD_SIZE, _spec.STATED_ERRORS_HEAD_OFFSETS, "head"
@@ -188,11 +191,11 @@ def read_declared_bounds(payload: Payload, index: Index) -> None:
     stated = head.record
     unlisted = stated.error_flags & ~sum(_spec.ERROR_FLAG_NAMES)
     if unlisted:
-        findings.of("RES-1", head, "error_flags", f"bits {unlisted:#04x} are reserved")
+        findings.add_field("RES-1", head, "error_flags", f"bits {unlisted:#04x} are reserved")
     splats = index.head.record.splat_count
     if stated.source_count - stated.pruned_count != splats:
         message = f"{stated.source_count} splats less {stated.pruned_count} are not the {splats} of the file"
-        findings.of("SER-4", head, "source_count", message)
+        findings.add_field("SER-4", head, "source_count", message)
     last = 0
     for i in range(stated.record_count):
         name = _spec.MEASURE_NAMES.get(payload.view[payload.at] if payload.left else 0, str(i))
@@ -204,9 +207,9 @@ def read_declared_bounds(payload: Payload, index: Index) -> None:
         )
         measure = record.record.measure
         if measure not in _spec.MEASURE_NAMES:
-            findings.of("SER-1", record, "measure", f"{measure} is no measure of the registry")
+            findings.add_field("SER-1", record, "measure", f"{measure} is no measure of the registry")
         elif measure <= last:
-            findings.of("SER-1", record, "measure", f"{measure} after {last}, wanted ascending measures")
+            findings.add_field("SER-1", record, "measure", f"{measure} after {last}, wanted ascending measures")
         last = max(last, measure)
         if _check_bound(findings, record) and measure in _spec.MEASURE_NAMES:
             _check_bound_possible(findings, record, index, stated.source_sh_degree)
@@ -214,17 +217,17 @@ def read_declared_bounds(payload: Payload, index: Index) -> None:
 
 
 def _check_bound(findings: Findings, record: PlacedRecord[_spec.StatedErrorRecord]) -> bool:
-    """SER-2. Whether both are numbers that can be compared."""
+    """Check SER-2; return True if maximum and rms can be compared."""
     largest, rms = record.record.max, record.record.rms
     wrong = [key for key, value in (("max", largest), ("rms", rms)) if not 0.0 <= value < math.inf]
     for key in wrong:
-        findings.of("SER-2", record, key, f"{getattr(record.record, key)}, wanted finite and not negative")
+        findings.add_field("SER-2", record, key, f"{getattr(record.record, key)}, wanted finite and not negative")
     if wrong:
         return False
     components = _COMPONENTS.get(_spec.MEASURE_NAMES.get(record.record.measure, ""))
     if components is not None and rms > largest * math.sqrt(components) * _ROUNDING:
         message = f"{largest:.9g}, and rms {rms:.9g} is more than that allows for {components} components"
-        findings.of("SER-2", record, "max", message)
+        findings.add_field("SER-2", record, "max", message)
         return False
     return True
 
@@ -232,20 +235,20 @@ def _check_bound(findings: Findings, record: PlacedRecord[_spec.StatedErrorRecor
 def _check_bound_possible(
     findings: Findings, record: PlacedRecord[_spec.StatedErrorRecord], index: Index, source_degree: int
 ) -> None:
-    """SER-5 without the source: no pair of scenes has these errors, or they exceed the true ones by too much.
+    """Check SER-5 without the source: whether any pair of scenes has errors that allow this bound.
 
-    One splat has the true maximum, which the stated one exceeds by little; so the true rms is at least that over √N,
-    and the stated one is hardly less (SER-7).
+    One splat has the true maximum, which the declared one exceeds by little. So the true rms is at least that maximum
+    over √N, and the declared rms is hardly less (SER-7).
     """
     largest, rms = record.record.max, record.record.rms
     splats, measure = index.head.record.splat_count, _spec.MEASURE_NAMES[record.record.measure]
     least = least_true_error(measure, largest)
     if splats and rms * _ROUNDING + bound_tolerance(measure, rms, 0.0) < least / math.sqrt(splats):
         message = f"{rms:.9g} is too small for max {largest:.9g} over {splats} splats"
-        findings.of("SER-5", record, "rms", message)
+        findings.add_field("SER-5", record, "rms", message)
     if measure == "opacities" and least > 1.0:
-        findings.of("SER-5", record, "max", f"alpha differs by at most 1, not by {largest:.9g}")
+        findings.add_field("SER-5", record, "max", f"alpha differs by at most 1, not by {largest:.9g}")
     band = record.record.measure - _spec.MEASURE_SH0
     degree = index.degree if index.degree is not None else _spec.SH_DEGREE_MAX
     if (band > max(degree, source_degree) or not splats) and least > 0.0:
-        findings.of("SER-5", record, "max", f"{largest:.9g} for {measure}, of which there is nothing to differ")
+        findings.add_field("SER-5", record, "max", f"{largest:.9g} for {measure}, of which there is nothing to differ")

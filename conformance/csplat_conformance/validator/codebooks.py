@@ -1,4 +1,4 @@
-"""Codebook chunks (spec 5.3), and which columns of them an attribute has."""
+"""Read codebook chunks (spec 5.3), and find the columns of an attribute in their entries."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from csplat_conformance.validator.index import Chunk, CodebookAt, Index
 from csplat_conformance.validator.streams import read_stream
 from csplat_conformance.validator.values import Place, check_integers
 
-#: By id and layer the entries, [size, C], of chunks that could be read and are sound.
+#: The entries, [size, C], of chunks that are sound, by codebook id and layer.
 CodebookEntries = dict[tuple[int, int], I64]
 
 _ENTRY_WIDTH_MAX = 4  # STR-2: "4 for codebooks' entries"
@@ -19,7 +19,7 @@ _ATTRIBUTES = {name: value for value, name in _spec.ATTRIBUTE_NAMES.items()}
 
 
 def codebook_attributes(book: CodebookAt) -> list[int]:
-    """The attributes that a codebook serves, in its order."""
+    """Return the attributes that a codebook holds, in its order."""
     if book.record.kind == _spec.CODEBOOK_KIND_SH:
         return [_spec.ATTRIBUTE_SH0 + band for band in range(book.record.band_first, book.record.band_last + 1)]
     return [_ATTRIBUTES[name] for name in _spec.CODEBOOK_KIND_ATTRIBUTES[book.record.kind]]
@@ -31,7 +31,7 @@ def first_attribute(book: CodebookAt) -> int:
 
 
 def attribute_columns(book: CodebookAt, attribute: int) -> slice | None:
-    """Return an attribute's columns in the entries of its layer; `None` if the codebook does not serve it."""
+    """Return the columns of an attribute in the entries of its layer, `None` if the codebook does not hold it."""
     first = 0
     for served in codebook_attributes(book):
         columns = _spec.ATTRIBUTE_COLUMNS[served]
@@ -48,9 +48,9 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: CodebookE
 
     Args:
         payload: payload of the chunk.
-        chunk: its record.
+        chunk: the chunk.
         index: index of the file.
-        books: gets the entries, if a sound record asks for the chunk.
+        books: receives the entries, if a sound codebook record requires the chunk.
 
     Raises:
         UnreadableError: the payload ends too early.
@@ -62,7 +62,7 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: CodebookE
     for key, wanted in (("codebook_id", chunk.identity), ("layer", chunk.layer)):
         found = getattr(head.record, key)
         if found != wanted:
-            findings.of("CDB-1", head, key, f"{found}, its records say {wanted}")
+            findings.add_field("CDB-1", head, key, f"{found}, its records say {wanted}")
     if book is None or chunk.layer not in layers:
         findings.skip(f"{chunk.name} from byte {payload.at} on", "no sound codebook record asks for it")
         return
@@ -73,7 +73,7 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: CodebookE
     if stream.elements is not None:
         table = stream.elements.astype(np.int64).reshape(columns, size).T
         where = (stream.head.offset, f"{payload.name}/entries")
-        # Without this, splats of invalid entries would be reported again for each tile.
+        # Otherwise every tile would report the invalid entries again.
         if _check_entries(findings, index, book, of_layer, table, where):
             books[chunk.identity, chunk.layer] = table
     payload.finish()
@@ -82,7 +82,7 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: CodebookE
 def _check_entries(
     findings: Findings, index: Index, book: CodebookAt, attributes: list[int], table: I64, where: Place
 ) -> bool:
-    """CBK-7: entries, used or not; but for scales to which a summand comes."""
+    """Check CBK-7 for entries, used or not. Scales are checked in the tile, with their summand."""
     sound = True
     for attribute in attributes:
         columns = attribute_columns(book, attribute)

@@ -10,20 +10,20 @@ from csplat import _spec
 
 T = TypeVar("T")
 
-#: A file of garbage with sound sizes breaks a clause every few bytes: nobody reads more.
+#: Largest number of violations; a file of garbage with sound sizes breaks a clause every few bytes.
 VIOLATIONS_MAX = 10_000
 
 
 @dataclass(frozen=True)
 class Violation:
-    """A clause that is broken.
+    """A violation of a clause of the spec.
 
     Attributes:
-        clause: id of the spec.
-        code: error code with which a decoder refuses the file; empty for SER-5, which no decoder can judge.
-        offset: byte of the file where the offending field, or else its structure, begins.
-        field: its name: structure and field, `tile[0].layer[1].offset`, `TILE.0.1/sh1.stream.count`.
-        message: what was found and what was expected, one line.
+        clause: id of the clause.
+        code: error code of a decoder's refusal; empty for SER-5, which no decoder checks.
+        offset: offset in the file of the offending field or, if there is none, of its structure.
+        field: name of structure and field, `tile[0].layer[1].offset`, `TILE.0.1/sh1.stream.count`.
+        message: one line: the value found and the value expected.
     """
 
     clause: str
@@ -39,11 +39,11 @@ class Violation:
 
 @dataclass(frozen=True)
 class Unread:
-    """A part of the file that could not be looked at, because of a violation before it.
+    """A part of the file that could not be checked because of a violation before it.
 
     Attributes:
         field: name of the part.
-        reason: why, a few words.
+        reason: the reason in a few words.
     """
 
     field: str
@@ -58,11 +58,10 @@ class Validation:
     """The result of validating a file.
 
     Attributes:
-        violations: ordered by offset. If there are none, the file conforms (CNF-1).
-        remarks: what no clause forbids although the spec asks otherwise: unused values that are not written as
-            stated, recommendations not followed. A line each.
-        unread: parts that were not checked; without violations there are none.
-        splat_count: N in the index, 0 if it could not be read.
+        violations: violations by offset. If there are none, the file conforms (CNF-1).
+        remarks: a line for each recommendation of the spec that the file does not follow.
+        unread: parts that were not checked; none without violations.
+        splat_count: N in the index, 0 if the index could not be read.
         tile_count: number of tile records that were read.
         checks: names of the checks that were made.
     """
@@ -81,18 +80,18 @@ class Validation:
 
 
 class TooManyViolationsError(Exception):
-    """Raised when there are too many violations for the rest to be worth checking."""
+    """Raised if there are so many violations that the rest is not worth checking."""
 
 
 @dataclass(frozen=True)
 class PlacedRecord(Generic[T]):
-    """A structure of the registry, and where it lies.
+    """A structure of the registry and its place in the file.
 
     Attributes:
-        record: its fields.
-        offset: byte of the file where it begins.
-        name: prefix of its fields' names, `tile[0]`.
-        places: offset of each field in it.
+        record: the fields.
+        offset: offset in the file.
+        name: prefix of the names of its fields, `tile[0]`.
+        places: offset of each field within the structure.
     """
 
     record: T
@@ -101,17 +100,17 @@ class PlacedRecord(Generic[T]):
     places: dict[str, int]
 
     def at(self, key: str, within: int = 0) -> int:
-        """Byte of the file where a field begins, or a byte within it."""
+        """Return the offset in the file of a field, or of a byte within it."""
         return self.offset + self.places[key] + within
 
     def path(self, key: str) -> str:
-        """Full name of a field."""
+        """Return the full name of a field."""
         return f"{self.name}.{key}"
 
 
 @dataclass
 class Findings:
-    """Collects what is found, in any order."""
+    """A collection of what was found so far, in any order."""
 
     violations: list[Violation] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
@@ -119,14 +118,14 @@ class Findings:
     checks: list[str] = field(default_factory=list)
 
     def add(self, clause: str, offset: int, name: str, message: str, code: str = "") -> None:
-        """Note a violation.
+        """Add a violation.
 
         Args:
-            clause: id of the spec.
-            offset: byte of the file.
+            clause: id of the clause.
+            offset: offset in the file.
             name: name of the field.
-            message: what was found and what was expected.
-            code: error code, if it is not the clause's usual one.
+            message: the value found and the value expected.
+            code: error code, if it is not the usual one of the clause.
 
         Raises:
             TooManyViolationsError: the list is full.
@@ -136,21 +135,21 @@ class Findings:
             self.remarks.append(f"more than {VIOLATIONS_MAX} violations: the rest of the file was not looked at")
             raise TooManyViolationsError
 
-    def of(
+    def add_field(
         self, clause: str, placed: PlacedRecord[Any], key: str, message: str, code: str = "", within: int = 0
     ) -> None:
-        """Note a violation by a field of a structure; the message gets the field's name."""
+        """Add a violation by a field of a structure."""
         self.add(clause, placed.at(key, within), placed.path(key), message, code)
 
-    def reserved(self, placed: PlacedRecord[Any]) -> None:
-        """RES-1: "A reserved field or bit MUST be 0"."""
+    def check_reserved(self, placed: PlacedRecord[Any]) -> None:
+        """Check RES-1: "A reserved field or bit MUST be 0"."""
         for key in placed.places:
             value = getattr(placed.record, key)
             if key.startswith("reserved_") and value != 0:
-                self.of("RES-1", placed, key, f"reserved, holds {value}, wanted 0")
+                self.add_field("RES-1", placed, key, f"reserved, holds {value}, wanted 0")
 
     def skip(self, name: str, reason: str) -> None:
-        """Note that a part is not looked at."""
+        """Add a part that is not checked."""
         self.unread.append(Unread(name, reason))
 
 
@@ -158,16 +157,16 @@ _Unpack = Callable[[memoryview, int], T]
 
 
 class UnreadableError(Exception):
-    """Raised when the place of what follows is unknown: a length or a kind is wrong. The violation has been noted."""
+    """Raised if the place of what follows is unknown because a length or a kind is wrong; the violation was added."""
 
 
 def read_record(view: memoryview, unpack: _Unpack[T], places: dict[str, int], at: int, name: str) -> PlacedRecord[T]:
-    """Read a structure that is known to fit."""
+    """Read a structure that is known to fit into the data."""
     return PlacedRecord(unpack(view, at), at, name, places)
 
 
 class Payload:
-    """The payload of a chunk, read from its beginning to its end.
+    """A reader of the payload of a chunk, from its beginning to its end.
 
     Args:
         view: the whole file.
@@ -188,14 +187,14 @@ class Payload:
 
     @property
     def left(self) -> int:
-        """Bytes that were not taken yet."""
+        """Number of bytes that were not read yet."""
         return self.end - self.at
 
     def take(self, size: int, what: str) -> int:
-        """Step over `size` bytes and return where they begin.
+        """Step over `size` bytes and return their offset.
 
         Raises:
-            UnreadableError: fewer are left.
+            UnreadableError: there are fewer.
         """
         at = self.at
         if size > self.left:
@@ -207,19 +206,20 @@ class Payload:
         return at
 
     def structure(self, unpack: _Unpack[T], size: int, places: dict[str, int], what: str) -> PlacedRecord[T]:
-        """Read the next structure and look at its reserved fields; its name is that of the chunk and `what`."""
+        """Read the next structure, named after the chunk and `what`, and check its reserved fields."""
         at = self.take(size, what)
         placed = read_record(self.view, unpack, places, at, f"{self.name}/{what}")
-        self.findings.reserved(placed)
+        self.findings.check_reserved(placed)
         return placed
 
     def finish(self) -> None:
-        """Nothing follows the last structure."""
+        """Check that nothing follows the last structure."""
         if self.left:
             self.findings.add(self.clause, self.at, f"{self.name}/tail", f"{self.left} bytes follow the last structure")
 
 
-#: Clause to error code; if the text names two, the one that this table has is the usual one.
+#: The error code of each requirement on a stream, the usual one if the text names two. Clauses about decoders, partial
+#: readers and editors are not here. A test compares this table with the text of the spec.
 CODES: Final[dict[str, str]] = {
     "RES-1": _spec.ERROR_RESERVED,
     "RES-2": _spec.ERROR_UNSUPPORTED,

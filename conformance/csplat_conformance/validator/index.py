@@ -35,19 +35,19 @@ CodebookAt = PlacedRecord[_spec.CodebookRecord]
 
 @dataclass
 class Index:
-    """The contents of the index, as far as it could be read.
+    """The contents of the index as far as they could be read.
 
     Attributes:
         head: the index head.
         degree: `sh_degree`; `None` if this version does not have that degree.
-        attributes: by registry value.
+        attributes: attribute records by registry value.
         steps: steps that obey ATT-6, by registry value.
         levels: levels that obey ATT-3 or ATT-4, by registry value.
-        codebooks: by id; only codebooks whose kind and sizes are valid.
+        codebooks: codebook records with valid kind and sizes, by id.
         codebook_ids: ids of all codebook records.
-        extras: bytes of each extra column's values, `None` if the type is unknown.
-        complete: whether all records before the directory fit into the index.
-        end: offset of the end of the last of them.
+        extras: bytes per value of each extra column, `None` if the type is unknown.
+        complete: whether all records that were read so far fit into the index.
+        end: offset of the end of these records.
     """
 
     head: Head
@@ -62,13 +62,13 @@ class Index:
     end: int = 0
 
     def size_of(self, kind: str) -> int:
-        """Return the bytes of the head or of a kind of record, tail included; at least the bytes of its fields."""
+        """Return the size of the head or of a kind of record with its tail, at least the size of its fields."""
         return max(_SIZES_MIN[kind], int(getattr(self.head.record, f"{kind}_size")))
 
 
 def scaled_step(step: float, exponent: int, *, single: bool = False) -> float | None:
-    """Return step × 2^exponent, `None` if it is not finite or subnormal in binary64, or binary32 (TIL-9, LAT-1)."""
-    if abs(exponent) > 4096:  # beyond any pair of binary64 values, and not worth such an integer
+    """Return step × 2^exponent, `None` if that is infinite or subnormal in binary64 or binary32 (TIL-9, LAT-1)."""
+    if abs(exponent) > 4096:  # beyond any pair of binary64 values; avoids a huge integer
         return None
     product = Fraction(step) * Fraction(2) ** exponent
     low, high = (_SINGLE_MIN, _SINGLE_MAX) if single else (_STEP_MIN, _STEP_MAX)
@@ -76,11 +76,11 @@ def scaled_step(step: float, exponent: int, *, single: bool = False) -> float | 
 
 
 def read_records(view: memoryview, end: int, findings: Findings) -> Index:
-    """Read everything of the index before the directory.
+    """Read the records of the index before the directory.
 
     Args:
         view: the file.
-        end: offset of the index's CRC by the header, at most the end of the data.
+        end: offset of the index's CRC by the header, not beyond the data.
         findings: receives the violations.
     """
     start = _spec.HEADER_SIZE
@@ -100,7 +100,7 @@ def read_records(view: memoryview, end: int, findings: Findings) -> Index:
 
 
 def _count_fitting(index: Index, at: int, end: int, count: int, size: int) -> int:
-    """Return how many records of a kind fit into the index; after the first kind that does not fit, none do."""
+    """Return the number of records of a kind that fit into the index; none after a kind that did not fit."""
     fitting = min(count, max(0, (end - at) // size)) if index.complete else 0
     index.complete &= fitting == count
     return fitting
@@ -108,24 +108,24 @@ def _count_fitting(index: Index, at: int, end: int, count: int, size: int) -> in
 
 def _check_head(findings: Findings, head: Head) -> None:
     record = head.record
-    findings.reserved(head)
+    findings.check_reserved(head)
     for kind, least in _SIZES_MIN.items():
         size = getattr(record, f"{kind}_size")
         if size < least:
-            findings.of("IDX-8", head, f"{kind}_size", f"{size}, wanted {least} at least")
+            findings.add_field("IDX-8", head, f"{kind}_size", f"{size}, wanted {least} at least")
     if record.sh_degree > _spec.SH_DEGREE_MAX:
-        findings.of("IDX-3", head, "sh_degree", f"{record.sh_degree}, wanted {_spec.SH_DEGREE_MAX} at most")
+        findings.add_field("IDX-3", head, "sh_degree", f"{record.sh_degree}, wanted {_spec.SH_DEGREE_MAX} at most")
     unlisted = record.scene_flags & 0x0F & ~sum(_spec.SCENE_FLAG_NAMES)
     if unlisted:
-        findings.of("RES-1", head, "scene_flags", f"bits {unlisted:#04x} are reserved")
+        findings.add_field("RES-1", head, "scene_flags", f"bits {unlisted:#04x} are reserved")
     letters = [_spec.DIRECTION_LETTER.get(axis) for axis in record.axes]
     if any(record.axes) and {_AXIS_OF_DIRECTION.get(letter or "") for letter in letters} != {0, 1, 2}:
-        findings.of("IDX-4", head, "axes", f"{list(record.axes)}, wanted zeros or directions along three lines")
+        findings.add_field("IDX-4", head, "axes", f"{list(record.axes)}, wanted zeros or directions along three lines")
     if not 0.0 <= record.unit_metres < math.inf:
-        findings.of("IDX-5", head, "unit_metres", f"{record.unit_metres}, wanted 0, or positive and finite")
+        findings.add_field("IDX-5", head, "unit_metres", f"{record.unit_metres}, wanted 0, or positive and finite")
     for axis, value in enumerate(record.origin):
         if not math.isfinite(value):
-            findings.of(
+            findings.add_field(
                 "IDX-6", head, "origin", f"component {axis} is {value}, wanted a finite number", within=8 * axis
             )
 
@@ -138,14 +138,16 @@ def _read_attributes(view: memoryview, at: int, end: int, index: Index, findings
     bands = 0 if index.degree is None else index.degree
     wanted = [value for value, layer in _spec.ATTRIBUTE_LAYER.items() if layer <= bands]
     if index.degree is not None and count != len(wanted):
-        findings.of("ATT-1", index.head, "attribute_count", f"{count}, wanted {len(wanted)} for SH degree {bands}")
+        findings.add_field(
+            "ATT-1", index.head, "attribute_count", f"{count}, wanted {len(wanted)} for SH degree {bands}"
+        )
     for i in range(_count_fitting(index, at, end, count, index.size_of("attribute"))):
         attribute = view[at]
         name = f"attribute[{_spec.ATTRIBUTE_NAMES.get(attribute, attribute)}]"
         placed = read_record(view, _spec.unpack_attribute_record, _spec.ATTRIBUTE_RECORD_OFFSETS, at, name)
-        findings.reserved(placed)
+        findings.check_reserved(placed)
         if count == len(wanted) and index.degree is not None and attribute != wanted[i]:
-            findings.of("ATT-1", placed, "attribute", f"{attribute}, wanted {wanted[i]} in place {i}")
+            findings.add_field("ATT-1", placed, "attribute", f"{attribute}, wanted {wanted[i]} in place {i}")
         if attribute in _spec.ATTRIBUTE_NAMES and attribute not in index.attributes:
             index.attributes[attribute] = placed
             _check_attribute(findings, placed, index)
@@ -157,11 +159,13 @@ def _check_attribute(findings: Findings, placed: AttributeAt, index: Index) -> N
     record = placed.record
     legal = _spec.ATTRIBUTE_MAPPINGS[record.attribute]
     if _spec.MAPPING_NAMES.get(record.mapping) not in legal:
-        findings.of("ATT-2", placed, "mapping", f"{record.mapping}, wanted {' or '.join(legal) or 'none'}")
+        findings.add_field("ATT-2", placed, "mapping", f"{record.mapping}, wanted {' or '.join(legal) or 'none'}")
     if record.chroma_shift > _spec.CHROMA_SHIFT_MAX:
-        findings.of("ATT-8", placed, "chroma_shift", f"{record.chroma_shift}, wanted {_spec.CHROMA_SHIFT_MAX} at most")
+        findings.add_field(
+            "ATT-8", placed, "chroma_shift", f"{record.chroma_shift}, wanted {_spec.CHROMA_SHIFT_MAX} at most"
+        )
     if record.chroma_shift and record.mapping != _spec.MAPPING_YCOCG:
-        findings.of("ATT-9", placed, "chroma_shift", f"{record.chroma_shift}, wanted 0 without YCOCG")
+        findings.add_field("ATT-9", placed, "chroma_shift", f"{record.chroma_shift}, wanted 0 without YCOCG")
     kind = _spec.ATTRIBUTE_KIND[record.attribute]
     if kind == "lattice":
         _check_lattice(findings, placed, index)
@@ -177,19 +181,19 @@ def _check_levels(findings: Findings, placed: AttributeAt, index: Index) -> None
     if low <= record.levels <= high:
         index.levels[record.attribute] = record.levels
     else:
-        findings.of(clause, placed, "levels", f"{record.levels}, wanted {low} to {high}")
+        findings.add_field(clause, placed, "levels", f"{record.levels}, wanted {low} to {high}")
     if record.step != 0.0 or math.copysign(1.0, record.step) < 0.0:
-        findings.of("ATT-7", placed, "step", f"{record.step} for an attribute of levels, wanted +0")
+        findings.add_field("ATT-7", placed, "step", f"{record.step} for an attribute of levels, wanted +0")
 
 
 def _check_lattice(findings: Findings, placed: AttributeAt, index: Index) -> None:
     record = placed.record
     if record.levels:
-        findings.of("ATT-5", placed, "levels", f"{record.levels} for a lattice, wanted 0")
+        findings.add_field("ATT-5", placed, "levels", f"{record.levels} for a lattice, wanted 0")
     if not 2.0**-1022 <= record.step < math.inf:
-        findings.of("ATT-6", placed, "step", f"{record.step}, wanted positive, finite and at least 2^-1022")
+        findings.add_field("ATT-6", placed, "step", f"{record.step}, wanted positive, finite and at least 2^-1022")
     elif record.attribute != _spec.ATTRIBUTE_MEANS and not _is_single(Fraction(record.step)):
-        findings.of("ATT-10", placed, "step", f"{record.step}, wanted a binary32 value of at least 2^-126")
+        findings.add_field("ATT-10", placed, "step", f"{record.step}, wanted a binary32 value of at least 2^-126")
     else:
         index.steps[record.attribute] = record.step
 
@@ -198,7 +202,7 @@ def _is_single(step: Fraction) -> bool:
     """Return True for a normal binary32 value: at most 24 bits from the first 1 to the last."""
     if not _SINGLE_MIN <= step <= _SINGLE_MAX:
         return False
-    odd = step.numerator  # a binary fraction: either over a power of two, or whole
+    odd = step.numerator  # the denominator is a power of two
     return (odd // (odd & -odd)).bit_length() <= 24
 
 
@@ -211,9 +215,9 @@ def _read_codebooks(view: memoryview, at: int, end: int, index: Index, findings:
         identity = int.from_bytes(view[at : at + 2], "little")
         name = f"codebook[{identity}]"
         placed = read_record(view, _spec.unpack_codebook_record, _spec.CODEBOOK_RECORD_OFFSETS, at, name)
-        findings.reserved(placed)
+        findings.check_reserved(placed)
         if identity <= last:
-            findings.of("CBR-1", placed, "codebook_id", f"{identity} after {last}, wanted ascending ids")
+            findings.add_field("CBR-1", placed, "codebook_id", f"{identity} after {last}, wanted ascending ids")
         last = identity
         index.codebook_ids.add(identity)
         if _is_sound_codebook(findings, placed, index):
@@ -227,15 +231,15 @@ def _is_sound_codebook(findings: Findings, placed: CodebookAt, index: Index) -> 
     before = len(findings.violations)
     first, last = record.band_first, record.band_last
     if record.kind not in _spec.CODEBOOK_KIND_NAMES:
-        findings.of("RES-2", placed, "kind", f"{record.kind} is no kind that this version uses")
+        findings.add_field("RES-2", placed, "kind", f"{record.kind} is no kind that this version uses")
     elif record.kind == _spec.CODEBOOK_KIND_SH:
         highest = _spec.SH_DEGREE_MAX if index.degree is None else index.degree
         if not 1 <= first <= last <= highest:
-            findings.of("CBR-2", placed, "band_first", f"bands {first} to {last} in a scene of degree {highest}")
+            findings.add_field("CBR-2", placed, "band_first", f"bands {first} to {last} in a scene of degree {highest}")
     elif first or last:
-        findings.of("CBR-2", placed, "band_first", f"bands {first} to {last} of a kind without bands, wanted 0")
+        findings.add_field("CBR-2", placed, "band_first", f"bands {first} to {last} of a kind without bands, wanted 0")
     if not 1 <= record.size <= _spec.CODEBOOK_ENTRIES_MAX:
-        findings.of("CBR-4", placed, "size", f"{record.size} entries, wanted 1 to {_spec.CODEBOOK_ENTRIES_MAX}")
+        findings.add_field("CBR-4", placed, "size", f"{record.size} entries, wanted 1 to {_spec.CODEBOOK_ENTRIES_MAX}")
     return len(findings.violations) == before
 
 
@@ -248,9 +252,9 @@ def _read_extras(view: memoryview, at: int, end: int, index: Index, findings: Fi
         placed = read_record(view, _spec.unpack_extra_record, _spec.EXTRA_RECORD_OFFSETS, at, f"extra[{i}]")
         record = placed.record
         if record.dtype < _spec.ANCILLARY_ID_MIN and record.dtype not in _spec.EXTRA_DTYPE_NAMES:
-            findings.of("RES-2", placed, "dtype", f"{record.dtype} is no type of the registry")
+            findings.add_field("RES-2", placed, "dtype", f"{record.dtype} is no type of the registry")
         if not 1 <= record.name_size <= _spec.EXTRA_NAME_MAX:
-            findings.of("EXR-1", placed, "name_size", f"{record.name_size}, wanted 1 to {_spec.EXTRA_NAME_MAX}")
+            findings.add_field("EXR-1", placed, "name_size", f"{record.name_size}, wanted 1 to {_spec.EXTRA_NAME_MAX}")
         else:
             _check_name(findings, placed, names)
         index.extras.append(_spec.EXTRA_DTYPE_BYTES.get(record.dtype))
@@ -262,16 +266,16 @@ def _check_name(findings: Findings, placed: PlacedRecord[_spec.ExtraRecord], nam
     raw = placed.record.name[: placed.record.name_size]
     rest = placed.record.name[placed.record.name_size :]
     if any(rest):
-        findings.of("EXR-3", placed, "name", "bytes behind the name are not 0", within=len(raw))
+        findings.add_field("EXR-3", placed, "name", "bytes behind the name are not 0", within=len(raw))
     try:
         name = raw.decode("utf-8")
     except UnicodeDecodeError as error:
-        findings.of("EXR-2", placed, "name", f"byte {error.start} is not UTF-8", within=error.start)
+        findings.add_field("EXR-2", placed, "name", f"byte {error.start} is not UTF-8", within=error.start)
         return
     if any(ord(character) < 0x20 or ord(character) == 0x7F for character in name):
-        findings.of("EXR-2", placed, "name", f"a control character in {name!r}")
+        findings.add_field("EXR-2", placed, "name", f"a control character in {name!r}")
     if name in names:
-        findings.of("EXR-2", placed, "name", f"a second column is called {name!r}")
+        findings.add_field("EXR-2", placed, "name", f"a second column is called {name!r}")
     names.add(name)
 
 
@@ -282,14 +286,14 @@ _LAYER_END = max(_spec.LAYER_NAMES) + 1
 
 @dataclass
 class Chunk:
-    """A chunk as a record names it.
+    """A chunk of a directory or layer record.
 
     Attributes:
         name: `META`, `CODB.2.0`, `TILE.0.1`.
-        kind: its type.
+        kind: chunk type.
         flags: flags of the record, or the flags registered for TILE.
         record: directory or layer record; both have `size` and `offset`.
-        identity: codebook id, or place of the tile.
+        identity: codebook id, or index of the tile.
         layer: layer of the record.
         whole: whether its bytes exist and belong to no other chunk.
     """
@@ -304,37 +308,37 @@ class Chunk:
 
     @property
     def offset(self) -> int:
-        """First byte."""
+        """Offset in the file."""
         return int(self.record.record.offset)
 
     @property
     def size(self) -> int:
-        """Bytes, header included."""
+        """Size in bytes with the chunk header."""
         return int(self.record.record.size)
 
     @property
     def rank(self) -> tuple[int, int]:
-        """Place in the order that 4.3.6 recommends: by layer, codebooks before tiles; ancillary chunks first."""
+        """Rank in the order that 4.3.6 recommends: ancillary chunks, then by layer, codebooks before tiles."""
         if self.kind == _spec.CHUNK_TILE:
             return (self.layer, 1)
         return (self.layer, 0) if self.kind == _spec.CHUNK_CODEBOOK else (-1, 0)
 
 
 def registered_flags(kind: bytes) -> int:
-    """Return the flags that a known type has."""
+    """Return the flags that the registry has for a known type."""
     return sum(bit for bit, name in _spec.CHUNK_FLAG_NAMES.items() if name in _spec.CHUNK_FLAGS[kind])
 
 
 def check_chunk_size(findings: Findings, chunk: Chunk) -> Chunk:
-    """CHK-3, as far as a record alone shows it: a chunk has a header."""
+    """Check CHK-3 as far as a record alone shows it: a chunk has a header."""
     least = _spec.CHUNK_HEADER_SIZE
     if chunk.size < least:
-        findings.of("CHK-3", chunk.record, "size", f"{chunk.size} bytes, a chunk has {least} at least")
+        findings.add_field("CHK-3", chunk.record, "size", f"{chunk.size} bytes, a chunk has {least} at least")
     return chunk
 
 
 def read_directory(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> list[Chunk]:
-    """Read the directory records that lie within the index; DIR-1 to DIR-6."""
+    """Read the directory records within the index and check DIR-1 to DIR-6."""
     start, chunks = at, list[Chunk]()
     count = index.head.record.directory_count
     size = index.size_of("directory")
@@ -344,7 +348,7 @@ def read_directory(view: memoryview, at: int, end: int, index: Index, findings: 
         placed = read_record(
             view, _spec.unpack_directory_record, _spec.DIRECTORY_RECORD_OFFSETS, at, f"directory[{name}]"
         )
-        findings.reserved(placed)
+        findings.check_reserved(placed)
         chunks.append(
             check_chunk_size(findings, Chunk(name, record.type, record.flags, placed, record.id, record.layer))
         )
@@ -359,7 +363,7 @@ def read_directory(view: memoryview, at: int, end: int, index: Index, findings: 
 
 
 def _chunk_name(record: _spec.DirectoryRecord, known: list[str]) -> str:
-    """Name a chunk; bytes that are no letters are written as escapes."""
+    """Return the name of a chunk, with escapes for bytes that are not printable."""
     kind = ascii(record.type.decode("latin-1"))[1:-1]
     if record.type == _spec.CHUNK_CODEBOOK:
         kind = f"CODB.{record.id}.{record.layer}"
@@ -370,23 +374,23 @@ def _check_type(findings: Findings, placed: PlacedRecord[_spec.DirectoryRecord])
     record = placed.record
     kind = record.type
     if kind == _spec.CHUNK_TILE:
-        findings.of("DIR-1", placed, "type", "TILE, which layer records name")
+        findings.add_field("DIR-1", placed, "type", "TILE, which layer records name")
         return
     if not all(0x20 <= byte <= 0x7E for byte in kind):
-        findings.of("DIR-1", placed, "type", f"{kind!r}, wanted bytes 0x20 to 0x7E")
+        findings.add_field("DIR-1", placed, "type", f"{kind!r}, wanted bytes 0x20 to 0x7E")
     flags = record.flags & 0x00FF  # the others are ancillary
     unlisted = flags & ~sum(_spec.CHUNK_FLAG_NAMES)
     if unlisted:
-        findings.of("RES-1", placed, "flags", f"bits {unlisted:#06x} are reserved")
+        findings.add_field("RES-1", placed, "flags", f"bits {unlisted:#06x} are reserved")
     if kind in _spec.CHUNK_NAMES:
         if flags & ~unlisted != registered_flags(kind):
-            findings.of("CHK-4", placed, "flags", f"{record.flags:#06x}, wanted {registered_flags(kind):#06x}")
+            findings.add_field("CHK-4", placed, "flags", f"{record.flags:#06x}, wanted {registered_flags(kind):#06x}")
     elif kind == _spec.CHUNK_TREE:
-        findings.of("RES-2", placed, "type", f"{kind.decode()} is reserved")
+        findings.add_field("RES-2", placed, "type", f"{kind.decode()} is reserved")
     elif flags & _spec.CHUNK_FLAG_CRITICAL:
         if kind[:1].islower():
-            findings.of("DIR-6", placed, "flags", f"{kind!r} is private and critical")
-        findings.of("DIR-2", placed, "type", f"{kind!r} is critical and not known")
+            findings.add_field("DIR-6", placed, "flags", f"{kind!r} is private and critical")
+        findings.add_field("DIR-2", placed, "type", f"{kind!r} is critical and not known")
 
 
 def _check_single(findings: Findings, chunks: Sequence[Chunk]) -> None:
@@ -395,16 +399,16 @@ def _check_single(findings: Findings, chunks: Sequence[Chunk]) -> None:
         if chunk.kind not in _SINGLE_CHUNKS:
             continue
         if chunk.kind in seen:
-            findings.of("DIR-4", chunk.record, "type", f"a second {chunk.kind.decode()}")
+            findings.add_field("DIR-4", chunk.record, "type", f"a second {chunk.kind.decode()}")
         if chunk.identity or chunk.layer:
             where = f"id {chunk.identity} and layer {chunk.layer}"
-            findings.of("DIR-4", chunk.record, "type", f"{chunk.kind.decode()} with {where}, wanted 0 and 0")
+            findings.add_field("DIR-4", chunk.record, "type", f"{chunk.kind.decode()} with {where}, wanted 0 and 0")
         seen.add(chunk.kind)
 
 
 def _check_codebook_chunks(findings: Findings, chunks: Sequence[Chunk], index: Index, start: int) -> None:
     if len(index.codebooks) != index.head.record.codebook_count:
-        return  # the codebooks that they need are not known: the violations have been noted
+        return  # some codebooks are unknown, and their violations were added
     wanted = {
         (identity, layer)
         for identity, book in index.codebooks.items()
@@ -415,18 +419,20 @@ def _check_codebook_chunks(findings: Findings, chunks: Sequence[Chunk], index: I
             continue
         key = (chunk.identity, chunk.layer)
         if key not in wanted:
-            findings.of("DIR-5", chunk.record, "type", "no codebook record asks for this chunk, or it is the second")
+            findings.add_field(
+                "DIR-5", chunk.record, "type", "no codebook record asks for this chunk, or it is the second"
+            )
         wanted.discard(key)
     for identity, layer in sorted(wanted):
         findings.add("DIR-5", start, "directory", f"no CODB chunk for codebook {identity}, layer {layer}")
 
 
 def check_coverage(findings: Findings, chunks: Sequence[Chunk], start: int, file_size: int, data_size: int) -> None:
-    """COV-1; marks the chunks whose bytes can be read, and remarks on another order than 4.3.6 recommends.
+    """Check COV-1, mark the chunks that can be read, and remark on an order that 4.3.6 does not recommend.
 
     Args:
         findings: receives the violations.
-        chunks: all of the file.
+        chunks: all chunks of the file.
         start: end of the index.
         file_size: size of the file in the header.
         data_size: size of the data.
@@ -435,7 +441,7 @@ def check_coverage(findings: Findings, chunks: Sequence[Chunk], start: int, file
     expected = covered = start
     for chunk in ordered:
         if chunk.offset != expected:
-            findings.of("COV-1", chunk.record, "offset", f"{chunk.offset}, the chunk before ends at {expected}")
+            findings.add_field("COV-1", chunk.record, "offset", f"{chunk.offset}, the chunk before ends at {expected}")
         end = chunk.offset + chunk.size
         # A chunk that begins within another is not read: a file could name the same bytes a million times.
         chunk.whole = covered <= chunk.offset <= end - _spec.CHUNK_HEADER_SIZE and end <= min(data_size, file_size)
@@ -456,7 +462,7 @@ def check_coverage(findings: Findings, chunks: Sequence[Chunk], start: int, file
 
 
 def check_frame(view: memoryview, chunk: Chunk, clause: str, findings: Findings) -> Payload:
-    """Check header and CRC of a chunk that is whole (CHK-1, CHK-3); return its payload.
+    """Check header and CRC of a whole chunk (CHK-1, CHK-3) and return its payload.
 
     Args:
         view: the file.
@@ -471,13 +477,13 @@ def check_frame(view: memoryview, chunk: Chunk, clause: str, findings: Findings)
             "CHK-1", at, chunk.name, f"{chunk.record.path('crc')} is {stored:#010x}, computed {computed:#010x}"
         )
     header = read_record(view, _spec.unpack_chunk_header, _spec.CHUNK_HEADER_OFFSETS, at, f"{chunk.name}/header")
-    findings.reserved(header)
+    findings.check_reserved(header)
     payload_size = chunk.size - _spec.CHUNK_HEADER_SIZE
     for key, wanted in (("type", chunk.kind), ("flags", chunk.flags), ("payload_size", payload_size)):
         found = getattr(header.record, key)
         if found != wanted:
-            findings.of("CHK-3", header, key, f"{found!r}, its record wants {wanted!r}")
-    # COV-1 has proved the record's size: the payload ends there.
+            findings.add_field("CHK-3", header, key, f"{found!r}, its record wants {wanted!r}")
+    # The payload ends by the size in the record, which COV-1 confirmed.
     return Payload(view, at + _spec.CHUNK_HEADER_SIZE, end, chunk.name, clause, findings)
 
 
@@ -489,11 +495,11 @@ class Tile:
     """A tile record with its layers and tables.
 
     Attributes:
-        place: in the index, from 0.
+        place: index of the tile, from 0.
         record: the tile record.
-        chunks: its TILE chunks, in the order of the layer records.
-        tables: ids of the codebooks that it names.
-        box_sound: whether corner, extent and exponent obey TIL-7 to TIL-9, so that they can be compared.
+        chunks: TILE chunks in the order of the layer records.
+        tables: ids of the codebooks that the tile lists.
+        box_sound: whether corner, extent and exponent obey TIL-7 to TIL-9.
     """
 
     place: int
@@ -504,28 +510,28 @@ class Tile:
 
     @property
     def count(self) -> int:
-        """Splats."""
+        """Number of splats."""
         return self.record.record.splat_count
 
 
 def read_tiles(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> list[Tile]:
-    """Read the tiles, which fill the index up to its CRC (IDX-2), and compare their sum with N (IDX-7).
+    """Read the tile records, which fill the index up to its CRC (IDX-2), and compare their sum with N (IDX-7).
 
     Args:
         view: the file.
-        at: offset of the first.
+        at: offset of the first record.
         end: offset of the index's CRC.
-        index: the part of the index before them.
+        index: the records before them.
         findings: receives the violations.
     """
     tiles: list[Tile] = []
     head = index.head.record
-    # A count that the index has no room for has been refused already, by IDX-2.
-    told = index.size_of("tile") * head.tile_count > end - at
+    # A count that the index has no room for was reported by `read_records`.
+    reported = index.size_of("tile") * head.tile_count > end - at
     while len(tiles) < head.tile_count:
         size = _tile_size(view, at, end, index)
         if size > end - at:
-            if not told:
+            if not reported:
                 findings.add("IDX-2", at, f"tile[{len(tiles)}]", "the index ends within the tile")
             findings.skip(f"tile[{len(tiles)}] and those after it", "the index ends before them")
             return tiles
@@ -535,7 +541,7 @@ def read_tiles(view: memoryview, at: int, end: int, index: Index, findings: Find
         findings.add("IDX-2", at, "index.rest", f"{end - at} bytes follow the last tile")
     total = sum(tile.count for tile in tiles)
     if total != head.splat_count:
-        findings.of("IDX-7", index.head, "splat_count", f"{head.splat_count}, the tiles have {total} splats")
+        findings.add_field("IDX-7", index.head, "splat_count", f"{head.splat_count}, the tiles have {total} splats")
     return tiles
 
 
@@ -549,12 +555,12 @@ def _tile_size(view: memoryview, at: int, end: int, index: Index) -> int:
 
 def _read_tile(view: memoryview, at: int, number: int, index: Index, findings: Findings) -> Tile:
     placed = read_record(view, _spec.unpack_tile_record, _spec.TILE_RECORD_OFFSETS, at, f"tile[{number}]")
-    findings.reserved(placed)
+    findings.check_reserved(placed)
     tile = Tile(number, placed)
     if placed.record.level:
-        findings.of("RES-1", placed, "level", f"{placed.record.level} is reserved, wanted 0")
+        findings.add_field("RES-1", placed, "level", f"{placed.record.level} is reserved, wanted 0")
     if not 1 <= tile.count <= _spec.TILE_SPLATS_MAX:
-        findings.of("TIL-1", placed, "splat_count", f"{tile.count}, wanted 1 to {_spec.TILE_SPLATS_MAX}")
+        findings.add_field("TIL-1", placed, "splat_count", f"{tile.count}, wanted 1 to {_spec.TILE_SPLATS_MAX}")
     _check_tile_box(findings, tile, index)
     at += index.size_of("tile")
     _read_layers(view, at, tile, index, findings)
@@ -567,14 +573,14 @@ def _check_tile_box(findings: Findings, tile: Tile, index: Index) -> None:
     for axis, (corner, extent) in enumerate(zip(record.corner, record.extent, strict=True)):
         if max(abs(corner), abs(corner + extent)) > _spec.INTEGER_MAX:
             message = f"axis {axis} reaches from {corner} to {corner + extent}, beyond {_spec.INTEGER_MAX}"
-            findings.of("TIL-7", tile.record, "corner", message, within=8 * axis)
+            findings.add_field("TIL-7", tile.record, "corner", message, within=8 * axis)
         if extent >= 1 << _spec.AXIS_BITS_MAX:
             message = f"axis {axis} has {extent}, wanted less than 2^{_spec.AXIS_BITS_MAX}"
-            findings.of("TIL-8", tile.record, "extent", message, within=4 * axis)
+            findings.add_field("TIL-8", tile.record, "extent", message, within=4 * axis)
     step = index.steps.get(_spec.ATTRIBUTE_MEANS)
     if step is not None and scaled_step(step, record.exponent) is None:
         message = f"{step} x 2^{record.exponent} is not finite and at least 2^-1022"
-        findings.of("TIL-9", tile.record, "exponent", message)
+        findings.add_field("TIL-9", tile.record, "exponent", message)
     tile.box_sound = len(findings.violations) == before
 
 
@@ -585,22 +591,22 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, findings: 
         layer = view[at]
         name = f"{tile.record.name}.layer[{layer}]"
         placed = read_record(view, _spec.unpack_layer_record, _spec.LAYER_RECORD_OFFSETS, at, name)
-        findings.reserved(placed)
+        findings.check_reserved(placed)
         if i == 0 and layer != _spec.LAYER_GEOMETRY:
-            findings.of("TIL-2", placed, "layer", f"the first is {layer}, wanted {_spec.LAYER_GEOMETRY}")
+            findings.add_field("TIL-2", placed, "layer", f"the first is {layer}, wanted {_spec.LAYER_GEOMETRY}")
         elif layer <= last:
-            findings.of("TIL-2", placed, "layer", f"{layer} after {last}, wanted ascending layers")
+            findings.add_field("TIL-2", placed, "layer", f"{layer} after {last}, wanted ascending layers")
         if layer < _spec.ANCILLARY_ID_MIN and layer not in _spec.LAYER_NAMES:
-            findings.of("RES-2", placed, "layer", f"{layer} is no layer that this version uses")
+            findings.add_field("RES-2", placed, "layer", f"{layer} is no layer that this version uses")
         if index.degree is not None and layer in _SH_LAYERS and layer > index.degree:
-            findings.of("TIL-3", placed, "layer", f"band {layer} in a scene of degree {index.degree}")
+            findings.add_field("TIL-3", placed, "layer", f"band {layer} in a scene of degree {index.degree}")
         chunk = Chunk(f"TILE.{tile.place}.{layer}", _spec.CHUNK_TILE, flags, placed, tile.place, layer)
         tile.chunks.append(check_chunk_size(findings, chunk))
         last = max(last, layer)
         at += index.size_of("layer")
     if not tile.chunks:
         findings.add("TIL-2", start, f"{tile.record.name}.layer", "no layer, wanted layer 0")
-        return  # TIL-5 would say nothing more
+        return  # TIL-5 follows from this
     has_extra = any(chunk.layer == _spec.LAYER_EXTRA for chunk in tile.chunks)
     if has_extra != bool(index.head.record.extra_count):
         verb = "has" if has_extra else "lacks"

@@ -1,4 +1,4 @@
-"""DEFLATE (RFC 1951, spec 6.2) bit by bit. Slow: it finds what is wrong with a stream that zlib refuses."""
+"""Inflate DEFLATE (RFC 1951, spec 6.2) bit by bit: slow, but it finds the clause that a stream breaks."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _FIXED_DISTANCES = [5] * 32
 
 
 class CodedError(Exception):
-    """The coded bytes break a clause.
+    """Raised if coded bytes break a clause.
 
     Args:
         clause: COD-1, COD-2, COD-5 to COD-8.
-        message: how it is broken.
-        within: byte of the coded bytes that is to blame.
+        message: the defect.
+        within: offset of the defect in the coded bytes.
     """
 
     def __init__(self, clause: str, message: str, within: int = 0) -> None:
@@ -30,7 +30,7 @@ class CodedError(Exception):
 
 
 class Inflater:
-    """One stream.
+    """A decoder of one DEFLATE stream.
 
     Args:
         coded: the stream.
@@ -42,10 +42,10 @@ class Inflater:
         self._out = bytearray()
 
     def inflate(self, size: int) -> bytes:
-        """Return what the final block completes, or more than `size` bytes as soon as there are more.
+        """Inflate to the end of the final block, or until there are more than `size` bytes.
 
         Raises:
-            CodedError: by COD-2 if the stream is cut or no DEFLATE, by COD-5 to COD-8.
+            CodedError: COD-2 if the stream is cut short or not DEFLATE; COD-5 to COD-8.
         """
         final = 0
         while not final:
@@ -64,7 +64,7 @@ class Inflater:
 
     @property
     def used(self) -> int:
-        """Bytes of the stream that have been read, the last perhaps in part."""
+        """Number of bytes that were read, the last one at least in part."""
         return (self._at + 7) // 8
 
     def refuse(self, clause: str, message: str) -> None:
@@ -94,7 +94,9 @@ class Inflater:
         """Read the header of a dynamic block."""
         literals, distances = self._number(5) + 257, self._number(5) + 1
         if literals > _LITERALS_MAX or distances > _DISTANCES_MAX:
-            self.refuse("COD-5", f"{literals} literal/length and {distances} distance symbols, 286 and 30 are the most")
+            self.refuse(
+                "COD-5", f"{literals} literal/length and {distances} distance symbols, 286 and 30 are the most"
+            )
         lengths = [0] * len(_ORDER)
         for symbol in _ORDER[: self._number(4) + 4]:
             lengths[symbol] = self._number(3)
@@ -127,7 +129,7 @@ class Inflater:
         return lengths[:count]
 
     def _matches(self, literals: _Code, distances: _Code, size: int) -> None:
-        """Read the body of a block, until it ends or has given more than `size` bytes."""
+        """Read the body of a block to its end, or until there are more than `size` bytes."""
         out = self._out
         while len(out) <= size:
             symbol = self._symbol(literals)
@@ -169,7 +171,7 @@ class Inflater:
 
 
 class _Code:
-    """A canonical code: how many codewords there are of each length, and the symbols in the order of the codewords."""
+    """A canonical code: the number of codewords of each length, and the symbols in the order of their codewords."""
 
     def __init__(self, lengths: Sequence[int]) -> None:
         used = [length for length in lengths if length]
@@ -182,5 +184,5 @@ def _is_complete(lengths: Sequence[int]) -> bool:
 
 
 def _is_lone(lengths: Sequence[int]) -> bool:
-    """Return True if there is one codeword, of one bit."""
+    """Return True if the only codeword has one bit."""
     return [length for length in lengths if length] == [1]

@@ -1,4 +1,4 @@
-"""Streams (spec 6.1 to 6.3): the head, the coder, the transforms."""
+"""Read streams (spec 6.1 to 6.3): the head, the coder, the transforms."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from csplat import _spec
 from csplat_conformance.validator.findings import Findings, Payload, PlacedRecord, UnreadableError
 from csplat_conformance.validator.inflate import CodedError, Inflater
 
-#: Elements of a stream: int64, or uint64 for RAW, which alone may be eight bytes wide.
+#: Elements of a stream: int64, or uint64 if they are eight bytes wide, as only RAW may be.
 Elements = NDArray[Any]
 
-#: No stream of a sound file has more: the columns of the highest band for a full tile or a full codebook.
+#: Largest number of elements in a sound file: the columns of the highest band for a full tile or codebook.
 _ELEMENTS_MAX = max(_spec.ATTRIBUTE_COLUMNS.values()) * max(_spec.TILE_SPLATS_MAX, _spec.CODEBOOK_ENTRIES_MAX)
 
 
 @dataclass(frozen=True)
 class Stream:
-    """A stream that has been stepped over.
+    """A stream that was read.
 
     Attributes:
-        head: its head: offset and fields.
-        elements: [count], `None` if a violation keeps them from being known.
+        head: the stream head and its place.
+        elements: [count], `None` if a violation hides them.
     """
 
     head: PlacedRecord[_spec.StreamHead]
@@ -46,11 +46,11 @@ def read_stream(
     """Read the next stream.
 
     Args:
-        payload: stands at the stream's head.
+        payload: reader at the stream head.
         what: name of the stream within its chunk, `sh0.stream`.
-        count: elements that its place requires; `None` for texts, which say themselves.
-        width_max: bytes of an element at most.
-        signed: two's complement of `width` bytes.
+        count: required number of elements; `None` for texts, whose head has it.
+        width_max: largest number of bytes per element.
+        signed: elements are in two's complement.
         count_max: budget of elements if `count` is `None`.
 
     Raises:
@@ -62,20 +62,20 @@ def read_stream(
     sound &= _check_transforms(findings, head)
     sound &= _check_packed(findings, head, sound)
     if count is None and head.record.count > count_max:
-        findings.of("STR-8", head, "count", f"{head.record.count} bytes of text, the budget is {count_max}")
+        findings.add_field("STR-8", head, "count", f"{head.record.count} bytes of text, the budget is {count_max}")
         sound = False
     coder_known = _check_coder(findings, head)
     size = head.record.coded_size
     if size > payload.left:
-        findings.of("STR-6", head, "coded_size", f"{size} bytes, {payload.left} are left")
+        findings.add_field("STR-6", head, "coded_size", f"{size} bytes, {payload.left} are left")
         raise UnreadableError
     at = payload.take(size, f"{what}.coded")
     if not coder_known:
         return Stream(head, None)
-    # Even if the head is wrong the coder can be tried, as long as it has a sane size to fill.
+    # The coder can be checked even if the head is wrong, as long as the size to fill is plausible.
     most = count_max if count is None else _ELEMENTS_MAX
     if count is not None and count > most:
-        sound = False  # the field that requires more has been refused
+        sound = False  # the field that requires more was reported
     if not sound and head.record.packed_size > 3 * width_max * most:
         return Stream(head, None)
     try:
@@ -89,44 +89,44 @@ def read_stream(
 
 
 def _check_counts(findings: Findings, head: PlacedRecord[_spec.StreamHead], count: int | None, width_max: int) -> bool:
-    """STR-1, STR-2."""
+    """Check STR-1 and STR-2."""
     sound = True
     found, width = head.record.count, head.record.width
     if found != (max(1, found) if count is None else count):
         wanted = "1 or more" if count is None else f"{count}, as its place requires"
-        findings.of("STR-1", head, "count", f"{found} elements, wanted {wanted}")
+        findings.add_field("STR-1", head, "count", f"{found} elements, wanted {wanted}")
         sound = False
     if not 1 <= width <= width_max:
-        findings.of("STR-2", head, "width", f"elements of {width} bytes, wanted 1 to {width_max}")
+        findings.add_field("STR-2", head, "width", f"elements of {width} bytes, wanted 1 to {width_max}")
         sound = False
     return sound
 
 
 def _check_transforms(findings: Findings, head: PlacedRecord[_spec.StreamHead]) -> bool:
-    """RES-2, STR-3."""
+    """Check RES-2 and STR-3."""
     listed = head.record.transforms
     used = listed.rstrip(b"\0")
     unknown = [value for value in used if value not in _spec.TRANSFORM_NAMES]
     if unknown:
-        findings.of("RES-2", head, "transforms", f"{unknown[0]} is no transform of the registry")
-        return False  # STR-3 is about lists without such an id
+        findings.add_field("RES-2", head, "transforms", f"{unknown[0]} is no transform of the registry")
+        return False  # STR-3 assumes known ids
     if any(a >= b for a, b in pairwise(used)) or 0 in used:
-        findings.of("STR-3", head, "transforms", f"{list(listed)}, wanted strictly ascending values, then zeros")
+        findings.add_field("STR-3", head, "transforms", f"{list(listed)}, wanted strictly ascending values, then zeros")
         return False
     return True
 
 
 def _check_packed(findings: Findings, head: PlacedRecord[_spec.StreamHead], sound: bool) -> bool:
-    """STR-4, STR-5; they say something only if count, width and transforms are known."""
+    """Check STR-4 and STR-5, if count, width and transforms are known."""
     if not sound:
         return False
     size, packed = head.record.count * head.record.width, head.record.packed_size
     if _spec.TRANSFORM_RUN_LENGTH not in head.record.transforms:
         if packed != size:
-            findings.of("STR-4", head, "packed_size", f"{packed} bytes, count x width is {size}")
+            findings.add_field("STR-4", head, "packed_size", f"{packed} bytes, count x width is {size}")
             return False
     elif packed % 3 or not 3 <= packed <= 3 * size:
-        findings.of(
+        findings.add_field(
             "STR-5", head, "packed_size", f"{packed} bytes of runs, wanted a multiple of 3 from 3 to {3 * size}"
         )
         return False
@@ -134,10 +134,10 @@ def _check_packed(findings: Findings, head: PlacedRecord[_spec.StreamHead], soun
 
 
 def _check_coder(findings: Findings, head: PlacedRecord[_spec.StreamHead]) -> bool:
-    """RES-2."""
+    """Check RES-2."""
     coder = head.record.coder
     if coder not in _spec.CODER_NAMES:
-        findings.of("RES-2", head, "coder", f"{coder} is no coder that this version uses")
+        findings.add_field("RES-2", head, "coder", f"{coder} is no coder that this version uses")
         return False
     return True
 
@@ -161,7 +161,7 @@ def _elements(
         data = np.repeat(runs[0], lengths)
     width, count = record.width, record.count
     if width == 1 and not signed and not {_spec.TRANSFORM_DELTA, _spec.TRANSFORM_ZIGZAG} & set(record.transforms):
-        return data  # texts and plain bytes: nothing to undo
+        return data  # nothing to undo for texts and plain bytes
     planes = data.reshape(width, count) if _spec.TRANSFORM_BYTE_PLANES in record.transforms else _columns(data, width)
     values = np.zeros(count, np.uint64)
     for i in range(width):
@@ -190,14 +190,14 @@ def undo_coder(coded: memoryview, coder: int, size: int) -> tuple[bytes, bool]:
 
     Args:
         coded: `coded_size` bytes.
-        coder: registry value, a used one.
+        coder: registry value of a known coder.
         size: `packed_size`.
 
     Returns:
-        `size` bytes, and whether the unused bits behind a DEFLATE stream are not 0.
+        `size` bytes, and whether unused bits after a DEFLATE stream are set.
 
     Raises:
-        CodedError: by COD-1, COD-2 or COD-5 to COD-8.
+        CodedError: COD-1, COD-2, COD-5 to COD-8.
     """
     if coder == _spec.CODER_STORED:
         if len(coded) != size:
@@ -207,7 +207,7 @@ def undo_coder(coded: memoryview, coder: int, size: int) -> tuple[bytes, bool]:
 
 
 def _inflate(coded: memoryview, size: int) -> tuple[bytes, bool]:
-    """COD-2, COD-5 to COD-8. The last byte is held back, so that its unused bits can be told from the others."""
+    """Inflate and check COD-2 and COD-5 to COD-8. The last byte comes separately, to find its unused bits."""
     body, last = coded[:-1], bytes(coded[-1:])
     inflater = zlib.decompressobj(_RAW_DEFLATE)
     try:
@@ -220,7 +220,7 @@ def _inflate(coded: memoryview, size: int) -> tuple[bytes, bool]:
         before = inflater.copy()
         rest = inflater.decompress(last, size + 1 - len(packed))
     except zlib.error as error:
-        Inflater(bytes(coded)).inflate(size)  # names the clause
+        Inflater(bytes(coded)).inflate(size)  # raises with the clause
         raise CodedError("COD-2", f"not a DEFLATE stream: {error}") from None
     packed += rest
     if len(packed) != size:

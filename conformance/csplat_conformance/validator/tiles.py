@@ -1,4 +1,4 @@
-"""TILE chunks (spec 5.2) and the codings of their blocks (6.4)."""
+"""Check TILE chunks (spec 5.2) and the codings of their blocks (6.4)."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _MORTON_AXES = 3
 
 @dataclass
 class CodebookIndices:
-    """The tile's first block of a codebook, which holds the indices for all.
+    """The indices into a codebook, from the tile's first block that is coded with it.
 
     Attributes:
-        indices: [n], `None` if they could not be read or name no entry.
-        escaped: [n] bool, `None` likewise.
+        indices: [n], `None` if they could not be read or are out of range.
+        escaped: [n] bool, `None` for the same reasons.
         escape_count: number of escapes in the block.
     """
 
@@ -38,16 +38,16 @@ class CodebookIndices:
 
 @dataclass
 class TileChecker:
-    """One tile while its layers are read, from the lowest to the highest.
+    """A check of one tile, whose layers are read from the lowest to the highest.
 
     Attributes:
         view: the file.
         index: index of the file.
-        tile: its record.
+        tile: the tile record.
         books: entries by codebook id and layer.
         findings: receives the violations.
-        first: by codebook id.
-        lost: layers of which blocks are missing, because they could not be told apart.
+        first: indices by codebook id.
+        lost: layers with blocks that could not be read.
     """
 
     view: memoryview
@@ -62,21 +62,21 @@ class TileChecker:
         """Read the payload of one of the tile's chunks.
 
         Raises:
-            UnreadableError: the rest of the payload cannot be told apart.
+            UnreadableError: the structure of the rest is unknown.
         """
         findings = self.findings
         if chunk.layer >= _spec.ANCILLARY_ID_MIN:
             return  # ANC-2
         head = payload.structure(_spec.unpack_tile_head, _spec.TILE_HEAD_SIZE, _spec.TILE_HEAD_OFFSETS, "head")
         if head.record.layer != chunk.layer:
-            findings.of("TLE-1", head, "layer", f"{head.record.layer}, its record says {chunk.layer}")
+            findings.add_field("TLE-1", head, "layer", f"{head.record.layer}, its record says {chunk.layer}")
         if chunk.layer not in _spec.LAYER_NAMES or not 1 <= self.tile.count <= _spec.TILE_SPLATS_MAX:
             findings.skip(f"{chunk.name} from byte {payload.at} on", "layer or splat_count of its record is wrong")
             return
         blocks = self._wanted(chunk.layer)
         announced = head.record.block_count
         if announced != len(blocks):
-            findings.of("TLE-2", head, "block_count", f"{announced} blocks, wanted {len(blocks)}")
+            findings.add_field("TLE-2", head, "block_count", f"{announced} blocks, wanted {len(blocks)}")
         for number, attribute in enumerate(blocks):
             if number >= announced and not payload.left:
                 return
@@ -96,14 +96,14 @@ class TileChecker:
         head = read_block_head(payload, name)
         if attribute != wanted:
             message = f"{attribute}, wanted {wanted} ({_spec.ATTRIBUTE_NAMES[wanted]}) in place {number}"
-            self.findings.of("TLE-2", head, "attribute", message)
+            self.findings.add_field("TLE-2", head, "attribute", message)
             if attribute not in _spec.ATTRIBUTE_NAMES:
                 raise UnreadableError
         coding = head.record.coding
         if _spec.CODING_NAMES.get(coding) not in _spec.ATTRIBUTE_CODINGS[attribute]:
             code = "" if coding in _spec.CODING_NAMES else _spec.ERROR_UNSUPPORTED
             message = f"{coding}, wanted {' or '.join(_spec.ATTRIBUTE_CODINGS[attribute])}"
-            self.findings.of("BLK-1", head, "coding", message, code)
+            self.findings.add_field("BLK-1", head, "coding", message, code)
             raise UnreadableError
         if coding == _spec.CODING_CODEBOOK:
             _read_codebook_block(self, payload, name, attribute, at)
@@ -117,14 +117,14 @@ class TileChecker:
             self._read_plain(payload, name, attribute, coding)
 
     def _read_sparse(self, payload: Payload, name: str, attribute: int) -> None:
-        """SPA-1 to SPA-3, and what holds for SIGNED."""
+        """Check SPA-1 to SPA-3 and the clauses of SIGNED."""
         params = payload.structure(
             _spec.unpack_sparse_params, _spec.SPARSE_PARAMS_SIZE, _spec.SPARSE_PARAMS_OFFSETS, f"{name}.params"
         )
         exponent, announced, count = params.record.exponent, params.record.present_count, self.tile.count
         sound = self.check_step(params, exponent, attribute)
         if not 1 <= announced <= count:
-            self.findings.of("SPA-1", params, "present_count", f"{announced}, wanted 1 to {count}")
+            self.findings.add_field("SPA-1", params, "present_count", f"{announced}, wanted 1 to {count}")
         mask = read_stream(payload, f"{name}.mask", -(-count // 8), 1)
         where = (mask.head.offset, f"{payload.name}/{name}.mask")
         if mask.elements is not None:
@@ -148,7 +148,7 @@ class TileChecker:
         step = self.index.steps.get(attribute)
         if step is None or scaled_step(step, exponent, single=True) is not None:
             return True
-        self.findings.of(
+        self.findings.add_field(
             "LAT-1", params, "exponent", f"{step} x 2^{exponent} is not finite in binary32 and at least 2^-126"
         )
         return False
@@ -159,7 +159,7 @@ class TileChecker:
             self.check_scales(int(rows.max()), exponent)
 
     def check_scales(self, largest: int, exponent: int) -> None:
-        """TIL-11, once the largest lattice integer of the scales is known."""
+        """Check TIL-11, given the largest lattice integer of the scales."""
         record = self.tile.record
         at = record.at("max_scale")
         stored = bytes(self.view[at : at + 4])
@@ -178,7 +178,7 @@ class TileChecker:
             )
             bits = params.record.bits
             if not 1 <= bits <= _spec.MORTON_BITS_MAX:
-                self.findings.of("MOR-1", params, "bits", f"{bits}, wanted 1 to {_spec.MORTON_BITS_MAX}")
+                self.findings.add_field("MOR-1", params, "bits", f"{bits}, wanted 1 to {_spec.MORTON_BITS_MAX}")
             stream = read_stream(payload, f"{name}.stream", count, width_max)
             rows = None if stream.elements is None else _axes(stream.elements.astype(np.int64))
             largest = 0 if stream.elements is None else int(stream.elements.max())
@@ -210,16 +210,18 @@ class TileChecker:
             _spec.unpack_raw_params, _spec.RAW_PARAMS_SIZE, _spec.RAW_PARAMS_OFFSETS, f"{name}.params"
         )
         if params.record.column != number:
-            self.findings.of("RAW-1", params, "column", f"{params.record.column}, wanted {number}")
+            self.findings.add_field("RAW-1", params, "column", f"{params.record.column}, wanted {number}")
         width_max = _spec.CODING_WIDTH_MAX[_spec.CODING_RAW]
         stream = read_stream(payload, f"{name}.stream", self.tile.count, width_max)
         size = self.index.extras[number] if number < len(self.index.extras) else None
         if size is not None and stream.head.record.width != size:
-            self.findings.of("RAW-2", stream.head, "width", f"{stream.head.record.width}, the column has {size} bytes")
+            self.findings.add_field(
+                "RAW-2", stream.head, "width", f"{stream.head.record.width}, the column has {size} bytes"
+            )
 
 
 def read_block_head(payload: Payload, name: str) -> BlockHead:
-    """Read a block head, also that of an escape block."""
+    """Read the head of a block or of an escape block."""
     return payload.structure(_spec.unpack_block_head, _spec.BLOCK_HEAD_SIZE, _spec.BLOCK_HEAD_OFFSETS, name)
 
 
@@ -229,7 +231,7 @@ def read_columns(
     """Read and check a block coded LEVELS, OFFSET or SIGNED.
 
     Returns:
-        [C, count] integers, `None` if a violation keeps them from being known or in range; and the exponent.
+        [C, count] integers, `None` if a violation hides them or they are out of range; and the exponent.
     """
     columns = _spec.ATTRIBUTE_COLUMNS[attribute]
     exponent, offsets, sound = 0, [0] * columns, True
@@ -250,19 +252,19 @@ def read_columns(
 
 
 def read_exponent(reader: TileChecker, payload: Payload, name: str, attribute: int, *, fixed: bool) -> tuple[int, bool]:
-    """Read lattice parameters: the exponent, and whether LAT-1, or LAT-2 if it is fixed, holds."""
+    """Read lattice parameters; return the exponent, and whether LAT-1, or LAT-2 if it is fixed, holds."""
     params = payload.structure(
         _spec.unpack_lattice_params, _spec.LATTICE_PARAMS_SIZE, _spec.LATTICE_PARAMS_OFFSETS, name
     )
     exponent = params.record.exponent
     if fixed and exponent:
-        reader.findings.of("LAT-2", params, "exponent", f"{exponent}, wanted 0")
+        reader.findings.add_field("LAT-2", params, "exponent", f"{exponent}, wanted 0")
         return exponent, False
     return exponent, fixed or reader.check_step(params, exponent, attribute)
 
 
 def read_offsets(payload: Payload, name: str, columns: int) -> tuple[list[int], bool]:
-    """Read the offsets, and whether LAT-3 holds."""
+    """Read the offsets; return them, and whether LAT-3 holds."""
     at = payload.take(4 * columns, name)
     offsets = [int(value) for value in np.frombuffer(payload.view, "<i4", columns, at)]
     sound = True
@@ -275,7 +277,7 @@ def read_offsets(payload: Payload, name: str, columns: int) -> tuple[list[int], 
 
 
 def _axes(codes: I64) -> I64:
-    """Bit 3·b + a of a code is bit b of axis a (6.4.2)."""
+    """Split codes into axes: bit 3·b + a of a code is bit b of axis a (6.4.2)."""
     rows = np.zeros((_MORTON_AXES, len(codes)), np.int64)
     for axis in range(_MORTON_AXES):
         for bit in range(_spec.MORTON_BITS_MAX):
@@ -290,17 +292,17 @@ _CodebookParams = PlacedRecord[_spec.CodebookParams]
 
 
 def _read_codebook_block(reader: TileChecker, payload: Payload, name: str, attribute: int, at: int) -> None:
-    """Read what follows a block head.
+    """Read a block coded CODEBOOK (6.4.5).
 
     Args:
         reader: the tile.
-        payload: stands behind the block head.
+        payload: reader after the block head.
         name: name of the block.
         attribute: registry value.
         at: offset of the block head.
 
     Raises:
-        UnreadableError: the number of streams that follow is not known.
+        UnreadableError: the number of streams that follow is unknown.
     """
     params = payload.structure(
         _spec.unpack_codebook_params, _spec.CODEBOOK_PARAMS_SIZE, _spec.CODEBOOK_PARAMS_OFFSETS, f"{name}.params"
@@ -329,17 +331,17 @@ def _read_codebook_block(reader: TileChecker, payload: Payload, name: str, attri
 
 
 def _find_book(reader: TileChecker, params: _CodebookParams, attribute: int) -> tuple[CodebookAt, slice]:
-    """CBK-1."""
+    """Check CBK-1; return the codebook and the columns of the attribute."""
     identity = params.record.codebook_id
     book = reader.index.codebooks.get(identity)
     columns = None if book is None else attribute_columns(book, attribute)
     name = _spec.ATTRIBUTE_NAMES[attribute]
     if identity not in reader.tile.tables:
-        reader.findings.of("CBK-1", params, "codebook_id", f"{identity} is not among the tile's table ids")
+        reader.findings.add_field("CBK-1", params, "codebook_id", f"{identity} is not among the tile's table ids")
     elif identity not in reader.index.codebook_ids:
-        reader.findings.of("CBK-1", params, "codebook_id", f"{identity} is the id of no codebook")
+        reader.findings.add_field("CBK-1", params, "codebook_id", f"{identity} is the id of no codebook")
     elif book is not None and columns is None:
-        reader.findings.of("CBK-1", params, "codebook_id", f"codebook {identity} does not serve {name}")
+        reader.findings.add_field("CBK-1", params, "codebook_id", f"codebook {identity} does not serve {name}")
     if book is None or columns is None:
         raise UnreadableError
     return book, columns
@@ -348,7 +350,7 @@ def _find_book(reader: TileChecker, params: _CodebookParams, attribute: int) -> 
 def _read_indices(
     reader: TileChecker, payload: Payload, name: str, book: CodebookAt, params: _CodebookParams
 ) -> CodebookIndices:
-    """CBK-2, CBK-3."""
+    """Read indices and check CBK-2 and CBK-3."""
     findings, size = reader.findings, book.record.size
     stream = read_stream(payload, f"{name}.indices", reader.tile.count, _INDEX_WIDTH_MAX)
     indices = stream.elements
@@ -359,15 +361,15 @@ def _read_indices(
     escaped = None if indices is None else np.asarray(indices == size)
     count = params.record.escape_count
     if escaped is not None and int(escaped.sum()) != count:
-        findings.of("CBK-3", params, "escape_count", f"{count}, the indices escape {int(escaped.sum())} splats")
+        findings.add_field("CBK-3", params, "escape_count", f"{count}, the indices escape {int(escaped.sum())} splats")
         escaped = None
     elif escaped is None and count > reader.tile.count:
-        findings.of("CBK-3", params, "escape_count", f"{count} of a tile of {reader.tile.count} splats")
+        findings.add_field("CBK-3", params, "escape_count", f"{count} of a tile of {reader.tile.count} splats")
     return CodebookIndices(indices, escaped, count)
 
 
 def _find_indices(reader: TileChecker, book: CodebookAt, params: _CodebookParams) -> CodebookIndices:
-    """CBK-4. An unknown one is returned if there is none, or if its block could not be read."""
+    """Check CBK-4; return the indices of an earlier block, or unknown ones if there are none."""
     identity, count = params.record.codebook_id, params.record.escape_count
     first = reader.first.get(identity)
     opener = first_attribute(book)
@@ -375,17 +377,17 @@ def _find_indices(reader: TileChecker, book: CodebookAt, params: _CodebookParams
     if first is None:
         if _spec.ATTRIBUTE_LAYER[opener] not in reader.lost:
             message = f"codebook {identity}, and no block of {name} before it is coded with it"
-            reader.findings.of("CBK-4", params, "codebook_id", message)
+            reader.findings.add_field("CBK-4", params, "codebook_id", message)
         return CodebookIndices(None, None, count)
     if first.escape_count != count:
         message = f"codebook {identity} with {count} escapes, the block of {name} has {first.escape_count}"
-        reader.findings.of("CBK-4", params, "codebook_id", message)
+        reader.findings.add_field("CBK-4", params, "codebook_id", message)
         return CodebookIndices(first.indices, None, count)
     return first
 
 
 def _read_summands(reader: TileChecker, payload: Payload, name: str, attribute: int) -> I64 | None:
-    """The common summand of scales: LAT-2, LAT-3; [n]."""
+    """Read the common summands of scales, [n], and check LAT-2 and LAT-3."""
     _, sound = read_exponent(reader, payload, f"{name}.summand", attribute, fixed=True)
     offsets, sane = read_offsets(payload, f"{name}.summand.offset", 1)
     width_max = _spec.CODING_WIDTH_MAX[_spec.CODING_OFFSET]
@@ -399,28 +401,28 @@ def _read_summands(reader: TileChecker, payload: Payload, name: str, attribute: 
 def _read_escapes(
     reader: TileChecker, payload: Payload, name: str, attribute: int, params: _CodebookParams
 ) -> I64 | None:
-    """CBK-5, and what the block's coding asks for; [C, escape_count]."""
+    """Read the escapes, [C, escape_count], and check CBK-5 and the clauses of their coding."""
     what = f"{name}.escape"
     head = read_block_head(payload, what)
     if head.record.attribute != attribute:
         message = f"{head.record.attribute}, wanted that of its block, {attribute}"
-        reader.findings.of("CBK-5", head, "attribute", message)
+        reader.findings.add_field("CBK-5", head, "attribute", message)
     coding = head.record.coding
     legal = (_spec.CODING_SIGNED,) if attribute == _spec.ATTRIBUTE_QUATS else _ESCAPE_CODINGS
     if coding not in _spec.CODING_NAMES:
         message = f"{coding} is no coding that this version uses"
-        reader.findings.of("BLK-1", head, "coding", message, _spec.ERROR_UNSUPPORTED)
+        reader.findings.add_field("BLK-1", head, "coding", message, _spec.ERROR_UNSUPPORTED)
         raise UnreadableError
     if coding not in legal:
         names = " or ".join(_spec.CODING_NAMES[one] for one in legal)
-        reader.findings.of("CBK-5", head, "coding", f"{_spec.CODING_NAMES[coding]}, wanted {names}")
+        reader.findings.add_field("CBK-5", head, "coding", f"{_spec.CODING_NAMES[coding]}, wanted {names}")
         raise UnreadableError
     rows, _ = read_columns(reader, payload, what, attribute, coding, params.record.escape_count, escape=True)
     return rows
 
 
 def _selected_entries(first: CodebookIndices, entries: I64) -> I64 | None:
-    """The entries of the splats that are not escaped, [C, n]; `None` if something is not known."""
+    """Return the entries of the splats that are not escaped, [C, n], `None` if they are unknown."""
     if first.indices is None or first.escaped is None:
         return None
     rows: I64 = entries[first.indices[~first.escaped].astype(np.intp)].T

@@ -36,7 +36,7 @@ from csplat_conformance.validator.tiles import TileChecker
 
 _CRC_SIZE = 4
 _TEXT_CHUNKS = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS)
-#: The clause that requires the payload to end with its last structure.
+#: The clause that requires a payload to end with its last structure, by chunk type.
 _END_CLAUSES = {
     _spec.CHUNK_CODEBOOK: "CDB-2",
     _spec.CHUNK_METADATA: "JSN-2",
@@ -56,22 +56,22 @@ def validate(
     splats_max: int | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Validation:
-    """Look for every violation of the spec in a file.
+    """Find every violation of the spec in a file.
 
     Args:
-        data: all of it, or as much as there is.
-        json_bytes_max: budget for one JSON text (STR-8).
-        splats_max: budget of splats (LIM-1), above which the tiles are not read; `None` for none: one tile lies in
-            memory at a time.
-        progress: called with the share of the file that has been checked.
+        data: the file, complete or cut short.
+        json_bytes_max: budget for one JSON text (STR-8), in bytes.
+        splats_max: budget of splats (LIM-1), above which the tiles are not read. Default: none, since only one tile is
+            in memory at a time.
+        progress: called with the share of the tiles that were checked.
 
     Returns:
-        What was found; never raises for what a file holds.
+        The findings. No content of a file raises an error.
     """
     view = memoryview(data).cast("B")
     findings = Findings()
     counts = _Counts()
-    with suppress(TooManyViolationsError):  # the last remark says so
+    with suppress(TooManyViolationsError):  # reported by the last remark
         _check(view, findings, counts, json_bytes_max, splats_max, progress or null_progress)
     return Validation(
         tuple(sorted(findings.violations, key=lambda one: one.offset)),
@@ -84,7 +84,7 @@ def validate(
 
 
 class _Counts:
-    """Numbers of splats and tiles, as far as they are known."""
+    """Numbers of splats and tiles as far as they are known."""
 
     splats = 0
     tiles = 0
@@ -125,7 +125,7 @@ def _check(
         return
     books = _read_directory_chunks(view, directory, index, json_bytes_max, findings)
     if splats_max is not None and sum(tile.count for tile in tiles) > splats_max:
-        findings.of("LIM-1", index.head, "splat_count", f"{counts.splats} splats, the budget is {splats_max}")
+        findings.add_field("LIM-1", index.head, "splat_count", f"{counts.splats} splats, the budget is {splats_max}")
         findings.skip("the tiles", "there are more splats than the budget allows")
         return
     _read_tile_chunks(view, tiles, index, books, findings, progress)
@@ -135,7 +135,7 @@ def _check(
 
 
 def _read_header(view: memoryview, findings: Findings) -> Header | None:
-    """HDR-1 to HDR-4, HDR-11; `None` if nothing more can be said."""
+    """Check HDR-1 to HDR-4 and HDR-11; return `None` if nothing else can be checked."""
     magic = bytes(view[: len(_spec.MAGIC)])
     if len(view) < _spec.HEADER_SIZE:
         if _spec.MAGIC.startswith(magic):
@@ -146,27 +146,27 @@ def _read_header(view: memoryview, findings: Findings) -> Header | None:
     header = read_record(view, _spec.unpack_header, _spec.HEADER_OFFSETS, 0, "header")
     record = header.record
     if magic != _spec.MAGIC:
-        findings.of("HDR-1", header, "magic", f"{magic.hex(' ')}, wanted {_spec.MAGIC.hex(' ')}")
+        findings.add_field("HDR-1", header, "magic", f"{magic.hex(' ')}, wanted {_spec.MAGIC.hex(' ')}")
         return None
     version = (record.version_major, record.version_minor)
     wanted = (_spec.VERSION_MAJOR, _spec.VERSION_MINOR)
     if version != wanted:
         message = f"{version[0]}.{version[1]}, this validator knows {wanted[0]}.{wanted[1]}"
-        findings.of("HDR-2", header, "version_major", message)
+        findings.add_field("HDR-2", header, "version_major", message)
         return None
     end = _spec.HEADER_OFFSETS["header_crc"]
     computed = zlib.crc32(view[:end])
     if record.header_crc != computed:
-        findings.of("HDR-3", header, "header_crc", f"{record.header_crc:#010x}, computed {computed:#010x}")
+        findings.add_field("HDR-3", header, "header_crc", f"{record.header_crc:#010x}, computed {computed:#010x}")
     findings.checks.append("header_crc")
     if record.profile not in _spec.PROFILE_NAMES:
-        findings.of("HDR-4", header, "profile", f"{record.profile} is no profile that this version uses")
-    findings.reserved(header)
+        findings.add_field("HDR-4", header, "profile", f"{record.profile} is no profile that this version uses")
+    findings.check_reserved(header)
     return header
 
 
 def _check_length(view: memoryview, size: int, findings: Findings) -> None:
-    """HDR-5, HDR-6."""
+    """Check HDR-5 and HDR-6."""
     if len(view) < size:
         findings.add("HDR-5", len(view), "end of the data", f"{len(view)} bytes, the header states {size}")
     elif len(view) > size:
@@ -174,13 +174,13 @@ def _check_length(view: memoryview, size: int, findings: Findings) -> None:
 
 
 def _index_end(view: memoryview, header: Header, findings: Findings) -> int | None:
-    """HDR-7, IDX-1; where the index ends, `None` if it has no room for its head or leaves the data."""
+    """Check HDR-7 and IDX-1; return the end of the index, `None` if its head does not fit or it leaves the data."""
     size, file_size = header.record.index_size, header.record.file_size
     least = _spec.INDEX_HEAD_SIZE + _CRC_SIZE
     end = _spec.HEADER_SIZE + size
     if size < least or end > file_size:
         message = f"{size}, wanted {least} to {file_size - _spec.HEADER_SIZE}"
-        findings.of("HDR-7", header, "index_size", message)
+        findings.add_field("HDR-7", header, "index_size", message)
     if size < least or end > len(view):
         return None
     at = end - _CRC_SIZE
@@ -238,7 +238,7 @@ def _read_tile_chunks(
 
 
 def _read_payload(payload: Payload, findings: Findings, read: Callable[[], None]) -> bool:
-    """Read a payload; note the rest of it as not checked if its structure is lost."""
+    """Read a payload; return False and list the rest as not checked if its structure is lost."""
     try:
         read()
     except UnreadableError:

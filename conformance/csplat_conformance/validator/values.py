@@ -1,4 +1,4 @@
-"""Ranges of integers and of the values that they stand for (spec 6.4, 7)."""
+"""Check the ranges of integers and of the values that they stand for (spec 6.4, 7)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from csplat.types import I64
 from csplat_conformance.validator.findings import Findings
 from csplat_conformance.validator.index import Index, scaled_step
 
-#: Byte of the file and name of what a message is about.
+#: Offset in the file and name of the field that a message is about.
 Place = tuple[int, str]
 
 
 def check_integers(findings: Findings, index: Index, attribute: int, rows: I64, exponent: int, where: Place) -> bool:
-    """Check the integers of a block, or of the part of it that one stream or one codebook gives.
+    """Check the integers of a block, or of the part of it that comes from one stream or codebook.
 
     Args:
         findings: receives the violations.
@@ -25,10 +25,10 @@ def check_integers(findings: Findings, index: Index, attribute: int, rows: I64, 
         attribute: registry value; not means.
         rows: [C, n] integers, before the lifting of 7.1.
         exponent: exponent of the block.
-        where: the place to blame.
+        where: the field to report.
 
     Returns:
-        Whether all clauses hold that could be looked at.
+        Whether all clauses hold that could be checked.
     """
     before = len(findings.violations)
     placed, levels = index.attributes.get(attribute), index.levels.get(attribute)
@@ -85,7 +85,7 @@ def _check_lattice(
 
 
 def _lifted(rows: I64, chroma_shift: int) -> I64:
-    """R, G, B of Y, Co, Cg (7.1); LAT-4 keeps all of it within 2^53."""
+    """Return R, G, B of Y, Co, Cg (7.1). LAT-4 keeps everything within 2^53."""
     y, co, cg = np.split(rows, 3)
     co, cg = co << chroma_shift, cg << chroma_shift
     t = y - (cg >> 1)
@@ -100,23 +100,23 @@ def value_bits(n: int, scale: float) -> bytes:
 
 
 def is_finite(n: int, scale: float) -> bool:
-    """LAT-5, MEA-1: whether the value of a lattice integer is finite in binary32."""
+    """Return True if the value of a lattice integer is finite in binary32 (LAT-5, MEA-1)."""
     return math.isfinite(float(np.frombuffer(value_bits(n, scale), "<f4")[0]))
 
 
 def check_box(
     findings: Findings, index: Index, record: Any, rows: I64, box: Place, stream: Place, *, sound: bool
 ) -> None:
-    """TIL-10 and MEA-1.
+    """Check TIL-10 and MEA-1.
 
     Args:
         findings: receives the violations.
         index: index of the file.
         record: the tile record.
         rows: [3, n], the integers q.
-        box: the record's `corner`.
+        box: the field `corner` of the record.
         stream: the stream of the means.
-        sound: TIL-7 to TIL-9 hold.
+        sound: whether TIL-7 to TIL-9 hold.
     """
     lows, highs = rows.min(axis=1).tolist(), rows.max(axis=1).tolist()
     for axis, (low, high, extent) in enumerate(zip(lows, highs, record.extent, strict=True)):
@@ -135,7 +135,7 @@ def check_box(
 
 
 def check_max_scale(findings: Findings, index: Index, largest: int, exponent: int, stored: bytes, where: Place) -> None:
-    """TIL-11, bit for bit: NaN differs from everything, and +0 from −0."""
+    """Check TIL-11 bit for bit: NaN differs from everything, and +0 from −0."""
     step = index.steps.get(_spec.ATTRIBUTE_SCALES)
     scale = None if step is None else scaled_step(step, exponent)
     if scale is None:
