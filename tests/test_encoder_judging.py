@@ -171,7 +171,7 @@ def test_of_no_splats_there_are_no_errors(tmp_path):
 
 
 def test_our_coarsest_preset_stays_below_half_of_every_bound(monkeypatch, plain):
-    for name in ("MEANS_OF_APART", "COVARIANCE_MAX", "COVARIANCE_RMS", "OPACITIES_MAX", "SH_MAX"):
+    for name in ("MEANS_PER_SEPARATION", "COVARIANCE_MAX", "COVARIANCE_RMS", "OPACITIES_MAX", "SH_MAX"):
         module = "csplat_conformance.encoders.error_checks"
         monkeypatch.setattr(f"{module}.{name}", 0.5 * getattr(__import__(module, fromlist=[name]), name))
     for preset in PRESETS:

@@ -1,4 +1,4 @@
-"""Prove an encoder: reference inputs, and what becomes of them (spec 9.3).
+"""The encoder suite: reference inputs, and checks of the files that an encoder writes for them (spec 9.3).
 
     >>> from csplat_conformance.encoders import run_encoder
     >>> run_encoder("my-encoder {ply} {out}").passed                                 # doctest: +SKIP
@@ -8,13 +8,13 @@ Four levels, each built on the one before:
 
 | level | the encoder |
 |---|---|
-| L1 | ends as it should, the file it writes breaks no clause, is the same every time, and lies alone |
-| L2 | keeps every splat of the source, or says how many it left out; nothing is guessed or wrapped |
-| L3 | states its errors rightly (SER-5), and they are not absurd |
-| L4 | keeps the picture: PSNR of renders against the source |
+| L1 | ends with the right status and writes a valid file, always the same, and nothing else |
+| L2 | keeps every splat of the source, or declares how many it pruned; guesses no metadata |
+| L3 | declares correct error bounds (SER-5) that are not absurdly large |
+| L4 | preserves renders: PSNR compared with the source |
 
-`trial` runs it, `ending` and `judge` look at what came (L1, L2), `mapping` at its source index, `proving` at the stated
-errors (L3; what is only coarse is in `coarse` and `cut`), `picturing` at renders (L4).
+`encoder_run` runs it and checks the run (L1), `file_checks` checks the file and its content (L1, L2), `error_checks`
+the bounds (L3), `render_checks` the renders (L4).
 """
 
 from __future__ import annotations

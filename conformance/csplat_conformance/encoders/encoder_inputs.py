@@ -1,4 +1,9 @@
-"""Reference inputs for encoders."""
+"""Reference inputs for encoders: PLY files made by recipe, and the sources that they hold.
+
+An encoder must accept `ordinary/`; it may refuse `nasty/` with status 1 and a line with the reason, but must not get
+them wrong; it must refuse `broken/`. Splats keep a distance of `separation`, so that only one source splat is near each
+decoded splat.
+"""
 
 from __future__ import annotations
 
@@ -12,26 +17,28 @@ from csplat_conformance.declared_bounds import Source
 from csplat_conformance.encoders.reference_ply import PlyLayout, PlyRows, source_of_rows, write_ply
 from csplat_conformance.encoders.surface_scenes import SPACING_MIN, surface_scene
 
-PSNR_MIN = 30.0  #: dB that renders must reach, unless an input sets another value
+PSNR_MIN = 30.0  #: lowest PSNR of renders, dB, unless an input sets another one
 PITCH = 0.1  #: scene units between neighbours
 _JITTER = 0.2  # fraction of the pitch, to either side
 SEPARATION = PITCH * (1.0 - 2.0 * _JITTER)  #: smallest distance between neighbours of a cloud, scene units
 
+_MANY = 65_536 + 600  # splats; more than a tile holds
+
 
 @dataclass(frozen=True)
 class EncoderInput:
-    """A PLY, and what an encoder may make of it.
+    """A PLY, its source, and the results that an encoder may give for it.
 
     Attributes:
         name: group and name, `ordinary/degree_3`.
-        why: one line: what it shows, why it hurts.
-        make: gives the bytes of the PLY.
-        source: gives the scene that it holds; `None` if there is nothing to encode.
-        separation: no two different splats are nearer to each other than this.
-        may_refuse: status 1 and a line are as good as a file.
+        why: one line: its purpose or difficulty.
+        make: returns the bytes of the PLY.
+        source: returns the scene in it; `None` if there is nothing to encode.
+        separation: smallest distance between different splats, scene units.
+        may_refuse: whether an encoder may refuse it, with status 1 and a line.
         renders: whether renders of it are meaningful.
-        psnr_min: dB that renders of it must reach at the default quality. Renders of csplat's
-            coarsest preset exceed it by at least 1 dB; defects that harm renders fall below it.
+        psnr_min: lowest PSNR of renders at the default quality, dB. Renders of csplat's coarsest preset exceed it by
+            at least 1 dB; defects that harm renders fall below it.
     """
 
     name: str
@@ -49,7 +56,7 @@ class EncoderInput:
         return self.source is None
 
     def psnr_required(self, psnr_min: float) -> float:
-        """Return the lowest PSNR of renders of it, dB, if `psnr_min` replaces `PSNR_MIN`; all inputs shift alike."""
+        """Return the lowest PSNR of renders, dB, if `psnr_min` replaces `PSNR_MIN`; all inputs shift equally."""
         return self.psnr_min + psnr_min - PSNR_MIN
 
 
@@ -68,7 +75,7 @@ def rows_input(
     renders: bool = True,
     psnr_min: float = PSNR_MIN,
 ) -> EncoderInput:
-    """Return an input of rows; those called `nasty/…` may be refused."""
+    """Return an input that holds rows; encoders may refuse it if its name begins with `nasty/`."""
     kept = cache(splats)
     may_refuse = name.startswith("nasty/")
     return EncoderInput(
@@ -102,11 +109,8 @@ def cloud(count: int, degree: int, seed: int = 0) -> PlyRows:
     )
 
 
-_MANY = 65_536 + 600  # more than one tile holds
-
-
 def ordinary_inputs() -> list[EncoderInput]:
-    """Return them, in the order of a run."""
+    """Return the inputs that an encoder must accept, in the order of a run."""
 
     def degree(number: int) -> Callable[[], PlyRows]:
         return lambda: cloud(216, number, number)
@@ -242,7 +246,7 @@ def surface_inputs() -> list[EncoderInput]:
 
 
 def unusual_value_inputs() -> list[EncoderInput]:
-    """Return them, in the order of a run."""
+    """Return inputs with extreme values, which an encoder may refuse but must not get wrong, in the order of a run."""
     no_splats = np.zeros(0, np.intp)
     return [
         rows_input("nasty/empty", "no splats", lambda: cloud(1, 0).select(no_splats), renders=False),
@@ -421,7 +425,7 @@ _CAMERA = (("element camera 1", "property double x", "property uchar kind"), byt
 
 
 def unusual_inputs() -> list[EncoderInput]:
-    """Return them, in the order of a run."""
+    """Return inputs of unusual make, which an encoder may refuse but must not get wrong, in the order of a run."""
     few = lambda: cloud(64, 1, 41)  # noqa: E731 - one of many recipes, used by several inputs
     lists = [bytes(range(row % 4)) for row in range(64)]
     return [
@@ -477,7 +481,7 @@ def _nan_extra() -> PlyRows:
 
 
 def invalid_inputs() -> list[EncoderInput]:
-    """Return them, in the order of a run."""
+    """Return the inputs that an encoder must refuse, in the order of a run."""
     whole = cache(lambda: write_ply(cloud(64, 1, 31)))
 
     def of(layout: PlyLayout) -> bytes:

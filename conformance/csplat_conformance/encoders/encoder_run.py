@@ -1,4 +1,4 @@
-"""Run an encoder on one input and check how it ended (L1)."""
+"""Run an encoder on an input; check how it ended, what it left behind, and whether it repeats its output (L1)."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ from csplat_conformance.encoders.encoder_inputs import EncoderInput
 from csplat_conformance.fields import read_fields
 from csplat_conformance.protocol import ProcessEnd, run_program
 
-#: A defect: the broken clause, empty if there is none, and a line about it.
+#: The broken clause, empty if there is none, and a line about the defect.
 Defect = tuple[str, str]
 
-_LINES_MAX = 2
+_LINES_MAX = 2  # lines of a verdict to show
+_LINE_MAX = 200  # characters of a program's line to show
+_TRACEBACK = b"Traceback (most recent call last)"
 
 
 @dataclass(frozen=True)
@@ -28,11 +30,11 @@ class Verdict:
     """The verdict of one level.
 
     Attributes:
-        status: whether it passed.
+        status: the result.
         message: the reason, or a remark.
-        clauses: the broken clauses.
+        clauses: broken clauses.
         code: error code of the first violation.
-        details: numbers, for programs.
+        details: numbers for programs.
     """
 
     status: Status
@@ -43,41 +45,40 @@ class Verdict:
 
 
 def failed_verdict(wrong: list[Defect], details: dict[str, Any]) -> Verdict:
-    """Return a failure for what is wrong."""
+    """Return the failure for some defects."""
     clauses = tuple(dict.fromkeys(clause for clause, _ in wrong if clause))
     return Verdict(Status.FAILED, "; ".join(text for _, text in wrong), clauses, details=details)
 
 
 def join_lines(lines: tuple[str, ...]) -> str:
-    """Return the first of some lines as one, and how many more there are: a line stays readable."""
+    """Join the first lines to one, and add the number of the others."""
     rest = f"; and {len(lines) - _LINES_MAX} more" if len(lines) > _LINES_MAX else ""
     return "; ".join(lines[:_LINES_MAX]) + rest
 
 
-#: Runs a command line with some places put in, within some seconds, without a process of its own.
+#: Runs a command line in this process: the line, the values of its places, the time limit in seconds.
 CommandRunner = Callable[[str, Mapping[str, str], float], ProcessEnd]
 
 #: Places that a command line must have, and may have.
 PLACES, OPTIONAL_PLACES = ("ply", "out"), ("index",)
-#: From the start of a run to that of its repetition: a time stamp in seconds is another one by then.
-REPEAT_SECONDS = 1.1
+REPEAT_SECONDS = 1.1  #: between a run and its repetition, so that time stamps in seconds differ
 
 _NAMES = {"ply": "in.ply", "out": "out.csplat", "index": "out.npy"}
 
 
 @dataclass(frozen=True)
 class EncoderRun:
-    """One run.
+    """A run of an encoder on an input.
 
     Attributes:
-        ended: how the process ended.
-        out: path where the file was to be written.
+        end: the end of the process.
+        out: path of the output.
         index: path of the source index; `None` if the command line has no place for it.
-        traces: what the run did in addition to writing its output, a line each.
-        started: time of the start, in seconds of `time.monotonic`.
+        traces: a line for each side effect of the run.
+        started: start time by `time.monotonic`, seconds.
     """
 
-    ended: ProcessEnd
+    end: ProcessEnd
     out: Path
     index: Path | None
     traces: tuple[str, ...]
@@ -85,26 +86,26 @@ class EncoderRun:
 
     @property
     def wrote(self) -> bool:
-        """True if there is a file, and the exit status reports success."""
-        return self.ended.status is None and self.ended.returncode == 0 and self.out.is_file()
+        """True if the exit status reports success and there is a file."""
+        return self.end.status is None and self.end.returncode == 0 and self.out.is_file()
 
 
-def run_once(command: str, one: EncoderInput, folder: Path, seconds: float, run: CommandRunner | None) -> EncoderRun:
+def run_once(command: str, case: EncoderInput, folder: Path, seconds: float, run: CommandRunner | None) -> EncoderRun:
     """Run an encoder once.
 
     Args:
         command: its command line.
-        one: the input.
-        folder: folder for input and output; existing files are replaced.
-        seconds: it may take.
-        run: runs it in this process; without it a process is started, in an empty working directory of its own.
+        case: the input.
+        folder: folder for input and output; it is emptied first.
+        seconds: time limit.
+        run: runs the command line in this process; default: start a process, in an empty working directory.
 
     Raises:
         InputError: there is no such program.
     """
-    ply = one.make()
+    ply = case.make()
     if folder.is_dir():
-        shutil.rmtree(folder)  # kept from an earlier run
+        shutil.rmtree(folder)  # from an earlier run
     folder.mkdir(parents=True)
     places = {
         name: folder / _NAMES[name]
@@ -117,16 +118,16 @@ def run_once(command: str, one: EncoderInput, folder: Path, seconds: float, run:
     traces: list[str] = []
     started = time.monotonic()
     if run is not None:
-        ended = run(command, named, seconds)
+        end = run(command, named, seconds)
     else:
         with tempfile.TemporaryDirectory(prefix="csplat-cwd-") as cwd:
-            ended = run_program(command, named, seconds, cwd=Path(cwd))
+            end = run_program(command, named, seconds, cwd=Path(cwd))
             traces += [f"left {name} in its working directory" for name in _names(Path(cwd))]
-    # A refusal that leaves its output is a status of its own.
-    outputs = {_NAMES["ply"], _NAMES["out"]} | ({_NAMES["index"]} if ended.returncode == 0 else set())
+    # A refusal that leaves an output is reported by `check_end`.
+    outputs = {_NAMES["ply"], _NAMES["out"]} | ({_NAMES["index"]} if end.returncode == 0 else set())
     left = [name for name in _names(folder) if name not in outputs]
     traces = [*_input_changes(places["ply"], ply), *(f"left {name} beside the output" for name in left), *traces]
-    return EncoderRun(ended, places["out"], places.get("index"), tuple(traces), started)
+    return EncoderRun(end, places["out"], places.get("index"), tuple(traces), started)
 
 
 def _has_place(command: str, name: str) -> bool:
@@ -138,75 +139,69 @@ def _names(folder: Path) -> list[str]:
 
 
 def _input_changes(path: Path, content: bytes) -> list[str]:
-    """Say what became of the input."""
+    """Return a line if the input was changed."""
     try:
         return [] if path.read_bytes() == content else ["the input was modified"]
     except OSError:
         return ["the input is gone"]
 
 
-_TRACEBACK = b"Traceback (most recent call last)"
-_LINE_MAX = 200  # characters of a program's line that are shown
-
-
-def check_end(one: EncoderInput, trial: EncoderRun) -> Verdict | None:
-    """Judge how the program ended; `None` if there is a file to look at."""
-    ended = trial.ended
-    if ended.status is not None:
-        return Verdict(ended.status, _with_line(ended.message, ended))
-    if ended.returncode == 1:
-        return _check_refusal(one, trial)
-    if not trial.out.is_file():
+def check_end(case: EncoderInput, run: EncoderRun) -> Verdict | None:
+    """Check how the program ended; return `None` if there is a file to check."""
+    end = run.end
+    if end.status is not None:
+        return Verdict(end.status, _with_line(end.message, end))
+    if end.returncode == 1:
+        return _check_refusal(case, run)
+    if not run.out.is_file():
         return Verdict(Status.NO_OUTPUT, "exit status 0, and there is no file")
-    if one.must_refuse:
+    if case.must_refuse:
         return Verdict(Status.FAILED, "accepted, though there are no splats in it")
     return None
 
 
-def _check_refusal(one: EncoderInput, trial: EncoderRun) -> Verdict:
-    ended = trial.ended
-    if _TRACEBACK in ended.stderr:
-        return Verdict(Status.CRASHED, _with_line("a traceback", ended))
-    if trial.out.exists():
+def _check_refusal(case: EncoderInput, run: EncoderRun) -> Verdict:
+    end = run.end
+    if _TRACEBACK in end.stderr:
+        return Verdict(Status.CRASHED, _with_line("a traceback", end))
+    if run.out.exists():
         return Verdict(Status.PARTIAL_OUTPUT, "exit status 1, and there is a file")
-    line = _last_line(ended)
+    line = _last_line(end)
     if not line:
         return Verdict(Status.WRONG_ANSWER, "exit status 1 without a line that says why")
-    if not (one.must_refuse or one.may_refuse):
+    if not (case.must_refuse or case.may_refuse):
         return Verdict(Status.REFUSED, line)
-    if trial.traces:
-        return failed_verdict([("", f"refused, but {trace}") for trace in trial.traces], {})
-    return Verdict(Status.PASSED if one.must_refuse else Status.DECLINED, f"refused: {line}")
+    if run.traces:
+        return failed_verdict([("", f"refused, but {trace}") for trace in run.traces], {})
+    return Verdict(Status.PASSED if case.must_refuse else Status.DECLINED, f"refused: {line}")
 
 
-def _last_line(ended: ProcessEnd) -> str:
-    text = (ended.stderr.strip() or ended.stdout.strip()).decode("utf-8", "replace")
+def _last_line(end: ProcessEnd) -> str:
+    text = (end.stderr.strip() or end.stdout.strip()).decode("utf-8", "replace")
     return text.splitlines()[-1].strip()[:_LINE_MAX] if text else ""
 
 
-def _with_line(message: str, ended: ProcessEnd) -> str:
-    line = _last_line(ended)
+def _with_line(message: str, end: ProcessEnd) -> str:
+    line = _last_line(end)
     return f"{message}; its last line: {line}" if line else message
 
 
-# Habits --------------------------------------------------------------------------------------------
+# Side effects and repetitions ---------------------------------------------------------------------
 
 
 def find_side_effects(first: EncoderRun, again: EncoderRun | None) -> list[Defect]:
-    """Say what a program that wrote its file did in addition, and how a second run differs from the first (CNF-10).
+    """Return the side effects of a run that wrote its file, and its differences from a repetition (CNF-10).
 
     Args:
-        first: the run that is judged.
-        again: the same from another folder, later; `None` if there was none.
+        first: the run to check.
+        again: a later run in another folder; `None` if there was none.
     """
     wrong: list[Defect] = [("", trace) for trace in first.traces]
     if again is None:
         return wrong
     if not again.wrote:
-        how = (
-            again.ended.message or f"exit status {again.ended.returncode}, {'a' if again.out.is_file() else 'no'} file"
-        )
-        return [*wrong, ("CNF-10", _with_line(f"a second run ended otherwise: {how}", again.ended))]
+        how = again.end.message or f"exit status {again.end.returncode}, {'a' if again.out.is_file() else 'no'} file"
+        return [*wrong, ("CNF-10", _with_line(f"a second run ended otherwise: {how}", again.end))]
     one, other = first.out.read_bytes(), again.out.read_bytes()
     if one != other:
         at = _first_difference(one, other)
@@ -219,8 +214,8 @@ def find_side_effects(first: EncoderRun, again: EncoderRun | None) -> list[Defec
     return wrong
 
 
-def _index_bytes(trial: EncoderRun) -> bytes | None:
-    return trial.index.read_bytes() if trial.index is not None and trial.index.is_file() else None
+def _index_bytes(run: EncoderRun) -> bytes | None:
+    return run.index.read_bytes() if run.index is not None and run.index.is_file() else None
 
 
 def _first_difference(one: bytes, other: bytes) -> int:
@@ -231,10 +226,10 @@ def _first_difference(one: bytes, other: bytes) -> int:
 
 
 def _field_at(data: bytes, at: int) -> str:
-    """Name what lies at a byte: a field, or the chunk; nothing if the file is not one."""
+    """Return the name of the field or the chunk at an offset; empty if the file cannot be read."""
     try:
         fields, spans = read_fields(data)
-    except Exception:  # noqa: BLE001 - a file that breaks clauses may end the walk anywhere, and is reported elsewhere
+    except Exception:  # noqa: BLE001 - an invalid file may fail anywhere; `check_stream` reports it
         return ""
     for name, entry in fields.items():
         if entry.offset <= at < entry.offset + entry.size:
@@ -246,7 +241,7 @@ def _field_at(data: bytes, at: int) -> str:
 
 
 def _name_with_type(data: bytes, name: str) -> str:
-    """Add the type of a chunk that has only a number."""
+    """Add the chunk type to the name of a directory record."""
     if not name.startswith("directory["):
         return name
     head = _spec.unpack_index_head(data, _spec.HEADER_SIZE)

@@ -1,4 +1,29 @@
-"""L3: check the error bounds that a file declares."""
+"""L3: check the error bounds that a file declares, and warn of bounds that are correct but probably unintended.
+
+Files with coarse values are valid. A warning means that they are coarser than anyone is likely to intend. `separation`
+is the smallest distance between centres of the input:
+
+| bound | warning above | csplat's coarsest preset reaches |
+|---|---|---|
+| means, maximum | a quarter of `separation` | 0.07 |
+| covariance, maximum | 1.15 | 0.63 |
+| covariance, rms | 0.65 | 0.31 |
+| opacities, maximum | 0.25 | 0.12 |
+| sh0 and bands, maximum | 0.3, or 4 % of the source's largest coefficient | 0.13 |
+| pruned splats (`file_checks`) | a quarter | 0 |
+
+An unrelated rotation gives a covariance error of 1.41 for needles, and about 1.1 for splats as thick as most here.
+
+An encoder that truncates instead of rounding is valid, too, if its bounds cover the error, but twice as coarse. Two
+signs of it are looked for in the measures that a file declares:
+
+- Means and opacities lie on a lattice that the file names. Rounding leaves at most half a step, truncation up to one.
+- Errors of scales, rotations and colours have either sign equally often. If nearly all have one sign, or point towards
+  0, values were truncated. Equal source values count once, since their errors are equal; values that became 0 do not
+  count, since rounding makes them smaller.
+
+Neither sign is a proof: encoders that weigh bytes against errors may prefer smaller integers.
+"""
 
 from __future__ import annotations
 
@@ -19,22 +44,37 @@ from csplat_conformance.encoders.encoder_inputs import EncoderInput
 from csplat_conformance.encoders.encoder_run import Verdict, join_lines
 from csplat_conformance.encoders.file_checks import SplatPairs
 
+# Largest bounds without a warning; see the table above.
+MEANS_PER_SEPARATION = 0.25
+COVARIANCE_MAX, COVARIANCE_RMS = 1.15, 0.65
+OPACITIES_MAX = 0.25
+SH_MAX, SH_PER_LARGEST = 0.3, 0.04
+
+# Signs of truncation.
+STEPS_MAX = 0.75  #: lattice steps; rounding leaves 0.5, or 0.71 next to alpha 0 if it searches the nearest alpha
+ONE_SIDED = 0.95  #: share of the errors with one sign; 40 fair coins are this one-sided once in 10^9 throws
+_TRUNCATED_STEPS_MAX = 1.05  # lattice steps; truncation alone leaves at most 1
+_VALUES_MIN = 40  # different values, below which signs mean nothing
+_ROWS_MAX = 4096  # splats to look at
+_SAME_ROTATION_MIN = 0.8  # smallest cosine of half the angle between rotations that are compared
+
 _NOT_PAIRED = "which splat is which is not known"
 _NO_BOUNDS = "the file states no errors"
+_TRUNCATED = "cut instead of rounded?"
 
 
-def check_errors(one: EncoderInput, scene: DecodedScene, pairs: SplatPairs) -> tuple[Verdict, str]:
-    """Judge L3: what is stated holds (SER-5); what is not stated is not proved.
+def check_errors(case: EncoderInput, scene: DecodedScene, pairs: SplatPairs) -> tuple[Verdict, str]:
+    """Check L3: the declared bounds hold (SER-5). Measures without a bound are not verified.
 
     Args:
-        one: the input.
+        case: the input.
         scene: the decoded scene.
-        pairs: the source splat of each of its splats.
+        pairs: the source splat of each decoded splat.
 
     Returns:
-        The verdict, and why only pictures can judge the rest; nothing if they need not.
+        The verdict, and the reason why only renders can check the rest; empty if they need not.
     """
-    source = one.source() if one.source is not None else None
+    source = case.source() if case.source is not None else None
     if source is None or pairs.strays or pairs.surplus:
         return Verdict(Status.SKIPPED, _NOT_PAIRED), ""
     stated = scene.declared_bounds
@@ -43,13 +83,15 @@ def check_errors(one: EncoderInput, scene: DecodedScene, pairs: SplatPairs) -> t
         return (
             (Verdict(Status.NOT_PROVED, _NO_BOUNDS), _NO_BOUNDS) if len(scene.model) else (Verdict(Status.PASSED), "")
         )
-    proof = verify_bounds(source, scene.model, scene.header, stated, pairs.source_index)
-    details = proof.as_json()["measures"]
-    unverified = f"{', '.join(proof.unverified)}: fitted anew, nothing is stated" if proof.unverified else ""
-    why = f"{', '.join(proof.unverified)} fitted anew" if proof.unverified and stated.refitted else ""
-    if not proof.holds:
-        return Verdict(Status.FAILED, join_lines(proof.failures), proof.clauses, details=details), why
-    coarse = coarse_errors(one, source, proof)
+    verification = verify_bounds(source, scene.model, scene.header, stated, pairs.source_index)
+    details = verification.as_json()["measures"]
+    unverified = (
+        f"{', '.join(verification.unverified)}: fitted anew, nothing is stated" if verification.unverified else ""
+    )
+    why = f"{', '.join(verification.unverified)} fitted anew" if verification.unverified and stated.refitted else ""
+    if not verification.holds:
+        return Verdict(Status.FAILED, join_lines(verification.failures), verification.clauses, details=details), why
+    coarse = coarse_errors(case, source, verification)
     warnings = [*coarse.values()]
     if len(scene.model) and not stated.refitted:  # refitted values differ on purpose
         names = frozenset(record.measure for record in stated.records) - coarse.keys()
@@ -59,19 +101,13 @@ def check_errors(one: EncoderInput, scene: DecodedScene, pairs: SplatPairs) -> t
     return Verdict(status, message, details=details), why
 
 
-MEANS_OF_APART = 0.25
-COVARIANCE_MAX, COVARIANCE_RMS = 1.15, 0.65
-OPACITIES_MAX = 0.25
-SH_MAX, SH_OF_LARGEST = 0.3, 0.04
-
-
-def coarse_errors(one: EncoderInput, source: Source, proof: BoundsVerification) -> dict[str, str]:
-    """Return by measure a line for each stated error that is beyond its bound."""
+def coarse_errors(case: EncoderInput, source: Source, verification: BoundsVerification) -> dict[str, str]:
+    """Return a line by measure for each declared bound that deserves a warning."""
     lines: dict[str, str] = {}
-    for measure in proof.measures:
+    for measure in verification.measures:
         if measure.declared_max is None or measure.declared_rms is None:
             continue
-        bound = _coarse_bound(measure, one, source)
+        bound = _coarse_bound(measure, case, source)
         if measure.declared_max > bound:
             coarse = "coarse, or a wrong rotation" if measure.name == "covariance" else "coarse"
             what = f"an error of {measure.declared_max:.3g}, beyond {bound:.3g} is {coarse}{_worst_splat(measure)}"
@@ -83,15 +119,15 @@ def coarse_errors(one: EncoderInput, source: Source, proof: BoundsVerification) 
     return lines
 
 
-def _coarse_bound(measure: MeasureVerification, one: EncoderInput, source: Source) -> float:
+def _coarse_bound(measure: MeasureVerification, case: EncoderInput, source: Source) -> float:
     if measure.name == "means":
-        return MEANS_OF_APART * one.separation
+        return MEANS_PER_SEPARATION * case.separation
     if measure.name == "covariance":
         return COVARIANCE_MAX
     if measure.name == "opacities":
         return OPACITIES_MAX
     largest = max(float(np.abs(array).max(initial=0.0)) for array in (source.sh0, source.shN))
-    return max(SH_MAX, SH_OF_LARGEST * largest)
+    return max(SH_MAX, SH_PER_LARGEST * largest)
 
 
 def _worst_splat(measure: MeasureVerification) -> str:
@@ -99,29 +135,20 @@ def _worst_splat(measure: MeasureVerification) -> str:
     return "" if worst is None else f": splat {worst.splat} (source splat {worst.source_splat})"
 
 
-STEPS_MAX = 0.75  #: lattice steps; rounding leaves 0.5, and 0.71 next to alpha 0 if it looks for the nearest alpha
-ONE_SIDED = 0.95  #: share of the errors with one sign; 40 fair coins are this one-sided once in 10^9 throws
-_TRUNCATED_STEPS_MAX = 1.05  # lattice steps: cutting alone leaves 1 at most
-_VALUES_MIN = 40  # different values
-_ROWS_MAX = 4096  # splats that are looked at: enough to see a habit
-_SAME_ROTATION_MIN = 0.8  # smallest cosine of half the angle between two rotations that count as the same
-_TRUNCATED = "cut instead of rounded?"
-
-
 def find_truncation(
     source: Source, decoded: SplatModel, header: SceneHeader, index: I64, stated: frozenset[str]
 ) -> list[str]:
-    """Look for them.
+    """Search for signs of truncation.
 
     Args:
         source: the encoded scene.
         decoded: the decoded file.
         header: header of the file.
-        index: [N] which splat of the source each of the file is.
-        stated: the measures to look at.
+        index: [N], source splat of each decoded splat.
+        stated: names of the measures to look at.
 
     Returns:
-        A line for each attribute that looks cut.
+        A line for each attribute with signs.
     """
     return [line for measure, line in _truncated_attributes(source, decoded, header, index) if measure in stated]
 
@@ -138,7 +165,7 @@ def _truncated_attributes(
             yield measure, f"{measure}: up to {steps:.2f} lattice steps off, rounding leaves 0.5: {what}"
     rows = np.linspace(0, len(decoded) - 1, min(len(decoded), _ROWS_MAX)).astype(np.int64)
     theirs = index[rows]
-    # Axes may be permuted; sorted scales are rounded as well as any.
+    # Axes may be permuted: compare sorted scales.
     yield from _one_sided(
         "covariance", "scales", *(np.sort(a, axis=1) for a in (source.scales[theirs], decoded.scales[rows]))
     )
@@ -156,7 +183,7 @@ def _truncated_attributes(
 
 
 def _mean_steps(source: Source, decoded: SplatModel, header: SceneHeader, index: I64) -> float:
-    """Return the largest error along an axis in steps of the tile's lattice, less what binary32 adds."""
+    """Return the largest error along an axis in steps of the tile's lattice, without the rounding of binary32."""
     step = header.attribute(_spec.ATTRIBUTE_MEANS).step
     near, reach = source.about(decoded.origin), source.reach(decoded.origin)
     largest = 0.0
@@ -171,7 +198,7 @@ def _mean_steps(source: Source, decoded: SplatModel, header: SceneHeader, index:
 
 
 def _opacity_steps(source: Source, decoded: SplatModel, header: SceneHeader, index: I64) -> float:
-    """Return the largest error of alpha, or of its root if the levels are of roots, in steps."""
+    """Return the largest error in steps, of alpha or of its root, as the file has it."""
     record = header.attribute(_spec.ATTRIBUTE_OPACITIES)
     ours, theirs = decoded.opacities.astype(np.float64), source.opacities[index].astype(np.float64)
     if record.mapping == _spec.MAPPING_SQUARE:
@@ -185,7 +212,7 @@ def _opacity_steps(source: Source, decoded: SplatModel, header: SceneHeader, ind
 def _one_sided(
     measure: str, name: str, source: NDArray[np.floating], decoded: NDArray[np.floating]
 ) -> Iterator[tuple[str, str]]:
-    """Yield a line if nearly all errors lie on one side."""
+    """Yield a line if nearly all errors have one sign."""
     theirs, ours = source.astype(np.float64).ravel(), decoded.astype(np.float64).ravel()
     theirs, first = np.unique(theirs, return_index=True)
     ours = ours[first]
@@ -203,7 +230,7 @@ def _one_sided(
 def _coded_colours(
     source: NDArray[np.float32], decoded: NDArray[np.float32], header: SceneHeader, attribute: int
 ) -> tuple[F64, F64]:
-    """Return colours as they are rounded: R, G, B, or Co and Cg, for which Y makes up."""
+    """Return the values that the encoder rounds: R, G, B, or Co and Cg. Y is left out, since it compensates them."""
     theirs, ours = source.astype(np.float64), decoded.astype(np.float64)
     if header.attribute(attribute).mapping != _spec.MAPPING_YCOCG:
         return theirs, ours
@@ -217,9 +244,9 @@ def _chroma(rgb: F64) -> F64:
 
 
 def _aligned_quats(source: NDArray[np.float32], decoded: NDArray[np.float32]) -> tuple[F64, F64]:
-    """Return x, y, z of rotations, the source's with the axes in the order and of the signs of the file's.
+    """Return x, y, z of rotations, the source's with the axis order and signs of the file's.
 
-    Splats that are turned too far to tell are left out.
+    Splats whose rotations differ too much are left out.
     """
     theirs, ours = source.astype(np.float64), decoded.astype(np.float64)
     turned = np.einsum("nq,tqp->tnp", theirs, _AXIS_ROTATIONS)  # [24, n, 4]
@@ -232,7 +259,7 @@ def _aligned_quats(source: NDArray[np.float32], decoded: NDArray[np.float32]) ->
 
 
 def _axis_rotations() -> F64:
-    """The rotations that map axes to axes, as matrices to multiply quaternions by on the right, [24, 4, 4]."""
+    """Return the rotations that map axes to axes as right factors of quaternions, [24, 4, 4]."""
     halves = [np.array(q, np.float64) for q in itertools.product((-1, 0, 1), repeat=4) if sum(map(abs, q)) in (1, 2, 4)]
     units = [q / np.sqrt(np.square(q).sum()) for q in halves if q[np.flatnonzero(q)[0]] > 0]  # −q turns as q does
     return np.stack([_right_factor(q) for q in units])

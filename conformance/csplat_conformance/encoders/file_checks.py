@@ -27,7 +27,7 @@ _VIOLATIONS_MAX = 3
 
 
 def check_stream(data: bytes) -> tuple[Verdict, DecodedScene | None]:
-    """L1: no clause is broken (CNF-1, CNF-5); and the scene, if so."""
+    """Check L1: the file breaks no clause (CNF-1, CNF-5). Return the verdict, and the scene if it passes."""
     if not data:
         return Verdict(Status.PARTIAL_OUTPUT, "an empty file"), None
     validation = validate(data)
@@ -49,24 +49,24 @@ def check_stream(data: bytes) -> tuple[Verdict, DecodedScene | None]:
 
 
 def check_content(
-    one: EncoderInput, source: Source, scene: DecodedScene, index: Path | None
+    case: EncoderInput, source: Source, scene: DecodedScene, index: Path | None
 ) -> tuple[Verdict, SplatPairs]:
-    """L2: each splat of the source once, or counted as pruned; facts that the source does not know are not stated.
+    """Check L2: each splat of the source is there once or counted as pruned, and no metadata is guessed.
 
     Args:
-        one: the input.
+        case: the input.
         source: the scene of the input.
         scene: the decoded scene.
-        index: the encoder's own source index, `None` if none was asked for.
+        index: path of the encoder's source index, `None` if the command has no place for it.
 
     Returns:
-        The verdict, and which splat of the source each of the file is: by the encoder's own index, if it is right.
+        The verdict, and the pairs of splats: by the encoder's index if it is correct.
     """
     decoded = scene.model
     centres = decoded.means.astype(np.float64) + np.subtract(decoded.origin, source.origin)
-    pairs = pair_splats(source.means.astype(np.float64), centres, one.separation)
+    pairs = pair_splats(source.means.astype(np.float64), centres, case.separation)
     details = {"splats": len(decoded), "source_splats": len(source), "missing": pairs.missing}
-    wrong = [*_wrong_splats(one, pairs), *_wrong_counts(source, scene, pairs), *_wrong_metadata(source, decoded)]
+    wrong = [*_wrong_splats(case, pairs), *_wrong_counts(source, scene, pairs), *_wrong_metadata(source, decoded)]
     if index is not None:
         pairs, wrong_numbers = check_index(index, source, len(decoded), pairs)
         details["source_index"] = not wrong_numbers
@@ -81,10 +81,10 @@ def check_content(
     return Verdict(Status.PASSED, remark, details=details), pairs
 
 
-def _wrong_splats(one: EncoderInput, pairs: SplatPairs) -> list[Defect]:
+def _wrong_splats(case: EncoderInput, pairs: SplatPairs) -> list[Defect]:
     wrong = []
     if pairs.strays:
-        far = f"not within {one.separation / 2.0:g} of a splat of the source"
+        far = f"not within {case.separation / 2.0:g} of a splat of the source"
         wrong.append(("CNF-6", f"{_count_text(pairs.strays, pairs.examples[0])} {far}"))
     if pairs.surplus:
         many = _count_text(pairs.surplus, pairs.examples[1])
@@ -115,7 +115,7 @@ def _wrong_counts(source: Source, scene: DecodedScene, pairs: SplatPairs) -> lis
 
 
 def _wrong_metadata(source: Source, decoded: SplatModel) -> list[Defect]:
-    """A PLY does not specify axes, unit and filters: an encoder that states them has guessed."""
+    """Return metadata that the encoder has guessed: a PLY does not specify axes, unit and filters."""
     facts = {
         "axes": (decoded.coordinate_system, UNSPECIFIED),
         "unit_metres": (decoded.unit_metres, None),
@@ -136,16 +136,16 @@ _INDEX_CLAUSE = "SRC-4"
 
 
 def check_index(path: Path, source: Source, count: int, pairs: SplatPairs) -> tuple[SplatPairs, list[Defect]]:
-    """Compare a source index with what lies near.
+    """Compare an encoder's source index with the pairs of nearby splats (SRC-4).
 
     Args:
         path: the .npy file.
         source: the encoded scene.
         count: splats of the file.
-        pairs: the source splat near each of them.
+        pairs: pairs by position.
 
     Returns:
-        The pairs with the encoder's own index if it is right, as they are if not; and what is wrong.
+        The pairs, with the encoder's index if it is correct; and the defects of the index.
     """
     if not path.exists():
         return pairs, [(_INDEX_CLAUSE, "no source index was written")]
@@ -157,7 +157,7 @@ def check_index(path: Path, source: Source, count: int, pairs: SplatPairs) -> tu
     index = found.astype(np.int64)
     paired = np.flatnonzero(pairs.source_index >= 0)
     near = pairs.source_index[paired]
-    # Only the encoder can tell splats with equal centres apart.
+    # Only the encoder can distinguish splats with equal centres.
     off = paired[(source.means[index[paired]] != source.means[near]).any(axis=1)]
     if len(off):
         text = (
@@ -169,7 +169,7 @@ def check_index(path: Path, source: Source, count: int, pairs: SplatPairs) -> tu
 
 
 _NONE = -1
-_CELL_MAX = 2.0**40  # centres more cells away from the origin than this share a cell; distance decides anyway
+_CELL_MAX = 2.0**40  # cells from the origin; centres beyond share a cell, which costs comparisons only
 _MIX = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F), np.uint64(0x165667B19E3779F9))
 
 
@@ -178,11 +178,11 @@ class SplatPairs:
     """Pairs of decoded splats and source splats.
 
     Attributes:
-        source_index: [N], the source splat of each decoded splat; −1 if none is near.
-        strays: decoded splats without a source.
-        surplus: decoded splats whose source splat is already paired with another.
-        missing: source splats without a decoded splat.
-        examples: index of the first of `strays` and of `surplus`; −1 if there is none.
+        source_index: [N], source splat of each decoded splat; −1 if none is near.
+        strays: number of decoded splats without a source splat.
+        surplus: number of decoded splats whose source splat is paired with another one.
+        missing: number of source splats without a decoded splat.
+        examples: first decoded splat of `strays` and of `surplus`; −1 if there is none.
     """
 
     source_index: I64
@@ -232,11 +232,11 @@ def _nearest(centres: F64, decoded: F64, separation: float) -> I64:
     own = _cells(decoded, separation)
     found = np.full(len(decoded), _NONE, np.int64)
     left = np.arange(len(decoded))
-    # Its own cell first: most need no other one.
+    # The own cell comes first: it is enough for most splats.
     for step in sorted(product((-1, 0, 1), repeat=3), key=lambda step: sum(map(abs, step))):
         wanted = _keys(own[left] + np.array(step, np.int64))
         first, last = np.searchsorted(keys, wanted, "left"), np.searchsorted(keys, wanted, "right")
-        # One cell holds few centres, since its side is their distance.
+        # A cell holds few centres, since its side is their smallest distance.
         for nth in range(int((last - first).max(initial=0))):
             more = first + nth < last
             rows, candidates = left[more], order[first[more] + nth]
@@ -255,7 +255,7 @@ def _cells(points: F64, side: float) -> I64:
 
 
 def _keys(cells: I64) -> NDArray[np.uint64]:
-    """Mix three numbers into one; equal keys of unequal cells cost a comparison, no more."""
+    """Hash cells. If unequal cells have equal keys, that costs a comparison only."""
     keys = np.zeros(len(cells), np.uint64)
     for axis, factor in enumerate(_MIX):
         keys ^= cells[:, axis].astype(np.uint64) * factor

@@ -1,4 +1,4 @@
-"""PLY files as trainers write them, and what they mean: written by hand, so that no reader is judged by itself.
+"""Write PLY files as trainers do, and return the sources that they hold, independently of the PLY reader under test.
 
 The columns are those of the reference implementation of 3D Gaussian splatting: centres, base colour `f_dc`, higher
 coefficients `f_rest` channel by channel, the logit of the opacity, logarithms of the standard deviations, and a
@@ -22,7 +22,7 @@ _TYPE_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i2": "short", "i4"
 
 @dataclass
 class PlyRows:
-    """Rows of a PLY, as they stand in it: float32, or float64 if a PLY of doubles holds more than that.
+    """The rows of a PLY: float32, or float64 for values that a PLY of doubles holds.
 
     Attributes:
         means: [N, 3].
@@ -31,7 +31,7 @@ class PlyRows:
         logits: [N], of the opacity.
         sh0: [N, 3].
         shN: [N, K, 3].
-        normals: [N, 3], which splats do not use.
+        normals: [N, 3], unused by splats.
         extra: further columns by name.
     """
 
@@ -45,7 +45,7 @@ class PlyRows:
     extra: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     def select(self, rows: NDArray[Any]) -> PlyRows:
-        """Keep some rows."""
+        """Return the given rows."""
         return PlyRows(
             self.means[rows],
             self.quats[rows],
@@ -59,7 +59,7 @@ class PlyRows:
 
 
 def is_splat(splats: PlyRows) -> NDArray[np.bool_]:
-    """Tell which rows are splats of the source (SRC-1): all numbers finite in binary32, logits may be infinite."""
+    """Return which rows are splats of the source (SRC-1): finite in binary32, but logits may be infinite."""
     good: NDArray[np.bool_] = ~np.isnan(splats.logits)
     with np.errstate(over="ignore"):
         for array in (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN):
@@ -68,7 +68,7 @@ def is_splat(splats: PlyRows) -> NDArray[np.bool_]:
 
 
 def source_of_rows(splats: PlyRows) -> Source:
-    """Return the source that the rows stand for (spec SRC-1, SRC-2): alpha of the logits, unit quaternions."""
+    """Return the source that the rows hold (SRC-1, SRC-2), with alpha for logits and unit quaternions."""
     splats = splats.select(np.flatnonzero(is_splat(splats)))
     with np.errstate(over="ignore"):
         alpha = 1.0 / (1.0 + np.exp(-splats.logits.astype(np.float32).astype(np.float64)))  # ±Inf are alpha 1 and 0
@@ -92,18 +92,18 @@ class PlyLayout:
 
     Attributes:
         format: format in the header: `ascii`, `binary_little_endian` or `binary_big_endian`.
-        normals: whether there are columns nx, ny, nz, as most trainers write; zero unless the rows have values.
-        dtype: `f4` or `f8`, the type of all columns but the extra ones.
+        normals: whether to write columns nx, ny, nz, as most trainers do; zero unless the rows have values.
+        dtype: type of all columns but the extra ones, `f4` or `f8`.
         means_dtype: type of x, y, z, if it differs.
         comments: comment lines of the header, with any characters; bytes that are not UTF-8 as surrogates.
         obj_info: `obj_info` lines of the header.
-        reverse: write columns in the opposite order: only their names count.
-        renamed: new names of columns; an empty one leaves the column out.
-        count: number of rows in the header, if it differs from the true one.
+        reverse: write the columns in the opposite order.
+        renamed: new names of columns; an empty name leaves the column out.
+        count: number of rows in the header, if wrong on purpose.
         line_end: end of the header's lines.
         lists: [N] lists of small numbers, a property of that kind before all others; not in `ascii`.
         before: header lines and bytes of elements before the splats.
-        after: the same for elements after them; or no lines, and bytes that the header does not mention.
+        after: header lines and bytes of elements after them; without lines, trailing bytes.
     """
 
     format: str = "binary_little_endian"
@@ -122,7 +122,7 @@ class PlyLayout:
 
 
 def write_ply(splats: PlyRows, layout: PlyLayout | None = None) -> bytes:
-    """Write the bytes of a PLY."""
+    """Return the bytes of a PLY."""
     layout = layout or PlyLayout()
     columns = _columns(splats, layout)
     head = _header_bytes(columns, len(splats.means), layout)
@@ -176,5 +176,5 @@ def _columns(splats: PlyRows, layout: PlyLayout) -> dict[str, NDArray[Any]]:
 
 
 def _format_number(value: float) -> str:
-    """Write a number so that it is read back exactly: the shortest digits of its binary64 do."""
+    """Return the shortest digits that give the same binary64."""
     return repr(value)

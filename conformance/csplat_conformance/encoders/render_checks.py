@@ -17,12 +17,12 @@ from csplat_conformance.encoders.encoder_inputs import EncoderInput
 from csplat_conformance.encoders.encoder_run import Verdict
 from csplat_conformance.encoders.file_checks import SplatPairs
 
-#: PSNR in dB of a decoded scene against its source; the source comes first.
+#: Returns the PSNR of renders of a decoded scene compared with its source, dB; called with source and decoded scene.
 RenderScore = Callable[[SplatModel, SplatModel], float]
 
 
 def check_renders(
-    one: EncoderInput,
+    case: EncoderInput,
     source: Source,
     scene: DecodedScene,
     pairs: SplatPairs,
@@ -30,20 +30,20 @@ def check_renders(
     render_score: RenderScore,
     psnr_min: float,
 ) -> Verdict:
-    """Judge L4: renders of the file look like those of the source.
+    """Check L4: renders of the file look like those of the source.
 
     Args:
-        one: the input.
+        case: the input.
         source: the scene of the input.
         scene: the decoded scene.
         pairs: the source splat of each decoded splat.
         size_bytes: size of the file.
-        render_score: compares.
-        psnr_min: lowest PSNR to pass, dB; an input shifts it by its own difference from the default.
+        render_score: computes the PSNR.
+        psnr_min: lowest PSNR that passes, dB; inputs shift it by their own difference from the default.
     """
     model, decoded = source.to_model(scene.model.origin), scene.model
     psnr = render_score(model, decoded)
-    figures, wanted = peer_figures(one.name), one.psnr_required(psnr_min)
+    figures, wanted = peer_figures(case.name), case.psnr_required(psnr_min)
     details = {"psnr": psnr, "wanted": wanted, "bytes": size_bytes, "beside": figures}
     size = f"in {size_bytes:,} bytes{format_figures(figures)}"
     if not psnr >= wanted:
@@ -57,7 +57,7 @@ def check_renders(
 def _score_exact_attributes(
     source: SplatModel, decoded: SplatModel, pairs: SplatPairs, render_score: RenderScore
 ) -> dict[str, float]:
-    """Return the PSNR with one attribute as exact as the source has it: what gains most is what costs most."""
+    """Return the PSNR with the source's values of one attribute: the largest gain shows the costliest attribute."""
     if pairs.strays or pairs.surplus:
         return {}
     theirs = source.select(pairs.source_index)
@@ -75,12 +75,12 @@ _DISPLAY_NAMES = {"spz": "SPZ"}
 
 
 def peer_figures(name: str) -> dict[str, dict[str, Any]]:
-    """Return by encoder `bytes` and `psnr` of an input; nothing if none were measured."""
+    """Return `bytes` and `psnr` of an input by encoder; empty if none were measured."""
     return _all_figures().get(name, {})
 
 
 def format_figures(figures: dict[str, dict[str, Any]]) -> str:
-    """Return them in words, with a blank before: ` (csplat 40.90 in 4,800, SPZ 39.10 in 7,900)`."""
+    """Return figures as text after a blank: ` (csplat 40.90 in 4,800, SPZ 39.10 in 7,900)`."""
     words = []
     for encoder, numbers in figures.items():
         psnr = f"{numbers['psnr']:.2f}" if numbers.get("psnr") is not None else ""

@@ -94,9 +94,7 @@ class Inflater:
         """Read the header of a dynamic block."""
         literals, distances = self._number(5) + 257, self._number(5) + 1
         if literals > _LITERALS_MAX or distances > _DISTANCES_MAX:
-            self.refuse(
-                "COD-5", f"{literals} literal/length and {distances} distance symbols, 286 and 30 are the most"
-            )
+            self.refuse("COD-5", f"{literals} literal/length and {distances} distance symbols, 286 and 30 are the most")
         lengths = [0] * len(_ORDER)
         for symbol in _ORDER[: self._number(4) + 4]:
             lengths[symbol] = self._number(3)
