@@ -1,4 +1,4 @@
-"""csplat's Python decoder behind the protocol of the suite (`protocol`), and in this process.
+"""Run csplat's Python decoder by the protocol of the suite (`protocol`), or in this process.
 
 csplat conformance decoder --cmd 'python -m csplat_conformance.adapter {input} {outdir}' --exact
 """
@@ -33,7 +33,7 @@ _FLOATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
 def answer(data: bytes, limits: Limits | None = None, threads: int | None = None) -> Answer:
-    """Decode a file to floats and to integers; both ways must agree on whether it is sound.
+    """Decode a file to floats and to integers; both must accept it, or refuse it alike.
 
     Args:
         data: the file.
@@ -71,11 +71,11 @@ def exact_floats(name: str) -> dict[str, NDArray[np.float32]]:
 
 
 class _DifferError(Exception):
-    """Two ways of decoding disagree: a defect of the decoder."""
+    """Raised if the two ways of decoding disagree, which is a defect of the decoder."""
 
 
 def _decoded(data: bytes, limits: Limits | None, threads: int | None) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """Return facts of the header, and raw values by `part.name`."""
+    """Return header fields, and raw values by `part.name`."""
     from csplat import decoder  # whoever reads the manifest alone need not load it
 
     results: list[Any] = []
@@ -98,7 +98,7 @@ def _decoded(data: bytes, limits: Limits | None, threads: int | None) -> tuple[d
 
 
 def _place(result: Any) -> tuple[str, str | None, int | None]:
-    """Return code, clause and offset of an error; of anything else what no error has."""
+    """Return code, clause and offset of an error; empty values for other results."""
     return getattr(result, "code", ""), getattr(result, "clause", None), getattr(result, "offset", None)
 
 
@@ -107,7 +107,7 @@ def _raw(array: NDArray[Any]) -> bytes:
 
 
 def _facts(header: Any) -> dict[str, Any]:
-    """Return the header's facts in the words of the manifest."""
+    """Return the header fields as the manifest has them."""
     flags = {_spec.SCENE_FLAG_ANTIALIASED: header.antialiased, _spec.SCENE_FLAG_FLAT: header.flat}
     return {
         "profile": header.profile,

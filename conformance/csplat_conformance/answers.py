@@ -4,9 +4,9 @@
 |---|---|
 | L1 | `header.json`; for broken files the refusal |
 | L2 | the integer arrays of spec 9.2 |
-| L3 | the float arrays of spec section 3 and the extra columns, bit for bit; floats of the class renderer by `near` |
+| L3 | the float arrays of spec section 3 and the extra columns, bit for bit, or by `tolerance` for the class renderer |
 
-L4, pictures, is `views`.
+L4, renders, is in `reference_renders`.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def _check_refused(vector: Vector, answer: Answer, exact: bool) -> Outcome:
 
 
 def _match_refusal(answer: Answer, wanted: Mapping[str, Any], exact: bool) -> tuple[Status, str]:
-    """A refusal is what counts: another order of checks may find another code first."""
+    """Compare a refusal; only `exact` compares its code, since another order of checks may find another code first."""
     found = _describe_error(answer.code, answer.clause, answer.offset)
     planted = f"planted {_describe_error(wanted['code'], wanted['clause'], wanted['offset'])}, reported {found}"
     if exact:
@@ -137,7 +137,7 @@ def _describe_error(code: str, clause: str | None, offset: int | None) -> str:
 
 
 def check_payload_consistency(outcomes: Iterable[Outcome]) -> tuple[list[Outcome], list[str]]:
-    """Hold a decoder to CHK-7: of each type of chunk it reads every payload by all clauses, or none (CHK-6).
+    """Check CHK-7: a decoder reads every payload of a chunk type by all clauses, or none (CHK-6).
 
     Args:
         outcomes: what `compare_answer` returned for all vectors.
@@ -186,12 +186,12 @@ def _compare(vector: Vector, answer: Answer, parts: tuple[str, ...], near: Float
 
 
 def _severity(status: Status) -> int:
-    """Rank a failure of the arrays of one vector: of several, the one with the largest rank is reported."""
+    """Rank a failure of an array; of several failures of a vector, the one with the largest rank is reported."""
     return -[Status.WRONG_ANSWER, Status.PARTIAL_OUTPUT, Status.FAILED].index(status)
 
 
 def whole_number(text: str) -> float:
-    """Read a JSON number without fraction or exponent: beyond 2^53 as JavaScript has it, which writes 2^65 so."""
+    """Convert a JSON integer; beyond 2^53 to a float, since JavaScript writes 2^65 as an integer."""
     value = int(text)
     return value if abs(value) <= 2**53 else float(value)
 

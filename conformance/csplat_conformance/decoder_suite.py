@@ -32,7 +32,7 @@ CountProgress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class DecoderSuiteOptions:
-    """Settings of a run: the vectors, and how strictly they are judged.
+    """Settings of a run of the decoder suite.
 
     Attributes:
         pattern: shell patterns of the vectors' names, `valid/sh*,valid/rich`; None for all.
@@ -64,12 +64,12 @@ class DecoderSuiteOptions:
 
     @property
     def near(self) -> FloatsByVector | None:
-        """The source of exact floats that a decoder's must be near; None if they must be equal bit for bit."""
+        """The exact floats by vector, for decoders of the class renderer; None if floats must be equal bit for bit."""
         return adapter.exact_floats if self.by == RENDERER else None
 
 
 def parse_levels(text: str) -> tuple[int, ...]:
-    """Return the levels that a word names: `3` is all up to 3, `1,3` is those two.
+    """Parse levels: `3` means all up to 3, `1,3` those two.
 
     Raises:
         InputError: there are no such levels.
@@ -84,7 +84,7 @@ def parse_levels(text: str) -> tuple[int, ...]:
 
 
 def run_builtin(choice: DecoderSuiteOptions | None = None, progress: CountProgress | None = None) -> ConformanceReport:
-    """Run this package's own decoder over the vectors: code, clause and offset of refusals are demanded of it.
+    """Run csplat's decoder over the vectors; its refusals must match in code, clause and offset.
 
     Args:
         choice: settings of the run; `exact`, `timeout` and `jobs` do not apply.

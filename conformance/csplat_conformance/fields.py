@@ -1,4 +1,4 @@
-"""Bytes with a name for every field, so that a vector can break one field and say where it lies."""
+"""Locate the fields of a file by name, and write structures with named fields."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _CRC_SIZE = 4
 
 @dataclass(frozen=True)
 class Field:
-    """A field's place: offset in the bytes that hold it, struct format, structure that it belongs to."""
+    """The place of a field: offset, struct format, and the structure that it belongs to."""
 
     offset: int
     format: str
@@ -23,19 +23,19 @@ class Field:
 
     @property
     def size(self) -> int:
-        """Bytes of the field."""
+        """Size in bytes."""
         return struct.calcsize(self.format)
 
 
 @dataclass
 class Writer:
-    """Bytes that grow, and the fields in them."""
+    """A writer of bytes that records the places of fields."""
 
     data: bytearray = field(default_factory=bytearray)
     fields: dict[str, Field] = field(default_factory=dict)
 
     def structure(self, name: str, structure: str, values: Iterable[Any]) -> None:
-        """Append a structure of the registry; its fields are called `name.field`."""
+        """Append a structure of the registry, with fields named `name.field`."""
         packer: struct.Struct = getattr(_spec, f"{structure.upper()}_STRUCT")
         offsets: dict[str, int] = getattr(_spec, f"{structure.upper()}_OFFSETS")
         for key, (offset, code) in _formats(packer.format, offsets).items():

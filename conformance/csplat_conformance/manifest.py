@@ -1,4 +1,4 @@
-"""The manifest: the vectors, and the result that a decoder must give for each."""
+"""The manifest: each vector, and the result that a decoder must give for it."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Vector:
         name: group and name, `valid/rich`.
         file: path below the folder of the vectors.
         sha256: SHA-256 of the file.
-        why: one line.
-        clauses: ids that the vector covers.
+        why: one line: its purpose.
+        clauses: clauses that the vector covers.
         since: version of the format.
         expect: `header`, `integers`, `floats`, `extra`; empty for a refusal.
         error: `code`, `clause`, `offset`, `also` (codes that do as well), `optional` (type
@@ -50,12 +50,12 @@ class Vector:
 
     @property
     def data(self) -> bytes:
-        """The file's bytes."""
+        """The bytes of the file."""
         return (VECTORS / self.file).read_bytes()
 
 
 def load(path: Path = VECTORS / "manifest.json") -> list[Vector]:
-    """Read the manifest; a file is read once in a process."""
+    """Read the manifest, once per process."""
     return list(_loaded(path))
 
 
@@ -65,7 +65,7 @@ def _loaded(path: Path) -> tuple[Vector, ...]:
 
 
 def picture_name(name: str, number: int) -> str:
-    """Return the path of a vector's reference picture, below the folder of the vectors."""
+    """Return the path of a vector's reference image below the folder of the vectors."""
     return f"{name}.{number}.png"
 
 
@@ -81,7 +81,7 @@ def _summary(array: NDArray[Any]) -> list[Any]:
 
 
 def to_json(vectors: Sequence[Vector]) -> str:
-    """Return the text of manifest.json, one vector a line."""
+    """Return the text of manifest.json, with a line per vector."""
     entries = [{key: value for key, value in vars(vector).items() if key != "views" or value} for vector in vectors]
     lines = [json.dumps(entry, ensure_ascii=False, separators=(",", ":")) for entry in entries]
     head = json.dumps({"format": f"csplat {_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}", "licence": "CC0-1.0"})
@@ -89,13 +89,13 @@ def to_json(vectors: Sequence[Vector]) -> str:
 
 
 def select_names(patterns: str | None, names: Collection[str], what: str) -> set[str]:
-    """Return the names that one of some patterns matches; all of them for None.
+    """Return the names that match any of some shell patterns; all names for None.
 
     Args:
-        patterns: as in a shell, with commas between them: `valid/sh*,valid/absent_*`. One matches whole names, or the
-            part before a hyphen: `MOR` is `MOR-*`, and so a chapter of clauses.
-        names: to choose from.
-        what: the thing that has the names, for messages.
+        patterns: separated by commas: `valid/sh*,valid/absent_*`. A pattern matches whole names, or the part before a
+            hyphen: `MOR` means `MOR-*`, a chapter of clauses.
+        names: names to select from.
+        what: kind of thing, for messages.
 
     Raises:
         InputError: a pattern matches none of them.

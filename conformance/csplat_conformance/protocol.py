@@ -1,4 +1,22 @@
-"""The protocol by which any decoder can be tested: one process for each vector."""
+"""The protocol by which any decoder can be tested: one process for each vector.
+
+    my-decoder INPUT OUTDIR
+
+The decoder exits with status 0 and leaves in OUTDIR `header.json` and a file of raw values for each array,
+little-endian, in C order: `integers.NAME.bin`, `floats.NAME.bin`, `extra.NAME.bin` (names of columns percent-encoded).
+Or it exits with status 1, its last line on standard output is JSON, `{"code": "E_CRC"}`, and OUTDIR stays empty.
+
+`run_program` starts any program with a time limit and returns how it end:
+
+    >>> places = {"input": "a b.ply", "out": "x"}
+    >>> end = run_program("my-tool {input} {out}", places, timeout_seconds=60)    # doctest: +SKIP
+    >>> end.status, end.returncode                                                # doctest: +SKIP
+    (None, 0)
+
+A command line is split as by a shell, but runs without one: no pipes, no variables. Names in braces are replaced after
+the split, so that file names may have spaces. See `run_program` for file names if the program has its own working
+directory.
+"""
 
 from __future__ import annotations
 
@@ -19,59 +37,59 @@ from csplat.system import kill_group, split_words
 from csplat_conformance.answers import Answer, whole_number
 from csplat_conformance.conformance_report import Status
 
-_MESSAGE_MAX = 200  # characters of a program's own message
+_MESSAGE_MAX = 200  # characters of a program's message to keep
 _PARTS = ("integers", "floats", "extra")
 
 
 def ask_decoder(command: str, path: Path, timeout: float, *, keep_floats: bool = False) -> Answer:
-    """Let a decoder have one file.
+    """Run a decoder on one file.
 
     Args:
         command: command line with `{input}` and `{outdir}`.
         path: the file.
-        timeout: seconds after which the process and its children are killed.
-        keep_floats: the answer holds the values of the float arrays too, not their hashes alone.
+        timeout: time limit in seconds; then the process and its children are killed.
+        keep_floats: keep the values of float arrays in the answer, not only their hashes.
     """
     with tempfile.TemporaryDirectory(prefix="csplat-conformance-") as folder:
         outdir = Path(folder) / "out"
         outdir.mkdir()
-        ended = run_program(command, {"input": str(path), "outdir": str(outdir)}, timeout)
-        return read_answer(ended, outdir, keep_floats=keep_floats)
+        end = run_program(command, {"input": str(path), "outdir": str(outdir)}, timeout)
+        return read_answer(end, outdir, keep_floats=keep_floats)
 
 
-def read_answer(ended: ProcessEnd, outdir: Path, *, keep_floats: bool = False) -> Answer:
-    """Read what a decoder left.
+def read_answer(end: ProcessEnd, outdir: Path, *, keep_floats: bool = False) -> Answer:
+    """Read the answer that a decoder left.
 
     Args:
-        ended: how the process ended.
-        outdir: the folder it was given.
-        keep_floats: as for `ask_decoder`.
+        end: the end of its process.
+        outdir: its output folder.
+        keep_floats: see `ask_decoder`.
     """
-    if ended.status is not None:
-        return Answer(ended.status, ended.message + last_words(ended), seconds=ended.seconds)
+    if end.status is not None:
+        return Answer(end.status, end.message + last_words(end), seconds=end.seconds)
     left = sorted(entry.name for entry in outdir.iterdir())
-    if ended.returncode == 1:
-        return _read_refusal(ended, left)
-    return _read_arrays(outdir, left, ended.seconds, keep_floats=keep_floats)
+    if end.returncode == 1:
+        return _read_refusal(end, left)
+    return _read_arrays(outdir, left, end.seconds, keep_floats=keep_floats)
 
 
-def _read_refusal(ended: ProcessEnd, left: list[str]) -> Answer:
+def _read_refusal(end: ProcessEnd, left: list[str]) -> Answer:
     try:
-        facts: dict[str, Any] = dict(json.loads((ended.stdout.splitlines() or [b""])[-1]))
+        facts: dict[str, Any] = dict(json.loads((end.stdout.splitlines() or [b""])[-1]))
         code, clause, offset = facts["code"], facts.get("clause"), facts.get("offset")
         if not isinstance(code, str):
             raise TypeError
     except (ValueError, LookupError, TypeError, RecursionError):
-        text = f"exit status 1 without a line of JSON that has a code{last_words(ended)}"
-        return Answer(Status.WRONG_ANSWER, text, seconds=ended.seconds)
+        text = f"exit status 1 without a line of JSON that has a code{last_words(end)}"
+        return Answer(Status.WRONG_ANSWER, text, seconds=end.seconds)
     if left:
-        return Answer(Status.PARTIAL_OUTPUT, f"refused, but left {', '.join(left)}", code=code, seconds=ended.seconds)
-    return Answer(Status.REFUSED, "refused", code=code, clause=clause, offset=offset, seconds=ended.seconds)
+        return Answer(Status.PARTIAL_OUTPUT, f"refused, but left {', '.join(left)}", code=code, seconds=end.seconds)
+    return Answer(Status.REFUSED, "refused", code=code, clause=clause, offset=offset, seconds=end.seconds)
 
 
-def last_words(ended: ProcessEnd) -> str:
-    """Return the last line of standard error as the end of a sentence, or nothing."""
-    lines = ended.stderr.decode("utf-8", "replace").split("\n")
+def last_words(end: ProcessEnd) -> str:
+    """Return the last line of standard error as the end of a sentence, or an empty string."""
+    lines = end.stderr.decode("utf-8", "replace").split("\n")
     words = next((line.strip() for line in reversed(lines) if line.strip()), "")
     return f": {words[:_MESSAGE_MAX]}" if words else ""
 
@@ -101,9 +119,9 @@ def _read_arrays(outdir: Path, left: list[str], seconds: float, *, keep_floats: 
     return Answer(Status.PASSED, header=header, arrays=arrays, floats=floats, seconds=seconds)
 
 
-_OUTPUT_MAX = 1 << 20  # bytes of each stream that are kept: a program may print for ever
-_SIGKILL = 9  # SIGKILL, which Windows has no name for
-_WINDOWS_EXCEPTION = 0xC0000000  # least exit status of a Windows program that crashed; of others it is at most 255
+_OUTPUT_MAX = 1 << 20  # bytes of each stream to keep; a program may print forever
+_SIGKILL = 9  # number of SIGKILL, which Windows does not name
+_WINDOWS_EXCEPTION = 0xC0000000  # smallest exit status of a Windows program that crashed
 
 
 @dataclass(frozen=True)
@@ -111,12 +129,12 @@ class ProcessEnd:
     """The end of a process.
 
     Attributes:
-        status: `CRASHED` by a signal, `HUNG`, `WRONG_STATUS` for anything but 0 and 1; `None` for 0 and 1.
-        returncode: exit status, minus the signal's number after a crash.
-        stdout: the end of standard output, a mebibyte at most.
-        stderr: the end of standard error, likewise.
-        seconds: time it ran.
-        message: the meaning of `status` here, in words; empty for `None`.
+        status: `CRASHED` by a signal, `HUNG`, `WRONG_STATUS` for an exit status above 1; `None` for 0 and 1.
+        returncode: exit status, or minus the signal's number after a crash.
+        stdout: end of standard output, at most a mebibyte.
+        stderr: end of standard error, at most a mebibyte.
+        seconds: running time.
+        message: explanation of `status`; empty for `None`.
     """
 
     status: Status | None
@@ -128,15 +146,15 @@ class ProcessEnd:
 
 
 def split_command(command: str, names: tuple[str, ...], optional: tuple[str, ...] = ()) -> list[str]:
-    """Split a command line and see to it that it names what it must.
+    """Split a command line and check its names in braces.
 
     Args:
-        command: the line.
-        names: names that must occur in it, in braces.
-        optional: names that may occur.
+        command: the command line.
+        names: required names.
+        optional: allowed names.
 
     Raises:
-        InputError: quotes without an end, no program, a name in braces that is missing or unknown.
+        InputError: a quote is not closed, there is no program, or a name is missing or unknown.
     """
     try:
         words = split_words(command)
@@ -153,18 +171,17 @@ def split_command(command: str, names: tuple[str, ...], optional: tuple[str, ...
 def run_program(
     command: str, places: Mapping[str, str], timeout_seconds: float, *, cwd: Path | None = None
 ) -> ProcessEnd:
-    """Run a command line in a process group of its own; what is left of the group after the time is killed.
+    """Run a command line in a process group of its own, which is killed at the end or after the time limit.
 
     Args:
         command: with the keys of `places` in braces.
         places: values to insert, by name.
         timeout_seconds: wall-clock limit.
-        cwd: working directory. A program with a slash is then still one of this process's own directory, and so are
-            words, or what follows the `=` of an option, that look like a path (a slash, or a suffix) and name
-            something there.
+        cwd: working directory. Paths are still relative to this process's directory: the program if it has a slash,
+            and words, or values of options after `=`, that look like a path (a slash, or a suffix) and exist there.
 
     Raises:
-        InputError: the command line is not one, or there is no such program.
+        InputError: the command line cannot be used, or there is no such program.
     """
     words = split_command(command, tuple(places))
     if cwd is not None:
@@ -200,7 +217,7 @@ def run_program(
 
 
 def _make_absolute(word: str) -> str:
-    """Make a word absolute that names something in the working directory."""
+    """Make a word absolute if it names something in the working directory."""
     option, equals, path = word.partition("=") if word.startswith("-") else ("", "", word)
     like_a_path = _has_separator(path) or bool(Path(path).suffix)
     # Path.exists() raises for words that are too long to be one.
@@ -209,7 +226,7 @@ def _make_absolute(word: str) -> str:
 
 
 def _absolute_path(path: str) -> str:
-    # A link stays one: the program of a virtual environment is known by where it lies.
+    # Do not resolve links: a virtual environment is found by the path of its program.
     return str(Path(path).absolute()).replace("{", "{{").replace("}", "}}")
 
 

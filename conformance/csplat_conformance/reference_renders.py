@@ -1,4 +1,14 @@
-"""L4: compare renders with reference images."""
+"""L4: compare renders of a scene, for given cameras, with reference images.
+
+A reference image is what the equations give in binary64 (`csplat_render.reference_rasteriser`), over black, clipped to 0..1, times 255
+and rounded; IMPLEMENTERS.md lists the conventions. A renderer is a command
+
+    my-renderer INPUT CAMERA OUT
+
+INPUT is a `.csplat` file, CAMERA a JSON file with a list of one camera, OUT the PNG to write. With `{outdir}` in place
+of `{out}`, the renderer may write one PNG of any name to that folder. PNG files have 8 bits per channel, and are read
+and written without an imaging library.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +34,13 @@ from csplat_conformance.protocol import last_words, run_program
 
 _LEVEL = "L4"
 
+#: PSNR of equal images, dB.
+PSNR_CAP = 99.0
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_SIDE_MAX = 4096
+_CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # colour type: grey, RGB, grey and alpha, RGBA
+
 
 def can_render() -> bool:
     """Return True if csplat's renderer can be imported (the extra `render`)."""
@@ -31,7 +48,7 @@ def can_render() -> bool:
 
 
 def quantise_render(rgb: NDArray[Any]) -> U8:
-    """Return a picture's 8-bit values: clipped to 0..1, times 255, rounded."""
+    """Return the 8-bit values of a render: clipped to 0..1, times 255, rounded."""
     picture: U8 = np.rint(np.clip(rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
     return picture
 
@@ -71,7 +88,7 @@ def score_renderer(vector: Vector, command: str, timeout: float) -> list[Outcome
 
 
 def skip_views(vector: Vector, why: str) -> list[Outcome]:
-    """Return outcomes that say why nothing was rendered."""
+    """Return skipped outcomes with the reason why nothing was rendered."""
     return [_outcome(vector, number, Status.SKIPPED, why) for number in range(len(vector.views))]
 
 
@@ -115,19 +132,11 @@ def _outcome(
     return Outcome(name, _LEVEL, status, tuple(vector.clauses), "", message, seconds, details)
 
 
-#: Score of equal pictures, dB.
-PSNR_CAP = 99.0
-
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_SIDE_MAX = 4096
-_CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # colour type: grey, RGB, grey and alpha, RGBA
-
-
 def psnr(reference: U8, picture: U8) -> float:
     """Return the peak signal-to-noise ratio over pixels and channels, in dB, at most `PSNR_CAP`.
 
     Raises:
-        InputError: the pictures differ in size.
+        InputError: the images differ in size.
     """
     if reference.shape != picture.shape:
         sizes = [f"{shape[1]}x{shape[0]}" for shape in (picture.shape, reference.shape)]
@@ -153,10 +162,10 @@ def _png_chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def read_png(data: bytes) -> U8:
-    """Return the [H, W, 3] values of a PNG of 8 bits per channel, not interlaced; alpha is dropped, grey spread.
+    """Read an image, [H, W, 3], from a PNG of 8 bits per channel that is not interlaced; alpha is dropped.
 
     Raises:
-        InputError: not such a PNG.
+        InputError: the data is not such a PNG.
     """
     try:
         return _decode_png(data)

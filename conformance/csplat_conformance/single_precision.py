@@ -1,4 +1,4 @@
-"""Compute what a GPU makes of a scene's integers: section 7 in single precision, and its distance from exact values.
+"""Compute the values that a GPU reconstructs, section 7 in single precision, and their distance from exact values.
 
 Usage:
     python -m csplat_conformance.single_precision                # all valid vectors, and seeded integers
@@ -38,7 +38,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class GpuArithmetic:
-    """Arithmetic in binary32.
+    """The arithmetic of a GPU in binary32.
 
     Attributes:
         product: ulp by which products may be off, 0.5 being the nearest.
@@ -55,7 +55,7 @@ class GpuArithmetic:
     flush: bool = False
 
     def times(self, a: F32, b: float | F32) -> F32:
-        """Multiply; what would be infinite becomes the largest number."""
+        """Multiply; infinite products become the largest number."""
         return self._off(self._in(a) * self._in(b), self.product)
 
     def over(self, a: F32, b: float) -> F32:
@@ -71,7 +71,7 @@ class GpuArithmetic:
         return np.where(np.abs(wide) < _SMALLEST, 0.0, wide) if self.flush else wide
 
     def _off(self, exact: NDArray[np.float64], allowed: float) -> F32:
-        """Return a number of binary32 that is off by as many ulp at most."""
+        """Round to binary32 with the largest allowed error in ulp."""
         if allowed != _NEAREST:
             ulp = np.where(exact == 0, 0.0, np.ldexp(1.0, np.frexp(exact)[1] - _BITS))  # nought stays nought
             end = exact + np.copysign(allowed * ulp, exact) * (1 if self.away else -1)
@@ -96,7 +96,7 @@ GPUS: Final = {
 
 
 def lattice_values(n: Ints, step: float, exponent: int, gpu: GpuArithmetic) -> F32:
-    """Return n, rounded to binary32 once, times s, rounded once; powers of two next to them (7.2, 7.4).
+    """Return n, rounded to binary32, times s, rounded once; powers of two are applied separately (7.2, 7.4).
 
     Args:
         n: int64, within 2^53: made of integers, whatever their size.
@@ -131,7 +131,7 @@ def quats(q: Ints, levels: int, gpu: GpuArithmetic) -> F32:
 
 
 def radicands(q: Ints, levels: int) -> Ints:
-    """Return R of each row of q, exact."""
+    """Return the exact R of each row of q."""
     squares: Ints = (q.astype(np.int64) ** 2).sum(axis=1)
     return 2 * levels * levels - squares
 
@@ -172,7 +172,7 @@ def _exact_values(model: Any, name: str) -> F32:
 
 
 def _file_values(files: Iterable[bytes]) -> Iterator[tuple[str, str, F32, F32]]:
-    """Yield array, accuracy, value and exact value of files."""
+    """Yield array name, accuracy, values and exact values of files."""
     for data in files:
         header, model, integers = decoder.read_header(data), decoder.decode(data), decoder.decode_integers(data)
         for accuracy, gpus in GPUS.items():
@@ -182,7 +182,7 @@ def _file_values(files: Iterable[bytes]) -> Iterator[tuple[str, str, F32, F32]]:
 
 
 def _seeded_values(seed: int = 1, count: int = 20000) -> Iterator[tuple[str, str, F32, F32]]:
-    """Yield the same of seeded rotations of 500 levels and means of 500 steps, and of all opacities of 500 levels."""
+    """Yield the same for seeded rotations of 500 levels, means of 500 steps, and all opacities of 500 levels."""
     rng = np.random.default_rng(seed)
     for levels in (3, *rng.integers(4, _spec.QUAT_LEVELS_MAX, 498).tolist(), _spec.QUAT_LEVELS_MAX):
         q = rng.integers(-levels, levels + 1, (count, 3))
