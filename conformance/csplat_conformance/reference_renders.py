@@ -1,7 +1,7 @@
 """L4: compare renders of a scene, for given cameras, with reference images.
 
-A reference image is what the equations give in binary64 (`csplat_render.reference_rasteriser`), over black, clipped to 0..1, times 255
-and rounded; IMPLEMENTERS.md lists the conventions. A renderer is a command
+A reference image is what the equations give in binary64 (`csplat_render.reference_rasteriser`), over black, clipped to
+0..1, times 255 and rounded; IMPLEMENTERS.md lists the conventions. A renderer is a command
 
     my-renderer INPUT CAMERA OUT
 
