@@ -333,7 +333,7 @@ def test_the_command_asks_for_the_disk_as_its_options_say(ply, tmp_path, monkeyp
     def encode_here(_local, _target, _options, _facts, scale, **_):
         asked.append(scale)
 
-    monkeypatch.setattr("csplat_tools.encode_file.encode_by_disk", encode_here)
+    monkeypatch.setattr("csplat_tools.encode_file.encode_out_of_core", encode_here)
     run = CliRunner().invoke
     foretold = run(app, ["encode", str(ply), str(target), "--memory", "300MB", "--dry-run", "--json"])
     assert 0 == foretold.exit_code

@@ -1,4 +1,4 @@
-"""Drafts: geometry is shown before colours are coded, and its file records options and source."""
+"""Plans show decoded geometry before colours are encoded; files record options and source."""
 
 import re
 from dataclasses import replace
@@ -18,7 +18,7 @@ from csplat_tools.inspect.file_description import describe_file
 ROOT = Path(__file__).resolve().parent.parent
 GEOMETRY = ("means", "quats", "scales", "opacities")
 COLOURS = ("sh0", "shN")
-WAYS = {
+OPTIONS = {
     "plain": {},
     "tiles": {"tile_splats": 50},
     "axis": {"means_coding": "axis"},
@@ -28,35 +28,35 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", OPTIONS)
 def test_the_scene_is_what_a_decoder_sees_but_for_its_colours(make_model, way):
     model = make_model(260, 2)
-    draft = EncodePlan.of(model, EncodeOptions(**WAYS[way]))
-    result = encode_tiles(draft).write()
+    plan = EncodePlan.of(model, EncodeOptions(**OPTIONS[way]))
+    result = encode_tiles(plan).write()
     decoded = decode(result.data)
     for name in GEOMETRY:
-        assert getattr(decoded, name).tobytes() == getattr(draft.scene, name)[result.source_index].tobytes(), name
+        assert getattr(decoded, name).tobytes() == getattr(plan.scene, name)[result.source_index].tobytes(), name
     for name in COLOURS:
-        assert getattr(model, name).tobytes() == getattr(draft.scene, name).tobytes(), name
+        assert getattr(model, name).tobytes() == getattr(plan.scene, name).tobytes(), name
 
 
-def test_a_draft_makes_the_file_of_encode(make_model):
+def test_a_plan_makes_the_file_of_encode(make_model):
     model = make_model(300, 3)
     assert encode(model) == encode_tiles(EncodePlan.of(model)).write().data
 
 
 def test_other_colours_change_colours_alone(make_model):
     model = make_model(260, 2)
-    draft = EncodePlan.of(model, EncodeOptions(attribute_psnr=80.0))
-    fitted = draft.with_colours(model.sh0 + 1, 0 * model.shN)
-    before, after = (decode_scene(encode_tiles(one).write().data) for one in (draft, fitted))
+    plan = EncodePlan.of(model, EncodeOptions(attribute_psnr=80.0))
+    fitted = plan.with_colours(model.sh0 + 1, 0 * model.shN)
+    before, after = (decode_scene(encode_tiles(one).write().data) for one in (plan, fitted))
     for name in GEOMETRY:
         assert np.array_equal(getattr(before.model, name), getattr(after.model, name)), name
     np.testing.assert_allclose(before.model.sh0 + 1, after.model.sh0, atol=0.02)
     assert not after.model.shN.any()
     assert (False, True) == (before.declared_bounds.refitted, after.declared_bounds.refitted)
     assert ["means", "covariance", "opacities"] == [record.measure for record in after.declared_bounds.records]
-    assert model.sh0 is draft.model.sh0  # the draft is as it was
+    assert model.sh0 is plan.model.sh0  # the plan is unchanged
 
 
 def test_colours_of_other_splats_are_refused(make_model):
@@ -103,8 +103,8 @@ def test_an_origin_of_other_splats_is_refused(make_model):
 
 def test_the_geometry_of_a_refitted_file_is_proved(make_model):
     source, rows = make_model(400, 3), np.arange(100, 300)
-    draft = EncodePlan.of(source.select(rows), origin=Origin(len(source), rows))
-    result = encode_tiles(draft.with_colours(draft.scene.sh0 + 1, draft.scene.shN)).write()
+    plan = EncodePlan.of(source.select(rows), origin=Origin(len(source), rows))
+    result = encode_tiles(plan.with_colours(plan.scene.sh0 + 1, plan.scene.shN)).write()
     scene = decode_scene(result.data)
     whole = verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index)
     assert whole.holds
@@ -148,9 +148,9 @@ def test_errors_are_stated_against_a_scene_that_was_not_drafted(make_model):
 
 def test_values_that_were_not_touched_freeze_to_the_same_splats(make_model):
     model = make_model(300, 2)
-    draft = EncodePlan.of(model, EncodeOptions(sh_coding="scalar"))
-    frozen = fix_quantisation(draft)
-    plain, thawed = encode_tiles(draft).write(), frozen.encode(frozen.start()).write()
+    plan = EncodePlan.of(model, EncodeOptions(sh_coding="scalar"))
+    frozen = fix_quantisation(plan)
+    plain, thawed = encode_tiles(plan).write(), frozen.encode(frozen.start()).write()
     assert np.array_equal(plain.source_index, thawed.source_index)
     one, other = decode(plain.data), decode(thawed.data)
     for name in ("means", "opacities", *COLOURS):

@@ -1,4 +1,4 @@
-"""Grades: splats sorted by what pictures lose, tiles with steps of their own; files that both decoders read."""
+"""Quantisation classes: splats sorted by visibility of errors, steps by class; files that both decoders read."""
 
 import hashlib
 import shutil
@@ -25,7 +25,7 @@ from csplat.model import normalise_quats
 from csplat_trainer.tuning.tuned_scene import TunedScene, cost_slopes
 
 ROOT = Path(__file__).resolve().parent.parent
-COUNT = 5_000  # splats, enough for several grades
+COUNT = 5_000  # splats, enough for several classes
 
 
 def unequal(model, seed=0, spread=3.0):
@@ -119,7 +119,7 @@ def test_what_rounding_loses_is_foretold():
 # the file
 
 
-def test_grades_have_steps_of_their_own(model):
+def test_classes_have_steps_of_their_own(model):
     plain, _ = encoded(model)
     graded, _ = encoded(model, important(model))
     said = graded.report.options["grades"]
@@ -154,36 +154,36 @@ def test_knobs_that_are_set_hold_for_all_splats(model):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("options", [{"grades": 1}, {"shape_codebook_size": 16}])
-def test_one_grade_is_as_without_curvatures(model, options):
+def test_one_class_is_as_without_blocks(model, options):
     with_them, without = important(model), Importance(np.ones(COUNT))
     assert encoded(model, with_them, **options)[0].data == encoded(model, without, **options)[0].data
 
 
-def test_few_splats_are_of_one_grade(make_model):
+def test_few_splats_are_in_one_class(make_model):
     few = make_model(200, 1)
     assert "grades" not in encoded(few, important(few))[0].report.options
 
 
-def test_where_nothing_is_lost_all_is_one_grade(model):
+def test_without_errors_all_is_one_class(model):
     nothing = GaussNewtonBlocks(np.zeros(COUNT), np.zeros((COUNT, 21)), np.zeros(COUNT), np.zeros(COUNT))
     result, _ = encoded(model, Importance(np.ones(COUNT), blocks=nothing))
     assert "grades" not in result.report.options
 
 
-def test_a_frozen_scene_has_one_grade(model):
+def test_classes_can_be_ruled_out(model):
     frozen = fix_quantisation(EncodePlan.of(model, importance=important(model), allow_classes=False))
     assert frozen.encode_plan.classes is None
     assert frozen.encode_plan.options.grades is None
 
 
-def test_huge_values_stay_apart_from_their_grade(model):
+def test_outliers_get_tiles_of_their_own(model):
     sh0 = model.sh0.copy()
     sh0[5] = 3e12
     exploded = replace(model, sh0=sh0)
     result, decoded = encoded(exploded, important(exploded))
     place = np.argsort(result.source_index)
     errors = np.abs(decoded.sh0[place] - sh0).max(axis=1)
-    assert np.delete(errors, 5).max() < 5.0  # the coarsest grade's step, not that of 3e12
+    assert np.delete(errors, 5).max() < 5.0  # the coarsest class's step, not that of 3e12
 
 
 def test_the_scene_of_a_draft_is_what_a_decoder_sees(model):
@@ -194,7 +194,7 @@ def test_the_scene_of_a_draft_is_what_a_decoder_sees(model):
         np.testing.assert_array_equal(getattr(draft.scene, name)[result.source_index], getattr(decoded, name))
 
 
-def test_what_is_frozen_of_several_grades_is_what_a_decoder_sees(model):
+def test_fixed_values_of_several_classes_are_as_decoded(model):
     frozen = fix_quantisation(EncodePlan.of(model, importance=important(model)))
     held = frozen.start()
     result = frozen.encode(held).write()
@@ -204,34 +204,34 @@ def test_what_is_frozen_of_several_grades_is_what_a_decoder_sees(model):
         np.testing.assert_array_equal(getattr(seen, name)[order], getattr(decoded, name))
 
 
-def test_integers_of_each_grade_are_counted_as_they_are_coded(make_model):
+def test_integers_of_each_class_are_counted_as_they_are_coded(make_model):
     """Counts are those of the encoder: integers divided by the multiple of their class."""
     model = make_model(8_000, 0)  # counts of fewer differ by more than a thousandth
     frozen = fix_quantisation(EncodePlan.of(model, EncodeOptions(sh_coding="none"), importance=important(model)))
     scene, plan, tiles = TunedScene(frozen), frozen.parameters, frozen.encode_plan.tiles
     held, bits = scene.held, 0.0
-    grades = list(dict.fromkeys(tile.factors for tile in tiles))
-    assert len(grades) > 1
-    for coarse in grades:
-        rows = np.concatenate([tile.rows for tile in tiles if tile.factors == coarse])
-        shape = quantise_shape(held.quats[rows], held.scales[rows], plan, None, coarse)
-        alpha = opacity_levels(held.opacities[rows], plan.opacity_levels, square=True, multiple=coarse.opacities)
+    classes = list(dict.fromkeys(tile.factors for tile in tiles))
+    assert len(classes) > 1
+    for factors in classes:
+        rows = np.concatenate([tile.rows for tile in tiles if tile.factors == factors])
+        shape = quantise_shape(held.quats[rows], held.scales[rows], plan, None, factors)
+        alpha = opacity_levels(held.opacities[rows], plan.opacity_levels, square=True, multiple=factors.opacities)
         colour = quantise_colour(
-            np.ascontiguousarray(held.sh0[rows].T), plan.sh0_step, plan.chroma_shift, coarse.sh0
+            np.ascontiguousarray(held.sh0[rows].T), plan.sh0_step, plan.chroma_shift, factors.sh0
         ).columns
-        for columns in (shape.scales, shape.quats // coarse.quats, alpha[None] // coarse.opacities, colour):
+        for columns in (shape.scales, shape.quats // factors.quats, alpha[None] // factors.opacities, colour):
             bits += cost_slopes([columns.T])[1]
     assert scene.count(scene.seen()[0], 1.0).bits == pytest.approx(bits, rel=1e-3)
 
 
-def test_codings_are_tried_on_splats_of_all_grades(model):
-    plan, grades = choose_classes(
+def test_codings_are_tried_on_splats_of_all_classes(model):
+    parameters, classes = choose_classes(
         model, unequal(model), choose_parameters(model, EncodeOptions(), importance_given=True), EncodeOptions()
     )
-    tiles = cut_scene(model, plan, grades)
-    found = grades.index[trial_rows(model, tiles, grades)]
-    assert set(found) == set(grades.index)
-    np.testing.assert_allclose(np.bincount(found) / len(found), np.bincount(grades.index) / COUNT, atol=0.05)
+    tiles = cut_scene(model, parameters, classes)
+    found = classes.index[trial_rows(model, tiles, classes)]
+    assert set(found) == set(classes.index)
+    np.testing.assert_allclose(np.bincount(found) / len(found), np.bincount(classes.index) / COUNT, atol=0.05)
     assert set(trial_rows(model, tiles, None)) == set(tiles[len(tiles) // 2].rows)
 
 
@@ -255,7 +255,7 @@ def test_any_step_may_be_given(model):
     assert result.report.options["position_step"] == 1e200
 
 
-def test_the_preset_fast_has_one_grade_unless_asked(model):
+def test_the_preset_fast_has_one_class_by_default(model):
     assert "grades" not in encoded(model, important(model), preset="fast")[0].report.options
     assert "grades" in encoded(model, important(model), preset="fast", grades=2)[0].report.options
 
@@ -308,19 +308,19 @@ console.log(hash.digest('hex'));
 # its parts
 
 
-def test_tiles_of_a_grade_are_as_coarse_as_it_is(model):
+def test_tiles_of_a_class_have_its_step_factors(model):
     plan = choose_parameters(model, EncodeOptions(), importance_given=True)
-    finer, grades = choose_classes(model, unequal(model), plan, EncodeOptions())
-    tiles = cut_scene(model, finer, grades)
+    finer, classes = choose_classes(model, unequal(model), plan, EncodeOptions())
+    tiles = cut_scene(model, finer, classes)
     assert sorted(np.concatenate([tile.rows for tile in tiles])) == list(range(COUNT))
     for tile in tiles:
-        assert len(set(grades.index[tile.rows])) == 1
-        assert tile.factors == grades.factors[grades.index[tile.rows[0]]]
+        assert len(set(classes.index[tile.rows])) == 1
+        assert tile.factors == classes.factors[classes.index[tile.rows[0]]]
         assert tile.exponent >= tile.factors.means
-    assert min(one.means for one in grades.factors) == min(one.sh0 for one in grades.factors) == 0
+    assert min(one.means for one in classes.factors) == min(one.sh0 for one in classes.factors) == 0
     weights = unequal(model).means
     assert (
-        weights[grades.index == 0].mean() > weights[grades.index == grades.index.max()].mean()
+        weights[classes.index == 0].mean() > weights[classes.index == classes.index.max()].mean()
     )  # the most important splats come first
 
 
