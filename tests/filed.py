@@ -1,6 +1,6 @@
 """Scenes as they lie in files of formats of fixed axes, for their tests: `csplat.read` turns them."""
 
-from csplat.files import local_file
+from csplat.disk_files import local_file
 from csplat.formats import detect_format
 
 

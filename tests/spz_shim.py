@@ -11,11 +11,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from filed import filed
 
+from csplat.editing.transform import axes_rotation, convert_axes, rotate_scene
 from csplat.errors import CsplatError
 from csplat.formats import write
 from csplat.model import SplatModel, normalise_quats
-from csplat.scene import scene_of
-from csplat.turning import axes_rotation, in_axes, turned
+from csplat.scene_source import source_from_model
 
 _AXES = "LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU"
 CoordinateSystem = Enum("CoordinateSystem", f"UNSPECIFIED {_AXES}")
@@ -60,7 +60,7 @@ class GaussianCloud:
             steps = [_QUARTER, matrix @ _QUARTER.T] if there else [_QUARTER @ matrix, _QUARTER.T]
         model = replace(_model(self, before), flat=True)  # so that axes of splats are not permuted
         for step in steps:
-            model = turned(model, step)
+            model = rotate_scene(model, step)
         lengths = np.linalg.norm(self.rotations.reshape(-1, 4), axis=1, keepdims=True)
         self.positions, self.sh = model.means.ravel(), model.shN.ravel()
         self.rotations = (model.quats[:, [1, 2, 3, 0]] * lengths).ravel()
@@ -84,7 +84,7 @@ def _model(cloud, axes):
 
 def _cloud(model, axes):
     if axes is not UNSPECIFIED:
-        model = turned(model, axes_rotation(model.coordinate_system, axes.name))
+        model = rotate_scene(model, axes_rotation(model.coordinate_system, axes.name))
     cloud = GaussianCloud()
     cloud.sh_degree, cloud.antialiased = model.sh_degree, model.antialiased
     cloud.positions, cloud.scales, cloud.colors = model.means.ravel(), model.scales.ravel(), model.sh0.ravel()
@@ -97,7 +97,7 @@ def _cloud(model, axes):
 def _saved(cloud, axes, usual, filename, format):
     try:
         model = _model(cloud, usual if axes is UNSPECIFIED else axes)
-        write(filename, in_axes(scene_of(model), usual.name).model(), format)
+        write(filename, convert_axes(source_from_model(model), usual.name).model(), format)
     except (CsplatError, OSError):
         return False
     return True

@@ -10,9 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from csplat import decode, read_ply, write_ply
+from csplat.editing.transform import rotate_scene
+from csplat.editing.up_axis import up_of
 from csplat.model import SplatModel
-from csplat.turning import turned
-from csplat.upright import up_of
 from csplat_tools.cli.app import app
 
 pytest.importorskip("numba", reason="the renderer needs numba: pip install 'csplat[render]'")
@@ -69,7 +69,7 @@ def untold(**fields):
         (untold(), ["--axes", "LUF"], "LUF", (0, 1, 0)),
         (untold(metadata={"up": [1, 0, 0]}), ["--axes", "RDF"], "RDF", (0, -1, 0)),
         (untold(coordinate_system="RDF"), ["--up", "z"], "unspecified", (0, 0, 1)),
-        (lambda _folder, make_model: turned(make_model(60, 1), TURN), ["--up", "z"], "unspecified", (0, 0, 1)),
+        (lambda _folder, make_model: rotate_scene(make_model(60, 1), TURN), ["--up", "z"], "unspecified", (0, 0, 1)),
     ],
     ids=[
         "blender", "colmap", "transforms", "transforms-told", "ply", "ply-told", "ply-axes", "up-axes",
@@ -120,7 +120,7 @@ def test_the_page_is_told_what_the_user_says(tmp_path, make_model):
 
 def test_a_scene_that_is_turned_with_its_sh_looks_the_same_on_its_orbit(make_model):
     model = make_model(60, 1, scales=np.full((60, 3), -0.7, np.float32) - np.arange(3, dtype=np.float32))
-    lying = turned(model, TURN)
+    lying = rotate_scene(model, TURN)
     told = [
         SplatModel(**{**vars(one), "metadata": {"up": up}}) for one, up in ((model, [0, -1, 0]), (lying, [0, 0, 1]))
     ]

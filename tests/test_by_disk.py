@@ -15,12 +15,12 @@ import pytest
 from typer.testing import CliRunner
 
 from csplat.decoder import decode, open_tiles
+from csplat.disk_files import read_array
 from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.errors import InputError
-from csplat.files import read_array
 from csplat.ply import write_ply
-from csplat.processes import CAN_COPY
-from csplat.scene import scene_of
+from csplat.scene_source import source_from_model
+from csplat.system import CAN_FORK
 from csplat_conformance.declared_bounds import PartSizes, Source, check_source_index, verify_bounds, verify_out_of_core
 from csplat_conformance.declared_bounds.out_of_core_verification import CellTree
 from csplat_tools.cli.app import app
@@ -36,7 +36,7 @@ def both(source, data, stated=None, index=None):
     opened = open_tiles(data)
     opened = replace(opened, declared_bounds=stated or opened.declared_bounds)
     at_once = verify_bounds(Source.of(source), decode(data), opened.header, opened.declared_bounds, index)
-    in_parts = verify_out_of_core(scene_of(source), opened, index, memory_bytes=1, sizes=PARTS)
+    in_parts = verify_out_of_core(source_from_model(source), opened, index, memory_bytes=1, sizes=PARTS)
     assert at_once.failures == in_parts.failures
     assert at_once.clauses == in_parts.clauses
     return rounded(at_once.as_json()), rounded(in_parts.as_json())
@@ -102,14 +102,14 @@ def test_a_partner_beyond_the_lattice_is_looked_for_as_far_as_is_stated(make_mod
         assert bool(at_once["failures"]) == (most < 0.07)
 
 
-@pytest.mark.skipif(not CAN_COPY, reason="processes are no copies of each other here")
+@pytest.mark.skipif(not CAN_FORK, reason="processes are no copies of each other here")
 def test_processes_find_what_one_finds(make_model, monkeypatch):
     source = make_model(600, 1)
     opened = open_tiles(encode_with_report(source, OPTIONS).data)
     far = np.where(np.arange(600) % 50, np.float32(0.04), np.float32(0.5))
     moved = replace(source, means=source.means + far[:, None])
     opened = replace(opened, declared_bounds=states(opened.declared_bounds, means={"max": 0.07}))
-    alone = verify_out_of_core(scene_of(moved), opened, memory_bytes=1, sizes=PARTS)
+    alone = verify_out_of_core(source_from_model(moved), opened, memory_bytes=1, sizes=PARTS)
     assert alone.failures
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
     memory, sizes, seen = 10**9, replace(PARTS, worth_a_process=1), []
@@ -121,10 +121,12 @@ def test_processes_find_what_one_finds(make_model, monkeypatch):
         for child in multiprocessing.active_children():
             os.kill(child.pid, signal.SIGKILL)
 
-    assert alone == verify_out_of_core(scene_of(moved), opened, memory_bytes=memory, sizes=sizes, progress=count)
+    assert alone == verify_out_of_core(
+        source_from_model(moved), opened, memory_bytes=memory, sizes=sizes, progress=count
+    )
     assert max(seen) == 3
     with pytest.raises(OSError, match="a worker process was killed"):
-        verify_out_of_core(scene_of(moved), opened, memory_bytes=memory, sizes=sizes, progress=kill)
+        verify_out_of_core(source_from_model(moved), opened, memory_bytes=memory, sizes=sizes, progress=kill)
 
 
 def test_another_scene_is_told_before_any_splat(make_model):

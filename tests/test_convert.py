@@ -11,12 +11,12 @@ from typer.testing import CliRunner
 
 import csplat
 from csplat import formats
+from csplat.editing.transform import convert_axes
 from csplat.encoder import EncodeOptions
 from csplat.formats import spz
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply import read_ply, write_ply
-from csplat.scene import scene_of
-from csplat.turning import in_axes
+from csplat.scene_source import source_from_model
 from csplat_tools.cli.app import app, command_function
 from csplat_tools.convert_file import Filters, convert_file, find_floaters
 from csplat_tools.encode_file import OutOfCoreOptions, encode_file
@@ -118,7 +118,7 @@ def test_a_scene_is_changed_in_the_order_that_help_says(tmp_path, ply):
 
 def test_a_sphere_is_kept_around_the_places_that_people_see(make_model):
     model = make_model(200, 0, origin=(100.0, 0.0, 0.0))
-    kept = Filters(crop_sphere=(100.0, 0.0, 0.0, 0.7)).applied(scene_of(model))
+    kept = Filters(crop_sphere=(100.0, 0.0, 0.0, 0.7)).applied(source_from_model(model))
     assert (np.linalg.norm(model.means, axis=1) <= 0.7).sum() == kept.count == len(kept.model())
 
 
@@ -156,7 +156,7 @@ def test_floaters_are_dropped():
         opacities=np.full(n, 0.9, np.float32),
         sh0=np.zeros((n, 3), np.float32),
     )
-    left = Filters(drop_floaters=True).applied(scene_of(model))
+    left = Filters(drop_floaters=True).applied(source_from_model(model))
     assert 3001 == left.count == len(left.model())
 
 
@@ -225,7 +225,8 @@ def keeps_what_both_call_exact(tmp_path, first, second, model):
         str(a), str(b), read_as=first, write_as=second, filters=Filters(to_axes=other.axes or "RDF")
     )
     source, found = (
-        in_axes(scene_of(formats.read(path, name)), "RDF").model() for path, name in ((a, first), (b, second))
+        convert_axes(source_from_model(formats.read(path, name)), "RDF").model()
+        for path, name in ((a, first), (b, second))
     )
     assert len(source) == converted.count == len(found)
     for name in one.exact & other.exact:

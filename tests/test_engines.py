@@ -13,9 +13,9 @@ pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
 from chromium import IN_CHROMIUM, absent
 
 from csplat import EncodeOptions, decode, encode, read_ply
+from csplat.editing.transform import convert_axes
 from csplat.formats import write
-from csplat.scene import scene_of
-from csplat.turning import in_axes
+from csplat.scene_source import source_from_model
 from csplat_bench.common.browser import serve
 from csplat_bench.viewer.loaders import Trial
 from csplat_bench.viewer.owners import stands, still
@@ -60,7 +60,7 @@ def files(packages, sample_path):
         (folder / "cut.csplat").write_bytes(data[: len(data) // 2])
         (folder / "text.csplat").write_text("no scene")
         write(folder / "scene.ply", model, "ply")
-        (folder / "left.csplat").write_bytes(encode(in_axes(scene_of(model), "LUF").model(), FAST))
+        (folder / "left.csplat").write_bytes(encode(convert_axes(source_from_model(model), "LUF").model(), FAST))
         yield folder, address, model, camera
 
 

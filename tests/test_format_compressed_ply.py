@@ -9,7 +9,7 @@ import csplat
 from csplat.errors import InputError
 from csplat.formats import detect_format, format_by_suffix, lint_file, open_scene
 from csplat.ply import read_ply
-from csplat.scene import BLOCK
+from csplat.scene_source import BLOCK_SPLATS
 
 BOUNDS = "min_x min_y min_z max_x max_y max_z min_scale_x min_scale_y min_scale_z max_scale_x max_scale_y max_scale_z"
 COLOURS = "min_r min_g min_b max_r max_g max_b"
@@ -70,10 +70,10 @@ def test_what_is_written_comes_back_within_a_step(tmp_path, make_model):
 
 def test_blocks_are_of_whole_chunks(tmp_path, make_model):
     model = make_model(300, 1)
-    large = model.select(np.arange(BLOCK + 300) % 300)
+    large = model.select(np.arange(BLOCK_SPLATS + 300) % 300)
     csplat.write(tmp_path / "a.compressed.ply", large)
     with open_scene(tmp_path / "a.compressed.ply") as scene:
-        assert [BLOCK, 300] == [len(one) for one in scene.blocks()]
+        assert [BLOCK_SPLATS, 300] == [len(one) for one in scene.blocks()]
         assert np.abs(np.sort(large.means[:, 0]) - np.sort(scene.model().means[:, 0])).max() < 0.01
 
 

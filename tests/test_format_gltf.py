@@ -11,11 +11,11 @@ import pytest
 from filed import filed
 
 import csplat
+from csplat.editing.transform import rotate_scene
 from csplat.errors import InputError
 from csplat.formats import formats, lint_file
 from csplat.formats.gltf import gltf_document
 from csplat.model import SplatModel
-from csplat.turning import turned
 
 ARRAYS = ("means", "quats", "opacities", "sh0", "shN")
 PREFIX = "KHR_gaussian_splatting"
@@ -139,7 +139,7 @@ def test_a_scene_comes_back(tmp_path, make_model, degree):
     csplat.write(tmp_path / "a.glb", model)
     back = filed(tmp_path / "a.glb")
     assert ("LUF", True, "CC0") == (back.coordinate_system, back.antialiased, back.metadata["licence"])
-    flipped = turned(back, np.diag([-1.0, -1.0, 1.0]))
+    flipped = rotate_scene(back, np.diag([-1.0, -1.0, 1.0]))
     assert model.origin == flipped.origin
     assert all((getattr(model, name) == getattr(flipped, name)).all() for name in ARRAYS)
     assert np.abs(model.scales - flipped.scales).max() < 1e-6
@@ -520,7 +520,7 @@ def test_damage_is_refused_or_read(monkeypatch):
     whole = glb(*document(TWO))
 
     def refused(data):
-        monkeypatch.setattr(gltf_document, "mapped", lambda _path: data)
+        monkeypatch.setattr(gltf_document, "map_file", lambda _path: data)
         try:
             with FORMAT.open(Path("a.glb")) as scene:
                 scene.model()

@@ -8,7 +8,7 @@ import pytest
 import csplat
 from csplat.errors import InputError
 from csplat.formats import lint_file, open_scene
-from csplat.scene import BLOCK
+from csplat.scene_source import BLOCK_SPLATS
 
 LEVELS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 CENTRES = np.array([[10, 20, 30], [-4, 0, 4], [100, 0, 0]], "<f4")
@@ -74,9 +74,11 @@ def test_the_bytes_of_each_level_mean_what_the_format_says(level, degree):
 
 
 def test_sections_of_several_degrees_are_one_scene():
-    sections = [section(rows(1, n, degree), 1, degree, bucket=n) for n, degree in ((3, 0), (BLOCK + 2, 2), (0, 0))]
+    sections = [
+        section(rows(1, n, degree), 1, degree, bucket=n) for n, degree in ((3, 0), (BLOCK_SPLATS + 2, 2), (0, 0))
+    ]
     with open_scene(ksplat(1, [*sections, (bytes(42), b"")])) as scene:
-        assert [3, BLOCK, 2] == [len(block) for block in scene.blocks()]
+        assert [3, BLOCK_SPLATS, 2] == [len(block) for block in scene.blocks()]
         model = scene.model()
     assert 2 == model.sh_degree
     assert not model.shN[:3].any()

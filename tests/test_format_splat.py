@@ -10,7 +10,7 @@ import pytest
 import csplat
 from csplat.errors import InputError
 from csplat.formats import assume_format, lint_file, open_scene
-from csplat.scene import BLOCK
+from csplat.scene_source import BLOCK_SPLATS
 
 ROW = struct.pack("<6f8B", 1.5, -2, 3e9, 1, 0.5, 0, 0, 255, 51, 102, 128, 0, 128, 128)
 
@@ -27,10 +27,12 @@ def test_a_row_means_what_the_format_says(tmp_path):
 
 
 def test_what_is_written_comes_back(tmp_path, make_model):
-    model = make_model(BLOCK + 5, 0, sh0=np.random.default_rng(0).uniform(-1.7, 1.7, (BLOCK + 5, 3)).astype("f4"))
+    model = make_model(
+        BLOCK_SPLATS + 5, 0, sh0=np.random.default_rng(0).uniform(-1.7, 1.7, (BLOCK_SPLATS + 5, 3)).astype("f4")
+    )
     csplat.write(tmp_path / "a.splat", model)
     with open_scene(tmp_path / "a.splat") as scene:
-        assert [BLOCK, 5] == [len(block) for block in scene.blocks()]
+        assert [BLOCK_SPLATS, 5] == [len(block) for block in scene.blocks()]
         found = scene.model()
     assert (model.means == found.means).all()
     np.testing.assert_allclose(found.scales, model.scales, atol=1e-6)

@@ -16,10 +16,10 @@ from conftest import of_peers
 from filed import filed
 
 import csplat
+from csplat.editing.transform import convert_axes
 from csplat.errors import InputError
 from csplat.formats import open_scene
-from csplat.scene import scene_of
-from csplat.turning import in_axes
+from csplat.scene_source import source_from_model
 
 WIDTHS = {1: (6, 1, 3, 3, 3), 2: (9, 1, 3, 3, 3), 3: (9, 1, 3, 3, 4), 4: (9, 1, 3, 3, 4)}
 AXES = struct.pack("<IIII", 0xABCD0001, 4, 7, 0xADBE0003) + struct.pack("<II", 4, 6)
@@ -115,7 +115,7 @@ def test_bands_above_those_asked_for_are_left_out(tmp_path):
         expected = np.frombuffer(parts[5], np.uint8).reshape(2, 24, 3)[:, :coefficients] / 128.0 - 1.0
         with open_scene(tmp_path / "a.spz", sh_degree=degree) as scene:
             assert (2, degree) == (scene.count, scene.facts.sh_degree)
-        read = in_axes(scene_of(csplat.read(tmp_path / "a.spz", sh_degree=degree)), "RUB").model()
+        read = convert_axes(source_from_model(csplat.read(tmp_path / "a.spz", sh_degree=degree)), "RUB").model()
         assert np.array_equal(expected, read.shN)
 
 

@@ -11,7 +11,7 @@ from csplat.errors import InputError
 from csplat.formats import assume_format, formats, open_scene, write_scene
 from csplat.formats import lint_file as formats_lint
 from csplat.ply import read_ply, write_ply
-from csplat.scene import BLOCK, Scene, scene_of
+from csplat.scene_source import BLOCK_SPLATS, SceneSource, source_from_model
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
@@ -27,7 +27,7 @@ def same(a, b):
 def large(make_model):
     """More splats than a block has."""
     model = make_model(60, 1)
-    return model.select(np.arange(BLOCK + 1000) % 60)
+    return model.select(np.arange(BLOCK_SPLATS + 1000) % 60)
 
 
 def test_a_ply_in_blocks_is_the_ply_at_once(tmp_path, large):
@@ -35,7 +35,7 @@ def test_a_ply_in_blocks_is_the_ply_at_once(tmp_path, large):
     with open_scene(tmp_path / "a.ply") as scene:
         assert len(large) == scene.count
         assert 0 == len(scene.facts)
-        assert [BLOCK, 1000] == [len(block) for block in scene.blocks()]
+        assert [BLOCK_SPLATS, 1000] == [len(block) for block in scene.blocks()]
         same(read_ply(tmp_path / "a.ply"), scene.model())
         write_scene(tmp_path / "b.ply", scene)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
@@ -186,10 +186,10 @@ def test_names_that_no_format_has_are_refused(tmp_path, make_model):
 
 
 def test_a_scene_in_memory_is_read_in_blocks(large):
-    scene = scene_of(large)
-    assert [BLOCK, 1000] == [len(one) for one in scene.blocks()]
+    scene = source_from_model(large)
+    assert [BLOCK_SPLATS, 1000] == [len(one) for one in scene.blocks()]
     same(large, scene.model())
-    assert 0 == len(Scene(0, scene.facts, lambda: iter(())).model())
+    assert 0 == len(SceneSource(0, scene.facts, lambda: iter(())).model())
 
 
 def test_scenes_in_a_zip_are_named(tmp_path):

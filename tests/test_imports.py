@@ -22,7 +22,7 @@ def test_the_decoder_loads_nothing_of_the_others_and_works_where_plyfile_is_abse
     loaded.remove("plyfile")
     packages = {name.split(".")[0] for name in loaded}
     assert not packages & {"plyfile", "torch", "numba", "deflate", "typer", "rich", "csplat_tools"}
-    foreign = ("csplat.encoder", "csplat.ply", "csplat.lint", "csplat.detect", "csplat.files")
+    foreign = ("csplat.encoder", "csplat.ply", "csplat.lint", "csplat.detect", "csplat.disk_files")
     assert not [name for name in loaded if name.startswith(foreign)]
 
 

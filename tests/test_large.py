@@ -20,8 +20,8 @@ from csplat import EncodeOptions, InputError, decode, encode, encode_with_report
 from csplat.encoder import encode_plan, encode_tiles, tiling
 from csplat.encoder.tiling import BucketCurve, bucket_rows
 from csplat.formats import open_scene
-from csplat.large import encode_scene, encoding
-from csplat.scene import scene_of
+from csplat.out_of_core import disk_encode, encode_scene
+from csplat.scene_source import source_from_model
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 from csplat_tools.encode_file import OutOfCoreOptions, encode_out_of_core, estimate_cost
@@ -34,7 +34,7 @@ FAST = EncodeOptions(preset="fast", threads=1, sh_degree=1, sh_coding="codebook"
 @pytest.fixture(autouse=True)
 def small_buckets(monkeypatch):
     """Scenes of thousands of splats are large."""
-    for module in (tiling, encode_plan, encoding):
+    for module in (tiling, encode_plan, disk_encode):
         monkeypatch.setattr(module, "BUCKET_SPLATS", WHOLE)
 
 
@@ -62,7 +62,10 @@ def whole(model):
 def test_a_scene_by_way_of_the_disk_has_the_bytes_that_it_has_in_memory(model, whole, tmp_path):
     stages = {}
     report = encode_large(
-        scene_of(model), tmp_path / "out.csplat", FAST, progress=lambda stage, done: stages.update({stage: done})
+        source_from_model(model),
+        tmp_path / "out.csplat",
+        FAST,
+        progress=lambda stage, done: stages.update({stage: done}),
     )
     assert whole == (tmp_path / "out.csplat").read_bytes()
     assert ["out.csplat"] == [path.name for path in tmp_path.iterdir()]
@@ -90,7 +93,7 @@ def test_colours_that_were_fitted_anew_are_those_that_are_decided_on(model):
 
 
 def test_two_processes_give_the_bytes_of_one(model, whole, tmp_path):
-    encode_large(scene_of(model), tmp_path / "out.csplat", replace(FAST, threads=2))
+    encode_large(source_from_model(model), tmp_path / "out.csplat", replace(FAST, threads=2))
     assert whole == (tmp_path / "out.csplat").read_bytes()
 
 
@@ -103,7 +106,7 @@ def test_two_processes_give_the_bytes_of_one(model, whole, tmp_path):
     ],
 )
 def test_options_are_those_of_memory(model, options, tmp_path):
-    encode_large(scene_of(model), tmp_path / "out.csplat", options)
+    encode_large(source_from_model(model), tmp_path / "out.csplat", options)
     assert encode(model, options) == (tmp_path / "out.csplat").read_bytes()
 
 
@@ -115,7 +118,7 @@ def test_positions_in_doubles_huge_values_and_huge_sh_are_those_of_memory(model,
     means = (doubles - np.array(origin)).astype(np.float32)
     hard = replace(model, means=means, origin=origin, means_double=doubles, scales=scales, shN=shN)
     options = EncodeOptions(preset="fast", sh_degree=1, threads=1)
-    encode_large(scene_of(hard), tmp_path / "out.csplat", options)
+    encode_large(source_from_model(hard), tmp_path / "out.csplat", options)
     assert encode(hard, options) == (tmp_path / "out.csplat").read_bytes()
 
 
@@ -134,7 +137,7 @@ class Interrupt:
 
 @pytest.mark.parametrize(("stage", "after"), [("looking", 0), ("sorting", 0), ("codebook", 0), ("coding", 3)])
 def test_an_interrupted_encoding_goes_on(model, whole, tmp_path, stage, after):
-    target, scene = tmp_path / "out.csplat", scene_of(model)
+    target, scene = tmp_path / "out.csplat", source_from_model(model)
     with pytest.raises(KeyboardInterrupt):
         encode_large(scene, target, FAST, progress=Interrupt(stage, after=after))
     assert not target.exists()
@@ -160,10 +163,10 @@ def test_a_killed_worker_is_said_and_nothing_is_lost(model, whole, tmp_path):
                 os.kill(child.pid, signal.SIGKILL)
 
     with pytest.raises(OSError, match="a worker process was killed") as error:
-        encode_large(scene_of(model), target, two, progress=kill)
+        encode_large(source_from_model(model), target, two, progress=kill)
     assert errno.ENOMEM == error.value.errno
     assert not target.exists()
-    encode_large(scene_of(model), target, two, resume=True)
+    encode_large(source_from_model(model), target, two, resume=True)
     assert whole == target.read_bytes()
 
 
@@ -172,7 +175,7 @@ def test_a_full_disk_is_said_before_and_survived_within(model, whole, tmp_path, 
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=1000))
         with pytest.raises(InputError, match="0 MB free, and 1 are wanted"):
-            encode_large(scene_of(model), target, FAST)
+            encode_large(source_from_model(model), target, FAST)
     assert not list(tmp_path.iterdir())
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
 
@@ -182,12 +185,12 @@ def test_a_full_disk_is_said_before_and_survived_within(model, whole, tmp_path, 
 
     try:
         with pytest.raises(OSError, match="File too large"):
-            encode_large(scene_of(model), target, FAST, progress=fill)
+            encode_large(source_from_model(model), target, FAST, progress=fill)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert not target.exists()
     assert [10_000] == [path.stat().st_size for path in (tmp_path / "out.csplat.work").glob("bucket-*")]
-    encode_large(scene_of(model), target, FAST, resume=True)
+    encode_large(source_from_model(model), target, FAST, resume=True)
     assert whole == target.read_bytes()
 
 
@@ -195,13 +198,13 @@ def test_a_full_disk_is_said_before_and_survived_within(model, whole, tmp_path, 
 def test_a_damaged_file_of_the_working_folder_is_named(model, tmp_path, kind):
     target = tmp_path / "out.csplat"
     with pytest.raises(KeyboardInterrupt):
-        encode_large(scene_of(model), target, FAST, progress=Interrupt("coding", after=2))
+        encode_large(source_from_model(model), target, FAST, progress=Interrupt("coding", after=2))
     path = tmp_path / "out.csplat.work" / kind
     data = bytearray(path.read_bytes())
     data[len(data) // 2 if kind != "state.json" else 0] ^= 0x10
     path.write_bytes(data)
     with pytest.raises(InputError, match=f"{kind} is damaged: remove out.csplat.work"):
-        encode_large(scene_of(model), target, FAST, resume=True)
+        encode_large(source_from_model(model), target, FAST, resume=True)
     assert not target.exists()
 
 
@@ -211,16 +214,18 @@ def test_a_folder_of_somebody_else_stays_as_it_is(model, tmp_path):
     (folder / "one.jpg").write_bytes(b"dear to somebody")
     for resume in (False, True):
         with pytest.raises(InputError, match="photographs holds something else"):
-            encode_large(scene_of(model), tmp_path / "out.csplat", FAST, folder=folder, resume=resume)
+            encode_large(source_from_model(model), tmp_path / "out.csplat", FAST, folder=folder, resume=resume)
     assert b"dear to somebody" == (folder / "one.jpg").read_bytes()
 
 
 def test_what_was_begun_by_way_of_the_disk_goes_on_there_with_more_memory(model, whole, tmp_path):
     target = tmp_path / "out.csplat"
     with pytest.raises(KeyboardInterrupt):
-        encode_large(scene_of(model), target, FAST, progress=Interrupt("coding", after=2))
+        encode_large(source_from_model(model), target, FAST, progress=Interrupt("coding", after=2))
     stages = []
-    encode_scene(scene_of(model), target, FAST, resume=True, progress=lambda stage, _done: stages.append(stage))
+    encode_scene(
+        source_from_model(model), target, FAST, resume=True, progress=lambda stage, _done: stages.append(stage)
+    )
     assert "coding" in stages
     assert "sorting" not in stages
     assert whole == target.read_bytes()
@@ -235,15 +240,15 @@ def test_a_scene_that_gets_shorter_while_it_is_read_is_refused(model, tmp_path):
         yield model.select(slice(0, COUNT if len(times) == 1 else 3000))
 
     with pytest.raises(InputError, match="3,000 splats came where 3,600 were announced"):
-        encode_large(replace(scene_of(model), blocks=blocks), tmp_path / "out.csplat", FAST)
+        encode_large(replace(source_from_model(model), blocks=blocks), tmp_path / "out.csplat", FAST)
     assert not (tmp_path / "out.csplat").exists()
 
 
 def test_too_little_memory_is_refused(model, tmp_path):
     with pytest.raises(InputError, match="100 MB of memory are too little for this scene, which wants 2"):
-        encode_large(scene_of(model), tmp_path / "out.csplat", FAST, memory_bytes=100_000_000)
+        encode_large(source_from_model(model), tmp_path / "out.csplat", FAST, memory_bytes=100_000_000)
     with pytest.raises(InputError, match="a codebook of shapes wants the scene in memory"):
-        encode_large(scene_of(model), tmp_path / "out.csplat", replace(FAST, shape_codebook_size=64))
+        encode_large(source_from_model(model), tmp_path / "out.csplat", replace(FAST, shape_codebook_size=64))
     assert not list(tmp_path.iterdir())
 
 
@@ -288,7 +293,7 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_is_killed(model, whole, 
                 os.kill(victims.pop(), signal.SIGKILL)
                 victims.clear()
 
-        encode_large(scene_of(model), target, FAST, cluster=cluster.scheduler_address, progress=kill)
+        encode_large(source_from_model(model), target, FAST, cluster=cluster.scheduler_address, progress=kill)
     assert not victims
     assert whole == target.read_bytes()
 
@@ -298,7 +303,7 @@ def test_a_cluster_that_does_not_answer_is_said(model, tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed", reason="a cluster wants the extra [scale]")
     monkeypatch.setattr(distributed, "Client", partial_client(distributed.Client))
     with pytest.raises(OSError, match=r"127\.0\.0\.1:9"):
-        encode_large(scene_of(model), tmp_path / "out.csplat", FAST, cluster="tcp://127.0.0.1:9")
+        encode_large(source_from_model(model), tmp_path / "out.csplat", FAST, cluster="tcp://127.0.0.1:9")
 
 
 def partial_client(client):

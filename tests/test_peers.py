@@ -15,8 +15,8 @@ from conftest import PEERS, of_peers
 from filed import filed
 
 import csplat
+from csplat.editing.transform import rotate_scene
 from csplat.model import SplatModel, normalise_quats
-from csplat.turning import turned
 
 pytestmark = [pytest.mark.slow, pytest.mark.area(name="peers")]
 
@@ -218,7 +218,7 @@ def cells(table, scenes):
 def judge(found, peer, format, scene, writer):
     source, reach = SCENES[scene], np.abs(SCENES[scene].means).max()
     if format.startswith("spz") and peer in UNTURNED:
-        source = turned(source, np.diag([1.0, -1.0, -1.0]))
+        source = rotate_scene(source, np.diag([1.0, -1.0, -1.0]))
     if format == "splat":
         source = SplatModel(**{**vars(source), "shN": source.shN[:, :0]})
     wrong, reordered = differences(source, found, format, bounds(format, writer, float(reach)))

@@ -20,11 +20,11 @@ import numpy as np
 import pytest
 
 import csplat
-from csplat import memory, processes, system
+from csplat import system
+from csplat.disk_files import atomic_writer
 from csplat.errors import InputError
-from csplat.files import atomic_writer
+from csplat.file_source import PageReleaser
 from csplat.formats.sog.sog_files import SogParts
-from csplat.inputs import LetGo
 from csplat_conformance.answers import Answer
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.protocol import run_program
@@ -58,8 +58,7 @@ ANY = re.compile(rf"{'|'.join(POSIX_MODULES)}|\.(?:{'|'.join(POSIX_NAMES.values(
 
 #: Files of the product that use them, each with the reason.
 USERS = {
-    "codec/csplat/inputs.py": "advice on pages that were read, if the system takes any",
-    "codec/csplat/memory.py": "the size of the memory, if the system tells",
+    "codec/csplat/file_source.py": "advice on pages that were read, if the system takes any",
     "codec/csplat/system.py": "the replacements",
     "trainer/csplat_trainer/training_report.py": "peak memory, or none",
 }
@@ -144,7 +143,7 @@ def test_a_mapped_file_without_advice_is_read(tmp_path):
     (tmp_path / "data").write_bytes(bytes(1 << 10))
     with (tmp_path / "data").open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
         view = memoryview(mapped)
-        LetGo(view).after(1 << 30)
+        PageReleaser(view).after(1 << 30)
         assert view[-1] == 0
         view.release()
 
@@ -182,7 +181,7 @@ def test_memory_has_a_size_where_the_system_does_not_tell(monkeypatch):
         raise FileNotFoundError
 
     monkeypatch.setattr(Path, "read_text", absent)
-    assert memory.available_bytes() > 1 << 30
+    assert system.available_memory_bytes() > 1 << 30
     assert peak_memory() is None
     assert system.core_count() == os.cpu_count()
 
@@ -193,9 +192,9 @@ def test_memory_has_a_size_where_the_system_does_not_tell(monkeypatch):
 @pytest.mark.slow
 def test_work_is_given_to_processes_that_are_no_copies(monkeypatch):
     starts, context = [], multiprocessing.get_context
-    monkeypatch.setattr(processes, "CAN_COPY", False)
+    monkeypatch.setattr(system, "CAN_FORK", False)
     monkeypatch.setattr(multiprocessing, "get_context", lambda start: (starts.append(start), context(start))[1])
-    done = dict(processes.each_apart(operator.mul, 3, [1, 2, 3], workers=2, copied=True))
+    done = dict(system.map_in_processes(operator.mul, 3, [1, 2, 3], workers=2, copied=True))
     assert {1: 3, 2: 6, 3: 9} == done
     assert ["spawn"] == starts
 

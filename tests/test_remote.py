@@ -12,11 +12,11 @@ from typer.testing import CliRunner
 
 import csplat
 from csplat import EncodeOptions, FormatError, InputError, LimitError, StoreError, _spec, decode, encode, read_header
+from csplat.byte_store import FileWindow, MemoryStore, RequestSizes
 from csplat.decoder import Limits, iter_tiles
-from csplat.inputs import LetGo, mapped
-from csplat.opened import SplatFile
-from csplat.remote import store_of
-from csplat.stores import Memory, RequestSizes, Window
+from csplat.file_source import PageReleaser, map_file
+from csplat.remote_store import open_store
+from csplat.splat_file import SplatFile
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 
@@ -34,7 +34,7 @@ class Watched(SplatFile):
 
 def opened(file):
     """Open a file that is asked for small parts."""
-    store = store_of(file)
+    store = open_store(file)
     store.sizes = SMALL
     return Watched(store, Limits())
 
@@ -121,10 +121,10 @@ def test_what_was_not_fetched_is_never_taken_for_data(data):
 
 def test_a_mapped_file_is_let_go_of_and_a_window_keeps_what_was_fetched(data, tmp_path):
     (tmp_path / "scene.csplat").write_bytes(data)
-    window = Window(Memory(data))
+    window = FileWindow(MemoryStore(data))
     window.fetch([(0, len(data))])
-    for view in (window.view, memoryview(mapped(tmp_path / "scene.csplat"))):
-        LetGo(view, step_bytes=1).after(1)
+    for view in (window.view, memoryview(map_file(tmp_path / "scene.csplat"))):
+        PageReleaser(view, step_bytes=1).after(1)
         assert data == view
 
 
@@ -147,8 +147,8 @@ def test_a_part_is_cut_out_in_small_requests_as_in_large_ones(data, box):
 
 
 def test_parts_that_lie_together_are_read_in_one_request(data):
-    store = Memory(data)
-    window, gap = Window(store), store.sizes.gap
+    store = MemoryStore(data)
+    window, gap = FileWindow(store), store.sizes.gap
     window.fetch([(10, 5), (0, 10), (15 + gap, 5)])
     assert (1, 20 + gap) == (store.requests, store.bytes_read)
     window.fetch([(12, gap)])  # is there

@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
 import csplat_tools
-from csplat import EncodeOptions, files, write_ply
+from csplat import EncodeOptions, disk_files, write_ply
 from csplat.encoder import encode_with_report
 from csplat.errors import InputError
-from csplat.scene import scene_of
+from csplat.scene_source import source_from_model
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.scorer import renderer
@@ -70,7 +70,7 @@ def by_disk(model, every=1, progress=None):
     def blocks():
         return (model.select(slice(start, start + 300)) for start in range(0, len(model), 300))
 
-    scene = replace(scene_of(model), blocks=blocks)
+    scene = replace(source_from_model(model), blocks=blocks)
     sample = model.select(slice(None, None, every))
     return SlicedScene(scene, sample, every, LITTLE, progress, slice_bytes=60_000)
 
@@ -236,7 +236,7 @@ def test_exact_pictures_of_what_does_not_fit_are_refused_in_a_line(files_of_both
 @pytest.mark.usefixtures("no_least")
 def test_a_disk_without_room_is_found_before_anything_is_drawn(files_of_both, monkeypatch):
     usage = type("Usage", (), {"free": 1000})
-    monkeypatch.setattr(files.shutil, "disk_usage", lambda _: usage)
+    monkeypatch.setattr(disk_files.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(InputError, match="TMPDIR"):
         csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
 

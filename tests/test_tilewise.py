@@ -10,7 +10,7 @@ from tables import failures
 from typer.testing import CliRunner
 
 import csplat
-from csplat import formats, inputs
+from csplat import file_source, formats
 from csplat.decoder import Limits, decode, decode_api, open_tiles, read_header
 from csplat.errors import CsplatError, LimitError
 from csplat.ply import write_ply
@@ -110,7 +110,7 @@ def test_what_a_decode_refuses_is_refused_in_the_same_words_and_leaves_no_ply(tm
 
 @pytest.mark.parametrize("threads", [1, 2, 7])
 def test_threads_and_letting_go_of_the_file_change_nothing(many_tiles, threads, monkeypatch):
-    monkeypatch.setattr(decode_api, "LetGo", partial(inputs.LetGo, step_bytes=1))
+    monkeypatch.setattr(decode_api, "PageReleaser", partial(file_source.PageReleaser, step_bytes=1))
     expected = decode(many_tiles)
     opened = open_tiles(many_tiles, threads=threads)
     for _ in range(2):
@@ -166,6 +166,6 @@ def test_progress_goes_from_nothing_to_all(many_tiles, tmp_path):
 @pytest.mark.parametrize("suffix", [".csplat", ".ply"])
 def test_who_wants_all_splats_at_once_is_refused_before_the_memory_is_full(many_tiles, tmp_path, monkeypatch, suffix):
     decode_file(str(many_tiles), str(tmp_path / "scene.ply"))
-    monkeypatch.setattr(scene_files, "available_bytes", lambda: 4000)
+    monkeypatch.setattr(scene_files, "available_memory_bytes", lambda: 4000)
     with pytest.raises(LimitError, match="allowed 4000"):
         scene_files.load_model(many_tiles.with_suffix(suffix))

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import csplat
-from csplat.bridges import to_gsplat
 from csplat.errors import InputError
+from csplat.interop import to_gsplat
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 

@@ -27,7 +27,7 @@ from csplat import EncodeOptions, decode, encode, write_ply
 from csplat._spec import CHUNK_CODEBOOK
 from csplat.decoder import read_header
 from csplat.errors import InputError
-from csplat.scene import without_bands
+from csplat.scene_source import drop_bands
 from csplat_render.camera_files import save_cameras
 from csplat_tools.cli.app import app
 from csplat_tools.study import Reduction
@@ -472,7 +472,7 @@ def test_commands_quote_what_a_shell_would_read(setting):
 def test_without_one_point_that_can_be_measured_it_fails(setting):
     wanted = SweepOptions(what=("strategies",), opacities=(0.99,), kmeans=())
     with pytest.raises(InputError, match=r"no point could be measured; opacity > 0.99: no splat"):
-        tradeoff(replace(setting, source=without_bands(setting.source, 0)), wanted)
+        tradeoff(replace(setting, source=drop_bands(setting.source, 0)), wanted)
 
 
 @pytest.mark.slow

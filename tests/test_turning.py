@@ -5,11 +5,18 @@ from itertools import permutations, product
 import numpy as np
 import pytest
 
+from csplat.editing.transform import (
+    axes_rotation,
+    convert_axes,
+    rotate_scene,
+    scale_scene,
+    stretch_scene,
+    translate_scene,
+)
+from csplat.editing.up_axis import up_of
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.scene import scene_of
-from csplat.turning import axes_rotation, in_axes, moved, scaled, stretched, turned
-from csplat.upright import up_of
+from csplat.scene_source import source_from_model
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 FLIPS = [np.diag(signs) for signs in product((1.0, -1.0), repeat=3)]
@@ -48,7 +55,7 @@ def colours(model, directions):
 @pytest.mark.parametrize("matrix", [*WHOLE[::5], ANY, -ANY])
 def test_shapes_and_colours_turn_with_their_places(make_model, matrix):
     model = make_model(20, 3, flat=True)
-    after = turned(model, matrix)
+    after = rotate_scene(model, matrix)
     directions = np.random.default_rng(1).standard_normal((30, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     assert np.abs(model.means @ matrix.T - after.means).max() < 1e-6
@@ -60,7 +67,7 @@ def test_shapes_and_colours_turn_with_their_places(make_model, matrix):
 @pytest.mark.parametrize("matrix", [ANY @ np.diag([0.5, 2.0, 1.0]), [[-3, 0, 0], [1, 1, 0], [0, 0, 2]], 2.0 * ANY])
 def test_any_linear_map_takes_shapes_along(make_model, matrix):
     model = make_model(20, 1, origin=(1.0, 2.0, 3.0))
-    after = stretched(model, matrix)
+    after = stretch_scene(model, matrix)
     assert (
         np.abs(np.dot(matrix, covariances(model)).swapaxes(0, 1) @ np.transpose(matrix) - covariances(after)).max()
         < 1e-6
@@ -74,20 +81,20 @@ def test_axes_there_and_back_are_the_same_bits(make_model, degree):
     model = make_model(20, degree, origin=(1.0, -2.5, 3.0))
     model.means[0] = (0.0, -0.0, 1e-45)
     for matrix in WHOLE:
-        back = turned(turned(model, matrix), matrix.T)
+        back = rotate_scene(rotate_scene(model, matrix), matrix.T)
         exact = ARRAYS if abs(matrix[2, 2]) == 1 or degree < 2 else ARRAYS[:-1]
         assert all(getattr(model, name).tobytes() == getattr(back, name).tobytes() for name in exact)
         assert np.abs(model.shN - back.shN).max(initial=0.0) < 2e-6
         assert model.origin == back.origin
     for matrix in (ANY, -ANY):  # a rotation has two quaternions; the original one comes back
-        assert np.abs(model.quats - turned(turned(model, matrix), matrix.T).quats).max() < 1e-6
+        assert np.abs(model.quats - rotate_scene(rotate_scene(model, matrix), matrix.T).quats).max() < 1e-6
 
 
 def test_letters_follow_a_scene(make_model):
     model = make_model(3, 0, coordinate_system="RDF", cameras=[CAMERA], metadata={"view": CAMERA, "up": [0, 0, 1]})
-    assert "LUF" == turned(model, axes_rotation("RDF", "LUF")).coordinate_system
+    assert "LUF" == rotate_scene(model, axes_rotation("RDF", "LUF")).coordinate_system
     for axes in ("RUB", "FRD", "UFL", "LDF"):
-        after = turned(model, axes_rotation("RDF", axes))
+        after = rotate_scene(model, axes_rotation("RDF", axes))
         assert axes == after.coordinate_system
         assert tuple(axes_rotation("RDF", axes)[:, 2]) == up_of(after.metadata)
         for before, camera in ((CAMERA, after.cameras[0]), (CAMERA, after.metadata["view"])):
@@ -96,7 +103,7 @@ def test_letters_follow_a_scene(make_model):
             assert (34 if mirrored else 30) == camera["K"][0][2]
             seen = np.array([-1, 1, 1] if mirrored else [1, 1, 1]) * (view[:3, :3] @ axes_rotation("RDF", axes))
             assert (seen == np.array(before["viewmat"])[:3, :3]).all()
-    named = turned(make_model(3, 0, coordinate_system="RDF"), ANY)
+    named = rotate_scene(make_model(3, 0, coordinate_system="RDF"), ANY)
     assert "unspecified" == named.coordinate_system
     assert np.abs(-ANY[:, 1] - up_of(named.metadata)).max() < 1e-6
 
@@ -113,13 +120,13 @@ def test_letters_follow_a_scene(make_model):
 )
 def test_a_scene_stands_upright_in_the_axes_of_a_format(make_model, fields, up):
     model = make_model(5, 1, **fields, origin=(1.0, 2.0, 3.0))
-    scene = in_axes(scene_of(model), "LUF")
+    scene = convert_axes(source_from_model(model), "LUF")
     after = scene.model()
     assert "LUF" == scene.facts.coordinate_system == after.coordinate_system
     assert (0, 1, 0) == up_of(after.metadata, "LUF")
     heights = model.means @ np.array(up) / np.linalg.norm(up)
     assert np.abs(heights - after.means[:, 1]).max() < 1e-6
-    assert in_axes(scene, "LUF") is scene
+    assert convert_axes(scene, "LUF") is scene
 
 
 def test_lengths_change_together(make_model):
@@ -127,9 +134,9 @@ def test_lengths_change_together(make_model):
     model = SplatModel(**{**vars(model), "means_double": model.means + np.array(model.origin)})
     model = SplatModel(**{**vars(model), "means": (model.means_double - model.origin).astype(np.float32)})
     for after, factor, offset in (
-        (scaled(model, 0.5), 0.5, 0.0),
-        (moved(model, (0.1, 0.2, 0.3)), 1.0, (0.1, 0.2, 0.3)),
-        (turned(model, np.eye(3)), 1.0, 0.0),
+        (scale_scene(model, 0.5), 0.5, 0.0),
+        (translate_scene(model, (0.1, 0.2, 0.3)), 1.0, (0.1, 0.2, 0.3)),
+        (rotate_scene(model, np.eye(3)), 1.0, 0.0),
     ):
         assert np.abs(model.means_double * factor + offset - after.means - after.origin).max() < 1e-6
         assert np.abs(model.scales + np.log(factor) - after.scales).max() < 1e-6
@@ -139,7 +146,7 @@ def test_lengths_change_together(make_model):
 
 def test_cameras_see_a_scene_where_it_was_moved_to(make_model):
     model = make_model(5, 0, cameras=[CAMERA], metadata={"view": CAMERA})
-    after = moved(model, (1.0, -2.0, 0.5))
+    after = translate_scene(model, (1.0, -2.0, 0.5))
     for before, now in ((CAMERA, after.cameras[0]), (CAMERA, after.metadata["view"])):
         seen = [
             one.means @ np.array(camera["viewmat"])[:3, :3].T + np.array(camera["viewmat"])[:3, 3]
@@ -151,8 +158,8 @@ def test_cameras_see_a_scene_where_it_was_moved_to(make_model):
 def test_refuses_what_is_no_turn(make_model):
     for matrix in (np.ones((3, 3)), np.eye(4), 2 * np.eye(3), np.full((3, 3), np.nan)):
         with pytest.raises(InputError, match="wanted an orthogonal matrix"):
-            turned(make_model(2, 0), matrix)
+            rotate_scene(make_model(2, 0), matrix)
     with pytest.raises(InputError, match="wanted one above 0"):
-        scaled(make_model(2, 0), -1.0)
+        scale_scene(make_model(2, 0), -1.0)
     with pytest.raises(InputError, match="one each of"):
         axes_rotation("RDF", "XYZ")

@@ -5,8 +5,8 @@ import math
 import pytest
 
 from csplat import decode, encode, read_ply, write_ply
+from csplat.editing.up_axis import unit_up, up_of, with_up
 from csplat.errors import InputError
-from csplat.upright import unit_up, up_of, with_up
 
 TILTED = (0.0, -0.99503719, 0.09950372)  # 0, -1, 0.1
 

@@ -405,8 +405,8 @@ def test_the_validator_shares_nothing_with_the_decoder_nor_the_encoder_suite_wit
     by_validator, by_suite = (line.split() for line in done.stdout.splitlines())
     loaded = [name for name in by_validator if name.startswith("csplat")]
 
-    # `csplat.inputs` releases memory that was read and `csplat.types` names array types: neither knows the format.
-    assert {"csplat", "csplat._spec", "csplat.inputs", "csplat.types", "csplat_conformance"} == {
+    # `csplat.file_source` releases memory that was read and `csplat.types` names array types: neither knows the format.
+    assert {"csplat", "csplat._spec", "csplat.file_source", "csplat.types", "csplat_conformance"} == {
         name for name in loaded if not name.startswith("csplat_conformance.")
     }
     assert {"csplat_conformance.tolerance", "csplat_conformance.validator"} == {

@@ -24,8 +24,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from csplat.bridges import from_gsplat, to_gsplat
     from csplat.decoder import decode, decode_integers, decode_scene, read_header
+    from csplat.editing.merge import merge
+    from csplat.editing.up_axis import with_up
     from csplat.encoder import EncodeOptions, EncodeResult, encode, encode_with_report
     from csplat.errors import (
         CsplatError,
@@ -36,11 +37,10 @@ if TYPE_CHECKING:
         UnsupportedError,
     )
     from csplat.formats import read, write
-    from csplat.merging import merge
+    from csplat.interop import from_gsplat, to_gsplat
     from csplat.model import SplatModel
-    from csplat.opened import SplatFile, extract, open
     from csplat.ply import lint_ply, read_ply, write_ply
-    from csplat.upright import with_up
+    from csplat.splat_file import SplatFile, extract, open
 
 __version__ = "0.1.0"
 
@@ -94,9 +94,9 @@ def lazy_exports(package: str, module_of: Mapping[str, str]) -> tuple[Callable[[
         except ModuleNotFoundError as error:
             if (error.name or "csplat").startswith("csplat"):
                 raise
-            from csplat.errors import missing
+            from csplat.errors import missing_package
 
-            raise missing(error) from None
+            raise missing_package(error) from None
         setattr(sys.modules[package], name, value)  # the next access does not come here again
         return value
 
@@ -110,7 +110,7 @@ _MODULE_OF = {
     "FormatError": "csplat.errors",
     "InputError": "csplat.errors",
     "LimitError": "csplat.errors",
-    "SplatFile": "csplat.opened",
+    "SplatFile": "csplat.splat_file",
     "SplatModel": "csplat.model",
     "StoreError": "csplat.errors",
     "UnsupportedError": "csplat.errors",
@@ -119,16 +119,16 @@ _MODULE_OF = {
     "decode_scene": "csplat.decoder",
     "encode": "csplat.encoder",
     "encode_with_report": "csplat.encoder",
-    "extract": "csplat.opened",
-    "from_gsplat": "csplat.bridges",
+    "extract": "csplat.splat_file",
+    "from_gsplat": "csplat.interop",
     "lint_ply": "csplat.ply",
-    "merge": "csplat.merging",
-    "open": "csplat.opened",
+    "merge": "csplat.editing.merge",
+    "open": "csplat.splat_file",
     "read_header": "csplat.decoder",
     "read": "csplat.formats",
     "read_ply": "csplat.ply",
-    "to_gsplat": "csplat.bridges",
-    "with_up": "csplat.upright",
+    "to_gsplat": "csplat.interop",
+    "with_up": "csplat.editing.up_axis",
     "write": "csplat.formats",
     "write_ply": "csplat.ply.ply_writer",
 }

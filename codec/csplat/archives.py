@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat.inputs import stand_in
+from csplat.file_source import describe_substitute
 
 #: What NumPy and zipfile raise of damage: RuntimeError is for passwords and unknown ways to compress, MemoryError for
 #: sizes that no array has, OSError for places outside the file and broken bz2.
@@ -124,7 +124,7 @@ def read_archive(path: str | Path, kind: str) -> Archive:
     """
     nothing = Archive(path, kind, {})
     with Path(path).open("rb") as stream:  # opened here: np.load leaves a damaged file open
-        if instead := stand_in(stream.read(64)):
+        if instead := describe_substitute(stream.read(64)):
             raise InputError(f"{path} is {instead}")
         if not zipfile.is_zipfile(stream):  # np.load would call others unsafe to load
             nothing.refuse("it is no .npz file")

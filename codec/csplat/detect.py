@@ -17,7 +17,7 @@ from pathlib import Path
 from csplat._spec import MAGIC
 from csplat.archives import folder_refusal, zip_refusal
 from csplat.errors import InputError
-from csplat.inputs import stand_in
+from csplat.file_source import describe_substitute
 
 #: Bytes at the beginning of a file that identify it.
 HEAD_SIZE = 512
@@ -67,7 +67,7 @@ def detect_content(path: Path, head: bytes) -> FileKind | None:
     Raises:
         InputError: the content is that of a pointer of Git LFS, or a web page, in place of a file.
     """
-    instead = stand_in(head)
+    instead = describe_substitute(head)
     if instead:
         raise InputError(f"{path.name} is {instead}")
     return next((kind for kind in KINDS.values() if kind.matches(path, head)), None)

@@ -160,7 +160,7 @@ def counted(count: int, one: str, many: str | None = None) -> str:
     return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
-def missing(error: ModuleNotFoundError, package: str | None = None, *, extra: str = "render") -> InputError:
+def missing_package(error: ModuleNotFoundError, package: str | None = None, *, extra: str = "render") -> InputError:
     """One line for a package that a plain install leaves out.
 
     Args:

@@ -59,7 +59,7 @@ class SplatModel:
         cameras: training cameras, each {K, viewmat, W, H, near, image}, viewmat world to camera
             with OpenCV axes, pixel centres at +0.5; `None` if there are none.
         metadata: free, JSON-compatible. Keys in use: `licence` (str), `comments` (list of str),
-            `training` (see `csplat.training_record`), `up` (see `csplat.upright`), `view`
+            `training` (see `csplat.training_record`), `up` (see `csplat.editing.up_axis`), `view`
             (a camera as those of `cameras`, from which the scene is shown first).
         extra: further columns by name, each [N], integer or floating.
 

@@ -1,29 +1,46 @@
-"""Calls that only some operating systems have, each with a replacement for the others.
+"""Use the operating system: files, memory, locks, signals and processes, with replacements where a system lacks a call.
 
-`sys.platform` is for type checkers: what a system has is asked of its modules.
+`sys.platform` is for type checkers: whether a system has a call is asked of its modules.
 """
 
 from __future__ import annotations
 
+import errno
 import mmap
+import multiprocessing
 import os
 import shlex
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-#: Whether a process can be copied with all of its memory. macOS can, but its system libraries do not survive it.
+#: True if a process can be copied with all of its memory. macOS can, but its system libraries do not survive it.
 CAN_FORK = sys.platform == "linux" and hasattr(os, "fork")
 
 #: `creationflags` of a process that an interrupt at the terminal does not reach; on POSIX `start_new_session` does it.
 NEW_GROUP_FLAGS: int = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
 
+_SHARE = 0.5  # fraction of the free memory that a command uses; other programs need some
+_UNKNOWN = 4 << 30  # bytes, if the system does not report its memory
+_LIMITS = (
+    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
+    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+)
+_SPAWNED_MAX = 61  # processes of one pool that Windows can wait for
+
+Shared = TypeVar("Shared")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
 _reading = threading.Lock()  # seek and read are two calls
+_task: list[Any] = []  # in a worker process: the function, and the value that all calls share
 
 
 def core_count() -> int:
@@ -58,7 +75,7 @@ def read_into(descriptor: int, buffer: memoryview, offset: int) -> int:
 
 
 class Pages:
-    """Zeroed memory that takes room only where it is written, on systems that can do so. Owns the memory.
+    """Zeroed memory of which only written pages take space, if the system can do so.
 
     Attributes:
         buffer: the memory.
@@ -74,7 +91,7 @@ class Pages:
         if sys.platform != "win32" and hasattr(mmap, "MAP_ANONYMOUS"):
             flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | getattr(mmap, "MAP_NORESERVE", 0)
             self.buffer = mmap.mmap(-1, size_bytes, flags=flags)
-        else:  # Windows: the page file has to have room for all of it
+        else:  # Windows: the page file must have space for all of it
             self.buffer = mmap.mmap(-1, size_bytes)
 
     def discard(self) -> None:
@@ -87,7 +104,7 @@ class Pages:
 def locked_folder(folder: Path, name: str) -> Iterator[bool]:
     """Lock a folder against other programs that do the same; yield whether this program has the lock.
 
-    File systems without locks count as locked. The system releases the lock when the program ends, however it ends.
+    File systems without locks count as locked. The system releases the lock when the program ends in any way.
 
     Args:
         folder: an existing folder.
@@ -171,3 +188,71 @@ def interrupt_main_thread() -> None:
         signal.pthread_kill(main, signal.SIGINT)
     else:
         signal.raise_signal(signal.SIGINT)
+
+
+def available_memory_bytes() -> int:
+    """Return the free memory of the machine, or of the control group of this process if that is less."""
+    found = [_free_machine_bytes()]
+    for limit, current in _LIMITS:
+        with suppress(OSError, ValueError):
+            found.append(int(Path(limit).read_text("ascii")) - int(Path(current).read_text("ascii")))
+    return max(0, min(found))
+
+
+def default_memory_bytes() -> int:
+    """Return the memory that a command uses by default: half of what is free."""
+    return int(_SHARE * available_memory_bytes())
+
+
+def _free_machine_bytes() -> int:
+    with suppress(OSError, ValueError):
+        for line in Path("/proc/meminfo").read_text("ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    with suppress(ValueError, OSError):
+        if sys.platform != "win32" and hasattr(os, "sysconf"):
+            return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    return _UNKNOWN
+
+
+def map_in_processes(
+    work: Callable[[Shared, Item], Result], shared: Shared, items: Sequence[Item], workers: int, *, copied: bool = False
+) -> Iterator[tuple[Item, Result]]:
+    """Call a function for each item in worker processes; yield every item with its result when it is done.
+
+    Args:
+        work: a top-level function, called with `shared` and an item.
+        shared: a value for all calls; changes that a call makes to it are not seen by others.
+        items: arguments, which can be pickled, as the results can.
+        workers: number of processes; 1: only this one.
+        copied: fork this process, if `CAN_FORK`: `shared` is not pickled and takes no memory of its own. The function
+            must not use a lock that another thread of this process may hold, such as that of a stream.
+
+    Raises:
+        OSError: a process was killed.
+    """
+    if workers == 1 or len(items) < 2:
+        for item in items:
+            yield item, work(shared, item)
+        return
+    start = ("fork" if copied else "forkserver") if CAN_FORK else "spawn"
+    workers = min(workers, _SPAWNED_MAX) if start == "spawn" else workers
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context(start), _begin, (work, shared))
+    try:
+        futures = {pool.submit(_call, item): item for item in items}
+        for future in as_completed(futures):
+            yield futures.pop(future), future.result()
+    except BrokenProcessPool:
+        raise OSError(errno.ENOMEM, "a worker process was killed, perhaps for want of memory") from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin(work: Callable[..., Any], shared: Any) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it and ends its workers
+    _task[:] = [work, shared]
+
+
+def _call(item: Any) -> Any:
+    work, shared = _task
+    return work(shared, item)

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import Limits, open_tiles
+from csplat.editing.transform import convert_axes, rotate_scene, scale_scene, translate_scene
 from csplat.errors import InputError
 from csplat.formats import Format, format_by_name, format_by_suffix, formats, open_scene
 from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
 from csplat.model import SplatModel
-from csplat.scene import Scene, without_bands
-from csplat.turning import in_axes, moved, scaled, turned
+from csplat.scene_source import SceneSource, drop_bands
 from csplat.types import F64, Mask, Progress
 from csplat_tools.file_streams import is_one_way, local_path, mapped_csplat, write_model
 from csplat_tools.scene_files import MetadataOverrides, findings_as_json, size_on_disk, with_progress
@@ -52,19 +52,19 @@ class Filters:
     drop_floaters: bool = False
     sh_degree: int | None = None
 
-    def applied(self, scene: Scene) -> Scene:
+    def applied(self, scene: SceneSource) -> SceneSource:
         """Return the changed scene."""
         if self.to_axes is not None:
-            scene = in_axes(scene, self.to_axes)
+            scene = convert_axes(scene, self.to_axes)
         if self.rotate is not None:
             matrix = _rotation(self.rotate)
-            scene = _changed(scene, lambda model: turned(model, matrix))
+            scene = _changed(scene, lambda model: rotate_scene(model, matrix))
         if self.scale is not None:
             factor = self.scale
-            scene = _changed(scene, lambda model: scaled(model, factor))
+            scene = _changed(scene, lambda model: scale_scene(model, factor))
         if self.translate is not None:
             offset = self.translate
-            scene = _changed(scene, lambda model: moved(model, offset))
+            scene = _changed(scene, lambda model: translate_scene(model, offset))
         if self.crop_box is not None:
             corners = np.sort(np.array(self.crop_box).reshape(2, 3), axis=0)
             scene = _kept(scene, lambda model: _inside_box(model, corners))
@@ -75,7 +75,7 @@ class Filters:
             scene = _without_floaters(scene)
         if self.sh_degree is not None:
             degree = self.sh_degree
-            scene = _changed(scene, lambda model: without_bands(model, degree))
+            scene = _changed(scene, lambda model: drop_bands(model, degree))
         return scene
 
 
@@ -118,12 +118,12 @@ def _key(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     return key
 
 
-def _changed(scene: Scene, change: Callable[[SplatModel], SplatModel]) -> Scene:
+def _changed(scene: SceneSource, change: Callable[[SplatModel], SplatModel]) -> SceneSource:
     blocks = scene.blocks
     return replace(scene, facts=change(scene.facts), blocks=lambda: (change(model) for model in blocks()))
 
 
-def _kept(scene: Scene, keep: Callable[[SplatModel], Mask]) -> Scene:
+def _kept(scene: SceneSource, keep: Callable[[SplatModel], Mask]) -> SceneSource:
     def blocks() -> Iterator[SplatModel]:
         for model in scene.blocks():
             left = keep(model)
@@ -134,7 +134,7 @@ def _kept(scene: Scene, keep: Callable[[SplatModel], Mask]) -> Scene:
     return replace(scene, count=count, blocks=blocks)
 
 
-def _without_floaters(scene: Scene) -> Scene:
+def _without_floaters(scene: SceneSource) -> SceneSource:
     """Drop isolated splats; holds centres and sizes of all splats in memory, 16 bytes each."""
     points, sizes = np.empty((scene.count, 3), np.float32), np.empty(scene.count, np.float32)
     at = 0
@@ -312,7 +312,7 @@ def decode_file(
     """
     with mapped_csplat(source) as data:
         opened = open_tiles(data, limits=None if max_splats is None else Limits(splats=max_splats))
-        decoded = Scene(opened.header.splat_count, opened.facts, opened.models)
+        decoded = SceneSource(opened.header.splat_count, opened.facts, opened.models)
         # All bands are decoded, even if some are left out: damage anywhere gives no PLY.
         scene = Filters(sh_degree=sh_degree).applied((facts or MetadataOverrides()).applied_to_all(decoded))
         if is_one_way(target):

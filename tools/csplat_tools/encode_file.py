@@ -11,11 +11,11 @@ from typing import Any
 from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, encode_with_report
 from csplat.errors import InputError
 from csplat.formats import detect_format, open_scene, read_all
-from csplat.large import Needs, encode_scene, needs_of
 from csplat.lint import Finding, refuse
-from csplat.memory import default_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel
+from csplat.out_of_core import ResourceNeeds, encode_scene, estimate_needs
 from csplat.ply.column_names import dropped_columns
+from csplat.system import default_memory_bytes
 from csplat.types import Progress
 from csplat_tools.console import note
 from csplat_tools.file_streams import (
@@ -65,7 +65,7 @@ class OutOfCoreOptions:
         """Return True if a scene may not fit in memory, and has to be opened to tell."""
         if self.cluster is not None or self.resume or self.by_disk:
             return True
-        bound = default_bytes() if self.memory_bytes is None else self.memory_bytes
+        bound = default_memory_bytes() if self.memory_bytes is None else self.memory_bytes
         size = size_on_disk(path)
         return size > _SMALL and (detect_format(path).name != "ply" or size * _FOLDS > bound)
 
@@ -120,7 +120,7 @@ def encode_out_of_core(
     if progress is not None:
         progress("opening", 0.0)
     with open_scene(local, sh_degree=read_degree(options)) as opened:
-        in_memory = needs_of(opened, options, scale.memory_bytes, by_disk=scale.by_disk).in_memory
+        in_memory = estimate_needs(opened, options, scale.memory_bytes, by_disk=scale.by_disk).in_memory
         if in_memory and scale.cluster is None and not scale.resume:
             if opened.format in CHEAP_TO_REOPEN:
                 return None
@@ -164,7 +164,7 @@ class CostEstimate:
 
     count: int
     sh_degree: int
-    needs: Needs
+    needs: ResourceNeeds
     seconds: float
     file_bytes: int
 
@@ -190,7 +190,7 @@ def estimate_cost(local: Path, options: EncodeOptions, scale: OutOfCoreOptions) 
         OSError: the scene cannot be read.
     """
     with open_scene(local, sh_degree=read_degree(options)) as opened:
-        needs = needs_of(opened, options, scale.memory_bytes, by_disk=scale.by_disk)
+        needs = estimate_needs(opened, options, scale.memory_bytes, by_disk=scale.by_disk)
         count = opened.count
         degree = opened.facts.sh_degree if options.sh_degree is None else min(options.sh_degree, opened.facts.sh_degree)
     read, code, book = _SECONDS[min(degree, 1) if options.preset == "fast" else degree]

@@ -23,14 +23,14 @@ from numpy.typing import NDArray
 
 from csplat._spec import MAGIC
 from csplat.detect import HEAD_SIZE, detect_content, detect_name, read_head, refusal
+from csplat.disk_files import atomic_writer, local_file
 from csplat.errors import CsplatError, InputError
-from csplat.files import atomic_writer, local_file
+from csplat.file_source import File, map_file
 from csplat.formats import formats
-from csplat.inputs import File, mapped
 from csplat.model import SplatModel
 from csplat.ply import write_ply, write_scene_ply
-from csplat.remote import is_url
-from csplat.scene import Scene
+from csplat.remote_store import is_url
+from csplat.scene_source import SceneSource
 
 STANDARD_STREAM = "-"
 
@@ -217,7 +217,7 @@ def mapped_csplat(path: str) -> Iterator[bytes | mmap]:
         OSError: the file cannot be read.
     """
     is_path = path != STANDARD_STREAM
-    data = mapped(path) if is_path else sys.stdin.buffer.read()
+    data = map_file(path) if is_path else sys.stdin.buffer.read()
     try:
         with naming(path):
             _refuse_others(path if is_path else "standard input", data[:HEAD_SIZE])
@@ -305,9 +305,9 @@ def write_json(path: str, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
-def write_model(path: str, model: SplatModel | Scene, *, absolute: bool) -> None:
+def write_model(path: str, model: SplatModel | SceneSource, *, absolute: bool) -> None:
     """Write a PLY to a file, or to standard output for `-`; `absolute` adds the origin and writes doubles."""
-    write: Callable[..., None] = write_scene_ply if isinstance(model, Scene) else write_ply
+    write: Callable[..., None] = write_scene_ply if isinstance(model, SceneSource) else write_ply
     with _output_stream(path) as stream:
         write(stream, model, absolute=absolute)
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.disk_files import read_array
 from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, encode_with_report
 from csplat.errors import InputError
-from csplat.files import read_array
 from csplat.model import SplatModel
 from csplat.types import Progress
 from csplat_render.virtual_cameras import scene_frame

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from importlib import import_module
 
-from csplat.errors import missing
+from csplat.errors import missing_package
 from csplat_tools.console import note, progress_bar
 
 _FRUGAL_SPINS = "1000"  # see _wait_frugally
@@ -120,7 +120,7 @@ def _need(module: str, package: str | None = None, *, extra: str = "render") -> 
     try:
         import_module(module)
     except ModuleNotFoundError as error:
-        raise missing(error, package, extra=extra) from None
+        raise missing_package(error, package, extra=extra) from None
 
 
 def _wait_frugally() -> None:

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 
 from csplat import formats
-from csplat import scene as scenes
+from csplat import scene_source as scenes
 from csplat.decoder import DeclaredBounds, Limits, SceneHeader, decode_scene
+from csplat.editing.up_axis import Direction, with_up
 from csplat.errors import LimitError
-from csplat.inputs import File
+from csplat.file_source import File
 from csplat.lint import Finding
-from csplat.memory import available_bytes, default_bytes
 from csplat.model import SplatModel
 from csplat.ply.column_names import dropped_columns
-from csplat.scene import Scene, joined, without_bands
+from csplat.scene_source import SceneSource, drop_bands, join_blocks
+from csplat.system import available_memory_bytes, default_memory_bytes
 from csplat.types import Progress, null_progress
-from csplat.upright import Direction, with_up
 from csplat_tools.file_streams import is_csplat, kept_path, local_path, mapped_csplat, naming, source_path
 
 #: Names of files that stand for the whole folder they are in: SOG as a folder, and with levels.
@@ -89,7 +89,7 @@ class OpenedScene:
         sample_splats: largest number of splats in the sample.
     """
 
-    scene: Scene
+    scene: SceneSource
     size_bytes: int
     path: Path
     memory_bytes: int
@@ -109,7 +109,7 @@ class OpenedScene:
                 if progress is not None:
                     progress("looking at the scene", rows.start / max(1, self.count))
                 parts.append(_plain(block.select(np.arange(-rows.start % every, len(block), every))))
-            self._sample.append(joined(_plain(self.facts), parts))
+            self._sample.append(join_blocks(_plain(self.facts), parts))
         return self._sample[0], every
 
     @property
@@ -134,7 +134,7 @@ class OpenedScene:
 
 
 def _plain(model: SplatModel) -> SplatModel:
-    return replace(without_bands(model, 0), extra={}, means_double=None)
+    return replace(drop_bands(model, 0), extra={}, means_double=None)
 
 
 def _sizes(count: int, facts: SplatModel, size_bytes: int) -> dict[str, Any]:
@@ -179,7 +179,7 @@ def load_model(scene: SceneLike, *, sh_degree: int | None = None) -> LoadedModel
 
 
 def _loaded(local: Path, sh_degree: int | None = None) -> LoadedModel:
-    size_bytes, name, free = size_on_disk(local), local.name, available_bytes()
+    size_bytes, name, free = size_on_disk(local), local.name, available_memory_bytes()
     if not is_csplat(local):
         if size_bytes > free:
             raise LimitError("memory for all splats at once", size_bytes, free)
@@ -247,7 +247,7 @@ def open_scenes(
         assert len(opened) == len(given), "all are in memory, or none"
         yield opened
         return
-    bound = default_bytes() if memory_bytes is None else memory_bytes
+    bound = default_memory_bytes() if memory_bytes is None else memory_bytes
     with ExitStack() as stack:
         local: dict[int, Path] = {}
         fits: dict[int, LoadedModel] = {}
@@ -324,11 +324,11 @@ def ply_splat_bytes(sh_degree: int) -> int:
     return 4 * (14 + 3 * (sh_degree + 1) ** 2)
 
 
-def with_progress(scene: Scene, stage: str, progress: Progress | None) -> Scene:
+def with_progress(scene: SceneSource, stage: str, progress: Progress | None) -> SceneSource:
     """Return the scene with blocks that report progress while they are iterated over to be written."""
     if progress is None:
         return scene
-    told = scenes.watched(scene, stage, progress)
+    told = scenes.with_progress(scene, stage, progress)
 
     def blocks() -> Iterator[SplatModel]:
         yield from told.blocks()
@@ -337,7 +337,7 @@ def with_progress(scene: Scene, stage: str, progress: Progress | None) -> Scene:
     return replace(scene, blocks=blocks)
 
 
-def without_extra_columns(scene: Scene) -> Scene:
+def without_extra_columns(scene: SceneSource) -> SceneSource:
     """Leave out the columns that splats do not have."""
     if not scene.facts.extra:
         return scene
@@ -374,6 +374,6 @@ class MetadataOverrides:
         model = replace(model, **changes) if changes else model
         return with_up(model, self.up, self.coordinate_system)
 
-    def applied_to_all(self, scene: Scene) -> Scene:
+    def applied_to_all(self, scene: SceneSource) -> SceneSource:
         """Return the scene with these overrides."""
         return replace(scene, facts=self.applied(scene.facts), blocks=lambda: map(self.applied, scene.blocks()))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from csplat.errors import missing
+from csplat.errors import missing_package
 from csplat_render.camera import Camera
 from csplat_render.conventions import Mode
 
@@ -61,7 +61,7 @@ def render(
         from csplat_render.rasteriser import Rasteriser
         from csplat_render.reference_rasteriser import render_exact
     except ModuleNotFoundError as error:
-        raise missing(error) from None
+        raise missing_package(error) from None
 
     if antialiased is None:
         antialiased = bool(getattr(model, "antialiased", False))

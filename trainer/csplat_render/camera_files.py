@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from csplat.disk_files import read_json
 from csplat.errors import InputError, counted
-from csplat.files import read_json
 from csplat.types import F64
 from csplat_render.camera import DEFAULT_NEAR, Camera, check_last_row, relative_to
 

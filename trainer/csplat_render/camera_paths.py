@@ -15,11 +15,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from csplat.editing.up_axis import up_of
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.training_record import VIEW
 from csplat.types import F64, Mask
-from csplat.upright import up_of
 from csplat_render.camera import Camera, camera_outliers, direction_at, intrinsics, look_at, orbit
 from csplat_render.virtual_cameras import (
     FIELD_OF_VIEW,

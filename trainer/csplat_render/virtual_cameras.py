@@ -28,10 +28,10 @@ from typing import Literal
 
 import numpy as np
 
+from csplat.editing.up_axis import Direction, up_of, with_up
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F64, I64
-from csplat.upright import Direction, up_of, with_up
 from csplat_render.camera import DEFAULT_NEAR, Camera, direction_at, intrinsics, look_at, orbit
 
 #: Splats of lower opacity are never drawn.

@@ -21,15 +21,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from csplat.bridges import from_gsplat
 from csplat.detect import detect_content, read_head
-from csplat.errors import InputError, counted, missing
+from csplat.errors import InputError, counted, missing_package
 from csplat.formats import Format
+from csplat.interop import from_gsplat
 from csplat.lint import Finding, too_many_bands
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.ply.columns import AttributeArrays, RowStatistics, choose_thickness, list_findings, survey_arrays
 from csplat.ply.comments import CommentMetadata, split_origin
-from csplat.scene import Scene, joined, scene_of
+from csplat.scene_source import SceneSource, join_blocks, source_from_model
 
 _MAGICS = (b"PK\x03\x04", b"\x80")  # of a zip, and of a pickle, which torch wrote before 1.6
 _NAMED = 5  # names in a message
@@ -51,14 +51,14 @@ _NAMES = {
 
 
 @contextmanager
-def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
+def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
     paths, findings = _parts(path)
     parts = [_read(one, sh_degree) for one in paths]
     models = [one.model for one in parts]
     degrees = sorted({one.sh_degree for one in models})
     if len(degrees) > 1:
         raise InputError(f"{path.name}: files of other GPUs beside it are of SH degree {degrees[0]} and {degrees[1]}")
-    model, counts = joined(models[0], models), RowStatistics()
+    model, counts = join_blocks(models[0], models), RowStatistics()
     for part in parts:
         survey_arrays(part.arrays, part.scale_count, counts)
     findings += [finding for part in parts for finding in part.findings] + list_findings(counts, len(model))
@@ -68,7 +68,7 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
         model = replace(model, means=means, origin=origin, means_double=doubles)
         text = f"positions are in doubles: {len(means)} means are float32 relative to {origin}"
         findings.append(Finding("double-means", len(means), text, "note"))
-    yield replace(scene_of(model), findings=findings)
+    yield replace(source_from_model(model), findings=findings)
 
 
 class _CheckpointPart(NamedTuple):
@@ -124,7 +124,7 @@ def _read(path: Path, sh_degree: int | None) -> _CheckpointPart:
     try:
         import torch
     except ModuleNotFoundError as error:
-        raise InputError(f"{path.name} is a checkpoint of torch: {missing(error, extra='train')}") from None
+        raise InputError(f"{path.name} is a checkpoint of torch: {missing_package(error, extra='train')}") from None
     try:
         with _plain_numbers(torch), warnings.catch_warnings(action="ignore"):
             # Mapped: of a checkpoint of splatfacto two thirds are Adam's memory.

@@ -13,8 +13,8 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from csplat.archives import read_archive
+from csplat.disk_files import atomic_writer
 from csplat.errors import InputError
-from csplat.files import atomic_writer
 from csplat_trainer.parameters import GROUPS, ParameterArrays, Parameters
 from csplat_trainer.strategies import grow
 from csplat_trainer.training_options import TrainOptions

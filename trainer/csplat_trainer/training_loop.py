@@ -15,11 +15,11 @@ import numpy as np
 from numpy.random import PCG64, Generator
 
 import csplat
+from csplat.editing.up_axis import with_up
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.training_record import TRAINING, VIEW
 from csplat.types import F32
-from csplat.upright import with_up
 from csplat_render.camera import Camera, central_camera
 from csplat_render.lpips import Lpips, load_lpips
 from csplat_render.metrics import psnr_of_mse

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from csplat.files import atomic_writer
+from csplat.disk_files import atomic_writer
 from csplat.types import F32, F64
 
 _WINDOW_SHARE = 50  # the moving average spans this part of the run

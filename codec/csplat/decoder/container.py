@@ -16,7 +16,7 @@ from typing import Any
 
 from csplat import _spec
 from csplat.errors import FormatError, InputError, UnsupportedError
-from csplat.inputs import File, mapped, stand_in
+from csplat.file_source import File, describe_substitute, map_file
 
 _CRC_SIZE = 4
 _STAND_IN_SIZE = 64  # bytes from which content of another kind is recognised
@@ -180,7 +180,7 @@ def view_of(data: File) -> memoryview:
         OSError: it cannot be read.
     """
     if isinstance(data, (str, os.PathLike)):
-        return memoryview(mapped(data))
+        return memoryview(map_file(data))
     try:
         # An mmap is a buffer and a file; other files must return bytes.
         read = None if isinstance(data, mmap.mmap) else getattr(data, "read", None)
@@ -221,7 +221,7 @@ def read_file_header(view: memoryview) -> _spec.Header:
     header = _spec.unpack_header(view)
     places = _spec.HEADER_OFFSETS
     if header.magic != _spec.MAGIC:
-        instead = stand_in(bytes(view[:_STAND_IN_SIZE]))
+        instead = describe_substitute(bytes(view[:_STAND_IN_SIZE]))
         detail = "a PLY, which csplat.read_ply reads" if magic[:4] in (b"ply\n", b"ply\r") else instead
         raise FormatError(_spec.ERROR_MAGIC, 0, "HDR-1", detail, found=magic.hex(" "), wanted=_spec.MAGIC.hex(" "))
     version = (header.version_major, header.version_minor)

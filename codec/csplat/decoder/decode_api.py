@@ -28,13 +28,13 @@ from csplat.decoder.reconstruct import (
 )
 from csplat.decoder.tiles import read_tile
 from csplat.errors import InputError, LimitError
-from csplat.inputs import LetGo
+from csplat.file_source import PageReleaser
 from csplat.model import SplatModel, trusted_model
 from csplat.types import F32
 
 if TYPE_CHECKING:
     from csplat.decoder.blocks import TileBlocks
-    from csplat.inputs import File
+    from csplat.file_source import File
 
 _THREADS_MAX = 8  # default maximum; memory bandwidth is the limit beyond that
 
@@ -370,7 +370,7 @@ def _iterate(request: DecodeRequest, threads: int | None) -> Iterator[tuple[Tile
     """Decode tiles in their order, each into arrays of its own."""
     header = request.header
     table = opacity_table(header.attribute(_spec.ATTRIBUTE_OPACITIES))
-    let_go = LetGo(request.view)
+    let_go = PageReleaser(request.view)
 
     def convert(_place: int, source: TileBlocks) -> tuple[Tile, SplatArrays]:
         arrays = SplatArrays.empty(source.tile.splat_count, request.degree, header)

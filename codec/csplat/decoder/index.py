@@ -20,7 +20,7 @@ from csplat.decoder.container import (
 from csplat.errors import FormatError, UnsupportedError
 
 if TYPE_CHECKING:
-    from csplat.inputs import File
+    from csplat.file_source import File
 
 
 #: Smallest normal number of binary64 (ATT-6, TIL-9).

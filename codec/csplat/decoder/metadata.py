@@ -15,7 +15,7 @@ from csplat.decoder.limits import Limits
 from csplat.errors import FormatError
 
 if TYPE_CHECKING:
-    from csplat.inputs import File
+    from csplat.file_source import File
 
 
 _BOM = b"\xef\xbb\xbf"

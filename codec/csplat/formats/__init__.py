@@ -16,16 +16,16 @@ from pathlib import Path
 
 from csplat.decoder import decode
 from csplat.detect import detect_content, detect_name, read_head, refusal
+from csplat.disk_files import local_file
+from csplat.editing.transform import DEFAULT_AXES, convert_axes
 from csplat.errors import InputError
-from csplat.files import local_file
+from csplat.file_source import File
 from csplat.formats.format import ARRAYS, Format
-from csplat.inputs import File
 from csplat.lint import Finding, refuse
 from csplat.model import SplatModel, check_model, check_sh_degree
 from csplat.plugins import load_plugins
 from csplat.ply import lint_ply, open_ply, read_ply, write_scene_ply
-from csplat.scene import Scene, scene_of, without_bands
-from csplat.turning import USUAL, in_axes
+from csplat.scene_source import SceneSource, drop_bands, source_from_model
 
 __all__ = [
     "ARRAYS",
@@ -102,7 +102,7 @@ def read(
 
 
 def read_all(
-    scene: Scene, *, strict: bool = False, keep_extra: bool = False, report: list[Finding] | None = None
+    scene: SceneSource, *, strict: bool = False, keep_extra: bool = False, report: list[Finding] | None = None
 ) -> SplatModel:
     """Read all splats of an open scene; otherwise as `read`."""
     model = scene.model()
@@ -134,7 +134,7 @@ def assume_format(format: str | None) -> Iterator[None]:
 @contextmanager
 def open_scene(
     file: File, format: str | None = None, *, level: int = 0, sh_degree: int | None = None
-) -> Iterator[Scene]:
+) -> Iterator[SceneSource]:
     """Open a scene in any format, to be read block by block.
 
     Args:
@@ -198,10 +198,10 @@ def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = 
         OSError: the file cannot be written.
     """
     check_model("write", model)
-    write_scene(path, scene_of(model), format)
+    write_scene(path, source_from_model(model), format)
 
 
-def write_scene(path: str | os.PathLike[str], scene: Scene, format: str | None = None) -> None:
+def write_scene(path: str | os.PathLike[str], scene: SceneSource, format: str | None = None) -> None:
     """Write a scene block by block; otherwise as `write`."""
     target = Path(path)
     found = format_by_suffix(target) if format is None else format_by_name(format)
@@ -287,7 +287,7 @@ def _readable_format(path: Path, format: str | None) -> Format:
 @contextmanager
 def _open(
     found: Format, path: Path, level: int = 0, sh_degree: int | None = None, *, lenient: bool = False
-) -> Iterator[Scene]:
+) -> Iterator[SceneSource]:
     """Open a scene along the usual axes, even with findings that are errors if `lenient`."""
     assert found.open is not None
     check_sh_degree(sh_degree)
@@ -302,14 +302,14 @@ def _open(
     with opened as all_bands:
         refuse([] if lenient else all_bands.findings, strict=False)
         scene = all_bands if sh_degree is None else _with_fewer_bands(all_bands, sh_degree)
-        yield replace(in_axes(scene, USUAL) if found.axes else scene, format=found.name)
+        yield replace(convert_axes(scene, DEFAULT_AXES) if found.axes else scene, format=found.name)
 
 
-def _with_fewer_bands(scene: Scene, sh_degree: int) -> Scene:
+def _with_fewer_bands(scene: SceneSource, sh_degree: int) -> SceneSource:
     if sh_degree >= scene.facts.sh_degree:
         return scene
     return replace(
         scene,
-        facts=without_bands(scene.facts, sh_degree),
-        blocks=lambda: (without_bands(model, sh_degree) for model in scene.blocks()),
+        facts=drop_bands(scene.facts, sh_degree),
+        blocks=lambda: (drop_bands(model, sh_degree) for model in scene.blocks()),
     )

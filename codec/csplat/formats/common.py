@@ -18,7 +18,7 @@ from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply.columns import SH_C0, RowStatistics, count_huge_rows, list_findings
-from csplat.scene import BLOCK, Scene
+from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, F64, I64
 
 Rows = NDArray[Any]
@@ -33,13 +33,13 @@ def finite_scene(
     facts: SplatModel,
     *,
     zero_quat: int = 0,
-) -> Scene:
+) -> SceneSource:
     """Make a scene of structured rows, dropping and counting those with NaN or infinity.
 
     Args:
-        blocks: yields rows, at most `BLOCK` at a time, together with arrays of the same length.
+        blocks: yields rows, at most `BLOCK_SPLATS` at a time, together with arrays of the same length.
         decode: makes a model of natural logarithms of scales and such a tuple.
-        facts: as in `Scene`.
+        facts: as in `SceneSource`.
         zero_quat: value of each component of a rotation of length 0 in the file.
 
     Returns:
@@ -74,7 +74,7 @@ def finite_scene(
                 scales = kept[0]["scales"].astype(np.float32)
                 yield decode(scales if are_logs else _log_scales(scales), *kept)
 
-    return Scene(kept, facts, models, findings)
+    return SceneSource(kept, facts, models, findings)
 
 
 def _count_empty_rows(rows: Rows) -> int:
@@ -250,7 +250,7 @@ _IN_MEMORY = 1 << 24  # bytes that are sorted without a file
 
 
 @contextmanager
-def sorted_along_curve(scene: Scene, folder: Path) -> Iterator[Scene]:
+def sorted_along_curve(scene: SceneSource, folder: Path) -> Iterator[SceneSource]:
     """Sort a scene along a Z curve, which keeps neighbours together; splats in one cell keep their order.
 
     Args:
@@ -297,9 +297,9 @@ def _fill_blocks(facts: SplatModel, parts: Iterator[NDArray[Any]]) -> Iterator[S
     left: list[NDArray[Any]] = []
     for rows in parts:
         left = [np.concatenate([*left, rows])]
-        while len(left[0]) >= BLOCK:
-            yield _model_of_rows(facts, left[0][:BLOCK])
-            left = [left[0][BLOCK:]]
+        while len(left[0]) >= BLOCK_SPLATS:
+            yield _model_of_rows(facts, left[0][:BLOCK_SPLATS])
+            left = [left[0][BLOCK_SPLATS:]]
     if left and len(left[0]):
         yield _model_of_rows(facts, left[0])
 
@@ -323,7 +323,7 @@ class _ZCurve:
     splits: I64
 
     @classmethod
-    def through(cls, scene: Scene) -> _ZCurve:
+    def through(cls, scene: SceneSource) -> _ZCurve:
         stride = -(-scene.count // _CURVE_SAMPLE) or 1
         taken, at = [np.zeros((0, 3), np.float32)], 0
         for model in scene.blocks():
@@ -337,7 +337,7 @@ class _ZCurve:
         low, high = sample.min(0).astype(np.float64), sample.max(0).astype(np.float64)
         curve = cls(low, np.where(high > low, high, low + 1.0), np.zeros(0, np.int64))
         codes = np.sort(curve.codes(sample))
-        blocks = -(-scene.count // BLOCK)
+        blocks = -(-scene.count // BLOCK_SPLATS)
         return replace(curve, splits=codes[np.arange(1, blocks) * len(codes) // blocks])
 
     def codes(self, means: F32) -> I64:

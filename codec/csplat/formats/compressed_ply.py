@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.disk_files import atomic_writer
 from csplat.errors import InputError, counted
-from csplat.files import atomic_writer
 from csplat.formats.common import crossed_bounds, decode_smallest_three, encode_smallest_three, sorted_along_curve
 from csplat.formats.format import Format
 from csplat.lint import Finding, too_many_bands, trailing_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.ply.comments import format_comments, parse_comments
 from csplat.ply.ply_header import read_ply_header
-from csplat.scene import BLOCK, Scene
+from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, U8, U32
 
 _CHUNK = 256  # splats that share bounds
@@ -59,7 +59,7 @@ class _Element:
 
 
 @contextmanager
-def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
+def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
     elements, comments, findings = _parse_header(path)
     chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
     if chunk is None or vertex is None:
@@ -113,14 +113,14 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
         raise InputError(f"{path.name}: {error}") from None
 
     def blocks() -> Iterator[SplatModel]:
-        for start in range(0, vertex.count, BLOCK):
-            stop = min(start + BLOCK, vertex.count)
+        for start in range(0, vertex.count, BLOCK_SPLATS):
+            stop = min(start + BLOCK_SPLATS, vertex.count)
             coefficients = None if sh is None else sh.read(path, start, stop)
             words = vertex.read(path, start, stop)
             chunk_bounds = bounds[start // _CHUNK : -(-stop // _CHUNK)]
             yield replace(facts, **_unpack(words, chunk_bounds, coefficients, kept))
 
-    yield Scene(vertex.count, facts, blocks, [*findings, *metadata.findings])
+    yield SceneSource(vertex.count, facts, blocks, [*findings, *metadata.findings])
 
 
 def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Finding]]:
@@ -215,7 +215,7 @@ def _sh_values() -> F32:
     return values.astype(np.float32)
 
 
-def _write(path: Path, scene: Scene) -> None:
+def _write(path: Path, scene: SceneSource) -> None:
     """Write a scene sorted along a Z curve."""
     rest = 3 * scene.facts.shN.shape[1]
     header = _build_header(scene.facts, scene.count, rest)

@@ -10,17 +10,17 @@ from pathlib import Path
 from csplat.decoder import open_tiles
 from csplat.encoder import EncodeOptions
 from csplat.formats.format import Format
-from csplat.large import encode_scene
-from csplat.scene import Scene
+from csplat.out_of_core import encode_scene
+from csplat.scene_source import SceneSource
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[Scene]:
+def _open(path: Path) -> Iterator[SceneSource]:
     opened = open_tiles(path)
-    yield Scene(opened.header.splat_count, opened.facts, opened.models)
+    yield SceneSource(opened.header.splat_count, opened.facts, opened.models)
 
 
-def _write(path: Path, scene: Scene) -> None:
+def _write(path: Path, scene: SceneSource) -> None:
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         encode_scene(scene, path, EncodeOptions(keep_extra=True), folder=Path(folder) / "work")
 

@@ -10,19 +10,21 @@ from typing import Any
 
 from csplat.detect import KINDS
 from csplat.model import UNSPECIFIED, SplatModel
-from csplat.scene import Scene
+from csplat.scene_source import SceneSource
 
 #: Splat attributes of every format.
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 # Opening a file raises InputError if it is incomplete or not of the format, OSError if it cannot be read; so do the
 # blocks of the scene, which can be read until the context ends.
-OpenScene = Callable[[Path], AbstractContextManager[Scene]]
-OpenLevel = Callable[[Path, int], AbstractContextManager[Scene]]  # level of detail, 0 is the finest
-OpenBands = Callable[[Path, int], AbstractContextManager[Scene]]  # highest SH degree to read; the file may have more
+OpenScene = Callable[[Path], AbstractContextManager[SceneSource]]
+OpenLevel = Callable[[Path, int], AbstractContextManager[SceneSource]]  # level of detail, 0 is the finest
+OpenBands = Callable[
+    [Path, int], AbstractContextManager[SceneSource]
+]  # highest SH degree to read; the file may have more
 # Writing raises InputError if the format cannot hold the scene (too many splats, positions out of range), OSError if
 # the file cannot be written. The path appears when the file is complete.
-WriteScene = Callable[[Path, Scene], None]
+WriteScene = Callable[[Path, SceneSource], None]
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ class Format:
         """List the parts of a scene that this format cannot store, a few words each; precision is not one of them.
 
         Args:
-            facts: `facts` of a `Scene`, or a model.
+            facts: `facts` of a `SceneSource`, or a model.
         """
         lost = []
         if facts.sh_degree > self.degree:

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
+from csplat.file_source import map_file
 from csplat.formats.common import finite_scene, sh0_from_bytes
 from csplat.formats.format import Format
-from csplat.inputs import mapped
 from csplat.lint import trailing_bytes
 from csplat.model import SplatModel, normalise_quats
-from csplat.scene import BLOCK, Scene
+from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, F64
 
 Rows = NDArray[Any]
@@ -80,8 +80,8 @@ class _SectionHead(NamedTuple):
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[Scene]:
-    data = mapped(path)
+def _open(path: Path) -> Iterator[SceneSource]:
+    data = map_file(path)
     if len(data) < _HEADER_SIZE:
         raise InputError(f"{path.name} ends inside of its header")
     major, minor, most, _, _, count, level, low, high = _HEADER.unpack_from(data)
@@ -178,8 +178,8 @@ def _buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[N
 
 
 def _section_blocks(section: _Section) -> Iterator[tuple[Rows, ...]]:
-    for start in range(0, len(section.rows), BLOCK):
-        rows = section.rows[start : start + BLOCK]
+    for start in range(0, len(section.rows), BLOCK_SPLATS):
+        rows = section.rows[start : start + BLOCK_SPLATS]
         bucket = np.searchsorted(section.ends, np.arange(start, start + len(rows)), side="right")
         yield rows, section.corners[bucket], np.full((len(rows), 1), section.step)
 

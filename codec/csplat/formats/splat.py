@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.disk_files import atomic_writer
 from csplat.errors import InputError, counted
-from csplat.files import atomic_writer
+from csplat.file_source import map_file
 from csplat.formats.common import finite_scene, sh0_from_bytes
 from csplat.formats.format import Format
-from csplat.inputs import mapped
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply.columns import SH_C0
-from csplat.scene import BLOCK, Scene
+from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colours", "u1", 4), ("quats", "u1", 4)])
@@ -35,22 +35,22 @@ _PRINTABLE = np.array([32 <= byte < 127 or byte in b"\t\n\r" for byte in range(2
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[Scene]:
-    data = mapped(path)
+def _open(path: Path) -> Iterator[SceneSource]:
+    data = map_file(path)
     if len(data) % _ROW.itemsize:
         raise InputError(f"{path.name} has {len(data):,} bytes, wanted a multiple of {_ROW.itemsize} (.splat)")
     rows = np.frombuffer(data, _ROW)
 
     def blocks() -> Iterator[tuple[NDArray[Any], ...]]:
-        for start in range(0, len(rows), BLOCK):
-            yield (rows[start : start + BLOCK],)
+        for start in range(0, len(rows), BLOCK_SPLATS):
+            yield (rows[start : start + BLOCK_SPLATS],)
 
     yield finite_scene(blocks, _decode_rows, _decode_rows(np.zeros((0, 3), np.float32), rows[:0]), zero_quat=_QUAT_ZERO)
 
 
 def _doubt(path: Path) -> str:
     """Return why a file hardly consists of splats (`Format.doubt`): half of a sample has to look like splats."""
-    data = mapped(path)
+    data = map_file(path)
     if len(data) % _ROW.itemsize or not len(data):
         return ""  # the reader reports what is wrong
     rows = np.frombuffer(data, _ROW)
@@ -88,7 +88,7 @@ def _decode_rows(scales: F32, rows: NDArray[Any]) -> SplatModel:
     )
 
 
-def _write(path: Path, scene: Scene) -> None:
+def _write(path: Path, scene: SceneSource) -> None:
     with atomic_writer(path) as stream:
         for model in scene.blocks():
             rows = np.empty(len(model), _ROW)

@@ -29,14 +29,14 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from csplat.disk_files import atomic_writer
+from csplat.editing.transform import convert_axes
 from csplat.errors import InputError
-from csplat.files import atomic_writer
 from csplat.formats.common import decode_smallest_three, encode_smallest_three
 from csplat.formats.format import Format
 from csplat.lint import Finding, too_many_bands, trailing_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats
-from csplat.scene import BLOCK, Scene
-from csplat.turning import in_axes
+from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, U8
 
 #: Directions of +x, +y and +z: right, up, back.
@@ -260,21 +260,21 @@ _SH_STEP = 4  # step of SH coefficients, in units of the 256 levels
 
 
 @contextmanager
-def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
+def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
     with path.open("rb") as file:
         packed = read_spz_file(file, path.name, path.stat().st_size, any_degree=sh_degree is not None)
     degree = packed.degree if sh_degree is None else min(packed.degree, sh_degree)
 
     def blocks() -> Iterator[SplatModel]:
-        for start in range(0, packed.count, BLOCK):
-            yield decode_block(packed, slice(start, start + BLOCK), degree)
+        for start in range(0, packed.count, BLOCK_SPLATS):
+            yield decode_block(packed, slice(start, start + BLOCK_SPLATS), degree)
 
-    yield Scene(packed.count, decode_block(packed, slice(0, 0), degree), blocks, packed.findings)
+    yield SceneSource(packed.count, decode_block(packed, slice(0, 0), degree), blocks, packed.findings)
 
 
-def write_spz(path: Path, scene: Scene, *, version: int) -> None:
+def write_spz(path: Path, scene: SceneSource, *, version: int) -> None:
     """Write version 3 or 4; otherwise as `Format.write`."""
-    scene = in_axes(scene, SPZ_AXES)
+    scene = convert_axes(scene, SPZ_AXES)
     flags = ANTIALIASED if scene.facts.antialiased else 0
     packed = SpzArrays(
         path.name, version, scene.count, scene.facts.sh_degree, _choose_fraction_bits(path, scene), flags
@@ -333,7 +333,7 @@ def _decode_rotations(rotations: U8) -> F32:
     return xyzw[:, [3, 0, 1, 2]]
 
 
-def _choose_fraction_bits(path: Path, scene: Scene) -> int:
+def _choose_fraction_bits(path: Path, scene: SceneSource) -> int:
     """Choose the fractional bits of positions: enough for the median splat, and no more than fit."""
     reach, scales = 0.0, np.zeros(256, np.int64)
     for block in scene.blocks():

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.editing.up_axis import UP, unit_up, up_of
 from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.training_record import TRAINING, VIEW, TrainingRecord
 from csplat.types import F32, F64
-from csplat.upright import UP, unit_up, up_of
 
 _PREFIX = "csplat"
 _SHOWN = 80  # characters of a comment in a message

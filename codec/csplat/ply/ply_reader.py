@@ -19,9 +19,9 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import plyfile
 
+from csplat.disk_files import local_file
 from csplat.errors import InputError, counted
-from csplat.files import local_file
-from csplat.inputs import File
+from csplat.file_source import File
 from csplat.lint import Finding, refuse
 from csplat.model import SplatModel, check_sh_degree
 from csplat.ply.column_names import ColumnMap, find_columns
@@ -36,7 +36,7 @@ from csplat.ply.columns import (
 )
 from csplat.ply.comments import CommentMetadata, parse_comments, split_origin
 from csplat.ply.ply_header import SPLAT_ELEMENT, PlyHeader, parse_text_rows, read_ply_header
-from csplat.scene import BLOCK, Scene
+from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, F64
 
 _EMPTY = Finding("empty", 0, "the file holds no splats", "note")
@@ -127,7 +127,7 @@ def lint_ply(file: File, *, sh_degree: int | None = None) -> list[Finding]:
 
 
 @contextmanager
-def open_ply(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
+def open_ply(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
     """Open a PLY to be read block by block (`csplat.formats.open_scene`); otherwise as `read_ply`.
 
     A first pass finds what depends on all splats: how many are kept, an origin for doubles, the thickness of discs.
@@ -139,7 +139,7 @@ def open_ply(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
     survey = _survey(ply, findings)
     refuse(findings, strict=False)
     metadata = _empty_model(ply, survey)
-    yield Scene(survey.kept_count, metadata, partial(_model_blocks, ply, survey, keep_extra=True), findings)
+    yield SceneSource(survey.kept_count, metadata, partial(_model_blocks, ply, survey, keep_extra=True), findings)
 
 
 class PlyContent(NamedTuple):
@@ -279,7 +279,7 @@ class _Survey(NamedTuple):
 def _survey(ply: _OpenPly, findings: list[Finding]) -> _Survey:
     """Go through all rows once, appending to `findings`."""
     statistics, kept_count, means, thinnest = RowStatistics(), 0, [], math.inf
-    for block in ply.blocks(BLOCK):
+    for block in ply.blocks(BLOCK_SPLATS):
         arrays = gather_arrays([block], len(block), ply.rows.dtype, ply.columns, statistics=statistics)
         kept_count += len(arrays.means)
         thinnest = min(thinnest, float(arrays.scales[:, : len(ply.columns.scales)].min(initial=math.inf)))
@@ -303,9 +303,9 @@ def _empty_model(ply: _OpenPly, survey: _Survey) -> SplatModel:
 
 
 def _model_blocks(ply: _OpenPly, survey: _Survey, *, keep_extra: bool) -> Iterator[SplatModel]:
-    """Yield the splats that are kept, at most `BLOCK` at a time."""
+    """Yield the splats that are kept, at most `BLOCK_SPLATS` at a time."""
     start = 0
-    for block in ply.blocks(BLOCK):
+    for block in ply.blocks(BLOCK_SPLATS):
         arrays = gather_arrays(
             [block], len(block), ply.rows.dtype, ply.columns, keep_extra=keep_extra, thinnest=survey.thinnest
         )

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.disk_files import BinaryWriter, open_writer
 from csplat.errors import InputError
-from csplat.files import BinaryWriter, opened_for_writing
 from csplat.model import SplatModel, check_model
 from csplat.ply.columns import logits_of_alpha
 from csplat.ply.comments import format_comments
-from csplat.scene import Scene
+from csplat.scene_source import SceneSource
 
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are built at a time: they stay in the cache
 
@@ -51,14 +51,14 @@ def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *,
         OSError: the file cannot be written.
     """
     check_model("write_ply", model)
-    write_scene_ply(file, Scene(len(model), model.select(slice(0, 0)), lambda: iter([model])), absolute=absolute)
+    write_scene_ply(file, SceneSource(len(model), model.select(slice(0, 0)), lambda: iter([model])), absolute=absolute)
 
 
-def write_scene_ply(file: str | os.PathLike[str] | BinaryWriter, scene: Scene, *, absolute: bool = False) -> None:
+def write_scene_ply(file: str | os.PathLike[str] | BinaryWriter, scene: SceneSource, *, absolute: bool = False) -> None:
     """Write a scene block by block; otherwise as `write_ply`."""
     dtype = _row_dtype(scene.facts, absolute=absolute)
     step = max(1, _BLOCK_SIZE // dtype.itemsize)
-    with opened_for_writing(file) as stream:
+    with open_writer(file) as stream:
         stream.write(_header(scene.facts, scene.count, absolute=absolute))
         rows = np.zeros(min(step, scene.count), dtype)
         for model in scene.blocks():

@@ -20,13 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.boxes import tile_boxes
 from csplat.decoder import SceneHeader, TileReader
-from csplat.inputs import LetGo
-from csplat.memory import default_bytes
+from csplat.file_source import PageReleaser
 from csplat.model import SplatModel
-from csplat.processes import CAN_COPY, each_apart
-from csplat.scene import Scene, joined
+from csplat.scene_source import SceneSource, join_blocks
+from csplat.splat_file import tile_boxes
+from csplat.system import CAN_FORK, default_memory_bytes, map_in_processes
 from csplat.types import F64, I8, I64, Progress
 from csplat_conformance.declared_bounds.bounds_verification import (
     BoundsVerification,
@@ -84,7 +83,7 @@ def fits_memory(opened: TileReader, source_count: int, source_bytes: int, memory
     splat_bytes = _splat_bytes(opened)
     source = max(source_count * (_COMPARE_FACTOR * splat_bytes + _SPLAT_BYTES), source_bytes)
     wanted = source + opened.header.splat_count * _COMPARE_FACTOR * splat_bytes
-    return wanted <= (default_bytes() if memory_bytes is None else memory_bytes)
+    return wanted <= (default_memory_bytes() if memory_bytes is None else memory_bytes)
 
 
 def _splat_bytes(opened: TileReader) -> int:
@@ -93,7 +92,7 @@ def _splat_bytes(opened: TileReader) -> int:
 
 
 def verify_out_of_core(
-    scene: Scene,
+    scene: SceneSource,
     opened: TileReader,
     source_index: NDArray[Any] | None = None,
     *,
@@ -126,7 +125,7 @@ def verify_out_of_core(
 class _OutOfCoreComparison:
     """A `SplatComparison` of parts of both scenes. Owns the temporary file."""
 
-    scene: Scene
+    scene: SceneSource
     opened: TileReader
     memory_bytes: int | None
     sizes: PartSizes
@@ -157,7 +156,7 @@ class _OutOfCoreComparison:
     @property
     def _memory(self) -> int:
         """Memory for parts, in bytes: the limit without what the program itself takes."""
-        return (default_bytes() if self.memory_bytes is None else self.memory_bytes) - _BASE_BYTES
+        return (default_memory_bytes() if self.memory_bytes is None else self.memory_bytes) - _BASE_BYTES
 
     @property
     def _most(self) -> int:
@@ -173,7 +172,7 @@ class _OutOfCoreComparison:
         """Number of processes, each with parts that are large enough, and the number of splats per part."""
         for workers in range(os.cpu_count() or 1, 1, -1):
             most = (self._memory // workers - _WORKER_BYTES) // self._row_bytes
-            if CAN_COPY and most >= self.sizes.worth_a_process:
+            if CAN_FORK and most >= self.sizes.worth_a_process:
                 return workers, min(most, self.sizes.most)
         return 1, self._most
 
@@ -257,7 +256,7 @@ class _OutOfCoreComparison:
             model.select(rows[tiles == tile] - header.tiles[tile].start)
             for tile, model in zip(chosen.tolist(), self.opened.models(chosen.tolist()), strict=True)
         ]
-        return joined(models[0], models)
+        return join_blocks(models[0], models)
 
     # With a source index ---------------------------------------------------------------------------
 
@@ -283,7 +282,7 @@ class _OutOfCoreComparison:
         for key, group in enumerate(groups):
             self._report("measuring splats", int(firsts[key]) / count)
             models = list(self.opened.models(group))
-            decoded = joined(models[0], models)
+            decoded = join_blocks(models[0], models)
             ((source, numbers),) = self._spool.sources(key, len(decoded))
             places = np.argsort(numbers)
             parts.append((int(firsts[key]), len(decoded), measure_pairs(source, decoded, places)))
@@ -308,7 +307,7 @@ def _invert_index(source_index: NDArray[Any], source_count: int) -> NDArray[Any]
     dtype = np.uint32 if len(source_index) < 2**32 - 1 else np.uint64
     became = np.full(source_count, np.iinfo(dtype).max, dtype)
     base = source_index.base
-    let_go = LetGo(memoryview(base)) if isinstance(base, mmap) else None
+    let_go = PageReleaser(memoryview(base)) if isinstance(base, mmap) else None
     for start in range(0, len(source_index), _INDEX_BLOCK):
         part = source_index[start : start + _INDEX_BLOCK]
         became[part] = np.arange(start, start + len(part), dtype=dtype)
@@ -401,7 +400,7 @@ class PartnerSearch:
         after, counts = found.copy(), self.spool.counts()
         own = replace(self, opened=replace(self.opened, threads=1)) if self.workers > 1 else self
         cells = list(counts)
-        for cell, results in each_apart(_search_in_process, (own, found, far), cells, self.workers, copied=True):
+        for cell, results in map_in_processes(_search_in_process, (own, found, far), cells, self.workers, copied=True):
             for splats, partners in results:
                 better = (partners == FOUND) | (after[splats] == UNMATCHED)
                 after[splats[better]] = partners[better]
@@ -442,10 +441,10 @@ class PartnerSearch:
             splats.append(rows.start + np.flatnonzero(inside))
             count += len(models[-1])
             if count >= self.most:
-                yield joined(models[0], models), np.concatenate(radii), np.concatenate(splats)
+                yield join_blocks(models[0], models), np.concatenate(radii), np.concatenate(splats)
                 models, radii, splats, count = [], [], [], 0
         if models:
-            yield joined(models[0], models), np.concatenate(radii), np.concatenate(splats)
+            yield join_blocks(models[0], models), np.concatenate(radii), np.concatenate(splats)
 
     @cached_property
     def _boxes(self) -> tuple[F64, F64]:

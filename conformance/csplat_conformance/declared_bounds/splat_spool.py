@@ -11,7 +11,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.files import check_room
+from csplat.disk_files import check_free_space
 from csplat.system import read_into
 from csplat.types import I64
 from csplat_conformance.declared_bounds.measurement import Source
@@ -162,5 +162,5 @@ def open_spool(layout: RecordLayout, count: int) -> SplatSpool:
         OSError: the file cannot be created.
     """
     folder = tempfile.gettempdir()
-    check_room(folder, count * layout.dtype.itemsize, "the source is compared: TMPDIR names another folder")
+    check_free_space(folder, count * layout.dtype.itemsize, "the source is compared: TMPDIR names another folder")
     return SplatSpool(tempfile.TemporaryFile(), layout)

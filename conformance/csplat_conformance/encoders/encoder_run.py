@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from csplat import _spec
-from csplat.files import atomic_writer
+from csplat.disk_files import atomic_writer
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.encoders.encoder_inputs import EncoderInput
 from csplat_conformance.fields import read_fields

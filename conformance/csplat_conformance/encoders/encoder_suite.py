@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from csplat.decoder import DecodedScene
+from csplat.disk_files import atomic_writer
 from csplat.errors import InputError
-from csplat.files import atomic_writer
 from csplat_conformance.conformance_report import ConformanceReport, Outcome, Status
 from csplat_conformance.encoders.encoder_inputs import PSNR_MIN, EncoderInput, all_inputs
 from csplat_conformance.encoders.encoder_run import (

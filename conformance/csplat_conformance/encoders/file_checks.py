@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.decoder import DecodedScene, decode_scene
+from csplat.disk_files import read_array
 from csplat.errors import CsplatError, InputError
-from csplat.files import read_array
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.types import F64, I64
 from csplat_conformance.conformance_report import Status

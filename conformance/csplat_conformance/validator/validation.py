@@ -9,7 +9,7 @@ from functools import partial
 from mmap import mmap
 
 from csplat import _spec
-from csplat.inputs import LetGo
+from csplat.file_source import PageReleaser
 from csplat.types import null_progress
 from csplat_conformance.validator.ancillary import read_declared_bounds, read_text
 from csplat_conformance.validator.codebooks import CodebookEntries, read_codebook
@@ -220,7 +220,7 @@ def _read_tile_chunks(
     findings: Findings,
     progress: Callable[[str, float], None],
 ) -> None:
-    let_go = LetGo(view)
+    let_go = PageReleaser(view)
     for tile in tiles:
         progress(_STAGE, tile.place / len(tiles))
         let_go.after(sum(chunk.size for chunk in tile.chunks))

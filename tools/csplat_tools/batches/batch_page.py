@@ -16,7 +16,7 @@ import numpy as np
 from csplat.errors import CsplatError
 from csplat.formats import detect_format, open_scene
 from csplat.model import SplatModel
-from csplat.scene import joined
+from csplat.scene_source import join_blocks
 from csplat.training_record import TrainingRecord
 from csplat_tools.batches.journal import JOURNAL, Record
 from csplat_tools.batches.scene_job import THUMBNAILS
@@ -187,4 +187,4 @@ def _read_every_nth(path: Path) -> SplatModel:
             first = -place.start % step
             kept = block.select(slice(first, None, step))
             blocks.append(replace(kept, extra={}, scales=kept.scales + np.float32(0.5 * np.log(step))))
-        return joined(facts, blocks)
+        return join_blocks(facts, blocks)

@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 from uuid import uuid4
 
-from csplat.errors import InputError, LimitError, missing
-from csplat.memory import available_bytes
-from csplat.remote import is_url
-from csplat.system import core_count
+from csplat.errors import InputError, LimitError, missing_package
+from csplat.remote_store import is_url
+from csplat.system import available_memory_bytes, core_count
 from csplat_tools.batches.batch_page import PAGE, write_batch_page
 from csplat_tools.batches.batch_scenes import Task, find_tasks
 from csplat_tools.batches.batch_worker import Worker, WorkerLostError
@@ -147,7 +146,7 @@ def batch(
             journal.begin([one.task.output for one in jobs if _may_begin(one)])
             if dask is None:
                 budget = MemoryBudget(
-                    memory_bytes, int(_FREE_SHARE * available_bytes()), has_option="memory" in options
+                    memory_bytes, int(_FREE_SHARE * available_memory_bytes()), has_option="memory" in options
                 )
                 work = partial(run_job, gate=budget.gate)
                 ended = run_jobs(jobs, [first, *(Worker() for _ in range(count - 1))], work, budget.stop)
@@ -402,7 +401,7 @@ def run_on_cluster(jobs: Sequence[SceneJob], dask: Any) -> Generator[tuple[Recor
     try:
         import distributed
     except ModuleNotFoundError as error:
-        raise missing(error, "dask[distributed]", extra="scale") from None
+        raise missing_package(error, "dask[distributed]", extra="scale") from None
     dasks: Any = distributed  # the package has no types
     with dasks.Client(dask, set_as_default=False) if isinstance(dask, str) else nullcontext(dask) as client:
         run = uuid4().hex  # Dask identifies tasks by name; those of an earlier batch must not be taken for these

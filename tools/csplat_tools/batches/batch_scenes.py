@@ -12,10 +12,10 @@ from fnmatch import fnmatch
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
+from csplat.disk_files import read_text
 from csplat.errors import InputError
-from csplat.files import read_text
 from csplat.formats import formats
-from csplat.remote import is_url
+from csplat.remote_store import is_url
 from csplat.system import split_words
 from csplat_tools.scene_files import FOLDER_NAMES
 

@@ -15,9 +15,9 @@ from urllib.parse import unquote
 
 from csplat import __version__
 from csplat.encoder import EncodeOptions
-from csplat.errors import CsplatError, StoreError, missing
+from csplat.errors import CsplatError, StoreError, missing_package
 from csplat.formats import detect_format
-from csplat.remote import is_url, store_of
+from csplat.remote_store import is_url, open_store
 from csplat_tools.batches.batch_scenes import Task
 from csplat_tools.batches.batch_worker import Worker, WorkerLostError, remove_left
 from csplat_tools.batches.journal import Record
@@ -219,7 +219,7 @@ def _local_source(source: str) -> Iterator[Path]:
         return
     with TemporaryDirectory(prefix="csplat-") as folder:
         local = Path(folder) / (PurePosixPath(source.partition("?")[0]).name or "scene")
-        with closing(store_of(source)) as store, local.open("wb") as copy:
+        with closing(open_store(source)) as store, local.open("wb") as copy:
             for start in range(0, store.size, _PART_BYTES):
                 copy.writelines(store.read([(start, min(start + _PART_BYTES, store.size))]))
         yield local
@@ -242,7 +242,7 @@ def _send(local: Path, url: str) -> None:
     try:
         from fsspec.core import url_to_fs
     except ModuleNotFoundError as error:
-        raise missing(error, extra="remote") from None
+        raise missing_package(error, extra="remote") from None
     try:
         files, place = url_to_fs(url)
         files.put(str(local), place)

@@ -20,7 +20,7 @@ from typing import Annotated, Any, ClassVar, Literal, NoReturn, ParamSpec, TypeV
 import typer
 from typer.models import OptionInfo
 
-from csplat.errors import CsplatError, InputError, missing
+from csplat.errors import CsplatError, InputError, missing_package
 from csplat.formats import assume_format
 from csplat.lint import Finding
 from csplat.types import Progress
@@ -228,7 +228,7 @@ def _imported(kinds: Sequence[str]) -> list[type]:
     try:
         return [getattr(import_module(module), name) for module, _, name in (kind.partition(":") for kind in kinds)]
     except ModuleNotFoundError as error:
-        raise missing(error) from None
+        raise missing_package(error) from None
 
 
 def _names(kind: type, taken: Collection[str]) -> list[tuple[str, type]]:

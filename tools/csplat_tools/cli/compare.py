@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from csplat.disk_files import read_array
 from csplat.errors import InputError, counted
-from csplat.files import read_array
 from csplat_tools.cli.command import OutputOptions, command
 from csplat_tools.cli.shared_options import Lpips, ModeWord, SplitOption, ViewOptions, parse_bytes
 from csplat_tools.console import format_bytes, format_table

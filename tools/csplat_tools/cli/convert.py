@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
+from csplat.editing.transform import DEFAULT_AXES
 from csplat.errors import counted
 from csplat.model import UNSPECIFIED
-from csplat.turning import USUAL
 from csplat_tools.cli.command import OptionGroup, OutputOptions, command
 from csplat_tools.cli.shared_options import OrientationOptions, ShDegree, parse_axes, parse_numbers
 from csplat_tools.console import format_bytes, format_table, note
@@ -129,7 +129,7 @@ def convert(
         note(f"lost on the way: {made.losses()}")
     before, after = made.axes
     if before != after:
-        said = f"{before} axes" if before != UNSPECIFIED else f"no axes, taken as {USUAL} (--axes says others)"
+        said = f"{before} axes" if before != UNSPECIFIED else f"no axes, taken as {DEFAULT_AXES} (--axes says others)"
         out.remark(f"turned to {after} axes, as {made.target_format} has them; the source has {said}")
     size = "a size that depends on the scene" if made.size_bytes is None else format_bytes(made.size_bytes)
     out.remark(

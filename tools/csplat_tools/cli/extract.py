@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from csplat.errors import counted
-from csplat.opened import open as opened
+from csplat.splat_file import open as opened
 from csplat_tools.cli.command import OutputOptions, command
 from csplat_tools.cli.shared_options import parse_numbers
 from csplat_tools.console import format_bytes

@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
+from csplat.editing.merge import merge as merged
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError, counted
-from csplat.merging import merge as merged
 from csplat_tools.cli.command import OutputOptions, command
 from csplat_tools.cli.shared_options import Preset
 from csplat_tools.console import format_bytes

@@ -10,10 +10,10 @@ from typing import Annotated, Any, ClassVar
 
 import typer
 
+from csplat.editing.up_axis import Direction, unit_up
 from csplat.encoder import PRESETS, EncodeOptions, PresetName
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_axes
-from csplat.upright import Direction, unit_up
 from csplat_render import Mode
 from csplat_render.virtual_cameras import estimate_up
 from csplat_tools.cli.command import LibrarySettings, OptionGroup, OutputOptions, chosen

@@ -12,12 +12,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat import scene as scenes
+from csplat import scene_source as scenes
 from csplat.decoder import DeclaredBounds, decode, open_tiles
+from csplat.disk_files import check_free_space
 from csplat.errors import CsplatError, InputError
-from csplat.files import check_room
 from csplat.model import SplatModel
-from csplat.scene import Scene
+from csplat.scene_source import SceneSource
 from csplat.types import F32, Progress, null_progress
 from csplat_conformance.declared_bounds import Source, find_partners, lattice_radii, measure_pairs, verify_out_of_core
 from csplat_conformance.declared_bounds.measurement import merge_errors
@@ -139,10 +139,10 @@ def attribute_errors_out_of_core(
     return AttributeErrors("order", other.count, 0, found)
 
 
-def _beside(a: Scene, b: Scene, progress: Progress | None) -> Iterator[tuple[int, SplatModel, SplatModel]]:
+def _beside(a: SceneSource, b: SceneSource, progress: Progress | None) -> Iterator[tuple[int, SplatModel, SplatModel]]:
     """Yield splats of two scenes of equal number, some at a time, with the number of the first of them."""
-    first = scenes.watched(a, "measuring splats", progress or null_progress).blocks()
-    second = scenes.watched(b, "", null_progress).blocks()
+    first = scenes.with_progress(a, "measuring splats", progress or null_progress).blocks()
+    second = scenes.with_progress(b, "", null_progress).blocks()
     start, ours, theirs = 0, a.facts, b.facts
     while start < a.count:
         ours, theirs = ours if len(ours) else next(first), theirs if len(theirs) else next(second)
@@ -332,7 +332,7 @@ def _measured(
         if one.memory_bytes < one.least_bytes:
             bound, least = (one.memory_bytes + kept) / 1e6, (one.least_bytes + kept) / 1e6
             raise InputError(f"{bound:,.0f} MB of memory are too little to draw these scenes, which want {least:,.0f}")
-    check_room(
+    check_free_space(
         tempfile.gettempdir(),
         max(first.disk_bytes, second.disk_bytes),
         "pictures are drawn: TMPDIR names another folder",

@@ -19,11 +19,11 @@ from csplat.decoder import (
     read_metadata,
     read_options,
 )
+from csplat.editing.up_axis import UP, up_of
 from csplat.errors import FormatError
 from csplat.formats import format_by_name, open_scene
 from csplat.model import SplatModel
 from csplat.training_record import TRAINING, VIEW, TrainingRecord
-from csplat.upright import UP, up_of
 from csplat_tools.console import finite_or_none, format_bytes
 from csplat_tools.file_streams import local_path
 from csplat_tools.scene_files import findings_as_json, size_on_disk

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from csplat import formats
 from csplat.decoder import decode, open_tiles
-from csplat.files import read_array
+from csplat.disk_files import read_array
 from csplat.model import MAX_SH_DEGREE
 from csplat.types import Progress
 from csplat_conformance.declared_bounds import (

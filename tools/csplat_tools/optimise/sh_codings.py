@@ -9,7 +9,7 @@ import numpy as np
 
 from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
-from csplat.scene import without_bands
+from csplat.scene_source import drop_bands
 from csplat_tools.optimise.candidates import Candidate, CodingChoice, Subset
 from csplat_tools.optimise.precision_search import PrecisionSearch
 
@@ -120,7 +120,7 @@ class CodingSearch:
         found: set[int] = set()
         for degree in reversed(range(self._degree)):
             if degree not in self._truncated:
-                self._truncated[degree] = solver.trials.validation_scorer.psnr(without_bands(self.source, degree))
+                self._truncated[degree] = solver.trials.validation_scorer.psnr(drop_bands(self.source, degree))
             shown = self._truncated[degree]
             if shown <= wanted + _NONE_DROPPED:
                 break  # fewer bands have a lower PSNR

@@ -20,12 +20,12 @@ from urllib.parse import quote, unquote, urlencode, urlsplit
 
 from csplat._spec import ERROR_TRAILING, ERROR_TRUNCATED
 from csplat.decoder import SceneHeader, decode, read_header
+from csplat.editing.up_axis import Direction
 from csplat.encoder import EncodeOptions, PresetName, encode_with_report
 from csplat.errors import CsplatError, FormatError, InputError
 from csplat.lint import Finding
 from csplat.model import UNSPECIFIED
 from csplat.types import Progress
-from csplat.upright import Direction
 from csplat_render.camera_files import load_cameras
 from csplat_render.virtual_cameras import estimate_up
 from csplat_tools.file_streams import STANDARD_STREAM, is_csplat, local_path, mapped_csplat

@@ -14,7 +14,7 @@ import numpy as np
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.scene import without_bands
+from csplat.scene_source import drop_bands
 from csplat.types import F32, Progress
 from csplat_render import Camera
 from csplat_render.refit import fit_colours
@@ -81,7 +81,7 @@ class SourceRenders:
         """
         if sh_degree > model.sh_degree:
             raise InputError(f"SH of degree {model.sh_degree} cannot be brought to degree {sh_degree}")
-        low = without_bands(model, sh_degree)
+        low = drop_bands(model, sh_degree)
         found, _ = fit_colours(
             low, self.cameras, self.wanted, steps=_STEPS, least_gain=0.01, background=self.background,
             antialiased=low.antialiased, threads=self.threads, progress=progress,

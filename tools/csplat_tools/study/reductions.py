@@ -11,7 +11,7 @@ from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, EncodePlan, EncodeResult, Origin, encode_tiles
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
-from csplat.scene import without_bands
+from csplat.scene_source import drop_bands
 from csplat.types import I64, Progress
 from csplat_render.virtual_cameras import surface_areas
 from csplat_tools.study.attribute_codebooks import Clustered, KMeans, attribute_floats, cluster_attributes, raw_bytes
@@ -118,7 +118,7 @@ def reduce_with(
         said["prune_opacity"] = reduction.prune_opacity
     if degree < source.sh_degree:
         said |= {"sh_degree": degree, "sh": "distilled" if reduction.distil else "truncated"}
-    model = without_bands(model, degree) if teacher is None else teacher.taught(model, degree, progress)
+    model = drop_bands(model, degree) if teacher is None else teacher.taught(model, degree, progress)
     if teacher is not None:
         said["views"] = len(teacher.cameras)
     clustered = None

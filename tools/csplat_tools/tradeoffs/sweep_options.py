@@ -11,7 +11,7 @@ from typing import Any
 
 from csplat.encoder import PRESETS, PresetName
 from csplat.errors import InputError
-from csplat.inputs import File
+from csplat.file_source import File
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat_render import Mode

@@ -9,7 +9,7 @@ from typing import Any
 
 from csplat.encoder import PRESETS, EncodeOptions, EncodeResult, encode_with_report
 from csplat.errors import CsplatError, InputError, counted
-from csplat.inputs import File
+from csplat.file_source import File
 from csplat.model import SplatModel
 from csplat.types import Progress, null_progress
 from csplat_render.kernels import thread_count

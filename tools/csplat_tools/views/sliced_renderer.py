@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.scene import BLOCK, Scene, scene_of
+from csplat.scene_source import BLOCK_SPLATS, SceneSource, source_from_model
 from csplat.types import F32, F64, Progress
 from csplat_conformance.declared_bounds import Source
 from csplat_conformance.declared_bounds.splat_spool import RecordLayout, SplatSpool, open_spool
@@ -51,7 +51,7 @@ class SlicedScene:
         slice_bytes: least bytes of memory for a slice.
     """
 
-    scene: Scene
+    scene: SceneSource
     sample: SplatModel
     every: int
     memory_bytes: int
@@ -90,7 +90,7 @@ class SlicedScene:
 
     @property
     def _beside(self) -> int:
-        return _BASE_BYTES + _BLOCKS * BLOCK * self.layout.dtype.itemsize
+        return _BASE_BYTES + _BLOCKS * BLOCK_SPLATS * self.layout.dtype.itemsize
 
     def renderer(
         self, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
@@ -122,7 +122,7 @@ class _SlicedRender:
 
     def drawn(self) -> RenderResult:
         """Draw all slices, and return the render."""
-        limits = self._limits(map(_source, scene_of(self._scene.sample).blocks()), 1, self._scene.every)
+        limits = self._limits(map(_source, source_from_model(self._scene.sample).blocks()), 1, self._scene.every)
         self._draw(_source(self._scene.scene.facts))  # so that there is a render even if no splat is visible
         self._sort_and_draw(self._blocks, self._scene.scene.count, limits, first=True)
         self._tell(1.0)
@@ -182,7 +182,9 @@ class _SlicedRender:
                         self._draw(part)
                 else:
                     every = -(-number // _LOOKED_AT)
-                    self._sort_and_draw(partial(read, BLOCK), number, self._limits(read(BLOCK), every, every, least=2))
+                    self._sort_and_draw(
+                        partial(read, BLOCK_SPLATS), number, self._limits(read(BLOCK_SPLATS), every, every, least=2)
+                    )
 
     def _read(self, spool: SplatSpool, key: int, most: int) -> Iterator[Source]:
         return (source for source, _ in spool.sources(key, most))

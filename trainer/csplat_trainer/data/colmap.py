@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from csplat.disk_files import read_text
 from csplat.errors import InputError, counted
-from csplat.files import read_text
-from csplat.inputs import stand_in
+from csplat.file_source import describe_substitute
 from csplat.types import F32, F64
 from csplat_trainer.data.dataset import (
     Shot,
@@ -386,7 +386,7 @@ class _BinaryFile:
             self._data = path.read_bytes()
         except OSError as error:
             raise InputError(f"{path}: {error.strerror or error}") from error
-        instead = stand_in(self._data[:64])
+        instead = describe_substitute(self._data[:64])
         if instead:
             raise InputError(f"{path} is {instead}")
         self._path = path

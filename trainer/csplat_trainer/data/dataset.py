@@ -11,14 +11,14 @@ import numpy as np
 from PIL import ExifTags, Image
 from scipy.ndimage import map_coordinates
 
+from csplat.disk_files import read_json, read_text
+from csplat.editing.up_axis import Direction
 from csplat.errors import InputError, counted
-from csplat.files import read_json, read_text
 from csplat.lint import Finding
 from csplat.model import UNSPECIFIED
 from csplat.ply.ply_reader import parse_ply
 from csplat.training_record import TrainingRecord
 from csplat.types import F32, F64, U8, Mask
-from csplat.upright import Direction
 from csplat_render.camera import DEFAULT_NEAR, Camera, camera_outliers, nearest_point
 from csplat_trainer.data.image_files import abbreviate, match_names, normalise_name
 from csplat_trainer.data.image_pixels import MASK_THRESHOLD, ImageHeader, mask_values, open_image, rgb_pixels

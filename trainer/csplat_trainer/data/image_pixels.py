@@ -23,7 +23,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageFile, TiffImagePlugin, UnidentifiedImageError
 
 from csplat.errors import InputError
-from csplat.inputs import stand_in
+from csplat.file_source import describe_substitute
 from csplat.types import F64, U8
 
 #: A mask's values from which on pixels count.
@@ -274,7 +274,7 @@ def _refuse_by_name(path: Path) -> None:
             head = file.read(_HEAD_SIZE)
     except OSError:
         return
-    instead = "empty" if not head else stand_in(head)
+    instead = "empty" if not head else describe_substitute(head)
     if instead:
         raise InputError(f"{path} is {instead}")
     name = next((name for at, magic, name in _UNREAD if head[at:].startswith(magic)), None)

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from csplat.disk_files import read_json
 from csplat.errors import InputError, counted
-from csplat.files import read_json
 from csplat.types import F32, F64
 from csplat_render.camera_files import (
     PERSPECTIVES,

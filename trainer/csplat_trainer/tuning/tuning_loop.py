@@ -19,9 +19,9 @@ from numpy.random import PCG64, Generator
 from numpy.typing import NDArray
 
 from csplat.archives import read_archive
+from csplat.disk_files import atomic_writer
 from csplat.encoder import DecodedValues, FixedQuantisation, FreeValues
 from csplat.errors import InputError
-from csplat.files import atomic_writer
 from csplat.types import F32
 from csplat_render.conventions import UncheckedSplats
 from csplat_render.metrics import psnr_of_mse

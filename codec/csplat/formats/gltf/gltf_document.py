@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
-from csplat.inputs import mapped, stand_in
+from csplat.file_source import describe_substitute, map_file
 from csplat.types import F32, F64
 
 JsonPath = tuple[str | int, ...]  # place of a value in the JSON: ("nodes", 3, "mesh")
@@ -223,10 +223,10 @@ class GltfDocument:
                 same = [path.name for path in folder.iterdir() if path.name.casefold() == target.name.casefold()]
                 hint = f", but {_shorten(same[0])}: rename it" if same else ""
                 raise self.error(place, f"there is no file {_shorten(uri)}{hint}")
-            data = memoryview(mapped(target))
+            data = memoryview(map_file(target))
         except (OSError, RuntimeError) as error:  # the latter of links in a circle
             raise self.error(place, f"{_shorten(uri)} cannot be read: {error}") from None
-        if instead := stand_in(bytes(data[:64])):
+        if instead := describe_substitute(bytes(data[:64])):
             raise self.error(place, f"{_shorten(uri)} is {instead}")
         return data
 
@@ -342,7 +342,7 @@ def open_document(path: Path) -> GltfDocument:
         InputError: the file is no glTF, incomplete, or of another version.
         OSError: the file cannot be read.
     """
-    data = memoryview(mapped(path))
+    data = memoryview(map_file(path))
     text, binary, tail = _split_chunks(path, data) if data[:4] == MAGIC else (data, None, 0)
     try:
         root = json.loads(bytes(text))  # UTF-8, with or without a mark, or UTF-16

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.editing.transform import axes_rotation, rotate_scene, sh_bands, sphere_lattice, stretch_scene
 from csplat.errors import InputError, counted
 from csplat.formats.common import RangeStatistics, classify_opacities, classify_scales
 from csplat.formats.gltf.gltf_document import Accessor, GltfDocument, JsonPath, PlacedPrimitive, open_document
@@ -33,8 +34,7 @@ from csplat.lint import Finding, too_many_bands, trailing_bytes
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply.columns import SH_C0, RowStatistics, alpha_of_logits, count_huge_rows, list_findings
 from csplat.ply.comments import CommentMetadata, parse_comments
-from csplat.scene import BLOCK, Scene
-from csplat.turning import axes_rotation, sh_bands, sphere_lattice, stretched, turned
+from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, F64
 
 #: Directions of +x, +y and +z: left, up, front.
@@ -204,8 +204,8 @@ class _GltfReading:
             opacity.
         """
         bad = infinite = 0
-        for start in range(0, count, BLOCK):
-            rows = slice(start, start + BLOCK)
+        for start in range(0, count, BLOCK_SPLATS):
+            rows = slice(start, start + BLOCK_SPLATS)
             good, largest = _finite_rows(arrays, rows)
             values = {name: arrays[name].values(rows) for name in ("SCALE", "OPACITY")}
             quats = arrays["ROTATION"].rows[rows]
@@ -258,7 +258,9 @@ class _GltfReading:
 
         def block(rows: slice) -> SplatModel:
             model = decode_block(packed, rows, degree)
-            return replace(model if stored else turned(model, rotation), coordinate_system=AXES, antialiased=False)
+            return replace(
+                model if stored else rotate_scene(model, rotation), coordinate_system=AXES, antialiased=False
+            )
 
         return block, packed.count
 
@@ -271,8 +273,8 @@ class _GltfReading:
         if len(numbers) == 6 and packed.count and all(type(one) in (int, float) for one in numbers):
             wanted = np.array(numbers, np.float64).reshape(2, 3)
             low, high = np.full(3, np.inf), np.full(3, -np.inf)
-            for start in range(0, packed.count, BLOCK):
-                means = decode_means(packed, slice(start, start + BLOCK))
+            for start in range(0, packed.count, BLOCK_SPLATS):
+                means = decode_means(packed, slice(start, start + BLOCK_SPLATS))
                 low, high = np.minimum(low, means.min(axis=0)), np.maximum(high, means.max(axis=0))
             both = np.stack([low, high])
             there = np.sort(both @ rotation.T, axis=0)
@@ -283,7 +285,7 @@ class _GltfReading:
 
 
 @contextmanager
-def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
+def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
     """Open a file (`Format.open`, `Format.open_bands`)."""
     file = open_document(path)
     reading = _GltfReading(
@@ -310,8 +312,8 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
 
     def blocks() -> Iterator[SplatModel]:
         for one in instances:
-            for start in range(0, one.count, BLOCK):
-                rows = slice(start, min(start + BLOCK, one.count))
+            for start in range(0, one.count, BLOCK_SPLATS):
+                rows = slice(start, min(start + BLOCK_SPLATS, one.count))
                 try:
                     block = one.decode(rows)
                     if len(block):
@@ -319,7 +321,7 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
                 except InputError as error:
                     raise InputError(f"{path.name}, splats {rows.start} to {rows.stop - 1}: {error}") from None
 
-    yield Scene(reading.count - reading.statistics.nonfinite, facts, blocks, reading.findings)
+    yield SceneSource(reading.count - reading.statistics.nonfinite, facts, blocks, reading.findings)
 
 
 def _conclude(reading: _GltfReading) -> None:
@@ -425,7 +427,7 @@ def _pad_bands(block: SplatModel, degree: int) -> SplatModel:
 def _place_block(block: SplatModel, instance: _Instance, facts: SplatModel) -> SplatModel:
     """Transform some splats to their place in the scene."""
     if not np.array_equal(instance.linear, np.eye(3)):
-        block = stretched(block, instance.linear)
+        block = stretch_scene(block, instance.linear)
     offset = instance.translation - np.array(facts.origin)
     if offset.any():
         with np.errstate(over="ignore"):

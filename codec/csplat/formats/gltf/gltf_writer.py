@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.disk_files import atomic_writer
+from csplat.editing.transform import convert_axes, scale_scene
 from csplat.errors import InputError
-from csplat.files import atomic_writer
 from csplat.formats.gltf.gltf_document import BIN, GLB_HEAD, JSON, MAGIC
 from csplat.formats.gltf.gltf_reader import AXES, COLOURS, EXTENSION, sh_names
 from csplat.model import SplatModel
 from csplat.ply.comments import format_comments
-from csplat.scene import Scene
-from csplat.turning import in_axes, scaled
+from csplat.scene_source import SceneSource
 from csplat.types import F32, F64
 
 _SH_C0 = 0.28209479177387814
@@ -27,7 +27,7 @@ _FLOAT, _BYTE, _ARRAY_BUFFER = 5126, 5121, 34962
 _LARGEST_FILE = (1 << 32) - 1  # bytes of a .glb: its length is a u32
 
 
-def write_gltf(path: Path, scene: Scene) -> None:
+def write_gltf(path: Path, scene: SceneSource) -> None:
     """Write a scene (`Format.write`)."""
     if path.suffix.lower() == ".gltf":
         raise InputError(f"{path.name}: glTF is written as one file, name it {path.with_suffix('.glb').name}")
@@ -36,10 +36,10 @@ def write_gltf(path: Path, scene: Scene) -> None:
     unit = scene.facts.unit_metres
     if unit not in (None, 1.0):
         before, metres = scene, float(unit)
-        scene = Scene(
-            scene.count, scaled(scene.facts, metres), lambda: (scaled(one, metres) for one in before.blocks())
+        scene = SceneSource(
+            scene.count, scale_scene(scene.facts, metres), lambda: (scale_scene(one, metres) for one in before.blocks())
         )
-    scene = in_axes(scene, AXES)
+    scene = convert_axes(scene, AXES)
     attributes = _list_attributes(scene.facts.sh_degree)
     lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
     for block in scene.blocks():
@@ -109,7 +109,7 @@ def _point_colours(model: SplatModel) -> NDArray[np.uint8]:
 
 
 def _build_json(
-    scene: Scene, attributes: list[_Attribute], offsets: list[int], bounds: tuple[F64, F64]
+    scene: SceneSource, attributes: list[_Attribute], offsets: list[int], bounds: tuple[F64, F64]
 ) -> dict[str, Any]:
     facts = scene.facts
     asset: dict[str, Any] = {"version": "2.0", "generator": "csplat"}

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.archives import DAMAGED, scenes_of
-from csplat.errors import InputError, missing
-from csplat.inputs import stand_in
+from csplat.errors import InputError, missing_package
+from csplat.file_source import describe_substitute
 from csplat.lint import Finding
 
 _LARGEST_JSON = 1 << 25  # bytes
@@ -151,7 +151,7 @@ class SogParts:
                 data = stream.read(most + 1)
             if len(data) > most:
                 self.refuse(f"{name[:80]} has more than {most:,} bytes")
-        if instead := stand_in(data[:64]):
+        if instead := describe_substitute(data[:64]):
             self.refuse(f"{name[:80]} is {instead}")
         return data
 
@@ -340,7 +340,7 @@ def decode_webp(parts: SogParts, name: str, data: bytes, fits: Any) -> NDArray[n
         from PIL.Image import DecompressionBombError
         from PIL.WebPImagePlugin import WebPImageFile  # Image.open loads all formats that Pillow knows
     except ModuleNotFoundError as error:
-        raise missing(error, "Pillow") from None
+        raise missing_package(error, "Pillow") from None
     if _is_lossy(data):
         parts.refuse(
             f"{name} is a lossy WebP, expected a lossless one: its codes are changed; take the file as exported"

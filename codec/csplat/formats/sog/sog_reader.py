@@ -22,7 +22,7 @@ from csplat.formats.sog.sog_files import JsonValue, SogParts, decode_webp, find_
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply.columns import alpha_of_logits
-from csplat.scene import BLOCK, Scene
+from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, U8, U16
 
 _MAX_OFFSET = 1 << 40  # splats
@@ -32,14 +32,14 @@ _Range = tuple[int, int, int]  # file index, first splat, end
 
 
 @contextmanager
-def open_sog(path: Path, level: int = 0) -> Iterator[Scene]:
+def open_sog(path: Path, level: int = 0) -> Iterator[SceneSource]:
     """Open a file or folder (`Format.open`, `Format.open_level`)."""
     parts, name = find_parts(path)
     with parts.held():
         yield _open_scene(path, parts, name, level)
 
 
-def _open_scene(path: Path, parts: SogParts, name: str, level: int) -> Scene:
+def _open_scene(path: Path, parts: SogParts, name: str, level: int) -> SceneSource:
     meta = parts.json(name)
     if isinstance(meta.value, dict) and not any(one in meta for one in _KEYS):
         where = folder_refusal(parts.path) if parts.folder is None else zip_refusal(path)
@@ -59,7 +59,7 @@ def _open_scene(path: Path, parts: SogParts, name: str, level: int) -> Scene:
         for arrays in images.blocks(degree):
             yield replace(facts, **arrays)
 
-    return Scene(sog.count, facts, blocks, [*parts.findings, *_list_findings(images)])
+    return SceneSource(sog.count, facts, blocks, [*parts.findings, *_list_findings(images)])
 
 
 def _empty_model(degree: int, *, antialiased: bool, flat: bool) -> SplatModel:
@@ -83,7 +83,7 @@ def _list_findings(images: SogImages) -> list[Finding]:
     return [Finding("zero-quats", images.zeros, text, "repair")]
 
 
-def _open_streamed(parts: SogParts, meta: JsonValue, level: int) -> Scene:
+def _open_streamed(parts: SogParts, meta: JsonValue, level: int) -> SceneSource:
     """Open a level of streamed SOG and its environment, which are read one file at a time."""
     names, leaves = _read_leaves(parts, meta)
     last = max([max(one) for one in leaves], default=0)
@@ -133,7 +133,7 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int) -> Scene:
         sum(stop - start for _, start, stop in (_range_at(leaf, one) for leaf in leaves)) for one in range(last + 1)
     ]
     around = count - inside[level]
-    return Scene(count, facts, blocks, findings, levels=tuple(one + around for one in inside))
+    return SceneSource(count, facts, blocks, findings, levels=tuple(one + around for one in inside))
 
 
 def _read_leaves(parts: SogParts, meta: JsonValue) -> tuple[list[str], list[dict[int, _Range]]]:
@@ -361,10 +361,10 @@ class SogImages:
         return cls(sog, low | high << np.uint16(8), quats, scales, sh0, labels, palette, int(none.sum()))
 
     def blocks(self, degree: int) -> Iterator[dict[str, Any]]:
-        """Yield the arrays of a model, at most `BLOCK` splats at a time, with zeros for missing SH up to a degree."""
+        """Yield arrays of at most `BLOCK_SPLATS` splats, with zeros for missing SH up to a degree."""
         sog, missing = self.sog, COEFFICIENTS[degree] - self.palette.shape[1]
-        for start in range(0, sog.count, BLOCK):
-            yield self._block(slice(start, start + BLOCK), missing)
+        for start in range(0, sog.count, BLOCK_SPLATS):
+            yield self._block(slice(start, start + BLOCK_SPLATS), missing)
 
     def _block(self, part: slice, missing: int) -> dict[str, Any]:
         sog, codes = self.sog, self.quats[part]

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.disk_files import atomic_writer
 from csplat.encoder.kmeans import assign, cluster
-from csplat.errors import InputError, missing
-from csplat.files import atomic_writer
+from csplat.errors import InputError, missing_package
 from csplat.formats.common import encode_smallest_three, sorted_along_curve
 from csplat.formats.sog.sog_reader import ENTRIES, LEAST_TAG
 from csplat.model import SplatModel
-from csplat.scene import Scene, joined
+from csplat.scene_source import SceneSource, join_blocks
 from csplat.types import F32, F64, U8, U32
 
 _LEAST_WEIGHT = 1e-3  # relative to a splat of opacity 1 and median area
@@ -38,7 +38,7 @@ _SAMPLE = 1 << 20  # splats from which codebooks and palette are computed
 _CHANNELS = {"means_l.webp": 3, "means_u.webp": 3, "quats.webp": 4, "scales.webp": 3, "sh0.webp": 4}
 
 
-def write_sog(path: Path, scene: Scene) -> None:
+def write_sog(path: Path, scene: SceneSource) -> None:
     """Write a zip or, for a path that ends in meta.json, files next to it (`Format.write`).
 
     Raises:
@@ -61,7 +61,7 @@ def write_sog(path: Path, scene: Scene) -> None:
                 archive.writestr(zipfile.ZipInfo(name, _DATE), data)
 
 
-def _encode_files(scene: Scene) -> Iterator[tuple[str, bytes]]:
+def _encode_files(scene: SceneSource) -> Iterator[tuple[str, bytes]]:
     """Yield each file, name and bytes. Memory holds 17 bytes per splat, 21 with SH."""
     count = scene.count
     width = max(1, math.ceil(math.sqrt(count) / 4)) * 4
@@ -114,7 +114,7 @@ def _encode_files(scene: Scene) -> Iterator[tuple[str, bytes]]:
     yield "meta.json", json.dumps(meta, separators=(",", ":")).encode()
 
 
-def _sample(scene: Scene) -> tuple[F64, F64, SplatModel]:
+def _sample(scene: SceneSource) -> tuple[F64, F64, SplatModel]:
     """Return the bounds of the logarithms of all positions, and at most `_SAMPLE` splats at equal steps."""
     step = -(-scene.count // _SAMPLE) or 1
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -125,7 +125,7 @@ def _sample(scene: Scene) -> tuple[F64, F64, SplatModel]:
         taken.append(model.select(np.arange(-rows.start % step, len(model), step)))
     if not taken:
         return np.zeros(3), np.zeros(3), scene.facts
-    return low, high, joined(scene.facts, taken)
+    return low, high, join_blocks(scene.facts, taken)
 
 
 def _signed_logs(means: F32) -> F64:
@@ -197,7 +197,7 @@ def _nearest_codes(codebook: F32, columns: F32) -> U8:
     return codes.astype(np.uint8)
 
 
-def _build_palette(scene: Scene, sample: SplatModel, weights_of: _SplatWeights) -> tuple[F32, U8, U32]:
+def _build_palette(scene: SceneSource, sample: SplatModel, weights_of: _SplatWeights) -> tuple[F32, U8, U32]:
     """Cluster the SH vectors of all splats.
 
     Returns:
@@ -243,7 +243,7 @@ def _encode_webp(pixels: U8) -> bytes:
     try:
         from PIL import Image
     except ModuleNotFoundError as error:
-        raise missing(error, "Pillow") from None
+        raise missing_package(error, "Pillow") from None
     buffer = io.BytesIO()
     # More effort does not help: method 6 at quality 100 took 100 times as long for 0.05 % more bytes.
     Image.fromarray(pixels).save(buffer, "WEBP", lossless=True, exact=True, quality=75, method=2)

@@ -27,7 +27,7 @@ import typer
 
 from csplat import read_ply
 from csplat.ply import write_scene_ply
-from csplat.scene import Scene as Blocks
+from csplat.scene_source import SceneSource as Blocks
 from csplat_bench.common.command import CACHE, JSON, listed, run
 from csplat_bench.common.making import copies
 from csplat_bench.common.report import Table, laid_out, tell_machine, write_json

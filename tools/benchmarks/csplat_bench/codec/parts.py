@@ -24,7 +24,7 @@ import numpy as np
 import typer
 
 import csplat
-from csplat.errors import missing
+from csplat.errors import missing_package
 from csplat_bench.common.command import JSON, MARKDOWN, WrongWords, run
 from csplat_bench.common.measuring import medians, timed
 from csplat_bench.common.report import table, tell_machine, write_json
@@ -175,7 +175,7 @@ def _fill(file: Path, storage: Mapping[str, Any]) -> None:
     try:
         from s3fs import S3FileSystem
     except ModuleNotFoundError as error:
-        raise missing(error, extra="remote") from None
+        raise missing_package(error, extra="remote") from None
     fs = S3FileSystem(**storage)
     fs.mkdir(_BUCKET)
     fs.put_file(str(file), f"{_BUCKET}/{file.name}")

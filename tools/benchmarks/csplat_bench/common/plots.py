@@ -6,7 +6,7 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from csplat.files import atomic_writer
+from csplat.disk_files import atomic_writer
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from csplat.files import atomic_writer
+from csplat.disk_files import atomic_writer
 from csplat_tools.console import format_table, note
 from csplat_tools.tradeoffs.machine import describe_machine
 

@@ -18,7 +18,7 @@ from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, Importance, encode_with_report
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat.scene import without_bands
+from csplat.scene_source import drop_bands
 from csplat_bench.common.command import MARKDOWN, SCENES, listed, run
 from csplat_bench.common.curves import Point, rate_at
 from csplat_bench.common.measuring import timed
@@ -50,7 +50,7 @@ def main(*, scenes: SCENES = _SCENES, markdown: MARKDOWN = False) -> None:
 
 
 def _rows(scene: Scene) -> list[tuple[str, ...]]:
-    source = without_bands(read_ply(scene.path), 0)
+    source = drop_bands(read_ply(scene.path), 0)
     beside = scene.path.with_suffix(".cameras.json")
     given = load_cameras(beside) if beside.exists() else []
     measures = {"virtual views": importance_views(source, find_view_set(source)), "half of its cameras": given[::2]}

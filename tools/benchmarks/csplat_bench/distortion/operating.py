@@ -21,7 +21,7 @@ from csplat.encoder import encode
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat.scene import without_bands
+from csplat.scene_source import drop_bands
 from csplat_bench.common.command import MARKDOWN, OUT, SCENES, TABLES, listed, run
 from csplat_bench.common.kept import Kept, read_kept
 from csplat_bench.common.measuring import timed
@@ -91,7 +91,7 @@ def _reached(source: SplatModel, ply_bytes: int, name: str) -> Reached:
         "size_bytes": len(data),
         "psnr": judge.psnr(model),
         "first_bytes": fetched_bytes(read_header(data), 0),
-        "first_psnr": judge.psnr(without_bands(model, 0)),
+        "first_psnr": judge.psnr(drop_bands(model, 0)),
         "seconds": timing.wall,
     }
 

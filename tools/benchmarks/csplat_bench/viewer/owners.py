@@ -27,12 +27,12 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from csplat.editing.transform import DEFAULT_AXES
+from csplat.editing.up_axis import up_of_axes
 from csplat.formats import format_by_name, read, write
 from csplat.formats.csplat_format import FORMAT as CSPLAT
 from csplat.formats.format import Format
 from csplat.model import UNSPECIFIED, SplatModel
-from csplat.turning import USUAL
-from csplat.upright import up_of_axes
 from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, listed, run
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, find_scenes
@@ -179,7 +179,7 @@ def still(page: Any, pause: float = _PAUSE) -> Picture:
 def stands(placed: SplatModel, world: Sequence[float]) -> str:
     """Tell how the up direction of a file's axes lies in a world whose y points up."""
     axes = placed.coordinate_system
-    up = up_of_axes(USUAL if axes == UNSPECIFIED else axes)
+    up = up_of_axes(DEFAULT_AXES if axes == UNSPECIFIED else axes)
     if up is None:
         return "?"
     height = (np.reshape(world, (4, 4)).T[:3, :3] @ np.array(up))[1]

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from csplat.editing.transform import convert_axes
 from csplat.errors import InputError
 from csplat.formats.format import Format
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat.scene import scene_of
-from csplat.turning import in_axes
+from csplat.scene_source import source_from_model
 from csplat_bench.common.browser import open_page, serve
 from csplat_bench.common.peers import npm_pinned
 from csplat_bench.common.scenes import ROOT, Scene
@@ -118,7 +118,7 @@ def looked_at(scene: Scene) -> tuple[SplatModel, Camera]:
 
 def placed_in(form: Format, model: SplatModel) -> tuple[SplatModel, Camera]:
     """Return a scene along a format's axes, and its camera."""
-    placed = in_axes(scene_of(model), form.axes).facts if form.axes else model
+    placed = convert_axes(source_from_model(model), form.axes).facts if form.axes else model
     return placed, Camera.from_json((placed.cameras or [])[0])
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit, urlunsplit
 
-from csplat.errors import InputError, StoreError, missing
-from csplat.inputs import File
-from csplat.stores import Disk, Memory, Store
+from csplat.byte_store import DiskStore, MemoryStore, Store
+from csplat.errors import InputError, StoreError, missing_package
+from csplat.file_source import File
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(://|::)")
 #: File systems of servers that may send all of a file when a part is requested.
@@ -31,7 +31,7 @@ def is_url(file: object) -> bool:
     return isinstance(file, str) and _URL.match(file) is not None
 
 
-def store_of(file: File, storage: Mapping[str, Any] | None = None) -> Store:
+def open_store(file: File, storage: Mapping[str, Any] | None = None) -> Store:
     """Open what a file lies in.
 
     Args:
@@ -44,15 +44,15 @@ def store_of(file: File, storage: Mapping[str, Any] | None = None) -> Store:
         OSError: it is not there, or cannot be read.
     """
     if isinstance(file, str) and is_url(file):
-        return _Remote(file, storage or {})
+        return RemoteStore(file, storage or {})
     if storage:
         raise InputError("storage options are for a URL, and the file is none")
     if isinstance(file, (str, os.PathLike)) and stat.S_ISREG(Path(file).stat().st_mode):
-        return Disk(Path(file))
-    return Memory(file)
+        return DiskStore(Path(file))
+    return MemoryStore(file)
 
 
-class _Remote(Store):
+class RemoteStore(Store):
     """A file at a URL. Connections are fsspec's, which keeps them for the next file; so are retries."""
 
     def __init__(self, url: str, options: Mapping[str, Any]) -> None:
@@ -115,7 +115,7 @@ class _Remote(Store):
     def _failure(self, error: BaseException) -> Exception:
         """Return the exception to raise for one that fsspec raised."""
         if isinstance(error, ModuleNotFoundError):
-            return missing(error, extra="remote")
+            return missing_package(error, extra="remote")
         if self._web and isinstance(error, FileNotFoundError) and error.__cause__ is not None:
             error = error.__cause__  # fsspec raises "not found" for any failure; this is its cause
         status = getattr(error, "status", 0)
@@ -135,7 +135,7 @@ def _file_system(url: str, options: Mapping[str, Any]) -> tuple[Any, str]:
     try:
         from fsspec.core import url_to_fs
     except ModuleNotFoundError as error:
-        raise missing(error, extra="remote") from None
+        raise missing_package(error, extra="remote") from None
     if url.startswith(("http://", "https://")):  # parts are of the file, not of what a server packs it into
         options = {**options, "headers": {"Accept-Encoding": "identity", **options.get("headers", {})}}
     try:

@@ -36,7 +36,7 @@ Buffer = bytes | bytearray | memoryview | mmap
 File = str | os.PathLike[str] | BinaryFile | Buffer
 
 
-def mapped(path: str | os.PathLike[str]) -> bytes | mmap:
+def map_file(path: str | os.PathLike[str]) -> bytes | mmap:
     """Return the bytes of a file, mapped if that is possible; the mapping is released with the last reference to it.
 
     Raises:
@@ -49,7 +49,7 @@ def mapped(path: str | os.PathLike[str]) -> bytes | mmap:
             return stream.read()
 
 
-def stand_in(head: bytes) -> str:
+def describe_substitute(head: bytes) -> str:
     """Name the content that came in place of a file, whatever file was expected; "" if there is no sign of that.
 
     Args:
@@ -72,7 +72,7 @@ def stand_in(head: bytes) -> str:
     return ""
 
 
-class LetGo:
+class PageReleaser:
     """Releases pages of a memory-mapped file during a sequential read. Owns the count of bytes since the last release.
 
     Pages that were read count as memory of the process until the machine is short of it; released pages are read again

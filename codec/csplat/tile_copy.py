@@ -9,10 +9,10 @@ from functools import cached_property, partial
 from itertools import accumulate
 
 from csplat import _spec
+from csplat.byte_store import FileWindow
 from csplat.decoder.container import SceneHeader, Tile, open_chunk
+from csplat.disk_files import BinaryWriter, open_writer
 from csplat.encoder.container import CodebookTable, FileChunk, FileTile, LazyPayload, Payload, SceneFields, file_pieces
-from csplat.files import BinaryWriter, opened_for_writing
-from csplat.stores import Window
 
 #: Chunks of a whole file that are as true of a part: not what an encoder states of errors and of its work.
 _KEPT = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
@@ -21,7 +21,7 @@ _ALL = 1 << 26  # bytes of all files that are fetched together
 
 
 @dataclass(frozen=True)
-class Part:
+class ExtractResult:
     """Result of cutting a part out of a file.
 
     Attributes:
@@ -35,9 +35,9 @@ class Part:
     size: int
 
 
-def write_part(
-    window: Window, header: SceneHeader, tiles: Sequence[Tile], output: str | os.PathLike[str] | BinaryWriter
-) -> Part:
+def write_extract(
+    window: FileWindow, header: SceneHeader, tiles: Sequence[Tile], output: str | os.PathLike[str] | BinaryWriter
+) -> ExtractResult:
     """Write some tiles of a file as a file of their own, for `csplat.extract`.
 
     Args:
@@ -52,20 +52,20 @@ def write_part(
         for record in header.directory
         if record.type in _KEPT or (record.type == _spec.CHUNK_CODEBOOK and record.id in tables)
     ]
-    copies = TileCopies(window)
+    copies = TileCopier(window)
     copied = [copies.of(tile) for tile in tiles]
     copies.begin(kept)
     chunks = [FileChunk(one.type, chunk_payload(window, one), one.id, one.layer) for one in kept]
     fields = scene_fields(window, header, tables, chunks)
     size = 0
-    with opened_for_writing(output) as stream:
+    with open_writer(output) as stream:
         for part in file_pieces(fields, copied):
             stream.write(part)
             size += len(part)
-    return Part(tuple(tile.index for tile in tiles), sum(tile.splat_count for tile in tiles), size)
+    return ExtractResult(tuple(tile.index for tile in tiles), sum(tile.splat_count for tile in tiles), size)
 
 
-class InTurn:
+class ChunkPrefetcher:
     """Chunks of a file that are read one after the other, several in a request.
 
     Args:
@@ -74,7 +74,7 @@ class InTurn:
         files: number of files that are read by turns.
     """
 
-    def __init__(self, window: Window, records: Sequence[_spec.LayerRecord], files: int = 1) -> None:
+    def __init__(self, window: FileWindow, records: Sequence[_spec.LayerRecord], files: int = 1) -> None:
         self._window = window
         self._records = records
         self._batch = min(window.store.sizes.batch, _ALL // files)
@@ -95,14 +95,14 @@ class InTurn:
         return self._records[place]
 
 
-class TileCopies:
+class TileCopier:
     """Tiles that are written again as they are. Their chunks are read when they are written.
 
     Args:
-        window, files: as in `InTurn`.
+        window, files: as in `ChunkPrefetcher`.
     """
 
-    def __init__(self, window: Window, files: int = 1) -> None:
+    def __init__(self, window: FileWindow, files: int = 1) -> None:
         self._window = window
         self._files = files
         self._records: dict[int, list[_spec.LayerRecord]] = {layer: [] for layer in _spec.LAYER_NAMES}
@@ -129,20 +129,20 @@ class TileCopies:
         self._turn[0].take(0, beside)
 
     @cached_property
-    def _turn(self) -> tuple[InTurn, dict[int, int]]:
+    def _turn(self) -> tuple[ChunkPrefetcher, dict[int, int]]:
         """All chunks, in the order in which files are written, and where each layer begins among them."""
         starts = dict(zip(self._records, accumulate(map(len, self._records.values()), initial=0), strict=False))
         records = [one for records in self._records.values() for one in records]
-        return InTurn(self._window, records, self._files), starts
+        return ChunkPrefetcher(self._window, records, self._files), starts
 
     def _read(self, layer: int, place: int) -> bytes:
         turn, starts = self._turn
         return chunk_payload(self._window, turn.take(starts[layer] + place))
 
 
-def chunk_payload(window: Window, record: _spec.DirectoryRecord | _spec.LayerRecord) -> bytes:
+def chunk_payload(window: FileWindow, record: _spec.DirectoryRecord | _spec.LayerRecord) -> bytes:
     """The payload of a chunk that was fetched, its CRC and header checked."""
-    with window.store.telling():
+    with window.store.named_errors():
         if isinstance(record, _spec.LayerRecord):
             cursor = open_chunk(window.view, record, _spec.CHUNK_TILE, _TILE_FLAGS, "TLE-1")
         else:
@@ -151,7 +151,7 @@ def chunk_payload(window: Window, record: _spec.DirectoryRecord | _spec.LayerRec
 
 
 def scene_fields(
-    window: Window, header: SceneHeader, tables: Container[int], chunks: Sequence[FileChunk]
+    window: FileWindow, header: SceneHeader, tables: Container[int], chunks: Sequence[FileChunk]
 ) -> SceneFields:
     """Return the scene fields of a file, with other chunks.
 

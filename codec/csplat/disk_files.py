@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat.inputs import File, stand_in
+from csplat.file_source import File, describe_substitute
 
 _PART_SIZE = 1 << 20
 _MB = 1e6
@@ -59,7 +59,7 @@ def read_text(path: str | os.PathLike[str]) -> str:
         data = Path(path).read_bytes()
     except OSError as error:
         raise InputError(f"{os.fspath(path)}: {error.strerror or error}") from error
-    instead = stand_in(data[:64])
+    instead = describe_substitute(data[:64])
     if instead:
         raise InputError(f"{os.fspath(path)} is {instead}")
     encoding = next((name for mark, name in _MARKS if data.startswith(mark)), "utf-8")
@@ -90,7 +90,7 @@ def read_json(path: str | os.PathLike[str]) -> Any:
         raise InputError(f"{os.fspath(path)} is not a JSON file: {error}") from error
 
 
-def check_room(folder: str | os.PathLike[str], wanted_bytes: int, what: str) -> None:
+def check_free_space(folder: str | os.PathLike[str], wanted_bytes: int, what: str) -> None:
     """Refuse work that a disk has no room for.
 
     Args:
@@ -164,7 +164,7 @@ def _named(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 @contextmanager
-def opened_for_writing(file: str | os.PathLike[str] | BinaryWriter) -> Iterator[BinaryWriter]:
+def open_writer(file: str | os.PathLike[str] | BinaryWriter) -> Iterator[BinaryWriter]:
     """Give what to write a file to: `atomic_writer` of a path; an open binary file as it is, and it stays open.
 
     Raises:
@@ -255,7 +255,7 @@ def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -
         if most_bytes is not None and Path(path).stat().st_size > most_bytes:
             return np.lib.format.open_memmap(path, mode="r")
         with Path(path).open("rb") as stream:
-            if instead := stand_in(stream.read(64)):
+            if instead := describe_substitute(stream.read(64)):
                 raise InputError(f"{path} is {instead}")
             stream.seek(0)
             array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)

@@ -1,7 +1,8 @@
-"""A file that is read in parts, from disk, memory or a URL: first its header and index, then the parts requested."""
+"""Read parts of a file on disk, in memory or at a URL: first header and index, then what is requested."""
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
@@ -11,12 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.boxes import tile_boxes, touching
+from csplat.byte_store import FileWindow, Store
 from csplat.decoder import (
     DecodedTile,
     Limits,
-    SceneHeader,
-    Tile,
     decode,
     iter_tiles,
     read_cameras,
@@ -24,17 +23,17 @@ from csplat.decoder import (
     read_metadata,
 )
 from csplat.decoder.codebooks import wanted_codebooks
-from csplat.decoder.container import check_length, read_file_header
+from csplat.decoder.container import SceneHeader, Tile, check_length, read_file_header
 from csplat.decoder.decode_api import DecodeRequest, prepare_decode
 from csplat.decoder.limits import check_budget, float_bytes
 from csplat.decoder.tiles import wanted_layers
+from csplat.disk_files import BinaryWriter
 from csplat.errors import InputError
-from csplat.files import BinaryWriter
-from csplat.inputs import File
+from csplat.file_source import File
 from csplat.model import SplatModel
-from csplat.parts import Part, write_part
-from csplat.remote import store_of
-from csplat.stores import Store, Window
+from csplat.remote_store import open_store
+from csplat.tile_copy import ExtractResult, write_extract
+from csplat.types import F64
 
 
 class SplatFile:
@@ -57,8 +56,8 @@ class SplatFile:
         self._store = store
         self._limits = limits
         self._open = True
-        with self._store.telling():
-            window = Window(store)
+        with self._store.named_errors():
+            window = FileWindow(store)
             self._head = _read_head(store, window)
             self.header = read_header(window.view)
 
@@ -107,7 +106,7 @@ class SplatFile:
     @cached_property
     def metadata(self) -> dict[str, Any] | None:
         """Content of the META chunk, `None` if there is none; read on first access."""
-        with self._store.telling():
+        with self._store.named_errors():
             window = self.window()
             window.fetch(self._chunks(_spec.CHUNK_METADATA))
             return read_metadata(window.view, limits=self._limits)
@@ -115,7 +114,7 @@ class SplatFile:
     @cached_property
     def cameras(self) -> list[dict[str, Any]] | None:
         """Content of the CAMS chunk, `None` if there is none; read on first access."""
-        with self._store.telling():
+        with self._store.named_errors():
             window = self.window()
             window.fetch(self._chunks(_spec.CHUNK_CAMERAS))
             return read_cameras(window.view, limits=self._limits)
@@ -138,8 +137,8 @@ class SplatFile:
             FormatError, LimitError: as in `csplat.decoder.iter_tiles`.
             StoreError, OSError: as in `csplat.open`.
         """
-        chosen = None if box is None else [tile.index for tile in touching(self.header, box)]
-        with self._store.telling():
+        chosen = None if box is None else [tile.index for tile in tiles_touching(self.header, box)]
+        with self._store.named_errors():
             window = self.window()
             job = prepare_decode(window.view, self._limits, chosen, sh_degree)
             decoded = iter_tiles(window.view, limits=self._limits, tiles=chosen, sh_degree=sh_degree)
@@ -174,8 +173,8 @@ class SplatFile:
         if box is not None:
             if tiles is not None:
                 raise InputError("a box and tiles are given: wanted one of them")
-            tiles = [tile.index for tile in touching(self.header, box)]
-        with self._store.telling():
+            tiles = [tile.index for tile in tiles_touching(self.header, box)]
+        with self._store.named_errors():
             window = self.window()
             job = prepare_decode(window.view, self._limits, tiles, sh_degree)
             splat_bytes = float_bytes(self.header, job.degree)
@@ -184,31 +183,31 @@ class SplatFile:
             window.fetch([*texts, *_side(job), *_layers(job.tiles, job.degree)])
             return decode(window.view, limits=self._limits, tiles=tiles, sh_degree=sh_degree)
 
-    def extract(self, box: Sequence[float], output: str | os.PathLike[str] | BinaryWriter) -> Part:
+    def extract(self, box: Sequence[float], output: str | os.PathLike[str] | BinaryWriter) -> ExtractResult:
         """Cut the tiles that touch a box out of the file, as `csplat.extract` does."""
-        with self._store.telling():
-            return write_part(self.window(), self.header, touching(self.header, box), output)
+        with self._store.named_errors():
+            return write_extract(self.window(), self.header, tiles_touching(self.header, box), output)
 
-    def window(self) -> Window:
+    def window(self) -> FileWindow:
         """A place for bytes of the file, for what copies them."""
         if not self._open:
             raise InputError(f"{self.name} is closed")
-        return Window(self._store, self._head)
+        return FileWindow(self._store, self._head)
 
-    def _iterate(self, window: Window, job: DecodeRequest, decoded: Iterator[DecodedTile]) -> Iterator[DecodedTile]:
+    def _iterate(self, window: FileWindow, job: DecodeRequest, decoded: Iterator[DecodedTile]) -> Iterator[DecodedTile]:
         side = _side(job)
         for batch in _batches(job.tiles, job.degree, self._store.sizes.batch):
             if not self._open:
                 raise InputError(f"{self.name} is closed")
             window.forget()
-            with self._store.telling():
+            with self._store.named_errors():
                 window.fetch([*side, *_layers(batch, job.degree)])
             for _ in batch:
-                with self._store.telling():
+                with self._store.named_errors():
                     tile = next(decoded)
                 yield tile
             side = []
-        with self._store.telling():
+        with self._store.named_errors():
             next(decoded, None)  # a scene without tiles still has chunks to check
 
     def _chunks(self, *kinds: bytes) -> list[tuple[int, int]]:
@@ -238,7 +237,7 @@ def open(file: File, *, limits: Limits | None = None, storage: Mapping[str, Any]
             has changed since it was opened. Nothing of what was asked for is returned then.
         OSError: the file is not there, or cannot be read.
     """
-    store = store_of(file, storage)
+    store = open_store(file, storage)
     try:
         return SplatFile(store, limits or Limits())
     except BaseException:
@@ -252,7 +251,7 @@ def extract(
     output: str | os.PathLike[str] | BinaryWriter,
     *,
     storage: Mapping[str, Any] | None = None,
-) -> Part:
+) -> ExtractResult:
     """Cut the tiles whose boxes touch a box out of a file, into a file of their own.
 
     Tiles stay whole, so that splats around the box come along; values are those of the file, bit for bit. Declared
@@ -280,7 +279,7 @@ def extract(
         return opened.extract(box, output)
 
 
-def _read_head(store: Store, window: Window) -> bytes:
+def _read_head(store: Store, window: FileWindow) -> bytes:
     """Read the data before the first chunk, and any data after it that came in the same request."""
     first = min(store.size, store.sizes.first)
     window.fetch([(0, first)])
@@ -314,3 +313,48 @@ def _batches(tiles: Sequence[Tile], degree: int, size_bytes: int) -> Iterator[li
         batch.append(tile)
         size += added
     yield batch
+
+
+def tile_boxes(header: SceneHeader) -> F64:
+    """Boxes around the centres of each tile's splats (spec 4.3.5).
+
+    Returns:
+        [T, 2, 3] float64: smallest and largest corner; scene units, relative to the origin, as the means.
+    """
+    step = header.attribute(_spec.ATTRIBUTE_MEANS).step
+    boxes = np.empty((len(header.tiles), 2, 3), np.float64)
+    for tile in header.tiles:
+        boxes[tile.index] = tile.corners(step)
+    return boxes
+
+
+def tiles_touching(header: SceneHeader, box: Sequence[float]) -> list[Tile]:
+    """The tiles whose boxes touch a box.
+
+    Args:
+        header: the scene.
+        box: two corners, x, y, z each, in any order; scene units, relative to the origin.
+
+    Raises:
+        InputError: six finite numbers are wanted; or no tile touches the box.
+    """
+    numbers = [float(value) for value in box]
+    if len(numbers) != 6 or not all(map(math.isfinite, numbers)):
+        raise InputError(f"a box is {tuple(box)!r}, wanted six finite numbers: two corners, x, y, z each")
+    low, high = np.sort(np.reshape(numbers, (2, 3)), axis=0)
+    boxes = tile_boxes(header)
+    found = ((boxes[:, 0] <= high) & (boxes[:, 1] >= low)).all(axis=1)
+    if not found.any():
+        raise InputError(f"no tile touches the box {_corner_text(low)} to {_corner_text(high)}: {_extent_text(boxes)}")
+    return [header.tiles[place] for place in np.flatnonzero(found)]
+
+
+def _corner_text(corner: F64) -> str:
+    return ", ".join(f"{value:g}" for value in corner)
+
+
+def _extent_text(boxes: F64) -> str:
+    """Say where the splats are."""
+    if not len(boxes):
+        return "the scene has no splats"
+    return f"centres lie within {_corner_text(boxes[:, 0].min(axis=0))} to {_corner_text(boxes[:, 1].max(axis=0))}"

@@ -1,7 +1,11 @@
-"""Merge several files: tiles are copied if that is possible, else the scenes are coded again together."""
+"""Merge several files: copy their tiles if that is possible, otherwise encode the scenes again together.
+
+Copied tiles are not decoded; those that name codebooks are rewritten with the ids of the merged file.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,25 +14,36 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from csplat import _spec
+from csplat.byte_store import FileWindow
 from csplat.decoder import read_header
+from csplat.decoder.container import SceneHeader, Tile
+from csplat.decoder.tiles import codebook_references
+from csplat.disk_files import BinaryWriter, open_writer
 from csplat.encoder import EncodeOptions
-from csplat.encoder.container import FileChunk, FileTile, SceneFields, file_pieces, json_payload
+from csplat.encoder.container import (
+    CodebookTable,
+    FileChunk,
+    FileTile,
+    LazyPayload,
+    SceneFields,
+    chunk_crc,
+    file_pieces,
+    json_payload,
+)
 from csplat.encoder.entropy import DeflateSettings
 from csplat.errors import InputError
-from csplat.files import BinaryWriter, opened_for_writing
-from csplat.inputs import File
-from csplat.large import encode_scene
+from csplat.file_source import File
 from csplat.model import UNSPECIFIED, SplatModel
-from csplat.opened import SplatFile
-from csplat.opened import open as opened
-from csplat.parts import scene_fields
-from csplat.renumbering import Books, Spool, renumbered
-from csplat.scene import Scene
+from csplat.out_of_core import encode_scene
+from csplat.scene_source import SceneSource
+from csplat.splat_file import SplatFile
+from csplat.splat_file import open as opened
+from csplat.tile_copy import ChunkPrefetcher, TileCopier, chunk_payload, scene_fields
 
 #: Fields that must be equal, because they determine how all splats of a file are shown: words for each, and its name.
 _FACTS = (
@@ -40,7 +55,7 @@ _FACTS = (
 
 
 @dataclass(frozen=True)
-class Merged:
+class MergeResult:
     """Result of merging several files.
 
     Attributes:
@@ -65,14 +80,14 @@ def merge(
     options: EncodeOptions | None = None,
     storage: Mapping[str, Any] | None = None,
     codebooks_max: int = (1 << 16) - 1,
-) -> Merged:
+) -> MergeResult:
     """Join files: the splats of the first, then those of the second, and so on.
 
     Tiles are copied bit for bit, without decoding, if the files agree on steps and levels of all attributes, SH
     degree, origin and extra columns, as parts of one file do (`extract`, or files that were encoded with the same
     steps); their codebooks get new ids. This takes memory for the codebooks of one file and some megabytes. Other files
-    are decoded and coded again together, as `csplat.large.encode_scene` does it, which costs quality once more;
-    `Merged.why` gives the reason. Pending data is kept in temporary files.
+    are decoded and coded again together, as `csplat.out_of_core.encode_scene` does it, which costs quality once more;
+    `MergeResult.why` gives the reason. Pending data is kept in temporary files.
 
     Metadata and cameras are kept as far as all files have the same. If one file leaves axes or unit open, another
     one may specify them. Copied files declare no errors and no options: nobody has measured the whole.
@@ -105,18 +120,18 @@ def merge(
         windows = [scene.window() for scene in scenes]
         fields = [scene_fields(one, scene.header, (), ()) for one, scene in zip(windows, scenes, strict=True)]
         why, ids = _difference(fields, names), []
-        spool = Spool(stack.enter_context(TemporaryFile()))
-        books = Books(spool)
+        spool = PayloadSpool(stack.enter_context(TemporaryFile()))
+        books = MergedCodebooks(spool)
         if not why:
             ids = [books.take(one, scene.header) for one, scene in zip(windows, scenes, strict=True)]
             if len(books.tables) > codebooks_max:
                 why = f"they have {len(books.tables):,} codebooks together, and a file at most {codebooks_max:,}"
         if why:
-            return _coded_again(scenes, output, options or EncodeOptions(keep_extra=True), why)
+            return _encode_again(scenes, output, options or EncodeOptions(keep_extra=True), why)
         tiles = [
             tile
             for one, scene, new in zip(windows, scenes, ids, strict=True)
-            for tile in renumbered(one, scene.header, new, spool, len(scenes))
+            for tile in renumber_tiles(one, scene.header, new, spool, len(scenes))
         ]
         together = replace(
             fields[0],
@@ -125,7 +140,7 @@ def merge(
             codebooks=books.tables,
             chunks=[*_agreed_chunks(scenes), *books.chunks],
         )
-        return _written(together, tiles, output)
+        return _write_merged(together, tiles, output)
 
 
 def _refuse_contradiction(words: str, values: Sequence[Any], names: Sequence[str]) -> None:
@@ -179,28 +194,30 @@ def _agreed(values: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {key: value for key, value in first.items() if all(key in one and one[key] == value for one in others)}
 
 
-def _written(scene: SceneFields, tiles: Sequence[FileTile], output: str | os.PathLike[str] | BinaryWriter) -> Merged:
+def _write_merged(
+    scene: SceneFields, tiles: Sequence[FileTile], output: str | os.PathLike[str] | BinaryWriter
+) -> MergeResult:
     size = 0
-    with opened_for_writing(output) as stream:
+    with open_writer(output) as stream:
         for part in file_pieces(scene, tiles):
             stream.write(part)
             size += len(part)
-    return Merged(sum(tile.splat_count for tile in tiles), len(tiles), size)
+    return MergeResult(sum(tile.splat_count for tile in tiles), len(tiles), size)
 
 
-def _coded_again(
+def _encode_again(
     scenes: Sequence[SplatFile], output: str | os.PathLike[str] | BinaryWriter, options: EncodeOptions, why: str
-) -> Merged:
+) -> MergeResult:
     """Decode tile by tile and encode anew, in memory if that is enough for it."""
     facts = _facts(scenes)
-    whole = Scene(sum(map(len, scenes)), facts, partial(_blocks, scenes, facts))
+    whole = SceneSource(sum(map(len, scenes)), facts, partial(_blocks, scenes, facts))
     dropped = {column.name for scene in scenes for column in scene.header.extras} - facts.extra.keys()
     with TemporaryDirectory(prefix="csplat-") as folder:
         path = Path(folder) / "merged.csplat"
         encode_scene(whole, path, options, folder=Path(folder) / "work")
-        with path.open("rb") as coded, opened_for_writing(output) as stream:
+        with path.open("rb") as coded, open_writer(output) as stream:
             shutil.copyfileobj(coded, stream)
-        return Merged(whole.count, len(read_header(path).tiles), path.stat().st_size, why, tuple(sorted(dropped)))
+        return MergeResult(whole.count, len(read_header(path).tiles), path.stat().st_size, why, tuple(sorted(dropped)))
 
 
 def _facts(scenes: Sequence[SplatFile]) -> SplatModel:
@@ -247,3 +264,138 @@ def _blocks(scenes: Sequence[SplatFile], facts: SplatModel) -> Iterator[SplatMod
                 facts, means=means, quats=tile.quats, scales=tile.scales, opacities=tile.opacities, sh0=tile.sh0,
                 shN=shN, extra={name: tile.extra[name] for name in facts.extra}, means_double=doubles,
             )  # fmt: skip
+
+
+_ID_SIZE, _ID_MAX = 2, (1 << 16) - 1
+_ID_END = _spec.CODEBOOK_HEAD_OFFSETS["codebook_id"] + _ID_SIZE
+
+
+class PayloadSpool:
+    """Payloads that wait in a file until theirs is written.
+
+    Args:
+        stream: a temporary file, open to write and read.
+    """
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._stream = stream
+
+    def put(self, kind: bytes, payload: bytes) -> LazyPayload:
+        """Put the payload of a chunk aside."""
+        start = self._stream.seek(0, os.SEEK_END)
+        self._stream.write(payload)
+        return LazyPayload(len(payload), chunk_crc(kind, payload), partial(self._again, start, len(payload)))
+
+    def _again(self, start: int, size: int) -> bytes:
+        self._stream.seek(start)
+        return self._stream.read(size)
+
+
+class MergedCodebooks:
+    """Codebooks under ids from 0 on; one that several files have alike is there once.
+
+    Args:
+        spool: where they wait.
+
+    Attributes:
+        tables: their records.
+        chunks: their chunks.
+    """
+
+    def __init__(self, spool: PayloadSpool) -> None:
+        self.tables: list[CodebookTable] = []
+        self.chunks: list[FileChunk] = []
+        self._spool = spool
+        self._known: dict[tuple[object, ...], int] = {}
+
+    def take(self, window: FileWindow, header: SceneHeader) -> dict[int, int]:
+        """Add the codebooks of a file that its tiles name; return the new ids by the old ones."""
+        used = {table for tile in header.tiles for table in tile.tables}
+        chunks = [one for one in header.directory if one.type == _spec.CHUNK_CODEBOOK and one.id in used]
+        window.fetch((one.offset, one.size) for one in chunks)
+        ids = {}
+        for book in header.codebooks:
+            if book.codebook_id in used:
+                own = sorted((one for one in chunks if one.id == book.codebook_id), key=lambda one: one.layer)
+                contents = {one.layer: chunk_payload(window, one)[_ID_END:] for one in own}
+                ids[book.codebook_id] = self._id(book, contents)
+        window.forget()
+        return ids
+
+    def _id(self, book: _spec.CodebookRecord, contents: Mapping[int, bytes]) -> int:
+        """The id of a codebook, known or new.
+
+        Args:
+            book: its record in its file.
+            contents: by layer, its payloads behind the id.
+        """
+        bands = (book.band_first, book.band_last)
+        digests = (hashlib.sha256(content).digest() for content in contents.values())
+        key = (book.kind, bands, book.size, *digests)
+        if key not in self._known:
+            id = self._known[key] = len(self.tables)
+            self.tables.append(CodebookTable(id, book.kind, bands, book.size))
+            if id <= _ID_MAX:  # who has more cannot be written
+                for layer, content in contents.items():
+                    payload = self._spool.put(_spec.CHUNK_CODEBOOK, _as_bytes(id) + content)
+                    self.chunks.append(FileChunk(_spec.CHUNK_CODEBOOK, payload, id, layer))
+        return self._known[key]
+
+
+def renumber_tiles(
+    window: FileWindow, header: SceneHeader, ids: Mapping[int, int], spool: PayloadSpool, files: int
+) -> list[FileTile]:
+    """Tiles of a file, with other ids of codebooks.
+
+    Args:
+        window, files: as of `ChunkPrefetcher`.
+        header: its header.
+        ids: the new ids by the old ones.
+        spool: where chunks wait that are rewritten; others are read when they are written.
+    """
+    changed: dict[int, dict[int, LazyPayload]] = {}
+    naming = [
+        (tile, tile.layers[layer])
+        for layer in range(_spec.SH_DEGREE_MAX + 1)
+        for tile in header.tiles
+        if layer in _naming_layers(header, tile, ids) & tile.layers.keys()
+    ]
+    turn = ChunkPrefetcher(window, [record for _, record in naming], files)
+    for place, (tile, record) in enumerate(naming):
+        turn.take(place)
+        if stored := _rewrite_ids(window, header, record, ids, spool):
+            changed.setdefault(tile.index, {})[record.layer] = stored
+    window.forget()
+    copies = TileCopier(window, files)
+    tiles = [copies.of(tile, changed.get(tile.index)) for tile in header.tiles]
+    return [replace(tile, tables=tuple(sorted({ids[table] for table in tile.tables}))) for tile in tiles]
+
+
+def _naming_layers(header: SceneHeader, tile: Tile, ids: Mapping[int, int]) -> set[int]:
+    """Layers of a tile that may name a codebook whose id is another one now."""
+    moved = {table for table in tile.tables if ids[table] != table}
+    return {
+        layer
+        for book in header.codebooks
+        if book.codebook_id in moved
+        for layer in range(book.band_first, book.band_last + 1)
+    }
+
+
+def _rewrite_ids(
+    window: FileWindow, header: SceneHeader, record: _spec.LayerRecord, ids: Mapping[int, int], spool: PayloadSpool
+) -> LazyPayload | None:
+    """A chunk with other ids, put aside; `None` where it names no codebook."""
+    with window.store.named_errors():
+        places = list(codebook_references(window.view, header, record))
+    if not places:
+        return None
+    payload = bytearray(chunk_payload(window, record))
+    begin = record.offset + _spec.CHUNK_HEADER_SIZE
+    for at, id in places:
+        payload[at - begin : at - begin + _ID_SIZE] = _as_bytes(ids[id])
+    return spool.put(_spec.CHUNK_TILE, bytes(payload))
+
+
+def _as_bytes(id: int) -> bytes:
+    return id.to_bytes(_ID_SIZE, "little")

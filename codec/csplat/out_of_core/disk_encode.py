@@ -1,4 +1,4 @@
-"""Encode a scene of any size to a file: in memory if it fits, else bucket by bucket by way of the disk."""
+"""Encode a scene of any size to a file: in memory if it fits, otherwise in buckets on disk."""
 
 from __future__ import annotations
 
@@ -11,23 +11,20 @@ from typing import Any
 import numpy as np
 
 from csplat import __version__
+from csplat.disk_files import atomic_writer, check_free_space
 from csplat.encoder import EncodeOptions, EncodeReport, encode_with_report
 from csplat.encoder.coding_parameters import CodingParameters, measure_contrast
 from csplat.encoder.container import file_pieces
 from csplat.encoder.encode_plan import EncodePlan, Origin, extra_records
 from csplat.encoder.error_bounds import ErrorSums
 from csplat.encoder.pipeline import EncodedTile, encoding_settings, file_chunks, make_notes, scene_fields
-from csplat.encoder.sh_codebook import FileCodebooks, final_parameters
-from csplat.encoder.tiling import BUCKET_SPLATS, contrast_buckets
+from csplat.encoder.sh_codebook import FileCodebooks, final_parameters, largest_sh
+from csplat.encoder.tiling import BUCKET_SPLATS, BucketCurve, contrast_buckets, sample_rows
 from csplat.errors import InputError
-from csplat.files import atomic_writer, check_room
-from csplat.large.bucket_files import BucketWriter, Layout, bucket_path, read_splats
-from csplat.large.coding import Coding, coded_bucket
-from csplat.large.survey import take_survey
-from csplat.large.work import Work
-from csplat.large.workers import code_here, code_on_cluster
-from csplat.memory import default_bytes
-from csplat.scene import Scene, watched
+from csplat.out_of_core.bucket_workers import BucketCoding, code_here, code_on_cluster, coded_bucket
+from csplat.out_of_core.spill_files import BucketWriter, SplatLayout, Survey, WorkingFolder, bucket_path, read_splats
+from csplat.scene_source import SceneSource, with_progress
+from csplat.system import default_memory_bytes
 from csplat.types import Progress, null_progress
 
 _MB = 1_000_000
@@ -39,7 +36,7 @@ _ROOM = 96 * _MB  # splats that wait for being written to their buckets
 
 
 @dataclass(frozen=True)
-class Needs:
+class ResourceNeeds:
     """Resources that an encoding takes.
 
     Attributes:
@@ -55,7 +52,9 @@ class Needs:
     disk_bytes: int
 
 
-def needs_of(scene: Scene, options: EncodeOptions, memory_bytes: int | None = None, *, by_disk: bool = False) -> Needs:
+def estimate_needs(
+    scene: SceneSource, options: EncodeOptions, memory_bytes: int | None = None, *, by_disk: bool = False
+) -> ResourceNeeds:
     """Estimate the resources that the encoding of a scene will take.
 
     Args:
@@ -67,14 +66,14 @@ def needs_of(scene: Scene, options: EncodeOptions, memory_bytes: int | None = No
     Raises:
         InputError: the bound is too low for any way.
     """
-    bound = default_bytes() if memory_bytes is None else memory_bytes
+    bound = default_memory_bytes() if memory_bytes is None else memory_bytes
     row = _layout(scene, options).row_bytes
     whole = _PROGRAM + int(scene.count * row * _WHOLE_ROW)
     file_bytes = int(scene.count * row * _CODED)
     if scene.count <= BUCKET_SPLATS or (whole <= bound and not by_disk):
         if memory_bytes is not None and whole > bound:
             raise _too_low(bound, whole)
-        return Needs(True, options.thread_count, whole, file_bytes)
+        return ResourceNeeds(True, options.thread_count, whole, file_bytes)
     if options.shape_codebook_size:
         raise InputError(f"a codebook of shapes wants the scene in memory, about {whole / _MB:,.0f} MB")
     worker = _PROGRAM + int(BUCKET_SPLATS * row * _PER_ROW)
@@ -83,12 +82,12 @@ def needs_of(scene: Scene, options: EncodeOptions, memory_bytes: int | None = No
         raise _too_low(bound, here)
     workers = max(1, min(options.thread_count, (bound - _PROGRAM) // worker))
     memory = here if workers == 1 else max(here, _PROGRAM + workers * worker)
-    return Needs(False, workers, memory, scene.count * row + file_bytes)
+    return ResourceNeeds(False, workers, memory, scene.count * row + file_bytes)
 
 
-def _layout(scene: Scene, options: EncodeOptions) -> Layout:
+def _layout(scene: SceneSource, options: EncodeOptions) -> SplatLayout:
     """Return the layout of the arrays that are carried."""
-    return Layout(scene.facts if options.keep_extra else replace(scene.facts, extra={}))
+    return SplatLayout(scene.facts if options.keep_extra else replace(scene.facts, extra={}))
 
 
 def _too_low(bound: int, least: int) -> InputError:
@@ -96,7 +95,7 @@ def _too_low(bound: int, least: int) -> InputError:
 
 
 def encode_scene(
-    scene: Scene,
+    scene: SceneSource,
     target: str | os.PathLike[str],
     options: EncodeOptions | None = None,
     *,
@@ -140,7 +139,7 @@ def encode_scene(
     path = Path(target)
     work_folder = path.with_name(path.name + ".work") if folder is None else Path(folder)
     by_disk = by_disk or cluster is not None or (resume and work_folder.exists())
-    needs = needs_of(scene, options, memory_bytes, by_disk=by_disk)
+    needs = estimate_needs(scene, options, memory_bytes, by_disk=by_disk)
     if needs.in_memory:
         result = encode_with_report(scene.model(), options, progress=progress)
         with atomic_writer(target) as stream:
@@ -152,7 +151,7 @@ def encode_scene(
         "splats": scene.count,
         "csplat": __version__,
     }
-    work = Work.begun(work_folder, _layout(scene, options), key, resume=resume)
+    work = WorkingFolder.begun(work_folder, _layout(scene, options), key, resume=resume)
     return _Encoding(scene, path, options, work, needs, cluster, progress or null_progress).run()
 
 
@@ -160,11 +159,11 @@ def encode_scene(
 class _Encoding:
     """The stages of one encoding by way of the disk, each of which is skipped if the folder has it."""
 
-    scene: Scene
+    scene: SceneSource
     target: Path
     options: EncodeOptions
-    work: Work
-    needs: Needs
+    work: WorkingFolder
+    needs: ResourceNeeds
     cluster: str | None
     progress: Progress
 
@@ -183,7 +182,7 @@ class _Encoding:
                 )
             )
         draft, books = self._decide()
-        self._code(Coding(work.layout, draft.parameters, books))
+        self._code(BucketCoding(work.layout, draft.parameters, books))
         report = self._write(draft, books)
         work.remove()
         return report
@@ -191,7 +190,7 @@ class _Encoding:
     def _check_room(self) -> None:
         work = self.work
         try:
-            check_room(work.folder, self.needs.disk_bytes, "this scene is encoded: --work names another folder")
+            check_free_space(work.folder, self.needs.disk_bytes, "this scene is encoded: --work names another folder")
         except InputError:
             if "curve" not in work.state:  # nothing is lost
                 work.remove()
@@ -201,11 +200,11 @@ class _Encoding:
         """Two passes over the scene: what it is like, and its splats into their buckets."""
         work, survey = self.work, self.work.survey
         if survey is None:
-            survey = take_survey(watched(self.scene, "looking", self.progress), work.layout)
+            survey = take_survey(with_progress(self.scene, "looking", self.progress), work.layout)
             work.keep(survey)
         writer = BucketWriter(work.folder, work.layout, survey.curve, _ROOM)
         del survey
-        for block in watched(self.scene, "sorting", self.progress).blocks():
+        for block in with_progress(self.scene, "sorting", self.progress).blocks():
             writer.add(block)
         writer.flush()
         work.note(counts=writer.counts.tolist())
@@ -228,7 +227,7 @@ class _Encoding:
         draft = EncodePlan(facts, self.options, origin, None, plan, [], extras, None, None)
         return draft, replace(books, tables=tables.select(none))
 
-    def _code(self, coding: Coding) -> None:
+    def _code(self, coding: BucketCoding) -> None:
         folder, buckets = self.work.folder, self.work.buckets
         left = {one.number: one for one in buckets if coded_bucket(folder, one) is None}
         for bucket in buckets:
@@ -261,3 +260,21 @@ class _Encoding:
                 self.progress("writing", min(1.0, size / max(1, payloads)))
         notes = make_notes(tiles, strict=draft.parameters.lattice.strict)
         return EncodeReport(settings, errors.declared(), errors.count, len(tiles), size, notes)
+
+
+def take_survey(scene: SceneSource, layout: SplatLayout) -> Survey:
+    """Look at a scene of more than `BUCKET_SPLATS` splats, and take a sample that has the arrays of the layout.
+
+    Raises:
+        CsplatError: its blocks cannot be read.
+        OSError: likewise.
+    """
+    rows = sample_rows(scene.count)
+    arrays, largest = layout.empty(len(rows)), 0.0
+    for where, block in scene.numbered():
+        first, last = np.searchsorted(rows, (where.start, where.stop))
+        for array, values in zip(arrays, layout.arrays(block), strict=True):
+            array[first:last] = values[rows[first:last] - where.start]
+        largest = max(largest, largest_sh(block.shN))
+    sample = layout.model(arrays)
+    return Survey(sample, largest, BucketCurve.through(sample.means, scene.count))

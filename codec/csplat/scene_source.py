@@ -1,8 +1,7 @@
-"""A scene that is read some splats at a time.
+"""Read a scene in blocks of a bounded number of splats.
 
-What is known before the first splat comes first, then blocks: a block is a `SplatModel` of a bounded number of splats
-that says the same of the scene as all others. Who writes a scene may go through its blocks several times, and needs no
-more memory than a block wants.
+A block is a `SplatModel` with the metadata of the whole scene. Blocks may be read several times, in memory for one of
+them.
 """
 
 from __future__ import annotations
@@ -16,24 +15,25 @@ import numpy as np
 from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import SplatModel
+from csplat.types import Progress
 
-#: Splats of a block, at most.
-BLOCK = 65_536
+#: Maximum number of splats of a block.
+BLOCK_SPLATS = 65_536
 
 
 @dataclass(frozen=True)
-class Scene:
-    """A scene that is read some splats at a time.
+class SceneSource:
+    """A scene that is read in blocks.
 
     Attributes:
         count: N.
         facts: the scene without its splats: SH degree, axes, origin, antialiasing, metadata, names and types of extra
             columns.
-        blocks: begins at the first splat whenever it is called, and gives all of them in order, in models of `BLOCK`
-            splats at most, whose facts are `facts`.
-        findings: what was noticed so far; grows while the first blocks are read.
-        format: name of the format that it is read from; "" of a scene in memory.
-        levels: splats of each level, the finest first, of a file that has the scene several times; this is one of them.
+        blocks: yields all splats in order, from the first one at every call, in models of at most `BLOCK_SPLATS` splats
+            that agree with `facts` in everything else.
+        findings: findings so far; grows while the first blocks are read.
+        format: name of the format that it is read from; "" if the scene is in memory.
+        levels: splats of each level of detail, the finest first, if the file has several; this scene is one of them.
     """
 
     count: int
@@ -44,29 +44,29 @@ class Scene:
     levels: tuple[int, ...] = ()
 
     def numbered(self) -> Iterator[tuple[slice, SplatModel]]:
-        """Each block, and which splats of the scene it has."""
+        """Yield each block with the range of its splats in the scene."""
         start = 0
         for block in self.blocks():
             yield slice(start, start + len(block)), block
             start += len(block)
 
     def model(self) -> SplatModel:
-        """All of it in memory."""
-        return joined(self.facts, list(self.blocks()))
+        """Read all blocks into one model."""
+        return join_blocks(self.facts, list(self.blocks()))
 
 
-def scene_of(model: SplatModel) -> Scene:
-    """A scene that is in memory already."""
+def source_from_model(model: SplatModel) -> SceneSource:
+    """Make a source of a scene in memory."""
 
     def blocks() -> Iterator[SplatModel]:
-        for start in range(0, len(model), BLOCK):
-            yield model.select(slice(start, start + BLOCK))
+        for start in range(0, len(model), BLOCK_SPLATS):
+            yield model.select(slice(start, start + BLOCK_SPLATS))
 
-    return Scene(len(model), model.select(slice(0, 0)), blocks)
+    return SceneSource(len(model), model.select(slice(0, 0)), blocks)
 
 
-def joined(facts: SplatModel, blocks: Sequence[SplatModel]) -> SplatModel:
-    """Blocks of a scene, one after the other."""
+def join_blocks(facts: SplatModel, blocks: Sequence[SplatModel]) -> SplatModel:
+    """Concatenate blocks of a scene."""
     if len(blocks) < 2:
         return blocks[0] if blocks else facts
     arrays: dict[str, Any] = {
@@ -82,18 +82,15 @@ def joined(facts: SplatModel, blocks: Sequence[SplatModel]) -> SplatModel:
     )
 
 
-def without_bands(model: SplatModel, sh_degree: int) -> SplatModel:
+def drop_bands(model: SplatModel, sh_degree: int) -> SplatModel:
     """Leave out the SH bands above a degree."""
     if sh_degree >= model.sh_degree:
         return model
     return replace(model, shN=np.ascontiguousarray(model.shN[:, : (sh_degree + 1) ** 2 - 1]))
 
 
-def watched(scene: Scene, stage: str, progress: Callable[[str, float], object]) -> Scene:
-    """The same scene; who goes through its blocks tells how far it has come.
-
-    Its blocks raise InputError where they are not as many splats as they were: somebody changed the file.
-    """
+def with_progress(scene: SceneSource, stage: str, progress: Progress) -> SceneSource:
+    """Return the scene with blocks that report progress, and raise `InputError` if the number of splats changed."""
 
     def blocks() -> Iterator[SplatModel]:
         done = 0

@@ -14,18 +14,18 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from csplat.editing.up_axis import UP, Direction, unit_up, up_of, up_of_axes
 from csplat.errors import InputError
 from csplat.model import UNSPECIFIED, SplatModel, check_axes, normalise_quats, sh_degree_of
-from csplat.scene import Scene
+from csplat.scene_source import SceneSource
 from csplat.training_record import VIEW
 from csplat.types import F32, F64
-from csplat.upright import UP, Direction, unit_up, up_of, up_of_axes
 
 _Rows = TypeVar("_Rows", F32, F64)
 
 _OPPOSITE = dict(zip("RLUDFB", "LRDUBF", strict=True))
 #: What the axes of a scene are taken for that does not name them: those of its cameras' makers, COLMAP and OpenCV.
-USUAL = "RDF"
+DEFAULT_AXES = "RDF"
 _ORTHOGONAL = 1e-6  # of the entries of M Mᵀ - 1
 _WHOLE = 1e-9  # entries of a computed rotation that are as near to a whole number are that number
 _DIRECTIONS = 40
@@ -44,8 +44,8 @@ def axes_rotation(before: str, after: str) -> F64:
         [3, 3] float64 of 0, 1 and -1; where one of the two is left-handed and the other is not, a mirror.
 
     Examples:
-        >>> import csplat.turning
-        >>> csplat.turning.axes_rotation("RDF", "LUF").tolist()
+        >>> import csplat.editing.transform
+        >>> csplat.editing.transform.axes_rotation("RDF", "LUF").tolist()
         [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
 
     Raises:
@@ -56,7 +56,7 @@ def axes_rotation(before: str, after: str) -> F64:
     return np.array([[(old == new) - float(old == _OPPOSITE[new]) for old in before] for new in after]) + 0.0
 
 
-def in_axes(scene: Scene, axes: str) -> Scene:
+def convert_axes(scene: SceneSource, axes: str) -> SceneSource:
     """A scene along the axes that a format has.
 
     Who names no axes is taken to have x to the right, y down and z forward, and is tilted then, where it says which way
@@ -69,16 +69,16 @@ def in_axes(scene: Scene, axes: str) -> Scene:
     matrix = _rotation_to(scene.facts, axes)
 
     def placed(model: SplatModel) -> SplatModel:
-        return replace(turned(model, matrix), coordinate_system=axes)
+        return replace(rotate_scene(model, matrix), coordinate_system=axes)
 
     def blocks() -> Iterator[SplatModel]:
         yield from map(placed, scene.blocks())
 
     same = scene.facts.coordinate_system == axes
-    return scene if same else Scene(scene.count, placed(scene.facts), blocks, scene.findings)
+    return scene if same else SceneSource(scene.count, placed(scene.facts), blocks, scene.findings)
 
 
-def turned(model: SplatModel, rotation: ArrayLike) -> SplatModel:
+def rotate_scene(model: SplatModel, rotation: ArrayLike) -> SplatModel:
     """The same scene turned about its zero, with all that has a direction: rotations, colours, origin, up, cameras.
 
     Where the matrix only permutes and flips axes, means, rotations and scales are exact, and SH as well where z stays
@@ -112,7 +112,7 @@ def turned(model: SplatModel, rotation: ArrayLike) -> SplatModel:
     )
 
 
-def scaled(model: SplatModel, factor: float) -> SplatModel:
+def scale_scene(model: SplatModel, factor: float) -> SplatModel:
     """The same scene in units that are so many times as short: all its lengths are multiplied.
 
     Raises:
@@ -136,7 +136,7 @@ def scaled(model: SplatModel, factor: float) -> SplatModel:
         )
 
 
-def stretched(model: SplatModel, matrix: ArrayLike) -> SplatModel:
+def stretch_scene(model: SplatModel, matrix: ArrayLike) -> SplatModel:
     """The same scene under any linear map: turned, and scaled in three directions, of which each may be another's.
 
     Args:
@@ -147,10 +147,10 @@ def stretched(model: SplatModel, matrix: ArrayLike) -> SplatModel:
         InputError: something leaves float32.
     """
     left, lengths, right = np.linalg.svd(np.asarray(matrix, np.float64))
-    model = turned(model, _snapped(left @ right))
+    model = rotate_scene(model, _snapped(left @ right))
     factor = float(lengths.mean())
     if np.ptp(lengths) < _EVEN * factor:
-        return model if abs(factor - 1.0) < _WHOLE else scaled(model, factor)
+        return model if abs(factor - 1.0) < _WHOLE else scale_scene(model, factor)
     stretch: F64 = (left * lengths) @ left.T
     x, y, z = (stretch @ model.origin).tolist()
     doubles = None if model.means_double is None else _applied(stretch, model.means_double)
@@ -170,7 +170,7 @@ def stretched(model: SplatModel, matrix: ArrayLike) -> SplatModel:
         )
 
 
-def moved(model: SplatModel, offset: Direction) -> SplatModel:
+def translate_scene(model: SplatModel, offset: Direction) -> SplatModel:
     """The same splats elsewhere: their means move, and not the origin, for which few formats have a place."""
     step = np.array(offset, np.float64)
     doubles = None if model.means_double is None else model.means_double + step
@@ -181,7 +181,7 @@ def moved(model: SplatModel, offset: Direction) -> SplatModel:
 
 def _rotation_to(facts: SplatModel, axes: str) -> F64:
     known = facts.coordinate_system != UNSPECIFIED
-    matrix = axes_rotation(facts.coordinate_system if known else USUAL, axes)
+    matrix = axes_rotation(facts.coordinate_system if known else DEFAULT_AXES, axes)
     up, wanted = up_of(facts.metadata), up_of_axes(axes)
     if known or up is None or wanted is None:
         return matrix

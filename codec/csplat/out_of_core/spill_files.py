@@ -1,14 +1,17 @@
-"""Splats on disk: a file for each bucket, to which rows are appended, and which is read as a whole.
+"""Keep an encoding's state in a working folder: splats of each bucket, and progress to resume from.
 
-A file is a row of frames. A frame has the number of its splats, a CRC, and then each array of a model one after the
-other, so that nothing has to be taken apart. The files are read by the machine that wrote them, in its own byte order.
+A bucket file is a sequence of frames. A frame has the number of its splats, a CRC, and then each array of a model in
+one piece. The files are read by the machine that wrote them, in its own byte order.
 """
 
 from __future__ import annotations
 
+import json
+import shutil
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.tiling import BucketCurve
+from csplat.disk_files import atomic_writer
+from csplat.encoder.tiling import BucketCurve, bucket_slices
 from csplat.errors import InputError
 from csplat.model import SplatModel
 
@@ -25,7 +29,7 @@ _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class SplatLayout:
     """Names and dtypes of a model's arrays.
 
     Attributes:
@@ -60,6 +64,41 @@ class Layout:
         return replace(self.facts, **named, means_double=doubles, extra=dict(zip(self.facts.extra, rest, strict=True)))
 
 
+@dataclass(frozen=True)
+class Bucket:
+    """Splats that are coded together.
+
+    Attributes:
+        number: index among all buckets.
+        place: index of the file that holds its splats. start, stop: its rows in that file.
+    """
+
+    number: int
+    place: int
+    start: int
+    stop: int
+
+    @property
+    def rows(self) -> slice:
+        """The bucket's rows in its file."""
+        return slice(self.start, self.stop)
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """Results of one pass over all splats of a scene.
+
+    Attributes:
+        sample: some of its splats, in the scene's order.
+        largest: magnitude of its largest SH coefficient.
+        curve: its buckets.
+    """
+
+    sample: SplatModel
+    largest: float
+    curve: BucketCurve
+
+
 @dataclass(eq=False)
 class BucketWriter:
     """Appends splats to the files of their buckets.
@@ -72,7 +111,7 @@ class BucketWriter:
     """
 
     folder: Path
-    layout: Layout
+    layout: SplatLayout
     curve: BucketCurve
     room_bytes: int
     counts: NDArray[np.int64] = field(init=False)
@@ -122,7 +161,7 @@ def bucket_path(folder: Path, place: int) -> Path:
     return folder / f"bucket-{place:06}"
 
 
-def write_splats(path: Path, layout: Layout, model: SplatModel) -> None:
+def write_splats(path: Path, layout: SplatLayout, model: SplatModel) -> None:
     """Write splats to a file of their own.
 
     Raises:
@@ -132,7 +171,7 @@ def write_splats(path: Path, layout: Layout, model: SplatModel) -> None:
         _append(stream, layout.arrays(model))
 
 
-def read_splats(path: Path, layout: Layout, part: slice | None = None) -> SplatModel:
+def read_splats(path: Path, layout: SplatLayout, part: slice | None = None) -> SplatModel:
     """Read the splats of a file, or a part of them.
 
     Raises:
@@ -166,18 +205,18 @@ def _append(stream: Any, arrays: Sequence[NDArray[Any]]) -> None:
         stream.write(array.reshape(-1).view(np.uint8).data)
 
 
-def _sizes(stream: Any, path: Path, layout: Layout) -> Iterator[int]:
+def _sizes(stream: Any, path: Path, layout: SplatLayout) -> Iterator[int]:
     """Rows of each frame."""
     size, at = path.stat().st_size, 0
     while at < size:
         stream.seek(at)
         head = stream.read(_FRAME.size)
         if len(head) < _FRAME.size:
-            raise damaged(path)
+            raise damaged_file(path)
         rows, _ = _FRAME.unpack(head)
         at += _FRAME.size + rows * layout.row_bytes
         if at > size:
-            raise damaged(path)
+            raise damaged_file(path)
         yield rows
 
 
@@ -189,9 +228,116 @@ def _read_frame(stream: Any, path: Path, frame: Sequence[NDArray[Any]]) -> None:
         stream.readinto(view)
         crc = zlib.crc32(view.data, crc)
     if found != (len(frame[0]), crc):
-        raise damaged(path)
+        raise damaged_file(path)
 
 
-def damaged(path: Path) -> InputError:
+def damaged_file(path: Path) -> InputError:
     """Return the error for a file of the working folder that is not as it was written."""
     return InputError(f"{path} is damaged: remove {path.parent.name} and begin again")
+
+
+_STATE = "state.json"
+_SAMPLE = "sample"
+
+
+@dataclass(eq=False)
+class WorkingFolder:
+    """A working folder.
+
+    Attributes:
+        folder: path of the folder.
+        layout: layout of the splats in it.
+        state: progress so far: `key`, the scene and the options; `curve` and `largest` after the first pass;
+            `counts`, splats of each bucket, after the second one; then `contrast`.
+    """
+
+    folder: Path
+    layout: SplatLayout
+    state: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def begun(cls, folder: Path, layout: SplatLayout, key: dict[str, Any], *, resume: bool) -> WorkingFolder:
+        """Make a folder, or go on in one.
+
+        Raises:
+            InputError: the folder is there and `resume` is not said, or is about another scene or other options, or
+                holds something else.
+            OSError: it cannot be made or read.
+        """
+        work = cls(folder, layout)
+        if (folder / _STATE).exists():
+            if not resume:
+                raise InputError(
+                    f"{folder} is left of an interrupted encoding: `--resume` goes on with it; or remove it"
+                )
+            try:
+                work.state = json.loads((folder / _STATE).read_text())
+            except ValueError:
+                raise damaged_file(folder / _STATE) from None
+            for name, value in key.items():
+                if (found := work.state["key"].get(name)) != value:
+                    raise InputError(f"{folder} was begun with another {name} ({found}, now {value}): remove it")
+            return work
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise InputError(f"{folder} holds something else: splats wait in a folder of their own, which is removed")
+        folder.mkdir(exist_ok=True)
+        work.note(key=key)
+        return work
+
+    def note(self, **done: Any) -> None:
+        """Write down what is done.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self.state.update(done)
+        with atomic_writer(self.folder / _STATE) as stream:
+            stream.write(json.dumps(self.state).encode())
+
+    @property
+    def survey(self) -> Survey | None:
+        """Results of the first pass, `None` if it is not done.
+
+        Raises:
+            InputError: its file is damaged.
+            OSError: it cannot be read.
+        """
+        if "curve" not in self.state:
+            return None
+        said = self.state["curve"]
+        curve = BucketCurve(np.array(said["corner"]), said["scale"], np.array(said["bounds"], np.int64))
+        return Survey(read_splats(self.folder / _SAMPLE, self.layout), self.state["largest"], curve)
+
+    def keep(self, survey: Survey) -> None:
+        """Write down the first pass.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        write_splats(self.folder / _SAMPLE, self.layout, survey.sample)
+        curve = survey.curve
+        said = {"corner": curve.corner.tolist(), "scale": curve.scale, "bounds": curve.bounds.tolist()}
+        self.note(curve=said, largest=survey.largest)
+
+    @property
+    def buckets(self) -> list[Bucket]:
+        """Buckets in the order of the file; known after the second pass."""
+        parts = [
+            (place, part) for place, count in enumerate(self.state["counts"]) if count for part in bucket_slices(count)
+        ]
+        return [Bucket(number, place, part.start, part.stop) for number, (place, part) in enumerate(parts)]
+
+    def clear_buckets(self) -> None:
+        """Remove what an interrupted second pass left."""
+        for path in self.folder.glob("bucket-*"):
+            path.unlink()
+
+    def drop(self, bucket: Bucket, left: Sequence[Bucket]) -> None:
+        """Remove the splats of a bucket that is coded, unless others that are not have the same file."""
+        if all(other.place != bucket.place for other in left):
+            bucket_path(self.folder, bucket.place).unlink(missing_ok=True)
+
+    def remove(self) -> None:
+        """Remove the folder: the file is written."""
+        with suppress(OSError):
+            shutil.rmtree(self.folder)

@@ -12,7 +12,7 @@ import numpy as np
 
 from csplat.decoder.container import view_of
 from csplat.errors import CsplatError, FormatError, LimitError, StoreError
-from csplat.inputs import File
+from csplat.file_source import File
 from csplat.system import Pages, read_at
 
 
@@ -86,7 +86,7 @@ class Store:
             return StoreError(said)
 
     @contextmanager
-    def telling(self) -> Iterator[None]:
+    def named_errors(self) -> Iterator[None]:
         """Name the file in errors, and report whether it is at fault or has changed since it was opened."""
         try:
             yield
@@ -106,7 +106,7 @@ class Store:
         return False
 
 
-class Memory(Store):
+class MemoryStore(Store):
     """Bytes, or an open file, which is read to its end."""
 
     def __init__(self, file: File) -> None:
@@ -118,7 +118,7 @@ class Memory(Store):
         return [bytes(self._view[start:stop]) for start, stop in ranges]
 
 
-class Disk(Store):
+class DiskStore(Store):
     """A file on this machine. It is not mapped: a process that truncates it during a read must not end the program."""
 
     def __init__(self, path: Path) -> None:
@@ -138,7 +138,7 @@ class Disk(Store):
         self._file.close()
 
 
-class Window:
+class FileWindow:
     """A file's bytes at their own places, as far as they were fetched; all others are 0, and take no memory.
 
     Attributes:

@@ -1,18 +1,20 @@
-"""One bucket, from its splats on disk to chunks on disk: what a worker does, in whatever process."""
+"""Encode buckets, from splats on disk to chunks on disk, in this process, several processes or on a Dask cluster."""
 
 from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from csplat import _spec
+from csplat.disk_files import atomic_writer
 from csplat.encoder.coding_parameters import CodingParameters
 from csplat.encoder.container import FileTile, LazyPayload, chunk_crc
 from csplat.encoder.encode_plan import clip_scales
@@ -20,32 +22,13 @@ from csplat.encoder.error_bounds import ErrorSums
 from csplat.encoder.pipeline import EncodedTile, encode_tile
 from csplat.encoder.sh_codebook import FileCodebooks, assign_splats
 from csplat.encoder.tiling import cut_scene
-from csplat.files import atomic_writer
-from csplat.large.bucket_files import Layout, bucket_path, damaged, read_splats
-
-
-@dataclass(frozen=True)
-class Bucket:
-    """Splats that are coded together.
-
-    Attributes:
-        number: index among all buckets.
-        place: index of the file that holds its splats. start, stop: its rows in that file.
-    """
-
-    number: int
-    place: int
-    start: int
-    stop: int
-
-    @property
-    def rows(self) -> slice:
-        """The bucket's rows in its file."""
-        return slice(self.start, self.stop)
+from csplat.errors import missing_package
+from csplat.out_of_core.spill_files import Bucket, SplatLayout, bucket_path, damaged_file, read_splats
+from csplat.system import map_in_processes
 
 
 @dataclass(frozen=True, eq=False)
-class Coding:
+class BucketCoding:
     """State that all buckets share.
 
     Attributes:
@@ -53,12 +36,12 @@ class Coding:
         plan: complete. books: as decided on the sample, without its splats' entries.
     """
 
-    layout: Layout
+    layout: SplatLayout
     plan: CodingParameters
     books: FileCodebooks
 
 
-def code_bucket(folder: Path, bucket: Bucket, coding: Coding) -> None:
+def code_bucket(folder: Path, bucket: Bucket, coding: BucketCoding) -> None:
     """Code a bucket, unless that is done.
 
     Args:
@@ -100,7 +83,7 @@ def coded_bucket(folder: Path, bucket: Bucket) -> list[EncodedTile] | None:
         return None
     data = path.read_bytes()
     if zlib.crc32(data[4:]).to_bytes(4, "little") != data[:4]:
-        raise damaged(path)
+        raise damaged_file(path)
     return [_tile(said, _chunks_path(folder, bucket)) for said in json.loads(data[4:])]
 
 
@@ -140,5 +123,53 @@ def _read_payload(path: Path, offset: int, size: int, crc: int) -> bytes:
         stream.seek(offset)
         data = stream.read(size)
     if len(data) != size or chunk_crc(_spec.CHUNK_TILE, data) != crc:
-        raise damaged(path)
+        raise damaged_file(path)
     return data
+
+
+def code_here(folder: Path, buckets: Sequence[Bucket], coding: BucketCoding, workers: int) -> Iterator[Bucket]:
+    """Code buckets on this machine, and give each when it is done.
+
+    Args:
+        folder: the working folder.
+        buckets: the buckets that are not done.
+        coding: the decisions that all buckets share.
+        workers: number of processes; 1: only this one.
+
+    Raises:
+        CsplatError: as in `code_bucket`.
+        OSError: likewise; or a process was killed.
+    """
+    for bucket, _ in map_in_processes(_code, (folder, coding), buckets, workers):
+        yield bucket
+
+
+def _code(shared: tuple[Path, BucketCoding], bucket: Bucket) -> None:
+    folder, coding = shared
+    code_bucket(folder, bucket, coding)
+
+
+def code_on_cluster(folder: Path, buckets: Sequence[Bucket], coding: BucketCoding, address: str) -> Iterator[Bucket]:
+    """Code buckets on a Dask cluster, whose workers see the working folder under the same name.
+
+    Dask runs again what a lost worker had begun.
+
+    Args:
+        folder, buckets, coding: as in `code_here`.
+        address: address of the scheduler.
+
+    Raises:
+        InputError: `dask.distributed` is not installed.
+        CsplatError: as in `code_bucket`.
+        OSError: likewise; or the scheduler does not answer.
+    """
+    try:
+        distributed: Any = import_module("distributed")  # it has no types
+    except ModuleNotFoundError as error:
+        raise missing_package(error, extra="scale") from None
+    with distributed.Client(address, set_as_default=False) as client, client.as_current():
+        shared = client.scatter(coding, broadcast=True)
+        futures = {client.submit(code_bucket, folder, bucket, shared, pure=False): bucket for bucket in buckets}
+        for future in distributed.as_completed(list(futures)):
+            future.result()
+            yield futures[future]

@@ -1,0 +1,1 @@
+"""Edit scenes and files: merge, transform, change the up direction."""

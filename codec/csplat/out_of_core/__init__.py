@@ -1,0 +1,7 @@
+"""Encode scenes that do not fit in memory, bucket by bucket on disk, to the same bytes as in memory."""
+
+from __future__ import annotations
+
+from csplat.out_of_core.disk_encode import ResourceNeeds, encode_scene, estimate_needs
+
+__all__ = ["ResourceNeeds", "encode_scene", "estimate_needs"]
