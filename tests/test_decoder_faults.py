@@ -15,15 +15,15 @@ from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import load
 from csplat_conformance.single_precision import GPUS
 from csplat_conformance.tolerance import EXACT, RENDERER
-from csplat_selftest.decoder_faults import FAULTS, off_by, single_precision
+from csplat_selftest.decoder_faults import all_faults, off_by, single_precision
 from csplat_selftest.decoder_processes import missing_javascript
 from csplat_selftest.faults import DecoderFault, ModuleEdit, edited, edited_module, find, table
 
 needs_javascript = pytest.mark.skipif(bool(missing_javascript()), reason=f"skipped: {missing_javascript()}")
 
 
-PYTHON = [fault for fault in FAULTS if fault.language == "Python"]
-JAVASCRIPT = [fault for fault in FAULTS if fault.language == "JavaScript"]
+PYTHON = [fault for fault in all_faults() if fault.language == "Python"]
+JAVASCRIPT = [fault for fault in all_faults() if fault.language == "JavaScript"]
 VECTOR_LIST = load()
 #: Tests of the suite itself: they run when it changes.
 in_depth = pytest.mark.area(name="suite")
@@ -143,7 +143,7 @@ def test_every_edit_finds_what_it_changes():
 
 def test_an_edit_that_finds_nothing_to_change_is_an_error():
     with pytest.raises(ValueError, match="wanted once"):
-        edited_module(ModuleEdit("container.mjs", "another text", ""))
+        edited_module(ModuleEdit("container.mjs", {"another text": ""}))
 
 
 def test_clauses_that_0_2_added_or_changed_have_wrong_decoders_of_their_own():

@@ -4,8 +4,8 @@ Usage:
     python -m csplat_selftest.decoder_faults             # the table: fault, vectors failed, clauses
     python -m csplat_selftest.decoder_faults --only python --vectors
 
-Faults of the Python decoder replace a function or a piece of its text, those of the JavaScript decoder a piece of the
-text of a module. Some compute in single precision, badly, and are tested by the class *renderer*.
+Faults replace a function of the Python decoder (here), or a piece of the text of a function in Python or a module in
+JavaScript (`decoder_faults.toml`). Some compute in single precision, badly, and are tested by the class *renderer*.
 """
 
 from __future__ import annotations
@@ -14,9 +14,12 @@ import argparse
 import json
 import math
 import sys
+import tomllib
 import zlib
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Final
 from unittest import mock
@@ -43,6 +46,20 @@ from csplat_selftest.faults import (
     together,
 )
 
+_EDITS: Final = Path(__file__).with_suffix(".toml")
+
+
+@cache
+def all_faults() -> list[DecoderFault]:
+    """Return all planted faults of our decoders."""
+    result = list(_REPLACEMENTS)
+    for language, rows in tomllib.loads(_EDITS.read_text(encoding="utf-8")).items():
+        for row in rows:
+            edits = {edit["old"]: edit["new"] for edit in row.get("edits", [row])}
+            plant = edited(row["in"], edits) if language == "python" else ModuleEdit(row["in"], edits)
+            result.append(DecoderFault(row["name"], row["what"], row["clause"], plant))
+    return result
+
 
 def main() -> int:
     """Print the table; the exit status is 1 if a fault goes unnoticed."""
@@ -53,7 +70,7 @@ def main() -> int:
     parser.add_argument("--vectors", action="store_true", help="list the vectors that each fault fails")
     args = parser.parse_args()
     findings = []
-    for fault in FAULTS:
+    for fault in all_faults():
         if args.only in (None, fault.language.lower()):
             try:
                 findings.append(find(fault))
@@ -276,17 +293,6 @@ def _library_json(_right: Wrong, text: bytes, _kind: type, at: int) -> Any:
         raise FormatError(_spec.ERROR_JSON, at, "JSN-1", str(error)) from None
 
 
-_COUNT = {"not 1 <= params.present_count <= count": "False"}
-_BITS = {"len(present) != params.present_count": "False"}
-_OF_THE_KIND = """context.first.get(params.codebook_id) or next(
-        (one for one in context.first.values() if one.book.record.kind == book.record.kind), None
-    )"""
-_CHECKED = """block = ColumnBlock(elements.reshape(1, count), offsets, 0, at)
-    check_integers(block.lows, block.highs, context.header.attribute(attribute), at)
-    return block"""
-_NFC = "__import__('unicodedata').normalize('NFC', {})"
-
-
 # Single precision ----------------------------------------------------------------------------------
 
 
@@ -367,10 +373,6 @@ def _renderer(name: str, what: str, clause: str, plant: Plant) -> DecoderFault:
     return DecoderFault(f"renderer: {name}", what, clause, plant, RENDERER)
 
 
-def _javascript(name: str, what: str, clause: str, file: str, old: str, new: str) -> DecoderFault:
-    return DecoderFault(name, what, clause, ModuleEdit(file, old, new))
-
-
 _NO_LIMITS = constants(
     **dict.fromkeys(
         ("CHROMA_SHIFT_MAX", "QUAT_LEVELS_MAX", "OPACITY_LEVELS_MAX", "COLUMN_MAX", "JSON_DEPTH_MAX"), 2**60
@@ -378,7 +380,7 @@ _NO_LIMITS = constants(
 )
 _NOTHING_READ = together(replaced("read_json", nothing), replaced("read_serr", nothing))
 
-FAULTS: Final = (
+_REPLACEMENTS: Final = (
     DecoderFault("CRC ignored", "no CRC-32 is compared", "CHK-1", replaced("_check_crc", nothing)),
     DecoderFault("CRC of the index", "the chunks have theirs", "IDX-1", replaced("_check_crc", crc_but("IDX-1"))),
     DecoderFault("CRCs of chunks", "the index has its own", "CHK-1", replaced("_check_crc", crc_but("CHK-1"))),
@@ -440,69 +442,12 @@ FAULTS: Final = (
     DecoderFault("exponents", "2^exponent is forgotten", "LAT-1", _no_exponents),
     DecoderFault("chroma shift", "Co and Cg are not shifted", "ATT-8", replaced("lift", _no_chroma_shift)),
     DecoderFault("lifting", "halves rounded towards zero", "ATT-2", replaced("lift", _lift_towards_zero)),
-    DecoderFault(
-        "version",
-        "any minor version is read",
-        "HDR-2",
-        edited("read_file_header", {"version != (_spec.VERSION_MAJOR, _spec.VERSION_MINOR)": "version[0]"}),
-    ),
     DecoderFault("CRC of the header", "the index has its own", "HDR-12", replaced("_check_crc", crc_but("HDR-3"))),
     DecoderFault("steps", "binary64, as the means'", "ATT-10", replaced("_is_single", lambda *_: True)),
     DecoderFault("lattices", "step × 2^exponent may be anything", "LAT-1", replaced("check_step", nothing)),
-    DecoderFault(
-        "offsets", "sums alone are looked at", "LAT-3", edited("read_offsets", {"> _spec.COLUMN_MAX": "> 2**32"})
-    ),
     DecoderFault("columns", "within 2^50, as in 0.1", "LAT-4", constants(COLUMN_MAX=2**50)),
-    DecoderFault(
-        "columns of chroma",
-        "the limit holds before the shift",
-        "LAT-4",
-        edited("_check_columns", {"record.chroma_shift if 3 * column >= len(lows) else 0": "0"}),
-    ),
-    DecoderFault(
-        "values of entries", "where they are used", "CBK-7", edited("_check_entries", {"check_values(": "id, ("})
-    ),
     DecoderFault("unnamed codebooks", "are not read", "CHK-2", replaced("check_unnamed_codebooks", nothing)),
     DecoderFault("unread payloads", "nor are frame and CRC looked at, which CHK-6 demands", "CHK-2", _NOTHING_READ),
-    DecoderFault("present splats", "the mask alone counts", "SPA-1", edited("read_sparse", _COUNT | _BITS)),
-    DecoderFault(
-        "bits of the mask",
-        "as many as `present_count` says, from the first on",
-        "SPA-2",
-        edited("read_sparse", _BITS | {"np.flatnonzero(bits)": "np.flatnonzero(bits)[: params.present_count]"}),
-    ),
-    DecoderFault(
-        "end of the mask",
-        "bits that belong to no splat are cut off",
-        "SPA-3",
-        edited("read_sparse", {"if bits[count:].any()": "bits = bits[:count]\n    if False"}),
-    ),
-    DecoderFault(
-        "names of columns",
-        "compared after normalisation",
-        "EXR-2",
-        edited(
-            "read_extras", {"name in columns": f"{_NFC.format('name')} in [{_NFC.format('one')} for one in columns]"}
-        ),
-    ),
-    DecoderFault(
-        "codebooks of a kind",
-        "a later block takes the indices of another, where its own has none",
-        "CBK-4",
-        edited("_indices", {"context.first.get(params.codebook_id)": _OF_THE_KIND}),
-    ),
-    DecoderFault(
-        "indices",
-        "beyond the escape index the last entry serves",
-        "CBK-2",
-        edited("_read_indices", {"largest > size": "False"}),
-    ),
-    DecoderFault(
-        "summands",
-        "LAT-4 holds for them, too",
-        "LAT-4",
-        edited("_read_summand", {"return ColumnBlock(elements.reshape(1, count), offsets, 0, at)": _CHECKED}),
-    ),
     DecoderFault("JSON", "as the library reads it", "JSN-1", replaced("parse_json", _library_json)),
     _renderer("3 ulp", "values of lattices", "CNF-7", off_by(3)),
     _renderer(
@@ -523,129 +468,6 @@ FAULTS: Final = (
         "a GPU that cuts products has no infinite ones, and the range is not looked at",
         "CNF-8",
         together(replaced("_check_finite", nothing), single_precision(GPUS["WGSL"][1])),
-    ),
-    _javascript(
-        "version",
-        "any minor version is read",
-        "HDR-2",
-        "container.mjs",
-        "major !== spec.VERSION_MAJOR || minor !== spec.VERSION_MINOR",
-        "major !== spec.VERSION_MAJOR",
-    ),
-    _javascript("steps", "binary64, as the means'", "ATT-10", "file_index.mjs", "Math.fround(step) === step && ", ""),
-    _javascript(
-        "lattices",
-        "step × 2^exponent may be anything",
-        "LAT-1",
-        "codings.mjs",
-        "if (!(s >= SINGLE_MIN && s < 2 ** 128))",
-        "if (false)",
-    ),
-    _javascript(
-        "columns of chroma",
-        "the limit holds before the shift",
-        "LAT-4",
-        "codings.mjs",
-        "spec.COLUMN_MAX / 2 ** attribute.chromaShift",
-        "spec.COLUMN_MAX",
-    ),
-    _javascript(
-        "bits of the mask", "uncounted", "SPA-2", "codings.mjs", "if (found !== count) throw", "if (false) throw"
-    ),
-    _javascript(
-        "end of the mask",
-        "not looked at",
-        "SPA-3",
-        "codings.mjs",
-        "if (n & 7 && mask[n >> 3] >> (n & 7)) throw",
-        "if (false) throw",
-    ),
-    _javascript(
-        "CRCs of chunks", "ignored", "CHK-1", "container.mjs", "checkCrc(chunk, place.crc, offset, 'CHK-1');", ""
-    ),
-    _javascript(
-        "CRC of the index",
-        "ignored",
-        "IDX-1",
-        "container.mjs",
-        "checkCrc(index.subarray(0, at), found, spec.HEADER_SIZE + at, 'IDX-1');",
-        "",
-    ),
-    _javascript(
-        "chunks unused",
-        "chunks of the directory are opened where they are read",
-        "CHK-2",
-        "reader.mjs",
-        "for (const [place, chunk] of chunks) if (!",
-        "for (const [place, chunk] of chunks) if (place.type in spec.CHUNK_NAMES && !",
-    ),
-    _javascript(
-        "tails of payloads", "a payload may go on", "TLE-3", "payload.mjs", "if (this.left) throw", "if (false) throw"
-    ),
-    _javascript(
-        "lenient inflate",
-        "as Node's inflateRaw by default",
-        "COD-2",
-        "inflate.mjs",
-        "if (used !== coded.length) throw",
-        "if (false) throw",
-    ),
-    _javascript(
-        "zigzag",
-        "the sign is lost",
-        "STR-3",
-        "transforms.mjs",
-        "x[i] = ((x[i] >>> 1) ^ -(x[i] & 1)) & mask",
-        "x[i] >>>= 1",
-    ),
-    _javascript(
-        "carry", "from the lower half of wide elements", "STR-2", "transforms.mjs", "(sum > 0xffffffff ? 1 : 0)", "0"
-    ),
-    _javascript(
-        "escapes",
-        "escaped splats take what index 0 gives",
-        "CBK-3",
-        "codebooks.mjs",
-        "block.columns[Math.floor(i / n) * stride + escaped[i % n]] = escapes.columns[i];",
-        "",
-    ),
-    _javascript(
-        "mask",
-        "bits from the highest on",
-        "SPA-2",
-        "codings.mjs",
-        "if ((mask[i >> 3] >> (i & 7)) & 1)",
-        "if ((mask[i >> 3] >> (7 - (i & 7))) & 1)",
-    ),
-    _javascript(
-        "unused entries",
-        "entries of a codebook are believed",
-        "CBK-7",
-        "codebooks.mjs",
-        "  checkEntries({",
-        "  if (false) checkEntries({",
-    ),
-    _javascript(
-        "quats, sign of w", "w is negative", "QUA-2", "arrays.mjs", "out[at] = Math.sqrt(", "out[at] = -Math.sqrt("
-    ),
-    _javascript(
-        "opacities",
-        "the square is forgotten",
-        "LEV-1",
-        "arrays.mjs",
-        "if (mapping === spec.MAPPING_NAMES[spec.MAPPING_SQUARE]) {",
-        "if (false) {",
-    ),
-    _javascript(
-        "lifting", "halves rounded towards zero", "ATT-2", "lattice.mjs", "Math.floor(co / 2)", "Math.trunc(co / 2)"
-    ),
-    _javascript(
-        "power",
-        "step × 2^exponent by way of 2^exponent, which may overflow",
-        "TIL-9",
-        "lattice.mjs",
-        "return view.getFloat64(0);",
-        "return x * 2 ** exponent;",
     ),
 )
 

@@ -37,13 +37,11 @@ class ModuleEdit:
 
     Attributes:
         file: module.
-        old: a piece of its text that occurs once.
-        new: its replacement.
+        edits: pieces of its text, each of which occurs once, and their replacements.
     """
 
     file: str
-    old: str
-    new: str
+    edits: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -172,7 +170,7 @@ def edited(name: str, edits: Mapping[str, str]) -> Plant:
 def edited_module(edit: ModuleEdit) -> str:
     """Return the text of a JavaScript module with the fault in it."""
     text = (js_folder() / edit.file).read_text(encoding="utf-8")
-    return _edited_text(edit.file, text, {edit.old: edit.new})
+    return _edited_text(edit.file, text, edit.edits)
 
 
 def constants(**values: int) -> Plant:
