@@ -1,4 +1,4 @@
-"""Fuzz the decoders and the readers of PLY and other formats: mutants with an eye for structure, checksums repaired.
+"""Fuzz the decoders and the readers of PLY and other formats: damage with an eye for structure, checksums repaired.
 
 | target | must |
 |---|---|
@@ -269,7 +269,7 @@ def case(target, seed, number, seeds, grown, *, plain=False):
     rng = random.Random(f"{target.name} {seed} {number}")  # noqa: S311 - repeatable, no secret
     traced = not plain and rng.random() < TRACED_SHARE
     corpus = grown if grown and rng.random() < GROWN_SHARE else seeds
-    return target.mutant(rng, corpus), traced
+    return target.case(rng, corpus), traced
 
 
 def attempt(target, data):

@@ -139,7 +139,7 @@ def test_faults_of_every_level_are_caught_and_freedoms_are_left(report_of):
 @in_depth
 @pytest.mark.slow
 @pytest.mark.parametrize("group", GROUPS)
-def test_every_wrong_encoder_is_caught_and_every_freedom_is_left(report_of, group):
+def test_every_fault_is_caught_and_every_freedom_is_left(report_of, group):
     assert [] == reported(report_of, GROUPS[group])
 
 

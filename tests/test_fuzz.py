@@ -81,22 +81,22 @@ def test_cases_are_the_same_for_a_seed():
     assert first != cases(DecoderTarget(), 6, 50, BASES)
 
 
-def test_most_mutants_have_sound_checksums():
+def test_most_damaged_files_have_sound_checksums():
     base = BASES[0]
-    mutants = [damaged_from(random.Random(number), base, BASES) for number in range(300)]  # noqa: S311 - no secret
+    damaged_files = [damaged_from(random.Random(number), base, BASES) for number in range(300)]  # noqa: S311 - no secret
 
-    assert sum(repaired for _, repaired, _ in mutants) > 240
-    assert all(data == repair(data, base.records) for data, repaired, _ in mutants if repaired)
+    assert sum(repaired for _, repaired, _ in damaged_files) > 240
+    assert all(data == repair(data, base.records) for data, repaired, _ in damaged_files if repaired)
 
 
-def test_mutants_reach_the_streams():
+def test_damaged_files_reach_the_streams():
     names = {attempt(data)[0] for data in cases(DecoderTarget(), 1, 250, BASES)}
 
     assert {"decoded", "E_STREAM", "E_CODER", "E_CODEBOOK", "E_BOX", "E_RANGE"} <= names
     assert "finding" not in names
 
 
-def test_a_mutant_can_be_mutated_again():
+def test_a_damaged_file_can_be_damaged_again():
     target, corpus = DecoderTarget(), list(BASES)
     for number in range(200):
         one, _ = fuzz.case(target, 3, number, BASES, corpus[1:])
@@ -201,7 +201,7 @@ def test_two_decoders_have_to_agree(ours, theirs, name):
 @pytest.mark.skipif(bool(missing_others()), reason=f"skipped: {missing_others()}")
 @pytest.mark.slow
 @pytest.mark.area(name="suite")  # `make test` fuzzes the others, too
-def test_all_decoders_agree_on_mutants():
+def test_all_decoders_agree_on_damaged_files():
     target = OthersTarget()
     names = {fuzz.attempt(target, data)[0] for data in cases(target, 2, 100, BASES)}
     target.close()
@@ -236,7 +236,7 @@ def test_a_javascript_process_that_hangs_is_a_finding(tmp_path):
         assert Status.HUNG == hanging.ask(b"").status
 
 
-def test_validator_and_decoder_agree_on_mutants():
+def test_validator_and_decoder_agree_on_damaged_files():
     names = {fuzz.attempt(ValidatorTarget(), data) for data in cases(ValidatorTarget(), 2, 60, BASES)}
 
     assert {("decoded", ""), ("E_INDEX", ""), ("E_STREAM", "")} <= names
@@ -267,7 +267,7 @@ def test_a_ply_is_taken_apart_and_put_together_again(ply_target):
         assert seed.data == Ply.parse(seed.data).data
 
 
-def test_mutants_of_plies_are_read_and_refused_and_nothing_else(ply_target):
+def test_damaged_plies_are_read_and_refused_and_nothing_else(ply_target):
     names = [fuzz.attempt(ply_target, data)[0] for data in cases(ply_target, 1, 120, ply_target.seeds([]))]
 
     assert {"read", "refused"} == set(names)

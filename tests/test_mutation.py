@@ -87,7 +87,7 @@ def test_a_sample_is_repeatable_and_holds_programs_alone():
     assert first == again != other
     assert 40 == len({(one.file, one.start, one.new) for one in first})
     assert all(decoder.valid(one) for one in first)
-    assert not decoder.valid(Mutant("morton.py", 1, 0, "", "def"))
+    assert not decoder.valid(Mutant("blocks.py", 1, 0, "", "def"))
 
 
 # What becomes of it --------------------------------------------------------------------------------
@@ -98,7 +98,7 @@ def test_a_mutant_that_fails_a_vector_is_caught(few):
     few("valid/one_splat", "valid/means_morton")
     decoder = PythonDecoder([])
 
-    result = decoder.attempt(mutant(decoder, "morton.py", "bits |= shifted", "bits &= shifted"))
+    result = decoder.attempt(mutant(decoder, "blocks.py", "bits |= shifted", "bits &= shifted"))
     assert (Fate.CAUGHT, "valid/means_morton") == (result.fate, result.by)
 
 
@@ -107,7 +107,7 @@ def test_a_mutant_that_only_a_fuzzed_file_shows_is_missed(few):
     few("valid/one_splat")
     decoder = PythonDecoder([BY_NAME[name].data for name in ("valid/quats", "valid/means_morton")])
 
-    result = decoder.attempt(mutant(decoder, "morton.py", "bits |= shifted", "bits &= shifted"))
+    result = decoder.attempt(mutant(decoder, "blocks.py", "bits |= shifted", "bits &= shifted"))
     assert Fate.MISSED is result.fate
     assert result.by.startswith("file 1: ")
 
@@ -117,7 +117,7 @@ def test_a_mutant_that_changes_nothing_is_the_same(few):
     few("valid/means_morton", "invalid/chunk_crc")
     decoder = PythonDecoder([BY_NAME["valid/rich"].data])
 
-    result = decoder.attempt(mutant(decoder, "job.py", "8", "(8 - 1)"))
+    result = decoder.attempt(mutant(decoder, "decode_api.py", "8", "(8 - 1)"))
     assert (Fate.SAME, "") == (result.fate, result.by)
 
 
@@ -126,7 +126,7 @@ def test_a_mutant_that_changes_nothing_is_the_same(few):
 def test_a_mutant_that_hangs_is_caught(few):
     few("valid/means_morton")
     decoder = PythonDecoder([], processor_seconds=1)
-    one = mutant(decoder, "morton.py", "bits |= shifted", "bits &= shifted")
+    one = mutant(decoder, "blocks.py", "bits |= shifted", "bits &= shifted")
 
     result = decoder.attempt(replace(one, new="while True: pass"))
     assert (Fate.CAUGHT, "hangs, or ends the process") == (result.fate, result.by)

@@ -339,7 +339,7 @@ def test_flipped_bits_of_a_trained_scene_are_found(data_dir):
 
 
 @pytest.mark.slow
-def test_the_validator_agrees_with_the_decoder_on_mutants():
+def test_the_validator_agrees_with_the_decoder_on_damaged_files():
     small = {vector.name for vector in VALID if vector.name.startswith("valid/") and len(vector.data) < 3000}
     bases = [build(recipe.scene) for recipe in sound_recipes() if recipe.name in small]
     for number in range(120):

@@ -1,6 +1,6 @@
 """Scenes and vectors declared in TOML.
 
-The files of `chapters/` hold a chapter of the specification each. A table is a vector: `[valid.NAME]`,
+The files of `chapters/` hold a section of the specification each. A table is a vector: `[valid.NAME]`,
 `[extreme.NAME]` or `[invalid.NAME]`. The keys from `code` on are for invalid ones:
 
 | key | meaning |

@@ -98,7 +98,7 @@ def _cut_to_size(right: Wrong, data: Any) -> memoryview:
 
 
 def crc_but(unchecked: str) -> Wrong:
-    """Return a mistake that checks all CRCs but those of one clause."""
+    """Return a fault that checks all CRCs but those of one clause."""
 
     def wrong(right: Wrong, covered: memoryview, stored: int, at: int, clause: str) -> None:
         if clause != unchecked:
@@ -248,7 +248,7 @@ def _channels_innermost(_right: Wrong, block: Any, record: _spec.AttributeRecord
 def _without_corner(right: Wrong, block: Any, record: _spec.AttributeRecord, count: int, **options: Any) -> Any:
     for start, stop, parts in right(block, record, count, **options):
         if record.attribute == _spec.ATTRIBUTE_MEANS:
-            parts = tuple(part - offset for part, offset in zip(parts, block.offsets, strict=True))  # noqa: PLW2901 - the mistake
+            parts = tuple(part - offset for part, offset in zip(parts, block.offsets, strict=True))  # noqa: PLW2901 - the fault
         yield start, stop, parts
 
 
@@ -314,7 +314,7 @@ def single_precision(gpu: GpuArithmetic) -> Plant:
 
 
 def off_by(ulps: int) -> Plant:
-    """Return a mistake that makes means, scales and colours larger by `ulps` ulps of binary32."""
+    """Return a fault that makes means, scales and colours larger by `ulps` ulps of binary32."""
 
     def wrong(right: Wrong, integers: Any, step: float, out: Any, **options: Any) -> None:
         right(integers, step, out, **options)

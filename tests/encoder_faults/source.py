@@ -107,7 +107,7 @@ def true_errors(source, decoded, index):
     ]
     most, squares = distance_errors(absolute[0][index].T, absolute[1].T)
     largest, all_squares = {**sums.largest, "means": most}, {**sums.squares, "means": squares}
-    return ErrorSums(sums.count, largest, all_squares).stated()
+    return ErrorSums(sums.count, largest, all_squares).declared()
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Damage files with an eye for their structure, for fuzzing; the checksums are repaired afterwards.
 
-A mutant is made in two steps: fields and bytes are overwritten in place, then perhaps one chunk changes its length
+A file is damaged in two steps: fields and bytes are overwritten in place, then perhaps one chunk changes its length
 or place and the file is laid out anew, so that offsets and sizes fit again.
 """
 

@@ -37,11 +37,11 @@ _MEMORY = 700_000_000  # bytes of another process; a heap of 512 MiB, and Node
 
 @dataclass(frozen=True)
 class FuzzCase:
-    """A mutant.
+    """A damaged file.
 
     Attributes:
         data: the file.
-        source: makes what it can be mutated from again, of the target's own type; None if nothing can.
+        source: makes what it can be damaged from again, of the target's own type; None if nothing can.
         notes: names that are counted, such as `(not repaired)`.
     """
 
@@ -64,10 +64,10 @@ class FuzzTarget(Protocol):
     watched: Sequence[Path]
 
     def seeds(self, paths: Iterable[Path]) -> list[Any]:
-        """Return what mutants start from, and the given files too."""
+        """Return what damaged files start from, and the given files too."""
         ...
 
-    def mutant(self, rng: random.Random, corpus: Sequence[Any]) -> FuzzCase:
+    def case(self, rng: random.Random, corpus: Sequence[Any]) -> FuzzCase:
         """Make a case from one or more entries of the corpus."""
         ...
 
@@ -106,7 +106,7 @@ class DecoderTarget:
         scenes = [recipe.scene for recipe in sound_recipes() if recipe.scene is not None and recipe.name in small]
         return [build(scene) for scene in scenes] + [built_from(p.read_bytes()) for p in paths]
 
-    def mutant(self, rng: random.Random, corpus: Sequence[Built]) -> FuzzCase:
+    def case(self, rng: random.Random, corpus: Sequence[Built]) -> FuzzCase:
         """Damage a file of the corpus."""
         base = rng.choice(corpus)
         data, repaired, in_place = damaged_from(rng, base, corpus)
@@ -218,7 +218,7 @@ class OthersTarget(DecoderTarget):
 
 
 def _built(data: bytes) -> Built | None:
-    """Return a mutant that was laid out anew with its fields, if its index still leads to its chunks."""
+    """Return a damaged file that was laid out anew with its fields, if its index still leads to its chunks."""
     try:
         found = built_from(data)
     except (ValueError, LookupError, struct.error):

@@ -63,7 +63,7 @@ class PlyTarget(FileTarget):
         """Return small PLYs of all degrees, encodings and oddities, and the given files."""
         return ply_damage.seeds() + [Ply.parse(path.read_bytes()) for path in paths]
 
-    def mutant(self, rng: random.Random, corpus: Sequence[Ply]) -> FuzzCase:
+    def case(self, rng: random.Random, corpus: Sequence[Ply]) -> FuzzCase:
         """Damage header, body or both."""
         ply = changed(rng, rng.choice(corpus))
         data = ply.data
@@ -195,7 +195,7 @@ class FormatTarget(FileTarget):
                 found.append(Seed("".join(path.suffixes), path.read_bytes()))
         return found + [Seed("".join(path.suffixes), path.read_bytes()) for path in paths]
 
-    def mutant(self, rng: random.Random, corpus: Sequence[Seed]) -> FuzzCase:
+    def case(self, rng: random.Random, corpus: Sequence[Seed]) -> FuzzCase:
         """Damage a file, or what is packed in it."""
         seed = rng.choice(corpus)
         change = _inside if rng.random() < 0.6 else _damaged

@@ -167,7 +167,7 @@ def fuzzed(count: int, seed: int) -> list[bytes]:
     """Return damaged files, most of them with their checksums repaired."""
     target, rng = DecoderTarget(), random.Random(seed)  # noqa: S311 - repeatable, no secret
     corpus = target.seeds(())
-    return [target.mutant(rng, corpus).data for _ in range(count)]
+    return [target.case(rng, corpus).data for _ in range(count)]
 
 
 def verdict(answer: Answer) -> Any:
