@@ -1,4 +1,4 @@
-"""Map the clauses of the spec to the vectors that cover them, with the reason for clauses that none covers."""
+"""Map the clauses of the spec to the vectors that cover them, with a reason for each clause without one."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ _NAMES_MAX = 4
 
 
 def clause_ids(text: str) -> list[str]:
-    """Return every clause id that the spec's text defines, in its order, repetitions kept."""
+    """Return the ids of the clauses in the text of the spec, in order and with repetitions."""
     return re.findall(r"\[([A-Z]{3}-[0-9]+)\]", text)
 
 
 def clause_map(text: str, vectors: Sequence[Vector]) -> str:
-    """Return annex C: a row for each clause."""
+    """Return annex C, with a row for each clause."""
     covering: dict[str, list[str]] = {}
     for vector in vectors:
         for clause in vector.clauses:
             covering.setdefault(clause, []).append(vector.name)
     lines = ["| clause | vectors, or why there are none |", "|---|---|"]
     for clause in clause_ids(text):
-        # Refusals say most about a clause: they come first.
+        # Invalid vectors come first, since they show most about a clause.
         names = sorted(covering.get(clause, []), key=lambda name: not name.startswith("invalid/"))
         cell = ", ".join(f"`{name}`" for name in names[:_NAMES_MAX])
         if len(names) > _NAMES_MAX:

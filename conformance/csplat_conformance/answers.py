@@ -1,8 +1,8 @@
 """Compare a decoder's answer for a vector with the manifest.
 
-| level | looks at |
+| level | compares |
 |---|---|
-| L1 | `header.json`; for broken files the refusal |
+| L1 | `header.json`; for invalid files the refusal |
 | L2 | the integer arrays of spec 9.2 |
 | L3 | the float arrays of spec section 3 and the extra columns, bit for bit, or by `tolerance` for the class renderer |
 
@@ -23,11 +23,11 @@ from csplat_conformance.conformance_report import Outcome, Status
 from csplat_conformance.manifest import Vector
 from csplat_conformance.tolerance import describe_deviation
 
-#: Levels that `compare_answer` knows, and the parts of a manifest's expectation that each looks at.
+#: The levels of `compare_answer`, and the parts of the expected result that each compares.
 PARTS = {1: ("header",), 2: ("integers",), 3: ("floats", "extra")}
 LEVELS = (*PARTS, 4)
 
-#: From the name of a vector to its float arrays.
+#: Returns the float arrays of a vector by its name.
 FloatsByVector = Callable[[str], Mapping[str, NDArray[Any]]]
 
 
@@ -36,15 +36,15 @@ class Answer:
     """A decoder's answer for one vector.
 
     Attributes:
-        status: PASSED if the file was decoded, REFUSED if it was refused, otherwise what went wrong.
-        message: one line about what went wrong.
+        status: PASSED if the file was decoded, REFUSED if it was refused, otherwise the kind of failure.
+        message: one line about the failure.
         header: fields of header and index.
-        arrays: by `part.name`, as `floats.means`: bytes and SHA-256 of the raw little-endian values.
-        floats: by name, as `means`: the raw values, if they were kept for the class renderer.
+        arrays: size in bytes and SHA-256 of the raw little-endian values, by `part.name`, as `floats.means`.
+        floats: raw values by name, as `means`, if they were kept for the class renderer.
         code: error code of a refusal.
-        clause: clause that it names, if any.
-        offset: byte offset in the file that it names, if any.
-        seconds: time it took.
+        clause: clause of a refusal, if reported.
+        offset: offset in the file of a refusal, if reported.
+        seconds: time the decoder took.
     """
 
     status: Status
@@ -73,7 +73,7 @@ def compare_answer(
         answer: the decoder's answer.
         levels: numbers of the levels to check.
         exact: require refusals to match in code, clause and offset, even optional ones: for csplat's own decoders.
-        near: gives the exact floats of a vector, which a decoder of the class renderer need only be near to.
+        near: returns the exact floats of a vector, for decoders of the class renderer.
     """
     if vector.error:
         return [_check_refused(vector, answer, exact)] if 1 in levels else []
@@ -140,11 +140,11 @@ def check_payload_consistency(outcomes: Iterable[Outcome]) -> tuple[list[Outcome
     """Check CHK-7: a decoder reads every payload of a chunk type by all clauses, or none (CHK-6).
 
     Args:
-        outcomes: what `compare_answer` returned for all vectors.
+        outcomes: the results of `compare_answer` for all vectors.
 
     Returns:
-        The same, but that a broken payload which was accepted is a failure if others of its type were refused; and
-        for each type of which some were accepted a line.
+        The outcomes, with failures for invalid payloads that were accepted while others of their type were refused;
+        and a line for each type with accepted payloads.
     """
     result, notes = list(outcomes), []
     for kind in sorted({one.details["payload"] for one in result if "payload" in one.details}):

@@ -11,7 +11,7 @@ protocol of `protocol`. The levels are described in `answers` and `reference_ren
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -23,10 +23,9 @@ from csplat_conformance.manifest import VECTORS, Vector, load, select_names
 from csplat_conformance.protocol import ask_decoder, split_command
 from csplat_conformance.tolerance import CLASSES, EXACT, RENDERER
 
-#: Seconds that another decoder has for each vector; the largest is of 65,536 splats.
-TIMEOUT_SECONDS = 60.0
+TIMEOUT_SECONDS = 60.0  #: per vector; the largest has 65,536 splats
 
-#: Called after each vector: how many are done, of how many.
+#: Called after each vector with the number of vectors done and the total.
 CountProgress = Callable[[int, int], None]
 
 
@@ -35,13 +34,13 @@ class DecoderSuiteOptions:
     """Settings of a run of the decoder suite.
 
     Attributes:
-        pattern: shell patterns of the vectors' names, `valid/sh*,valid/rich`; None for all.
-        clause: shell patterns of clauses, `HDR-*,LIM-1`: vectors that cover one of them; None for all.
-        levels: levels to check, of 1 to 4.
-        exact: require refusals to match in code, clause and offset, even optional ones: for csplat's own decoders.
-        timeout: time limit for one process, seconds.
-        jobs: number of processes at a time; None for the number of processors.
-        by: the class of decoders (spec 9.2) whose rules apply.
+        pattern: shell patterns of names of vectors, `valid/sh*,valid/rich`; None for all.
+        clause: shell patterns of clauses, `HDR-*,LIM-1`, to select the vectors that cover them; None for all.
+        levels: levels to check, 1 to 4.
+        exact: require refusals to match in code, clause and offset, even optional ones, as csplat's own decoders must.
+        timeout: time limit of a process, seconds.
+        jobs: number of processes at a time; None: one per core.
+        by: class of the decoder (spec 9.2).
     """
 
     pattern: str | None = None
@@ -83,41 +82,38 @@ def parse_levels(text: str) -> tuple[int, ...]:
     return tuple(level for level in LEVELS if level <= numbers[0]) if len(numbers) == 1 else tuple(sorted(set(numbers)))
 
 
-def run_builtin(choice: DecoderSuiteOptions | None = None, progress: CountProgress | None = None) -> ConformanceReport:
+def run_builtin(options: DecoderSuiteOptions | None = None, progress: CountProgress | None = None) -> ConformanceReport:
     """Run csplat's decoder over the vectors; its refusals must match in code, clause and offset.
 
     Args:
-        choice: settings of the run; `exact`, `timeout` and `jobs` do not apply.
+        options: settings of the run; `exact`, `timeout` and `jobs` do not apply.
         progress: called with the number of vectors that are done.
 
     Raises:
-        InputError: a pattern of `choice` matches nothing.
+        InputError: a pattern of `options` matches nothing.
     """
-    choice = choice or DecoderSuiteOptions()
+    options = options or DecoderSuiteOptions()
 
     def run(vector: Vector) -> list[Outcome]:
         outcomes = []
-        if any(level in choice.levels for level in PARTS):
-            outcomes = compare_answer(vector, adapter.answer(vector.data), choice.levels, exact=True, near=choice.near)
-        if 4 in choice.levels and vector.views:
+        if any(level in options.levels for level in PARTS):
+            outcomes = compare_answer(
+                vector, adapter.answer(vector.data), options.levels, exact=True, near=options.near
+            )
+        if 4 in options.levels and vector.views:
             if reference_renders.can_render():
                 outcomes += reference_renders.score_own_renderer(vector)
             else:
                 outcomes += reference_renders.skip_views(vector, "needs the packages of the extra render")
         return outcomes
 
-    chosen = _select_vectors(choice)
-    results = []
-    for done, vector in enumerate(chosen, 1):
-        results.append(run(vector))
-        if progress:
-            progress(done, len(chosen))
-    return _make_report("csplat's decoder", results, choice)
+    vectors = _select_vectors(options)
+    return _make_report("csplat's decoder", map(run, vectors), len(vectors), options, progress)
 
 
 def run_command(
     command: str | None,
-    choice: DecoderSuiteOptions | None = None,
+    options: DecoderSuiteOptions | None = None,
     *,
     render: str | None = None,
     progress: CountProgress | None = None,
@@ -126,14 +122,14 @@ def run_command(
 
     Args:
         command: command line of the decoder with `{input}` and `{outdir}`; None to test a renderer alone.
-        choice: settings of the run.
+        options: settings of the run.
         render: command line of the renderer with `{input}`, `{camera}` and `{out}` or `{outdir}`, for L4.
         progress: called with the number of vectors that are done.
 
     Raises:
-        InputError: a command line that cannot be run; a pattern of `choice` matches nothing.
+        InputError: a command line that cannot be run; a pattern of `options` matches nothing.
     """
-    choice = choice or DecoderSuiteOptions()
+    options = options or DecoderSuiteOptions()
     if command is not None:
         split_command(command, ("input", "outdir"))
     if render is not None:
@@ -141,39 +137,45 @@ def run_command(
 
     def run(vector: Vector) -> list[Outcome]:
         outcomes = []
-        if command is not None and any(level in choice.levels for level in PARTS):
-            answer = ask_decoder(command, VECTORS / vector.file, choice.timeout, keep_floats=choice.near is not None)
-            outcomes = compare_answer(vector, answer, choice.levels, exact=choice.exact, near=choice.near)
-        if 4 in choice.levels:
+        if command is not None and any(level in options.levels for level in PARTS):
+            answer = ask_decoder(command, VECTORS / vector.file, options.timeout, keep_floats=options.near is not None)
+            outcomes = compare_answer(vector, answer, options.levels, exact=options.exact, near=options.near)
+        if 4 in options.levels:
             if render is None:
                 outcomes += reference_renders.skip_views(vector, "no command of a renderer was given")
             else:
-                outcomes += reference_renders.score_renderer(vector, render, choice.timeout)
+                outcomes += reference_renders.score_renderer(vector, render, options.timeout)
         return outcomes
 
-    chosen = _select_vectors(choice)
+    vectors = _select_vectors(options)
     if command is None:
-        chosen = [vector for vector in chosen if vector.views]
-    results = []
-    with ThreadPoolExecutor(choice.jobs or os.cpu_count() or 1) as pool:
-        for done, outcomes in enumerate(pool.map(run, chosen), 1):
-            results.append(outcomes)
-            if progress:
-                progress(done, len(chosen))
-    return _make_report(command or render or "", results, choice)
+        vectors = [vector for vector in vectors if vector.views]
+    with ThreadPoolExecutor(options.jobs or os.cpu_count() or 1) as pool:
+        return _make_report(command or render or "", pool.map(run, vectors), len(vectors), options, progress)
 
 
-def _select_vectors(choice: DecoderSuiteOptions) -> list[Vector]:
+def _select_vectors(options: DecoderSuiteOptions) -> list[Vector]:
     vectors = load()
-    names = select_names(choice.pattern, [vector.name for vector in vectors], "vector")
+    names = select_names(options.pattern, [vector.name for vector in vectors], "vector")
     clauses = select_names(
-        choice.clause, {clause for vector in vectors for clause in vector.clauses}, "clause of a vector"
+        options.clause, {clause for vector in vectors for clause in vector.clauses}, "clause of a vector"
     )
     return [vector for vector in vectors if vector.name in names and clauses & {*vector.clauses}]
 
 
-def _make_report(subject: str, results: Sequence[list[Outcome]], choice: DecoderSuiteOptions) -> ConformanceReport:
-    outcomes, notes = check_payload_consistency(outcome for result in results for outcome in result)
-    if choice.by != EXACT:
-        notes.append(f"judged as a decoder of the class {choice.by}")
+def _make_report(
+    subject: str,
+    results: Iterable[list[Outcome]],
+    vector_count: int,
+    options: DecoderSuiteOptions,
+    progress: CountProgress | None,
+) -> ConformanceReport:
+    outcomes: list[Outcome] = []
+    for done, some in enumerate(results, 1):
+        outcomes += some
+        if progress:
+            progress(done, vector_count)
+    outcomes, notes = check_payload_consistency(outcomes)
+    if options.by != EXACT:
+        notes.append(f"judged as a decoder of the class {options.by}")
     return ConformanceReport("decoder", subject, outcomes, notes)

@@ -49,8 +49,8 @@ def can_render() -> bool:
 
 def quantise_render(rgb: NDArray[Any]) -> U8:
     """Return the 8-bit values of a render: clipped to 0..1, times 255, rounded."""
-    picture: U8 = np.rint(np.clip(rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
-    return picture
+    image: U8 = np.rint(np.clip(rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
+    return image
 
 
 def reference_render(floats: Mapping[str, NDArray[Any]], camera: Mapping[str, Any], antialiased: bool) -> U8:
@@ -71,8 +71,8 @@ def score_own_renderer(vector: Vector) -> list[Outcome]:
     model = decode(vector.data)
     result = []
     for number, view in enumerate(vector.views):
-        picture = quantise_render(render(model, Camera.from_json(view["camera"])).rgb)
-        result.append(_compare_render(vector, number, picture, 0.0))
+        image = quantise_render(render(model, Camera.from_json(view["camera"])).rgb)
+        result.append(_compare_render(vector, number, image, 0.0))
     return result
 
 
@@ -80,9 +80,9 @@ def score_renderer(vector: Vector, command: str, timeout: float) -> list[Outcome
     """Render a vector's views with the command of another renderer.
 
     Args:
-        vector: with views.
+        vector: a vector with views.
         command: command line with `{input}`, `{camera}` and `{out}` or `{outdir}`.
-        timeout: seconds for each picture.
+        timeout: time limit for each render, seconds.
     """
     return [_score_view(vector, number, command, timeout) for number in range(len(vector.views))]
 
@@ -100,12 +100,12 @@ def _score_view(vector: Vector, number: int, command: str, timeout: float) -> Ou
         camera.write_text(json.dumps([vector.views[number]["camera"]]), encoding="utf-8")
         out = {"outdir": outdir} if "{outdir}" in command else {"out": outdir / "0.png"}
         places = {"input": VECTORS / vector.file, "camera": camera, **out}
-        ended = run_program(command, {key: str(path) for key, path in places.items()}, timeout)
-        seconds = ended.seconds
-        if ended.status is not None:
-            return _outcome(vector, number, ended.status, ended.message + last_words(ended), seconds)
-        if ended.returncode:
-            return _outcome(vector, number, Status.REFUSED, f"exit status 1{last_words(ended)}", seconds)
+        end = run_program(command, {key: str(path) for key, path in places.items()}, timeout)
+        seconds = end.seconds
+        if end.status is not None:
+            return _outcome(vector, number, end.status, end.message + last_words(end), seconds)
+        if end.returncode:
+            return _outcome(vector, number, Status.REFUSED, f"exit status 1{last_words(end)}", seconds)
         found = sorted(outdir.rglob("*.png"))
         if len(found) != 1:
             wrong = Status.WRONG_ANSWER if found else Status.NO_OUTPUT
@@ -116,9 +116,9 @@ def _score_view(vector: Vector, number: int, command: str, timeout: float) -> Ou
             return _outcome(vector, number, Status.WRONG_ANSWER, str(error), seconds)
 
 
-def _compare_render(vector: Vector, number: int, picture: U8, seconds: float) -> Outcome:
+def _compare_render(vector: Vector, number: int, image: U8, seconds: float) -> Outcome:
     view = vector.views[number]
-    found = psnr(read_png((VECTORS / view["picture"]).read_bytes()), picture)
+    found = psnr(read_png((VECTORS / view["picture"]).read_bytes()), image)
     passed = found >= view["psnr"]
     message = "" if passed else f"{found:.1f} dB against {view['picture']}, wanted {view['psnr']:g}"
     status = Status.PASSED if passed else Status.FAILED
@@ -132,26 +132,26 @@ def _outcome(
     return Outcome(name, _LEVEL, status, tuple(vector.clauses), "", message, seconds, details)
 
 
-def psnr(reference: U8, picture: U8) -> float:
+def psnr(reference: U8, image: U8) -> float:
     """Return the peak signal-to-noise ratio over pixels and channels, in dB, at most `PSNR_CAP`.
 
     Raises:
         InputError: the images differ in size.
     """
-    if reference.shape != picture.shape:
-        sizes = [f"{shape[1]}x{shape[0]}" for shape in (picture.shape, reference.shape)]
+    if reference.shape != image.shape:
+        sizes = [f"{shape[1]}x{shape[0]}" for shape in (image.shape, reference.shape)]
         raise InputError(f"the picture has {sizes[0]} pixels, wanted {sizes[1]}")
-    error = float(np.mean((reference.astype(np.float64) - picture.astype(np.float64)) ** 2))
+    error = float(np.mean((reference.astype(np.float64) - image.astype(np.float64)) ** 2))
     return min(PSNR_CAP, 10.0 * math.log10(255.0**2 / error)) if error else PSNR_CAP
 
 
-def write_png(picture: U8) -> bytes:
+def write_png(image: U8) -> bytes:
     """Return a PNG of [H, W, 3] values."""
-    height, width, _ = picture.shape
-    before = np.zeros_like(picture)
-    before[:, 1:] = picture[:, :-1]
+    height, width, _ = image.shape
+    before = np.zeros_like(image)
+    before[:, 1:] = image[:, :-1]
     # Filter 1, "sub": the difference from the pixel to the left.
-    rows = np.concatenate([np.ones((height, 1), np.uint8), (picture - before).reshape(height, -1)], axis=1)
+    rows = np.concatenate([np.ones((height, 1), np.uint8), (image - before).reshape(height, -1)], axis=1)
     head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(rows.tobytes(), 9)), (b"IEND", b""))
     return _SIGNATURE + b"".join(_png_chunk(kind, data) for kind, data in chunks)
@@ -191,8 +191,8 @@ def _decode_png(data: bytes) -> U8:
     channels = _CHANNELS[colour]
     raw = zlib.decompressobj().decompress(coded, height * (width * channels + 1))
     rows = np.frombuffer(raw, np.uint8).reshape(height, width * channels + 1)
-    picture = _undo_filters(rows, channels).reshape(height, width, channels)
-    return np.ascontiguousarray(picture[..., :3] if channels > 2 else np.repeat(picture[..., :1], 3, axis=2))
+    image = _undo_filters(rows, channels).reshape(height, width, channels)
+    return np.ascontiguousarray(image[..., :3] if channels > 2 else np.repeat(image[..., :1], 3, axis=2))
 
 
 def _undo_filters(rows: U8, channels: int) -> U8:

@@ -1,4 +1,4 @@
-"""Decoders in long-lived processes that are asked file after file: C and JavaScript."""
+"""Run decoders in C and JavaScript in long-lived processes, which decode file after file. Only a checkout has them."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _READ_BYTES = 1 << 16
 
 
 class DecoderProcess:
-    """A process that is started when it is first asked, and anew after a crash.
+    """A decoder process, which is started for the first file and again after a crash.
 
     Args:
-        words: its command line.
-        timeout: seconds for one file.
-        environment: environment of the process; None for ours.
+        words: command line.
+        timeout: time limit for one file, seconds.
+        environment: environment of the process; None for that of this process.
     """
 
     def __init__(self, words: Sequence[str], timeout: float, environment: Mapping[str, str] | None = None) -> None:
@@ -47,11 +47,11 @@ class DecoderProcess:
         self.close()
 
     def ask(self, data: bytes) -> Answer:
-        """Decode one file, as floats and as integers."""
+        """Decode a file to floats and to integers."""
         raise NotImplementedError
 
     def close(self) -> None:
-        """Let the process end."""
+        """End the process."""
         if self._process is not None and self._process.stdin:
             self._process.stdin.close()
             try:
@@ -64,7 +64,7 @@ class DecoderProcess:
         self._process = None
 
     def resident_bytes(self) -> int:
-        """Return what the process holds in memory now; 0 if nobody can tell."""
+        """Return the resident memory of the process now, 0 if unknown."""
         if self._process is None:
             return 0
         try:
@@ -74,7 +74,7 @@ class DecoderProcess:
         return pages * mmap.PAGESIZE
 
     def _answered(self, request: bytes) -> bytes | Answer:
-        """Return the line with which the process answers, or what went wrong."""
+        """Send a request; return the line of the answer, or the failure."""
         began = time.monotonic()
         process = self._started()
         assert process.stdin
@@ -104,7 +104,7 @@ class DecoderProcess:
         return self._process
 
     def _line(self, process: subprocess.Popen[bytes], began: float) -> bytes | None:
-        """Return a line, what there is of it when the process ended, or None when it takes too long."""
+        """Read a line, the part of it before the process ended, or None after the time limit."""
         assert process.stdout
         if not hasattr(select, "poll"):
             return _read_line_in_thread(process.stdout, began + self._timeout - time.monotonic())
@@ -132,7 +132,7 @@ class DecoderProcess:
 
 
 def _read_line_in_thread(stream: IO[bytes], seconds: float) -> bytes | None:
-    """Return a line as `DecoderProcess._line` does. Windows cannot wait for pipes; the thread ends with the process."""
+    """Read a line as `DecoderProcess._line` does, where the system cannot wait for pipes (Windows)."""
     lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=lambda: lines.put(stream.readline()), daemon=True).start()
     try:
@@ -147,7 +147,7 @@ _C_MEMORY_KIB = 3_000_000  # kibibytes of address space: an allocation without b
 
 
 def c_folder() -> Path:
-    """Return the folder of the C decoder: only a checkout has it.
+    """Return the folder of the C decoder.
 
     Raises:
         InputError: neither this package nor the working folder belongs to a checkout.
@@ -175,7 +175,7 @@ def compile_c(out: Path, *words: str | Path) -> None:
 
     Args:
         out: the file to write.
-        words: further arguments of the command line.
+        words: further arguments.
 
     Raises:
         InputError: the compiler is not here, or does not take them.
@@ -190,11 +190,11 @@ def compile_c(out: Path, *words: str | Path) -> None:
 
 
 class CDecoder(DecoderProcess):
-    """A process of the adapter that decodes the files it is given.
+    """A process of the adapter of the C decoder.
 
     Args:
-        program: the adapter, compiled; None for the checkout's, which is compiled when it is first asked.
-        limits: budgets: splats, bytes, bytes of a text; the registry's if left out.
+        program: the compiled adapter; None: compile that of the checkout for the first file.
+        limits: budgets: splats, bytes, bytes of a text; default: those of the registry.
         timeout: seconds for one file.
     """
 
@@ -207,7 +207,7 @@ class CDecoder(DecoderProcess):
         super().__init__(["sh", "-c", shell, str(self._program), *map(str, limits)], timeout)
 
     def ask(self, data: bytes) -> Answer:
-        """Decode one file, as floats and as integers.
+        """Decode a file to floats and to integers.
 
         Raises:
             InputError: the adapter cannot be compiled.
@@ -227,7 +227,7 @@ class CDecoder(DecoderProcess):
             shutil.rmtree(self._outdir)
 
     def close(self) -> None:
-        """Let the process end, and remove what it wrote."""
+        """End the process and remove its files."""
         super().close()
         self._folder.cleanup()
 
@@ -237,7 +237,7 @@ _JS_HEAP_MB = 512
 
 
 def js_folder() -> Path:
-    """Return the folder of the JavaScript decoder, whose tests hold the adapter: only a checkout has them.
+    """Return the folder of the JavaScript decoder, whose tests have the adapter.
 
     Raises:
         InputError: neither this package nor the working folder belongs to a checkout.
@@ -261,11 +261,11 @@ def missing_javascript() -> str:
 
 
 class JsDecoder(DecoderProcess):
-    """A Node process that decodes what it is sent.
+    """A Node process of the JavaScript decoder.
 
     Args:
-        folder: folder of the decoder's modules, a copy that may have been changed; None for the checkout's.
-        limits: budgets, by their names in JavaScript; the registry's if left out.
+        folder: folder of the decoder's modules, which may be a changed copy; None for that of the checkout.
+        limits: budgets by their names in JavaScript; default: those of the registry.
         timeout: seconds for one file.
         coverage: folder to which Node writes its coverage when it ends.
     """
@@ -290,7 +290,7 @@ class JsDecoder(DecoderProcess):
         super().__init__(words, timeout, environment)
 
     def ask(self, data: bytes) -> Answer:
-        """Decode one file, as floats and as integers."""
+        """Decode a file to floats and to integers."""
         began = time.monotonic()
         line = self._answered(struct.pack("<I", len(data)) + data)
         if isinstance(line, Answer):
