@@ -15,8 +15,8 @@
     all         2       1       1        0
 
 A suite makes one `Outcome` for each check, that is for each vector or input and level. `failed` and everything that a
-process can do instead of an answer (`crashed`, `hung` and so on) count as failures; the statuses differ to help whoever
-mends the program. Statuses that only some suites have are columns of their reports alone (`ConformanceReport.extra`).
+process can do instead of an answer (`crashed`, `hung` and so on) count as failures; the status tells what to fix in
+the program. Statuses that only some suites have are columns of their reports alone (`ConformanceReport.extra`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from enum import StrEnum
 from html import escape
 from typing import Any
 
-#: Characters that XML 1.0 cannot hold, not even as references.
+#: Characters that XML 1.0 does not allow, not even as references.
 _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
@@ -36,9 +36,9 @@ class Status(StrEnum):
     """The result of a check. The statuses from `FAILED` to `REFUSED` are failures."""
 
     PASSED = "passed"
-    WARNED = "warned"  #: passed: legal, and far worse than need be
+    WARNED = "warned"  #: passed: valid, but far worse than necessary
     DECLINED = "declined"  #: refused an input that may be refused
-    NOT_PROVED = "not proved"  #: nothing contradicts it, nothing shows it
+    NOT_PROVED = "not proved"  #: neither confirmed nor contradicted
     FAILED = "failed"  #: the answer is wrong
     CRASHED = "crashed"  #: ended by a signal
     HUNG = "hung"  #: did not end in time
@@ -51,9 +51,9 @@ class Status(StrEnum):
 
 
 _GOOD = frozenset((Status.PASSED, Status.WARNED, Status.DECLINED, Status.NOT_PROVED, Status.SKIPPED))
-#: Neither failures nor passes: JUnit calls these skipped.
+#: Neither failures nor passes; JUnit reports them as skipped.
 _OPEN = frozenset((Status.DECLINED, Status.NOT_PROVED, Status.SKIPPED))
-#: Checks that came to no answer: JUnit calls these errors.
+#: Checks without an answer; JUnit reports them as errors.
 _ERRORS = frozenset((Status.CRASHED, Status.HUNG, Status.WRONG_STATUS, Status.NO_OUTPUT, Status.WRONG_ANSWER))
 
 
@@ -65,10 +65,10 @@ class Outcome:
         name: the vector or input, with its group, `invalid/index_crc`.
         level: the level that was checked, `L1`.
         status: the result.
-        clauses: ids of the broken clauses of the spec or, if they are unknown, of the clauses that the check covers.
+        clauses: broken clauses of the spec or, if unknown, the clauses that the check covers.
         code: error code that was reported or found, `E_CRC`.
-        message: one line; of a check that passed a remark, if there is one.
-        seconds: time it took.
+        message: one line: the reason of a failure, or a remark.
+        seconds: time of the run.
         details: JSON-compatible facts for programs, such as measured numbers.
     """
 
@@ -95,7 +95,7 @@ class ConformanceReport:
         suite: `decoder` or `encoder`.
         subject: what was tested: a command line, or a description.
         outcomes: in the order of the run.
-        notes: a line each about the run as a whole.
+        notes: lines about the run as a whole.
         extra: statuses that this suite counts in addition to passed, failed and skipped.
     """
 
@@ -116,11 +116,11 @@ class ConformanceReport:
         return bool(self.outcomes) and not self.failures
 
     def levels(self) -> dict[str, dict[str, int]]:
-        """Return by level how many checks there were, how many passed, failed and were skipped, and so on."""
+        """Return the counts of each level."""
         return {level: self.counts(level) for level in _levels(self)}
 
     def counts(self, level: str | None = None) -> dict[str, int]:
-        """Return the same of one level, or of all."""
+        """Return the number of checks of a level, or of all, and how many passed, failed, were skipped and so on."""
         return _counts((one for one in self.outcomes if level in (None, one.level)), self.extra)
 
 
@@ -154,12 +154,12 @@ def to_table(report: ConformanceReport, *, verbose: bool = False) -> str:
 
 
 def _word(status: Status) -> str:
-    """Failures are in capitals, so that the eye and grep find them."""
+    """Return the word for a status, in capitals for failures, which makes them easy to find."""
     return "ok" if status is Status.PASSED else str(status) if status in _GOOD else str(status).upper()
 
 
 def _remark(one: Outcome) -> str:
-    message = " ".join(one.message.split())  # a line stays a line, whatever a foreign program printed
+    message = " ".join(one.message.split())  # may come from a foreign program: keep it on one line
     where = ", ".join([*one.clauses, *([one.code] if one.code else [])])
     if not where or (one.good and not message):
         return message
@@ -167,7 +167,7 @@ def _remark(one: Outcome) -> str:
 
 
 def _aligned(rows: Sequence[Sequence[str]], *, right: bool = False) -> list[str]:
-    """Lay out rows in columns: all but the first to the right if requested, the last never padded."""
+    """Align columns; all but the first to the right if requested."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
     lines = []
     for row in rows:
@@ -244,7 +244,7 @@ def _junit_case(one: Outcome, suite: str) -> str:
 
 
 def _xml(text: str) -> str:
-    """Quote for an attribute; what XML has no way to write becomes a question mark."""
+    """Quote for an attribute, with question marks for characters that XML does not allow."""
     return (
         escape(_NOT_XML.sub("?", text), quote=True).replace("\n", "&#10;").replace("\t", "&#9;").replace("\r", "&#13;")
     )
