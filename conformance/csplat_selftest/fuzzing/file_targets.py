@@ -53,7 +53,7 @@ class PlyTarget(FileTarget):
 
     name = "ply"
     suffix = ".ply"
-    watched: Sequence[Path] = tuple(sorted([*_PACKAGE.glob("ply*.py"), _PACKAGE / "lint.py", _PACKAGE / "detect.py"]))
+    watched: Sequence[Path] = (_PACKAGE / "ply", _PACKAGE / "lint.py", _PACKAGE / "detect.py")
 
     def __init__(self) -> None:
         super().__init__()
@@ -180,7 +180,7 @@ class FormatTarget(FileTarget):
 
     name = "formats"
     suffix = ".case"
-    watched: Sequence[Path] = tuple(sorted(_PACKAGE.glob("formats/*.py")))
+    watched: Sequence[Path] = (_PACKAGE / "formats",)
 
     def seeds(self, paths: Iterable[Path]) -> list[Seed]:
         """Return small scenes in every format that is written to one file, and the given files."""
