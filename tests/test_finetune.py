@@ -142,7 +142,7 @@ def test_pixels_that_do_not_count_teach_nothing(coarse, views):
         shown = []
         for one in views.train:
             buffer = np.empty((*mask.shape, 3), np.float32)
-            pixels = np.rint(255.0 * np.clip(one.picture(BLACK, buffer), 0.0, 1.0)).astype(np.uint8)
+            pixels = np.rint(255.0 * np.clip(one.image(BLACK, buffer), 0.0, 1.0)).astype(np.uint8)
             pixels[~mask] = value
             shown.append(TuningView(one.camera, PosedImage(one.camera, pixels, mask)))
         return TuningViews(shown, shown[:2], BLACK)
@@ -913,7 +913,7 @@ def test_a_trained_scene_loses_less_when_tuned(data_dir):
     def score(scene):
         error = []
         for view in held_out:
-            wanted = view.picture(white, np.empty((64, 64, 3), np.float32))
+            wanted = view.image(white, np.empty((64, 64, 3), np.float32))
             picture = np.clip(render(scene, view.camera, background=white).rgb, 0, 1)
             error.append(np.square(picture - wanted).mean())
         return -10.0 * math.log10(float(np.mean(error)))
