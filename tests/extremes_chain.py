@@ -110,7 +110,7 @@ def _learn(source: SplatModel) -> Learnt:
 
 
 def _tune(source: SplatModel, seen_from: list[Camera]) -> SplatModel:
-    views = split_views(renders_of(source, seen_from, BLACK, None), BLACK, aside=2)
+    views = split_views(renders_of(source, seen_from, BLACK, None), BLACK, validation_count=2)
     frozen = fix_quantisation(EncodePlan.of(source, COARSE))
     result = tune(frozen, views, replace(SHORT, iterations=20))
     return decode(frozen.encode(result.held).write().data)

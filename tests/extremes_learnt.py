@@ -80,11 +80,13 @@ def trained(name: str) -> TrainResult:
 def tuned(name: str, count: int = 52) -> tuple[FixedQuantisation, FinetuneResult, Scorer]:
     """Tune the scene as a file to `count` images but four; return it and a judge of those four."""
     source = learnt_from(name)
-    views = split_views(renders_of(source, virtual_cameras(source, count, 48, 36), BLACK, None), BLACK, aside=4)
+    views = split_views(
+        renders_of(source, virtual_cameras(source, count, 48, 36), BLACK, None), BLACK, validation_count=4
+    )
     frozen = fix_quantisation(EncodePlan.of(source, COARSE))
     aside = Scorer(
         [view.camera for view in views.validation],
-        [ReferenceImage(view.wanted.astype(np.float32)) for view in views.validation],
+        [ReferenceImage(view.reference.astype(np.float32)) for view in views.validation],
     )
     return frozen, tune(frozen, views, SHORT), aside
 

@@ -102,7 +102,7 @@ def test_the_control_learns(source):
     off = replace(source, sh0=source.sh0 + np.float32(0.3))
     frozen = Unquantised.freeing(fix_quantisation(EncodePlan.of(off, EncodeOptions(preset="fast", sh_coding="scalar"))))
     options = FinetuneOptions(iterations=60, warm_up=10, validate_every=20, byte_cost=0.0)
-    log = tune(frozen, split_views(wanted, BLACK, aside=2), options).log
+    log = tune(frozen, split_views(wanted, BLACK, validation_count=2), options).log
     assert log["best_psnr"] > log["start_psnr"] + 3.0
 
 

@@ -562,7 +562,7 @@ def test_cameras_far_from_all_others_are_named_and_do_not_count(tmp_path):
         assert (7, 2) == (len(data.train), len(data.test))
         assert [words in line for line in data.report if "times the usual distance" in line] == [True]
         assert usual == pytest.approx(data.train[0].camera.near, rel=0.05)
-        assert measure_extent(data.counted).extent < 5.0
+        assert measure_extent(data.inliers).extent < 5.0
         assert (0.0, 0.0, 0.0) == data.origin
     assert not any("usual distance" in line for line in reports_of_near_sets(tmp_path / "near"))
 

@@ -42,11 +42,11 @@ def test_slopes_are_those_of_the_loss_with_the_correction():
     exposures, loss = ImageGains(2), PhotometricLoss(20, 24)
     exposures.values[0] = rng.uniform(-0.3, 0.3, (2, 3))
     one, moved = ImageGain(exposures, 0, 0.0), []
-    exposures.move = lambda number, slope, rate: moved.append((number, slope, rate))  # type: ignore[method-assign]
-    slope = one.learnt(seen, loss(one.applied(seen), photograph.copy())[1].copy()).copy()
+    exposures.step = lambda number, slope, rate: moved.append((number, slope, rate))  # type: ignore[method-assign]
+    slope = one.backward(seen, loss(one.apply(seen), photograph.copy())[1].copy()).copy()
 
     def value(seen) -> float:
-        return float(loss(one.applied(seen), photograph.copy())[0].loss)
+        return float(loss(one.apply(seen), photograph.copy())[0].loss)
 
     expected = np.zeros((2, 3))
     for place in np.ndindex(2, 3):

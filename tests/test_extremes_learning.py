@@ -223,7 +223,7 @@ def test_splats_wider_than_float32_are_tuned():
     """Their standard deviation is e^100."""
     source = learnt_from("needles").select(slice(40))
     source = replace(source, scales=np.full_like(source.scales, 100.0))
-    views = split_views(renders_of(source, virtual_cameras(source, 6, 32, 24), BLACK, None), BLACK, aside=2)
+    views = split_views(renders_of(source, virtual_cameras(source, 6, 32, 24), BLACK, None), BLACK, validation_count=2)
     frozen = fix_quantisation(EncodePlan.of(source, COARSE))
     result = tune(frozen, views, replace(SHORT, iterations=20))
     assert_finite(decode(frozen.encode(result.held).write().data))

@@ -69,11 +69,11 @@ def coarse(source):
 
 @pytest.fixture(scope="module")
 def views(source):
-    return split_views(renders_of(source, cameras(14), BLACK, None), BLACK, aside=3)
+    return split_views(renders_of(source, cameras(14), BLACK, None), BLACK, validation_count=3)
 
 
 def psnr(model, views):
-    error = [np.square(render(model, view.camera).rgb - view.wanted).mean() for view in views]
+    error = [np.square(render(model, view.camera).rgb - view.reference).mean() for view in views]
     return -10.0 * math.log10(float(np.mean(error)))
 
 
@@ -106,7 +106,7 @@ def fine():
     """Few splats, coded so finely that tuning gains nothing, and views of them."""
     few = shell(3).select(slice(0, 40))
     frozen = fix_quantisation(EncodePlan.of(few, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar")))
-    return frozen, split_views(renders_of(few, cameras(8), BLACK, None), BLACK, aside=3)
+    return frozen, split_views(renders_of(few, cameras(8), BLACK, None), BLACK, validation_count=3)
 
 
 # learning
@@ -165,7 +165,7 @@ def test_the_decoded_file_scores_what_was_scored_while_tuning(coarse, views):
     splats = UncheckedSplats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
     for view in views.validation:
         picture = rasteriser.forward(splats, view.camera, background=BLACK).rgb
-        error.append(np.square(np.clip(picture, 0, 1) - np.clip(view.wanted, 0, 1)).mean(dtype=np.float64))
+        error.append(np.square(np.clip(picture, 0, 1) - np.clip(view.reference, 0, 1)).mean(dtype=np.float64))
     assert tuned.log["best_psnr"] == pytest.approx(-10.0 * math.log10(np.mean(error)), abs=1e-6)
 
 
@@ -217,7 +217,7 @@ def test_gradients_of_entries_are_those_of_all_their_users(source, views):
     )
     scene, view = TunedScene(frozen), views.train[0]
     loss, rasteriser = PhotometricLoss(H, W, 1.0, 0.0), Rasteriser(dtype=np.float64)
-    seen, _ = scene.seen()
+    seen, _ = scene.dequantise()
     wanted = np.zeros((H, W, 3), np.float32)
 
     def rendered(shN):
@@ -255,7 +255,7 @@ def test_a_step_moves_values_through_their_quantisers(coarse, views):
     scene = TunedScene(coarse)
     before = {name: values.copy() for name, values in scene.parameters.values.items()}
     rasteriser, view = Rasteriser(), views.train[0]
-    seen, alphas = scene.seen()
+    seen, alphas = scene.dequantise()
     splats = UncheckedSplats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
     wanted = view.image(BLACK, np.empty((H, W, 3), np.float32))
     _, slope = PhotometricLoss(H, W)(rasteriser.forward(splats, view.camera, background=BLACK).rgb, wanted)
@@ -285,7 +285,7 @@ def test_costs_are_the_entropy_and_their_slopes_point_away_from_what_is_common()
 def test_costs_take_the_integers_that_are_coded(source):
     frozen = fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar", chroma_shift=1)))
     scene = TunedScene(frozen)
-    seen, _ = scene.seen()
+    seen, _ = scene.dequantise()
     found = colour_integers_of(seen.shN, frozen.parameters.sh_step, 1)
     from csplat.encoder.quantisation import quantise_sh
 
@@ -298,8 +298,8 @@ def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, g
     """A made-up cost, quadratic in the integers, has slopes that finite differences know."""
     frozen = fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)))
     scene = TunedScene(frozen)
-    seen, _ = scene.seen()
-    stored = scene.stored(seen)
+    seen, _ = scene.dequantise()
+    stored = scene.stream_values(seen)
     name = {"logits": "opacities"}.get(group, group)
     integers = np.arange(-128, 129, dtype=np.float32)
     costs = scene.count(seen, weight=float(len(source)))
@@ -336,8 +336,8 @@ def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, g
 
 def test_a_weight_of_bytes_is_loss_per_bit_and_splat(coarse):
     scene = TunedScene(coarse)
-    seen, _ = scene.seen()
-    costs = RateTerm.counted(scene.frozen, scene.stored(seen), 2e-4)
+    seen, _ = scene.dequantise()
+    costs = RateTerm.count(scene.frozen, scene.stream_values(seen), 2e-4)
     assert costs.loss == pytest.approx(2e-4 * costs.bits / 300)
     assert 5 < costs.bits / 300 < 200
 
@@ -401,7 +401,7 @@ def test_bytes_cost_what_keeps_a_file_to_its_size(source, views, tmp_path):
 
 def test_a_file_that_is_too_large_adds_its_excess_to_the_loss():
     budget = RateController(1_000, 1e-4)
-    assert (0.0, 0.0, 0.25) == tuple(budget.overdrawn(size, 4_000.0) for size in (900, 1_000, 1_250))
+    assert (0.0, 0.0, 0.25) == tuple(budget.excess(size, 4_000.0) for size in (900, 1_000, 1_250))
 
 
 def test_bytes_that_are_free_at_first_are_dear_in_time():
@@ -409,11 +409,11 @@ def test_bytes_that_are_free_at_first_are_dear_in_time():
     budget, bits = RateController(100_000, 1e-4), 470_000.0
     for count in range(20):
         done = count / 20
-        budget.overdrawn(round(37_500 + bits / 8), bits)
-        budget.weigh(bits, done, 1e-4)
+        budget.excess(round(37_500 + bits / 8), bits)
+        budget.update(bits, done, 1e-4)
         moves = 0.5 + 0.5 * math.cos(math.pi * done)
         bits *= 1.0 - 0.003 * moves * math.log2(budget.byte_cost / 1e-4)
-    assert 0.0 == budget.overdrawn(round(37_500 + bits / 8), bits)
+    assert 0.0 == budget.excess(round(37_500 + bits / 8), bits)
     assert 0.98 * 100_000 < 37_500 + bits / 8
 
 
@@ -520,11 +520,11 @@ def test_renders_that_teach_are_those_of_the_source(source):
 
 def test_views_that_judge_teach_unless_they_are_kept_aside():
     views = [TuningView(camera, np.zeros((H, W, 3), np.float32)) for camera in cameras(20)]
-    together, apart = split_views(views, BLACK), split_views(views, BLACK, aside=4)
-    assert (20, 16, False) == (len(together.train), len(together.validation), together.kept_aside)
-    assert (16, 4, True) == (len(apart.train), len(apart.validation), apart.kept_aside)
+    together, apart = split_views(views, BLACK), split_views(views, BLACK, validation_count=4)
+    assert (20, 16, False) == (len(together.train), len(together.validation), together.is_held_out)
+    assert (16, 4, True) == (len(apart.train), len(apart.validation), apart.is_held_out)
     with pytest.raises(InputError, match="leave none"):
-        split_views(views, BLACK, aside=20)
+        split_views(views, BLACK, validation_count=20)
     with pytest.raises(InputError, match="at least one view"):
         TuningViews([], [], BLACK)
 

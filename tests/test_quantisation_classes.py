@@ -221,7 +221,7 @@ def test_integers_of_each_class_are_counted_as_they_are_coded(make_model):
         ).columns
         for columns in (shape.scales, shape.quats // factors.quats, alpha[None] // factors.opacities, colour):
             bits += cost_slopes([columns.T])[1]
-    assert scene.count(scene.seen()[0], 1.0).bits == pytest.approx(bits, rel=1e-3)
+    assert scene.count(scene.dequantise()[0], 1.0).bits == pytest.approx(bits, rel=1e-3)
 
 
 def test_codings_are_tried_on_splats_of_all_classes(model):

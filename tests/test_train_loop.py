@@ -156,8 +156,8 @@ def test_one_camera_far_away_does_not_stop_splats_from_learning(make_data, make_
     data = make_data(make_model)
     away = replace(data.train[0], camera=relative_to((3e4, 0.0, 0.0), data.train[0].camera))
     far = replace(data, train=[away, *data.train[1:]])
-    assert data.train == data.counted
-    assert data.train[1:] == far.counted
+    assert data.train == data.inliers
+    assert data.train[1:] == far.inliers
     assert measure_extent(data.train).extent == pytest.approx(
         train(far, TrainOptions(**QUICK)).log["scene_extent"], rel=0.2
     )

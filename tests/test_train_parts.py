@@ -266,12 +266,12 @@ def test_sh_degrees_come_one_after_the_other():
 
 def test_splats_go_a_few_at_a_time_and_the_last_long_before_the_end():
     options = TrainOptions(max_splats=1000, final_share=0.4, iterations=1000, refine_stop=0.6)
-    left = {step: options.thinnings_left(step) for step in range(1, 1001) if options.thinnings_left(step)}
+    left = {step: options.prunings_left(step) for step in range(1, 1001) if options.prunings_left(step)}
     assert dict(zip(range(624, 841, 24), range(10, 0, -1), strict=True)) == left  # 600 is the last at which splats move
     for stop, last in ((0.5, 8), (0.8, 9), (1.0, 10)):  # few steps: fewer times
         short = TrainOptions(final_share=0.4, iterations=10, refine_stop=stop)
-        assert [last] == [step for step in range(11) if short.thinnings_left(step) == 1]
-    assert not any(TrainOptions(iterations=1000).thinnings_left(step) for step in range(1, 1001))
+        assert [last] == [step for step in range(11) if short.prunings_left(step) == 1]
+    assert not any(TrainOptions(iterations=1000).prunings_left(step) for step in range(1, 1001))
 
 
 def test_those_go_that_pictures_need_least(make_model):

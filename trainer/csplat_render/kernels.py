@@ -218,13 +218,13 @@ def thread_count(threads: int | None) -> Iterator[int]:
     if threads is not None and threads < 1:
         raise InputError(f"threads is {threads}, wanted 1 or more")
     with LOCK:
-        before = _threads.wanted
+        before = _threads.limit
         if threads is not None:
-            _threads.wanted = min(threads, available_threads())
+            _threads.limit = min(threads, available_threads())
         try:
-            yield _threads.wanted or available_threads()
+            yield _threads.limit or available_threads()
         finally:
-            _threads.wanted = before
+            _threads.limit = before
 
 
 class _HelperThread:
@@ -270,12 +270,12 @@ class _ThreadPool:
     """The threads that run kernels, in addition to the calling one. Owns them and the number of threads to use."""
 
     def __init__(self) -> None:
-        self.wanted: int | None = None
+        self.limit: int | None = None
         self._helpers: list[_HelperThread] = []
 
     def run(self, function: Any, arguments: tuple[Any, ...]) -> None:
         """Call `function(lane, lanes, *arguments)` for every lane."""
-        lanes = self.wanted or (1 if _bytes_of(arguments) < _SERIAL_BYTES else available_threads())
+        lanes = self.limit or (1 if _bytes_of(arguments) < _SERIAL_BYTES else available_threads())
         while len(self._helpers) < lanes - 1:
             self._helpers.append(_HelperThread())
         waiting: list[_HelperThread] = []
@@ -318,7 +318,7 @@ def _after_fork() -> None:
     """Reset the lock and the threads in a child process, which has neither."""
     global LOCK  # noqa: PLW0603  # a thread that does not exist here may hold it for ever
     LOCK = threading.RLock()
-    _threads.wanted = None
+    _threads.limit = None
     _threads.forget()
 
 

@@ -1,10 +1,11 @@
-"""Training of Gaussian splats on the CPU: data sets, loss, optimisation, and a torch wrapper of the renderer.
+"""Training of Gaussian splats on the CPU: data sets, losses, optimisation, and a torch wrapper of the renderer.
 
     >>> import csplat_trainer
     >>> found = csplat_trainer.train("capture")  # doctest: +SKIP
 
-The names load their modules when first used. `train` and `finetune` work with numba alone; torch is wanted by
-`autograd`, `perceptual` and `cuda`, and by `torch_checkpoints`: `csplat.read` of what gsplat and splatfacto leave.
+The names load their modules on first use. `train` and `finetune` need numba only. torch is needed by
+`torch_rasteriser`, `gsplat_engine`, the perceptual loss, and `torch_checkpoints`, with which `csplat.read` reads
+checkpoints of gsplat and splatfacto.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ _MAX_LOG_SCALE = 40.0  # largest log scale whose gradient Adam can square in flo
 
 
 class Engine(Protocol):
-    """Training engine: the numba kernels of the CPU, or gsplat's on a GPU."""
+    """A training engine: the numba kernels of the CPU, or gsplat's on a GPU."""
 
     screen: ScreenGradients | None
 
@@ -34,7 +34,7 @@ class Engine(Protocol):
 
     @parameters.setter
     def parameters(self, parameters: Parameters) -> None:
-        """Go on from another state."""
+        """Continue from another state."""
         ...
 
     def step(
@@ -44,18 +44,18 @@ class Engine(Protocol):
         degree: int,
         rates: dict[str, float],
         rng: Generator,
-        exposure: ImageGain | None = None,
+        gain: ImageGain | None = None,
     ) -> LossValue:
         """Make one step of training on one image."""
         ...
 
     def render(self, camera: Camera, background: F32, degree: int) -> F32:
-        """The image at present, [H, W, 3]."""
+        """Render the present state, [H, W, 3]."""
         ...
 
 
 class CpuEngine:
-    """Training steps in numba; all buffers are kept from one step to the next.
+    """A training engine in numba, which keeps its buffers from one step to the next.
 
     Args:
         parameters: initial state; changed in place by `step`.
@@ -85,7 +85,7 @@ class CpuEngine:
         degree: int,
         rates: dict[str, float],
         rng: Generator,
-        exposure: ImageGain | None = None,
+        gain: ImageGain | None = None,
     ) -> LossValue:
         """Make one step of training on one image.
 
@@ -95,21 +95,21 @@ class CpuEngine:
             degree: degree of the SH bands that are evaluated.
             rates: learning rate of each group of parameters.
             rng: source of the noise.
-            exposure: how the photograph was exposed, if that is learnt.
+            gain: gain and bias of the image, if they are trained.
 
         Returns:
-            The photometric figures before the step.
+            The photometric loss before the step.
         """
         options, camera = self._options, image.camera
         loss, photograph = self._loss_for(camera)
         compose(image, background, photograph)
         rgb = self._forward(camera, background, degree)
-        shown = rgb if exposure is None else exposure.applied(rgb)
+        shown = rgb if gain is None else gain.apply(rgb)
         value, slope = loss(shown, photograph, image.mask)
         if self._perceptual is not None:
             slope += self._perceptual.gradient(shown, photograph, options.lpips_weight)
-        if exposure is not None:
-            slope = exposure.learnt(rgb, slope)
+        if gain is not None:
+            slope = gain.backward(rgb, slope)
         gradients = self._rasteriser.backward(slope)
         values, count = self.parameters.values, max(1, len(self.parameters))
         _chain(
@@ -140,7 +140,7 @@ class CpuEngine:
         return value
 
     def render(self, camera: Camera, background: F32, degree: int) -> F32:
-        """The image at present, [H, W, 3]; a buffer that the next image overwrites."""
+        """Render the present state, [H, W, 3], into a buffer that the next render overwrites."""
         return self._forward(camera, background, degree)
 
     def _forward(self, camera: Camera, background: F32, degree: int) -> F32:
@@ -155,7 +155,7 @@ class CpuEngine:
         return result.rgb
 
     def _loss_for(self, camera: Camera) -> tuple[PhotometricLoss, F32]:
-        """Loss and photograph buffer of a size of image."""
+        """Return the loss and the image buffer for images of a camera's size."""
         size = (camera.H, camera.W)
         if size not in self._losses:
             weights = LOSS_WEIGHTS[self._options.loss]
@@ -164,13 +164,13 @@ class CpuEngine:
 
 
 def _per_half_image(norms: F32, camera: Camera) -> F32:
-    """Gradient norms per pixel as norms per half an image, which thresholds are stated in."""
+    """Convert gradient norms per pixel into norms per half an image, the unit of thresholds."""
     return norms * np.float32(0.5 * max(camera.W, camera.H))
 
 
 @parallel_kernel(relaxed=True)
 def _activate(lane: int, lanes: int, logits: F32, alphas: F32) -> None:
-    """Opacities of logits; vectorises over splats."""
+    """Compute opacities from logits; vectorises over splats."""
     one = np.float32(1.0)
     first, end = lane_range(lane, lanes, len(logits))
     x, y = logits[first:end], alphas[first:end]
@@ -190,7 +190,7 @@ def _chain(
     scale_weight: np.float32,
     by_logit: F32,
 ) -> None:
-    """From opacities to logits, plus the gradients of both regularisers; vectorises over splats.
+    """Propagate gradients from opacities to logits, and add those of both regularisers; vectorises over splats.
 
     Args:
         alphas: [N].

@@ -32,7 +32,7 @@ _GATE_SLOPE, _GATE_CENTRE = 100.0, 0.995  # as in csplat_trainer.strategies
 
 
 def gsplat_rasterization() -> Callable[..., Any]:
-    """The entry point of gsplat.
+    """Return the entry point of gsplat.
 
     Raises:
         InputError: there is no GPU, or the package is not installed.
@@ -48,16 +48,16 @@ def gsplat_rasterization() -> Callable[..., Any]:
 
 
 class GsplatEngine:
-    """Training steps in torch.
+    """A training engine in torch.
 
     Args:
-        parameters: where to start.
+        parameters: initial state.
         options: weights of the loss, antialiasing, noise.
-        rasterization: what draws, with gsplat's arguments; `None`: gsplat.
-        device: `cuda`; tests give `cpu` and their own `rasterization`.
+        rasterization: rasteriser with gsplat's arguments; `None`: gsplat.
+        device: `cuda`; tests use `cpu` and their own `rasterization`.
 
     Attributes:
-        screen: gradients on screen since it was last replaced, where the strategy wants them.
+        screen: gradients on screen since it was last replaced, if the strategy needs them.
     """
 
     def __init__(
@@ -96,16 +96,16 @@ class GsplatEngine:
         degree: int,
         rates: dict[str, float],
         rng: Generator,
-        exposure: ImageGain | None = None,
+        gain: ImageGain | None = None,
     ) -> LossValue:
-        """Make one step of training on one image: see `CpuEngine.step`. No exposure is learnt here."""
-        assert exposure is None
+        """Make one step of training on one image: see `CpuEngine.step`. Gains are not trained here."""
+        assert gain is None
         camera = image.camera
         photograph = self._upload(compose(image, background, np.empty((camera.H, camera.W, 3), np.float32)))
         rendered, info = self._draw(camera, background, degree)
         if self.screen is not None:
             info["means2d"].retain_grad()
-        if image.mask is not None:  # what does not count is taken for what is seen
+        if image.mask is not None:  # pixels that do not count equal the render
             counts = torch.from_numpy(image.mask).to(photograph.device)[..., None]
             photograph = torch.where(counts, photograph, rendered.detach())
         total, value = self._loss(rendered, photograph)
@@ -118,7 +118,7 @@ class GsplatEngine:
         return value
 
     def render(self, camera: Camera, background: F32, degree: int) -> F32:
-        """The image at present, [H, W, 3]."""
+        """Render the present state, [H, W, 3]."""
         with torch.no_grad():
             image: F32 = self._draw(camera, background, degree)[0].cpu().numpy()
         return image
@@ -210,7 +210,7 @@ class GsplatEngine:
 
 
 def _rotations(quats: Tensor) -> Tensor:
-    """Rotation matrices of unit quaternions, [N, 3, 3]."""
+    """Return the rotation matrices of unit quaternions, [N, 3, 3]."""
     w, x, y, z = quats.unbind(dim=1)
     rows = [
         1 - 2 * (y * y + z * z),

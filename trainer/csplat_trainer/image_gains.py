@@ -15,23 +15,23 @@ import numpy as np
 from csplat.errors import InputError
 from csplat.types import F32, F64
 
-_STATE = (4, 2, 3)  # state of a photograph: values, both of Adam's means, steps
+_STATE = (4, 2, 3)  # state of an image: values, both of Adam's means, steps; [gain, bias]; channels
 _BETA1, _BETA2, _EPSILON = 0.9, 0.99, 1e-15
-_LIMIT = 1.0  # limit on the logarithm of a gain, and on a shift: images that differ by more are not of one scene
+_LIMIT = 1.0  # largest logarithm of a gain, and largest bias: images that differ by more are not of one scene
 
 
 class ImageGains:
-    """Per-image gain and bias of the training photographs, and Adam's memory of them.
+    """Per-image gain and bias of the training images, and Adam's memory of them.
 
     Args:
-        count: number of photographs.
-        stored: what `as_json` returned, to go on from.
+        count: number of images.
+        stored: the result of `as_json` to continue from.
 
     Attributes:
-        values: [P, 2, 3], logarithms of the gains, and shifts, by photograph; their mean is 0.
+        values: [P, 2, 3], logarithms of the gains, and biases, by image; their mean is 0.
 
     Raises:
-        InputError: the stored state is for another number of photographs.
+        InputError: the stored state is for another number of images.
     """
 
     def __init__(self, count: int, stored: Sequence[Sequence[float]] = ()) -> None:
@@ -44,12 +44,12 @@ class ImageGains:
         self.values, self._first, self._second, self._steps = (state[:, part] for part in range(_STATE[0]))
 
     def as_json(self) -> list[list[float]]:
-        """Everything, by photograph."""
+        """Return the whole state, one list for each image."""
         state = np.stack([self.values, self._first, self._second, self._steps], axis=1)
         return [row.ravel().tolist() for row in state]
 
-    def move(self, number: int, slope: F64, rate: float) -> None:
-        """Move the correction of a photograph against the slope of the loss, [2, 3], by Adam."""
+    def step(self, number: int, slope: F64, rate: float) -> None:
+        """Make a step of Adam on the correction of an image, against the gradient of the loss, [2, 3]."""
         first, second, steps = self._first[number], self._second[number], self._steps[number]
         steps += 1.0
         first[:] = _BETA1 * first + (1.0 - _BETA1) * slope
@@ -62,37 +62,37 @@ class ImageGains:
 
 @dataclass(frozen=True, eq=False)
 class ImageGain:
-    """The correction of one photograph.
+    """The correction of one image.
 
     Attributes:
-        among: the corrections of all photographs.
-        number: index of the photograph.
+        gains: the corrections of all images.
+        number: index of the image.
         rate: learning rate.
     """
 
-    among: ImageGains
+    gains: ImageGains
     number: int
     rate: float
 
-    def applied(self, seen: F32) -> F32:
-        """Apply the photograph's correction to a render, [H, W, 3]."""
-        gain, shift = self.among.values[self.number]
-        shown: F32 = seen * np.exp(gain).astype(np.float32) + shift.astype(np.float32)
-        return shown
+    def apply(self, render: F32) -> F32:
+        """Apply the correction to a render, [H, W, 3]."""
+        gain, bias = self.gains.values[self.number]
+        corrected: F32 = render * np.exp(gain).astype(np.float32) + bias.astype(np.float32)
+        return corrected
 
-    def learnt(self, seen: F32, slope: F32) -> F32:
-        """Learn from a step, and take its slope back to what is seen.
+    def backward(self, render: F32, slope: F32) -> F32:
+        """Update the correction, and propagate the gradient of the loss to the render.
 
         Args:
-            seen: [H, W, 3], as given to `applied`.
-            slope: [H, W, 3], of the loss by what `applied` returned; changed.
+            render: [H, W, 3], as given to `apply`.
+            slope: [H, W, 3], gradient towards the result of `apply`; changed.
 
         Returns:
-            The slope by what is seen, in the memory of the other.
+            The gradient towards the render, in the memory of `slope`.
         """
-        gain = np.exp(self.among.values[self.number, 0])
-        by_shift = slope.sum(axis=(0, 1), dtype=np.float64)
-        by_gain = gain * np.einsum("hwc,hwc->c", slope, seen, dtype=np.float64)
-        self.among.move(self.number, np.stack([by_gain, by_shift]), self.rate)
+        gain = np.exp(self.gains.values[self.number, 0])
+        by_bias = slope.sum(axis=(0, 1), dtype=np.float64)
+        by_gain = gain * np.einsum("hwc,hwc->c", slope, render, dtype=np.float64)
+        self.gains.step(self.number, np.stack([by_gain, by_bias]), self.rate)
         slope *= gain.astype(np.float32)
         return slope

@@ -19,12 +19,12 @@ from csplat_trainer.posed_images import PosedImage
 
 SH_C0 = 0.28209479177387814
 
-_OPACITY = 0.5
+_OPACITY = 0.5  # of each initial splat
 _BATCH = 20_000  # points drawn at a time
-_BATCHES = 400  # before what was found must do
-_MASK = 0.02  # alpha at and above which a pixel belongs to the object
+_BATCHES = 400  # largest number of batches
+_MASK = 0.02  # alpha from which a pixel belongs to the object
 _MISSES = 0.02  # fraction of the images that may miss a point of the hull: rounding to pixels
-_NEIGHBOURS = 3
+_NEIGHBOURS = 3  # number of neighbours whose distance determines a splat's size
 _BOX_SHARE = 0.9  # fraction of the middle camera's field of view at the distance of the focus
 _PHOTO_BOX = 1.5  # factor for photographs, which show the surroundings of their subject too
 
@@ -46,16 +46,16 @@ class SceneExtent:
 
 
 def measure_extent(images: Sequence[PosedImage]) -> SceneExtent:
-    """Find the extent and the focus of the scene.
+    """Measure the extent and the focus of the scene.
 
     Args:
-        images: at least one, without outliers: `DataSet.counted`.
+        images: at least one, without outliers: `DataSet.inliers`.
     """
     cameras = [image.camera for image in images]
     positions = np.array([camera.position for camera in cameras])
     axes = np.array([camera.viewmat[2, :3] for camera in cameras])
     spread = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max()
-    # Least squares over the distances from the lines; the small term holds parallel ones together.
+    # Least squares over the distances from the lines; the small term resolves parallel ones.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     weight = 1e-3 * len(cameras)
     guess = (positions + axes * max(float(spread), 1e-6)).mean(axis=0)
@@ -83,7 +83,7 @@ def place_splats(
     points: F32 | None = None,
     colours: F32 | None = None,
 ) -> ParameterArrays:
-    """Place the splats that training begins with.
+    """Place the initial splats.
 
     Args:
         images: images of the training views.
@@ -93,7 +93,7 @@ def place_splats(
         rng: source of random choices.
         init: `points`, `hull`, `box`, or `auto` for the first of them that there is.
         points: [P, 3], points of the scene, if the data set has any.
-        colours: [P, 3] in 0..1, their colours; `None`: those of the images there.
+        colours: [P, 3] in 0..1, their colours; `None`: the mean of the images there.
 
     Raises:
         InputError: there are no points, or no masks, to start from; or points that are not finite.
@@ -124,15 +124,15 @@ def place_splats(
 
 
 def _at_points(points: F32, colours: F32, count: int, scene: SceneExtent, rng: Generator) -> tuple[F64, F64]:
-    """Choose some of the points, or all of them and repeat some if more are needed."""
+    """Choose some of the points, or all of them and repeat some, with noise, if more are needed."""
     order = rng.permutation(len(points))
     chosen = np.concatenate([order, rng.integers(0, len(points), max(0, count - len(points)))])[:count]
     means = points[chosen].astype(np.float64)
     colour = np.asarray(colours, np.float64)
-    beside = np.arange(len(chosen)) >= len(points)
-    if beside.any():
-        spread = _neighbour_distances(points.astype(np.float64), scene)[chosen[beside]]
-        means[beside] += rng.standard_normal((int(beside.sum()), 3)) * spread[:, None]
+    repeated = np.arange(len(chosen)) >= len(points)
+    if repeated.any():
+        spread = _neighbour_distances(points.astype(np.float64), scene)[chosen[repeated]]
+        means[repeated] += rng.standard_normal((int(repeated.sum()), 3)) * spread[:, None]
     return means, colour[chosen]
 
 
@@ -155,7 +155,7 @@ def _in_box(
         total += int(keep.sum())
         if total >= count:
             break
-    if total == 0:  # masks that do not fit together, cameras that look elsewhere
+    if total == 0:  # inconsistent masks, or cameras that look elsewhere
         return scene.focus + scene.half * rng.uniform(-1.0, 1.0, (count, 3)), np.full((count, 3), 0.5)
     means, colour = np.concatenate(found), np.concatenate(colours)
     chosen = np.concatenate([np.arange(total), rng.integers(0, total, max(0, count - total))])[:count]
@@ -176,7 +176,7 @@ def _sample_images(images: Sequence[PosedImage], points: F64) -> tuple[NDArray[n
 
 
 def _pixels_at(image: PosedImage, points: F64) -> tuple[NDArray[np.int64], F64]:
-    """The points that fall into an image, and its pixels there, RGBA in 0..1."""
+    """Return the points that are inside an image, and its pixels there, RGBA in 0..1."""
     camera: Camera = image.camera
     V, K = camera.viewmat, camera.K
     x, y, z = (points @ V[axis, :3] + V[axis, 3] for axis in range(3))
@@ -205,9 +205,9 @@ def _splats(means: F64, colour: F64, sh_degree: int, scene: SceneExtent, rng: Ge
 
 
 def _neighbour_distances(points: F64, scene: SceneExtent) -> F64:
-    """Root mean square distance to the nearest three others, never 0.
+    """Return the root mean square distance to the nearest three others, never 0.
 
-    If most points have others in the very same place, that carries no information: then as if they filled the box.
+    If most points coincide with others, distances carry no information: they are set as if points filled the box.
     """
     evenly = 2.0 * scene.half / max(1, len(points)) ** (1.0 / 3.0)
     if len(points) < 2:

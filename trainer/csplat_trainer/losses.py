@@ -42,7 +42,7 @@ from csplat_render.metric_kernels import (
 #: Weights of L1 and of 1 − SSIM, by the name of the option.
 LOSS_WEIGHTS = {"inria": (0.8, 0.2), "study": (1.0, 0.2), "l1": (1.0, 0.0)}
 
-_PAD = CHANNELS * RADIUS  # values on either side of a row; three channels lie next to each other
+_PAD = CHANNELS * RADIUS  # values on either side of a row; three channels are adjacent
 _TAPS = WINDOW[RADIUS:].astype(np.float32)  # weights of the window, from its middle outwards
 
 
@@ -64,7 +64,7 @@ class LossValue:
 
 
 class PhotometricLoss:
-    """L1 + SSIM against photographs of one size; its buffers are kept between calls.
+    """L1 + SSIM against images of one size; its buffers are kept between calls.
 
     Args:
         height: height of the images, in pixels.
@@ -89,11 +89,11 @@ class PhotometricLoss:
         Args:
             rendered: [H, W, 3], C-contiguous.
             photograph: [H, W, 3], C-contiguous.
-            mask: [H, W], pixels that count; where others are, `photograph` is made what is rendered. `None`: all.
+            mask: [H, W], pixels that count; for the others, `photograph` is set to `rendered`. `None`: all count.
 
         Returns:
-            The figures, and the gradient of `loss` by `rendered`, [H, W, 3]: a buffer that the next
-            call overwrites. It is 0 where pixels do not count.
+            The terms, and the gradient of `loss` towards `rendered`, [H, W, 3]: a buffer that the next
+            call overwrites. It is 0 for pixels that do not count.
         """
         assert rendered.shape == self._shape == photograph.shape
         if mask is not None:
@@ -120,7 +120,7 @@ class PhotometricLoss:
 
 @parallel_kernel(relaxed=True)
 def _ssim_partials(lane: int, lanes: int, x: F32, y: F32, across: F32, partial: F32, sums: F64) -> None:
-    """SSIM of each value, its derivatives by mean, square and product; vectorises over a row."""
+    """Compute SSIM of each value and its derivatives by mean, square and product; vectorises over a row."""
     height, width = x.shape
     c1, c2, two, one = np.float32(C1), np.float32(C2), np.float32(2.0), np.float32(1.0)
     moments = np.empty((5, width), np.float32)
@@ -179,7 +179,7 @@ def _combine(
 
 @parallel_kernel(relaxed=True)
 def _l1_alone(lane: int, lanes: int, x: F32, y: F32, l1_step: np.float32, gradient: F32, sums: F64) -> None:
-    """L1 and squared error of each row; vectorises over the values of a row."""
+    """Compute L1 and squared error of each row; vectorises over the values of a row."""
     height, width = x.shape
     for r in range(lane, height, lanes):
         l1_sum, square_sum = np.float32(0.0), np.float32(0.0)
@@ -196,7 +196,7 @@ def _l1_alone(lane: int, lanes: int, x: F32, y: F32, l1_step: np.float32, gradie
 def photometric_loss_twin(
     rendered: F64, photograph: F64, l1_weight: float = 0.8, ssim_weight: float = 0.2
 ) -> tuple[LossValue, F64]:
-    """The slow twin of `PhotometricLoss`: float64, whole images, one formula after the other.
+    """Compute `PhotometricLoss` the slow way: float64, whole images, one formula after the other.
 
     Args:
         rendered: [H, W, 3].
@@ -205,7 +205,7 @@ def photometric_loss_twin(
         ssim_weight: factor of 1 − SSIM.
 
     Returns:
-        The figures, and the gradient of `loss` by `rendered`, [H, W, 3].
+        The terms, and the gradient of `loss` towards `rendered`, [H, W, 3].
     """
     x, y = rendered.astype(np.float64), photograph.astype(np.float64)
     m1, m2 = blur_twin(x), blur_twin(y)
@@ -226,7 +226,7 @@ def photometric_loss_twin(
 
 
 _STRIDES, _PADDINGS = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
-_POOLED = (1, 2)  # layers that a 3×3 pooling of stride 2 precedes
+_POOLED = (1, 2)  # layers after a 3×3 pooling of stride 2
 _LPIPS_EPSILON = 1e-10
 
 
@@ -234,7 +234,7 @@ class PerceptualLoss:
     """LPIPS v0.1 with the AlexNet backbone (https://arxiv.org/abs/1801.03924).
 
     Args:
-        weights: of the five layers and of their differences.
+        weights: weights of the five layers and of their differences.
 
     Raises:
         InputError: torch is not installed.
@@ -248,13 +248,13 @@ class PerceptualLoss:
         self._shift, self._scale = (torch.from_numpy(one.copy()).reshape(1, 3, 1, 1) for one in (SHIFT, SCALE))
 
     def distance(self, first: F32, second: F32) -> float:
-        """LPIPS of two images, [H, W, 3] in 0..1."""
+        """Return LPIPS of two images, [H, W, 3] in 0..1."""
         torch = _import_torch()
         with torch.no_grad():
             return float(self._distance(self._tensor(first), self._tensor(second)))
 
     def gradient(self, rendered: F32, photograph: F32, weight: float) -> F32:
-        """Gradient of `weight` · LPIPS by the rendered image, [H, W, 3]."""
+        """Return the gradient of `weight` · LPIPS towards the rendered image, [H, W, 3]."""
         x = self._tensor(rendered).requires_grad_(requires_grad=True)
         (weight * self._distance(x, self._tensor(photograph))).backward()
         slope: F32 = x.grad[0].permute(1, 2, 0).contiguous().numpy()
@@ -284,7 +284,7 @@ class PerceptualLoss:
 
 
 def _unit(x: Any) -> Any:
-    """Feature vectors at unit length."""
+    """Scale feature vectors to unit length."""
     return x / (x.square().sum(dim=1, keepdim=True) + _LPIPS_EPSILON).sqrt()
 
 

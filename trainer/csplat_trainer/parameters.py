@@ -17,12 +17,12 @@ from csplat_render.kernels import parallel_kernel, relaxed_kernel
 
 ParameterArrays = dict[str, F32]
 
-#: Names of the arrays of `ParameterArrays`, in the order of everything that goes through them.
+#: Names of the arrays of `ParameterArrays`, in the order in which they are processed.
 GROUPS = ("means", "quats", "scales", "logits", "sh0", "shN")
 
 _BETA1, _EPSILON = 0.9, 1e-15
-_LOGIT_LIMIT = 14.0  # float32 alpha has few digits beyond
-_BLOCK = 1 << 13  # values that one thread takes at a time
+_LOGIT_LIMIT = 14.0  # beyond it, alpha in float32 has few digits
+_BLOCK = 1 << 13  # values that a thread processes at a time
 
 
 @dataclass
@@ -31,11 +31,11 @@ class Parameters:
 
     Attributes:
         values: means [N, 3], quats [N, 4], scales [N, 3] (log), logits [N], sh0 [N, 3], shN [N, K, 3]; fine-tuning
-            has a group more, and as many rows as its file holds.
+            has one more group, and the rows that its file holds.
         first: Adam's running mean of the gradients, the same shapes.
         second: Adam's running mean of their squares.
         step: number of steps that Adam has made.
-        beta2: share of the mean of squares that a step leaves.
+        beta2: decay of the mean of squares in a step.
     """
 
     values: ParameterArrays
@@ -46,7 +46,7 @@ class Parameters:
 
     @classmethod
     def starting_at(cls, values: ParameterArrays) -> Parameters:
-        """Parameters that have not moved yet."""
+        """Return parameters before the first step."""
         first, second = ({name: np.zeros_like(array) for name, array in values.items()} for _ in range(2))
         return cls(values, first, second)
 
@@ -71,7 +71,7 @@ class Parameters:
                 part[name] = np.ascontiguousarray(part[name][rows])
 
     def append(self, values: ParameterArrays) -> None:
-        """Add splats that Adam knows nothing of."""
+        """Add splats, without any memory of Adam."""
         for name in GROUPS:
             self.values[name] = np.concatenate([self.values[name], values[name]])
             for memory in (self.first, self.second):
@@ -96,7 +96,7 @@ def from_model(model: SplatModel, sh_degree: int) -> ParameterArrays:
 
 
 def to_model(values: ParameterArrays, *, antialiased: bool = False) -> SplatModel:
-    """The splats as a model."""
+    """Return the splats as a model."""
     return SplatModel(
         means=values["means"].copy(),
         quats=normalise_quats(values["quats"]),
@@ -109,13 +109,13 @@ def to_model(values: ParameterArrays, *, antialiased: bool = False) -> SplatMode
 
 
 def sigmoid(logits: F32) -> F32:
-    """Opacities of logits, in float64, rounded once."""
+    """Return the opacities of logits, computed in float64, rounded once."""
     alpha: F32 = (1.0 / (1.0 + np.exp(-logits.astype(np.float64)))).astype(np.float32)
     return alpha
 
 
 def adam_step(parameters: Parameters, gradients: ParameterArrays, rates: dict[str, float]) -> None:
-    """One step of Adam (no weight decay), then unit quaternions and bounded logits.
+    """Make a step of Adam (no weight decay), then normalise quaternions and bound logits.
 
     Args:
         parameters: changed in place.
@@ -155,7 +155,7 @@ def _adam(
 ) -> None:
     """Adam on a flat array; vectorises over its values.
 
-    `a2` is 1 - `b2`, which a compiler that knows of it may turn into a difference of squares: of infinite ones NaN.
+    `a2` is 1 - `b2`; a compiler that knew this might use a difference of squares, which is NaN for infinite ones.
     """
     b1, a1 = np.float32(_BETA1), np.float32(1.0 - _BETA1)
     epsilon, tiny = np.float32(_EPSILON), np.float32(1e-30)
@@ -169,7 +169,7 @@ def _adam(
             slope = g[i]
             mean = b1 * m[i] + a1 * slope
             square = b2 * v[i] + a2 * slope * slope
-            # A splat that no image sees decays towards denormal numbers, which are slow.
+            # The memory of a splat that no image shows decays towards denormal numbers, which are slow.
             mean = mean if abs(mean) > tiny else np.float32(0.0)
             square = square if square > tiny else np.float32(0.0)
             m[i] = mean

@@ -21,7 +21,7 @@ from csplat_render.scorer import ReferenceImage, Scorer
 
 @dataclass(frozen=True, eq=False)
 class UnreadPixels:
-    """Pixels that are read when they are first asked for, and then kept.
+    """Pixels that are read on first access, and then kept.
 
     Attributes:
         has_alpha: True if there is an alpha channel.
@@ -33,13 +33,13 @@ class UnreadPixels:
 
     @cached_property
     def pixels(self) -> U8:
-        """As `read` returns them; raises what it raises."""
+        """The result of `read`, which may raise."""
         return self.read()
 
 
 @dataclass(frozen=True, eq=False)
 class UnreadMask:
-    """A mask that is read when it is first asked for, and then kept.
+    """A mask that is read on first access, and then kept.
 
     Attributes:
         read: makes the array that `PosedImage` needs.
@@ -49,7 +49,7 @@ class UnreadMask:
 
     @cached_property
     def mask(self) -> Mask:
-        """As `read` returns it; raises what it raises."""
+        """The result of `read`, which may raise."""
         return self.read()
 
 
@@ -60,7 +60,7 @@ class PosedImage:
     Attributes:
         camera: its camera; W and H are those of the image.
         source: [H, W, 3] or [H, W, 4] uint8, C-contiguous, RGB or RGBA with straight (not
-            premultiplied) alpha; or such pixels that are not read yet.
+            premultiplied) alpha; or pixels that are not read yet.
         masked: [H, W], True for pixels that count in training and scores; or a mask that is not read yet. `None`: all
             of them count.
 
@@ -104,11 +104,11 @@ class PosedImage:
 
     @property
     def has_alpha(self) -> bool:
-        """True if there is an alpha channel; nothing is read for it."""
+        """True if there is an alpha channel; pixels are not read."""
         return self.source.has_alpha if isinstance(self.source, UnreadPixels) else self.source.shape[2] == 4
 
     def at(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> F64:
-        """Some pixels, RGBA in 0..1, [M, 4]; alpha 1 if there is none."""
+        """Return some pixels, RGBA in 0..1, [M, 4]; alpha is 1 if there is none."""
         values = self.pixels[rows, columns].astype(np.float64) / 255.0
         return values if self.has_alpha else np.concatenate([values, np.ones((len(values), 1))], axis=1)
 
@@ -121,7 +121,7 @@ class PosedImage:
 
 
 def compose(image: PosedImage, background: F32, out: F32) -> F32:
-    """The image as floats, in front of a background.
+    """Convert an image to floats, in front of a background.
 
     Args:
         image: the image to compose.
@@ -136,10 +136,10 @@ def compose(image: PosedImage, background: F32, out: F32) -> F32:
 
 
 def halve(image: PosedImage) -> PosedImage:
-    """The image at half its width and height: each pixel is the mean of four, weighted with their alpha.
+    """Return the image at half its width and height: each pixel is the mean of four, weighted by their alpha.
 
     A last odd row or column is left out. A pixel counts if all four do; if none would, or the image is one
-    pixel wide or high, it stays as it is.
+    pixel wide or high, it is returned unchanged.
     """
     camera = image.camera
     W, H = camera.W // 2, camera.H // 2

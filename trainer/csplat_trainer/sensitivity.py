@@ -174,7 +174,7 @@ class _Derivatives(Rasteriser):
         rows = n if magnitudes else 0
         self._colour = np.zeros((rows, count, 3), np.float32)
         self._net, self._sizes = np.zeros((rows, 7)), np.zeros((rows, 7))
-        self._squares, self._bends = np.zeros((n, 3)), np.zeros((n, 21))
+        self._squares, self._shape_matrices = np.zeros((n, 3)), np.zeros((n, 21))
         self._metric = np.zeros((n if metric else 0, count * (count + 1) // 2), np.float32)
         self._views = np.zeros(n, np.int64)
         self._wanted, self._magnitudes = metric, magnitudes
@@ -200,7 +200,7 @@ class _Derivatives(Rasteriser):
             )  # fmt: skip
             add_view(
                 a.means, a.opacities, a.scales, view, last.degree, shape, near, offsets, records,
-                self._colour, self._net, self._sizes, self._squares, self._metric, self._bends,
+                self._colour, self._net, self._sizes, self._squares, self._metric, self._shape_matrices,
                 self._views,
             )  # fmt: skip
         self._view_count += 1
@@ -210,8 +210,8 @@ class _Derivatives(Rasteriser):
         """Divide by the pixels, and take the largest of each group."""
         pixels = max(1, self._pixel_count)
         self._metric /= np.float32(pixels)
-        bends, squares, net, sizes = (
-            _mean_over(sums, pixels) for sums in (self._bends, self._squares, self._net, self._sizes)
+        shape_matrices, squares, net, sizes = (
+            _mean_over(sums, pixels) for sums in (self._shape_matrices, self._squares, self._net, self._sizes)
         )
         kept = self._magnitudes
         return Sensitivity(
@@ -222,9 +222,9 @@ class _Derivatives(Rasteriser):
             shape_net=net[:, 1:].max(axis=1) if kept else None,
             colour_squares=squares[:, 0],
             opacity_squares=squares[:, 1],
-            shape_squares=bends[:, _DIAGONAL].sum(axis=1),
+            shape_squares=shape_matrices[:, _DIAGONAL].sum(axis=1),
             means_squares=squares[:, 2],
-            shape_metric=bends,
+            shape_metric=shape_matrices,
             metric=self._metric if self._wanted else None,
             views=self._views,
             view_count=self._view_count,
@@ -475,7 +475,7 @@ def _moments(body: Any, count: int, form: Any, sums: Any) -> None:
 @parallel_kernel()
 def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, view: Any, degree: int, shape: Any,
              near: Any, offsets: Any, records: Any, colour: Any, net: Any, sizes: Any, squares: Any, metric: Any,
-             bends: Any, views: Any) -> None:  # fmt: skip
+             shape_matrices: Any, views: Any) -> None:  # fmt: skip
     """Add one view's sums for every splat; parallel over blocks of splats, records in one order.
 
     Args:
@@ -546,6 +546,6 @@ def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, vie
             place = 0
             for e in range(6):
                 for f in range(e, 6):
-                    beside = (2.0 if e > 2 else 1.0) * (2.0 if f > 2 else 1.0)
-                    bends[i, place] += math.sqrt(beside) * sums[18 + place]
+                    multiplicity = (2.0 if e > 2 else 1.0) * (2.0 if f > 2 else 1.0)
+                    shape_matrices[i, place] += math.sqrt(multiplicity) * sums[18 + place]
                     place += 1

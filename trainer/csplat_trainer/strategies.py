@@ -27,11 +27,11 @@ from csplat_render.pruning_error import measure_pruning_error
 from csplat_trainer.parameters import GROUPS, Parameters, to_model
 from csplat_trainer.posed_images import PosedImage
 
-_MAX_SHARE = 51  # splats in one place at most, as the paper's code has it
+_MAX_SHARE = 51  # largest number of splats in one place, as in the paper's code
 _BINOMIAL = np.array([[float(math.comb(n, k)) for k in range(_MAX_SHARE + 1)] for n in range(_MAX_SHARE + 1)])
-_GATE_SLOPE, _GATE_CENTRE = 100.0, 0.995  # of the paper: noise for splats that are nearly transparent
-_MAX_NOISE = 1.0  # standard deviations per step; the paper's noise flings large splats out of small scenes
-_GATE_OFF = 0.1  # at this opacity and above the gate is below 1e-4
+_GATE_SLOPE, _GATE_CENTRE = 100.0, 0.995  # the paper's gate: noise for nearly transparent splats only
+_MAX_NOISE = 1.0  # standard deviations per step; the paper's noise moves large splats out of small scenes
+_GATE_OFF = 0.1  # opacity from which the gate is below 1e-4
 
 
 def relocate(parameters: Parameters, dead_opacity: float, rng: Generator) -> int:
@@ -39,11 +39,11 @@ def relocate(parameters: Parameters, dead_opacity: float, rng: Generator) -> int
 
     Args:
         parameters: changed in place.
-        dead_opacity: at this opacity and below a splat is dead.
-        rng: chooses.
+        dead_opacity: a splat of at most this opacity is dead.
+        rng: source of random choices.
 
     Returns:
-        How many moved.
+        Number of splats that were moved.
     """
     alphas = parameters.alphas
     dead = np.flatnonzero(alphas <= dead_opacity)
@@ -59,17 +59,17 @@ def relocate(parameters: Parameters, dead_opacity: float, rng: Generator) -> int
 
 
 def grow(parameters: Parameters, factor: float, cap: int, dead_opacity: float, rng: Generator) -> int:
-    """Add splats beside others that are chosen by opacity, up to a cap.
+    """Add splats at the places of others, which are chosen by opacity, up to a cap.
 
     Args:
         parameters: changed in place.
-        factor: how many splats there are afterwards, as a multiple of those there are, below the cap.
-        cap: no more splats than this.
-        dead_opacity: no new splat is more transparent than this.
-        rng: chooses.
+        factor: growth of the number of splats, below the cap.
+        cap: largest number of splats.
+        dead_opacity: least opacity of a new splat.
+        rng: source of random choices.
 
     Returns:
-        How many were added.
+        Number of splats that were added.
     """
     count = len(parameters)
     wanted = min(cap, max(count + 1, int(factor * count))) - count
@@ -83,7 +83,7 @@ def grow(parameters: Parameters, factor: float, cap: int, dead_opacity: float, r
 
 
 def share_opacity(alphas: F64, counts: I64) -> tuple[F64, F64]:
-    """Opacity and scale of n equal splats in one place that look like one (equation 9 of the paper).
+    """Return opacity and scale of n equal splats in one place that look like one (equation 9 of the MCMC paper).
 
     Args:
         alphas: opacity of the one.
@@ -93,7 +93,7 @@ def share_opacity(alphas: F64, counts: I64) -> tuple[F64, F64]:
         Opacities of each of the n, and factors of their standard deviations.
     """
     shared = 1.0 - (1.0 - alphas) ** (1.0 / counts)
-    # The paper's double sum, added up along its outer index: sum_i C(i - 1, k) = C(n, k + 1).
+    # The paper's double sum, summed over its outer index: sum_i C(i - 1, k) = C(n, k + 1).
     denominator = np.zeros_like(shared)
     for k in range(int(counts.max(initial=1))):
         denominator += _BINOMIAL[counts, k + 1] * (-1.0) ** k / math.sqrt(k + 1) * shared ** (k + 1)
@@ -101,7 +101,7 @@ def share_opacity(alphas: F64, counts: I64) -> tuple[F64, F64]:
 
 
 def _draw_by_opacity(alphas: F32, among: I64, count: int, rng: Generator) -> I64:
-    """Draw splats with replacement, each as likely as it is opaque."""
+    """Draw splats with replacement, in proportion to their opacity."""
     edges = np.cumsum(alphas[among].astype(np.float64))
     drawn = np.searchsorted(edges, rng.random(count) * edges[-1], side="right")
     chosen: I64 = among[np.minimum(drawn, len(among) - 1)]
@@ -119,7 +119,7 @@ def _share_among(parameters: Parameters, sources: I64, alphas: F32, least: float
 
 
 def add_noise(parameters: Parameters, strength: float, normals: F32) -> None:
-    """Move splats at random inside their own shapes, the more the more transparent they are.
+    """Move splats at random inside their own shapes, transparent ones more.
 
     The paper's noise, covariance · normal · gate · strength, but along no axis wider than the splat.
 
@@ -136,7 +136,7 @@ def add_noise(parameters: Parameters, strength: float, normals: F32) -> None:
 def _noise(
     lane: int, lanes: int, means: F32, quats: F32, scales: F32, logits: F32, strength: np.float32, normals: F32
 ) -> None:
-    """Add the noise to each mean; a thread takes a run of splats."""
+    """Add the noise to each mean; parallel over runs of splats."""
     highest = math.log(_GATE_OFF / (1.0 - _GATE_OFF))
     for i in range(*lane_range(lane, lanes, means.shape[0])):
         if logits[i] > highest:
@@ -155,19 +155,19 @@ def _noise(
         m0 = np.float32(means[i, 0] + (r00 * l0 + r01 * l1 + r02 * l2))
         m1 = np.float32(means[i, 1] + (r10 * l0 + r11 * l1 + r12 * l2))
         m2 = np.float32(means[i, 2] + (r20 * l0 + r21 * l1 + r22 * l2))
-        if np.isfinite(m0) and np.isfinite(m1) and np.isfinite(m2):  # a splat as wide as float32 stays where it is
+        if np.isfinite(m0) and np.isfinite(m1) and np.isfinite(m2):  # a splat as wide as float32 is not moved
             means[i, 0], means[i, 1], means[i, 2] = m0, m1, m2
 
 
-_SPLIT_SIZE = 0.01  # of the extent: larger splats are split, smaller ones cloned
-_SPLIT_SHRINK = 1.6  # of the two halves of a split
-_RESET_ALPHA = 0.01
-_MAX_LOG_SCALE = 60.0  # of a scale whose halves stay within float32
+_SPLIT_SIZE = 0.01  # fraction of the extent: larger splats are split, smaller ones cloned
+_SPLIT_SHRINK = 1.6  # factor by which the halves of a split are smaller
+_RESET_ALPHA = 0.01  # opacity after a reset
+_MAX_LOG_SCALE = 60.0  # log scale up to which offsets of a split fit float32
 
 
 @dataclass
 class ScreenGradients:
-    """Mean norm of the gradient by each splat's place on screen, over the images that drew it.
+    """Mean norm of the gradient towards each splat's position on screen, over the renders that show it.
 
     Attributes:
         total: [N] float64.
@@ -179,17 +179,17 @@ class ScreenGradients:
 
     @classmethod
     def none(cls, splats: int) -> ScreenGradients:
-        """No image yet."""
+        """Return the sums before the first render."""
         return cls(np.zeros(splats), np.zeros(splats, np.int64))
 
     def add(self, norms: F32, drawn: NDArray[np.bool_]) -> None:
-        """Add one image's norms, where it drew the splat."""
+        """Add one render's norms, for the splats that it shows."""
         self.total[drawn] += norms[drawn]
         self.count[drawn] += 1
 
     @property
     def mean(self) -> F64:
-        """The mean, 0 for splats that no image drew."""
+        """The mean, 0 for splats that no render shows."""
         return self.total / np.maximum(self.count, 1)
 
 
@@ -202,27 +202,27 @@ def densify(
     dead_opacity: float,
     rng: Generator,
 ) -> int:
-    """Clone and split where the gradient is above a threshold, strongest first up to the cap; prune.
+    """Clone and split splats whose gradient is above a threshold, strongest first up to the cap; prune dead ones.
 
     Args:
         parameters: changed in place.
-        screen: gathered since the last time.
-        extent: of the scene.
-        threshold: of the mean norm.
-        cap: no more splats than this.
-        dead_opacity: splats at this opacity and below are removed.
-        rng: places the halves of a split.
+        screen: gradients since the last call.
+        extent: extent of the scene.
+        threshold: threshold of the mean norm.
+        cap: largest number of splats.
+        dead_opacity: splats of at most this opacity are pruned.
+        rng: source of the offsets of splits.
 
     Returns:
-        By how much the number of splats changed.
+        Change of the number of splats.
     """
     before = len(parameters)
     alive = parameters.alphas > dead_opacity
     if not alive.any():
         return 0
     strength = np.where(alive, screen.mean, 0.0)
-    room = max(0, cap - int(alive.sum()))
-    strongest = np.argsort(-strength, kind="stable")[:room]
+    free = max(0, cap - int(alive.sum()))
+    strongest = np.argsort(-strength, kind="stable")[:free]
     chosen = np.sort(strongest[strength[strongest] > threshold])
     values = parameters.values
     large = values["scales"][chosen].max(axis=1) > np.log(_SPLIT_SIZE * extent)
@@ -241,7 +241,7 @@ def densify(
 
 
 def reset_opacities(parameters: Parameters) -> None:
-    """Make every splat nearly transparent, so that only those come back that images want."""
+    """Make every splat nearly transparent: training restores those that the images need."""
     logit = np.float32(np.log(_RESET_ALPHA / (1.0 - _RESET_ALPHA)))
     np.minimum(parameters.values["logits"], logit, out=parameters.values["logits"])
     for memory in (parameters.first, parameters.second):
@@ -249,7 +249,7 @@ def reset_opacities(parameters: Parameters) -> None:
 
 
 def _split_offsets(quats: F32, scales: F32, rng: Generator) -> tuple[F32, F32]:
-    """Two offsets for each splat, drawn from its own shape."""
+    """Draw two offsets for each splat from its own shape."""
     w, x, y, z = quats.astype(np.float64).T
     rotation = np.stack(
         [
@@ -265,7 +265,7 @@ def _split_offsets(quats: F32, scales: F32, rng: Generator) -> tuple[F32, F32]:
     return first, second
 
 
-_PRUNING_VIEWS = 32  # at most, spread over all, that say what splats are worth
+_PRUNING_VIEWS = 32  # largest number of views, spread over all, in which the pruning error is measured
 
 
 def prune_least_needed(
@@ -276,14 +276,14 @@ def prune_least_needed(
     *,
     antialiased: bool,
 ) -> None:
-    """Remove the splats that images need least.
+    """Prune the splats that images need least.
 
     Args:
         parameters: changed in place.
-        images: those that are trained on.
+        images: the training images.
         background: [3], behind the splats.
-        count: how many stay.
-        antialiased: as the scene is trained.
+        count: number of splats to keep.
+        antialiased: apply the mip-splatting filter.
     """
     views = images[:: -(-len(images) // _PRUNING_VIEWS)]
     model = to_model(parameters.values, antialiased=antialiased)

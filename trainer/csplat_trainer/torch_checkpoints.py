@@ -51,8 +51,8 @@ _NAMES = {
 
 
 @contextmanager
-def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
-    paths, findings = _parts(path)
+def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
+    paths, findings = _rank_files(path)
     parts = [_read(one, sh_degree) for one in paths]
     models = [one.model for one in parts]
     degrees = sorted({one.sh_degree for one in models})
@@ -87,7 +87,7 @@ class _CheckpointPart(NamedTuple):
     findings: list[Finding]
 
 
-def _parts(path: Path) -> tuple[list[Path], list[Finding]]:
+def _rank_files(path: Path) -> tuple[list[Path], list[Finding]]:
     """The files of all GPUs of a run of gsplat, of which one is named.
 
     Raises:
@@ -128,7 +128,7 @@ def _read(path: Path, sh_degree: int | None) -> _CheckpointPart:
     try:
         with _plain_numbers(torch), warnings.catch_warnings(action="ignore"):
             # Mapped: of a checkpoint of splatfacto two thirds are Adam's memory.
-            said = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
+            content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
     except OSError:
         raise
     except Exception as error:  # noqa: BLE001 -- an unpickler raises whatever a damaged file makes of it
@@ -138,7 +138,7 @@ def _read(path: Path, sh_degree: int | None) -> _CheckpointPart:
             reason = "is no whole checkpoint of torch: copy it again, or save its splats as PLY where it was trained"
         raise InputError(f"{path.name} {reason}") from None
     try:
-        return _model_of(said, path.stat().st_size, sh_degree)
+        return _model_of(content, path.stat().st_size, sh_degree)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
 
@@ -152,25 +152,25 @@ def _plain_numbers(torch: Any) -> Any:
     return torch.serialization.safe_globals([make, (make, "numpy.core.multiarray.scalar"), np.dtype, *kinds])
 
 
-def _model_of(said: object, size: int, sh_degree: int | None) -> _CheckpointPart:
-    inria = _of_inria(said)
+def _model_of(content: object, size: int, sh_degree: int | None) -> _CheckpointPart:
+    inria = _inria_tensors(content)
     if inria is not None:
-        return _bounded(inria, size, sh_degree)
-    if not isinstance(said, Mapping):
-        raise InputError(f"it holds a {type(said).__name__}, wanted a checkpoint of gsplat, splatfacto or INRIA")
-    if isinstance(said.get("splats"), Mapping):
-        return _bounded(said["splats"], size, sh_degree)
-    holder = next((said[name] for name in _HOLDERS if isinstance(said.get(name), Mapping)), said)
+        return _checked_part(inria, size, sh_degree)
+    if not isinstance(content, Mapping):
+        raise InputError(f"it holds a {type(content).__name__}, wanted a checkpoint of gsplat, splatfacto or INRIA")
+    if isinstance(content.get("splats"), Mapping):
+        return _checked_part(content["splats"], size, sh_degree)
+    holder = next((content[name] for name in _HOLDERS if isinstance(content.get(name), Mapping)), content)
     named = {str(name): value for name, value in holder.items()}
     models = _models_in(named)
     if len(models) > 1:
         shown = ", ".join(f"{prefix}* ({_count(named[prefix + 'means'])})" for prefix in models[:_NAMED])
         raise InputError(f"it holds {len(models)} models of splats, expected one: {shown}; save one of them alone")
     if not models:
-        names = ", ".join(map(str, list(said)[:_NAMED]))
+        names = ", ".join(map(str, list(content)[:_NAMED]))
         raise InputError(f"it holds {names or 'nothing'}: neither splats of gsplat nor a pipeline of splatfacto")
     found = {name.removeprefix(models[0]): value for name, value in named.items() if name.startswith(models[0])}
-    part = _bounded({_NAMES.get(name, name): value for name, value in found.items()}, size, sh_degree)
+    part = _checked_part({_NAMES.get(name, name): value for name, value in found.items()}, size, sh_degree)
     if part.model.sh_degree or "features_rest" not in found:
         return part
     # Without SH splatfacto trains logits of colours.
@@ -178,9 +178,9 @@ def _model_of(said: object, size: int, sh_degree: int | None) -> _CheckpointPart
     return part._replace(model=replace(part.model, sh0=((colours - 0.5) / _SH_C0).astype(np.float32)))
 
 
-def _of_inria(said: object) -> dict[str, Any] | None:
+def _inria_tensors(content: object) -> dict[str, Any] | None:
     """The splats of a checkpoint of INRIA's trainer: what `capture` returned, and the iteration."""
-    captured = said[0] if isinstance(said, tuple) and len(said) == 2 else None
+    captured = content[0] if isinstance(content, tuple) and len(content) == 2 else None
     if not isinstance(captured, tuple) or len(captured) <= len(_INRIA) or not hasattr(captured[1], "numel"):
         return None
     return dict(zip(_INRIA, captured[1:], strict=False))
@@ -200,7 +200,7 @@ def _count(means: Any) -> str:
     return counted(shape[0], "splat") if shape else "no tensor"
 
 
-def _bounded(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> _CheckpointPart:
+def _checked_part(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> _CheckpointPart:
     """The splats of tensors, none of which has more numbers than the file has bytes: one may be said to be many."""
     for name in _NAMES.values():
         numbers = getattr(splats.get(name), "numel", None)

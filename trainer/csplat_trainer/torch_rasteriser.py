@@ -32,7 +32,7 @@ def render(
     antialiased: bool = False,
     sh_degree: int | None = None,
 ) -> Tensor:
-    """Draw splats; gradients flow back to each of the six tensors.
+    """Render splats; gradients flow back to each of the six tensors.
 
     Args:
         means: [N, 3], all float32 or all float64 (then everything is computed in float64), on the CPU.
@@ -41,10 +41,10 @@ def render(
         opacities: [N], alpha.
         sh0: [N, 3].
         shN: [N, K, 3].
-        camera: where from.
-        background: behind the splats.
+        camera: the camera to render from.
+        background: red, green, blue behind the splats.
         antialiased: apply the mip-splatting low-pass filter.
-        sh_degree: of the bands that are evaluated; `None`: all there are.
+        sh_degree: highest degree of the SH bands; `None`: that of `shN`.
 
     Returns:
         [H, W, 3], not clipped.
@@ -63,7 +63,7 @@ def render(
 
 
 class _Render(Function):
-    """Forward keeps the rasteriser, whose buffers hold what backward needs."""
+    """The autograd function; its context keeps the rasteriser, whose buffers hold the state for backward."""
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> Tensor:

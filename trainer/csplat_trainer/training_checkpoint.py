@@ -28,13 +28,13 @@ class TrainingCheckpoint:
     """A training run between two steps.
 
     Attributes:
-        iteration: steps that were made.
-        parameters: of the splats, with Adam's memory.
-        rng_state: of the generator of every random choice, JSON-compatible.
-        queue: images that are still to come in this round.
-        options: of the run, as a dictionary.
-        log: what was logged so far.
-        origin: what the means are relative to.
+        iteration: number of steps made.
+        parameters: parameters of the splats, with Adam's memory.
+        rng_state: state of the random generator, JSON-compatible.
+        queue: indices of the images that remain in this epoch.
+        options: options of the run, as a dictionary.
+        log: log so far.
+        origin: point that the means are relative to.
     """
 
     iteration: int
@@ -47,7 +47,7 @@ class TrainingCheckpoint:
 
 
 def save_checkpoint(path: str | Path, checkpoint: TrainingCheckpoint) -> None:
-    """Write a checkpoint; the file appears under its name only when it is complete."""
+    """Write a checkpoint; the file gets its name only when it is complete."""
     facts = {
         "version": _VERSION,
         "iteration": checkpoint.iteration,
@@ -70,7 +70,7 @@ def load_checkpoint(path: str | Path) -> TrainingCheckpoint:
     """Read a checkpoint.
 
     Raises:
-        InputError: the file is not one, or was written by another version.
+        InputError: the file is not a checkpoint, or was written by another version.
         OSError: it cannot be read.
     """
     stored = read_archive(path, "a checkpoint of csplat train")
@@ -92,7 +92,7 @@ def load_checkpoint(path: str | Path) -> TrainingCheckpoint:
 
 
 def _origin(path: str | Path, facts: dict[str, Any]) -> tuple[float, float, float]:
-    """Return the origin that a checkpoint states; those of older versions state none, and had 0."""
+    """Return the origin of a checkpoint; older versions store none, and had 0."""
     try:
         x, y, z = (float(value) for value in facts.get("origin", (0.0, 0.0, 0.0)))
     except (TypeError, ValueError):
@@ -121,16 +121,15 @@ def _check(path: str | Path, parts: list[ParameterArrays]) -> None:
 
 
 def fit_to_options(parameters: Parameters, options: TrainOptions, rng: Generator) -> Parameters:
-    """Make parameters fit the options.
+    """Adapt the parameters of a checkpoint to other options: another number of splats, another SH degree.
 
-    Too many splats: those that show least (opacity times the area of their two longer axes) go.
-    Too few for a fixed count: splats are added beside others, as growth does. SH bands are cut off,
-    or added as zeros.
+    If there are too many splats, those of least opacity times area of their two longer axes are pruned. If
+    there are too few for a fixed count, splats are added as by growth. SH bands are cut off, or added as zeros.
 
     Args:
-        parameters: of a checkpoint; changed in place.
-        options: of the run that goes on.
-        rng: chooses where splats are added.
+        parameters: parameters of a checkpoint; changed in place.
+        options: options of the run that continues.
+        rng: source of random choices.
 
     Returns:
         `parameters`.
@@ -158,5 +157,5 @@ def _fit_degree(part: ParameterArrays, degree: int) -> None:
 
 def _most_visible(parameters: Parameters, count: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     longer = np.sort(parameters.values["scales"].astype(np.float64), axis=1)[:, 1:]
-    weight = parameters.alphas * np.exp(np.minimum(longer.sum(axis=1), 700.0))  # below the end of float64
+    weight = parameters.alphas * np.exp(np.minimum(longer.sum(axis=1), 700.0))  # the exponential fits float64
     return np.sort(np.argsort(-weight, kind="stable")[:count])

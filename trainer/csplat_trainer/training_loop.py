@@ -37,11 +37,12 @@ from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult
 from csplat_trainer.training_report import TrainingStep, peak_memory, save_image, side_by_side
 
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-_COLOURS = {"black": _BLACK, "white": _WHITE, "random": _WHITE}  # random: what evaluations are in front of
+_COLOURS = {"black": _BLACK, "white": _WHITE, "random": _WHITE}  # random: background of evaluations
 _RESET_EVERY = 3000  # steps between resets of the opacities, gradient strategy
-_KEPT_AT_ONCE, _STEPS_BETWEEN = 0.85, 100  # share of the splats that stays where some go late, and steps that follow
-_LARGE_EXTENT = 50.0  # scene units; the weight of the mean standard deviation is meant for scenes that are no larger
-_FIRST_SHARE = 0.5  # of the cap: how many splats mcmc begins with where there are no points
+_KEPT_AT_ONCE = 0.85  # fraction of the splats that a late pruning keeps
+_STEPS_BETWEEN = 100  # steps after each late pruning
+_LARGE_EXTENT = 50.0  # scene units; in larger scenes the weight of the mean standard deviation is reduced
+_FIRST_SHARE = 0.5  # fraction of the cap: initial number of splats of mcmc without points
 
 
 def train(
@@ -52,21 +53,20 @@ def train(
     progress: Callable[[str, float], None] | None = None,
     on_step: Callable[[TrainingStep], None] | None = None,
 ) -> TrainResult:
-    """Train splats on images, as `csplat train` does; wants the packages of the render extra.
+    """Train splats on images, as `csplat train` does; requires the packages of the render extra.
 
     The same images, options and library versions give the same splats on the same machine, at
     any number of threads.
 
     Args:
-        data: images, and points of the scene where they are known; or what `load` makes them of: a folder, or a
-            `transforms.json`.
-        options: how.
-        outputs: checkpoints and early images.
-        progress: is told the stage and the share of it that is done, 0 to 1, every `log_every` steps.
-        on_step: is told then where the run stands.
+        data: a data set, or its path for `load`: a folder, or a `transforms.json`.
+        options: options of the training.
+        outputs: checkpoints and early renders.
+        progress: called every `log_every` steps with the stage and the fraction of it that is done, 0 to 1.
+        on_step: called then with the progress of the run.
 
     Returns:
-        The scene, the log, and scores on the images that were held out.
+        The scene, the log, and scores on the test images.
 
     Examples:
         >>> import csplat, csplat_trainer
@@ -74,8 +74,7 @@ def train(
         >>> csplat.write_ply("scene.ply", found.model)  # doctest: +SKIP
 
     Raises:
-        InputError: there is no image, an option does not suit the data, or a file is not what it
-            is said to be.
+        InputError: there is no image, an option does not suit the data, or a file is damaged or of another kind.
     """
 
     def show(now: TrainingStep) -> None:
@@ -85,7 +84,7 @@ def train(
             on_step(now)
 
     images = data if isinstance(data, DataSet) else load(data)
-    return _TrainingRun(images, options or TrainOptions(), outputs or Outputs()).to_the_end(show)
+    return _TrainingRun(images, options or TrainOptions(), outputs or Outputs()).run(show)
 
 
 @dataclass
@@ -97,14 +96,14 @@ class _Window:
 
 
 class _TrainingRun:
-    """A run: the engine, the random numbers, the log."""
+    """The state of a run: the engine, the random generator, the log."""
 
     def __init__(self, data: DataSet, options: TrainOptions, outputs: Outputs) -> None:
         if not data.train:
             raise InputError("there is no picture to train on")
         data.read()
         self._data, self._options, self._outputs = data, options, outputs
-        self._scene = measure_extent(data.counted)
+        self._scene = measure_extent(data.inliers)
         self._rng = Generator(PCG64(options.seed))
         self._iteration = 0
         self._queue: list[int] = []
@@ -114,21 +113,21 @@ class _TrainingRun:
             parameters = Parameters.starting_at(self._start(self._scene))
             self._log["growth"] = options.growth_from(len(parameters))
         else:
-            parameters = self._go_on(load_checkpoint(outputs.resume))
-        self._exposures = ImageGains(len(data.train), self._log.get("exposures", ()))
+            parameters = self._resume(load_checkpoint(outputs.resume))
+        self._gains = ImageGains(len(data.train), self._log.get("exposures", ()))
         self._lpips = _lpips(options, outputs)
         share = min(1.0, _LARGE_EXTENT / self._scene.extent)
         self._engine = _engine(parameters, replace(options, scale_weight=share * options.scale_weight), self._lpips)
         self._behind = _COLOURS.get(options.background, data.background)
         self._background = np.array(self._behind, np.float32)
 
-    def to_the_end(self, show: Callable[[TrainingStep], None]) -> TrainResult:
+    def run(self, show: Callable[[TrainingStep], None]) -> TrainResult:
         options, outputs = self._options, self._outputs
         window = _Window()
-        spent = float(self._log["seconds"])  # by what was resumed
+        spent = float(self._log["seconds"])  # before the run was resumed
         begin, first = time.perf_counter(), self._iteration
-        if first and not any(map(options.thinnings_left, range(first + 1, options.iterations + 1))):
-            self._thin_late(show)
+        if first and not any(map(options.prunings_left, range(first + 1, options.iterations + 1))):
+            self._prune_late(show)
         while self._iteration < options.iterations:
             self._iteration += 1
             step = self._iteration
@@ -138,12 +137,12 @@ class _TrainingRun:
             window.errors.append(value[1])
             if options.refines_after(step):
                 self._refine()
-            if times := options.thinnings_left(step):
-                self._thin(times)
+            if times := options.prunings_left(step):
+                self._prune(times)
             seconds = time.perf_counter() - begin
             if step % options.log_every == 0 or step == options.iterations:
                 left = seconds / (step - first) * (options.iterations - step)
-                now = self._entry(window, degree, spent + seconds, left)
+                now = self._log_entry(window, degree, spent + seconds, left)
                 window = _Window()
                 show(now)
             if options.eval_every and step % options.eval_every == 0 and step < options.iterations and self._data.test:
@@ -168,7 +167,7 @@ class _TrainingRun:
             points = 0 if data.points is None or options.init in ("hull", "box") else len(data.points)
             count = points or max(1, int(_FIRST_SHARE * options.max_splats))
         return place_splats(
-            data.counted,
+            data.inliers,
             scene,
             min(count, options.max_splats),
             options.sh_degree,
@@ -178,14 +177,14 @@ class _TrainingRun:
             colours=data.points_rgb,
         )
 
-    def _go_on(self, checkpoint: TrainingCheckpoint) -> Parameters:
+    def _resume(self, checkpoint: TrainingCheckpoint) -> Parameters:
         options = self._options
         self._rng.bit_generator.state = checkpoint.rng_state
         self._iteration = checkpoint.iteration
         self._queue = [index for index in checkpoint.queue if index < len(self._data.train)]
         self._log |= checkpoint.log
         shift = np.subtract(checkpoint.origin, self._data.origin)
-        if shift.any():  # of a set with other cameras
+        if shift.any():  # the data set has another origin, from other cameras
             means = checkpoint.parameters.values["means"]
             checkpoint.parameters.values["means"] = (means + shift).astype(np.float32)
         return fit_to_options(checkpoint.parameters, options, self._rng)
@@ -199,16 +198,16 @@ class _TrainingRun:
         if self._options.background == "random":
             background = self._rng.random(3, dtype=np.float32)
         rates = self._options.learning_rates(self._iteration, self._scene.extent)
-        exposure = ImageGain(self._exposures, number, rates["exposure"]) if self._options.lr_exposure else None
-        value = self._engine.step(image, background, degree, rates, self._rng, exposure)
+        gain = ImageGain(self._gains, number, rates["exposure"]) if self._options.lr_exposure else None
+        value = self._engine.step(image, background, degree, rates, self._rng, gain)
         if not math.isfinite(value.loss):
             raise InputError(f"the loss is not finite at step {self._iteration}: try smaller learning rates")
         self._log["losses"].append(float(f"{value.loss:.6g}"))
         return value.loss, value.mse
 
     def _picture(self, number: int) -> PosedImage:
-        """A photograph that teaches, of the size that its step wants."""
-        if not self._options.halves(self._iteration):
+        """Return a training image, at half its size in the first steps if so requested."""
+        if not self._options.is_half_size(self._iteration):
             self._halved.clear()
             return self._data.train[number]
         if number not in self._halved:
@@ -237,8 +236,8 @@ class _TrainingRun:
                 grow(parameters, self._log["growth"], options.max_splats, options.dead_opacity, self._rng)
         self._engine.parameters = parameters
 
-    def _thin(self, times: int) -> None:
-        """Have splats go, so that as many such times leave the share of them that is wanted."""
+    def _prune(self, times: int) -> None:
+        """Prune splats, so that the given number of equal prunings reaches the final share."""
         options, parameters = self._options, self._engine.parameters
         wanted = options.final_share * self._log.setdefault("splats_before_thinning", len(parameters))
         count = len(parameters) * math.pow(wanted / len(parameters), 1.0 / times) if times > 1 else wanted
@@ -250,8 +249,8 @@ class _TrainingRun:
         if self._engine.screen is not None:
             self._engine.screen = ScreenGradients.none(len(parameters))
 
-    def _thin_late(self, show: Callable[[TrainingStep], None]) -> None:
-        """Have splats go after the steps at which they usually do, each time with some more steps at the last rates."""
+    def _prune_late(self, show: Callable[[TrainingStep], None]) -> None:
+        """Prune splats after the usual steps, each time followed by some steps at the last learning rates."""
         count = len(self._engine.parameters)
         wanted = max(1, round(self._options.final_share * self._log.get("splats_before_thinning", count)))
         if wanted >= count:
@@ -260,16 +259,16 @@ class _TrainingRun:
         degree = self._options.active_degree(self._iteration)
         times = math.ceil(math.log(wanted / count) / math.log(_KEPT_AT_ONCE))
         for left in range(times, 0, -1):
-            self._thin(left)
+            self._prune(left)
             window = _Window()
             for _ in range(_STEPS_BETWEEN):
                 loss, error = self._step(degree)
                 window.losses.append(loss)
                 window.errors.append(error)
             seconds = time.perf_counter() - begin
-            show(self._entry(window, degree, spent + seconds, seconds / (times - left + 1) * (left - 1)))
+            show(self._log_entry(window, degree, spent + seconds, seconds / (times - left + 1) * (left - 1)))
 
-    def _entry(self, window: _Window, degree: int, seconds: float, left: float) -> TrainingStep:
+    def _log_entry(self, window: _Window, degree: int, seconds: float, left: float) -> TrainingStep:
         mse = sum(window.errors) / len(window.errors)
         now = TrainingStep(
             iteration=self._iteration,
@@ -310,7 +309,7 @@ class _TrainingRun:
     def _save(self) -> None:
         assert self._outputs.checkpoint is not None
         if self._options.lr_exposure:
-            self._log["exposures"] = self._exposures.as_json()
+            self._log["exposures"] = self._gains.as_json()
         save_checkpoint(
             self._outputs.checkpoint,
             TrainingCheckpoint(
@@ -326,10 +325,10 @@ class _TrainingRun:
 
     def _model(self) -> SplatModel:
         model = to_model(self._engine.parameters.values, antialiased=self._options.antialiased)
-        said = {TRAINING: self._data.trained_on(self._behind).as_json()}
-        if scene_frame(model).kind == "surrounding":  # an object shows itself, from any side
-            said[VIEW] = _first_view([image.camera for image in self._data.train])
-        model = replace(model, metadata=said, origin=self._data.origin)
+        metadata = {TRAINING: self._data.trained_on(self._behind).as_json()}
+        if scene_frame(model).kind == "surrounding":  # an object can be viewed from any side
+            metadata[VIEW] = _first_view([image.camera for image in self._data.train])
+        model = replace(model, metadata=metadata, origin=self._data.origin)
         return with_up(model, self._data.up, self._data.coordinate_system)
 
     def _full_log(self, metrics: dict[str, Any] | None) -> dict[str, Any]:
@@ -344,12 +343,12 @@ class _TrainingRun:
             "peak_memory_bytes": peak_memory(),
             "metrics": metrics,
             **self._log,
-            **({"exposures": np.round(self._exposures.values, 5).tolist()} if self._options.lr_exposure else {}),
+            **({"exposures": np.round(self._gains.values, 5).tolist()} if self._options.lr_exposure else {}),
         }
 
 
 def _first_view(cameras: Sequence[Camera]) -> dict[str, Any]:
-    """A camera of CAMS (spec 5.4), to seven digits."""
+    """Return the central camera as an entry of CAMS (spec 5.4), to seven digits."""
     camera = central_camera(cameras)
     matrices = {
         name: [[float(f"{value:.7g}") for value in row] for row in matrix.tolist()]
@@ -359,7 +358,7 @@ def _first_view(cameras: Sequence[Camera]) -> dict[str, Any]:
 
 
 def _lpips(options: TrainOptions, outputs: Outputs) -> Lpips | None:
-    """Weights of LPIPS where they are at hand; a loss that wants them must have them."""
+    """Return the weights of LPIPS if they are found; a loss that needs them raises otherwise."""
     try:
         return load_lpips(outputs.lpips_weights)
     except InputError:

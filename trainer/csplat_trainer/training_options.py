@@ -10,9 +10,9 @@ from typing import Any, Literal, get_args
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
 
-#: How splats come and go: `mcmc` grows to the cap and moves dead splats, with noise and
+#: How splats are added and removed: `mcmc` grows to the cap and moves dead splats, with noise and
 #: regularisation; `fixed` starts at the cap and moves dead splats; `gradient` clones, splits and
-#: prunes; `none` keeps what it began with.
+#: prunes; `none` keeps the initial splats.
 Strategy = Literal["mcmc", "fixed", "gradient", "none"]
 Loss = Literal["inria", "study", "l1"]
 Init = Literal["auto", "points", "hull", "box"]
@@ -34,7 +34,7 @@ class TrainOptions:
     opacity (0.003 for 0.01): Lego with 10,000 splats gained 1.1 dB in 7,000 steps.
 
     Attributes:
-        max_splats: no more splats than this, ever.
+        max_splats: largest number of splats.
         sh_degree: SH degree of the finished scene, 0 to 3.
         iterations: training steps, one image each.
         seed: seed of every random choice.
@@ -50,29 +50,30 @@ class TrainOptions:
         antialiased: train with the mip-splatting low-pass filter.
         loss: `inria` 0.8 L1 + 0.2 (1 − SSIM), `study` L1 + 0.2 (1 − SSIM), `l1` L1 alone.
         lpips_weight: weight of a perceptual term, LPIPS-Alex; 0: none. Needs torch and the weights.
-        lr_means: at first, as a share of the scene's extent; falls exponentially ...
-        lr_means_final: ... to this.
+        lr_means: initial learning rate of the means, as a fraction of the scene's extent; falls exponentially to
+            `lr_means_final`.
+        lr_means_final: final learning rate of the means.
         lr_quats: learning rate of the rotations.
         lr_scales: learning rate of the log scales.
         lr_opacities: learning rate of the logits of opacity.
         lr_sh0: learning rate of the base colour.
         lr_shN: learning rate of the higher SH coefficients.
-        lr_exposure: learning rate of a gain and a shift per photograph and channel, for photographs that were exposed
-            differently; no scene holds them. Falls exponentially to a twentieth; 0: none are learnt.
+        lr_exposure: learning rate of a gain and a bias per image and channel, for images that were exposed
+            differently; they are stored in no scene. Falls exponentially to a twentieth; 0: they are not trained.
         lr_decay: the other rates fall to this fraction, along half a cosine from `refine_stop` (unless
             that is 1) to the end.
-        half_size: fraction of the iterations, at the start, that train on photographs of half the width and height:
-            while splats are few and their places rough.
+        half_size: fraction of the iterations, at the start, that train on images of half the width and height,
+            while splats are few and inaccurate.
         sh_interval: steps before each next SH degree; 0: a fifteenth of the iterations, at most 1000.
         opacity_weight: weight of the mean opacity in the loss (mcmc and fixed).
         scale_weight: weight of the mean standard deviation in the loss (mcmc and fixed).
         noise: noise of the positions, as a multiple of their learning rate (mcmc and fixed).
         dead_opacity: splats below this are moved (mcmc, fixed) or removed (gradient).
-        refine_start: step of the first change of the splats' number or places.
-        refine_stop: fraction of the iterations after which there is none.
-        refine_every: steps from one to the next.
-        growth: mcmc grows by this factor each time; 0: by a twentieth, or by as much as reaches the
-            cap halfway to `refine_stop`.
+        refine_start: first step after which the strategy may act.
+        refine_stop: fraction of the iterations after which it no longer acts.
+        refine_every: steps between its actions.
+        growth: factor by which mcmc grows each time; 0: 1.05, or the factor that reaches the cap halfway
+            to `refine_stop` if that is larger.
         grad_threshold: gradient densifies splats whose mean gradient on screen, in pixels of half
             an image, is above this.
         eval_every: steps between evaluations on the test views; 0: at the end alone.
@@ -140,15 +141,15 @@ class TrainOptions:
 
     @property
     def refine_end(self) -> int:
-        """The step after which splats are neither moved nor added nor removed."""
+        """Last step after which splats may be moved, added or removed by the strategy."""
         return int(self.refine_stop * self.iterations)
 
-    def halves(self, iteration: int) -> bool:
-        """Return True if a step trains on a photograph of half the size."""
+    def is_half_size(self, iteration: int) -> bool:
+        """Return True if a step trains on an image of half the size."""
         return iteration <= self.half_size * self.iterations
 
     def active_degree(self, iteration: int) -> int:
-        """SH degree that is trained at a step."""
+        """Return the SH degree that is trained at a step."""
         return min(self.sh_degree, iteration // self.sh_every)
 
     def refines_after(self, iteration: int) -> bool:
@@ -156,7 +157,7 @@ class TrainOptions:
         due = iteration % self.refine_every == 0
         return self.strategy != "none" and due and self.refine_start <= iteration <= self.refine_end
 
-    def thinnings_left(self, iteration: int) -> int:
+    def prunings_left(self, iteration: int) -> int:
         """Return the number of prunings left, including the one after this step; 0 if no pruning follows this step.
 
         The last one happens when two fifths of the steps after the last move of splats are left.
@@ -175,7 +176,7 @@ class TrainOptions:
         return max(_GROWTH, math.pow(self.max_splats / max(1, count), 1.0 / max(1, times)))
 
     def learning_rates(self, iteration: int, extent: float) -> dict[str, float]:
-        """Learning rate of each group of parameters at a step.
+        """Return the learning rate of each group of parameters at a step.
 
         Args:
             iteration: 1 for the first.
@@ -198,10 +199,10 @@ class TrainOptions:
         }
 
 
-_GROWTH = 1.05  # factor of the paper
-_MAX_PRUNINGS = 10  # prunings, at most
-_PRUNING_SHARE = 0.6  # fraction of the steps after the last move of splats in which they happen
-_LAST_EXPOSURE = 0.05  # share of the learning rate of exposures that is left at the end
+_GROWTH = 1.05  # growth factor of the MCMC paper
+_MAX_PRUNINGS = 10  # largest number of prunings
+_PRUNING_SHARE = 0.6  # fraction of the steps after the last action of the strategy, over which prunings are spread
+_LAST_EXPOSURE = 0.05  # fraction of the learning rate of image gains that remains at the end
 
 _CHOICES = {
     "device": DEVICES,
@@ -247,15 +248,15 @@ _RANGES: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class Outputs:
-    """Files that a run writes on its way.
+    """Files that a run reads and writes, besides its data set.
 
     Attributes:
         checkpoint: file for checkpoints (each replaces the last), or `None`.
-        checkpoint_every: steps from one to the next; 0: at the end alone.
-        previews: folder for early renders (photograph and render next to each other), or `None`.
-        preview_every: steps from one to the next; 0: at powers of two from 100 on, and the end.
-        resume: checkpoint to go on from, or `None`.
-        lpips_weights: file of the weights of LPIPS-Alex; `None`: they are looked for in the usual places.
+        checkpoint_every: steps between checkpoints; 0: only at the end.
+        previews: folder for early renders (image and render next to each other), or `None`.
+        preview_every: steps between previews; 0: after 100, 200, 400, … steps and at the end.
+        resume: checkpoint to continue from, or `None`.
+        lpips_weights: file of the weights of LPIPS-Alex; `None`: see `csplat_render.lpips`.
     """
 
     checkpoint: str | Path | None = None
@@ -282,7 +283,7 @@ class TrainResult:
 
     Attributes:
         model: the scene.
-        log: JSON-compatible: options, entries on the way, the loss of each step, figures, times.
+        log: JSON-compatible: options, entries, the loss of each step, scores, times.
         metrics: scores on the test images, see `evaluate`; `None` if there are none.
     """
 

@@ -13,7 +13,7 @@ import numpy as np
 from csplat.disk_files import atomic_writer
 from csplat.types import F32, F64
 
-_WINDOW_SHARE = 50  # the moving average spans this part of the run
+_WINDOW_SHARE = 50  # the moving average spans the run divided by this
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class TrainingStep:
 
 
 def peak_memory() -> int | None:
-    """Return the most memory that this process has held, bytes; `None` if the system does not report it."""
+    """Return the peak memory of this process in bytes; `None` if the system does not report it."""
     if sys.platform == "win32":
         return None
     try:
@@ -54,7 +54,7 @@ def peak_memory() -> int | None:
 
 
 def moving_average(values: Sequence[float], window: int) -> F64:
-    """Mean of each value and those before it, `window` of them at most.
+    """Return the mean of each value and those before it, `window` of them at most.
 
     Args:
         values: in order of time.

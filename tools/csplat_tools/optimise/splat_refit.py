@@ -217,7 +217,7 @@ class _QuantisedValues:
 
     def seen(self) -> UncheckedSplats:
         self._seen = None  # as large as the scene
-        self._seen, self._alphas = self.tuned.seen()
+        self._seen, self._alphas = self.tuned.dequantise()
         s = self._seen
         return UncheckedSplats(s.means, s.quats, s.scales, s.opacities, s.sh0, s.shN)
 

@@ -215,7 +215,7 @@ def choose_and_finetune(
     while True:
         made = csplat_trainer.finetune(
             chosen.model, looked, encoding, options, size_bytes=size_bytes, importance=chosen.importance,
-            source=source, origin=Origin(len(source), chosen.rows), said=chosen.said, outputs=outputs,
+            source=source, origin=Origin(len(source), chosen.rows), metadata=chosen.said, outputs=outputs,
             progress=progress, on_step=on_step,
         )  # fmt: skip
         if size_bytes is None or len(made.data) <= size_bytes:

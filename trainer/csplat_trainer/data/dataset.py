@@ -86,7 +86,7 @@ class DataSet:
         return [image for image, outlier in zip(images, outliers, strict=True) if outlier]
 
     @property
-    def counted(self) -> list[PosedImage]:
+    def inliers(self) -> list[PosedImage]:
         """Training images that determine where the scene lies: all but outliers, or all if only outliers are left."""
         outliers = {id(image) for image in self.outliers}
         return [image for image in self.train if id(image) not in outliers] or self.train

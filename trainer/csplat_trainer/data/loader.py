@@ -93,8 +93,8 @@ def load(
     if 0 < with_alpha < len(shots):
         background = "white" if 2 * with_alpha >= len(shots) else "black"
         report.append(f"{with_alpha} of {len(shots)} images have transparency: the background of all is {background}")
-    taught = {shot.path for shot in found.train}
-    both = sum(shot.path in taught for shot in found.test)
+    training_paths = {shot.path for shot in found.train}
+    both = sum(shot.path in training_paths for shot in found.test)
     if both:
         report.append(f"{counted(both, 'test image')} used for training, too: they do not show what new views are like")
     if found.points is None and not any(image.has_alpha for image in train):
@@ -104,14 +104,14 @@ def load(
         shade = " ".join(f"{value:.3g}" for value in colours[0].tolist())
         report.append(f"all points have the colour {shade}: splats start with the colours of the images there")
         colours = None
-    axes, up, said = _choose_axes(found.coordinate_system, shots)
+    axes, up, axes_note = _choose_axes(found.coordinate_system, shots)
     data = DataSet(
         name,
         train,
         test,
         None if found.points is None else found.points.astype(np.float32),
         colours,
-        tuple(line for line in (*report, said) if line),
+        tuple(line for line in (*report, axes_note) if line),
         axes,
         up,
         found.test_every,

@@ -34,7 +34,7 @@ class Finetuned:
         result: result of the encoder.
         decoded: values that a decoder returns from it, which are the tuned ones, bit for bit.
         plain: the file of the same decisions without tuning.
-        log: JSON-compatible: options, losses, looks at the views, times.
+        log: JSON-compatible: options, losses, evaluations on the validation views (`looks`), times.
         seconds: duration of `encoding` and `tuning`.
     """
 
@@ -74,26 +74,26 @@ def finetune(
     importance: NDArray[Any] | Importance | None = None,
     source: SplatModel | None = None,
     origin: Origin | None = None,
-    said: Mapping[str, Any] | None = None,
+    metadata: Mapping[str, Any] | None = None,
     outputs: Outputs | None = None,
     progress: Callable[[str, float], None] | None = None,
     on_step: Callable[[TuningStep], None] | None = None,
 ) -> Finetuned:
-    """Encode a scene, and move what the file holds until a decoder's images look right; `csplat finetune` calls it.
+    """Encode a scene, and optimise the values in the file for what a decoder shows; `csplat finetune` calls it.
 
     The same scene, views and options give the same bytes on the same machine, at any number of threads.
 
     Args:
         model: the splats that the file will hold.
-        views: the reference images: photographs, or renders of the scene itself (`renders_of`). From a data set, the
-            training images are used, in front of the background that the scene records.
+        views: the reference images: images of a data set, or renders of the scene itself (`renders_of`). From a data
+            set, the training images are used, in front of the background that the scene records.
         encoding: options of the encoder; its threads apply to everything.
         options: options of the tuning.
         size_bytes: largest size of the file, as far as the rate weight can bring it there; as in `tune`.
         importance: importance of the splats, as for the encoder; `None`: measured in the training views.
         source: the scene that the splats were chosen from, if they are not all, and `origin` their indices in it.
         origin: as for the encoder.
-        said: metadata about the tuning, in addition to the steps and the number of views.
+        metadata: metadata about the tuning, in addition to the steps and the number of views.
         outputs: checkpoints.
         progress: called with the stage and the fraction of it that is done, 0 to 1.
         on_step: called with the progress of the tuning, every `log_every` steps.
@@ -106,9 +106,9 @@ def finetune(
         True
 
     Raises:
-        InputError: no view shows a splat, the size has no room for one, an option does not suit the scene, or a
+        InputError: no view shows a splat, the size is too small for one, an option does not suit the scene, or a
             checkpoint is of another run.
-        RuntimeError: the file is not what was tuned: a fault of csplat.
+        RuntimeError: the file does not hold the tuned values: a fault of csplat.
     """
     check_model("finetune", model)
     clock, encoding, options = Clock(), encoding or EncodeOptions(), options or FinetuneOptions()
@@ -124,12 +124,12 @@ def finetune(
         coded = frozen.encode(frozen.start())
         plain = coded.write()
 
-    def told(steps: int) -> dict[str, Any]:
+    def tuning_metadata(steps: int) -> dict[str, Any]:
         """Return the metadata about the tuning; after pruning, its `simplified_from` is the splat count before."""
-        return {"finetuned": {"simplified": {}, "views": len(views.train), "steps": steps, **(said or {})}}
+        return {"finetuned": {"simplified": {}, "views": len(views.train), "steps": steps, **(metadata or {})}}
 
     if size_bytes is not None:
-        size_bytes -= len(coded.write(told(options.iterations)).data) - len(plain.data)
+        size_bytes -= len(coded.write(tuning_metadata(options.iterations)).data) - len(plain.data)
         if size_bytes < 1:
             raise InputError("the size that is wanted has no room for what the file says of itself")
 
@@ -146,25 +146,25 @@ def finetune(
             checkpoint_every=files.checkpoint_every, resume=files.resume, threads=encoding.threads,
         )  # fmt: skip
     with clock.stage("encoding"):
-        result = frozen.encode(tuned.held).write(told(tuned.log["best_iteration"]))
+        result = frozen.encode(tuned.held).write(tuning_metadata(tuned.log["best_iteration"]))
         decoded = decode(result.data)
     _check_identity(frozen.dequantise(tuned.held), frozen.source_index, result, decoded)
     return Finetuned(result, decoded, plain, tuned.log, clock.seconds)
 
 
 def _views_of(data: DataSet, model: SplatModel) -> TuningViews:
-    """Return the training photographs of a data set, in front of the background that the scene records."""
+    """Return the training images of a data set, in front of the background that the scene records."""
     trained = TrainingRecord.of(model.metadata)
     behind = data.background if trained is None else trained.background
     shift = np.subtract(model.origin, data.origin)
-    looks = [TuningView(relative_to(shift, one.camera), one) for one in data.train]
-    return split_views(looks, np.array(behind, np.float32))
+    training = [TuningView(relative_to(shift, one.camera), one) for one in data.train]
+    return split_views(training, np.array(behind, np.float32))
 
 
 def _measured(
     model: SplatModel, views: TuningViews, encoding: EncodeOptions, progress: Callable[[str, float], None] | None
 ) -> Importance:
-    """Measure how much the training views depend on each splat."""
+    """Measure the importance of each splat for the training views."""
     cameras = [one.camera for one in views.train]
     found = measure_sensitivity(
         model, cameras, background=views.background, metric=True, magnitudes=False, threads=encoding.threads,
@@ -174,7 +174,7 @@ def _measured(
 
 
 def _check_identity(seen: DecodedValues, source_index: I64, result: EncodeResult, decoded: SplatModel) -> None:
-    """Raise a `RuntimeError` unless what was tuned is what was written, bit for bit: no file would be better."""
+    """Raise a `RuntimeError` unless the file holds the tuned values, bit for bit: no file would be better."""
     places = np.empty(int(source_index.max()) + 1, np.int64)
     places[source_index] = np.arange(len(source_index))
     rows = places[result.source_index]

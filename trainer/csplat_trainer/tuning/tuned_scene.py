@@ -29,11 +29,11 @@ _ALPHAS = (1e-6, 1.0 - 1e-6)  # range of the opacities that logits are computed 
 
 
 class TunedScene:
-    """Values of a frozen scene, Adam's memory of them, and the way from images' gradients to both.
+    """Values of a frozen scene, with Adam's memory, which gradients of renders update.
 
     Args:
         frozen: the encoder's decisions.
-        parameters: state to go on from; `None`: the values that the encoder found.
+        parameters: state to continue from; `None`: the values that the encoder found.
 
     Attributes:
         frozen: as given.
@@ -52,19 +52,19 @@ class TunedScene:
 
     @property
     def held(self) -> FreeValues:
-        """The values as the encoder takes them; all but the opacities are the parameters' own arrays."""
+        """The values for the encoder; all arrays except the opacities are the parameters' own."""
         return self._held(sigmoid(self.parameters.values["logits"]))
 
     def _held(self, alphas: F32) -> FreeValues:
         v = self.parameters.values
         return FreeValues(v["means"], v["quats"], v["scales"], alphas, v["sh0"], v["shN"], v["sizes"])
 
-    def seen(self) -> tuple[DecodedValues, F32]:
+    def dequantise(self) -> tuple[DecodedValues, F32]:
         """Return the values that a decoder will return, and the opacities before they were quantised."""
         held = self.held
         return self.frozen.dequantise(held), held.opacities
 
-    def stored(self, seen: DecodedValues) -> StreamValues:
+    def stream_values(self, seen: DecodedValues) -> StreamValues:
         """Return the contents of the file's streams, as a decoder will return them."""
         sh = self.frozen.dequantise_sh_rows(self.parameters.values["shN"]) if self.frozen.book is not None else seen.shN
         if self.frozen.shapes is None:
@@ -73,19 +73,19 @@ class TunedScene:
         return StreamValues(quats, scales, sizes, seen.opacities, seen.sh0, sh)
 
     def count(self, seen: DecodedValues, weight: float) -> RateTerm:
-        """Count what the integers of the file cost, at a weight in loss per bit and splat."""
-        return RateTerm.counted(self.frozen, self.stored(seen), weight)
+        """Count the bits of the file's integers; `weight` is in loss per bit and splat."""
+        return RateTerm.count(self.frozen, self.stream_values(seen), weight)
 
     def step(
         self, gradients: Gradients, seen: DecodedValues, alphas: F32, rates: dict[str, float], costs: RateTerm | None
     ) -> None:
-        """Move the values against the gradients by what was seen.
+        """Make a step against the gradients of the loss and the rate term.
 
         Args:
             gradients: gradients of the loss.
-            seen, alphas: as `seen` returned them.
+            seen, alphas: the result of `dequantise`.
             rates: learning rate of each group.
-            costs: costs of bytes, a further part of the loss.
+            costs: the rate term; `None` for no rate term.
         """
         quats, scales, sizes = self._by_shape(gradients)
         steps = {
@@ -98,12 +98,12 @@ class TunedScene:
             "shN": self._by_row(gradients.shN),
         }
         if costs is not None:
-            costs.add_to(steps, self.stored(seen))
+            costs.add_to(steps, self.stream_values(seen))
         adam_step(self.parameters, steps, rates)
         self.frozen.constrain(self._held(alphas))
 
     def _by_row(self, by_splat: F32) -> F32:
-        """Gradients of the rows of SH that the file holds, of those of all splats [N, K, 3]."""
+        """Return the gradients of the file's rows of SH, given those of all splats [N, K, 3]."""
         book = self.frozen.book
         if book is None or self._users is None:
             return by_splat
@@ -113,7 +113,7 @@ class TunedScene:
         return rows
 
     def _by_shape(self, gradients: Gradients) -> tuple[F32, F32, F32]:
-        """Gradients of the rotations and scales that the file holds, and of what splats add to the latter."""
+        """Return the gradients of the file's rotations and scales, and of the splats' own sizes."""
         shapes = self.frozen.shapes
         if shapes is None or self._shape_users is None:
             return gradients.quats, gradients.scales, np.zeros(0, np.float32)
@@ -139,7 +139,7 @@ def _values(held: FreeValues) -> ParameterArrays:
 
 
 def _users(index: NDArray[np.int32], size: int) -> tuple[I64, I64]:
-    """Splats by the entry that they use, and where those of each entry begin, [size + 1]; escaped ones come last."""
+    """Return splats sorted by their entry, and the start of each entry, [size + 1]; escaped ones come last."""
     order = np.argsort(index, kind="stable")
     starts = np.searchsorted(index[order], np.arange(size + 1))
     return order.astype(np.int64), starts.astype(np.int64)
@@ -153,12 +153,12 @@ def _sum_by_entry(values: F32, order: I64, starts: I64, size: int) -> F32:
 
 @parallel_kernel()
 def sum_by_entry(lane: int, lanes: int, values: F32, order: I64, starts: I64, out: F32) -> None:
-    """Sum the rows of the users of each entry, in float32 and in their order; vectorises over a row.
+    """Sum the rows of the splats of each entry, in float32 and in their order; vectorises over a row.
 
     Args:
         values: [N, C].
         order: [N], rows of `values` by entry.
-        starts: [size + 1], index in `order` of an entry's first user.
+        starts: [size + 1], index in `order` of an entry's first splat.
         out: [size, C], overwritten.
     """
     for entry in range(lane, out.shape[0], lanes):
@@ -171,20 +171,20 @@ def sum_by_entry(lane: int, lanes: int, values: F32, order: I64, starts: I64, ou
 
 
 def sum_by_entry_twin(values: F32, order: I64, starts: I64, out: F32) -> None:
-    """The slow twin of `sum_by_entry`."""
+    """Compute `sum_by_entry` the slow way."""
     for entry in range(len(out)):
         out[entry] = values[order[starts[entry] : starts[entry + 1]]].sum(axis=0)
 
 
-_MAX_INTEGER = 128  # integers beyond ± this cost as much as the last ones
+_MAX_INTEGER = 128  # integers beyond ± this cost the same as ± this
 _ROWS = 1 << 15  # rows of SH that are counted at a time: their integers take several times the memory of the values
-_MAX_SLOPE = 4.0  # bits per step; rare integers are counted too badly for more
+_MAX_SLOPE = 4.0  # bits per step; the frequencies of rare integers are too uncertain for more
 _ROOT2 = np.sqrt(2.0)
 
 
 @dataclass(frozen=True, eq=False)
 class StreamValues:
-    """Contents of a file's streams, as a decoder will return them: arrays as in `Held`, all on their lattices."""
+    """Contents of a file's streams, as a decoder will return them: arrays as in `FreeValues`, on their lattices."""
 
     quats: F32
     scales: F32
@@ -196,14 +196,14 @@ class StreamValues:
 
 @dataclass(eq=False)
 class RateTerm:
-    """Slopes of the costs of all attributes, and how they reach the gradients.
+    """The rate term of the loss: bits of the file's integers, and their slopes by attribute.
 
     Attributes:
         frozen: lattices.
         weight: loss per bit and splat.
         tables: by attribute, and quantisation class if there are several: slopes in bits per step,
             [columns, 2 · 128 + 1].
-        bits: bits of all integers together, by their order-0 entropy; without centres and indices, which hardly change.
+        bits: bits of all integers, by their order-0 entropy, without centres and indices, which hardly change.
     """
 
     frozen: FixedQuantisation
@@ -212,7 +212,7 @@ class RateTerm:
     bits: float = 0.0
 
     @classmethod
-    def counted(cls, frozen: FixedQuantisation, stored: StreamValues, weight: float) -> RateTerm:
+    def count(cls, frozen: FixedQuantisation, stored: StreamValues, weight: float) -> RateTerm:
         """Count the integers of a scene.
 
         Args:
@@ -246,7 +246,7 @@ class RateTerm:
 
     @property
     def loss(self) -> float:
-        """Rate term of the loss: weight times bits per splat."""
+        """Weight times bits per splat."""
         return self.weight * self.bits / len(self.frozen.source_index)
 
     def add_to(self, steps: ParameterArrays, stored: StreamValues) -> None:
@@ -279,7 +279,7 @@ class RateTerm:
 
 @dataclass(frozen=True)
 class _ClassSteps:
-    """Rows that have the same steps, one after the other; all of them if there are no quantisation classes."""
+    """Consecutive rows with the same quantisation steps; all rows if there are no quantisation classes."""
 
     rows: slice
     scale_step: float
@@ -314,7 +314,7 @@ def _table_name(name: str, number: int) -> str:
 
 
 def cost_slopes(parts: Iterable[NDArray[Any]]) -> tuple[F32, float]:
-    """Slope of the cost of integers in bits per step, and the cost of all of them.
+    """Return the slope of the cost of integers in bits per step, and the cost of all of them.
 
     Args:
         parts: [n, C] integers each, one part at least: rows of the same C columns.
@@ -330,7 +330,7 @@ def cost_slopes(parts: Iterable[NDArray[Any]]) -> tuple[F32, float]:
         found = np.bincount(places.reshape(-1), minlength=width * size).reshape(width, size)
         counts = counts + found if len(counts) else found
     count = int(counts.sum(axis=1).max(initial=0))
-    # One more of each and a narrow blur: an integer that happens not to occur is no more than rare.
+    # One more of each and a narrow blur: an integer that happens not to occur counts as rare.
     padded = np.pad(counts + 1.0, ((0, 0), (1, 1)), mode="edge")
     blurred = 0.25 * padded[:, :-2] + 0.5 * padded[:, 1:-1] + 0.25 * padded[:, 2:]
     bits = -np.log2(blurred / (count + size))
@@ -341,7 +341,7 @@ def cost_slopes(parts: Iterable[NDArray[Any]]) -> tuple[F32, float]:
 
 
 def colour_integers_of(seen: F32, step: float, shift: int) -> I32:
-    """Y, Co, Cg [..., 3] int32 of colours on their lattice [..., 3], as they are coded."""
+    """Return Y, Co, Cg [..., 3] int32 of colours on their lattice [..., 3], as they are coded."""
     rgb = _integers(seen, step)
     red, green, blue = rgb[..., 0], rgb[..., 1], rgb[..., 2]
     co = red - blue
@@ -358,7 +358,7 @@ def _integers(seen: F32, step: float) -> I32:
 def _add_plain(
     lane: int, lanes: int, seen: F32, step: float, first: int, tables: F32, per_bit: np.float32, out: F32
 ) -> None:
-    """Add the slopes of plain columns, [n, C] from column `first` on; a thread takes a run of rows."""
+    """Add the slopes of plain columns, [n, C] from column `first` on; parallel over runs of rows."""
     reach = tables.shape[1] // 2
     over = np.float32(1.0 / step)
     begin, end = lane_range(lane, lanes, seen.shape[0])
@@ -373,7 +373,7 @@ def _add_plain(
 def _add_colour(
     lane: int, lanes: int, seen: F32, step: float, shift: int, tables: F32, per_bit: np.float32, out: F32
 ) -> None:
-    """Add the slopes of colours [n, K, 3] through the transform to luma and chroma; a thread takes a run of rows."""
+    """Add the slopes of colours [n, K, 3] through the transform to luma and chroma; parallel over runs of rows."""
     reach = tables.shape[1] // 2
     over = np.float32(1.0 / step)
     chroma = np.float32(0.5**shift)

@@ -34,7 +34,7 @@ from csplat_trainer.tuning.tuned_scene import RateTerm, TunedScene
 from csplat_trainer.tuning.tuning_options import FinetuneOptions, TuningView, TuningViews
 
 _COUNT_EVERY = 50  # steps between counts of the integers
-_MIN_GAIN = 2e-4  # smallest difference of the score that counts as a gain
+_MIN_GAIN = 2e-4  # smallest relative difference of the score that counts as a gain
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class FinetuneResult:
 
     Attributes:
         held: the values that scored best on the validation views, those of the start if none did.
-        log: JSON-compatible: options, losses, looks, times.
+        log: JSON-compatible: options, losses, evaluations (`looks`), times.
     """
 
     held: FreeValues
@@ -97,22 +97,22 @@ def tune(
             `byte_cost`.
         progress: called every `log_every` steps.
         checkpoint: file for checkpoints, each of which replaces the last; `None`: none are written.
-        checkpoint_every: steps from one to the next; 0: at the end alone.
-        resume: a checkpoint of the same frozen scene to go on from.
+        checkpoint_every: steps between checkpoints; 0: only at the end.
+        resume: a checkpoint of the same frozen scene to continue from.
         threads: number of threads; `None` for all.
 
     Raises:
-        InputError: a checkpoint is none, or of another scene, views or options; or a loss or a value is not finite.
+        InputError: a checkpoint is damaged, or of another scene, views or options; or a loss or a value is not finite.
     """
     run = _TuningRun(frozen, views, options or FinetuneOptions(), threads, size_bytes)
     if resume is not None:
-        run.go_on(load_finetune(resume, frozen))
-    return run.to_the_end(progress, checkpoint, checkpoint_every)
+        run.resume(load_finetune(resume, frozen))
+    return run.run(progress, checkpoint, checkpoint_every)
 
 
 @dataclass
 class _BestValues:
-    """The best look so far, and how many that count came after it."""
+    """The values of the best evaluation so far, and the number of later evaluations that count."""
 
     held: FreeValues
     score: float
@@ -123,14 +123,14 @@ class _BestValues:
 
 @dataclass
 class _ImageBuffers:
-    """Loss and reference image of a size; kept from step to step."""
+    """Loss and reference image for images of one size, kept from step to step."""
 
     loss: PhotometricLoss
-    wanted: F32
+    reference: F32
 
 
 class _TuningRun:
-    """A run: the scene, the renderer, the random numbers, the log."""
+    """The state of a run: the scene, the renderer, the random generator, the log."""
 
     def __init__(
         self,
@@ -151,24 +151,24 @@ class _TuningRun:
         self._iteration, self._queue = 0, list[int]()
         self._sizes: dict[tuple[int, int], _ImageBuffers] = {}
         self._log: dict[str, Any] = {"losses": [], "looks": [], "seconds": 0.0, "views": views.digest}
-        self._exposures = ImageGains(len(views.train))
+        self._gains = ImageGains(len(views.train))
         self._numbers = {id(view): number for number, view in enumerate(views.train)}
         self._best: _BestValues | None = None
-        self._costs: RateTerm | None = None
-        self._budget = None if size_bytes is None else RateController(size_bytes, options.byte_cost)
+        self._rate_term: RateTerm | None = None
+        self._controller = None if size_bytes is None else RateController(size_bytes, options.byte_cost)
 
-    def go_on(self, checkpoint: FinetuneCheckpoint) -> None:
-        """Take up what a checkpoint holds.
+    def resume(self, checkpoint: FinetuneCheckpoint) -> None:
+        """Continue from a checkpoint.
 
         Raises:
             InputError: it is of a run with other views or options.
         """
         if checkpoint.log["views"] != self._views.digest:
             raise InputError("the checkpoint is of a run with other views")
-        budget = RateController.of(checkpoint.log.get("budget"))
-        if (budget and budget.size_bytes) != (self._budget and self._budget.size_bytes):
+        controller = RateController.of(checkpoint.log.get("budget"))
+        if (controller and controller.size_bytes) != (self._controller and self._controller.size_bytes):
             raise InputError("the checkpoint is of a run with another target")
-        before = {**asdict(FinetuneOptions()), **checkpoint.options}  # an older one does not name all of them
+        before = {**asdict(FinetuneOptions()), **checkpoint.options}  # older checkpoints lack some options
         for name, value in asdict(self._options).items():
             if name != "iterations" and before[name] != value:
                 raise InputError(f"the checkpoint is of a run with another {name}: {before[name]}")
@@ -179,32 +179,32 @@ class _TuningRun:
         self._log = checkpoint.log
         for look in self._log["looks"]:
             look.setdefault("size_bytes", 0)  # older checkpoints lack it if no size was requested
-        self._exposures = ImageGains(len(self._views.train), self._log.get("exposures", ()))
+        self._gains = ImageGains(len(self._views.train), self._log.get("exposures", ()))
         self._best = _BestValues(checkpoint.best_held, *checkpoint.best)
-        self._budget = budget
+        self._controller = controller
         if checkpoint.costs:
-            self._costs = RateTerm(self._scene.frozen, self._byte_cost, checkpoint.costs)
+            self._rate_term = RateTerm(self._scene.frozen, self._byte_cost, checkpoint.costs)
 
-    def to_the_end(
+    def run(
         self, progress: Callable[[TuningStep], None] | None, checkpoint: str | Path | None, checkpoint_every: int
     ) -> FinetuneResult:
         options = self._options
         begin, first, spent = time.perf_counter(), self._iteration, float(self._log["seconds"])
         if self._best is None:
-            self._look()
+            self._validate()
         window = list[float]()
-        while self._iteration < options.iterations and not self._settled:
+        while self._iteration < options.iterations and not self._has_converged:
             self._iteration += 1
             window.append(self._step())
             if self._iteration % options.validate_every == 0 or self._iteration == options.iterations:
-                self._look()
+                self._validate()
             seconds = time.perf_counter() - begin
             self._log["seconds"] = spent + seconds
             if progress is not None and (
-                self._iteration % options.log_every == 0 or self._iteration == options.iterations or self._settled
+                self._iteration % options.log_every == 0 or self._iteration == options.iterations or self._has_converged
             ):
                 left = seconds / (self._iteration - first) * (options.iterations - self._iteration)
-                progress(self._moment(window, left))
+                progress(self._progress(window, left))
                 window = []
             if checkpoint is not None and checkpoint_every and self._iteration % checkpoint_every == 0:
                 self._save(checkpoint)
@@ -214,43 +214,43 @@ class _TuningRun:
         return FinetuneResult(self._best.held, self._full_log())
 
     @property
-    def _settled(self) -> bool:
+    def _has_converged(self) -> bool:
         """True if evaluations have brought no gain for long enough."""
         assert self._best is not None
         return 0 < self._options.patience <= self._best.since
 
     def _step(self) -> float:
-        """One image; returns its loss before the step."""
+        """Make a step on one image; return its loss before the step."""
         if not self._queue:
             self._queue = self._rng.permutation(len(self._views.train)).tolist()
         number = self._queue.pop()
         view = self._views.train[number]
-        seen, alphas = self._scene.seen()
-        if self._byte_cost > 0.0 and (self._costs is None or self._iteration % _COUNT_EVERY == 0):
-            self._costs = self._scene.count(seen, self._byte_cost)
-            if self._budget is not None:
+        seen, alphas = self._scene.dequantise()
+        if self._byte_cost > 0.0 and (self._rate_term is None or self._iteration % _COUNT_EVERY == 0):
+            self._rate_term = self._scene.count(seen, self._byte_cost)
+            if self._controller is not None:
                 done = (self._iteration - 1) / self._options.iterations
-                self._budget.weigh(self._costs.bits, done, self._options.byte_cost)
+                self._controller.update(self._rate_term.bits, done, self._options.byte_cost)
         rendered = self._render(seen, view)
         buffers = self._buffers(view)
         rate = self._options.lr_exposure * self._options.share(self._iteration)
-        exposure = ImageGain(self._exposures, number, rate) if self._options.lr_exposure else None
-        shown = rendered if exposure is None else exposure.applied(rendered)
-        value, slope = buffers.loss(shown, view.image(self._views.background, buffers.wanted), view.mask)
+        gain = ImageGain(self._gains, number, rate) if self._options.lr_exposure else None
+        shown = rendered if gain is None else gain.apply(rendered)
+        value, slope = buffers.loss(shown, view.image(self._views.background, buffers.reference), view.mask)
         if not math.isfinite(value.loss):
             if self._iteration == 1:  # before anything has moved
                 raise InputError("the scene's pictures are beyond float32: its colours are too large to be tuned")
             raise InputError(f"the loss is not finite at step {self._iteration}: try smaller learning rates")
-        if exposure is not None:
-            slope = exposure.learnt(rendered, slope)
-        self._scene.step(self._rasteriser.backward(slope), seen, alphas, self._rates(), self._costs)
+        if gain is not None:
+            slope = gain.backward(rendered, slope)
+        self._scene.step(self._rasteriser.backward(slope), seen, alphas, self._rates(), self._rate_term)
         self._log["losses"].append(float(f"{value.loss:.6g}"))
         return value.loss
 
     @property
     def _byte_cost(self) -> float:
         """The present rate weight: loss per bit and splat."""
-        return self._options.byte_cost if self._budget is None else self._budget.byte_cost
+        return self._options.byte_cost if self._controller is None else self._controller.byte_cost
 
     def _rates(self) -> dict[str, float]:
         options = self._options
@@ -271,30 +271,30 @@ class _TuningRun:
             splats, view.camera, background=self._views.background, antialiased=self._antialiased
         ).rgb
 
-    def _look(self) -> None:
-        """Score on the validation views, and keep the best values: by their loss, and the rate term of the bytes."""
+    def _validate(self) -> None:
+        """Score on the validation views, and keep the values with the least sum of loss and rate term."""
         if not all(np.isfinite(values).all() for values in self._scene.parameters.values.values()):
             raise InputError(f"a value is not finite at step {self._iteration}: try smaller learning rates")
-        seen, _ = self._scene.seen()
+        seen, _ = self._scene.dequantise()
         loss, error, count = 0.0, 0.0, 0
         for view in self._views.validation:
             buffers, rendered = self._buffers(view), self._render(seen, view)
             if self._options.lr_exposure and id(view) in self._numbers:  # a training view, too
-                rendered = ImageGain(self._exposures, self._numbers[id(view)], 0.0).applied(rendered)
-            wanted = view.image(self._views.background, buffers.wanted)
-            loss += buffers.loss(rendered, wanted, view.mask)[0].loss / len(self._views.validation)
-            error += float(np.square(np.clip(rendered, 0, 1) - np.clip(wanted, 0, 1)).sum(dtype=np.float64))
+                rendered = ImageGain(self._gains, self._numbers[id(view)], 0.0).apply(rendered)
+            reference = view.image(self._views.background, buffers.reference)
+            loss += buffers.loss(rendered, reference, view.mask)[0].loss / len(self._views.validation)
+            error += float(np.square(np.clip(rendered, 0, 1) - np.clip(reference, 0, 1)).sum(dtype=np.float64))
             count += rendered.size if view.mask is None else 3 * int(view.mask.sum())
         costs = self._scene.count(seen, self._options.byte_cost)
         psnr = psnr_of_mse(error / count)
         size_bytes = len(self._scene.frozen.encode(self._scene.held).write().data)
         shrinks = False
-        if self._budget is None:
+        if self._controller is None:
             score = loss + costs.loss
         else:
-            overdrawn = self._budget.overdrawn(size_bytes, costs.bits)
-            shrinks = overdrawn > 0.0 and not self._budget.exhausted
-            score = loss + overdrawn
+            excess = self._controller.excess(size_bytes, costs.bits)
+            shrinks = excess > 0.0 and not self._controller.is_exhausted
+            score = loss + excess
         self._log["looks"].append({"iteration": self._iteration, "loss": loss, "psnr": psnr, "size_bytes": size_bytes})
         if self._best is None or score < self._best.score * (1.0 - _MIN_GAIN):
             self._best = _BestValues(self._scene.held.copy(), score, psnr, self._iteration)
@@ -308,7 +308,7 @@ class _TuningRun:
             self._sizes[size] = _ImageBuffers(loss, np.empty((*size, 3), np.float32))
         return self._sizes[size]
 
-    def _moment(self, window: list[float], left: float) -> TuningStep:
+    def _progress(self, window: list[float], left: float) -> TuningStep:
         assert self._best is not None
         look = self._log["looks"][-1]
         return TuningStep(
@@ -325,9 +325,9 @@ class _TuningRun:
     def _save(self, path: str | Path) -> None:
         assert self._best is not None
         if self._options.lr_exposure:
-            self._log["exposures"] = self._exposures.as_json()
-        if self._budget is not None:
-            self._log["budget"] = asdict(self._budget)
+            self._log["exposures"] = self._gains.as_json()
+        if self._controller is not None:
+            self._log["budget"] = asdict(self._controller)
         best = (self._best.score, self._best.psnr, self._best.iteration, self._best.since)
         save_finetune(
             path,
@@ -339,7 +339,7 @@ class _TuningRun:
                 asdict(self._options),
                 self._log,
                 self._best.held,
-                {} if self._costs is None else self._costs.tables,
+                {} if self._rate_term is None else self._rate_term.tables,
                 best,
             ),
             self._scene.frozen,
@@ -351,37 +351,37 @@ class _TuningRun:
             "options": asdict(self._options),
             "train_views": len(self._views.train),
             "validation_views": len(self._views.validation),
-            "kept_aside": self._views.kept_aside,
+            "kept_aside": self._views.is_held_out,
             "steps": self._iteration,
-            "settled": self._settled,
+            "settled": self._has_converged,
             "byte_cost": self._byte_cost,
             "start_psnr": self._log["looks"][0]["psnr"],
             "best_psnr": self._best.psnr,
             "best_iteration": self._best.iteration,
             "peak_memory_bytes": peak_memory(),
             **self._log,
-            **({"exposures": np.round(self._exposures.values, 5).tolist()} if self._options.lr_exposure else {}),
+            **({"exposures": np.round(self._gains.values, 5).tolist()} if self._options.lr_exposure else {}),
         }
 
 
-_TARGET_SHARE = 0.6  # fraction of the steps after which the size should be reached: later ones hardly move a value
-_SIZE_MARGIN = 0.002  # fraction of the size that is left free: counts come every few steps, and files grow between them
-_GAIN, _MAX_CHANGE = 40.0, 0.5  # gain of log(cost) per relative excess of bits, and its largest change at each count
-_WEIGHT_RANGE = (1e-7, 1e-2)
-# Smallest cost, as a fraction of the first: files grow while values move far, and a cost that had fallen to nothing,
-# because bytes were free before, rises too late.
+_TARGET_SHARE = 0.6  # fraction of the steps after which the size should be reached; later ones hardly move a value
+_SIZE_MARGIN = 0.002  # fraction of the size that is left free: files grow between counts
+_GAIN, _MAX_CHANGE = 40.0, 0.5  # change of log(rate weight) per relative excess of bits, and its limit at each count
+_WEIGHT_RANGE = (1e-7, 1e-2)  # range of the rate weight
+# Smallest rate weight, as a fraction of the first: files grow while values move far, and a weight that had fallen to
+# almost 0 before would rise too late.
 _MIN_WEIGHT_SHARE = 0.25
 
 
 @dataclass
 class RateController:
-    """Bytes that a file may have, and what they cost at present so that it does.
+    """A target size, and the rate weight that reaches it.
 
     Attributes:
         size_bytes: largest size of the file.
         byte_cost: rate weight at present: loss per bit and splat.
         first_bits: bits of the integers at the start of the run; 0: not known yet.
-        goal_bits: bits of the integers of a file of that size, by the last file that was made.
+        goal_bits: bits of the integers of a file of that size, estimated from the last file.
     """
 
     size_bytes: int
@@ -390,26 +390,25 @@ class RateController:
     goal_bits: float = 0.0
 
     def __post_init__(self) -> None:
-        self.byte_cost = min(
-            max(self.byte_cost, _WEIGHT_RANGE[0]), _WEIGHT_RANGE[1]
-        )  # a cost of 0 would stay 0 under any factor
+        # A weight of 0 would remain 0 under any factor.
+        self.byte_cost = min(max(self.byte_cost, _WEIGHT_RANGE[0]), _WEIGHT_RANGE[1])
 
     @property
-    def exhausted(self) -> bool:
+    def is_exhausted(self) -> bool:
         """True if the rate weight cannot be raised further."""
         return self.byte_cost >= _WEIGHT_RANGE[1]
 
     @classmethod
     def of(cls, stored: Any) -> RateController | None:
-        """The budget of a checkpoint; `None` if it holds none, or not all of its numbers."""
+        """Return the controller of a checkpoint; `None` if its state is absent or incomplete."""
         names = {one.name for one in fields(cls)}
         if not isinstance(stored, dict) or stored.keys() != names:
             return None
         numbers = all(isinstance(one, (int, float)) and math.isfinite(one) for one in stored.values())
         return cls(**stored) if numbers else None
 
-    def overdrawn(self, size_bytes: int, bits: float) -> float:
-        """Return the penalty of a file that is too large; its size determines how many bits its integers may have.
+    def excess(self, size_bytes: int, bits: float) -> float:
+        """Return the relative excess of a file over the target size, and update the target number of bits.
 
         Args:
             size_bytes: size of the file.
@@ -420,16 +419,16 @@ class RateController:
         self.goal_bits = max(bits + 8.0 * (allowed - size_bytes), 0.1 * bits)
         return max(0.0, size_bytes / self.size_bytes - 1.0)
 
-    def weigh(self, bits: float, done: float, first_cost: float) -> None:
-        """Make bytes dearer or cheaper, by how many bits there are and how many should be left.
+    def update(self, bits: float, done: float, first_cost: float) -> None:
+        """Adjust the rate weight to the present number of bits and the planned one.
 
         Args:
             bits: bits of the integers at present.
             done: fraction of the steps done.
             first_cost: rate weight at the start of the run.
         """
-        wanted = self.goal_bits + (self.first_bits - self.goal_bits) * max(0.0, 1.0 - done / _TARGET_SHARE)
-        by = min(max(_GAIN * (bits / max(wanted, 1.0) - 1.0), -_MAX_CHANGE), _MAX_CHANGE)
+        planned_bits = self.goal_bits + (self.first_bits - self.goal_bits) * max(0.0, 1.0 - done / _TARGET_SHARE)
+        by = min(max(_GAIN * (bits / max(planned_bits, 1.0) - 1.0), -_MAX_CHANGE), _MAX_CHANGE)
         least = max(_MIN_WEIGHT_SHARE * min(first_cost, _WEIGHT_RANGE[1]), _WEIGHT_RANGE[0])
         self.byte_cost = min(max(self.byte_cost * math.exp(by), least), _WEIGHT_RANGE[1])
 
@@ -439,7 +438,7 @@ _FACTS = {
     "frozen": str, "iteration": int, "step": int, "rng_state": dict, "queue": list, "options": dict, "log": dict,
     "best": list,
 }  # fmt: skip
-_BEST_COUNT = 4  # numbers of the best look
+_BEST_COUNT = 4  # length of `best` in a checkpoint
 _KIND = "csplat finetune"
 _FREE_VALUES = ("means", "quats", "scales", "opacities", "sh0", "sh", "sizes")
 _GROUPS = (*GROUPS, "sizes")
@@ -450,15 +449,15 @@ class FinetuneCheckpoint:
     """A run between two steps.
 
     Attributes:
-        iteration: steps that were made.
+        iteration: number of steps made.
         parameters: the values, with Adam's memory.
-        rng_state: of the generator of the order of images, JSON-compatible.
-        queue: images that are still to come in this round.
-        options: of the run, as a dictionary.
-        log: what was logged so far.
+        rng_state: state of the random generator, JSON-compatible.
+        queue: indices of the images that remain in this epoch.
+        options: options of the run, as a dictionary.
+        log: log so far.
         best_held: the best values so far.
-        costs: slopes of the costs of bytes by attribute, as they were last counted; empty if they never were.
-        best: their score and PSNR on the validation views, the step that they stood at, how many looks came after.
+        costs: slopes of the rate by attribute, from the last count; empty before the first.
+        best: score and PSNR of the best values on the validation views, their step, number of evaluations since.
     """
 
     iteration: int
@@ -473,7 +472,7 @@ class FinetuneCheckpoint:
 
 
 def save_finetune(path: str | Path, checkpoint: FinetuneCheckpoint, frozen: FixedQuantisation) -> None:
-    """Write a checkpoint; the file appears under its name only when it is complete."""
+    """Write a checkpoint; the file gets its name only when it is complete."""
     facts = {
         "kind": _KIND,
         "version": _VERSION,
@@ -499,7 +498,7 @@ def load_finetune(path: str | Path, frozen: FixedQuantisation) -> FinetuneCheckp
     """Read a checkpoint of a frozen scene.
 
     Raises:
-        InputError: the file is no checkpoint, was written by another version, or for another scene or other options
+        InputError: the file is not a checkpoint, was written by another version, or for another scene or other options
             of the encoder.
         OSError: it cannot be read.
     """
@@ -536,7 +535,7 @@ def load_finetune(path: str | Path, frozen: FixedQuantisation) -> FinetuneCheckp
 
 
 def fingerprint(frozen: FixedQuantisation) -> str:
-    """A digest of all that was decided, and of the values that it was decided for."""
+    """Return a digest of the encoder's decisions, and of the values that they were made for."""
     digest, start = hashlib.sha256(repr(frozen.parameters).encode()), frozen.start()
     index = () if frozen.book is None else (frozen.book.index,)
     for array in (frozen.source_index, *index, *(getattr(start, name) for name in _FREE_VALUES)):

@@ -35,15 +35,15 @@ class FinetuneOptions:
         lr_sh0: learning rate of the base colour.
         lr_shN: learning rate of the higher SH coefficients.
         lr_entries: learning rate of the codebook's entries.
-        lr_exposure: as in `TrainOptions`; 0: no photograph is treated as brighter or darker than others.
-        byte_cost: rate weight in the loss, per bit and splat; 0: files may grow as they please.
-        warm_up: steps in which Adam learns the sizes of the gradients, and values hardly move.
-        decay: fraction of the learning rates that is left at the end. Next to nothing: values that still move go back
-            and forth between two integers.
+        lr_exposure: as in `TrainOptions`; 0: gains and biases of images are not trained.
+        byte_cost: rate weight: loss per bit and splat; 0: the size of the file has no influence.
+        warm_up: steps in which Adam estimates the magnitude of gradients, and values hardly move.
+        decay: fraction of the learning rates that remains at the end. It is tiny, because values that still move
+            alternate between two integers.
         validate_every: steps between evaluations on the validation views.
         patience: evaluations without a gain after which a run ends early, once the learning rates have fallen to a
-            quarter: before, values shake too much to score their best. With a size target, evaluations at which the
-            file is still too large do not count. 0: never.
+            quarter: before, values fluctuate too much. With a size target, evaluations at which the file is still too
+            large do not count. 0: never.
         log_every: steps between entries of the log.
 
     Raises:
@@ -77,7 +77,7 @@ class FinetuneOptions:
                 raise InputError(f"{name} is {value}, wanted {low:g} to {high:g}")
 
     def share(self, iteration: int) -> float:
-        """Share of the learning rates that a step gets."""
+        """Return the factor of the learning rates at a step."""
         done = (iteration - 1) / self.iterations
         rising = min(1.0, iteration / (self.warm_up + 1))
         return rising * (self.decay + (1.0 - self.decay) * 0.5 * (1.0 + math.cos(math.pi * done)))
@@ -87,12 +87,12 @@ class FinetuneOptions:
         return iteration > 0.5 * self.iterations and self.share(iteration) <= _CALM
 
     def scaled(self, factor: float) -> FinetuneOptions:
-        """The same with all learning rates times a factor."""
+        """Return the same options with all learning rates times a factor."""
         rates = {name: getattr(self, name) * factor for name in _RANGES if name.startswith("lr_")}
         return replace(self, **rates)
 
 
-_CALM = 0.25  # fraction of the learning rates
+_CALM = 0.25  # factor of the learning rates from which evaluations without a gain count
 
 _RANGES: dict[str, tuple[float, float]] = {
     "iterations": (1, 10**7),
@@ -114,7 +114,7 @@ _RANGES: dict[str, tuple[float, float]] = {
 }
 
 
-_MAX_VALIDATION = 16  # validation views at most, if they are training views too
+_MAX_VALIDATION = 16  # largest number of validation views that are training views too
 _FLOAT16_MAX = np.float32(6e4)  # largest value for float16
 
 
@@ -124,30 +124,30 @@ class TuningView:
 
     Attributes:
         camera: relative to the scene's origin.
-        wanted: a photograph, or [H, W, 3] float16 or float32: the reference image.
+        reference: the reference image: an image of a data set, or [H, W, 3] float16 or float32.
 
     Raises:
-        InputError: an image of another size.
+        InputError: the reference has another size than the camera's image.
     """
 
     camera: Camera
-    wanted: PosedImage | NDArray[np.floating[Any]]
+    reference: PosedImage | NDArray[np.floating[Any]]
 
     def __post_init__(self) -> None:
         shape = (self.camera.H, self.camera.W, 3)
-        if not isinstance(self.wanted, PosedImage) and self.wanted.shape != shape:
-            raise InputError(f"a wanted picture has shape {list(self.wanted.shape)}, wanted {list(shape)}")
+        if not isinstance(self.reference, PosedImage) and self.reference.shape != shape:
+            raise InputError(f"a wanted picture has shape {list(self.reference.shape)}, wanted {list(shape)}")
 
     @property
     def mask(self) -> NDArray[np.bool_] | None:
         """Pixels that count, [H, W]; `None`: all of them."""
-        return self.wanted.mask if isinstance(self.wanted, PosedImage) else None
+        return self.reference.mask if isinstance(self.reference, PosedImage) else None
 
     def image(self, background: F32, out: F32) -> F32:
         """Return the reference image, [H, W, 3] float32; `out` may be overwritten and returned."""
-        if isinstance(self.wanted, PosedImage):
-            return compose(self.wanted, background, out)
-        np.copyto(out, self.wanted)
+        if isinstance(self.reference, PosedImage):
+            return compose(self.reference, background, out)
+        np.copyto(out, self.reference)
         return out
 
 
@@ -157,7 +157,7 @@ class TuningViews:
 
     Attributes:
         train: at least one.
-        validation: at least one; they are among `train` unless they were kept aside.
+        validation: at least one; they are among `train` unless they are held out.
         background: [3].
 
     Raises:
@@ -176,43 +176,43 @@ class TuningViews:
     def digest(self) -> str:
         """Hash of the training cameras, the split and the background, which identifies these views."""
         cameras = [(c.W, c.H, c.K.tolist(), c.viewmat.tolist()) for c in (one.camera for one in self.train)]
-        said = repr((cameras, len(self.validation), self.kept_aside, self.background.tolist()))
-        return hashlib.sha256(said.encode()).hexdigest()
+        identity = repr((cameras, len(self.validation), self.is_held_out, self.background.tolist()))
+        return hashlib.sha256(identity.encode()).hexdigest()
 
     @property
-    def kept_aside(self) -> bool:
+    def is_held_out(self) -> bool:
         """True if no validation view is a training view."""
         return not any(one is other for one in self.validation for other in self.train)
 
 
-def split_views(views: Sequence[TuningView], background: F32, aside: int = 0) -> TuningViews:
+def split_views(views: Sequence[TuningView], background: F32, validation_count: int = 0) -> TuningViews:
     """Split views into training and validation views.
 
-    A scene fits the images that it was trained on better than any others. Those of them that are held out look worse
-    with every step, whatever is gained elsewhere; so by default all are training views, and some of them are
+    A scene fits the images that it was trained on better than others. If some of them are held out here, they score
+    worse with every step, whatever is gained elsewhere; so by default all are training views, and some of them are
     validation views, too.
 
     Args:
-        views: the views, in the order of their taking.
+        views: the views, in the order in which they were taken.
         background: [3], behind all of them.
-        aside: number of validation views that are held out: images that the scene was not trained on, or renders of
-            it. 0: none.
+        validation_count: number of validation views that are held out: images that the scene was not trained on, or
+            renders of it. 0: none.
 
     Raises:
-        InputError: there are not as many views.
+        InputError: `validation_count` leaves no training view.
     """
-    if aside >= len(views):
-        raise InputError(f"{aside} of {len(views)} views to decide by leave none to learn from")
-    count = aside or min(len(views), _MAX_VALIDATION)
-    judges = {(2 * number + 1) * len(views) // (2 * count) for number in range(count)}
-    teachers = [view for number, view in enumerate(views) if not aside or number not in judges]
-    return TuningViews(teachers, [views[number] for number in sorted(judges)], background)
+    if validation_count >= len(views):
+        raise InputError(f"{validation_count} of {len(views)} views to decide by leave none to learn from")
+    count = validation_count or min(len(views), _MAX_VALIDATION)
+    validation = {(2 * number + 1) * len(views) // (2 * count) for number in range(count)}
+    training = [view for number, view in enumerate(views) if not validation_count or number not in validation]
+    return TuningViews(training, [views[number] for number in sorted(validation)], background)
 
 
 def renders_of(source: SplatModel, cameras: Sequence[Camera], background: F32, threads: int | None) -> list[TuningView]:
-    """Return views of a scene itself: the reference for its file if there are no photographs.
+    """Return renders of a scene as views: the reference for its file if there are no images.
 
-    They are kept in float16, 66 dB and more from what they were up to white; there are hundreds of them.
+    They are kept in float16, with a PSNR of at least 66 dB up to white; there are hundreds of them.
     """
     rasteriser = Rasteriser(gradients=False, threads=threads)
     views = []
