@@ -51,7 +51,7 @@ _NAMES = {
 
 
 @contextmanager
-def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
+def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
     paths, findings = _rank_files(path)
     parts = [_read(one, sh_degree) for one in paths]
     models = [one.model for one in parts]
