@@ -45,10 +45,10 @@ def lines(display, clock, capsys, seconds):
 
 def test_without_a_terminal_there_is_a_line_every_ten_seconds(clock, capsys):
     display = Display(terminal=False, clock=clock)
-    display.tell("reading", 1.0)
-    display.tell("encoding", 0.0)
+    display.report("reading", 1.0)
+    display.report("encoding", 0.0)
     assert [] == lines(display, clock, capsys, 9)
-    display.tell("encoding", 0.4)
+    display.report("encoding", 0.4)
     assert ["encoding 40 %, about 15 s left; 0:10 so far"] == lines(display, clock, capsys, 2)
     assert 3 == len(lines(display, clock, capsys, 30))
 
@@ -56,19 +56,19 @@ def test_without_a_terminal_there_is_a_line_every_ten_seconds(clock, capsys):
 def test_work_that_tells_nothing_is_seen_to_go_on(clock, capsys):
     display = Display(terminal=False, clock=clock)
     assert ["working; 0:10 so far"] == lines(display, clock, capsys, 11)
-    display.tell("matching", 0.0)
-    display.tell("matching", 1.0)
-    display.tell("preparing the renderer", 0.0)
+    display.report("matching", 0.0)
+    display.report("matching", 1.0)
+    display.report("preparing the renderer", 0.0)
     assert ["preparing the renderer; 1:00 so far"] == lines(display, clock, capsys, 50)[-1:]
 
 
 def test_time_left_is_that_of_a_stage_that_began_anew(clock, capsys):
     display = Display(terminal=False, clock=clock)
-    display.tell("tiles", 0.9)
+    display.report("tiles", 0.9)
     clock.now += 1000.0
-    display.tell("tiles", 0.1)
+    display.report("tiles", 0.1)
     clock.now += 20.0
-    display.tell("tiles", 0.5)
+    display.report("tiles", 0.5)
     display.tick()
     assert "tiles 50 %, about 20 s left; 17:00 so far\n" == capsys.readouterr().err
 
@@ -101,7 +101,7 @@ def test_a_terminal_shows_bars_after_two_seconds(clock, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setenv("TERM", "xterm")
     display = Display(terminal=True, clock=clock)
-    display.tell("tiles", 0.25)
+    display.report("tiles", 0.25)
     clock.now += 1.9
     display.tick()
     assert "" == sys.stderr.getvalue()

@@ -356,7 +356,7 @@ def test_the_command_asks_for_the_disk_as_its_options_say(ply, tmp_path, monkeyp
 def test_only_large_files_and_small_memories_make_a_command_look_whether_a_scene_fits(ply, tmp_path):
     def may_leave(path, size, **scale):
         os.truncate(path, size)  # no byte of the rest takes room
-        return OutOfCoreOptions(**scale).may_leave_memory(path)
+        return OutOfCoreOptions(**scale).may_exceed_memory(path)
 
     assert not may_leave(ply, 4 << 20, memory_bytes=1)
     assert may_leave(ply, 5 << 20, memory_bytes=19 << 20)

@@ -204,7 +204,7 @@ def test_the_command_loses_no_more_against_photographs_than_is_allowed(tmp_path)
 def test_long_work_is_foretold_unless_it_is_short_or_nobody_is_told(capsys):
     told = {}
     for name, quiet, seconds in (("long", False, 170.0), ("short", False, 5.0), ("quiet", True, 170.0)):
-        OutputOptions(quiet=quiet).foretell(lambda seconds=seconds: seconds, "a preset takes seconds")
+        OutputOptions(quiet=quiet).announce_time(lambda seconds=seconds: seconds, "a preset takes seconds")
         told[name] = capsys.readouterr().err
     assert "this takes about 2 to 5 minutes here; a preset takes seconds" in told.pop("long")
     assert {"short": "", "quiet": ""} == told
@@ -212,7 +212,7 @@ def test_long_work_is_foretold_unless_it_is_short_or_nobody_is_told(capsys):
 
 def test_the_command_foretells_a_search_before_it_begins(tmp_path, ply, monkeypatch):
     """The search itself is refused: nothing shows in the view that judges."""
-    monkeypatch.setattr("csplat_tools.optimise.target_search.picture_seconds", lambda *_, **__: 170.0 / 520.0)
+    monkeypatch.setattr("csplat_tools.optimise.target_search.render_seconds", lambda *_, **__: 170.0 / 520.0)
     K = intrinsics(48, 40, 60.0)
     save_cameras(tmp_path / "away.json", [look_at((40.0, 0.0, 0.0), (80.0, 0.0, 0.0), (0, 0, 1), K, 48, 40)])
     words = ("encode", ply, tmp_path / "s.csplat", "--target-psnr", "30", "--cameras", tmp_path / "away.json")

@@ -79,7 +79,7 @@ def progress_bar(*, quiet: bool = False) -> Iterator[Progress | None]:
         The progress callback; `None` if nothing is shown.
     """
     with _displayed(quiet=quiet) as display:
-        yield None if display is None else display.tell
+        yield None if display is None else display.report
 
 
 @contextmanager
@@ -107,7 +107,7 @@ def step_progress(
             if left > LONG_WORK_SECONDS:
                 note(f"{name} takes about {format_range(_SPREAD[0] * left, _SPREAD[1] * left)} from here")
         if display is not None:
-            display.tell(name, now.iteration / now.iterations, tell(now))
+            display.report(name, now.iteration / now.iterations, tell(now))
 
     with _displayed(quiet=quiet) as display:
         yield None if display is None else show
@@ -140,7 +140,7 @@ class Display:
         self._bars: Bars | None = None
         self._tasks: dict[str, TaskID] = {}
 
-    def tell(self, stage: str, done: float, words: str | None = None) -> None:
+    def report(self, stage: str, done: float, words: str | None = None) -> None:
         """Record the progress of a stage.
 
         Args:

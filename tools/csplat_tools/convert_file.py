@@ -52,7 +52,7 @@ class Filters:
     drop_floaters: bool = False
     sh_degree: int | None = None
 
-    def applied(self, scene: SceneSource) -> SceneSource:
+    def apply(self, scene: Scene) -> Scene:
         """Return the changed scene."""
         if self.to_axes is not None:
             scene = convert_axes(scene, self.to_axes)
@@ -232,7 +232,7 @@ def convert_file(
     read_as: str | None = None,
     write_as: str | None = None,
     level: int = 0,
-    facts: MetadataOverrides | None = None,
+    overrides: MetadataOverrides | None = None,
     filters: Filters | None = None,
     no_loss: bool = False,
     dry_run: bool = False,
@@ -247,7 +247,7 @@ def convert_file(
         read_as: the name of the source's format, if its content does not tell.
         write_as: the name of the target's format.
         level: level of detail to read from a source that has several; 0 is the finest.
-        facts: overrides of the source's metadata.
+        overrides: overrides of the source's metadata.
         filters: changes of the scene on the way.
         no_loss: refuse if anything would be lost.
         dry_run: write nothing.
@@ -262,9 +262,9 @@ def convert_file(
         raise InputError(f"{target} would be {writes.title}, which csplat does not write")
     sh_degree = None if filters is None else filters.sh_degree
     with local_path(source) as local, open_scene(local, read_as, level=level, sh_degree=sh_degree) as opened:
-        scene = (facts or MetadataOverrides()).applied_to_all(opened)
+        scene = (overrides or MetadataOverrides()).apply_to_scene(opened)
         before = scene.facts.coordinate_system
-        scene = (filters or Filters()).applied(scene)
+        scene = (filters or Filters()).apply(scene)
         lost = writes.losses(scene.facts)
         rounded = tuple(
             name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.facts.sh_degree)
@@ -289,7 +289,7 @@ def decode_file(
     sh_degree: int | None = None,
     absolute: bool = False,
     max_splats: int | None = None,
-    facts: MetadataOverrides | None = None,
+    overrides: MetadataOverrides | None = None,
     progress: Progress | None = None,
 ) -> tuple[int, int]:
     """Read a .csplat file, write a PLY, some splats at a time.
@@ -300,7 +300,7 @@ def decode_file(
         sh_degree: leave out the SH bands above.
         absolute: add the origin and write doubles.
         max_splats: refuse a scene of more splats; `None`: no limit.
-        facts: overrides of the file's metadata for the PLY.
+        overrides: overrides of the file's metadata for the PLY.
         progress: called with the stage's name and the fraction done.
 
     Returns:
@@ -314,7 +314,7 @@ def decode_file(
         opened = open_tiles(data, limits=None if max_splats is None else Limits(splats=max_splats))
         decoded = SceneSource(opened.header.splat_count, opened.facts, opened.models)
         # All bands are decoded, even if some are left out: damage anywhere gives no PLY.
-        scene = Filters(sh_degree=sh_degree).applied((facts or MetadataOverrides()).applied_to_all(decoded))
+        scene = Filters(sh_degree=sh_degree).apply((overrides or MetadataOverrides()).apply_to_scene(decoded))
         if is_one_way(target):
             for _ in with_progress(decoded, "checking", progress).blocks():
                 pass

@@ -61,7 +61,7 @@ class OutOfCoreOptions:
     cluster: str | None = None
     by_disk: bool = False
 
-    def may_leave_memory(self, path: Path) -> bool:
+    def may_exceed_memory(self, path: Path) -> bool:
         """Return True if a scene may not fit in memory, and has to be opened to tell."""
         if self.cluster is not None or self.resume or self.by_disk:
             return True
@@ -92,7 +92,7 @@ def encode_out_of_core(
     local: Path,
     target: str,
     options: EncodeOptions,
-    facts: MetadataOverrides | None,
+    overrides: MetadataOverrides | None,
     scale: OutOfCoreOptions,
     *,
     strict: bool,
@@ -104,7 +104,7 @@ def encode_out_of_core(
         local: the scene, in any format.
         target: the file to write.
         options: options of the encoder.
-        facts: overrides of the scene's metadata.
+        overrides: overrides of the scene's metadata.
         scale: memory, disk, workers.
         strict: refuse defects that would be repaired.
         progress: progress callback.
@@ -128,7 +128,7 @@ def encode_out_of_core(
             if progress is not None:
                 progress("reading", 0.0)
             model = read_all(opened, strict=strict, keep_extra=options.keep_extra, report=findings)
-            model = (facts or MetadataOverrides()).applied(model)
+            model = (overrides or MetadataOverrides()).apply(model)
             return LoadedModel(model, size_on_disk(local), name=local.name, findings=tuple(findings))
         if target == STANDARD_STREAM:
             raise InputError("the scene does not fit the memory, and would be written by way of the disk: name a file")
@@ -136,7 +136,7 @@ def encode_out_of_core(
         if opened.facts.extra and not options.keep_extra:
             findings.append(dropped_columns(list(opened.facts.extra)))
         refuse(findings, strict=strict)
-        scene = (facts or MetadataOverrides()).applied_to_all(opened)
+        scene = (overrides or MetadataOverrides()).apply_to_scene(opened)
         try:
             report = encode_scene(
                 scene, target, options, memory_bytes=scale.memory_bytes, by_disk=scale.by_disk, folder=scale.folder,
@@ -265,7 +265,7 @@ def encode_file(
     target: str,
     options: EncodeOptions,
     *,
-    facts: MetadataOverrides | None = None,
+    overrides: MetadataOverrides | None = None,
     strict: bool = False,
     importance: str | None = None,
     prune_unseen: bool = False,
@@ -280,7 +280,7 @@ def encode_file(
         source: a PLY, or `-`.
         target: the file to write, or `-`. The caller has checked that it may be replaced.
         options: options of the encoder; `keep_extra` applies to reading, too.
-        facts: overrides of the PLY's metadata.
+        overrides: overrides of the PLY's metadata.
         strict: refuse defects that would be repaired.
         importance: a .npy file with one weight per splat of the PLY as read, or a file of `csplat sensitivity`.
         prune_unseen: leave out the splats that no view of the sensitivities saw.
@@ -297,15 +297,15 @@ def encode_file(
     in_memory = encoder is not None or importance is not None or source_index is not None
     read: LoadedModel | None = None
     with source_path(source) as local:
-        if not in_memory and scale.may_leave_memory(local):
-            done = encode_out_of_core(local, target, options, facts, scale, strict=strict, progress=progress)
+        if not in_memory and scale.may_exceed_memory(local):
+            done = encode_out_of_core(local, target, options, overrides, scale, strict=strict, progress=progress)
             if isinstance(done, OutOfCoreResult):
                 seconds = time.perf_counter() - start
                 return EncodedFile(done.facts, done.report, None, done.findings, size_on_disk(local), seconds)
             read = done
         if read is None:
             read = read_source(
-                local, facts, strict=strict, keep_extra=options.keep_extra, sh_degree=read_degree(options),
+                local, overrides, strict=strict, keep_extra=options.keep_extra, sh_degree=read_degree(options),
                 progress=progress,
             )  # fmt: skip
     model = read.model

@@ -193,7 +193,7 @@ def _loaded(local: Path, sh_degree: int | None = None) -> LoadedModel:
 
 def read_source(
     file: File,
-    facts: MetadataOverrides | None = None,
+    overrides: MetadataOverrides | None = None,
     *,
     strict: bool = False,
     keep_extra: bool = False,
@@ -204,7 +204,7 @@ def read_source(
 
     Args:
         file: a path, or `-`; an open binary file; or bytes.
-        facts: overrides of the scene's metadata.
+        overrides: overrides of the scene's metadata.
         strict: refuse defects that would be repaired.
         keep_extra: carry columns that splats do not have.
         sh_degree: leave out the SH bands above, even of a file of a higher degree than 3; `None`: keep all.
@@ -221,7 +221,7 @@ def read_source(
         model = formats.read(local, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=findings)
         size_bytes, name = size_on_disk(local), local.name
     report("reading", 1.0)
-    return LoadedModel((facts or MetadataOverrides()).applied(model), size_bytes, name=name, findings=tuple(findings))
+    return LoadedModel((overrides or MetadataOverrides()).apply(model), size_bytes, name=name, findings=tuple(findings))
 
 
 @contextmanager
@@ -364,7 +364,7 @@ class MetadataOverrides:
     licence: str | None = None
     up: Direction | None = None
 
-    def applied(self, model: SplatModel) -> SplatModel:
+    def apply(self, model: SplatModel) -> SplatModel:
         """Return the model with these overrides."""
         changes: dict[str, Any] = {
             name: value for name in ("unit_metres", "antialiased") if (value := getattr(self, name)) is not None
@@ -374,6 +374,6 @@ class MetadataOverrides:
         model = replace(model, **changes) if changes else model
         return with_up(model, self.up, self.coordinate_system)
 
-    def applied_to_all(self, scene: SceneSource) -> SceneSource:
+    def apply_to_scene(self, scene: Scene) -> Scene:
         """Return the scene with these overrides."""
-        return replace(scene, facts=self.applied(scene.facts), blocks=lambda: map(self.applied, scene.blocks()))
+        return replace(scene, facts=self.apply(scene.facts), blocks=lambda: map(self.apply, scene.blocks()))

@@ -330,7 +330,7 @@ class OutputOptions(OptionGroup):
         for line in () if self.quiet else lines:
             note(line)
 
-    def foretell(self, expected: Callable[[], float], sooner: str) -> None:
+    def announce_time(self, expected: Callable[[], float], sooner: str) -> None:
         """Announce how long the work takes if it is long, so that people may choose otherwise.
 
         Args:
@@ -341,7 +341,7 @@ class OutputOptions(OptionGroup):
         if seconds > LONG_WORK_SECONDS:
             note(f"this takes about {format_estimate(seconds)} here; {sooner}")
 
-    def findings(self, findings: Sequence[Finding], name: str = "") -> None:
+    def print_findings(self, findings: Sequence[Finding], name: str = "") -> None:
         """Print unusual findings in a file, unless `--quiet` is given; repairs are printed in any case.
 
         Args:

@@ -99,13 +99,13 @@ def compare(
                 f"A and B do not fit {format_bytes(source.memory_bytes)} of memory: they are drawn by way of the disk"
             )
         for name, one in ((a, source), (b, other)):
-            out.findings(one.findings, Path(name).name)
+            out.print_findings(one.findings, Path(name).name)
         model, every = source.sample(progress)
         around = views.find(model, out, count=0, split=split, every=every)
         if mode == "exact":
             from csplat_tools.views.view_sets import total_render_seconds
 
-            out.foretell(
+            out.announce_time(
                 lambda: 2 * total_render_seconds(model, around.test, mode=mode), "--mode standard takes seconds"
             )
         compared = csplat_tools.compare(

@@ -121,10 +121,10 @@ def convert(
         out.check(str(folder) if made_anew else output, inputs=(source,))
     with out.bar() as progress:
         made = convert_file(
-            source, output, write_as=write_as, level=level, facts=upright.upright(),
+            source, output, write_as=write_as, level=level, overrides=upright.upright(),
             filters=changes.filters(sh_degree), no_loss=no_loss, dry_run=dry_run, progress=progress,
         )  # fmt: skip
-    out.findings(made.findings)
+    out.print_findings(made.findings)
     if made.losses():
         note(f"lost on the way: {made.losses()}")
     before, after = made.axes

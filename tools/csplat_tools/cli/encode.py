@@ -262,11 +262,11 @@ def encode(
     reaching: EncodeFunction = partial(_reach, goal, views, virtual, importance, out)
     with out.bar() as progress:
         encoded = encode_file(
-            source, output, options, facts=facts.read(), strict=facts.strict, importance=importance,
+            source, output, options, overrides=facts.read(), strict=facts.strict, importance=importance,
             prune_unseen=prune_unseen, source_index=source_index, scale=scale,
             encoder=reaching if goal.is_rendered or goal.max_error is not None else None, progress=progress,
         )  # fmt: skip
-    out.findings(encoded.findings)
+    out.print_findings(encoded.findings)
     for line in encoded.report.notes:
         note(line)
     out.remark(*(() if encoded.made is None else encoded.made.lines), *_stated(encoded))
@@ -276,7 +276,7 @@ def encode(
         psnr = None if out.quiet else _psnr(encoded, encoding.threads)
     about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(ESTIMATE_SIZE)}
     if not out.quiet and encoded.made is not None and len(encoded.source) <= ESTIMATE_SPLATS_MAX:
-        facts.seeming(estimate_up(encoded.source), out, shown=False)
+        facts.take_estimated_up(estimate_up(encoded.source), out, shown=False)
     out.remark(_summary(encoded, psnr, source, output))
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
 
@@ -325,7 +325,7 @@ def _reach(
         around = views.find(model, out, **given)
         if len(model) and around.test:
             may_prune = not goal.no_prune and goal.keep is None
-            out.foretell(
+            out.announce_time(
                 partial(
                     expected_seconds, model, encoding, target, around, no_prune=goal.no_prune, simplifying=simplifying
                 ),

@@ -157,7 +157,7 @@ def finetune(
     distance = None if lpips is None else load_lpips(None if lpips == "auto" else lpips)
     degree = read_degree(encoder)
     read = read_source(source, facts.read(), strict=facts.strict, keep_extra=facts.keep_extra, sh_degree=degree)
-    out.findings(read.findings)
+    out.print_findings(read.findings)
     given = {"count": tuning.VIEWS, "size": tuning.VIEW_SIZE, **virtual.given()}
     aside_count = validation_count or tuning.default_validation_count(
         given["count"], cameras=views.cameras, data=views.data

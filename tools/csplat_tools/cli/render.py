@@ -110,13 +110,13 @@ def render(
         check_name(output, ".webp", "render", source)
     require_renderer()
     read = load_model(source, sh_degree=sh_degree)
-    out.findings(read.findings)
-    model = upright.upright().applied(read.model)
+    out.print_findings(read.findings)
+    model = upright.upright().apply(read.model)
     report: list[str] = []
     cameras = find_cameras(model, views.cameras, orbit, shots, pixels, split=split, report=report)
     out.remark(*report)
     if orbit is not None:
-        upright.seeming(estimate_up(model), out)
+        upright.take_estimated_up(estimate_up(model), out)
     write = partial(render_film, fps=fps) if film else partial(render_folder, depth=depth, alpha=alpha)
     with out.bar() as progress:
         rendered = write(

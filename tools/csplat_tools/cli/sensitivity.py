@@ -55,7 +55,7 @@ def sensitivity(
     from csplat_tools.views.view_sets import total_render_seconds
 
     read = load_model(source)
-    out.findings(read.findings)
+    out.print_findings(read.findings)
     model = read.model
     looked_for = views.data is None and views.cameras is None  # virtual ones
     prepare_renderer(quiet=out.quiet, simplify=looked_for)
@@ -63,7 +63,7 @@ def sensitivity(
     around = views.find(
         model, out, seed=seed, validation_count=None if views.data is None else 0, **virtual.given() | count
     )
-    out.foretell(
+    out.announce_time(
         lambda: _PASSES * total_render_seconds(model, around.training or around.test),
         "fewer or smaller views take less: --help-all",
     )

@@ -112,7 +112,9 @@ class OrientationOptions(OptionGroup):
         up = None if self.up is None else parse_up(self.up)
         return MetadataOverrides(None if self.axes is None else parse_axes(self.axes), up=up)
 
-    def seeming(self, axis: Direction | None, output: OutputOptions, *, shown: bool = True) -> Direction | None:
+    def take_estimated_up(
+        self, axis: Direction | None, output: OutputOptions, *, shown: bool = True
+    ) -> Direction | None:
         """Return the estimated up direction, with a remark, if neither the user nor the scene specifies one.
 
         Args:

@@ -96,14 +96,14 @@ def simplify(
     out.check(output, inputs=(source, *views.inputs), named={"--source-index": source_index})
     check_name(output, ".ply", "simplify", source)
     read = load_model(source)
-    out.findings(read.findings)
-    model = upright.upright().applied(read.model)
+    out.print_findings(read.findings)
+    model = upright.upright().apply(read.model)
     prepare_renderer(quiet=out.quiet, simplify=True)
     given = virtual.given()
     around = views.find(model, out, seed=seed, **given)
     options = replace(options, view_size=given.get("size"))
     passes = _PASSES[keep is None] * (0.5 + 0.5 * options.work)
-    out.foretell(
+    out.announce_time(
         lambda: passes * total_render_seconds(model, shrink_cameras(around.training, options.pictures(len(model))[1])),
         "fewer or smaller views take less: --help-all",
     )

@@ -85,7 +85,7 @@ def tradeoff(
         source, cameras=views.cameras, data=views.photographs(), background=views.colour, lpips=lpips
     )
     prepare_renderer(quiet=out.quiet, simplify=bool(_SLOW & set(wanted.what)), ssim=True, lpips=lpips is not None)
-    out.findings(setting.findings)
+    out.print_findings(setting.findings)
     out.remark(*setting.views.notes)
     with out.bar() as progress:
         measured = csplat_tools.tradeoff(setting, wanted, say=None if out.quiet else note, progress=progress)

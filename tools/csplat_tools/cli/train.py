@@ -181,18 +181,26 @@ def train(
         check_name(output, ".ply", "train", source)
     data = DataOptions(source, None if size is None else parse_size(size), images, test_every, near)
     files = Outputs(checkpoint, checkpoint_every, previews, preview_every, resume, lpips_weights)
-    facts = upright.upright()
+    overrides = upright.upright()
     if not to_file:
         out.publish(
             run_training(
-                data, output, options, files, facts=facts, plot=plot, page=page, threads=threads, quiet=out.quiet
+                data,
+                output,
+                options,
+                files,
+                overrides=overrides,
+                plot=plot,
+                page=page,
+                threads=threads,
+                quiet=out.quiet,
             )
         )
         return
     encoding = EncodeOptions(preset or "small", seed=seed, threads=threads, shape_codebook_size=SHAPE_ENTRIES)
     report = run_training_to_file(
         data, output, options, files, encoding, chosen(tuning_after, training=options, byte_cost=byte_cost),
-        size_bytes=size_bytes, psnr=psnr, facts=facts, plot=plot, page=page, quiet=out.quiet,
+        size_bytes=size_bytes, psnr=psnr, overrides=overrides, plot=plot, page=page, quiet=out.quiet,
     )  # fmt: skip
     out.remark(format_tuning_report(report["file"]))
     out.publish(report)

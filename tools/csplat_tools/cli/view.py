@@ -62,7 +62,7 @@ def view(
         wishes |= _scene_wishes(scene, cameras, upright, out)
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
-            out.findings(scene.findings)
+            out.print_findings(scene.findings)
             out.remark(*_encoded(scene, preset))
             out.publish({"url": opened.url, "splats": scene.header.splat_count}, opened.url)
             sys.stdout.flush()
@@ -105,7 +105,7 @@ def export_html(
         wishes |= _scene_wishes(scene, cameras, upright, out)
         exported = viewer_page.export_page(data, scene.name, wishes)
         write_bytes(output, exported.page)
-        out.findings(scene.findings)
+        out.print_findings(scene.findings)
         out.remark(*_encoded(scene, preset))
     out.remark(
         f"{output}: {format_bytes(len(exported.page))}, of which the scene {format_bytes(exported.scene_bytes)}"
@@ -151,7 +151,7 @@ def _scene_wishes(
         report: list[str] = []
         wishes = page_parameters(cameras, report=report, origin=scene.header.origin)
         out.remark(*report)
-    return wishes | estimated_up_parameters(upright.seeming(scene.seems_up, out))
+    return wishes | estimated_up_parameters(upright.take_estimated_up(scene.seems_up, out))
 
 
 def _encoded(scene: ViewerScene, preset: str) -> list[str]:

@@ -36,7 +36,7 @@ def run_training(
     options: TrainOptions,
     files: Outputs,
     *,
-    facts: MetadataOverrides | None = None,
+    overrides: MetadataOverrides | None = None,
     plot: str | None = None,
     page: str | None = None,
     threads: int | None = None,
@@ -49,7 +49,7 @@ def run_training(
         output: the PLY to write, or `-`.
         options: options of the training.
         files: files that are written and read during training.
-        facts: overrides of the metadata that the set provides.
+        overrides: overrides of the metadata that the set provides.
         plot: a PNG to write with the loss over the steps.
         page: an HTML report to write.
         threads: number of threads; `None` for all.
@@ -63,7 +63,7 @@ def run_training(
         OSError: a file cannot be read or written.
     """
     result = _trained(data, options, files, plot=plot, threads=threads, quiet=quiet)
-    model = (facts or MetadataOverrides()).applied(result.model)
+    model = (overrides or MetadataOverrides()).apply(result.model)
     write_model(output, model, absolute=False)
     if page is not None:
         views = find_view_set(model, data=data, validation_count=0)
@@ -83,7 +83,7 @@ def run_training_to_file(
     *,
     size_bytes: int | None = None,
     psnr: float | None = None,
-    facts: MetadataOverrides | None = None,
+    overrides: MetadataOverrides | None = None,
     plot: str | None = None,
     page: str | None = None,
     quiet: bool = False,
@@ -91,7 +91,7 @@ def run_training_to_file(
     """Read a data set, train, and tune a file to the same photographs; the trained scene itself is not written.
 
     Args:
-        data, options, facts, plot, page, quiet: as for `run_training`.
+        data, options, overrides, plot, page, quiet: as for `run_training`.
         output: the `.csplat` file to write, or `-`.
         files: as for `run_training`; checkpoints of the tuning are next to those of the training
             (`tuning_checkpoint`), and a run goes on from them if the training had ended.
@@ -111,7 +111,7 @@ def run_training_to_file(
     for one in _loaded(data).val:  # finds a damaged image before training; they are not kept
         _ = one.pixels, one.mask
     result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
-    model = (facts or MetadataOverrides()).applied(result.model)
+    model = (overrides or MetadataOverrides()).apply(result.model)
     views = find_view_set(model, data=data, validation_count=default_validation_count(0, cameras=None, data=data))
     known = None
     if result.metrics is not None and options.eval_views == 0 and options.device == "cpu":
