@@ -122,10 +122,10 @@ def sample_path() -> Path:
 
 @pytest.fixture(scope="module")
 def small_views():
-    """Make virtual views that decide and judge small: for searches and reports whose figures nobody reads."""
-    from csplat_tools.views.virtual_views import VirtualSizes
+    """Make virtual validation and test views small: for searches and reports whose figures nobody reads."""
+    from csplat_tools.views.virtual_views import VirtualViewSizes
 
-    small = VirtualSizes(judging=(8, 160, 120), deciding=(12, 80, 60), elsewhere=(12, 80, 60))
+    small = VirtualViewSizes(test=(8, 160, 120), validation=(12, 80, 60), extra=(12, 80, 60))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("csplat_tools.views.virtual_views.VIRTUAL_SIZES", small)
         yield

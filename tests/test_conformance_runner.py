@@ -444,5 +444,5 @@ def test_reports_for_one_place_are_refused_before_anything_runs(tmp_path, monkey
     command = f"touch {tmp_path / 'ran'}"
     result = invoke("--cmd", command + " {input} {outdir}", "--report", "same.json", "--junit", "same.json")
     assert 1 == result.exit_code
-    assert "is wanted for two outputs" in result.stderr
+    assert "is given for two outputs" in result.stderr
     assert [] == list(tmp_path.iterdir())

@@ -270,7 +270,7 @@ def test_a_packed_scene_that_fits_the_memory_is_unpacked_once(tmp_path, make_mod
 
     monkeypatch.setattr(spz, "read_spz_file", counting)
     encode_file(
-        str(tmp_path / "a.spz"), str(tmp_path / "a.csplat"), EncodeOptions(), scale=OutOfCoreOptions(by_disk=True)
+        str(tmp_path / "a.spz"), str(tmp_path / "a.csplat"), EncodeOptions(), scale=OutOfCoreOptions(out_of_core=True)
     )
     assert 1 == len(unpacked)
     with open_scenes((tmp_path / "a.spz", tmp_path / "a.spz"), 1 << 30) as (one, _):

@@ -851,7 +851,7 @@ def test_two_outputs_in_one_place_are_refused(capture, tmp_path, monkeypatch, wo
     monkeypatch.chdir(tmp_path)
     result = invoke("finetune", capture / "scene.ply", "--self", "-o", tmp_path / "s.csplat", *words)
     assert 1 == result.exit_code
-    assert "is wanted for two outputs" in result.stderr
+    assert "is given for two outputs" in result.stderr
     assert [] == list(tmp_path.iterdir())
 
 

@@ -317,7 +317,7 @@ def ply(model, tmp_path):
 
 
 def test_a_file_goes_by_way_of_the_disk_where_it_is_told(ply, tmp_path):
-    target, scale = tmp_path / "out.csplat", OutOfCoreOptions(memory_bytes=300_000_000, by_disk=True)
+    target, scale = tmp_path / "out.csplat", OutOfCoreOptions(memory_bytes=300_000_000, out_of_core=True)
     options = EncodeOptions(preset="fast", sh_degree=1, threads=1)
     foretold = estimate_cost(ply, options, scale)
     assert (COUNT, 1, False) == (foretold.count, foretold.sh_degree, foretold.needs.in_memory)

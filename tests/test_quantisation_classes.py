@@ -369,4 +369,4 @@ def test_the_command_says_that_weights_alone_grade_nothing(model, tmp_path, grad
     words = ["encode", tmp_path / "scene.ply", tmp_path / "a.csplat", "--importance", tmp_path / "weights.npy", "-q"]
     done = CliRunner().invoke(app, [str(word) for word in [*words, *(["--grades", grades] if grades else [])]])
     assert done.exit_code == 0
-    assert ("of one grade" in done.stderr) == (grades is not None)
+    assert ("in one quantisation class" in done.stderr) == (grades is not None)

@@ -213,7 +213,7 @@ def test_a_report_never_takes_the_place_of_the_film(ply, tmp_path):
     film = tmp_path / "turn.webp"
     result = CliRunner().invoke(app, ["render", str(ply), str(film), "--orbit", "2", "--report", str(film)])
     assert 1 == result.exit_code
-    assert "is wanted for two outputs" in result.stderr
+    assert "is given for two outputs" in result.stderr
     assert not film.exists()
 
 

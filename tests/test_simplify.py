@@ -232,7 +232,7 @@ def test_more_loss_lets_more_splats_go(source):
     noisy = [np.clip(p + 0.05 * rng.standard_normal(p.shape), 0, 1) for p in render_pictures(source, cameras)]
     pictures = [PosedImage(c, np.rint(255.0 * p).astype(np.uint8)) for c, p in zip(cameras, noisy, strict=True)]
     views = views_of(cameras, pictures)
-    judge = photograph_scorer(views.pictures(views.validation), views.background)
+    judge = photograph_scorer(views.photographs_of(views.validation), views.background)
     sizes = []
     for loss in (0.05, 1.0):
         result = simplify(source, max_psnr_drop=loss, views=views, options=replace(SMALL, bands=False, refit=False))

@@ -213,7 +213,7 @@ def test_no_command_decides_by_what_judges_and_all_say_the_same_of_the_same_scen
     model = read_ply(ply)
     views = find_view_set(model, data=DataOptions(str(sets["rgba"]), (24, 20), test_every=5))
     draw = renderer(model, views.background)
-    photographs, behind = views.pictures(views.test), np.array(views.background, np.float32)
+    photographs, behind = views.photographs_of(views.test), np.array(views.background, np.float32)
     found["evaluate"] = evaluate(lambda camera: draw(camera).rgb, photographs, behind)["psnr"]
     assert max(found.values()) - min(found.values()) < 0.01, found
     again = run("compare", ply, tmp_path / "half.ply")["photographs"]["b"]["psnr"]

@@ -1,4 +1,7 @@
-"""Print data on standard output, and messages, progress and tables on standard error."""
+"""Print data on standard output, messages and progress on standard error; format and parse what people read.
+
+Progress is a bar on a terminal, otherwise a line now and then. There is one standard error, so one display at a time.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +24,24 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 
-_PATIENCE = 2.0  # seconds for which a terminal shows nothing
-_EVERY = 10.0  # seconds from one line to the next if standard error is not a terminal
-_LOOK = 0.2  # seconds from one look at the clock to the next
-_ENOUGH = (0.03, 1.0)  # fraction done and seconds of a stage from which its remaining time is estimated
-_TOLD = 2  # reports of steps from which the time of the others is estimated
-_SPREAD = (0.8, 2.0)  # range of that estimate, as factors: a scene that grows takes longer
-_ABOUT = (0.6, 1.7)  # the same for estimates from the time that renders take
-_STAGES = 2  # number of stages shown at a time: those that were reported last
+_BAR_DELAY = 2.0  # seconds before a terminal shows bars
+_LINE_EVERY = 10.0  # seconds from one line to the next if standard error is not a terminal
+_TICK = 0.2  # seconds from one update of the display to the next
+_ESTIMATE_FROM = (0.03, 1.0)  # fraction done and seconds of a stage from which its remaining time is estimated
+_TIMED_REPORTS = 2  # reports of a long run from which its time is estimated
+_RUN_RANGE = (0.8, 2.0)  # range of that estimate, as factors: a scene that grows takes longer
+_RENDER_RANGE = (0.6, 1.7)  # the same for estimates from the time of renders
+_STAGES = 2  # stages shown at a time: those that were reported last
 _WORKING = "working"  # shown if no stage is known
 _MINUTES_FROM = 100.0  # seconds from which durations are given in minutes
 
-#: Work that takes more seconds than this is announced.
+#: Regular expression of a number, with one group.
+NUMBER = r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
+
+_UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
+_FILE_BYTES_MIN = 64  # size of a file's header: no file is smaller
+
+#: Seconds from which the time of work is announced.
 LONG_WORK_SECONDS = 10.0
 
 
@@ -42,7 +51,7 @@ def print_data(text: str) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Print a value as JSON. It must not contain NaN or infinities: JSON has none."""
+    """Print a value as JSON; NaN and infinities are refused, since JSON has none."""
     print_data(json.dumps(value, indent=2, allow_nan=False))
 
 
@@ -57,7 +66,7 @@ def note(text: str) -> None:
 
 
 class RunProgress(Protocol):
-    """The progress of a long run: the current iteration, and the number of all."""
+    """The progress of a long run."""
 
     @property
     def iteration(self) -> int:
@@ -84,30 +93,30 @@ def progress_bar(*, quiet: bool = False) -> Iterator[Progress | None]:
 
 @contextmanager
 def step_progress(
-    name: str, tell: Callable[[S], str], *, quiet: bool = False, clock: Callable[[], float] = time.monotonic
+    name: str, describe: Callable[[S], str], *, quiet: bool = False, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[Callable[[S], None] | None]:
-    """Show the steps of a long run as `progress_bar` does, with a text of its own, and announce the time they take.
+    """Show the progress of a long run with a text of its own, and announce its time.
 
     Args:
         name: name of the run.
-        tell: describes in a line the state of a run, and what is left.
+        describe: returns a line on the state of a run, and the time left.
         quiet: show nothing.
         clock: returns seconds.
 
     Yields:
         A callback for each step; `None` if nothing is shown.
     """
-    told: list[tuple[float, int]] = []
+    reports: list[tuple[float, int]] = []
 
     def show(now: S) -> None:
-        told.append((clock(), now.iteration))
-        if len(told) == _TOLD:  # the first steps load and compile: their time is not that of the others
-            (begun, first), (seconds, last) = told[0], told[-1]
+        reports.append((clock(), now.iteration))
+        if len(reports) == _TIMED_REPORTS:  # the first steps load and compile: their time is not that of the others
+            (begun, first), (seconds, last) = reports[0], reports[-1]
             left = (seconds - begun) / max(1, last - first) * (now.iterations - last)
             if left > LONG_WORK_SECONDS:
-                note(f"{name} takes about {format_range(_SPREAD[0] * left, _SPREAD[1] * left)} from here")
+                note(f"{name} takes about {format_range(_RUN_RANGE[0] * left, _RUN_RANGE[1] * left)} from here")
         if display is not None:
-            display.report(name, now.iteration / now.iterations, tell(now))
+            display.report(name, now.iteration / now.iterations, describe(now))
 
     with _displayed(quiet=quiet) as display:
         yield None if display is None else show
@@ -115,18 +124,18 @@ def step_progress(
 
 @dataclass
 class _Stage:
-    """A stage of the work: the time it began, and the last report of it."""
+    """A stage of the work: when it began, and its last report."""
 
     begun: float
     done: float = 0.0
-    words: str | None = None
+    text: str | None = None
 
 
 class Display:
-    """The display of progress. Owns the times at which work and its stages began, and the bars.
+    """A display of progress. Owns the times at which work and its stages began, and the bars.
 
-    A terminal shows nothing for two seconds, then a bar for each stage that goes on. Otherwise a line is printed every
-    ten seconds. `tick` is called often, whether there was a report or not: silent work is seen to go on, too.
+    A terminal shows nothing for two seconds, then a bar for each unfinished stage. Otherwise a line is printed every
+    ten seconds. `tick` is called often, with or without reports: silent work is shown as well.
 
     Args:
         terminal: True if standard error is a terminal.
@@ -135,37 +144,37 @@ class Display:
 
     def __init__(self, *, terminal: bool, clock: Callable[[], float] = time.monotonic) -> None:
         self._terminal, self._clock, self._lock = terminal, clock, threading.RLock()
-        self._begun = self._said = clock()
+        self._begun = self._printed = clock()
         self._stages: dict[str, _Stage] = {}
         self._bars: Bars | None = None
         self._tasks: dict[str, TaskID] = {}
 
-    def report(self, stage: str, done: float, words: str | None = None) -> None:
+    def report(self, stage: str, done: float, text: str | None = None) -> None:
         """Record the progress of a stage.
 
         Args:
             stage: its name.
-            done: fraction that is done, 0 to 1; if it is less than before, the stage has begun anew.
-            words: text to show instead of percentage and time left.
+            done: fraction done, 0 to 1; less than before: the stage has begun anew.
+            text: text to show instead of percentage and time left.
         """
         with self._lock:
             known = self._stages.pop(stage, None)
             if known is None or done < known.done:
                 known = _Stage(self._clock())
-            known.done, known.words = done, words
+            known.done, known.text = done, text
             self._stages[stage] = known  # last in the order: reported last
 
     def tick(self) -> None:
         """Update the bars, or print a line if one is due."""
         with self._lock:
             now = self._clock()
-            going = [(name, stage) for name, stage in self._stages.items() if stage.done < 1.0][-_STAGES:]
+            unfinished = [(name, stage) for name, stage in self._stages.items() if stage.done < 1.0][-_STAGES:]
             if self._terminal:
-                if now - self._begun >= _PATIENCE:
-                    self._move(going or [(_WORKING, _Stage(now))], now)
-            elif now - self._said >= _EVERY:
-                self._said = now
-                text = "; ".join(f"{name} {_words(stage, now)}".rstrip() for name, stage in going) or _WORKING
+                if now - self._begun >= _BAR_DELAY:
+                    self._update_bars(unfinished or [(_WORKING, _Stage(now))], now)
+            elif now - self._printed >= _LINE_EVERY:
+                self._printed = now
+                text = "; ".join(f"{name} {_stage_text(stage, now)}".rstrip() for name, stage in unfinished) or _WORKING
                 minutes, seconds = divmod(int(now - self._begun), 60)
                 note(f"{text}; {minutes}:{seconds:02d} so far")
 
@@ -176,25 +185,25 @@ class Display:
                 self._bars.stop()
             self._bars, self._tasks = None, {}
 
-    def _move(self, going: Sequence[tuple[str, _Stage]], now: float) -> None:
+    def _update_bars(self, unfinished: Sequence[tuple[str, _Stage]], now: float) -> None:
         """Update the bars, and remove those of stages that ended."""
         if self._bars is None:
             self._bars = _new_bars()
             self._bars.start()
-        for name in self._tasks.keys() - dict(going).keys():
+        for name in self._tasks.keys() - dict(unfinished).keys():
             self._bars.remove_task(self._tasks.pop(name))
-        for name, stage in going:
+        for name, stage in unfinished:
             if name not in self._tasks:
                 self._tasks[name] = self._bars.add_task(name, words="")
             total = 1.0 if stage.done > 0.0 else None  # None: a bar that only shows that work goes on
-            self._bars.update(self._tasks[name], completed=stage.done, total=total, words=_words(stage, now))
+            self._bars.update(self._tasks[name], completed=stage.done, total=total, words=_stage_text(stage, now))
         self._bars.refresh()
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[object]], *, left: int = 1) -> str:
-    """Lay out a table as text: the first columns to the left, the others to the right.
+    """Format a table: the first `left` columns flush left, the others flush right.
 
-    The same on a terminal and in a pipe, so that it can be searched, cut and compared.
+    The text is the same on a terminal and in a pipe, so that it can be searched, cut and compared.
     """
     cells = [list(header), *([str(cell) for cell in row] for row in rows)]
     widths = [max(len(row[column]) for row in cells) for column in range(len(header))]
@@ -216,6 +225,22 @@ def format_bytes(size_bytes: int) -> str:
     return f"{size_bytes} bytes"
 
 
+def parse_size_bytes(text: str) -> int:
+    """Parse a size such as `5MB`, `300 kB`, `1.5MiB` or `123456`; MB is 10⁶, MiB is 2²⁰ bytes.
+
+    Raises:
+        InputError: the text is not a size, or is smaller than any file.
+    """
+    found = re.fullmatch(NUMBER + r"\s*([kmg]?i?b?)", text.strip(), re.IGNORECASE)
+    unit = None if found is None else _UNITS.get(found[2].lower())
+    size = None if found is None or unit is None else float(found[1]) * unit
+    if size is None or not 1.0 <= size < 2.0**63:
+        raise InputError(f"a size is {text!r}, wanted bytes, or a number with kB, MB, GB, KiB, MiB or GiB")
+    if size < _FILE_BYTES_MIN:
+        raise InputError(f"no file has {size:.0f} bytes or fewer; did you mean {text.strip()}MB?")
+    return int(size)
+
+
 def format_seconds(seconds: float) -> str:
     """Format a duration for people, rounded: `12 s`, `3 minutes`."""
     return f"{seconds:.0f} s" if seconds < _MINUTES_FROM else f"{seconds / 60.0:.0f} minutes"
@@ -223,7 +248,7 @@ def format_seconds(seconds: float) -> str:
 
 def format_estimate(seconds: float) -> str:
     """Format an estimated duration as a range: `20 to 50 s`."""
-    return format_range(_ABOUT[0] * seconds, _ABOUT[1] * seconds)
+    return format_range(_RENDER_RANGE[0] * seconds, _RENDER_RANGE[1] * seconds)
 
 
 def format_range(least: float, most: float) -> str:
@@ -238,7 +263,7 @@ _displays: list[Display] = []  # the display that is shown, at most one: there i
 
 @contextmanager
 def displayed(display: Display) -> Iterator[Display]:
-    """Show progress on this display until the end; `print_data` and `note` take its bars away first."""
+    """Show progress on a display until the end; `print_data` and `note` remove its bars first."""
     _displays.append(display)
     try:
         yield display
@@ -259,11 +284,11 @@ def _displayed(*, quiet: bool) -> Iterator[Display | None]:
 
     with displayed(Display(terminal=sys.stderr.isatty())) as display:
 
-        def look() -> None:
-            while not ended.wait(_LOOK):
+        def tick() -> None:
+            while not ended.wait(_TICK):
                 display.tick()
 
-        thread = threading.Thread(target=look, name="csplat progress", daemon=True)
+        thread = threading.Thread(target=tick, name="csplat progress", daemon=True)
         thread.start()
         try:
             yield display
@@ -272,14 +297,14 @@ def _displayed(*, quiet: bool) -> Iterator[Display | None]:
             thread.join()
 
 
-def _words(stage: _Stage, now: float) -> str:
-    """Return the percentage done of a stage, and an estimate of the time left."""
-    if stage.words is not None:
-        return stage.words
+def _stage_text(stage: _Stage, now: float) -> str:
+    """Return the percentage of a stage that is done, and an estimate of the time left."""
+    if stage.text is not None:
+        return stage.text
     if stage.done <= 0.0:
         return ""
     share, seconds = f"{100.0 * stage.done:.0f} %", now - stage.begun
-    if stage.done < _ENOUGH[0] or seconds < _ENOUGH[1]:
+    if stage.done < _ESTIMATE_FROM[0] or seconds < _ESTIMATE_FROM[1]:
         return share
     return f"{share}, about {format_seconds(seconds * (1.0 / stage.done - 1.0))} left"
 
@@ -302,26 +327,3 @@ def _echo(text: str, stream: TextIO) -> None:
         display.close()  # bars and lines on one terminal do not mix
     encoding = stream.encoding or "utf-8"  # file names and metadata may hold characters that it cannot represent
     stream.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
-
-
-#: A regular expression for a number, which is its first group.
-NUMBER = r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
-
-_UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
-_LEAST_FILE = 64  # bytes of a file's header: no file is smaller
-
-
-def parse_size_bytes(text: str) -> int:
-    """Parse a number of bytes from `5MB`, `300 kB`, `1.5MiB` or `123456`; MB is 10⁶, MiB is 2²⁰.
-
-    Raises:
-        InputError: the text is not a size, or is smaller than any file.
-    """
-    found = re.fullmatch(NUMBER + r"\s*([kmg]?i?b?)", text.strip(), re.IGNORECASE)
-    unit = None if found is None else _UNITS.get(found[2].lower())
-    size = None if found is None or unit is None else float(found[1]) * unit
-    if size is None or not 1.0 <= size < 2.0**63:
-        raise InputError(f"a size is {text!r}, wanted bytes, or a number with kB, MB, GB, KiB, MiB or GiB")
-    if size < _LEAST_FILE:
-        raise InputError(f"no file has {size:.0f} bytes or fewer; did you mean {text.strip()}MB?")
-    return int(size)

@@ -22,9 +22,9 @@ from csplat.types import F64, Mask, Progress
 from csplat_tools.file_streams import is_one_way, local_path, mapped_csplat, write_model
 from csplat_tools.scene_files import MetadataOverrides, findings_as_json, size_on_disk, with_progress
 
-_CELL = 0.01  # fraction of a scene's extent: distance within which neighbours count for any splat
-_SPREAD = 4.0  # standard deviations of a splat: distance within which neighbours count if that is farther
-_COMPANY = 8  # number of splats, itself included: with fewer in its neighbourhood a splat is a floater
+_CELL = 0.01  # fraction of the scene's extent: distance of neighbours of any splat
+_SPREAD = 4.0  # standard deviations of a splat: distance of its neighbours, if that is farther
+_NEIGHBOURS_MIN = 8  # splats in the neighbourhood, itself included: with fewer a splat is a floater
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Filters:
         translate: offset added to all positions, scene units.
         crop_box: keep splats whose centres lie between two corners, x y z each.
         crop_sphere: keep splats whose centres lie within a sphere, x y z and radius.
-        drop_floaters: drop splats that have next to no others around them.
+        drop_floaters: drop splats with almost no others around them.
         sh_degree: leave out the SH bands above.
     """
 
@@ -58,38 +58,38 @@ class Filters:
             scene = convert_axes(scene, self.to_axes)
         if self.rotate is not None:
             matrix = _rotation(self.rotate)
-            scene = _changed(scene, lambda model: rotate_scene(model, matrix))
+            scene = _map_blocks(scene, lambda model: turned(model, matrix))
         if self.scale is not None:
             factor = self.scale
-            scene = _changed(scene, lambda model: scale_scene(model, factor))
+            scene = _map_blocks(scene, lambda model: scaled(model, factor))
         if self.translate is not None:
             offset = self.translate
-            scene = _changed(scene, lambda model: translate_scene(model, offset))
+            scene = _map_blocks(scene, lambda model: moved(model, offset))
         if self.crop_box is not None:
             corners = np.sort(np.array(self.crop_box).reshape(2, 3), axis=0)
-            scene = _kept(scene, lambda model: _inside_box(model, corners))
+            scene = _select(scene, lambda model: _inside_box(model, corners))
         if self.crop_sphere is not None:
             sphere = np.array(self.crop_sphere)
-            scene = _kept(scene, lambda model: _inside_sphere(model, sphere))
+            scene = _select(scene, lambda model: _inside_sphere(model, sphere))
         if self.drop_floaters:
             scene = _without_floaters(scene)
         if self.sh_degree is not None:
             degree = self.sh_degree
-            scene = _changed(scene, lambda model: drop_bands(model, degree))
+            scene = _map_blocks(scene, lambda model: without_bands(model, degree))
         return scene
 
 
 def find_floaters(points: F64, sizes: F64) -> Mask:
-    """Find splats with next to no others around them: within 1 % of the extent, or four times their own size.
+    """Find splats with almost no others within 1 % of the extent, or within four times their own size.
 
     Args:
         points: [N, 3] centres.
         sizes: [N] standard deviations, scene units.
 
     Returns:
-        [N] bool, True for isolated splats.
+        [N] bool, True for floaters.
     """
-    if len(points) < _COMPANY:
+    if len(points) < _NEIGHBOURS_MIN:
         return np.zeros(len(points), np.bool_)
     low, high = np.quantile(points, [0.05, 0.95], axis=0)
     extent = float(np.sqrt(np.sum((high - low) ** 2)))
@@ -103,12 +103,12 @@ def find_floaters(points: F64, sizes: F64) -> Mask:
         cells = np.floor(np.clip((points - low) / (_CELL * extent * 2.0**octave), -(2.0**19), 2.0**19)).astype(np.int64)
         keys, counts = np.unique(_key(cells), return_counts=True)
         own = np.flatnonzero(octaves == octave)
-        company = np.zeros(len(own), np.int64)
+        neighbours = np.zeros(len(own), np.int64)
         for step in np.ndindex(3, 3, 3):
             wanted = _key(cells[own] + (np.array(step) - 1))
             at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-            company += np.where(keys[at] == wanted, counts[at], 0)
-        found[own] = company < _COMPANY
+            neighbours += np.where(keys[at] == wanted, counts[at], 0)
+        found[own] = neighbours < _NEIGHBOURS_MIN
     return found
 
 
@@ -118,17 +118,17 @@ def _key(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     return key
 
 
-def _changed(scene: SceneSource, change: Callable[[SplatModel], SplatModel]) -> SceneSource:
+def _map_blocks(scene: Scene, change: Callable[[SplatModel], SplatModel]) -> Scene:
     blocks = scene.blocks
     return replace(scene, facts=change(scene.facts), blocks=lambda: (change(model) for model in blocks()))
 
 
-def _kept(scene: SceneSource, keep: Callable[[SplatModel], Mask]) -> SceneSource:
+def _select(scene: Scene, keep: Callable[[SplatModel], Mask]) -> Scene:
     def blocks() -> Iterator[SplatModel]:
         for model in scene.blocks():
-            left = keep(model)
-            if left.any():
-                yield model.select(left)
+            kept = keep(model)
+            if kept.any():
+                yield model.select(kept)
 
     count = sum(int(np.count_nonzero(keep(model))) for model in scene.blocks())
     return replace(scene, count=count, blocks=blocks)
@@ -147,10 +147,10 @@ def _without_floaters(scene: SceneSource) -> SceneSource:
     def blocks() -> Iterator[SplatModel]:
         at = 0
         for model in scene.blocks():
-            left = ~floats[at : at + len(model)]
+            kept = ~floats[at : at + len(model)]
             at += len(model)
-            if left.any():
-                yield model.select(left)
+            if kept.any():
+                yield model.select(kept)
 
     return replace(scene, count=scene.count - int(np.count_nonzero(floats)), blocks=blocks)
 
@@ -187,7 +187,7 @@ class Conversion:
         count, sh_degree: number of splats and SH degree of the scene that was written, or would be.
         source_bytes, size_bytes: sizes of the files; the latter is an estimate if nothing was written, `None` if it
             cannot be estimated.
-        lost: contents that the target has no place for.
+        lost: contents that the target cannot hold.
         rounded: names of the arrays that the target rounds.
         axes: axes before and after.
         findings: findings in the source.
@@ -244,14 +244,14 @@ def convert_file(
         source: a file, or a folder, or `-`.
         target: the file or folder to write; its name determines the format unless `write_as` does. The caller has
             checked that it may be replaced.
-        read_as: the name of the source's format, if its content does not tell.
+        read_as: name of the source's format, if its content does not identify it.
         write_as: the name of the target's format.
-        level: level of detail to read from a source that has several; 0 is the finest.
+        level: level of detail to read if the source has several; 0 is the finest.
         overrides: overrides of the source's metadata.
         filters: changes of the scene on the way.
         no_loss: refuse if anything would be lost.
         dry_run: write nothing.
-        progress: called with the fraction of splats that is read; some formats read them twice.
+        progress: progress callback; some formats read splats twice.
 
     Raises:
         CsplatError: the source is not whole, the target cannot hold it, or `no_loss` is set and something is lost.
@@ -261,25 +261,25 @@ def convert_file(
     if writes.write is None:
         raise InputError(f"{target} would be {writes.title}, which csplat does not write")
     sh_degree = None if filters is None else filters.sh_degree
-    with local_path(source) as local, open_scene(local, read_as, level=level, sh_degree=sh_degree) as opened:
-        scene = (overrides or MetadataOverrides()).apply_to_scene(opened)
+    with local_path(source) as local, open_scene(local, read_as, level=level, sh_degree=sh_degree) as reader:
+        scene = (overrides or MetadataOverrides()).apply_to_scene(reader)
         before = scene.facts.coordinate_system
         scene = (filters or Filters()).apply(scene)
         lost = writes.losses(scene.facts)
         rounded = tuple(
             name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.facts.sh_degree)
         )
-        made = Conversion(
-            opened.format, writes.name, scene.count, scene.facts.sh_degree, size_on_disk(local),
+        result = Conversion(
+            reader.format, writes.name, scene.count, scene.facts.sh_degree, size_on_disk(local),
             writes.expected_bytes(scene.facts, scene.count), lost, rounded,
             (before, writes.axes or scene.facts.coordinate_system), (),
         )  # fmt: skip
         if no_loss and (lost or rounded):
-            raise InputError(f"{writes.title} does not keep all of {source}: {made.losses()}")
+            raise InputError(f"{writes.title} does not keep all of {source}: {result.losses()}")
         if not dry_run:
             writes.write(Path(target), with_progress(scene, "reading", progress))
-            made = replace(made, size_bytes=size_on_disk(Path(target)))
-        return replace(made, findings=tuple(opened.findings))
+            result = replace(result, size_bytes=size_on_disk(Path(target)))
+        return replace(result, findings=tuple(reader.findings))
 
 
 def decode_file(
@@ -292,7 +292,7 @@ def decode_file(
     overrides: MetadataOverrides | None = None,
     progress: Progress | None = None,
 ) -> tuple[int, int]:
-    """Read a .csplat file, write a PLY, some splats at a time.
+    """Decode a .csplat file to a PLY, some splats at a time.
 
     Args:
         source: the file, or `-`.
@@ -301,7 +301,7 @@ def decode_file(
         absolute: add the origin and write doubles.
         max_splats: refuse a scene of more splats; `None`: no limit.
         overrides: overrides of the file's metadata for the PLY.
-        progress: called with the stage's name and the fraction done.
+        progress: progress callback.
 
     Returns:
         The number of splats written, and their SH degree.

@@ -33,57 +33,57 @@ from csplat_tools.scene_files import (
     size_on_disk,
 )
 
-_FOLDS = 4  # memory of a scene as a multiple of its PLY's size; other formats have to be opened to tell
-#: By SH degree: seconds per million splats to read once, and to code; seconds for a codebook. Within a tenth of the
-#: times measured with copies of fox120k at `balanced`: 10 M and 100 M splats of degree 0, 3 M of degrees 1, 2 and 3,
-#: 30 M of degree 3.
+_MEMORY_FACTOR = 4  # memory of a scene over the size of its PLY; other formats have to be opened to tell
+#: By SH degree: seconds per million splats for one reading pass and for coding; seconds for a codebook. Within a tenth
+#: of the times measured with copies of fox120k at `balanced`: 10 M and 100 M splats of degree 0, 3 M of degrees 1, 2
+#: and 3, 30 M of degree 3.
 _SECONDS = ((0.2, 3.1, 0.0), (0.35, 7.0, 8.0), (0.45, 7.3, 12.0), (0.55, 8.0, 20.0))
 #: Bytes per splat of a file, by preset and SH degree 0 to 3.
 _FILE_BYTES = {"fast": (9.0, 9.5, 10.0, 11.0), "balanced": (6.5, 8.0, 8.5, 9.0), "small": (5.0, 6.5, 7.0, 7.5)}
-_SMALL = 4 << 20  # bytes: a file up to this size, in any format, fits in every memory
+_SMALL = 4 << 20  # bytes: a file up to this size, in any format, fits in any memory
 
 
 @dataclass(frozen=True)
 class OutOfCoreOptions:
-    """Options for encoding scenes larger than memory.
+    """Options for encoding scenes that may be larger than memory.
 
     Attributes:
         memory_bytes: bound on the memory; `None`: half of the free memory.
-        folder: the working folder; `None`: next to the file.
-        resume: go on from the content of the working folder.
+        folder: working folder; `None`: next to the file.
+        resume: continue from the content of the working folder.
         cluster: address of a Dask scheduler.
-        by_disk: a scene of several buckets does not stay in memory, even if it would fit.
+        out_of_core: a scene of several buckets is encoded out of core, even if it fits in memory.
     """
 
     memory_bytes: int | None = None
     folder: str | None = None
     resume: bool = False
     cluster: str | None = None
-    by_disk: bool = False
+    out_of_core: bool = False
 
     def may_exceed_memory(self, path: Path) -> bool:
         """Return True if a scene may not fit in memory, and has to be opened to tell."""
-        if self.cluster is not None or self.resume or self.by_disk:
+        if self.cluster is not None or self.resume or self.out_of_core:
             return True
         bound = default_memory_bytes() if self.memory_bytes is None else self.memory_bytes
         size = size_on_disk(path)
-        return size > _SMALL and (detect_format(path).name != "ply" or size * _FOLDS > bound)
+        return size > _SMALL and (detect_format(path).name != "ply" or size * _MEMORY_FACTOR > bound)
 
 
 @dataclass(frozen=True)
 class OutOfCoreResult:
-    """The outcome of encoding a scene that was not in memory."""
+    """The outcome of encoding a scene out of core."""
 
-    facts: SplatModel
+    metadata: SplatModel
     report: EncodeReport
     findings: tuple[Finding, ...]
 
 
 def read_degree(options: EncodeOptions) -> int | None:
-    """Return the SH degree with which to read a scene to be encoded; `None` keeps all bands.
+    """Return the SH degree at which to read a scene to be encoded; `None` keeps all bands.
 
-    Bands that the encoder drops are read, too, because they are part of the declared errors. A file of a higher degree
-    than models have is readable only if bands are to be left out.
+    Bands that the encoder drops are read as well: they are part of the declared errors. A file of a higher degree than
+    models have is readable only if bands are to be left out.
     """
     return None if options.sh_degree is None else MAX_SH_DEGREE
 
@@ -98,7 +98,7 @@ def encode_out_of_core(
     strict: bool,
     progress: Progress | None,
 ) -> OutOfCoreResult | LoadedModel | None:
-    """Encode a scene by way of the disk, or return it if it fits in memory.
+    """Encode a scene out of core, or return it if it fits in memory.
 
     Args:
         local: the scene, in any format.
@@ -110,8 +110,8 @@ def encode_out_of_core(
         progress: progress callback.
 
     Returns:
-        The outcome of the encoding; or the scene in memory, as `read_source` returns it; `None` if it fits in memory
-        and its format has a reader that is faster from the beginning.
+        The outcome of the encoding; or the scene in memory, as `read_source` returns it; `None` if it fits in memory,
+        and is read faster by `read_source`.
 
     Raises:
         CsplatError: as for `encode_scene`; or the scene is too large to go to standard output.
@@ -119,34 +119,34 @@ def encode_out_of_core(
     """
     if progress is not None:
         progress("opening", 0.0)
-    with open_scene(local, sh_degree=read_degree(options)) as opened:
-        in_memory = estimate_needs(opened, options, scale.memory_bytes, by_disk=scale.by_disk).in_memory
+    with open_scene(local, sh_degree=read_degree(options)) as reader:
+        in_memory = needs_of(reader, options, scale.memory_bytes, by_disk=scale.out_of_core).in_memory
         if in_memory and scale.cluster is None and not scale.resume:
-            if opened.format in CHEAP_TO_REOPEN:
+            if reader.format in CHEAP_TO_REOPEN:
                 return None
             findings: list[Finding] = []
             if progress is not None:
                 progress("reading", 0.0)
-            model = read_all(opened, strict=strict, keep_extra=options.keep_extra, report=findings)
+            model = read_all(reader, strict=strict, keep_extra=options.keep_extra, report=findings)
             model = (overrides or MetadataOverrides()).apply(model)
             return LoadedModel(model, size_on_disk(local), name=local.name, findings=tuple(findings))
         if target == STANDARD_STREAM:
-            raise InputError("the scene does not fit the memory, and would be written by way of the disk: name a file")
-        findings = [*opened.findings]
-        if opened.facts.extra and not options.keep_extra:
-            findings.append(dropped_columns(list(opened.facts.extra)))
+            raise InputError("the scene does not fit in memory, and is written by way of the disk: name a file")
+        findings = [*reader.findings]
+        if reader.facts.extra and not options.keep_extra:
+            findings.append(dropped_columns(list(reader.facts.extra)))
         refuse(findings, strict=strict)
-        scene = (overrides or MetadataOverrides()).apply_to_scene(opened)
+        scene = (overrides or MetadataOverrides()).apply_to_scene(reader)
         try:
             report = encode_scene(
-                scene, target, options, memory_bytes=scale.memory_bytes, by_disk=scale.by_disk, folder=scale.folder,
+                scene, target, options, memory_bytes=scale.memory_bytes, by_disk=scale.out_of_core, folder=scale.folder,
                 resume=scale.resume, cluster=scale.cluster, progress=progress,
                 source={"name": local.name, "size": size_on_disk(local), "changed": local.stat().st_mtime_ns},
             )  # fmt: skip
         except (KeyboardInterrupt, OSError):
             folder = Path(scale.folder or f"{target}.work")
             if folder.exists():
-                note(f"{folder} keeps what is done: --resume goes on with it")
+                note(f"{folder} keeps what is done: --resume continues with it")
             raise
         return OutOfCoreResult(scene.facts, report, tuple(findings))
 
@@ -183,16 +183,16 @@ class CostEstimate:
 
 
 def estimate_cost(local: Path, options: EncodeOptions, scale: OutOfCoreOptions) -> CostEstimate:
-    """Estimate the cost of encoding a scene, without looking at its splats.
+    """Estimate the cost of encoding a scene, without reading its splats.
 
     Raises:
         CsplatError: the scene is not valid, or the memory is too little.
         OSError: the scene cannot be read.
     """
-    with open_scene(local, sh_degree=read_degree(options)) as opened:
-        needs = estimate_needs(opened, options, scale.memory_bytes, by_disk=scale.by_disk)
-        count = opened.count
-        degree = opened.facts.sh_degree if options.sh_degree is None else min(options.sh_degree, opened.facts.sh_degree)
+    with open_scene(local, sh_degree=read_degree(options)) as reader:
+        needs = needs_of(reader, options, scale.memory_bytes, by_disk=scale.out_of_core)
+        count = reader.count
+        degree = reader.facts.sh_degree if options.sh_degree is None else min(options.sh_degree, reader.facts.sh_degree)
     read, code, book = _SECONDS[min(degree, 1) if options.preset == "fast" else degree]
     passes = 1 if needs.in_memory else 4
     seconds = count / 1e6 * (read * passes + code / needs.workers) + book * min(1.0, count / 5e5) / needs.workers
@@ -205,18 +205,18 @@ class EncoderOutcome:
 
     Attributes:
         result: the encoder's result.
-        key: name of the entry of a JSON report that holds `said`; "": none.
-        said: report of the target, the candidates and the choice, JSON-compatible.
+        key: name of the entry of a JSON report that holds `report`; "": none.
+        report: the target, the candidates and the choice, JSON-compatible.
         lines: remarks for the user, a sentence each.
     """
 
     result: EncodeResult
     key: str = ""
-    said: Mapping[str, Any] = field(default_factory=dict)
+    report: Mapping[str, Any] = field(default_factory=dict)
     lines: tuple[str, ...] = ()
 
 
-#: Encodes a scene, with a progress callback.
+#: A function that encodes a scene, with a progress callback.
 EncodeFunction = Callable[[SplatModel, EncodeOptions, Progress | None], EncoderOutcome]
 
 
@@ -225,9 +225,9 @@ class EncodedFile:
     """The outcome of an encoding.
 
     Attributes:
-        source: the scene as it was encoded; without its splats if it did not stay in memory.
+        source: the scene as it was encoded; without its splats if it was not in memory.
         report: choices and errors.
-        made: the encoded file; `None` if the scene did not stay in memory.
+        outcome: the encoded file; `None` if the scene was not in memory.
         findings: findings of lint in the PLY.
         source_bytes: size of the PLY.
         seconds: time of reading, encoding and writing.
@@ -235,14 +235,14 @@ class EncodedFile:
 
     source: SplatModel
     report: EncodeReport
-    made: EncoderOutcome | None
+    outcome: EncoderOutcome | None
     findings: tuple[Finding, ...]
     source_bytes: int
     seconds: float
 
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
-        report, made = self.report, self.made
+        report, outcome = self.report, self.outcome
         count = report.splat_count
         return {
             "splats": count,
@@ -256,7 +256,7 @@ class EncodedFile:
             "notes": list(report.notes),
             "stated_errors": {name: {"max": pair[0], "rms": pair[1]} for name, pair in report.errors.items()},
             "options": report.options,
-            **({made.key: dict(made.said)} if made is not None and made.key else {}),
+            **({outcome.key: dict(outcome.report)} if outcome is not None and outcome.key else {}),
         }
 
 
@@ -274,7 +274,7 @@ def encode_file(
     scale: OutOfCoreOptions | None = None,
     progress: Progress | None = None,
 ) -> EncodedFile:
-    """Read a PLY, encode it, write the file.
+    """Read a scene file, encode it, and write the .csplat file.
 
     Args:
         source: a PLY, or `-`.
@@ -285,7 +285,7 @@ def encode_file(
         importance: a .npy file with one weight per splat of the PLY as read, or a file of `csplat sensitivity`.
         prune_unseen: leave out the splats that no view of the sensitivities saw.
         source_index: a .npy file to write: for each splat of the file, its index in the PLY as read.
-        encoder: encodes instead of the plain encoder, such as a target search; it does not get `importance`.
+        encoder: a function to call instead of the encoder, such as a target search; it does not get `importance`.
         scale: memory, disk and workers. An `encoder`, an importance or a source index requires the scene in memory.
         progress: progress callback.
 
@@ -301,7 +301,7 @@ def encode_file(
             done = encode_out_of_core(local, target, options, overrides, scale, strict=strict, progress=progress)
             if isinstance(done, OutOfCoreResult):
                 seconds = time.perf_counter() - start
-                return EncodedFile(done.facts, done.report, None, done.findings, size_on_disk(local), seconds)
+                return EncodedFile(done.metadata, done.report, None, done.findings, size_on_disk(local), seconds)
             read = done
         if read is None:
             read = read_source(
@@ -310,18 +310,20 @@ def encode_file(
             )  # fmt: skip
     model = read.model
     if encoder is not None:
-        made = encoder(model, options, progress)
+        outcome = encoder(model, options, progress)
     elif importance is None:
         if prune_unseen:
-            raise InputError("only what `csplat sensitivity` wrote says which splats no view saw")
-        made = EncoderOutcome(encode_with_report(model, options, progress=progress))
+            raise InputError("splats that no view saw are known only from a file of `csplat sensitivity`")
+        outcome = EncoderOutcome(encode_with_report(model, options, progress=progress))
     else:
         from csplat_tools.importance_file import encode_by_importance  # imports names of trainer and renderer
 
-        made = EncoderOutcome(
+        outcome = EncoderOutcome(
             encode_by_importance(model, options, importance, prune_unseen=prune_unseen, progress=progress)
         )
-    write_bytes(target, made.result.data)
+    write_bytes(target, outcome.result.data)
     if source_index is not None:
-        write_array(source_index, made.result.source_index)
-    return EncodedFile(model, made.result.report, made, read.findings, read.size_bytes, time.perf_counter() - start)
+        write_array(source_index, outcome.result.source_index)
+    return EncodedFile(
+        model, outcome.result.report, outcome, read.findings, read.size_bytes, time.perf_counter() - start
+    )

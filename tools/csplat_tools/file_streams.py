@@ -1,4 +1,4 @@
-"""Files, standard input and standard output of the commands.
+"""Open the files, standard input and standard output of commands.
 
 `-` is standard input or output. A file appears under its name only when it is complete, and an existing one is
 replaced only with `force`.
@@ -34,10 +34,10 @@ from csplat.scene_source import SceneSource
 
 STANDARD_STREAM = "-"
 
-_OURS = ("ply", "csplat")  # names of the formats that commands other than `convert` write
+_OWN_FORMATS = ("ply", "csplat")  # names of the formats that commands other than `convert` write
 _PLY_MAGICS = (b"ply\n", b"ply\r")
 
-#: The command that makes an output from an input, by their file name endings; `*`: any.
+#: Commands by the file name endings of their input and output; `*`: any.
 _MAKERS = {
     (".csplat", ".ply"): "decode",
     (".ply", ".csplat"): "encode",
@@ -45,19 +45,19 @@ _MAKERS = {
     ("*", ".npz"): "sensitivity",
 }
 
-#: File name endings that csplat does not write, or not for scenes.
-_OTHERS = {".csv", ".gif", ".jpg", ".json", ".mp4", ".npy", ".pdf", ".png", ".svg", ".txt", ".webp", ".xml"}
+#: File name endings of files that are no scenes.
+_NO_SCENES = {".csv", ".gif", ".jpg", ".json", ".mp4", ".npy", ".pdf", ".png", ".svg", ".txt", ".webp", ".xml"}
 
 
 class _StandardInput(io.BytesIO):
     name = "standard input"
 
 
-_free: set[Path] = set()  # names that were free when checked: a file written there meanwhile is not replaced
+_free: set[Path] = set()  # names that were free when checked: a file that has appeared since is not replaced
 
 
 def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> None:
-    """Refuse an output before any work is done for it.
+    """Refuse an unusable output before any work is done for it.
 
     Args:
         path: the file to be written, or `-`.
@@ -89,12 +89,12 @@ def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> Non
 
 
 def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[str | None] = ()) -> None:
-    """Refuse outputs before any work is done for them: each as `check_output` does, or two of them in one place.
+    """Refuse unusable outputs before any work is done for them; see `check_output`.
 
     Args:
-        paths: the files to be written, or `-`; None for those that are not requested.
+        paths: the files to be written, or `-`; `None` for those that are not requested.
         force: existing files may be replaced.
-        inputs: files that the command reads, folders or URLs; None for those that are not given.
+        inputs: files that the command reads, folders or URLs; `None` for those that are not given.
 
     Raises:
         InputError: as for `check_output`; or two paths name the same file.
@@ -104,7 +104,7 @@ def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[
     places = [path if path == STANDARD_STREAM else Path(path).resolve() for path in outputs]
     for number, place in enumerate(places):
         if place in places[:number]:
-            raise InputError(f"{outputs[number]} is wanted for two outputs: name a file for each")
+            raise InputError(f"{outputs[number]} is given for two outputs: name a file for each")
     read = tuple(path for path in inputs if path is not None and not is_url(path))
     for path in read:
         if path != STANDARD_STREAM:
@@ -114,26 +114,26 @@ def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[
 
 
 def check_name(path: str, wanted: str, writer: str, source: str = "") -> None:
-    """Refuse an output whose name is that of another kind of file.
+    """Refuse an output with the name of another kind of file.
 
     Args:
         path: the output, or `-`.
-        wanted: file name ending of the files that are written.
-        writer: the name of the command whose argument it is, or the option whose value it is.
-        source: the input of that command; with it the message suggests a command that makes such a file, if any.
+        wanted: file name ending of the output.
+        writer: name of the command whose argument it is, or the option whose value it is.
+        source: the input of that command, to suggest a command that makes such a file.
 
     Raises:
-        InputError: the name ends like those of another kind of file. The message suggests what was meant.
+        InputError: the name has the ending of another kind of file; the message suggests what was meant.
     """
     target, suffix = Path(path), Path(path).suffix.lower()
     if suffix == wanted:
         return
-    others = [one for one in formats() if one.write is not None and one.name not in _OURS]
+    others = [one for one in formats() if one.write is not None and one.name not in _OWN_FORMATS]
     converts = any(target.name.lower().endswith(one.suffixes) for one in others)
     kind = None if converts else detect_name(target)
-    known = None if kind is None or kind.name in _OURS or not kind.is_scene else kind.title
+    known = None if kind is None or kind.name in _OWN_FORMATS or not kind.is_scene else kind.title
     maker = _MAKERS.get((Path(source).suffix.lower(), suffix)) or _MAKERS.get(("*", suffix)) or converts * "convert"
-    if known is None and not maker and suffix not in {kind for pair in _MAKERS for kind in pair} | _OTHERS:
+    if known is None and not maker and suffix not in {kind for pair in _MAKERS for kind in pair} | _NO_SCENES:
         return
     what = f"csplat does not write {known} yet, and" if known else f"it has the name of a {suffix} file, and"
     line = writer if writer.startswith("-") else f"csplat {writer}"
@@ -145,7 +145,7 @@ def check_name(path: str, wanted: str, writer: str, source: str = "") -> None:
 
 @contextmanager
 def local_path(file: File) -> Iterator[Path]:
-    """Yield the path of a file that can be read twice; `-`, named pipes, open files and bytes are copied first.
+    """Yield the path of a file that can be read twice; `-`, named pipes, open files and bytes are copied.
 
     Raises:
         InputError: `file` is not a file.
@@ -164,7 +164,7 @@ def kept_path(file: File) -> AbstractContextManager[Path]:
 
 @contextmanager
 def naming(file: object) -> Iterator[None]:
-    """Set the path of errors that do not name a file yet, if this file has a name."""
+    """Set the path of errors that name no file, if this file has a name."""
     try:
         yield
     except CsplatError as error:
@@ -192,9 +192,9 @@ def source_path(file: File) -> Iterator[Path]:
 
 
 def is_csplat(path: Path) -> bool:
-    """Return True if a file is a .csplat file, by its first bytes, or by its name if they are damaged.
+    """Return True for a .csplat file, by its first bytes, or by its name if they are damaged.
 
-    A PLY is not, whatever its name; nor is a folder (an unbundled SOG).
+    A PLY is none, whatever its name; nor is a folder (an unbundled SOG).
 
     Raises:
         OSError: the file cannot be read.
@@ -202,15 +202,15 @@ def is_csplat(path: Path) -> bool:
     if path.is_dir():
         return False
     with path.open("rb") as stream:
-        begin = stream.read(max(len(MAGIC), 4))
-    return begin.startswith(MAGIC) or (path.suffix.lower() == ".csplat" and not begin.startswith(_PLY_MAGICS))
+        head = stream.read(max(len(MAGIC), 4))
+    return head.startswith(MAGIC) or (path.suffix.lower() == ".csplat" and not head.startswith(_PLY_MAGICS))
 
 
 @contextmanager
 def mapped_csplat(path: str) -> Iterator[bytes | mmap]:
     """Yield the bytes of a .csplat file, memory-mapped if possible.
 
-    Their validity is checked by the decoder; only files of other known formats are recognised and refused here.
+    The decoder checks if they are valid; only files of other known formats are refused here.
 
     Raises:
         InputError: the file is in another format.
@@ -252,7 +252,7 @@ def write_array(path: str, array: NDArray[Any]) -> None:
 
 
 def write_bytes(path: str, data: bytes) -> None:
-    """Write a file, or to standard output; devices and named pipes are written directly."""
+    """Write a file or to standard output; devices and named pipes are written directly."""
     with _output_stream(path) as stream:
         stream.write(data)
 
@@ -270,7 +270,7 @@ def _output_stream(path: str) -> Iterator[BinaryIO]:
 
 @contextmanager
 def whole_output(path: str) -> Iterator[BinaryIO]:
-    """Like `_output_stream`, but data goes to standard output, too, only when it is complete."""
+    """Like `_output_stream`, but data reaches standard output only when it is complete."""
     if path != STANDARD_STREAM:
         with open_output(path) as stream:
             yield stream
@@ -283,7 +283,7 @@ def whole_output(path: str) -> Iterator[BinaryIO]:
 
 @contextmanager
 def open_output(path: str) -> Iterator[BinaryIO]:
-    """Open a file that takes its name when it is complete. One that was free when it was checked has to be free still.
+    """Open a file that gets its name when it is complete; a name that `check_output` found free must still be free.
 
     Raises:
         InputError: another program has written a file of that name meanwhile.
@@ -295,13 +295,13 @@ def open_output(path: str) -> Iterator[BinaryIO]:
             yield stream
     except FileExistsError:
         raise InputError(
-            f"{path} exists: another program wrote it meanwhile, and its file stays; --force replaces it"
+            f"{path} exists: another program wrote it meanwhile, and it was kept; --force replaces it"
         ) from None
     _free.discard(target)
 
 
 def write_json(path: str, value: Any) -> None:
-    """Write a value as JSON. It must not contain NaN or infinities: JSON has none."""
+    """Write a value as JSON; NaN and infinities are refused, since JSON has none."""
     write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
@@ -313,7 +313,7 @@ def write_model(path: str, model: SplatModel | SceneSource, *, absolute: bool) -
 
 
 def is_one_way(path: str) -> bool:
-    """Return True if data written to a path cannot be taken back: standard output, a device, a named pipe."""
+    """Return True for a path from which data cannot be withdrawn: standard output, a device, a named pipe."""
     return path == STANDARD_STREAM or (Path(path).exists() and not Path(path).is_file())
 
 
@@ -328,4 +328,4 @@ def _close(data: mmap) -> None:
     try:
         data.close()
     except BufferError:
-        return  # an error on its way up still holds a view; the garbage collector closes it
+        return  # an error that is raised still holds a view; the garbage collector closes it

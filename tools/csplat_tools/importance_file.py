@@ -1,4 +1,4 @@
-"""Encode by importance read from a file: weights (.npy), or the output of `csplat sensitivity` (.npz)."""
+"""Encode by the importance in a file: weights (.npy), or the output of `csplat sensitivity` (.npz)."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from csplat_render.virtual_cameras import scene_frame
 from csplat_trainer.sensitivity_file import StoredSensitivity, read_sensitivity
 
 _ZIP = b"PK"  # first bytes of a .npz file
-_ONE_GRADE = (
-    "all splats are of one grade: weights alone do not say how precise they have to be, nor do virtual views inside of"
-    " surroundings; `csplat sensitivity` from cameras does"
+_ONE_CLASS = (
+    "all splats are in one quantisation class: their precision does not follow from weights, nor from virtual views"
+    " inside surroundings; `csplat sensitivity` from cameras gives it"
 )
 
 
@@ -81,35 +81,35 @@ def encode_by_importance(
     found = read_importance(path, model)
     stored = found if isinstance(found, StoredSensitivity) else None
     if prune_unseen and stored is None:
-        raise InputError("only what `csplat sensitivity` wrote says which splats no view saw")
+        raise InputError("splats that no view saw are known only from a file of `csplat sensitivity`")
     weights = encoder_importance(found, model)
-    notes = _unheeded(options, weights)
+    notes = _class_notes(options, weights)
     if not prune_unseen or stored is None or stored.seen.all():
-        return _noted(encode_with_report(model, options, importance=weights, progress=progress), *notes)
+        return _with_notes(encode_with_report(model, options, importance=weights, progress=progress), *notes)
     rows = np.flatnonzero(stored.seen)
     if not len(rows):
-        raise InputError(f"{path}: no view saw any splat; nothing would be left")
-    said = {"unseen": len(model) - len(rows), "views": stored.view_count, "source": stored.source}
+        raise InputError(f"{path}: no view saw any splat; none would be kept")
+    pruned = {"unseen": len(model) - len(rows), "views": stored.view_count, "source": stored.source}
     result = encode_with_report(
         model.select(rows), options, importance=weights.select(rows) if isinstance(weights, Importance) else None,
-        origin=Origin(len(model), rows), metadata={"pruned": said}, progress=progress,
+        origin=Origin(len(model), rows), said={"pruned": pruned}, progress=progress,
     )  # fmt: skip
     if stored.missed_share > 0.0:  # False for NaN: no view was held out
         missed = (
-            f"{100 * stored.missed_share:.1f} % of the splats are left out although views that were kept aside saw"
+            f"{100 * stored.missed_share:.1f} % of the splats are left out although held-out views saw"
             " them: `csplat sensitivity` with more views misses fewer"
         )
         notes = (*notes, missed)
-    return _noted(result, *notes)
+    return _with_notes(result, *notes)
 
 
-def _unheeded(options: EncodeOptions, weights: NDArray[Any] | Importance) -> tuple[str, ...]:
+def _class_notes(options: EncodeOptions, weights: NDArray[Any] | Importance) -> tuple[str, ...]:
     """Return a note if quantisation classes were requested and the importance cannot provide them."""
     if (options.grades or 1) == 1 or (isinstance(weights, Importance) and weights.blocks is not None):
         return ()
-    return (_ONE_GRADE,)
+    return (_ONE_CLASS,)
 
 
-def _noted(result: EncodeResult, *notes: str) -> EncodeResult:
+def _with_notes(result: EncodeResult, *notes: str) -> EncodeResult:
     """Return the result with notes for the user added."""
     return replace(result, report=replace(result.report, notes=(*result.report.notes, *notes)))

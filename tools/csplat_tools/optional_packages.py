@@ -1,4 +1,4 @@
-"""Load optional packages, or raise a one-line error that tells how to install them."""
+"""Import optional packages, or raise an error that tells how to install them; compile the renderer."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from importlib import import_module
 from csplat.errors import missing_package
 from csplat_tools.console import note, progress_bar
 
-_FRUGAL_SPINS = "1000"  # see _wait_frugally
+_SPIN_COUNT = "1000"  # see `_limit_spinning`
 _PHOTOGRAPHS = (
     ("numba", None),
     ("scipy", None),
@@ -17,7 +17,7 @@ _PHOTOGRAPHS = (
 
 
 def require_renderer() -> None:
-    """Import the package that rendering needs, to fail before the minutes that reading may take.
+    """Import the package for rendering, to fail before the minutes that reading may take.
 
     Raises:
         InputError: numba is not installed.
@@ -28,7 +28,7 @@ def require_renderer() -> None:
 def prepare_renderer(
     *, quiet: bool, gradients: bool = False, simplify: bool = False, ssim: bool = False, lpips: bool = False
 ) -> None:
-    """Compile the renderer, or load what was compiled before; print a note if that takes long.
+    """Compile the renderer, or load it from the cache; print a note if that takes long.
 
     Args:
         quiet: print nothing.
@@ -44,19 +44,19 @@ def prepare_renderer(
     from csplat_render.warmup import warm_up
 
     others = [_warm_up_adam] if simplify else []
-    with progress_bar(quiet=quiet) as tell:
-        if tell is not None:
-            tell("preparing the renderer", 0.0)
+    with progress_bar(quiet=quiet) as progress:
+        if progress is not None:
+            progress("preparing the renderer", 0.0)
         warm_up(
             None if quiet else note, gradients=gradients or simplify, simplify=simplify, ssim=ssim, lpips=lpips,
             others=others,
         )  # fmt: skip
-        if tell is not None:
-            tell("preparing the renderer", 1.0)
+        if progress is not None:
+            progress("preparing the renderer", 1.0)
 
 
 def require_trainer(*, plots: bool = False) -> None:
-    """Import the packages that training on the CPU needs (not torch), after setting how OpenMP threads wait.
+    """Import the packages for training on the CPU (not torch), after setting how OpenMP threads wait.
 
     Args:
         plots: import the package for plots, too.
@@ -64,14 +64,14 @@ def require_trainer(*, plots: bool = False) -> None:
     Raises:
         InputError: a package is not installed.
     """
-    _wait_frugally()
+    _limit_spinning()
     require_photographs()
     if plots:
         require_plots()
 
 
 def require_images() -> None:
-    """Import the package that writing images needs.
+    """Import the package for writing images.
 
     Raises:
         InputError: pillow is not installed.
@@ -80,7 +80,7 @@ def require_images() -> None:
 
 
 def require_film() -> None:
-    """Import the package that writing MP4 needs.
+    """Import the package for writing MP4.
 
     Raises:
         InputError: PyAV is not installed.
@@ -89,7 +89,7 @@ def require_film() -> None:
 
 
 def require_plots() -> None:
-    """Import the package that drawing plots needs.
+    """Import the package for plots.
 
     Raises:
         InputError: matplotlib is not installed.
@@ -98,7 +98,7 @@ def require_plots() -> None:
 
 
 def require_photographs() -> None:
-    """Import the packages that reading data sets needs.
+    """Import the packages for reading data sets.
 
     Raises:
         InputError: a package is not installed.
@@ -123,11 +123,11 @@ def _need(module: str, package: str | None = None, *, extra: str = "render") -> 
         raise missing_package(error, package, extra=extra) from None
 
 
-def _wait_frugally() -> None:
+def _limit_spinning() -> None:
     """Let the threads of GNU OpenMP sleep soon while they wait for each other.
 
     They spin for milliseconds otherwise, and if another program uses the same cores, a training step waits for a
     thread that waits for a core; measured 57 instead of 470 ms per step. The library reads the variable when it is
     loaded, so it is set before; a value that the user has set is kept.
     """
-    os.environ.setdefault("GOMP_SPINCOUNT", _FRUGAL_SPINS)
+    os.environ.setdefault("GOMP_SPINCOUNT", _SPIN_COUNT)

@@ -22,13 +22,13 @@ _NAME_LENGTH_MAX = 200  # file systems take 255 bytes
 
 
 def image_names(images: Sequence[str | None]) -> list[str]:
-    """Name pictures, without an ending, no two alike.
+    """Return unique file names for renders, without ending.
 
     Args:
         images: names of the cameras' photographs, such as `images/0007.jpg`, or `None`.
 
     Returns:
-        The photographs' own names; a number for a camera without one; both if the names are not unique.
+        The names of the photographs; a number for a camera without one; both if the names are not unique.
     """
     stems = [_stem(image) for image in images]
     numbers = [f"{number:0{_DIGITS}d}" for number in range(len(stems))]
@@ -39,7 +39,7 @@ def image_names(images: Sequence[str | None]) -> list[str]:
 
 
 def make_output_folder(folder: str, names: Sequence[str], *, force: bool) -> Path:
-    """Make a folder for files; refuse if that would replace some.
+    """Make a folder for files, and refuse to replace existing ones.
 
     Args:
         folder: the folder; it may exist already.
@@ -54,7 +54,7 @@ def make_output_folder(folder: str, names: Sequence[str], *, force: bool) -> Pat
     if path.exists() and not path.is_dir():
         raise InputError(f"{folder} is not a folder")
     if len(set(names)) < len(names):
-        raise InputError("two pictures would get the same name: give the cameras' images other ones")
+        raise InputError("two renders would get the same name: rename the cameras' images")
     for name in names:
         target = path / name
         if target.exists() and not (force and target.is_file()):
@@ -155,19 +155,19 @@ def check_film(path: str, sizes: Sequence[tuple[int, int]], fps: float) -> None:
     else:
         require_images()
     if len(set(sizes)) > 1:
-        raise InputError(f"a film wants pictures of one size, the cameras have {len(set(sizes))}: give --size")
+        raise InputError(f"a film has frames of one size, the cameras have {len(set(sizes))}: give --size")
     width, height = sizes[0]
     if kind == _MP4 and min(width, height) < 2:
-        raise InputError(f"MP4 pictures have at least 2 pixels a side, wanted {width}x{height}")
+        raise InputError(f"MP4 frames have at least 2 pixels a side, wanted {width}x{height}")
     if max(width, height) > _MAX_SIDE[kind]:
-        raise InputError(f"{kind} pictures have at most {_MAX_SIDE[kind]} pixels a side, wanted {width}x{height}")
+        raise InputError(f"{kind} frames have at most {_MAX_SIDE[kind]} pixels a side, wanted {width}x{height}")
     if len(sizes) * width * height * 3 > _MAX_BYTES:
         raise InputError(
-            f"{len(sizes)} pictures of {width}x{height} are more than {_MAX_BYTES >> 30} GiB: render into a folder, "
+            f"{len(sizes)} frames of {width}x{height} are more than {_MAX_BYTES >> 30} GiB: render into a folder, "
             "and let ffmpeg make a film of it"
         )
     if fps > min(MAX_FPS, _TICKS[kind]):
-        raise InputError(f"{fps:g} pictures per second, wanted {MAX_FPS:g} at most")
+        raise InputError(f"{fps:g} frames per second, wanted {MAX_FPS:g} at most")
 
 
 def write_film(path: str, frames: Sequence[U8], fps: float) -> None:

@@ -24,13 +24,13 @@ from csplat.system import available_memory_bytes, default_memory_bytes
 from csplat.types import Progress, null_progress
 from csplat_tools.file_streams import is_csplat, kept_path, local_path, mapped_csplat, naming, source_path
 
-#: Names of files that stand for the whole folder they are in: SOG as a folder, and with levels.
+#: Names of files that represent the whole folder they are in: SOG as a folder, and with levels.
 FOLDER_NAMES = ("meta.json", "lod-meta.json")
 
-#: Formats that unpack nothing when they are opened, and whose readers take all splats at once in fewer passes.
+#: Formats that unpack nothing when they are opened, and are read as a whole in fewer passes.
 CHEAP_TO_REOPEN = ("ply", "csplat")
-_SMALL = 1 << 20  # bytes: a file up to this size, in any format, fits in every memory
-#: Bytes that a comparison takes in addition to the scenes' arrays: for the program, and per splat drawn and searched.
+_SMALL = 1 << 20  # bytes: a file up to this size, in any format, fits in any memory
+#: Bytes of a comparison in addition to the scenes' arrays: for the program, and per splat drawn and searched.
 _BASE_BYTES, _SPLAT_BYTES = 200_000_000, 320
 
 
@@ -79,7 +79,7 @@ class LoadedModel:
 
 @dataclass(frozen=True, eq=False)
 class OpenedScene:
-    """A scene that is not in memory.
+    """A scene that is open, but not in memory.
 
     Attributes:
         scene: the splats, some at a time.
@@ -97,7 +97,7 @@ class OpenedScene:
     _sample: list[SplatModel] = field(default_factory=list, init=False)
 
     def sample(self, progress: Progress | None = None) -> tuple[SplatModel, int]:
-        """Return every Nth splat, without SH bands, and N. The sample is read once and kept.
+        """Return every Nth splat, without SH bands, and N. The sample is read once and cached.
 
         Raises:
             CsplatError: the scene is not whole.
@@ -107,7 +107,7 @@ class OpenedScene:
             parts = []
             for rows, block in self.scene.numbered():
                 if progress is not None:
-                    progress("looking at the scene", rows.start / max(1, self.count))
+                    progress("sampling the scene", rows.start / max(1, self.count))
                 parts.append(_plain(block.select(np.arange(-rows.start % every, len(block), every))))
             self._sample.append(join_blocks(_plain(self.facts), parts))
         return self._sample[0], every
@@ -146,16 +146,16 @@ def _sizes(count: int, facts: SplatModel, size_bytes: int) -> dict[str, Any]:
     }
 
 
-#: A scene, as functions of this package take it: a model, or a file in any format.
+#: A scene as an argument: a model, or a file in any format.
 SceneLike = SplatModel | LoadedModel | File
 
 
 def load_model(scene: SceneLike, *, sh_degree: int | None = None) -> LoadedModel:
-    """Read a scene in any format (`csplat formats`), which is detected by its content.
+    """Read a scene in any format (`csplat formats`), detected by its content.
 
     Args:
-        scene: the file: a path, an open binary file, or bytes; the path `-` is standard input. A model, or a scene
-            that is loaded already, is taken as it is.
+        scene: the file: a path, an open binary file, or bytes; the path `-` is standard input. A model, or a
+            scene that is loaded already, is returned as it is.
         sh_degree: leave out the SH bands above when reading a file, even one of a higher degree than 3; `None`: keep
             all.
 
@@ -200,7 +200,7 @@ def read_source(
     sh_degree: int | None = None,
     progress: Progress | None = None,
 ) -> LoadedModel:
-    """Read a scene in any format, and repair defects if that is safe.
+    """Read a scene to be encoded, in any format but .csplat, and repair defects if that is safe.
 
     Args:
         file: a path, or `-`; an open binary file; or bytes.
@@ -228,11 +228,11 @@ def read_source(
 def open_scenes(
     given: Sequence[SceneLike | OpenedScene], memory_bytes: int | None = None
 ) -> Iterator[Sequence[LoadedModel] | Sequence[OpenedScene]]:
-    """Read scenes that are to be compared: all into memory, or none if they do not fit together.
+    """Read scenes for a comparison: all into memory, or none if they do not fit together.
 
     Args:
         given: scenes as for `load_model`. If one is a model or loaded already, all are read into memory; if all are
-            opened already, they stay so.
+            open already, they remain so.
         memory_bytes: approximate bound on the memory; `None`: half of the free memory.
 
     Yields:
@@ -255,8 +255,8 @@ def open_scenes(
             if not isinstance(one, (SplatModel, LoadedModel, OpenedScene)):
                 with naming(one):
                     local[place] = stack.enter_context(kept_path(one))
-        looked_at = memory_bytes is not None or any(size_on_disk(path) > _SMALL for path in local.values())
-        if len(local) == len(given) and looked_at:
+        has_large = memory_bytes is not None or any(size_on_disk(path) > _SMALL for path in local.values())
+        if len(local) == len(given) and has_large:
             opening = stack.enter_context(ExitStack())
             found = [_opened(opening, given[place], path, bound) for place, path in local.items()]
             if _together_bytes(found) > bound:
@@ -297,7 +297,7 @@ def _in_memory(opened: OpenedScene) -> LoadedModel:
 
 
 def _together_bytes(found: Sequence[OpenedScene]) -> float:
-    """Return the bytes of memory that a comparison takes with all splats in memory."""
+    """Estimate the bytes of memory for a comparison with all splats in memory."""
     arrays = sum(one.count * ply_splat_bytes(one.facts.sh_degree) for one in found)
     return _BASE_BYTES + arrays + _SPLAT_BYTES * max(one.count for one in found)
 
@@ -324,21 +324,21 @@ def ply_splat_bytes(sh_degree: int) -> int:
     return 4 * (14 + 3 * (sh_degree + 1) ** 2)
 
 
-def with_progress(scene: SceneSource, stage: str, progress: Progress | None) -> SceneSource:
-    """Return the scene with blocks that report progress while they are iterated over to be written."""
+def with_progress(scene: Scene, stage: str, progress: Progress | None) -> Scene:
+    """Return the scene with blocks that report progress while they are written."""
     if progress is None:
         return scene
-    told = scenes.with_progress(scene, stage, progress)
+    reporting = scenes.watched(scene, stage, progress)
 
     def blocks() -> Iterator[SplatModel]:
-        yield from told.blocks()
+        yield from reporting.blocks()
         progress("writing", 0.0)  # or another pass over the scene, which begins anew
 
     return replace(scene, blocks=blocks)
 
 
-def without_extra_columns(scene: SceneSource) -> SceneSource:
-    """Leave out the columns that splats do not have."""
+def without_extra_columns(scene: Scene) -> Scene:
+    """Return the scene without the columns that splats do not have."""
     if not scene.facts.extra:
         return scene
     return replace(
@@ -350,12 +350,12 @@ def without_extra_columns(scene: SceneSource) -> SceneSource:
 
 @dataclass(frozen=True)
 class MetadataOverrides:
-    """Overrides of a scene's metadata, which a PLY may lack; `None` keeps the file's own.
+    """Overrides of a scene's metadata; `None` keeps that of the file.
 
     Attributes:
         coordinate_system, unit_metres, antialiased: as in `SplatModel`.
         licence: text for the metadata.
-        up: the direction that is up, see `with_up`.
+        up: the up direction, see `with_up`.
     """
 
     coordinate_system: str | None = None

@@ -269,13 +269,13 @@ def encode(
     out.print_findings(encoded.findings)
     for line in encoded.report.notes:
         note(line)
-    out.remark(*(() if encoded.made is None else encoded.made.lines), *_stated(encoded))
+    out.remark(*(() if encoded.outcome is None else encoded.outcome.lines), *_stated(encoded))
     with out.bar() as progress:
         if progress is not None:
             progress("eight small renders", 0.0)
         psnr = None if out.quiet else _psnr(encoded, encoding.threads)
     about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(ESTIMATE_SIZE)}
-    if not out.quiet and encoded.made is not None and len(encoded.source) <= ESTIMATE_SPLATS_MAX:
+    if not out.quiet and encoded.outcome is not None and len(encoded.source) <= ESTIMATE_SPLATS_MAX:
         facts.take_estimated_up(estimate_up(encoded.source), out, shown=False)
     out.remark(_summary(encoded, psnr, source, output))
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
@@ -348,10 +348,10 @@ def _stated(encoded: EncodedFile) -> list[str]:
 
 def _psnr(encoded: EncodedFile, threads: int | None) -> float | None:
     """Return an approximate PSNR in dB; `None` if it is known already, or if measuring it would take long."""
-    made = encoded.made
-    if made is None or made.said.get("psnr") is not None or find_spec("numba") is None:
+    outcome = encoded.outcome
+    if outcome is None or outcome.report.get("psnr") is not None or find_spec("numba") is None:
         return None
-    return estimate_psnr(encoded.source, made.result.data, threads=threads)
+    return estimate_psnr(encoded.source, outcome.result.data, threads=threads)
 
 
 def _summary(encoded: EncodedFile, psnr: float | None, source: str, output: str) -> str:
@@ -361,11 +361,11 @@ def _summary(encoded: EncodedFile, psnr: float | None, source: str, output: str)
     ratio = encoded.source_bytes / report.size_bytes
     splats = f"{counted(report.splat_count, 'splat')} in {counted(report.tile_count, 'tile')}, {encoded.seconds:.2f} s"
     sizes = f"{format_bytes(encoded.source_bytes)} -> {format_bytes(report.size_bytes)}{per_splat}"
-    quality, found = "", None if encoded.made is None else encoded.made.said.get("psnr")
+    quality, found = "", None if encoded.outcome is None else encoded.outcome.report.get("psnr")
     if psnr is not None:
         quality = f", about {psnr:.1f} dB (PSNR of eight small renders)"
     elif found is not None:
         quality = f", PSNR {found:.2f} dB"
-    elif encoded.made is not None and len(encoded.source) and "-" not in (source, output):
+    elif encoded.outcome is not None and len(encoded.source) and "-" not in (source, output):
         quality = f"; `csplat compare {source} {output}` says how it looks"
     return f"{splats}: {sizes}, {ratio:.1f} times smaller{quality}"

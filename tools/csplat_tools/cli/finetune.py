@@ -163,7 +163,7 @@ def finetune(
         given["count"], cameras=views.cameras, data=views.data
     )
     around = views.find(read.model, out, near=near, validation_count=aside_count, **given)
-    around.read()
+    around.read_photographs()
     report = tuning.run_finetuning(
         read.model, around, output, encoder, options, Outputs(checkpoint, checkpoint_every, resume=resume), keep=keep,
         prune_unseen=prune_unseen, importance=importance, source_index=source_index, lpips=distance,

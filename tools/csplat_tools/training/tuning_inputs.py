@@ -51,7 +51,7 @@ def training_views(source: SplatModel, views: ViewSet, threads: int | None) -> T
 
     def looks(cameras: Sequence[Camera]) -> list[TuningView]:
         if views.photographs:
-            return [TuningView(one.camera, one) for one in views.pictures(cameras)]
+            return [TuningView(one.camera, one) for one in views.photographs_of(cameras)]
         return renders_of(source, cameras, behind, threads)
 
     teach = looks(views.training)

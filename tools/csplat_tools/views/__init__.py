@@ -1,4 +1,4 @@
-"""Views of a scene by role: training views (teach), validation views (decide), and test views (judge)."""
+"""Views of a scene by role: training, validation and test."""
 
 from __future__ import annotations
 

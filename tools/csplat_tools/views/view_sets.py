@@ -1,4 +1,15 @@
-"""Assign views their roles: training, validation and test."""
+"""Assign the views of a scene their roles: training, validation and test.
+
+Values are fitted to training views; validation views decide how many splats are kept, which step is best and when a
+search ends; scores in reports are those of test views. No view has two roles.
+
+| views | training | validation | test |
+|---|---|---|---|
+| virtual | `count` small ones and 16 more, all around | twelve like those of `psnr` | the eight of `psnr` |
+| camera file, 40 or more | the others | every 8th of the others | every 4th, 24 at most |
+| camera file, fewer | virtual ones | virtual ones | all |
+| data set | training photographs | 16 for validation at most, else every 8th training one | held-out ones |
+"""
 
 from __future__ import annotations
 
@@ -34,7 +45,6 @@ from csplat_tools.views.virtual_views import HELD_OUT_COUNT, camera_sequence, de
 if TYPE_CHECKING:
     from csplat_trainer.posed_images import PosedImage
 
-
 Colour = tuple[float, float, float]
 
 BLACK: Colour = (0.0, 0.0, 0.0)
@@ -47,10 +57,24 @@ VIRTUAL = "virtual"
 Split = Literal["test", "train"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 
+_SPLIT_FROM = 40  # cameras in a file from which they are split into all three roles
+_TEST_EVERY, _TEST_MAX = 4, 24  # every Nth camera of a file is a test view, up to this number
+_VALIDATION_EVERY = 8  # every Nth view that is not a test view is a validation view
+_VALIDATION_MAX = 16  # validation photographs of a data set that are used, at most
+_VALIDATION_SEED = 1000  # seed of virtual validation views, added to the user's
+_HOLD_OUT_EVERY = 8  # every Nth photograph is held out if nothing else is specified
+
+_TIMED_MAX = 2  # renders that are timed, at most
+_TIMED_DIVISOR = 8  # of width and height in mode `exact`, whose renders take a minute: time grows with pixels
+
+_DISPLAY_MAX, _DISPLAY_SIZE = 6, (640, 480)  # views to display, at most; width and height, pixels
+_DISPLAY_CANDIDATES, _DISPLAY_POINTS, _DISPLAY_SEED = 64, 40_000, 0  # candidate views; points of the scene; seed
+_DISPLAY_DETAIL = 0.8  # least detail of a view to display, as a fraction of the best one's
+
 
 @dataclass(frozen=True, eq=False)
 class ViewSet:
-    """The views of a scene by role. No view has two roles: a choice made by a view looks better there than elsewhere.
+    """The views of a scene by role. No view has two roles: what a view has chosen scores better there than elsewhere.
 
     Attributes:
         name: source of the test views: `virtual`, or the name of a camera file or of a data set.
@@ -140,13 +164,13 @@ class ViewSet:
         """
         return self._by_photographs(self.validation, "standard", threads)
 
-    def pictures(self, cameras: Sequence[Camera]) -> list[PosedImage]:
-        """Return the photographs that the given cameras took, in the order of the cameras."""
+    def photographs_of(self, cameras: Sequence[Camera]) -> list[PosedImage]:
+        """Return the photographs of the given cameras, in their order."""
         taken = {id(one.camera): one for one in self.photographs}
         return [taken[id(camera)] for camera in cameras]
 
-    def read(self) -> None:
-        """Read all photographs now, so that a damaged one is found before minutes are spent on the others.
+    def read_photographs(self) -> None:
+        """Read all photographs, so that a damaged one is found before minutes are spent on the others.
 
         Raises:
             InputError: a file is not an image, or is truncated.
@@ -159,7 +183,7 @@ class ViewSet:
 
         if not self.photographs:
             raise InputError("there are no photographs: name a data set")
-        shown = self.pictures(cameras)
+        shown = self.photographs_of(cameras)
         return photograph_scorer(shown, self.background, mode=mode, threads=threads, origin=self.origin)
 
 
@@ -179,17 +203,9 @@ def pose_key(camera: Camera) -> bytes:
     return (np.round(np.concatenate([camera.viewmat[:3].ravel(), lens.ravel()]), 9) + 0.0).tobytes()
 
 
-_ENOUGH = 40  # number of cameras of a file from which they are split into all three roles
-_JUDGE_EVERY, _MOST_JUDGES = 4, 24  # every Nth of them is a test view, up to this number
-_DECIDE_EVERY = 8  # every Nth of the others is a validation view
-_MOST_DECIDING = 16  # largest number of a data set's validation photographs that are used
-_DECIDING_SEED = 1000  # seed of virtual validation views, added to the user's
-_TEST_EVERY = 8  # every Nth photograph is held out if nothing else is specified
-
-
 @dataclass(frozen=True)
 class DataOptions:
-    """A data set, as a command line specifies it. For `None` the scene's own metadata is used, else the default.
+    """A data set of photographs. For `None` the scene's own metadata is used, else the default.
 
     Attributes:
         path: the set's folder, or its transforms.json.
@@ -208,7 +224,7 @@ class DataOptions:
 
 def comparison_cameras(source: SplatModel, every: int = 1) -> list[Camera]:
     """Return the cameras of `psnr`: virtual ones, chosen by the source alone, or by every Nth of its splats."""
-    return virtual_cameras(source, *virtual_views.VIRTUAL_SIZES.judging, seed=0, every=every)
+    return virtual_cameras(source, *virtual_views.VIRTUAL_SIZES.test, seed=0, every=every)
 
 
 def find_view_set(
@@ -224,7 +240,7 @@ def find_view_set(
     split: Split = "test",
     every: int = 1,
 ) -> ViewSet:
-    """Read or place views, and assign each a role; see the table above.
+    """Read or place views, and assign each a role; see the table at the head of the module.
 
     Args:
         source: the scene.
@@ -250,171 +266,57 @@ def find_view_set(
     usual = default_views(every * len(source))
     count, size = usual[0] if count is None else count, size or usual[1]
     if data is not None:
-        return _of_data(source, data, background, validation_count, split)
+        return _views_of_data(source, data, background, validation_count, split)
     if cameras is None:
         test = comparison_cameras(source, every)
-        judging = {pose_key(camera) for camera in test}  # in a scene without splats all views are alike
+        test_poses = {pose_key(camera) for camera in test}  # in a scene without splats all views are the same
         training, validation = (
-            _without(judging, part) for part in _virtual(source, count, size, seed, validation_count)
+            _without(test_poses, part) for part in _place_virtual(source, count, size, seed, validation_count)
         )
-        notes = (
-            () if every < 2 else (f"the scene is not in memory: one in {every} of its splats says where views stand",)
-        )
+        notes = () if every < 2 else (f"the scene is not in memory: views are placed by one in {every} of its splats",)
         colour = background or BLACK
         return ViewSet(VIRTUAL, colour, training, validation, test, virtual=True, origin=source.origin, notes=notes)
-    return _of_file(source, cameras, background, (count, size, seed), validation_count)
+    return _views_of_file(source, cameras, background, (count, size, seed), validation_count)
 
 
 def with_validation_views(views: ViewSet) -> ViewSet:
     """Return the views; if there are no validation views, every eighth training view becomes one."""
     if views.validation:
         return views
-    validation, training = _apart(views.training, None)
+    validation, training = _split_validation(views.training, None)
     return replace(views, training=training, validation=validation)
 
 
-def _of_file(
-    source: SplatModel,
-    path: str,
-    background: Colour | None,
-    virtual: tuple[int, tuple[int, int], int],
-    validation_count: int | None,
-) -> ViewSet:
-    report: list[str] = []
-    given = list({pose_key(camera): camera for camera in load_cameras(path, report, source.origin)}.values())
-    said = TrainingRecord.of(source.metadata)
-    colour, notes = _colour(background, said)
-    few = len(given) < _ENOUGH
-    if few:
-        judging = {pose_key(camera) for camera in given}
-        test = given
-        training, validation = (_without(judging, part) for part in _virtual(source, *virtual, validation_count))
-    else:
-        every = range(0, len(given), _JUDGE_EVERY)
-        test, rest = _parted(given, evenly_spaced(every, _MOST_JUDGES))
-        validation, training = _apart(rest, validation_count)
-    return ViewSet(
-        _named_file(path), colour, training, validation, test, virtual=few, origin=source.origin,
-        notes=(*report, *notes),
-    )  # fmt: skip
+def display_cameras(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
+    """Choose views whose renders are worth showing to people.
 
+    The views of `psnr` are spread all around a scene: some see the back of objects, or a wall from nearby; a scene
+    without a known up direction may lie on its side. That is fair to files, but of no use to a reader.
 
-def _of_data(
-    source: SplatModel, data: DataOptions, background: Colour | None, validation_count: int | None, split: Split
-) -> ViewSet:
-    require_photographs()
-    from csplat_trainer.data import load
+    Args:
+        source: the scene.
+        views: its test views are shown; if they are virtual, other views are searched.
 
-    said = TrainingRecord.of(source.metadata)
-    wanted, notes = _settled(data, said)
-    every = _TEST_EVERY if wanted.test_every is None else wanted.test_every
-    found = load(wanted.path, wanted.size, images=wanted.images, test_every=every, near=wanted.near)
-    shift = np.subtract(source.origin, found.origin)
-    parts = (found.train, found.test, evenly_spaced(found.val, _MOST_DECIDING))
-    train, test, val = (_moved(part, shift) for part in parts)
-    colour, more = _colour(background, said, photographs=True)
-    if split == "train":
-        train, test, val = [], train, []
-    judging = {pose_key(one.camera) for one in test}
-    apart = _without(judging, [one.camera for one in train])
-    if len(apart) < len(train):
-        more.append(f"{len(train) - len(apart)} training photographs stand where others judge, and are left out")
-    validation, training = (
-        _without(judging | {pose_key(camera) for camera in apart}, [one.camera for one in val]),
-        apart,
-    )
-    if validation_count or not validation:
-        validation, training = _apart(apart, validation_count)
-    return ViewSet(
-        _named_file(data.path), colour, training, validation, [one.camera for one in test], [*train, *val, *test],
-        origin=source.origin, notes=(*found.report, *notes, *more), split=split,
-    )  # fmt: skip
-
-
-def _settled(data: DataOptions, said: TrainingRecord | None) -> tuple[DataOptions, list[str]]:
-    """Return the user's options, completed by the scene's metadata, with remarks on contradictions."""
-    values: dict[str, Any] = {}
-    notes = []
-    for name in (field.name for field in fields(data) if field.name != "path"):
-        asked, known = getattr(data, name), getattr(said, name, None)
-        values[name] = known if asked is None else asked
-        if None not in (asked, known) and asked != known:
-            notes.append(f"{name} is {asked}, but the scene was trained with {known}")
-    return replace(data, **values), notes
-
-
-def _colour(
-    background: Colour | None, said: TrainingRecord | None, *, photographs: bool = False
-) -> tuple[Colour, list[str]]:
-    """Return the background colour, with remarks on it, which matter most if photographs are compared."""
-    if background is not None:
-        if said is not None and said.background != background:
-            return background, [
-                f"background is {_named(background)}, but the scene was trained on {_named(said.background)}"
-            ]
-        return background, []
-    if said is not None:
-        return said.background, []
-    note = "the scene does not say in front of what it was trained: black is behind it, --background changes that"
-    return BLACK, [note] if photographs else []
-
-
-def _named_file(path: str) -> str:
-    """Return the name of a file or a folder, changed if it is that of virtual views."""
-    name = Path(path).resolve().name
-    return f"./{name}" if name == VIRTUAL else name
-
-
-def _named(colour: Colour) -> str:
-    return {BLACK: "black", WHITE: "white"}.get(colour) or ",".join(f"{value:g}" for value in colour)
-
-
-def _moved(pictures: Sequence[PosedImage], shift: NDArray[np.float64]) -> list[PosedImage]:
-    return [replace(one, camera=relative_to(shift, one.camera)) for one in pictures]
-
-
-def _virtual(
-    source: SplatModel, count: int, size: tuple[int, int], seed: int, validation_count: int | None
-) -> tuple[list[Camera], list[Camera]]:
-    """Return virtual training and validation views; the latter are like the test views of `psnr`, at other places."""
-    if count < 1:
-        return [], []
-    usual, width, height = virtual_views.VIRTUAL_SIZES.deciding
-    kept = usual if validation_count is None else validation_count
-    validation = virtual_cameras(source, kept, width, height, seed=_DECIDING_SEED + seed) if kept else []
-    return camera_sequence(source, count + HELD_OUT_COUNT, size, seed=seed), validation
-
-
-def _apart(cameras: Sequence[Camera], validation_count: int | None) -> tuple[list[Camera], list[Camera]]:
-    """Split cameras into validation views, evenly spread, and training views without those of the same pose."""
-    count = len(cameras)
-    if validation_count is None:
-        every = min(_DECIDE_EVERY, count)
-        places: Collection[int] = range(every // 2, count, every) if count > 1 else ()
-    elif validation_count and validation_count >= count:
-        raise InputError(f"{validation_count} of {count} views to decide by leave none to learn from")
-    else:
-        places = [(2 * number + 1) * count // (2 * validation_count) for number in range(validation_count)]
-    validation, others = _parted(cameras, places)
-    return validation, _without({pose_key(camera) for camera in validation}, others)
-
-
-def _parted(cameras: Sequence[Camera], places: Collection[int]) -> tuple[list[Camera], list[Camera]]:
-    chosen = set(places)
-    return [cameras[i] for i in sorted(chosen)], [one for i, one in enumerate(cameras) if i not in chosen]
-
-
-def _without(judging: Collection[bytes], cameras: Sequence[Camera]) -> list[Camera]:
-    """Return the cameras whose pose is not in `judging`."""
-    return [one for one in cameras if pose_key(one) not in judging]
-
-
-_SAMPLES = 2  # largest number of cameras that are rendered
-_SMALLER = 8  # divisor of width and height in mode `exact`, in which a render takes a minute: time grows with pixels
+    Returns:
+        Cameras relative to the scene's origin: the test views, or virtual ones far apart from each other that show fine
+        splats with nothing in front of them.
+    """
+    if views.name != VIRTUAL or not len(source):
+        return views.test
+    upright = with_estimated_up(source)
+    own = views.test if upright is source else ()  # otherwise they would show the scene lying on its side
+    cameras = [*own, *camera_sequence(upright, _DISPLAY_CANDIDATES, _DISPLAY_SIZE, seed=_DISPLAY_SEED)]
+    cloud = sample_cloud(source, _DISPLAY_POINTS, np.random.default_rng(_DISPLAY_SEED))
+    nearest = HIDING * scene_frame(source).extent
+    details = np.array([detail(cloud, camera, nearest) for camera in cameras])
+    good = np.flatnonzero(details >= _DISPLAY_DETAIL * details.max())
+    positions = np.stack([cameras[i].position for i in good])
+    chosen = farthest_points(positions, int(np.argmax(details[good])), min(_DISPLAY_MAX, len(good)))
+    return [cameras[good[i]] for i in chosen]
 
 
 def total_render_seconds(source: SplatModel, cameras: Sequence[Camera], *, mode: Mode = "standard") -> float:
-    """Estimate the seconds that renders from all cameras take, from some of them; 0 without splats or cameras."""
+    """Estimate the seconds for renders from all cameras, from some of them; 0 without splats or cameras."""
     return len(cameras) * render_seconds(source, cameras, mode=mode) if len(source) and cameras else 0.0
 
 
@@ -426,19 +328,19 @@ def render_seconds(
     threads: int | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> float:
-    """Measure the seconds that a render takes, from some that are discarded.
+    """Measure the seconds for a render, from some that are discarded.
 
     Args:
         source: the scene.
         cameras: the views, at least one.
         mode, threads: mode of the renderer, and its number of threads.
-        clock: returns the seconds that have passed.
+        clock: returns seconds.
     """
     draw = renderer(source, (0.0, 0.0, 0.0), mode=mode, threads=threads)
-    tried, times = cameras[:: max(1, len(cameras) // _SAMPLES)][:_SAMPLES], 1
+    tried, times = cameras[:: max(1, len(cameras) // _TIMED_MAX)][:_TIMED_MAX], 1
     if mode == "exact":
-        times = _SMALLER**2
-        tried = [resized(one, max(1, one.W // _SMALLER), max(1, one.H // _SMALLER)) for one in tried[:1]]
+        times = _TIMED_DIVISOR**2
+        tried = [resized(one, max(1, one.W // _TIMED_DIVISOR), max(1, one.H // _TIMED_DIVISOR)) for one in tried[:1]]
     else:
         draw(tried[0])  # not timed: allocates buffers and loads kernels
     start = clock()
@@ -447,30 +349,136 @@ def render_seconds(
     return times * (clock() - start) / len(tried)
 
 
-_COUNT, _SIZE = 6, (640, 480)  # largest number of views; their width and height, pixels
-_TRIED, _POINTS, _SEED = 64, 40_000, 0  # candidates; points sampled from the scene; seed of both
-_GOOD_DETAIL = 0.8  # least detail as a fraction of the best view's
+def _views_of_file(
+    source: SplatModel,
+    path: str,
+    background: Colour | None,
+    virtual: tuple[int, tuple[int, int], int],
+    validation_count: int | None,
+) -> ViewSet:
+    report: list[str] = []
+    given = list({pose_key(camera): camera for camera in load_cameras(path, report, source.origin)}.values())
+    record = TrainingRecord.of(source.metadata)
+    colour, notes = _choose_background(background, record)
+    few = len(given) < _SPLIT_FROM
+    if few:
+        test_poses = {pose_key(camera) for camera in given}
+        test = given
+        training, validation = (
+            _without(test_poses, part) for part in _place_virtual(source, *virtual, validation_count)
+        )
+    else:
+        every = range(0, len(given), _TEST_EVERY)
+        test, rest = _split(given, evenly_spaced(every, _TEST_MAX))
+        validation, training = _split_validation(rest, validation_count)
+    return ViewSet(
+        _set_name(path), colour, training, validation, test, virtual=few, origin=source.origin,
+        notes=(*report, *notes),
+    )  # fmt: skip
 
 
-def display_cameras(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
-    """Return the views to show.
+def _views_of_data(
+    source: SplatModel, data: DataOptions, background: Colour | None, validation_count: int | None, split: Split
+) -> ViewSet:
+    require_photographs()
+    from csplat_trainer.data import load
 
-    Args:
-        source: the scene.
-        views: the user's own test views are shown; if they are virtual, others are searched.
+    record = TrainingRecord.of(source.metadata)
+    options, notes = _complete_options(data, record)
+    every = _HOLD_OUT_EVERY if options.test_every is None else options.test_every
+    found = load(options.path, options.size, images=options.images, test_every=every, near=options.near)
+    shift = np.subtract(source.origin, found.origin)
+    parts = (found.train, found.test, evenly_spaced(found.val, _VALIDATION_MAX))
+    train, test, val = (_shifted(part, shift) for part in parts)
+    colour, more = _choose_background(background, record, photographs=True)
+    if split == "train":
+        train, test, val = [], train, []
+    test_poses = {pose_key(one.camera) for one in test}
+    training = _without(test_poses, [one.camera for one in train])
+    if len(training) < len(train):
+        more.append(f"{len(train) - len(training)} training photographs have the pose of a test view, and are left out")
+    taken = test_poses | {pose_key(camera) for camera in training}
+    validation = _without(taken, [one.camera for one in val])
+    if validation_count or not validation:
+        validation, training = _split_validation(training, validation_count)
+    return ViewSet(
+        _set_name(data.path), colour, training, validation, [one.camera for one in test], [*train, *val, *test],
+        origin=source.origin, notes=(*found.report, *notes, *more), split=split,
+    )  # fmt: skip
 
-    Returns:
-        Cameras relative to the scene's origin: the test views, or virtual ones far apart from each other that show fine
-        splats with nothing in front of them.
-    """
-    if views.name != VIRTUAL or not len(source):
-        return views.test
-    told = with_estimated_up(source)
-    own = views.test if told is source else ()  # else they would show it lying on its side
-    cameras = [*own, *camera_sequence(told, _TRIED, _SIZE, seed=_SEED)]
-    cloud, nearest = sample_cloud(source, _POINTS, np.random.default_rng(_SEED)), HIDING * scene_frame(source).extent
-    details = np.array([detail(cloud, camera, nearest) for camera in cameras])
-    good = np.flatnonzero(details >= _GOOD_DETAIL * details.max())
-    positions = np.stack([cameras[i].position for i in good])
-    chosen = farthest_points(positions, int(np.argmax(details[good])), min(_COUNT, len(good)))
-    return [cameras[good[i]] for i in chosen]
+
+def _complete_options(data: DataOptions, record: TrainingRecord | None) -> tuple[DataOptions, list[str]]:
+    """Return the user's options, completed from the scene's metadata, and remarks on contradictions."""
+    values: dict[str, Any] = {}
+    notes = []
+    for name in (field.name for field in fields(data) if field.name != "path"):
+        asked, known = getattr(data, name), getattr(record, name, None)
+        values[name] = known if asked is None else asked
+        if None not in (asked, known) and asked != known:
+            notes.append(f"{name} is {asked}, but the scene was trained with {known}")
+    return replace(data, **values), notes
+
+
+def _choose_background(
+    background: Colour | None, record: TrainingRecord | None, *, photographs: bool = False
+) -> tuple[Colour, list[str]]:
+    """Return the background colour, with remarks on it, which matter most if photographs are compared."""
+    if background is not None:
+        if record is None or record.background == background:
+            return background, []
+        names = [_colour_name(one) for one in (background, record.background)]
+        return background, [f"background is {names[0]}, but the scene was trained on {names[1]}"]
+    if record is not None:
+        return record.background, []
+    note = "the background of the training is not known: black is used, --background changes that"
+    return BLACK, [note] if photographs else []
+
+
+def _set_name(path: str) -> str:
+    """Return the name of a file or a folder, changed if it is that of virtual views."""
+    name = Path(path).resolve().name
+    return f"./{name}" if name == VIRTUAL else name
+
+
+def _colour_name(colour: Colour) -> str:
+    return {BLACK: "black", WHITE: "white"}.get(colour) or ",".join(f"{value:g}" for value in colour)
+
+
+def _shifted(images: Sequence[PosedImage], shift: NDArray[np.float64]) -> list[PosedImage]:
+    return [replace(one, camera=relative_to(shift, one.camera)) for one in images]
+
+
+def _place_virtual(
+    source: SplatModel, count: int, size: tuple[int, int], seed: int, validation_count: int | None
+) -> tuple[list[Camera], list[Camera]]:
+    """Return virtual training and validation views; the latter are like the test views of `psnr`, at other places."""
+    if count < 1:
+        return [], []
+    usual, width, height = virtual_views.VIRTUAL_SIZES.validation
+    kept = usual if validation_count is None else validation_count
+    validation = virtual_cameras(source, kept, width, height, seed=_VALIDATION_SEED + seed) if kept else []
+    return camera_sequence(source, count + HELD_OUT_COUNT, size, seed=seed), validation
+
+
+def _split_validation(cameras: Sequence[Camera], validation_count: int | None) -> tuple[list[Camera], list[Camera]]:
+    """Split cameras into validation views, evenly spread, and training views without those of the same pose."""
+    count = len(cameras)
+    if validation_count is None:
+        every = min(_VALIDATION_EVERY, count)
+        places: Collection[int] = range(every // 2, count, every) if count > 1 else ()
+    elif validation_count and validation_count >= count:
+        raise InputError(f"{validation_count} of {count} validation views leave no training views")
+    else:
+        places = [(2 * number + 1) * count // (2 * validation_count) for number in range(validation_count)]
+    validation, others = _split(cameras, places)
+    return validation, _without({pose_key(camera) for camera in validation}, others)
+
+
+def _split(cameras: Sequence[Camera], places: Collection[int]) -> tuple[list[Camera], list[Camera]]:
+    chosen = set(places)
+    return [cameras[i] for i in sorted(chosen)], [one for i, one in enumerate(cameras) if i not in chosen]
+
+
+def _without(poses: Collection[bytes], cameras: Sequence[Camera]) -> list[Camera]:
+    """Return the cameras whose pose is not among `poses`."""
+    return [one for one in cameras if pose_key(one) not in poses]

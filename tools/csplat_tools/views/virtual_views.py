@@ -1,4 +1,8 @@
-"""Place virtual cameras around a scene."""
+"""Place virtual cameras around a scene: for training, and for a test of other places.
+
+Training cameras are many and small, evenly spread at any count: many small renders overfit less than few large ones
+with the same number of pixels.
+"""
 
 from __future__ import annotations
 
@@ -32,27 +36,27 @@ T = TypeVar("T")
 VIEW_COUNT = 160
 VIEW_SIZE = (240, 180)
 
-#: Number of virtual views in addition to those requested, with which choices made on the others are checked.
+#: Virtual views in addition to those requested, held out to check choices that are made on the others.
 HELD_OUT_COUNT = 16
 
 
 @dataclass(frozen=True)
-class VirtualSizes:
-    """Numbers and sizes of virtual views that nothing is fitted to: count, width and height in pixels.
+class VirtualViewSizes:
+    """Counts of virtual views to which nothing is fitted, and their widths and heights in pixels.
 
     Attributes:
-        judging: test views, those of `psnr`.
-        deciding: validation views.
-        elsewhere: views of `elsewhere`, of each kind.
+        test: test views, those of `psnr`.
+        validation: validation views.
+        extra: views of each kind of `extra_test_cameras`.
     """
 
-    judging: tuple[int, int, int] = (8, 640, 480)
-    deciding: tuple[int, int, int] = (12, 320, 240)
-    elsewhere: tuple[int, int, int] = (12, 320, 240)
+    test: tuple[int, int, int] = (8, 640, 480)
+    validation: tuple[int, int, int] = (12, 320, 240)
+    extra: tuple[int, int, int] = (12, 320, 240)
 
 
 #: The default, with which all published figures were measured.
-VIRTUAL_SIZES = VirtualSizes()
+VIRTUAL_SIZES = VirtualViewSizes()
 
 _PIXELS = 50  # pixels of all views together per splat
 _LARGEST = 2.0  # largest factor of width and height: all renders are in memory, and larger ones would be too few
@@ -70,7 +74,7 @@ _STEPS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)  # powers 
 
 
 def default_views(splats: int) -> tuple[int, tuple[int, int]]:
-    """Return the default number of virtual training views, and their width and height, by the number of splats.
+    """Return the default count of virtual training views, and their width and height, by the number of splats.
 
     The cost of a render grows with splats, not with pixels: for many splats, fewer and larger views are more efficient.
     At the same PSNR a file of 290,000 splats is 16 % smaller with 110 views of 348x261 than with 160 of 240x180.
@@ -158,21 +162,21 @@ def _in_surroundings(frame: SceneFrame, number: int, point: F64, K: F64, size: t
     return look_at(eye, target, frame.up, K, *size, frame.near)
 
 
-def evenly_spaced(those: Sequence[T], most: int) -> list[T]:
-    """Return at most `most` of some items, evenly spread over their order."""
-    places = np.linspace(0, len(those) - 1, min(most, len(those))).round().astype(int)
-    return [those[i] for i in places]
+def evenly_spaced(items: Sequence[T], most: int) -> list[T]:
+    """Return at most `most` items, evenly spread over their order."""
+    places = np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)
+    return [items[i] for i in places]
 
 
-_SEED = 2000  # seed of these views; validation views use 1000 and more
+_SEED = 2000  # seed of extra test views; validation views use 1000 and more
 _NEARER, _FARTHER = (0.6, 0.7, 0.8, 0.9), 2.0  # factors of the distance from the middle of the scene
 # points that are sampled from the scene
 
 
 def extra_test_cameras(source: SplatModel) -> dict[str, list[Camera]]:
-    """Place virtual cameras like those of `psnr` at other places, and the same nearer to and farther from the middle.
+    """Place virtual cameras like those of `psnr` at other places, and nearer to and farther from the middle.
 
-    Nearer ones stay outside of the objects that they look at.
+    They have no part in fits and choices. Nearer ones stay outside of the objects that they look at.
 
     Args:
         source: the scene; its own cameras are not used.
@@ -181,18 +185,18 @@ def extra_test_cameras(source: SplatModel) -> dict[str, list[Camera]]:
         12 cameras of each kind: `beside`, `nearer`, `farther`.
     """
     frame = scene_frame(source)
-    beside = virtual_cameras(source, *VIRTUAL_SIZES.elsewhere, seed=_SEED)
+    beside = virtual_cameras(source, *VIRTUAL_SIZES.extra, seed=_SEED)
     found = {"beside": beside, "farther": [_at(camera, frame.centre, _FARTHER) for camera in beside]}
     if not len(source):
         return {**found, "nearer": beside}
     cloud = sample_cloud(source, _POINTS, np.random.default_rng(_SEED))
-    tried = [[_at(camera, frame.centre, times) for times in _NEARER] + [camera] for camera in beside]
-    nearer = [next((one for one in those if is_clear(frame, cloud, one)), those[-1]) for those in tried]
+    candidates = [[_at(camera, frame.centre, times) for times in _NEARER] + [camera] for camera in beside]
+    nearer = [next((one for one in each if is_clear(frame, cloud, one)), each[-1]) for each in candidates]
     return {**found, "nearer": nearer}
 
 
 def _at(camera: Camera, centre: NDArray[np.float64], times: float) -> Camera:
-    """Return the camera with its distance from a centre multiplied."""
+    """Multiply the distance of a camera from a centre."""
     turn = camera.viewmat[:3, :3]
     eye = -turn.T @ camera.viewmat[:3, 3]
     return relative_to((1.0 - times) * (eye - centre), camera)
