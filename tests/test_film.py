@@ -68,7 +68,7 @@ def test_a_film_shows_what_the_pictures_show(ply, pictures, tmp_path, ending, to
     film = tmp_path / f"turn.{ending}"
     done = invoke("render", ply, *ORBIT, "-o", film, "--fps", 20)
     assert (0, "") == (done.exit_code, done.stdout), done.stderr
-    assert f"4 pictures in {film}\n" == done.stderr
+    assert f"4 frames in {film}\n" == done.stderr
     frames, times, loop = frames_of(film)
     assert (4, [50] * 4, 0) == (len(frames), times, loop)
     for expected, frame in zip(pictures, frames, strict=True):

@@ -81,7 +81,7 @@ def test_the_page_shows_the_source_beside_the_file(files, page):
 def test_the_page_opens_in_a_browser_without_a_complaint(tab, page):
     tab.page.set_viewport_size({"width": 400, "height": 700})
     tab.page.goto(page.as_uri())
-    assert "a & b.csplat: what is in it" == tab.page.title()
+    assert "a & b.csplat: content" == tab.page.title()
     assert 0 == tab.page.evaluate("[...document.images].filter((one) => !one.naturalWidth).length")
     root = "document.documentElement"
     assert tab.page.evaluate(f"{root}.scrollWidth <= {root}.clientWidth")
@@ -140,7 +140,7 @@ for words in ((f"{folder}/a.html",), (f"{folder}/b.html", "--source", source)):
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     alone, compared = map(json.loads, done.stdout.splitlines())
     assert [0, ""] == alone
-    assert "How exact it says it is" in (tmp_path / "a.html").read_text()
+    assert "Declared error bounds" in (tmp_path / "a.html").read_text()
     assert [1, "error: this needs numba: pip install 'csplat[render]' (E_INPUT)\n"] == compared
     assert not (tmp_path / "b.html").exists()
 

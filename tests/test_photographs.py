@@ -150,7 +150,7 @@ def test_renders_have_the_names_and_sizes_of_the_photographs(scene, files, tmp_p
 def test_a_set_without_test_pictures_is_refused(scene, tmp_path):
     data = write_set(tmp_path / "capture", scene, alpha=False)
     write_ply(tmp_path / "a.ply", scene)
-    with pytest.raises(InputError, match="has no test pictures"):
+    with pytest.raises(InputError, match="has no test views"):
         compare(scene, scene, views=find_view_set(scene, data=DataOptions(str(data), test_every=0)))
 
 

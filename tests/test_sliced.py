@@ -243,7 +243,7 @@ def test_a_disk_without_room_is_found_before_anything_is_drawn(files_of_both, mo
 
 def test_a_bound_that_cannot_be_held_is_refused(files_of_both, monkeypatch):
     monkeypatch.setattr(SlicedScene, "least_bytes", 450_000_000)
-    with pytest.raises(InputError, match=r"^0 MB of memory are too little to draw these scenes, which want 482$"):
+    with pytest.raises(InputError, match=r"^0 MB of memory are too little to draw these scenes, which take 482$"):
         csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
 
 

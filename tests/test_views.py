@@ -102,7 +102,7 @@ def test_as_many_decide_as_are_asked_for(sets, scene):
     assert 0 == len(find_view_set(scene, data=data, validation_count=0).validation)
     views = find_view_set(scene, data=data, validation_count=4)
     assert (10, 4, 2) == tuple(map(len, poses(views)))
-    with pytest.raises(InputError, match="leave none to learn from"):
+    with pytest.raises(InputError, match="leave no training views"):
         find_view_set(scene, data=data, validation_count=14)
 
 
@@ -157,7 +157,7 @@ def test_a_scene_that_says_nothing_is_noted_once(sets, scene):
     for kind in ("rgb", "rgba"):
         views = find_view_set(scene, data=DataOptions(str(sets[kind])))
         assert BLACK == views.background
-        assert 1 == sum("does not say" in line for line in views.notes)
+        assert 1 == sum("the background of the training" in line for line in views.notes)
     assert () == find_view_set(scene, count=2).notes
 
 

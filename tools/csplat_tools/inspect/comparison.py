@@ -1,4 +1,4 @@
-"""Compare two scenes in size, errors of the splats and renders."""
+"""Compare a scene with its source: sizes, errors of splats whose pairs are known or found, and scores of renders."""
 
 from __future__ import annotations
 
@@ -35,8 +35,15 @@ from csplat_tools.views import Colour, ViewSet, comparison_cameras, find_view_se
 from csplat_tools.views.sliced_renderer import SlicedScene
 
 Pairing = Literal["index", "order", "search"]
-
-_NEAR = 0.01  # fraction of the scene's spread: splats in the same order are nearer than this, shuffled ones far off
+_NEAR = 0.01  # fraction of the scene's spread: splats in the same order are nearer than this
+#: Value that searches the LPIPS weights in the usual places, instead of the name of a file.
+AUTO_WEIGHTS = "auto"
+_PIXEL_BYTES = 13  # bytes per pixel of the renders of the source, which are kept
+#: Width and height of the renders, pixels. Smaller ones average errors away: half of 640×480 gives 0.4 dB too much,
+#: this size 0.2 dB at most.
+ESTIMATE_SIZE = (480, 360)
+#: Largest number of splats to render for an estimate; more take too long.
+ESTIMATE_SPLATS_MAX = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -44,11 +51,11 @@ class AttributeErrors:
     """Errors of pairs of splats.
 
     Attributes:
-        pairing: how the pairs are known. `index`: from a source index. `order`: both scenes hold the same number of
-            splats, and the centres show that the order is the same. `search`: a source splat was found within the
-            errors that the file declares, which need not be the original one.
-        matched: number of splats of the other scene that have a partner; only these are measured.
-        unmatched: number of those that have none.
+        pairing: origin of the pairs. `index`: a source index. `order`: both scenes have the same number of splats,
+            in the same order by their centres. `search`: a source splat was found within the errors that the file
+            declares; it need not be the original one.
+        matched: number of splats with a partner; only these are measured.
+        unmatched: number of splats without one.
         errors: largest and rms error by measure, in the order of the registry.
     """
 
@@ -58,7 +65,7 @@ class AttributeErrors:
     errors: dict[str, tuple[float, float]]
 
     def as_json(self) -> dict[str, Any]:
-        """Return everything as JSON-compatible values; an error that overflowed is `null`."""
+        """Return everything as JSON-compatible values; overflowed errors are `null`."""
         return {
             "pairing": self.pairing,
             "matched": self.matched,
@@ -70,115 +77,12 @@ class AttributeErrors:
         }
 
 
-def attribute_errors(
-    source: LoadedModel,
-    other: LoadedModel,
-    source_index: NDArray[Any] | None = None,
-    *,
-    progress: Progress | None = None,
-) -> AttributeErrors | None:
-    """Measure the errors of a scene's splats against those of its source.
-
-    Args:
-        source: the scene that `other` was made from.
-        other: the scene whose errors are measured.
-        source_index: [N] integers, the source splat of each splat of `other`; `None`: not known.
-        progress: progress callback of a search.
-
-    Returns:
-        The errors; `None` if the pairs of splats cannot be found.
-
-    Raises:
-        InputError: `source_index` is not one index of a source splat for each splat of `other`.
-    """
-    ours, theirs = Source.of(source.model), other.model
-    if source_index is not None:
-        return AttributeErrors("index", len(theirs), 0, _errors(ours, theirs, source_index))
-    if _same_order(source.model, theirs):
-        return AttributeErrors("order", len(theirs), 0, _errors(ours, theirs, np.arange(len(theirs))))
-    stated, header = other.declared_bounds, other.header
-    if header is None or stated is None or not len(theirs):
-        return None
-    bounds = {record.measure: record.max for record in stated.records}
-    if not bounds.keys() >= {"means", "opacities", "sh0"}:
-        return None
-    found = find_partners(ours, theirs, bounds, lattice_radii(theirs, header), progress=progress)
-    matched = np.flatnonzero(found >= 0)
-    if not len(matched):
-        return None
-    errors = _errors(ours, theirs.select(matched), found[matched])
-    return AttributeErrors("search", len(matched), len(theirs) - len(matched), errors)
-
-
-def attribute_errors_out_of_core(
-    source: OpenedScene,
-    other: OpenedScene,
-    source_index: NDArray[Any] | None = None,
-    *,
-    progress: Progress | None = None,
-) -> AttributeErrors | None:
-    """Like `attribute_errors` for scenes not in memory: without a search, and a source index only for .csplat files."""
-    if source_index is not None:
-        if not is_csplat(other.path):
-            return None
-        # For a file that declares no errors and was refitted, all errors are measured.
-        nothing = DeclaredBounds(source.count, 0, source.facts.sh_degree, refitted=True, records=())
-        opened = replace(open_tiles(other.path), declared_bounds=nothing)
-        proof = verify_out_of_core(
-            source.scene, opened, source_index, memory_bytes=source.memory_bytes, progress=progress
-        )
-        found = {one.name: (one.measured_max or 0.0, one.measured_rms or 0.0) for one in proof.measures}
-        return AttributeErrors("index", other.count, 0, found)
-    if source.count != other.count or not _same_order(source.sample(progress)[0], other.sample(progress)[0]):
-        return None
-    parts = [
-        (start, len(theirs), measure_pairs(Source.of(ours), theirs, np.arange(len(theirs))))
-        for start, ours, theirs in _beside(source.scene, other.scene, progress)
-    ]
-    found = {name: (one.max, one.rms) for name, one in merge_errors(parts).items()}
-    return AttributeErrors("order", other.count, 0, found)
-
-
-def _beside(a: SceneSource, b: SceneSource, progress: Progress | None) -> Iterator[tuple[int, SplatModel, SplatModel]]:
-    """Yield splats of two scenes of equal number, some at a time, with the number of the first of them."""
-    first = scenes.with_progress(a, "measuring splats", progress or null_progress).blocks()
-    second = scenes.with_progress(b, "", null_progress).blocks()
-    start, ours, theirs = 0, a.facts, b.facts
-    while start < a.count:
-        ours, theirs = ours if len(ours) else next(first), theirs if len(theirs) else next(second)
-        count = min(len(ours), len(theirs))
-        if count:
-            yield start, ours.select(slice(0, count)), theirs.select(slice(0, count))
-        ours, theirs, start = ours.select(slice(count, None)), theirs.select(slice(count, None)), start + count
-
-
-def _errors(source: Source, other: SplatModel, index: NDArray[Any]) -> dict[str, tuple[float, float]]:
-    return {name: (found.max, found.rms) for name, found in measure_pairs(source, other, index).items()}
-
-
-def _same_order(source: SplatModel, other: SplatModel) -> bool:
-    """Return True if splat i of one scene is splat i of the other: in a shuffled scene half the splats are far off."""
-    if len(source) != len(other) or not len(source):
-        return False
-    means = source.means.astype(np.float64)
-    shift = np.subtract(other.origin, source.origin)
-    distances = np.linalg.norm(other.means.astype(np.float64) + shift - means, axis=1)
-    spread = float(np.median(np.linalg.norm(means - np.median(means, axis=0), axis=1)))
-    return float(np.median(distances)) <= _NEAR * spread
-
-
-#: Given instead of a file of LPIPS weights: look for them in the usual places.
-AUTO_WEIGHTS = "auto"
-
-_PIXEL_BYTES = 13  # bytes per pixel of a render of the source, which is kept
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
     """The outcome of comparing two scenes.
 
     Attributes:
-        a: the source; opened, but not in memory, if both do not fit together.
+        a: the source; open, but not in memory, if both do not fit together.
         b: the scene compared with it; likewise.
         attributes: errors of B's splats; `None` if the pairs of splats cannot be found, which is the usual case
             without a source index if the scenes are not in memory.
@@ -287,7 +191,7 @@ def compare(
     with open_scenes((a, b), memory_bytes) as (source, other):
         views = views or _views(source, background, progress)
         if not views.test:
-            raise InputError(f"{views.name} has no {views.split} pictures")
+            raise InputError(f"{views.name} has no {views.split} views")
         by_photographs = views.photograph_test_scorer(mode=mode) if views.photographs else None
         viewers: list[OnView] = []
         if pictures is not None:
@@ -307,90 +211,77 @@ def compare(
         )  # fmt: skip
 
 
-def _views(source: LoadedModel | OpenedScene, background: Colour | None, progress: Progress | None) -> ViewSet:
-    model, every = source.sample(progress)
-    return find_view_set(model, background=background, count=0, every=every)
+def attribute_errors(
+    source: LoadedModel,
+    other: LoadedModel,
+    source_index: NDArray[Any] | None = None,
+    *,
+    progress: Progress | None = None,
+) -> AttributeErrors | None:
+    """Measure the errors of a scene's splats against those of its source.
+
+    Args:
+        source: the scene that `other` was made from.
+        other: the scene whose errors are measured.
+        source_index: [N] integers, the source splat of each splat of `other`; `None`: unknown.
+        progress: progress callback of a search.
+
+    Returns:
+        The errors; `None` if the pairs of splats cannot be found.
+
+    Raises:
+        InputError: `source_index` is not one index of a source splat for each splat of `other`.
+    """
+    ours, theirs = Source.of(source.model), other.model
+    if source_index is not None:
+        return AttributeErrors("index", len(theirs), 0, _errors(ours, theirs, source_index))
+    if _same_order(source.model, theirs):
+        return AttributeErrors("order", len(theirs), 0, _errors(ours, theirs, np.arange(len(theirs))))
+    stated, header = other.declared_bounds, other.header
+    if header is None or stated is None or not len(theirs):
+        return None
+    bounds = {record.measure: record.max for record in stated.records}
+    if not bounds.keys() >= {"means", "opacities", "sh0"}:
+        return None
+    found = match(ours, theirs, bounds, lattice_radii(theirs, header), progress=progress)
+    matched = np.flatnonzero(found >= 0)
+    if not len(matched):
+        return None
+    errors = _errors(ours, theirs.select(matched), found[matched])
+    return AttributeErrors("search", len(matched), len(theirs) - len(matched), errors)
 
 
-def _measured(
-    source: LoadedModel | OpenedScene,
-    other: LoadedModel | OpenedScene,
-    cameras: Sequence[Camera],
-    source_index: NDArray[np.integer[Any]] | None,
-    progress: Progress | None,
-) -> tuple[SplatModel | SlicedScene, SplatModel | SlicedScene, AttributeErrors | None]:
-    """Return a renderable form of each scene, and the errors of B's splats."""
-    if isinstance(source, LoadedModel) and isinstance(other, LoadedModel):
-        return source.model, other.model, attribute_errors(source, other, source_index, progress=progress)
-    assert isinstance(source, OpenedScene), "both are in memory, or none"
-    assert isinstance(other, OpenedScene), "likewise"
-    kept = sum(_PIXEL_BYTES * camera.W * camera.H for camera in cameras)
-    first, second = (
-        SlicedScene(one.scene, *one.sample(progress), one.memory_bytes - kept, progress) for one in (source, other)
-    )
-    for one in (first, second):
-        if one.memory_bytes < one.least_bytes:
-            bound, least = (one.memory_bytes + kept) / 1e6, (one.least_bytes + kept) / 1e6
-            raise InputError(f"{bound:,.0f} MB of memory are too little to draw these scenes, which want {least:,.0f}")
-    check_free_space(
-        tempfile.gettempdir(),
-        max(first.disk_bytes, second.disk_bytes),
-        "pictures are drawn: TMPDIR names another folder",
-    )
-    return first, second, attribute_errors_out_of_core(source, other, source_index, progress=progress)
-
-
-class _PhotographScores:
-    """Scorer of A's and B's renders against the photographs."""
-
-    def __init__(self, judge: Scorer, distance: Distance | None) -> None:
-        self._judge, self._distance = judge, distance
-        self._each: dict[str, list[ViewScore]] = {"a": [], "b": []}
-
-    def __call__(self, number: int, a: F32, b: F32) -> None:
-        for each, seen in zip(self._each.values(), (a, b), strict=True):
-            each.append(self._judge.score(number, seen, lpips=self._distance))
-
-    def as_json(self) -> dict[str, Any]:
-        return {name: Scores.of(each).as_json() for name, each in self._each.items()}
-
-
-class _ImageWriter:
-    """Writer of one PNG per view, named after its photograph."""
-
-    def __init__(
-        self, folder: str, names: Sequence[str], photographs: Scorer | None, amplification: float, *, force: bool
-    ) -> None:
-        self._files = [f"{name}.png" for name in names]
-        self._target = make_output_folder(folder, self._files, force=force)
-        self._photographs, self._amplification = photographs, amplification
-
-    def __call__(self, number: int, a: F32, b: F32) -> None:
-        shown = None if self._photographs is None else self._photographs.reference(number).rgb
-        write_png(self._target / self._files[number], side_by_side(a, b, self._amplification, shown))
-
-
-def _all_of(viewers: Sequence[OnView]) -> OnView:
-    def show(number: int, a: F32, b: F32) -> None:
-        for viewer in viewers:
-            viewer(number, a, b)
-
-    return show
-
-
-#: Width and height of the renders, pixels; smaller ones average errors away: half of 640×480 gives 0.4 dB too much,
-#: this 0.2 at most.
-ESTIMATE_SIZE = (480, 360)
-#: Largest number of splats: more take longer to render than a remark is worth.
-ESTIMATE_SPLATS_MAX = 1_000_000
+def attribute_errors_out_of_core(
+    source: OpenedScene,
+    other: OpenedScene,
+    source_index: NDArray[Any] | None = None,
+    *,
+    progress: Progress | None = None,
+) -> AttributeErrors | None:
+    """Measure errors as `attribute_errors` does, out of core: without search; an index only for .csplat files."""
+    if source_index is not None:
+        if not is_csplat(other.path):
+            return None
+        # For a file that declares no errors and was refitted, all errors are measured.
+        nothing = DeclaredBounds(source.count, 0, source.facts.sh_degree, refitted=True, records=())
+        opened = replace(open_tiles(other.path), declared_bounds=nothing)
+        proof = prove_by_disk(source.scene, opened, source_index, memory_bytes=source.memory_bytes, progress=progress)
+        found = {one.name: (one.measured_max or 0.0, one.measured_rms or 0.0) for one in proof.measures}
+        return AttributeErrors("index", other.count, 0, found)
+    if source.count != other.count or not _same_order(source.sample(progress)[0], other.sample(progress)[0]):
+        return None
+    parts = [
+        (start, len(theirs), measure_pairs(Source.of(ours), theirs, np.arange(len(theirs))))
+        for start, ours, theirs in _paired_blocks(source.scene, other.scene, progress)
+    ]
+    found = {name: (one.max, one.rms) for name, one in merged(parts).items()}
+    return AttributeErrors("order", other.count, 0, found)
 
 
 def estimate_psnr(
     source: SplatModel, data: bytes, *, threads: int | None = None, splats_max: int = ESTIMATE_SPLATS_MAX
 ) -> float | None:
-    """Return the approximate PSNR of a file against its source.
-
-    The views are those of `csplat compare`, at another size.
+    """Estimate the PSNR of `csplat compare` in a second, from smaller renders.
 
     Args:
         source: the scene that was encoded.
@@ -411,3 +302,102 @@ def estimate_psnr(
         return Scorer.of_source(source, cameras, threads=threads).psnr(decode(data, threads=threads))
     except (CsplatError, MemoryError):  # the file is written: this is a remark on it
         return None
+
+
+def _paired_blocks(a: Scene, b: Scene, progress: Progress | None) -> Iterator[tuple[int, SplatModel, SplatModel]]:
+    """Yield blocks of the splats of two scenes of the same order, with the number of the first splat."""
+    first = scenes.watched(a, "measuring splats", progress or null_progress).blocks()
+    second = scenes.watched(b, "", null_progress).blocks()
+    start, ours, theirs = 0, a.facts, b.facts
+    while start < a.count:
+        ours, theirs = ours if len(ours) else next(first), theirs if len(theirs) else next(second)
+        count = min(len(ours), len(theirs))
+        if count:
+            yield start, ours.select(slice(0, count)), theirs.select(slice(0, count))
+        ours, theirs, start = ours.select(slice(count, None)), theirs.select(slice(count, None)), start + count
+
+
+def _errors(source: Source, other: SplatModel, index: NDArray[Any]) -> dict[str, tuple[float, float]]:
+    return {name: (found.max, found.rms) for name, found in measure_pairs(source, other, index).items()}
+
+
+def _same_order(source: SplatModel, other: SplatModel) -> bool:
+    """Return True if splat i of one scene is splat i of the other; in a shuffled scene half of them are far apart."""
+    if len(source) != len(other) or not len(source):
+        return False
+    means = source.means.astype(np.float64)
+    shift = np.subtract(other.origin, source.origin)
+    distances = np.linalg.norm(other.means.astype(np.float64) + shift - means, axis=1)
+    spread = float(np.median(np.linalg.norm(means - np.median(means, axis=0), axis=1)))
+    return float(np.median(distances)) <= _NEAR * spread
+
+
+def _views(source: LoadedModel | OpenedScene, background: Colour | None, progress: Progress | None) -> ViewSet:
+    model, every = source.sample(progress)
+    return find_view_set(model, background=background, count=0, every=every)
+
+
+def _measured(
+    source: LoadedModel | OpenedScene,
+    other: LoadedModel | OpenedScene,
+    cameras: Sequence[Camera],
+    source_index: NDArray[np.integer[Any]] | None,
+    progress: Progress | None,
+) -> tuple[SplatModel | SlicedScene, SplatModel | SlicedScene, AttributeErrors | None]:
+    """Return both scenes in a form to render, and the errors of B's splats."""
+    if isinstance(source, LoadedModel) and isinstance(other, LoadedModel):
+        return source.model, other.model, attribute_errors(source, other, source_index, progress=progress)
+    assert isinstance(source, OpenedScene), "both are in memory, or none"
+    assert isinstance(other, OpenedScene), "likewise"
+    kept = sum(_PIXEL_BYTES * camera.W * camera.H for camera in cameras)
+    first, second = (
+        SlicedScene(one.scene, *one.sample(progress), one.memory_bytes - kept, progress) for one in (source, other)
+    )
+    for one in (first, second):
+        if one.memory_bytes < one.least_bytes:
+            bound, least = (one.memory_bytes + kept) / 1e6, (one.least_bytes + kept) / 1e6
+            raise InputError(f"{bound:,.0f} MB of memory are too little to draw these scenes, which take {least:,.0f}")
+    check_room(
+        tempfile.gettempdir(),
+        max(first.disk_bytes, second.disk_bytes),
+        "scenes are rendered: TMPDIR names another folder",
+    )
+    return first, second, attribute_errors_out_of_core(source, other, source_index, progress=progress)
+
+
+class _PhotographScores:
+    """The scores of A's and B's renders against the photographs."""
+
+    def __init__(self, judge: Scorer, distance: Distance | None) -> None:
+        self._judge, self._distance = judge, distance
+        self._each: dict[str, list[ViewScore]] = {"a": [], "b": []}
+
+    def __call__(self, number: int, a: F32, b: F32) -> None:
+        for each, seen in zip(self._each.values(), (a, b), strict=True):
+            each.append(self._judge.score(number, seen, lpips=self._distance))
+
+    def as_json(self) -> dict[str, Any]:
+        return {name: Scores.of(each).as_json() for name, each in self._each.items()}
+
+
+class _ImageWriter:
+    """A writer of one PNG per view, named after its photograph."""
+
+    def __init__(
+        self, folder: str, names: Sequence[str], photographs: Scorer | None, amplification: float, *, force: bool
+    ) -> None:
+        self._files = [f"{name}.png" for name in names]
+        self._target = make_output_folder(folder, self._files, force=force)
+        self._photographs, self._amplification = photographs, amplification
+
+    def __call__(self, number: int, a: F32, b: F32) -> None:
+        shown = None if self._photographs is None else self._photographs.look(number).picture
+        write_png(self._target / self._files[number], side_by_side(a, b, self._amplification, shown))
+
+
+def _all_of(viewers: Sequence[OnView]) -> OnView:
+    def show(number: int, a: F32, b: F32) -> None:
+        for viewer in viewers:
+            viewer(number, a, b)
+
+    return show

@@ -1,4 +1,8 @@
-"""Describe a file without decoding it, for `csplat info`."""
+"""Describe a file without decoding it, for `csplat info`.
+
+The blocks of a .csplat file are walked by their heads: nothing is inflated and no CRC is computed, so that a
+memory-mapped file of any size is described at once. Every length is checked against the bytes that remain.
+"""
 
 from __future__ import annotations
 
@@ -28,13 +32,39 @@ from csplat_tools.console import finite_or_none, format_bytes
 from csplat_tools.file_streams import local_path
 from csplat_tools.scene_files import findings_as_json, size_on_disk
 
+_ALWAYS = ("bits_per_splat",)
+_STREAM_CLAUSE = "STR-6"
+
 
 @dataclass(frozen=True)
 class Span:
-    """The smallest and the largest of some integers."""
+    """A range of integers, both ends included."""
 
     min: int
     max: int
+
+
+@dataclass
+class AttributeUsage:
+    """The bytes and codings of one attribute, over all tiles.
+
+    Attributes:
+        block_bytes: size of the blocks in tiles: heads, parameters and streams.
+        codebook_bytes: size of the codebook chunks with the attribute's columns.
+        codings, coders: number of blocks or streams that use each, by name.
+        escaped_count: number of splats whose values are coded as escapes instead of codebook entries.
+    """
+
+    block_bytes: int = 0
+    codebook_bytes: int = 0
+    codings: Counter[str] = field(default_factory=Counter)
+    coders: Counter[str] = field(default_factory=Counter)
+    escaped_count: int = 0
+
+    @property
+    def size_bytes(self) -> int:
+        """All bytes of the attribute."""
+        return self.block_bytes + self.codebook_bytes
 
 
 @dataclass(frozen=True)
@@ -43,7 +73,7 @@ class AttributeSummary:
 
     Attributes:
         size_bytes: all bytes of the attribute.
-        codebook_bytes: those among them of its columns of codebooks.
+        codebook_bytes: those of its codebook columns, included in `size_bytes`.
         bits_per_splat: average over all splats; `None` without splats.
         codings, coders: number of blocks or streams that use each, by name.
         escaped_splats: number of splats whose values are coded as escapes instead of codebook entries.
@@ -64,7 +94,7 @@ class AttributeSummary:
 
 @dataclass(frozen=True)
 class LayerSummary:
-    """Size of a layer: its tiles, and the codebook chunks that it needs."""
+    """The size of a layer: its tiles, and the codebook chunks that it requires."""
 
     size_bytes: int
     codebook_bytes: int
@@ -85,7 +115,7 @@ class CodebookSummary:
 
 @dataclass(frozen=True)
 class FileDescription:
-    """A file as it describes itself; sizes in bytes.
+    """The content of a .csplat file; sizes in bytes.
 
     Attributes:
         header: header and index.
@@ -93,9 +123,9 @@ class FileDescription:
         codebooks: codebooks in the order of the index.
         overhead: bytes outside attributes, by name: header, index, chunks of the whole file, frames of the tiles'
             chunks.
-        cameras: number of cameras; `None` without the chunk, as for all that follows.
+        cameras: number of cameras; `None` without the chunk, as for the following ones.
         options, metadata: the file's JSON.
-        declared_bounds: the source of which the file is an encoding, and the declared error bounds.
+        declared_bounds: the source of the file, and the declared error bounds.
     """
 
     header: SceneHeader
@@ -116,7 +146,7 @@ class FileDescription:
 
     @property
     def spans(self) -> dict[str, Span]:
-        """Ranges of splat count, lattice exponent and bits per axis over the tiles; empty without tiles."""
+        """Ranges of splat counts, lattice exponents and bits per axis over the tiles; empty without tiles."""
         tiles = self.header.tiles
         columns = {
             "splats": [one.splat_count for one in tiles],
@@ -163,11 +193,8 @@ class FileDescription:
         }
 
 
-_ALWAYS = ("bits_per_splat",)
-
-
 def describe_file(data: bytes | mmap) -> FileDescription:
-    """Describe a file by its header, its index, the heads of its blocks, and its small chunks.
+    """Describe a .csplat file by its header, its index, the heads of its blocks, and its small chunks.
 
     Args:
         data: the whole file; little of a memory-mapped one is touched.
@@ -193,6 +220,52 @@ def describe_file(data: bytes | mmap) -> FileDescription:
     )
 
 
+def describe_other_format(source: str) -> tuple[dict[str, Any], str]:
+    """Describe a file in any format by what is known before its splats are read.
+
+    Args:
+        source: a scene in any format, or `-`.
+
+    Returns:
+        JSON-compatible values, and the same as text.
+
+    Raises:
+        InputError: the file is in no format that is read, or not whole.
+        OSError: the file cannot be read.
+    """
+    with local_path(source) as path, open_scene(path) as scene:
+        facts, size, count = scene.facts, size_on_disk(path), scene.count
+        per_splat = size / count if count else None
+        report = {
+            "format": scene.format,
+            "size_bytes": size,
+            "bytes_per_splat": per_splat,
+            "splats": count,
+            "levels": list(scene.levels),
+            "sh_degree": facts.sh_degree,
+            "coordinate_system": facts.coordinate_system,
+            "origin": list(facts.origin),
+            "unit_metres": facts.unit_metres,
+            "antialiased": facts.antialiased,
+            "flat": facts.flat,
+            "extra": {name: str(column.dtype) for name, column in facts.extra.items()},
+            "metadata": dict(facts.metadata),
+            "defects": findings_as_json(scene.findings),
+        }
+        average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
+        words = describe_placement(facts, count, facts.metadata)
+        if scene.levels:
+            words["levels"] = f"{' / '.join(f'{one:,}' for one in scene.levels)} splats (csplat convert --level)"
+        if facts.extra:
+            words["extra"] = ", ".join(f"{name} ({column.dtype})" for name, column in facts.extra.items())
+        if facts.metadata:
+            words["metadata"] = json.dumps(facts.metadata, sort_keys=True)
+        lines = [f"{format_by_name(scene.format).title}, {format_bytes(size)}{average}"]
+        lines += [f"{name:12} {value}" for name, value in words.items()]
+        lines += [str(one) for one in scene.findings if not one.usual]
+    return report, "\n".join(lines)
+
+
 def bytes_by_attribute(data: bytes | mmap, header: SceneHeader) -> dict[str, int]:
     """Return the bytes of each attribute, and as `overhead` those of everything else.
 
@@ -201,6 +274,117 @@ def bytes_by_attribute(data: bytes | mmap, header: SceneHeader) -> dict[str, int
     """
     use = attribute_usage(data, header)
     return {**{name: one.size_bytes for name, one in use.items()}, "overhead": sum(_overhead(header, use).values())}
+
+
+def attribute_usage(data: bytes | mmap, header: SceneHeader) -> dict[str, AttributeUsage]:
+    """Add up the bytes and codings of each attribute.
+
+    Args:
+        data: the file.
+        header: its header and index.
+
+    Returns:
+        By attribute name, in the order of the registry. A codebook of several attributes other than SH bands counts
+        with its first.
+
+    Raises:
+        FormatError: the heads contradict each other, or the data is not one whole file.
+    """
+    if len(data) < header.file_size:
+        raise FormatError(
+            _spec.ERROR_TRUNCATED, len(data), "HDR-5", found=f"{len(data)} bytes", wanted=f"{header.file_size} bytes"
+        )
+    if len(data) > header.file_size:
+        raise FormatError(
+            _spec.ERROR_TRAILING, header.file_size, "HDR-6", found=f"{len(data)} bytes", wanted=f"{header.file_size}"
+        )
+    codebooks = {record.codebook_id: record for record in header.codebooks}
+    use: dict[int, AttributeUsage] = {}
+    for tile in header.tiles:
+        for layer in (one for id_, one in tile.layers.items() if id_ in _spec.LAYER_NAMES):
+            _walk_tile(_Cursor(data, layer.offset, layer.size), codebooks, use)
+    for chunk in header.directory:
+        if chunk.type == _spec.CHUNK_CODEBOOK:
+            attribute = _first_attribute(codebooks[chunk.id], chunk.layer)
+            use.setdefault(attribute, AttributeUsage()).codebook_bytes += chunk.size
+    return {_spec.ATTRIBUTE_NAMES[id_]: use[id_] for id_ in sorted(use)}
+
+
+def format_headline(file: FileDescription) -> str:
+    """Return a headline: format version, profile, size, bytes per splat."""
+    header, per_splat = file.header, file.bytes_per_splat
+    average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
+    version = f"csplat {header.version[0]}.{header.version[1]}"
+    return f"{version}, profile {header.profile}, {format_bytes(header.file_size)}{average}"
+
+
+def describe_scene(file: FileDescription) -> dict[str, str]:
+    """Describe the scene in words, by title."""
+    header = file.header
+    words = describe_placement(header, header.splat_count, file.metadata or {})
+    words["tiles"] = _tiles(file)
+    extras = ", ".join(f"{one.name} ({one.dtype or 'of a type not known here'})" for one in header.extras)
+    if extras:
+        words["extra"] = extras
+    if file.cameras is not None:
+        words["cameras"] = str(file.cameras)
+    trained = TrainingRecord.of(file.metadata or {})
+    if trained is not None:
+        words["trained on"] = str(trained)
+    view = (file.metadata or {}).get(VIEW)
+    if view is not None:
+        words["first view"] = "a camera of the metadata"
+    return words
+
+
+def describe_placement(scene: SceneHeader | SplatModel, count: int, metadata: Mapping[str, Any]) -> dict[str, str]:
+    """Describe splat count, axes, up direction, unit, origin and flags in words, by title.
+
+    Args:
+        scene: header of a .csplat file, or metadata of another one.
+        count: number of splats.
+        metadata: metadata of the scene.
+    """
+    flags = [name for name in ("antialiased", "flat") if getattr(scene, name)]
+    up = up_of(metadata, scene.coordinate_system)
+    return {
+        "splats": f"{count:,}, SH degree {scene.sh_degree}",
+        "axes": str(scene.coordinate_system),
+        "up": "unknown" if up is None else " ".join(f"{value:g}" for value in up),
+        "unit": "unknown" if scene.unit_metres is None else f"{scene.unit_metres:g} m",
+        "origin": " ".join(f"{value:.17g}" for value in scene.origin),
+        "flags": ", ".join(flags) or "none",
+    }
+
+
+def describe_coding(attribute: AttributeSummary) -> str:
+    """Describe how an attribute is coded."""
+    words = ["+".join(attribute.codings)]
+    if attribute.step is not None:
+        words.append(f"step {attribute.step:.4g}")
+    if attribute.levels:
+        words.append(f"{attribute.levels} levels")
+    if attribute.mapping not in (None, "lattice", "unit_w"):
+        words.append(str(attribute.mapping))
+    if attribute.chroma_shift:
+        words.append(f"chroma / {2**attribute.chroma_shift}")
+    if attribute.codebook_bytes:
+        words.append(f"codebook {format_bytes(attribute.codebook_bytes)}")
+    if attribute.escaped_splats:
+        words.append(f"{attribute.escaped_splats} escaped")
+    words.append("+".join(attribute.coders))
+    return ", ".join(word for word in words if word)
+
+
+def other_metadata(file: FileDescription) -> dict[str, object]:
+    """Return the metadata that `describe_scene` does not describe."""
+    metadata = dict(file.metadata or {})
+    if TrainingRecord.of(metadata) is not None:
+        del metadata[TRAINING]
+    if up_of(metadata) is not None:
+        del metadata[UP]
+    metadata.pop(VIEW, None)
+    return metadata
 
 
 def _bits(size_bytes: int, count: int) -> float | None:
@@ -273,68 +457,8 @@ def _stated(stated: DeclaredBounds) -> dict[str, Any]:
     }
 
 
-_STREAM_CLAUSE = "STR-6"
-
-
-@dataclass
-class AttributeUsage:
-    """The bytes and codings of one attribute, over all tiles.
-
-    Attributes:
-        block_bytes: size of the blocks in tiles: heads, parameters and streams.
-        codebook_bytes: size of the codebook chunks with the attribute's columns.
-        codings, coders: number of blocks or streams that use each, by name.
-        escaped_count: number of splats whose values are coded as escapes instead of codebook entries.
-    """
-
-    block_bytes: int = 0
-    codebook_bytes: int = 0
-    codings: Counter[str] = field(default_factory=Counter)
-    coders: Counter[str] = field(default_factory=Counter)
-    escaped_count: int = 0
-
-    @property
-    def size_bytes(self) -> int:
-        """All bytes of the attribute."""
-        return self.block_bytes + self.codebook_bytes
-
-
-def attribute_usage(data: bytes | mmap, header: SceneHeader) -> dict[str, AttributeUsage]:
-    """Add up the bytes and codings of each attribute.
-
-    Args:
-        data: the file.
-        header: its header and index.
-
-    Returns:
-        By attribute name, in the order of the registry. A codebook of several attributes other than SH bands counts
-        with its first.
-
-    Raises:
-        FormatError: the heads contradict each other, or the data is not one whole file.
-    """
-    if len(data) < header.file_size:
-        raise FormatError(
-            _spec.ERROR_TRUNCATED, len(data), "HDR-5", found=f"{len(data)} bytes", wanted=f"{header.file_size} bytes"
-        )
-    if len(data) > header.file_size:
-        raise FormatError(
-            _spec.ERROR_TRAILING, header.file_size, "HDR-6", found=f"{len(data)} bytes", wanted=f"{header.file_size}"
-        )
-    codebooks = {record.codebook_id: record for record in header.codebooks}
-    use: dict[int, AttributeUsage] = {}
-    for tile in header.tiles:
-        for layer in (one for id_, one in tile.layers.items() if id_ in _spec.LAYER_NAMES):
-            _walk_tile(_Cursor(data, layer.offset, layer.size), codebooks, use)
-    for chunk in header.directory:
-        if chunk.type == _spec.CHUNK_CODEBOOK:
-            attribute = _first_attribute(codebooks[chunk.id], chunk.layer)
-            use.setdefault(attribute, AttributeUsage()).codebook_bytes += chunk.size
-    return {_spec.ATTRIBUTE_NAMES[id_]: use[id_] for id_ in sorted(use)}
-
-
 class _Cursor:
-    """A place in the payload of one chunk."""
+    """A position in the payload of a chunk."""
 
     def __init__(self, data: bytes | mmap, offset: int, size: int) -> None:
         self.data = data
@@ -430,135 +554,12 @@ def _name(names: Mapping[int, str], id_: int, what: str, offset: int) -> str:
     return names[id_]
 
 
-def format_headline(facts: FileDescription) -> str:
-    """Return a headline: format version, profile, size, bytes per splat."""
-    header, per_splat = facts.header, facts.bytes_per_splat
-    average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
-    version = f"csplat {header.version[0]}.{header.version[1]}"
-    return f"{version}, profile {header.profile}, {format_bytes(header.file_size)}{average}"
-
-
-def describe_scene(facts: FileDescription) -> dict[str, str]:
-    """Return descriptions of the scene, by title."""
-    header = facts.header
-    words = describe_placement(header, header.splat_count, facts.metadata or {})
-    words["tiles"] = _tiles(facts)
-    extras = ", ".join(f"{one.name} ({one.dtype or 'of a type not known here'})" for one in header.extras)
-    if extras:
-        words["extra"] = extras
-    if facts.cameras is not None:
-        words["cameras"] = str(facts.cameras)
-    trained = TrainingRecord.of(facts.metadata or {})
-    if trained is not None:
-        words["trained on"] = str(trained)
-    view = (facts.metadata or {}).get(VIEW)
-    if view is not None:
-        words["first view"] = "a camera of the metadata"
-    return words
-
-
-def describe_placement(said: SceneHeader | SplatModel, count: int, metadata: Mapping[str, Any]) -> dict[str, str]:
-    """Return the number of splats, the axes, the up direction, the unit, the origin and flags in words, by title.
-
-    Args:
-        said: header of a .csplat file, or metadata of another one.
-        count: number of splats.
-        metadata: metadata of the scene.
-    """
-    flags = [name for name in ("antialiased", "flat") if getattr(said, name)]
-    up = up_of(metadata, said.coordinate_system)
-    return {
-        "splats": f"{count:,}, SH degree {said.sh_degree}",
-        "axes": str(said.coordinate_system),
-        "up": "unknown" if up is None else " ".join(f"{value:g}" for value in up),
-        "unit": "unknown" if said.unit_metres is None else f"{said.unit_metres:g} m",
-        "origin": " ".join(f"{value:.17g}" for value in said.origin),
-        "flags": ", ".join(flags) or "none",
-    }
-
-
-def other_metadata(facts: FileDescription) -> dict[str, object]:
-    """Return the metadata that `describe_scene` does not describe."""
-    metadata = dict(facts.metadata or {})
-    if TrainingRecord.of(metadata) is not None:
-        del metadata[TRAINING]
-    if up_of(metadata) is not None:
-        del metadata[UP]
-    metadata.pop(VIEW, None)
-    return metadata
-
-
-def describe_coding(attribute: AttributeSummary) -> str:
-    """Describe how an attribute is coded."""
-    words = ["+".join(attribute.codings)]
-    if attribute.step is not None:
-        words.append(f"step {attribute.step:.4g}")
-    if attribute.levels:
-        words.append(f"{attribute.levels} levels")
-    if attribute.mapping not in (None, "lattice", "unit_w"):
-        words.append(str(attribute.mapping))
-    if attribute.chroma_shift:
-        words.append(f"chroma / {2**attribute.chroma_shift}")
-    if attribute.codebook_bytes:
-        words.append(f"codebook {format_bytes(attribute.codebook_bytes)}")
-    if attribute.escaped_splats:
-        words.append(f"{attribute.escaped_splats} escaped")
-    words.append("+".join(attribute.coders))
-    return ", ".join(word for word in words if word)
-
-
-def _tiles(facts: FileDescription) -> str:
+def _tiles(file: FileDescription) -> str:
     words = {
-        name: str(one.min) if one.min == one.max else f"{one.min} to {one.max}" for name, one in facts.spans.items()
+        name: str(one.min) if one.min == one.max else f"{one.min} to {one.max}" for name, one in file.spans.items()
     }
     if not words:
         return "0"
-    count = len(facts.header.tiles)
+    count = len(file.header.tiles)
     bits = f"{words['bits_per_axis']} bits per axis, exponents {words['exponents']}"
     return f"{count} of {words['splats']} splats, {bits}"
-
-
-def describe_other_format(source: str) -> tuple[dict[str, Any], str]:
-    """Describe a file by what is known of it before its splats are read.
-
-    Args:
-        source: a scene in any format, or `-`.
-
-    Returns:
-        JSON-compatible values, and the same as text.
-
-    Raises:
-        InputError: the file is in no format that is read, or not whole.
-        OSError: the file cannot be read.
-    """
-    with local_path(source) as path, open_scene(path) as scene:
-        facts, size, count = scene.facts, size_on_disk(path), scene.count
-        per_splat = size / count if count else None
-        said = {
-            "format": scene.format,
-            "size_bytes": size,
-            "bytes_per_splat": per_splat,
-            "splats": count,
-            "levels": list(scene.levels),
-            "sh_degree": facts.sh_degree,
-            "coordinate_system": facts.coordinate_system,
-            "origin": list(facts.origin),
-            "unit_metres": facts.unit_metres,
-            "antialiased": facts.antialiased,
-            "flat": facts.flat,
-            "extra": {name: str(column.dtype) for name, column in facts.extra.items()},
-            "metadata": dict(facts.metadata),
-            "defects": findings_as_json(scene.findings),
-        }
-        average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
-        words = describe_placement(facts, count, facts.metadata)
-        if scene.levels:
-            words["levels"] = f"{' / '.join(f'{one:,}' for one in scene.levels)} splats (csplat convert --level)"
-        if facts.extra:
-            words["extra"] = ", ".join(f"{name} ({column.dtype})" for name, column in facts.extra.items())
-        if facts.metadata:
-            words["metadata"] = json.dumps(facts.metadata, sort_keys=True)
-        lines = [f"{format_by_name(scene.format).title}, {format_bytes(size)}{average}"]
-        lines += [f"{name:12} {value}" for name, value in words.items()]
-        lines += [str(one) for one in scene.findings if not one.usual]
-    return said, "\n".join(lines)

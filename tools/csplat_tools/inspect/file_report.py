@@ -1,4 +1,4 @@
-"""The HTML report on a file: `csplat info --page`."""
+"""Write the HTML report on a file: `csplat info --page`."""
 
 from __future__ import annotations
 
@@ -23,48 +23,48 @@ from csplat_tools.inspect.file_description import (
 from csplat_tools.scene_files import LoadedModel, load_model
 
 _ATTRIBUTES = {
-    "opacities": "how dense each splat is",
-    "scales": "how large along its three axes",
-    "quats": "how it is turned",
-    "means": "where its centre is",
-    "sh0": "its colour, the same from everywhere",
-    "sh1": "how the colour changes with the direction of view, coarsely",
+    "opacities": "opacity of each splat",
+    "scales": "size along its three axes",
+    "quats": "rotation",
+    "means": "position of its centre",
+    "sh0": "its colour, independent of the view direction",
+    "sh1": "change of colour with the view direction, coarse",
     "sh2": "the same, finer",
     "sh3": "the same, finest",
-    "overhead": "header, index, frames, and what is said of the whole file",
+    "overhead": "header, index, frames, and metadata of the file",
 }
 _LAYERS = {
-    "geometry": "everything but how colours change: a viewer shows the scene as soon as it is there",
-    "sh1": "first band of that change, fetched afterwards",
+    "geometry": "everything but view-dependent colour: a viewer shows the scene when it has arrived",
+    "sh1": "first band of view-dependent colour, fetched afterwards",
     "sh2": "second band",
     "sh3": "third band",
 }
 _MEASURES = {
-    "means": "how far a centre has moved, in units of the scene",
-    "covariance": "how much a splat's shape has changed, as a share of itself: 0.01 is one per cent",
-    "opacities": "how much its alpha, 0 to 1, has changed",
-    "sh0": "its base colour; times 0.28 it is brightness, 0 to 1: 0.014 is one step of an 8-bit picture",
-    "sh1": "first band of the change of colour with the direction of view",
+    "means": "distance by which a centre has moved, in scene units",
+    "covariance": "relative change of a splat's shape: 0.01 is one per cent",
+    "opacities": "change of its alpha, 0 to 1",
+    "sh0": "its base colour; times 0.28 it is brightness, 0 to 1: 0.014 is one step of an 8-bit image",
+    "sh1": "first band of the change of colour with the view direction",
     "sh2": "second band",
     "sh3": "third band",
 }
 _CHECK = "<code>csplat verify FILE --source SCENE</code> checks that."
 _SCENE = {
-    "axes": "where +x, +y and +z point: Right, Left, Up, Down, Forward, Back",
-    "up": "the direction that is up",
+    "axes": "directions of +x, +y and +z: Right, Left, Up, Down, Forward, Back",
+    "up": "the up direction",
     "unit": "length of one unit of the scene",
-    "origin": "what positions are relative to",
-    "tiles": "parts that decode on their own",
-    "first view": "where a viewer shows the scene from at first",
+    "origin": "reference of positions",
+    "tiles": "parts that decode independently",
+    "first view": "camera from which a viewer first shows the scene",
 }
 
 
 @dataclass(frozen=True)
 class _SourceComparison:
-    """The results of a comparison with the source, as text and HTML."""
+    """The comparison with the source, as text and HTML."""
 
     facts: dict[str, str]
-    pictures: str
+    images: str
 
 
 def write_page(
@@ -76,43 +76,43 @@ def write_page(
     *,
     progress: Progress | None = None,
 ) -> None:
-    """Write the page.
+    """Write the report.
 
     Args:
-        path: path of the page.
+        path: path of the report.
         name: name of the file that it describes, or `-`.
         data: the file.
         facts: the file's description of itself.
-        source: a scene with which it is compared; this requires the renderer.
+        source: a scene to compare it with, which requires the renderer.
         progress: progress callback of the comparison.
 
     Raises:
         CsplatError: the file or the source is not valid.
-        OSError: the source cannot be read, or the page cannot be written.
+        OSError: the source cannot be read, or the report cannot be written.
     """
     title = "standard input" if name == STANDARD_STREAM else PurePath(name).name
-    beside = None if source is None else _compared(data, source, progress)
-    write_bytes(path, make_page(title, facts, beside).encode())
+    comparison = None if source is None else _compare(data, source, progress)
+    write_bytes(path, make_page(title, facts, comparison).encode())
 
 
-def make_page(title: str, facts: FileDescription, beside: _SourceComparison | None = None) -> str:
-    """Return the page as HTML: the same for the same file and source."""
+def make_page(title: str, facts: FileDescription, comparison: _SourceComparison | None = None) -> str:
+    """Return the report as HTML: the same for the same file and source."""
     count = facts.header.splat_count
     return document(
-        f"{title}: what is in it",
+        f"{title}: content",
         [
             f'<h1>{escape(title)}</h1>\n<p class="quiet">{escape(f"{count:,} splats; {format_headline(facts)}")}</p>',
-            _source(beside),
+            _source(comparison),
             _bytes(facts),
             _layers(facts),
-            "" if facts.declared_bounds is None else _stated(facts.declared_bounds),
+            "" if facts.declared_bounds is None else _bounds(facts.declared_bounds),
             _scene(facts),
         ],
     )
 
 
-def _compared(data: bytes | mmap, source: str, progress: Progress | None) -> _SourceComparison:
-    """Render file and source: from the views of `psnr` for the scores, and from others to show the hardest place."""
+def _compare(data: bytes | mmap, source: str, progress: Progress | None) -> _SourceComparison:
+    """Render file and source: from the views of `psnr` for scores, and from others to find the hardest place."""
     from csplat_render.scorer import Scorer
     from csplat_tools.hardest_place import IMAGES_NOTE, HardestPlaceSearch, piece_images
     from csplat_tools.views import display_cameras, find_view_set
@@ -126,25 +126,26 @@ def _compared(data: bytes | mmap, source: str, progress: Progress | None) -> _So
     place = hardest.found()
     assert place is not None
     facts = {
-        "source": _source_words(source, loaded, len(data)),
-        "PSNR": f"{scores.psnr:.2f} dB: how near pictures of the file come to those of the source, from"
-        f" {len(scores.each)} views all around; at 30 people see a difference, at 40 they hardly do",
+        "source": _source_text(source, loaded, len(data)),
+        "PSNR": f"{scores.psnr:.2f} dB: likeness of renders of the file and of the source, from"
+        f" {len(scores.each)} views all around; at 30 a difference is visible, at 40 hardly",
         "worst view": f"{scores.psnr_worst:.2f} dB",
         "SSIM": f"{scores.ssim:.4f}: likeness of structure, 1 at best",
     }
     return _SourceComparison(facts, f"<p>{escape(IMAGES_NOTE)}</p>\n{piece_images(place, 'the file')}")
 
 
-def _source_words(path: str, source: LoadedModel, size_bytes: int) -> str:
+def _source_text(path: str, source: LoadedModel, size_bytes: int) -> str:
     name = "standard input" if path == STANDARD_STREAM else PurePath(path).name
     times = f"{source.size_bytes / size_bytes:.1f} times as many bytes"
     return f"{name}: {len(source.model):,} splats, {format_bytes(source.size_bytes)}, {times}"
 
 
-def _source(beside: _SourceComparison | None) -> str:
-    if beside is None:
+def _source(comparison: _SourceComparison | None) -> str:
+    if comparison is None:
         return ""
-    return f"<h2>Beside its source</h2>\n{definitions(beside.facts)}\n<h3>The hardest place</h3>\n{beside.pictures}"
+    facts = definitions(comparison.facts)
+    return f"<h2>Compared with its source</h2>\n{facts}\n<h3>The hardest place</h3>\n{comparison.images}"
 
 
 def _bytes(facts: FileDescription) -> str:
@@ -156,8 +157,8 @@ def _bytes(facts: FileDescription) -> str:
     ]
     overhead = ", ".join(f"{name} {number}" for name, number in facts.overhead.items())
     rows.append(("overhead", _ATTRIBUTES["overhead"], f"{sizes['overhead']:,}", "", overhead))
-    head = ("attribute", "what it says", "bytes", "bits per splat", "how it is coded")
-    return f"<h2>Where the bytes are</h2>\n{attribute_figure(sizes)}\n{table(head, rows, words=(1, 4))}"
+    head = ("attribute", "meaning", "bytes", "bits per splat", "coding")
+    return f"<h2>Bytes by attribute</h2>\n{attribute_figure(sizes)}\n{table(head, rows, words=(1, 4))}"
 
 
 def _layers(facts: FileDescription) -> str:
@@ -165,23 +166,23 @@ def _layers(facts: FileDescription) -> str:
         (name, _LAYERS.get(name, ""), f"{one.size_bytes:,}", f"{100.0 * one.size_bytes / facts.header.file_size:.1f} %")
         for name, one in facts.layers.items()
     ]
-    head = ("layer", "what it is for", "bytes", "of the file")
-    return f"<h2>In which order it arrives</h2>\n{table(head, rows, words=(1,))}" if rows else ""
+    head = ("layer", "content", "bytes", "share of the file")
+    return f"<h2>Layers, in order of arrival</h2>\n{table(head, rows, words=(1,))}" if rows else ""
 
 
-def _stated(stated: DeclaredBounds) -> str:
+def _bounds(bounds: DeclaredBounds) -> str:
     text = (
-        f"The file stands for a source of {stated.source_count:,} splats of SH degree {stated.source_sh_degree};"
-        f" {stated.pruned_count:,} of them it leaves out. Of the others it states how far they are from the source's:"
-        " no splat is farther than the largest error, and rms says how far they usually are."
+        f"The file was made from a source of {bounds.source_count:,} splats of SH degree {bounds.source_sh_degree};"
+        f" {bounds.pruned_count:,} of them were pruned. For the others it declares error bounds:"
+        " no splat has more than the largest error; rms is the root of the mean square."
     )
-    if stated.refitted:
+    if bounds.refitted:
         text += (
-            " Some attributes were fitted anew to what the source looks like: they have no error here, pictures judge."
+            " Some attributes were refitted to renders of the source: they have no bounds, and are checked by renders."
         )
-    rows = [(one.measure, _MEASURES.get(one.measure, ""), f"{one.max:.4g}", f"{one.rms:.4g}") for one in stated.records]
-    errors = table(("error of", "what it is", "largest", "rms"), rows, words=(1,)) if rows else ""
-    return f"<h2>How exact it says it is</h2>\n<p>{escape(text)} {_CHECK}</p>\n{errors}"
+    rows = [(one.measure, _MEASURES.get(one.measure, ""), f"{one.max:.4g}", f"{one.rms:.4g}") for one in bounds.records]
+    errors = table(("error of", "meaning", "largest", "rms"), rows, words=(1,)) if rows else ""
+    return f"<h2>Declared error bounds</h2>\n<p>{escape(text)} {_CHECK}</p>\n{errors}"
 
 
 def _scene(facts: FileDescription) -> str:

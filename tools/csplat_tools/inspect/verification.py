@@ -32,8 +32,8 @@ class Verification:
     """The outcome of verifying a file.
 
     Attributes:
-        validation: every violation of the spec, and the checks that were made.
-        proof: verification of the declared errors; `None` if no source was given, or if the file breaks a clause.
+        validation: violations of the spec, and the checks that were made.
+        proof: verification of the declared bounds; `None` without a source, or if the file violates a clause.
     """
 
     validation: Validation
@@ -72,15 +72,14 @@ def verify_file(
     memory_bytes: int | None = None,
     progress: Progress | None = None,
 ) -> Verification:
-    """Look for every violation in a file; if there is none and a source is given, verify its declared errors.
+    """Find every violation in a file; if there is none and a source is given, verify its declared bounds.
 
     Args:
         path: the file, or `-`.
         source: the PLY that it was made from.
         source_index: the .npy file that the encoder wrote.
         max_splats: refuse a scene of more splats (LIM-1); `None`: no limit.
-        memory_bytes: memory that the verification may take; it uses the disk if that is too little. `None`: half of
-            the free memory.
+        memory_bytes: bound on the memory; the disk is used if it is too little. `None`: half of the free memory.
         progress: progress callback for validating and matching.
 
     Raises:
@@ -92,10 +91,10 @@ def verify_file(
         validation = validate(data, splats_max=max_splats, progress=progress)
         if source is None or not validation.conforms:
             return Verification(validation, None)
-        return Verification(validation, _proved(data, source, rows, memory_bytes, progress))
+        return Verification(validation, _verify_bounds(data, source, rows, memory_bytes, progress))
 
 
-def _proved(
+def _verify_bounds(
     data: bytes | mmap, source: str, rows: NDArray[Any] | None, memory_bytes: int | None, progress: Progress | None
 ) -> BoundsVerification:
     opened = open_tiles(data)

@@ -81,7 +81,7 @@ class SearchReport:
         if "keep" in goal:
             asked.append(f"{100.0 * goal['keep']:g} % of {counted(self.splats_before, 'splat')}")
         if "max_loss" in goal:
-            asked.append(f"a loss of {goal['max_psnr_drop']:g} dB by the photographs that decide")
+            asked.append(f"a loss of {goal['max_loss']:g} dB by the photographs that decide")
         lines = [f"target: {'; '.join(asked)}"]
         if self.photographs:
             file, source = self.photographs["file"], self.photographs["source"]

@@ -49,7 +49,7 @@ def find_cameras(
     split: Split = "test",
     report: list[str] | None = None,
 ) -> list[Camera]:
-    """Return the cameras that a command line specifies: those of a file, of a data set, or of an orbit.
+    """Return the cameras of a file, of a data set, or of an orbit.
 
     Args:
         model: the scene to orbit around; a data set's cameras are made relative to its origin.
@@ -58,25 +58,24 @@ def find_cameras(
         data: a data set; its own size is used instead of `size`, unless there is an orbit.
         size: width and height of the renders; the file's own, or 640 by 480, if left out.
         split: the part of a data set whose cameras are used.
-        report: receives lines on how the camera file of another program was understood.
+        report: receives remarks on the camera file of another program.
 
     Raises:
         InputError: none of the three is given, or both a file and a set; the file or the set is invalid; a render of
             that size would be distorted.
     """
     if (path, orbit_count, data) == (None, None, None) or None not in (path, data):
-        raise InputError("wanted the cameras: a file of them, a data set, or a number for an orbit")
+        raise InputError("wanted cameras: a file, a data set, or a number for an orbit")
     cameras: list[Camera] = []
     if path is not None:
         cameras = load_cameras(path, report, model.origin)
     elif data is not None:
-        shots = (
-            data if orbit_count is None else replace(data, size=None)
-        )  # the cameras' positions are needed, not the size of their photographs
-        found = find_view_set(model, data=shots, count=0, split=split)
+        # An orbit requires the cameras' positions, not the size of their photographs.
+        photographs = data if orbit_count is None else replace(data, size=None)
+        found = find_view_set(model, data=photographs, count=0, split=split)
         cameras = [*found.test, *(() if orbit_count is None else (*found.training, *found.validation))]
         if not cameras:
-            raise InputError(f"{data.path} has no {split} pictures")
+            raise InputError(f"{data.path} has no {split} views")
     if orbit_count is not None:
         return orbit_cameras(model, orbit_count, *(size or _DEFAULT_SIZE), along=cameras)
     return cameras if size is None or data is not None else [resized(camera, *size) for camera in cameras]
@@ -122,8 +121,8 @@ def render_folder(
     target = make_output_folder(folder, [name + ending for name in names for ending in endings], force=force)
     files, ignored = [], 0
     with _removed_if_empty(target if is_new else None):
-        pictures = _pictures(model, cameras, background, mode, prepare, progress)
-        for name, result in zip(names, pictures, strict=True):
+        renders = _renders(model, cameras, background, mode, prepare, progress)
+        for name, result in zip(names, renders, strict=True):
             ignored = max(ignored, result.ignored)
             files.append(target / f"{name}.png")
             write_png(files[-1], to_uint8(result.rgb))
@@ -166,14 +165,14 @@ def render_film(
     check_output(path, force=force)
     check_film(path, [(camera.W, camera.H) for camera in cameras], fps)
     frames, ignored = [], 0
-    for result in _pictures(model, cameras, background, mode, prepare, progress):
+    for result in _renders(model, cameras, background, mode, prepare, progress):
         ignored = max(ignored, result.ignored)
         frames.append(to_uint8(result.rgb))
     write_film(path, frames, fps)
     return Rendered((Path(path),), ignored)
 
 
-def _pictures(
+def _renders(
     model: SplatModel,
     cameras: Sequence[Camera],
     background: Colour | None,
@@ -184,8 +183,8 @@ def _pictures(
     """Render camera after camera; see `render_folder`."""
     if prepare is not None:
         prepare()
-    said = TrainingRecord.of(model.metadata)
-    behind = background or (said.background if said else BLACK)
+    record = TrainingRecord.of(model.metadata)
+    behind = background or (record.background if record else BLACK)
     for number, camera in enumerate(cameras):
         if progress is not None:
             progress("rendering", number / len(cameras))
@@ -207,6 +206,6 @@ def _removed_if_empty(folder: Path | None) -> Iterator[None]:
 
 
 def _mean_depth(depth: F32, alpha: F32) -> F32:
-    """Return the mean depth: the renderer sums weight times depth, and alpha is the sum of the weights."""
+    """Return the mean depth: the renderer's depth is a sum over weights, whose own sum is alpha."""
     mean = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0.0)
     return mean.astype(np.float32)
