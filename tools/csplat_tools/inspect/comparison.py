@@ -243,7 +243,7 @@ def attribute_errors(
     bounds = {record.measure: record.max for record in stated.records}
     if not bounds.keys() >= {"means", "opacities", "sh0"}:
         return None
-    found = match(ours, theirs, bounds, lattice_radii(theirs, header), progress=progress)
+    found = find_partners(ours, theirs, bounds, lattice_radii(theirs, header), progress=progress)
     matched = np.flatnonzero(found >= 0)
     if not len(matched):
         return None
@@ -265,7 +265,9 @@ def attribute_errors_out_of_core(
         # For a file that declares no errors and was refitted, all errors are measured.
         nothing = DeclaredBounds(source.count, 0, source.facts.sh_degree, refitted=True, records=())
         opened = replace(open_tiles(other.path), declared_bounds=nothing)
-        proof = prove_by_disk(source.scene, opened, source_index, memory_bytes=source.memory_bytes, progress=progress)
+        proof = verify_out_of_core(
+            source.scene, opened, source_index, memory_bytes=source.memory_bytes, progress=progress
+        )
         found = {one.name: (one.measured_max or 0.0, one.measured_rms or 0.0) for one in proof.measures}
         return AttributeErrors("index", other.count, 0, found)
     if source.count != other.count or not _same_order(source.sample(progress)[0], other.sample(progress)[0]):
@@ -274,7 +276,7 @@ def attribute_errors_out_of_core(
         (start, len(theirs), measure_pairs(Source.of(ours), theirs, np.arange(len(theirs))))
         for start, ours, theirs in _paired_blocks(source.scene, other.scene, progress)
     ]
-    found = {name: (one.max, one.rms) for name, one in merged(parts).items()}
+    found = {name: (one.max, one.rms) for name, one in merge_errors(parts).items()}
     return AttributeErrors("order", other.count, 0, found)
 
 
