@@ -74,7 +74,7 @@ def test_the_page_shows_the_source_beside_the_file(files, page):
     assert 4 == len(re.findall(r'<img src="data:image/webp;base64,', text))
     words = ["compare", str(files[1]), str(files[0])]
     compared = CliRunner().invoke(app, words).stdout
-    assert re.search(r"^psnr +(\S+) dB", compared, re.MULTILINE)[1] == re.search(r"([\d.]+) dB: how near", text)[1]
+    assert re.search(r"^psnr +(\S+) dB", compared, re.MULTILINE)[1] == re.search(r"([\d.]+) dB: likeness", text)[1]
 
 
 @pytest.mark.slow

@@ -92,7 +92,7 @@ def encode_by_importance(
     pruned = {"unseen": len(model) - len(rows), "views": stored.view_count, "source": stored.source}
     result = encode_with_report(
         model.select(rows), options, importance=weights.select(rows) if isinstance(weights, Importance) else None,
-        origin=Origin(len(model), rows), said={"pruned": pruned}, progress=progress,
+        origin=Origin(len(model), rows), metadata={"pruned": pruned}, progress=progress,
     )  # fmt: skip
     if stored.missed_share > 0.0:  # False for NaN: no view was held out
         missed = (

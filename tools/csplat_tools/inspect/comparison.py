@@ -393,7 +393,7 @@ class _ImageWriter:
         self._photographs, self._amplification = photographs, amplification
 
     def __call__(self, number: int, a: F32, b: F32) -> None:
-        shown = None if self._photographs is None else self._photographs.look(number).picture
+        shown = None if self._photographs is None else self._photographs.reference(number).rgb
         write_png(self._target / self._files[number], side_by_side(a, b, self._amplification, shown))
 
 
