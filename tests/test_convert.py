@@ -118,7 +118,7 @@ def test_a_scene_is_changed_in_the_order_that_help_says(tmp_path, ply):
 
 def test_a_sphere_is_kept_around_the_places_that_people_see(make_model):
     model = make_model(200, 0, origin=(100.0, 0.0, 0.0))
-    kept = Filters(crop_sphere=(100.0, 0.0, 0.0, 0.7)).apply(scene_of(model))
+    kept = Filters(crop_sphere=(100.0, 0.0, 0.0, 0.7)).apply(source_from_model(model))
     assert (np.linalg.norm(model.means, axis=1) <= 0.7).sum() == kept.count == len(kept.model())
 
 
@@ -156,7 +156,7 @@ def test_floaters_are_dropped():
         opacities=np.full(n, 0.9, np.float32),
         sh0=np.zeros((n, 3), np.float32),
     )
-    left = Filters(drop_floaters=True).apply(scene_of(model))
+    left = Filters(drop_floaters=True).apply(source_from_model(model))
     assert 3001 == left.count == len(left.model())
 
 

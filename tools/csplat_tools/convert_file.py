@@ -52,19 +52,19 @@ class Filters:
     drop_floaters: bool = False
     sh_degree: int | None = None
 
-    def apply(self, scene: Scene) -> Scene:
+    def apply(self, scene: SceneSource) -> SceneSource:
         """Return the changed scene."""
         if self.to_axes is not None:
             scene = convert_axes(scene, self.to_axes)
         if self.rotate is not None:
             matrix = _rotation(self.rotate)
-            scene = _map_blocks(scene, lambda model: turned(model, matrix))
+            scene = _map_blocks(scene, lambda model: rotate_scene(model, matrix))
         if self.scale is not None:
             factor = self.scale
-            scene = _map_blocks(scene, lambda model: scaled(model, factor))
+            scene = _map_blocks(scene, lambda model: scale_scene(model, factor))
         if self.translate is not None:
             offset = self.translate
-            scene = _map_blocks(scene, lambda model: moved(model, offset))
+            scene = _map_blocks(scene, lambda model: translate_scene(model, offset))
         if self.crop_box is not None:
             corners = np.sort(np.array(self.crop_box).reshape(2, 3), axis=0)
             scene = _select(scene, lambda model: _inside_box(model, corners))
@@ -75,7 +75,7 @@ class Filters:
             scene = _without_floaters(scene)
         if self.sh_degree is not None:
             degree = self.sh_degree
-            scene = _map_blocks(scene, lambda model: without_bands(model, degree))
+            scene = _map_blocks(scene, lambda model: drop_bands(model, degree))
         return scene
 
 
@@ -118,12 +118,12 @@ def _key(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     return key
 
 
-def _map_blocks(scene: Scene, change: Callable[[SplatModel], SplatModel]) -> Scene:
+def _map_blocks(scene: SceneSource, change: Callable[[SplatModel], SplatModel]) -> SceneSource:
     blocks = scene.blocks
     return replace(scene, facts=change(scene.facts), blocks=lambda: (change(model) for model in blocks()))
 
 
-def _select(scene: Scene, keep: Callable[[SplatModel], Mask]) -> Scene:
+def _select(scene: SceneSource, keep: Callable[[SplatModel], Mask]) -> SceneSource:
     def blocks() -> Iterator[SplatModel]:
         for model in scene.blocks():
             kept = keep(model)

@@ -120,7 +120,7 @@ def encode_out_of_core(
     if progress is not None:
         progress("opening", 0.0)
     with open_scene(local, sh_degree=read_degree(options)) as reader:
-        in_memory = needs_of(reader, options, scale.memory_bytes, by_disk=scale.out_of_core).in_memory
+        in_memory = estimate_needs(reader, options, scale.memory_bytes, by_disk=scale.out_of_core).in_memory
         if in_memory and scale.cluster is None and not scale.resume:
             if reader.format in CHEAP_TO_REOPEN:
                 return None
@@ -190,7 +190,7 @@ def estimate_cost(local: Path, options: EncodeOptions, scale: OutOfCoreOptions) 
         OSError: the scene cannot be read.
     """
     with open_scene(local, sh_degree=read_degree(options)) as reader:
-        needs = needs_of(reader, options, scale.memory_bytes, by_disk=scale.out_of_core)
+        needs = estimate_needs(reader, options, scale.memory_bytes, by_disk=scale.out_of_core)
         count = reader.count
         degree = reader.facts.sh_degree if options.sh_degree is None else min(options.sh_degree, reader.facts.sh_degree)
     read, code, book = _SECONDS[min(degree, 1) if options.preset == "fast" else degree]

@@ -324,11 +324,11 @@ def ply_splat_bytes(sh_degree: int) -> int:
     return 4 * (14 + 3 * (sh_degree + 1) ** 2)
 
 
-def with_progress(scene: Scene, stage: str, progress: Progress | None) -> Scene:
+def with_progress(scene: SceneSource, stage: str, progress: Progress | None) -> SceneSource:
     """Return the scene with blocks that report progress while they are written."""
     if progress is None:
         return scene
-    reporting = scenes.watched(scene, stage, progress)
+    reporting = scenes.with_progress(scene, stage, progress)
 
     def blocks() -> Iterator[SplatModel]:
         yield from reporting.blocks()
@@ -337,7 +337,7 @@ def with_progress(scene: Scene, stage: str, progress: Progress | None) -> Scene:
     return replace(scene, blocks=blocks)
 
 
-def without_extra_columns(scene: Scene) -> Scene:
+def without_extra_columns(scene: SceneSource) -> SceneSource:
     """Return the scene without the columns that splats do not have."""
     if not scene.facts.extra:
         return scene
@@ -374,6 +374,6 @@ class MetadataOverrides:
         model = replace(model, **changes) if changes else model
         return with_up(model, self.up, self.coordinate_system)
 
-    def apply_to_scene(self, scene: Scene) -> Scene:
+    def apply_to_scene(self, scene: SceneSource) -> SceneSource:
         """Return the scene with these overrides."""
         return replace(scene, facts=self.apply(scene.facts), blocks=lambda: map(self.apply, scene.blocks()))

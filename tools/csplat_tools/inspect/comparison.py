@@ -306,10 +306,12 @@ def estimate_psnr(
         return None
 
 
-def _paired_blocks(a: Scene, b: Scene, progress: Progress | None) -> Iterator[tuple[int, SplatModel, SplatModel]]:
+def _paired_blocks(
+    a: SceneSource, b: SceneSource, progress: Progress | None
+) -> Iterator[tuple[int, SplatModel, SplatModel]]:
     """Yield blocks of the splats of two scenes of the same order, with the number of the first splat."""
-    first = scenes.watched(a, "measuring splats", progress or null_progress).blocks()
-    second = scenes.watched(b, "", null_progress).blocks()
+    first = scenes.with_progress(a, "measuring splats", progress or null_progress).blocks()
+    second = scenes.with_progress(b, "", null_progress).blocks()
     start, ours, theirs = 0, a.facts, b.facts
     while start < a.count:
         ours, theirs = ours if len(ours) else next(first), theirs if len(theirs) else next(second)
@@ -359,7 +361,7 @@ def _measured(
         if one.memory_bytes < one.least_bytes:
             bound, least = (one.memory_bytes + kept) / 1e6, (one.least_bytes + kept) / 1e6
             raise InputError(f"{bound:,.0f} MB of memory are too little to draw these scenes, which take {least:,.0f}")
-    check_room(
+    check_free_space(
         tempfile.gettempdir(),
         max(first.disk_bytes, second.disk_bytes),
         "scenes are rendered: TMPDIR names another folder",
