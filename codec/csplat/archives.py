@@ -1,4 +1,4 @@
-"""Reading NumPy's archives (.npz) that may be damaged, or something else."""
+"""Read NumPy archives (.npz), which may be damaged or something else, and name the scenes in zips and folders."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.file_source import describe_substitute
 
-#: What NumPy and zipfile raise of damage: RuntimeError is for passwords and unknown ways to compress, MemoryError for
-#: sizes that no array has, OSError for places outside the file and broken bz2.
+#: Exceptions of NumPy and zipfile for damaged files: RuntimeError for passwords and unknown compression, MemoryError
+#: for impossible sizes, OSError for offsets outside the file and broken bz2.
 DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError,
             SyntaxError, OSError, struct.error, tokenize.TokenError, lzma.LZMAError, zlib.error,
             zipfile.BadZipFile)  # fmt: skip
 
 
-#: Endings of the files of scenes, which somebody may have put into a zip.
+#: File name endings of scenes, which a zip may hold.
 _SCENES = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf", ".csplat", ".pt", ".ckpt", ".pth")
-#: Where they lie in the folder of a trainer's outputs: INRIA's, gsplat's, nerfstudio's.
+#: Their places in the output folders of INRIA's trainer, gsplat's and nerfstudio's.
 _PLACES = ("*", "iteration_*/*", "point_cloud/iteration_*/*", "ply/*", "ckpts/*", "nerfstudio_models/*")
-_POINTS = "input.ply"  # the points that INRIA's trainer began with
-_NAMED = 5  # scenes that a message names, at most
+_POINTS = "input.ply"  # initial points of INRIA's trainer
+_NAMED = 5  # maximum number of scenes in a message
 
 
 def scenes_of(names: Iterable[str]) -> list[str]:
@@ -41,7 +41,7 @@ def scenes_of(names: Iterable[str]) -> list[str]:
 
 
 def zip_refusal(path: Path) -> str:
-    """Say of a zip that is no scene itself which scenes lie in it."""
+    """Return the message for a zip that is not a scene; it names the scenes in it."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = [name for name in archive.namelist() if not name.startswith("__MACOSX/")]
@@ -59,7 +59,7 @@ def zip_refusal(path: Path) -> str:
 
 
 def folder_refusal(path: Path) -> str:
-    """Say of a folder that is no scene itself which scenes lie in it, as trainers leave them."""
+    """Return the message for a folder that is not a scene; it names the scenes that a trainer left in it."""
     found = {one for place in _PLACES for one in path.glob(place) if one.name.lower().endswith(_SCENES)}
     scenes = sorted(one.relative_to(path).as_posix() for one in found if one.name != _POINTS)
     if not scenes:
@@ -70,12 +70,12 @@ def folder_refusal(path: Path) -> str:
 
 
 class Archive(dict[str, NDArray[Any]]):
-    """The arrays of a file by name; one that is wanted and not there is an `InputError`.
+    """The arrays of a file by name; a missing one raises `InputError`.
 
     Args:
-        path: of the file.
-        kind: what it should be, for messages: "a checkpoint of csplat train".
-        arrays: what it holds.
+        path: the file.
+        kind: its kind, for messages: "a checkpoint of csplat train".
+        arrays: its arrays.
     """
 
     def __init__(self, path: str | Path, kind: str, arrays: dict[str, NDArray[Any]]) -> None:
@@ -86,15 +86,15 @@ class Archive(dict[str, NDArray[Any]]):
         self.refuse(f"it holds no {name}")
 
     def refuse(self, reason: object) -> NoReturn:
-        """Raise the `InputError` that says why the file is not what it should be."""
+        """Raise the `InputError` for a file that is not of its kind."""
         text = textwrap.shorten(str(reason), 120)
         raise InputError(f"{self._path} is not {self._kind}: {text}")
 
     def facts(self) -> dict[str, Any]:
-        """The JSON object that is kept as an array of bytes by the name of "facts".
+        """Return the JSON object in the array of bytes "facts".
 
         Raises:
-            InputError: there is none.
+            InputError: there is no such object.
         """
         try:
             found = json.loads(self["facts"].tobytes())
@@ -112,14 +112,14 @@ class Archive(dict[str, NDArray[Any]]):
 
 
 def read_archive(path: str | Path, kind: str) -> Archive:
-    """Read all arrays of a .npz file; nothing in it is run.
+    """Read all arrays of a .npz file, without pickle.
 
     Args:
         path: the file.
         kind: as in `Archive`.
 
     Raises:
-        InputError: it is damaged, or no such file.
+        InputError: it is damaged, or not a .npz file.
         OSError: it cannot be read.
     """
     nothing = Archive(path, kind, {})

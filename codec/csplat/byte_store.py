@@ -1,4 +1,4 @@
-"""Files in memory, on disk or at a URL, read in parts."""
+"""Read parts of files in memory or on disk; the base of the store for URLs."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class RequestSizes:
         first: bytes of the first request: the index of a scene of some twenty million splats.
         batch: bytes of tiles that are fetched together if tiles are read one after the other.
         gap: bytes between two parts that are read along with them: they take less time than a separate request.
-        request: bytes of one request, at most.
-        at_once: requests that run concurrently.
+        request: maximum size of one request in bytes.
+        at_once: maximum number of concurrent requests.
     """
 
     first: int = 1 << 16
@@ -42,8 +42,8 @@ class Store:
         name: name in messages; for a URL, without passwords and signatures; empty if it has none.
         size: size of the file in bytes.
         requests: number of requests to the store, including those for its size.
-        bytes_read: bytes that it gave.
-        sizes: how it is asked; may be replaced before the first request.
+        bytes_read: number of bytes read.
+        sizes: sizes of requests; may be replaced before the first one.
     """
 
     sizes = RequestSizes()
@@ -55,11 +55,14 @@ class Store:
         self.bytes_read = 0
 
     def read(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-        """Read parts of the file: first byte and the one behind the last, of each.
+        """Read parts of the file.
+
+        Args:
+            ranges: first byte of each part, and the byte behind its last.
 
         Raises:
-            StoreError: the store gave something else, or broke off.
-            OSError: the file is not there any more, or may not be read.
+            StoreError: the store returned something else, or the connection broke.
+            OSError: the file no longer exists, or may not be read.
         """
         self.requests += len(ranges)
         try:
@@ -78,16 +81,16 @@ class Store:
         """Return a message if the file is not the one that was opened; otherwise ""."""
         return f"{self.name} has changed while it was read: open it again" if self._is_other() else ""
 
-    def _fault(self, said: str) -> StoreError:
+    def _fault(self, message: str) -> StoreError:
         """Return the error for unexpected data, which a changed file would explain."""
         try:
-            return StoreError(self.changed() or said)
+            return StoreError(self.changed() or message)
         except (StoreError, OSError):
-            return StoreError(said)
+            return StoreError(message)
 
     @contextmanager
     def named_errors(self) -> Iterator[None]:
-        """Name the file in errors, and report whether it is at fault or has changed since it was opened."""
+        """Name the file in errors, and report it as changed if it is not the file that was opened."""
         try:
             yield
         except CsplatError as error:
@@ -97,7 +100,7 @@ class Store:
             raise
 
     def close(self) -> None:
-        """Let go of it."""
+        """Release the file."""
 
     def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
         raise NotImplementedError
@@ -107,12 +110,12 @@ class Store:
 
 
 class MemoryStore(Store):
-    """Bytes, or an open file, which is read to its end."""
+    """A file in memory: bytes, or an open file, which is read to its end."""
 
     def __init__(self, file: File) -> None:
         self._view = view_of(file)
-        said = file if isinstance(file, (str, os.PathLike)) else getattr(file, "name", None)
-        super().__init__(os.fspath(said) if isinstance(said, (str, os.PathLike)) else "", len(self._view))
+        name = file if isinstance(file, (str, os.PathLike)) else getattr(file, "name", None)
+        super().__init__(os.fspath(name) if isinstance(name, (str, os.PathLike)) else "", len(self._view))
 
     def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
         return [bytes(self._view[start:stop]) for start, stop in ranges]
@@ -139,7 +142,7 @@ class DiskStore(Store):
 
 
 class FileWindow:
-    """A file's bytes at their own places, as far as they were fetched; all others are 0, and take no memory.
+    """A view of a file in which only the fetched parts are present; all other bytes are 0 and take no memory.
 
     Attributes:
         view: as long as the file.
@@ -147,7 +150,7 @@ class FileWindow:
 
     Args:
         store: the file.
-        head: its beginning, if that was read already.
+        head: its beginning, if it was read already.
     """
 
     def __init__(self, store: Store, head: bytes = b"") -> None:
@@ -163,7 +166,10 @@ class FileWindow:
         self.view[: len(head)] = head
 
     def fetch(self, parts: Iterable[tuple[int, int]]) -> None:
-        """Read parts of the file, each an offset and a size; those that lie together in one request, others not again.
+        """Read parts of the file that are not present yet; adjacent ones in one request.
+
+        Args:
+            parts: offset and size of each.
 
         Raises:
             StoreError, OSError: as in `Store.read`.
@@ -180,7 +186,7 @@ class FileWindow:
         self._take(waiting)
 
     def forget(self) -> None:
-        """Let go of all that was fetched; nothing may look at it any more."""
+        """Discard all fetched parts; they must no longer be used."""
         if self._pages is not None:
             self._pages.discard()
         self.view[: len(self._head)] = self._head
@@ -195,7 +201,7 @@ class FileWindow:
 
 
 def _joined(ranges: Iterable[tuple[int, int]], gap: int = 0) -> list[tuple[int, int]]:
-    """Ranges in order, as one if no more than a gap lies between them."""
+    """Sort ranges, and join those that are at most `gap` apart."""
     runs: list[tuple[int, int]] = []
     for start, stop in sorted(ranges):
         if runs and start - runs[-1][1] <= gap:

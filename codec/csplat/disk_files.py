@@ -1,4 +1,4 @@
-"""Files as callers name them: written so that a reader never sees half of one, read from wherever they are."""
+"""Read text, JSON and arrays; copy inputs to disk; write files that appear only when complete."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class BinaryWriter(Protocol):
     """A binary file open for writing, such as `open(path, "wb")` or `io.BytesIO`."""
 
     def write(self, data: bytes | memoryview, /) -> object:
-        """Take some bytes."""
+        """Write some bytes."""
         ...
 
 
@@ -91,12 +91,12 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 
 def check_free_space(folder: str | os.PathLike[str], wanted_bytes: int, what: str) -> None:
-    """Refuse work that a disk has no room for.
+    """Refuse work that needs more space than a disk has free.
 
     Args:
         folder: a folder on the disk.
         wanted_bytes: bytes that the work will write.
-        what: the work that needs them, in words.
+        what: the work, in words.
 
     Raises:
         InputError: the disk has fewer free.
@@ -111,10 +111,10 @@ def check_free_space(folder: str | os.PathLike[str], wanted_bytes: int, what: st
 
 @contextmanager
 def local_file(file: File, name: str = "") -> Iterator[Path]:
-    """Give the path of a file that can be read twice. What is none is copied into a temporary one first.
+    """Yield the path of a file that can be read twice; anything but a path is copied into a temporary file.
 
     Args:
-        file: a path; a binary file, read from its current position; or bytes. Named pipes are copied, too.
+        file: a path; a binary file, read from its current position; or bytes. Named pipes are copied as well.
         name: name of the copy, for messages; by default that of the binary file, or "data".
 
     Raises:
@@ -130,8 +130,8 @@ def local_file(file: File, name: str = "") -> Iterator[Path]:
             yield copied
             return
     with TemporaryDirectory(prefix="csplat-", ignore_cleanup_errors=True) as folder:  # Windows: it may be mapped yet
-        said = getattr(file, "name", None)
-        spool = Path(folder) / (name or (Path(said).name if isinstance(said, str) else "") or "data")
+        own = getattr(file, "name", None)
+        spool = Path(folder) / (name or (Path(own).name if isinstance(own, str) else "") or "data")
         with _named(spool), spool.open("wb") as stream:
             for part in _parts(file):
                 stream.write(part)
@@ -139,7 +139,7 @@ def local_file(file: File, name: str = "") -> Iterator[Path]:
 
 
 def _parts(file: Any) -> Iterator[memoryview]:
-    """The bytes of what is no path, some at a time."""
+    """Yield the bytes of anything but a path, piece by piece."""
     try:
         if isinstance(file, mmap) or not hasattr(file, "read"):
             yield memoryview(file).cast("B")
@@ -154,7 +154,7 @@ def _parts(file: Any) -> Iterator[memoryview]:
 
 @contextmanager
 def _named(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Make errors name the file that could not be written: writing itself does not."""
+    """Add the name of the file to errors of writing."""
     try:
         yield
     except OSError as error:
@@ -165,7 +165,7 @@ def _named(path: str | os.PathLike[str]) -> Iterator[None]:
 
 @contextmanager
 def open_writer(file: str | os.PathLike[str] | BinaryWriter) -> Iterator[BinaryWriter]:
-    """Give what to write a file to: `atomic_writer` of a path; an open binary file as it is, and it stays open.
+    """Yield a writer for a file: `atomic_writer` for a path; an open binary file itself, which stays open.
 
     Raises:
         InputError: it is neither.
@@ -189,13 +189,13 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
 
     Args:
         path: path of the file to write.
-        replace: replace an existing file; if False, a file that was created meanwhile is kept, too.
+        replace: replace an existing file; if False, a file that was created meanwhile is kept as well.
 
     Yields:
         A binary file object, positioned at 0.
 
     Raises:
-        FileExistsError: the file is there and is not to be replaced.
+        FileExistsError: the file exists and `replace` is False.
         OSError: the folder does not exist, is full or is not writable.
     """
     if Path(path).exists() and not Path(path).is_file():
@@ -222,10 +222,10 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
 
 
 def _take_name(temporary: Path, target: Path) -> None:
-    """Give a complete file its name, which of several writers one gets.
+    """Give a complete file its name, unless another writer was faster.
 
     Raises:
-        FileExistsError: another one was quicker.
+        FileExistsError: another writer was faster.
     """
     try:
         os.link(temporary, target)
@@ -243,7 +243,7 @@ def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -
 
     Args:
         path: path of the file.
-        most_bytes: larger files are mapped into memory; `None`: none are.
+        most_bytes: larger files are mapped into memory; `None`: no file is.
 
     Raises:
         InputError: it is not one.

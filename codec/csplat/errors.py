@@ -1,12 +1,12 @@
-"""Exceptions, one class for each party at fault.
+"""Define the exceptions, one class for each party at fault.
 
 | class | at fault | what helps |
 |---|---|---|
 | `FormatError` | the file: it breaks a clause of the format | another copy of the file |
-| `UnsupportedError` | nobody: the file asks for what this decoder does not do | a newer decoder |
-| `LimitError` | nobody: the file asks for more than the caller allows | larger limits |
-| `InputError` | the caller's data: a PLY, an array, an option | the message says |
-| `StoreError` | a server, or the line to it: a file's bytes do not come, or are others | trying again |
+| `UnsupportedError` | nobody: the file needs a feature that this decoder does not have | a newer decoder |
+| `LimitError` | nobody: the file needs more than the caller allows | larger limits |
+| `InputError` | the caller's data: a PLY, an array, an option | see the message |
+| `StoreError` | a server, or the connection to it | trying again |
 
 Every error has a `code`, a short constant string that programs may compare.
 """
@@ -34,8 +34,7 @@ class FormatError(CsplatError):
 
     Args:
         code: error code of the registry, `E_...`.
-        offset: byte of the file where the offending field begins; `None` if no single byte is
-            to blame.
+        offset: offset in the file of the invalid field; `None` if it is not a single field.
         clause: id of the clause that is broken, `CRC-1`.
         detail: text after the colon, if `found` and `wanted` are not enough.
         found: value in the file.
@@ -63,12 +62,12 @@ class FormatError(CsplatError):
 
 
 class UnsupportedError(CsplatError):
-    """A file asks for a feature that this decoder does not have.
+    """A file needs a feature that this decoder does not have.
 
     Args:
         feature: name of the feature that the file requires, `version 0.7`.
         code: error code of the registry.
-        offset: offset in the file of the bytes that ask for it, if known.
+        offset: offset in the file of the bytes that need it, if known.
         clause: id of the clause that specifies this, if there is one.
     """
 
@@ -90,14 +89,14 @@ class UnsupportedError(CsplatError):
 
 
 class LimitError(CsplatError):
-    """A file asks for more than the caller's limits allow. Nothing was allocated.
+    """A file needs more than the caller's limits allow. Nothing was allocated.
 
     Args:
         limit: name of the limit, `max_splats`.
-        wanted: amount that the file asks for.
+        wanted: amount that the file needs.
         allowed: amount that the caller allows.
         code: error code of the registry.
-        offset: offset in the file of the bytes that ask for it, if known.
+        offset: offset in the file of the bytes that need it, if known.
         clause: id of the clause that specifies this, if there is one.
     """
 
@@ -137,7 +136,7 @@ class InputError(CsplatError):
 
 
 class StoreError(CsplatError):
-    """The store that a file lies in did not give its bytes: a server without parts, a lost connection, another file.
+    """The store of a file did not return its bytes: no support of ranges, a lost connection, a changed file.
 
     Args:
         message: one line that names the file and states what arrived instead.
@@ -150,18 +149,18 @@ class StoreError(CsplatError):
 
 
 def counted(count: int, one: str, many: str | None = None) -> str:
-    """A number and what it counts, for messages: `1 tile`, `59,325 tiles`.
+    """Format a number with the noun it counts: `1 tile`, `59,325 tiles`.
 
     Args:
         count: the number.
-        one: the word for one of them.
-        many: that for others; `None`: the same with an s.
+        one: the noun in the singular.
+        many: the noun in the plural; `None`: the singular with an s.
     """
     return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
 def missing_package(error: ModuleNotFoundError, package: str | None = None, *, extra: str = "render") -> InputError:
-    """One line for a package that a plain install leaves out.
+    """Return the error for a package that a plain install leaves out.
 
     Args:
         error: error raised by its import.

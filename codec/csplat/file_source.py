@@ -1,4 +1,4 @@
-"""Input files: the forms they may be passed in, content that comes in their place, and files on disk as bytes."""
+"""Accept input files as paths, binary files or bytes; map files; recognise content that came in their place."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Protocol
 
 _LFS = "Git LFS, not the file itself: run `git lfs pull`"
-#: By how they begin, files that stand for others in a repository, of what, and what helps.
+#: Pointer files of repositories by their first bytes: program and remedy.
 _POINTERS = {
     b"version https://git-lfs.github.com/spec/": _LFS,
     b"version https://hawser.github.com/spec/": _LFS,
@@ -50,7 +50,7 @@ def map_file(path: str | os.PathLike[str]) -> bytes | mmap:
 
 
 def describe_substitute(head: bytes) -> str:
-    """Name the content that came in place of a file, whatever file was expected; "" if there is no sign of that.
+    """Return a description of content that came in place of a file, for any kind of file; "" if there is no sign of it.
 
     Args:
         head: the first bytes of the file, 64 or more if it has them.
@@ -73,7 +73,7 @@ def describe_substitute(head: bytes) -> str:
 
 
 class PageReleaser:
-    """Releases pages of a memory-mapped file during a sequential read. Owns the count of bytes since the last release.
+    """Releases pages of a memory-mapped file during a sequential read.
 
     Pages that were read count as memory of the process until the machine is short of it; released pages are read again
     when they are needed again. Bytes in memory stay as they are.
@@ -91,7 +91,7 @@ class PageReleaser:
         self._read_bytes, self._step_bytes = 0, step_bytes
 
     def after(self, size_bytes: int) -> None:
-        """Count bytes that were read, and release all pages now and then."""
+        """Count bytes that were read, and release all pages after every `step_bytes`."""
         self._read_bytes += size_bytes
         if sys.platform != "win32" and self._file is not None and self._read_bytes >= self._step_bytes:
             self._read_bytes = 0

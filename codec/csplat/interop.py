@@ -1,8 +1,8 @@
 # torch may be absent:
 # pyright: reportMissingImports=false
-"""To and from what trainers hold: a dict of arrays or tensors under gsplat's names.
+"""Convert models to and from dicts of arrays or tensors under gsplat's names, as trainers have them.
 
-| name | `form="parameters"`, as in training and checkpoints | `form="activated"`, as `gsplat.rasterization` wants it |
+| name | `form="parameters"`, as in training and checkpoints | `form="activated"`, as in `gsplat.rasterization` |
 |---|---|---|
 | `means` | [N, 3] scene units | the same |
 | `quats` | [N, 4] w x y z, of any length | the same |
@@ -11,8 +11,8 @@
 | `sh0` | [N, 1, 3] coefficient of degree 0 | the same |
 | `shN` | [N, K, 3] the higher ones, K = 0, 3, 8 or 15 | the same |
 
-A `SplatModel` holds logarithms of scales and alpha, which is neither of the two: say which form is meant.
-torch is imported where tensors are asked for, and nowhere else.
+A `SplatModel` holds logarithms of scales and alpha, which is neither of the two: the form must be given.
+torch is imported only when tensors are requested.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 Form = Literal["parameters", "activated"]
 
 _NEEDED = ("means", "quats", "scales", "opacities", "sh0")
-_SPLATS = "splats"  # where a checkpoint of gsplat's trainer has them
+_SPLATS = "splats"  # the member of gsplat's checkpoints that has them
 
 
 def from_gsplat(splats: Mapping[str, Any], *, form: Form = "parameters") -> SplatModel:
-    """Make a model of a dict under gsplat's names.
+    """Make a model from a dict under gsplat's names.
 
     Args:
         splats: arrays, or tensors of torch on any device, with or without gradients: `means` [N, 3], `quats` [N, 4]
@@ -48,8 +48,8 @@ def from_gsplat(splats: Mapping[str, Any], *, form: Form = "parameters") -> Spla
             `gsplat.rasterization` takes them: standard deviations in scene units, alpha.
 
     Returns:
-        The scene: float32, rotations at unit length. The arrays are copies. What no array says is as by default: of a
-        scene that was trained so, `dataclasses.replace(model, antialiased=True)` says it.
+        The scene: float32, rotations at unit length. The arrays are copies. Other fields have their defaults; for a
+        scene that was trained with antialiasing, use `dataclasses.replace(model, antialiased=True)`.
 
     Examples:
         >>> import csplat, numpy as np
@@ -95,7 +95,7 @@ def to_gsplat(model: SplatModel, *, form: Form = ..., device: str) -> dict[str, 
 def to_gsplat(
     model: SplatModel, *, form: Form = "parameters", device: str | None = None
 ) -> dict[str, F32] | dict[str, Tensor]:
-    """Give a model as a dict under gsplat's names.
+    """Convert a model to a dict under gsplat's names.
 
     To render with gsplat: `s = to_gsplat(model, form="activated", device="cuda")`, and then
     `rasterization(s["means"], s["quats"], s["scales"], s["opacities"], torch.cat([s["sh0"], s["shN"]], 1), viewmats,
@@ -118,7 +118,7 @@ def to_gsplat(
         ((1000, 1, 3), (1000, 15, 3), True)
 
     Raises:
-        InputError: it is no model, the form is none, or torch is not installed.
+        InputError: it is not a model, the form is unknown, or torch is not installed.
     """
     check_model("to_gsplat", model)
     _check_form(form)
@@ -143,7 +143,7 @@ def to_gsplat(
 
 
 def _array(name: str, value: Any) -> F32:
-    """A float32 copy of an array, or of a tensor wherever it is."""
+    """Copy an array or a tensor of any device to float32."""
     if hasattr(value, "detach"):
         value = value.detach().cpu().float().numpy()  # float: NumPy knows no bfloat16
     try:

@@ -1,7 +1,7 @@
-"""`SplatModel`: the one in-memory form of a scene of 3D Gaussian splats.
+"""Hold a scene of 3D Gaussian splats in memory: `SplatModel`.
 
-Everything that reads, writes, renders or compresses splats meets here. The constructor checks
-and never repairs: readers of other formats bring their data into this form first.
+All readers, writers, renderers and the codec use it. The constructor checks and never repairs: readers convert their
+data first.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _NO_SH: F32 = np.zeros((0, 0, 3), np.float32)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SplatModel:
-    """N splats and what a viewer must know about them.
+    """N splats and the metadata that a viewer needs.
 
     The arrays are not copied and not made read-only; treat them as constant.
 
@@ -46,7 +46,7 @@ class SplatModel:
         opacities: [N] float32, alpha in [0, 1] (no logits).
         sh0: [N, 3] float32, spherical-harmonics coefficient of degree 0, red green blue.
         shN: [N, K, 3] float32, the higher coefficients, K = (d + 1)**2 - 1 for d = 0, 1, 2, 3.
-            Left out: none, K = 0.
+            By default none, K = 0.
         origin: what to add to `means`, three float64, scene units. A scene at geographic
             coordinates keeps its float32 precision this way.
         means_double: [N, 3] float64, the centres as the source has them, origin included, where
@@ -65,7 +65,7 @@ class SplatModel:
 
     Raises:
         InputError: an array has another shape or dtype, holds NaN or infinity, or is out of
-            range; or a field does not hold what is said above.
+            range; or another field is invalid.
     """
 
     means: F32
@@ -135,7 +135,7 @@ class SplatModel:
         """Keep some splats, in the order of `index`; everything else stays.
 
         Args:
-            index: whatever indexes the first axis of a NumPy array: positions, a mask, a slice.
+            index: an index of the first axis of a NumPy array: positions, a mask, a slice.
 
         Returns:
             A model of the chosen splats (views of this one's arrays for a slice).
@@ -170,10 +170,10 @@ def trusted_model(**values: Any) -> SplatModel:
 
 
 def check_model(caller: str, model: object) -> None:
-    """Refuse what is no model, naming what makes one.
+    """Refuse anything but a model, with a hint how to make one.
 
     Raises:
-        InputError: it is none.
+        InputError: it is not a model.
     """
     if not isinstance(model, SplatModel):
         raise InputError(
@@ -183,7 +183,7 @@ def check_model(caller: str, model: object) -> None:
 
 
 def check_sh_degree(sh_degree: int | None) -> None:
-    """Refuse a highest SH band that no model has.
+    """Refuse a highest SH band out of range.
 
     Raises:
         InputError: it is neither `None` nor 0 to `MAX_SH_DEGREE`.
@@ -193,7 +193,7 @@ def check_sh_degree(sh_degree: int | None) -> None:
 
 
 def sh_degree_of(coefficient_count: int) -> int:
-    """Spherical-harmonics degree of K higher coefficients.
+    """Return the spherical-harmonics degree of K higher coefficients.
 
     Args:
         coefficient_count: K, the length of the middle axis of `shN`.
@@ -296,14 +296,14 @@ def _checked_origin(origin: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _check_doubles(means: F32, doubles: F64, origin: tuple[float, float, float]) -> None:
-    """A model whose means were changed has to let go of the doubles."""
+    """Refuse doubles of which the means are not the rounding: changed means need other doubles or none."""
     fits = isinstance(doubles, np.ndarray) and doubles.dtype == np.float64 and doubles.shape == means.shape
     if not fits or not np.array_equal((doubles - np.array(origin)).astype(np.float32), means):
         raise InputError("means_double is not the centres of which means are the float32 less the origin")
 
 
 def check_axes(letters: str) -> None:
-    """Refuse what is no directions of +x, +y and +z.
+    """Refuse letters that are not directions of +x, +y and +z.
 
     Raises:
         InputError: they are not three letters, one each of R/L, U/D and F/B.

@@ -1,4 +1,4 @@
-"""Files at URLs of any store that fsspec knows, and which store a file lies in."""
+"""Read parts of files at URLs, with fsspec, and choose the store of a file."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ def is_url(file: object) -> bool:
 
 
 def open_store(file: File, storage: Mapping[str, Any] | None = None) -> Store:
-    """Open what a file lies in.
+    """Open the store of a file.
 
     Args:
         file: a path, a URL, an open binary file, or bytes.
         storage: options of fsspec's file system, for a URL.
 
     Raises:
-        InputError: it is none of these, or a URL that nothing here knows.
+        InputError: it is none of these, or a URL of an unknown kind.
         StoreError: the store does not answer.
-        OSError: it is not there, or cannot be read.
+        OSError: the file does not exist, or cannot be read.
     """
     if isinstance(file, str) and is_url(file):
         return RemoteStore(file, storage or {})
@@ -53,7 +53,7 @@ def open_store(file: File, storage: Mapping[str, Any] | None = None) -> Store:
 
 
 class RemoteStore(Store):
-    """A file at a URL. Connections are fsspec's, which keeps them for the next file; so are retries."""
+    """A file at a URL; fsspec manages connections, which it keeps for the next file, and retries."""
 
     def __init__(self, url: str, options: Mapping[str, Any]) -> None:
         self._fs, self._path = _file_system(url, options)
@@ -79,7 +79,7 @@ class RemoteStore(Store):
         starts, stops = [start for start, _ in rest], [stop for _, stop in rest]
         try:
             found: list[Any] = self._fs.cat_ranges([self._path] * len(rest), starts, stops, on_error="return", **how)
-        except Exception as error:  # noqa: BLE001  # stores raise whatever their libraries raise
+        except Exception as error:  # noqa: BLE001  # stores raise the exceptions of their libraries
             raise self._failure(error) from None
         for one in found:
             if isinstance(one, BaseException):
@@ -87,16 +87,16 @@ class RemoteStore(Store):
         return parts + found
 
     def _careful(self, start: int, stop: int) -> bytes:
-        """Read a part of a server that may not know parts; fsspec's file notices before all of the file has come."""
+        """Read a part from a server that may not support ranges, which fsspec's file notices early."""
         try:
             with self._fs.open(self._path, "rb", cache_type="none", size=self.size) as stream:
                 stream.seek(start)
                 part: bytes = stream.read(stop - start)
-        except ValueError:  # fsspec's word for it
+        except ValueError:  # raised by fsspec
             raise StoreError(f"{self.name}: the server sends whole files alone, no parts (HTTP Range)") from None
         except Exception as error:  # noqa: BLE001  # as above
             raise self._failure(error) from None
-        self._proved = start > 0  # the beginning comes from any server
+        self._proved = start > 0  # any server returns the beginning
         return part
 
     def _asked(self) -> dict[str, Any]:
@@ -126,17 +126,17 @@ class RemoteStore(Store):
             number = errno.EACCES
         if number:
             return OSError(number, os.strerror(number), self._shown)  # gives the subclass that belongs to the number
-        said = f"HTTP status {status}" if status else str(error)  # aiohttp would add the address, secrets too
-        return StoreError(f"{self._shown}: {' '.join(said.split()) or type(error).__name__}")
+        text = f"HTTP status {status}" if status else str(error)  # aiohttp would add the address, with secrets
+        return StoreError(f"{self._shown}: {' '.join(text.split()) or type(error).__name__}")
 
 
 def _file_system(url: str, options: Mapping[str, Any]) -> tuple[Any, str]:
-    """The file system that fsspec has for a URL, and the path in it."""
+    """Return fsspec's file system for a URL, and the path in it."""
     try:
         from fsspec.core import url_to_fs
     except ModuleNotFoundError as error:
         raise missing_package(error, extra="remote") from None
-    if url.startswith(("http://", "https://")):  # parts are of the file, not of what a server packs it into
+    if url.startswith(("http://", "https://")):  # ranges refer to the file, not to its compressed transfer
         options = {**options, "headers": {"Accept-Encoding": "identity", **options.get("headers", {})}}
     try:
         fs, path = url_to_fs(url, **options)
@@ -148,7 +148,7 @@ def _file_system(url: str, options: Mapping[str, Any]) -> tuple[Any, str]:
 
 
 def _shown(url: str) -> str:
-    """A URL for messages: passwords and signatures are nobody's business."""
+    """Return a URL for messages, without passwords and signatures."""
     parts = urlsplit(url)
     if not parts.netloc:
         return url

@@ -37,17 +37,17 @@ from csplat.types import F64
 
 
 class SplatFile:
-    """A `.csplat` file of which parts are read. `csplat.open` makes it; it is a context manager.
+    """A `.csplat` file that is read in parts, a context manager; `csplat.open` makes it.
 
-    Whatever is read is checked as a decode of the same part checks it.
+    Parts are checked as in a decode of the same part.
 
     Attributes:
         header: header and index.
         splat_count: its splats; also its length.
         name: the path or URL, for messages.
         size: bytes of the file.
-        requests: how often the store was asked so far.
-        bytes_read: bytes that it gave so far.
+        requests: number of requests to the store so far.
+        bytes_read: number of bytes read so far.
     """
 
     header: SceneHeader
@@ -80,7 +80,7 @@ class SplatFile:
 
     @property
     def name(self) -> str:
-        """The path or URL, without what is secret in it."""
+        """Path or URL, without secrets."""
         return self._store.name
 
     @property
@@ -120,7 +120,7 @@ class SplatFile:
             return read_cameras(window.view, limits=self._limits)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._open = False
         self._store.close()
 
@@ -128,12 +128,12 @@ class SplatFile:
         """Decode tile by tile, in memory for the codebooks, a tile and some megabytes of the file.
 
         Args:
-            box: tiles that touch it, whole; all if it is left out. Two corners, x, y, z each, in any order;
+            box: read the tiles that touch it, whole; by default all. Two corners, x, y, z each, in any order;
                 scene units, relative to the origin.
-            sh_degree: highest SH band to read; all if it is left out.
+            sh_degree: highest SH band to read; by default all.
 
         Raises:
-            InputError: an argument is at fault, or no tile touches the box.
+            InputError: an argument is invalid, or no tile touches the box.
             FormatError, LimitError: as in `csplat.decoder.iter_tiles`.
             StoreError, OSError: as in `csplat.open`.
         """
@@ -166,7 +166,7 @@ class SplatFile:
             True
 
         Raises:
-            InputError: an argument is at fault, or no tile touches the box.
+            InputError: an argument is invalid, or no tile touches the box.
             FormatError, LimitError: as in `csplat.decode`.
             StoreError, OSError: as in `csplat.open`.
         """
@@ -189,7 +189,7 @@ class SplatFile:
             return write_extract(self.window(), self.header, tiles_touching(self.header, box), output)
 
     def window(self) -> FileWindow:
-        """A place for bytes of the file, for what copies them."""
+        """Return a view into which parts of the file can be fetched, to copy them."""
         if not self._open:
             raise InputError(f"{self.name} is closed")
         return FileWindow(self._store, self._head)
@@ -232,10 +232,10 @@ def open(file: File, *, limits: Limits | None = None, storage: Mapping[str, Any]
 
     Raises:
         FormatError, UnsupportedError: as in `read_header`, or the file is shorter or longer than its header states.
-        InputError: the file is none of these; storage options for what is no URL; the extra is not installed.
-        StoreError: a server does not answer, gives no parts of files (HTTP Range), or not all of one; or the file
-            has changed since it was opened. Nothing of what was asked for is returned then.
-        OSError: the file is not there, or cannot be read.
+        InputError: the file is none of these; storage options without a URL; the extra is not installed.
+        StoreError: a server does not answer, does not support ranges (HTTP Range), or breaks off; or the file
+            has changed since it was opened. Nothing is returned in this case.
+        OSError: the file does not exist, or cannot be read.
     """
     store = open_store(file, storage)
     try:
@@ -280,7 +280,7 @@ def extract(
 
 
 def _read_head(store: Store, window: FileWindow) -> bytes:
-    """Read the data before the first chunk, and any data after it that came in the same request."""
+    """Read header and index, and any data after them that came in the same request."""
     first = min(store.size, store.sizes.first)
     window.fetch([(0, first)])
     head = read_file_header(window.view)
@@ -292,7 +292,7 @@ def _read_head(store: Store, window: FileWindow) -> bytes:
 
 
 def _side(job: DecodeRequest) -> list[tuple[int, int]]:
-    """Return the ranges to read besides tiles: their codebooks; or, for a whole file, everything, to check it."""
+    """Return the ranges to read in addition to tiles: their codebooks, or for a whole file all chunks."""
     records = job.header.directory if job.whole else wanted_codebooks(job.header, job.tiles, job.degree)
     return [(record.offset, record.size) for record in records]
 
@@ -302,7 +302,7 @@ def _layers(tiles: Sequence[Tile], degree: int) -> list[tuple[int, int]]:
 
 
 def _batches(tiles: Sequence[Tile], degree: int, size_bytes: int) -> Iterator[list[Tile]]:
-    """Tiles that are fetched together; a first batch in any case."""
+    """Yield tiles to fetch together; at least one batch, which may be empty."""
     batch: list[Tile] = []
     size = 0
     for tile in tiles:
@@ -316,7 +316,7 @@ def _batches(tiles: Sequence[Tile], degree: int, size_bytes: int) -> Iterator[li
 
 
 def tile_boxes(header: SceneHeader) -> F64:
-    """Boxes around the centres of each tile's splats (spec 4.3.5).
+    """Return the boxes around the centres of each tile's splats (spec 4.3.5).
 
     Returns:
         [T, 2, 3] float64: smallest and largest corner; scene units, relative to the origin, as the means.
@@ -329,14 +329,14 @@ def tile_boxes(header: SceneHeader) -> F64:
 
 
 def tiles_touching(header: SceneHeader, box: Sequence[float]) -> list[Tile]:
-    """The tiles whose boxes touch a box.
+    """Return the tiles whose boxes touch a box.
 
     Args:
         header: the scene.
         box: two corners, x, y, z each, in any order; scene units, relative to the origin.
 
     Raises:
-        InputError: six finite numbers are wanted; or no tile touches the box.
+        InputError: the box is not six finite numbers, or no tile touches it.
     """
     numbers = [float(value) for value in box]
     if len(numbers) != 6 or not all(map(math.isfinite, numbers)):
@@ -354,7 +354,7 @@ def _corner_text(corner: F64) -> str:
 
 
 def _extent_text(boxes: F64) -> str:
-    """Say where the splats are."""
+    """Return the extent of the splats, for messages."""
     if not len(boxes):
         return "the scene has no splats"
     return f"centres lie within {_corner_text(boxes[:, 0].min(axis=0))} to {_corner_text(boxes[:, 1].max(axis=0))}"

@@ -162,7 +162,7 @@ def split_words(command: str, *, is_posix: bool = os.sep == "/") -> list[str]:
 
 
 def kill_group(process: subprocess.Popen[Any]) -> None:
-    """Kill a process and, on POSIX, whatever it started: it must lead a session (`start_new_session`)."""
+    """Kill a process and, on POSIX, its children: it must lead a session (`start_new_session`)."""
     if sys.platform != "win32" and hasattr(os, "killpg"):
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -172,7 +172,7 @@ def kill_group(process: subprocess.Popen[Any]) -> None:
 
 
 def interrupt_process(process: subprocess.Popen[Any]) -> None:
-    """Ask a process to end: by SIGINT, or by closing its standard input where no signals reach processes (Windows)."""
+    """Ask a process to end: by SIGINT, or by closing its standard input if signals do not reach processes (Windows)."""
     if sys.platform != "win32" and hasattr(signal, "pthread_kill"):
         process.send_signal(signal.SIGINT)
     elif process.stdin is not None:

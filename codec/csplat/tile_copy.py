@@ -1,4 +1,4 @@
-"""A part of a file as a file of its own: tiles are copied as they are, and no stream is decoded."""
+"""Copy tiles of a file into another one without decoding a stream."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from csplat.decoder.container import SceneHeader, Tile, open_chunk
 from csplat.disk_files import BinaryWriter, open_writer
 from csplat.encoder.container import CodebookTable, FileChunk, FileTile, LazyPayload, Payload, SceneFields, file_pieces
 
-#: Chunks of a whole file that are as true of a part: not what an encoder states of errors and of its work.
+#: Chunks that are copied with a part of a file; declared bounds and options are about the whole.
 _KEPT = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
 _TILE_FLAGS = sum(getattr(_spec, f"CHUNK_FLAG_{name.upper()}") for name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
-_ALL = 1 << 26  # bytes of all files that are fetched together
+_ALL = 1 << 26  # maximum size of the data fetched together from all files, bytes
 
 
 @dataclass(frozen=True)
 class ExtractResult:
-    """Result of cutting a part out of a file.
+    """The result of cutting a part out of a file.
 
     Attributes:
-        tiles: places of its tiles in the file.
+        tiles: indices of its tiles in the file.
         splat_count: its splats.
         size: its bytes.
     """
@@ -66,12 +66,12 @@ def write_extract(
 
 
 class ChunkPrefetcher:
-    """Chunks of a file that are read one after the other, several in a request.
+    """Fetches chunks of a file in their order, several in a request.
 
     Args:
-        window: the file; what was fetched into it is forgotten in the end.
-        records: records of the chunks, in the order they are taken.
-        files: number of files that are read by turns.
+        window: the file; fetched data is discarded when the next chunks are fetched.
+        records: records of the chunks, in the order of `take`.
+        files: number of files that are read in turn.
     """
 
     def __init__(self, window: FileWindow, records: Sequence[_spec.LayerRecord], files: int = 1) -> None:
@@ -80,8 +80,8 @@ class ChunkPrefetcher:
         self._batch = min(window.store.sizes.batch, _ALL // files)
         self._here = range(0)
 
-    def take(self, place: int, beside: Sequence[_spec.DirectoryRecord] = ()) -> _spec.LayerRecord:
-        """Make sure that the window holds a chunk, perhaps the next ones, and `beside`; return its record."""
+    def take(self, place: int, extra: Sequence[_spec.DirectoryRecord] = ()) -> _spec.LayerRecord:
+        """Fetch a chunk, the next ones that fit a batch, and `extra`, unless the window has it; return its record."""
         if place not in self._here:
             stop, size = place + 1, self._records[place].size
             while stop < len(self._records) and size + self._records[stop].size <= self._batch:
@@ -89,14 +89,14 @@ class ChunkPrefetcher:
                 stop += 1
             if self._here:
                 self._window.forget()
-            wanted = [(one.offset, one.size) for one in beside]
+            wanted = [(one.offset, one.size) for one in extra]
             self._window.fetch(wanted + [(one.offset, one.size) for one in self._records[place:stop]])
             self._here = range(place, stop)
         return self._records[place]
 
 
 class TileCopier:
-    """Tiles that are written again as they are. Their chunks are read when they are written.
+    """Makes tiles of another file from those of a file, unchanged; their chunks are read when they are written.
 
     Args:
         window, files: as in `ChunkPrefetcher`.
@@ -108,7 +108,7 @@ class TileCopier:
         self._records: dict[int, list[_spec.LayerRecord]] = {layer: [] for layer in _spec.LAYER_NAMES}
 
     def of(self, tile: Tile, changed: Mapping[int, LazyPayload] | None = None) -> FileTile:
-        """A tile; layers of unknown ids are left out.
+        """Return the tile for the other file, without layers of unknown ids.
 
         Args:
             tile: its record.
@@ -124,13 +124,13 @@ class TileCopier:
             tile.splat_count, tile.exponent, tile.corner, tile.extent, tile.max_scale, layers, tile.tables
         )  # fmt: skip
 
-    def begin(self, beside: Sequence[_spec.DirectoryRecord]) -> None:
-        """Once all tiles are known, read the first chunks, and `beside`, which is needed before any tile."""
-        self._turn[0].take(0, beside)
+    def begin(self, extra: Sequence[_spec.DirectoryRecord]) -> None:
+        """Once all tiles are known, fetch the first chunks, and `extra`, which is needed before any tile."""
+        self._turn[0].take(0, extra)
 
     @cached_property
     def _turn(self) -> tuple[ChunkPrefetcher, dict[int, int]]:
-        """All chunks, in the order in which files are written, and where each layer begins among them."""
+        """Return all chunks, in the order of the file, and the index of the first chunk of each layer."""
         starts = dict(zip(self._records, accumulate(map(len, self._records.values()), initial=0), strict=False))
         records = [one for records in self._records.values() for one in records]
         return ChunkPrefetcher(self._window, records, self._files), starts
@@ -141,7 +141,7 @@ class TileCopier:
 
 
 def chunk_payload(window: FileWindow, record: _spec.DirectoryRecord | _spec.LayerRecord) -> bytes:
-    """The payload of a chunk that was fetched, its CRC and header checked."""
+    """Return the payload of a fetched chunk, its CRC and header checked."""
     with window.store.named_errors():
         if isinstance(record, _spec.LayerRecord):
             cursor = open_chunk(window.view, record, _spec.CHUNK_TILE, _TILE_FLAGS, "TLE-1")

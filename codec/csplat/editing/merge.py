@@ -45,7 +45,7 @@ from csplat.splat_file import SplatFile
 from csplat.splat_file import open as opened
 from csplat.tile_copy import ChunkPrefetcher, TileCopier, chunk_payload, scene_fields
 
-#: Fields that must be equal, because they determine how all splats of a file are shown: words for each, and its name.
+#: Fields that must be equal, because they determine how all splats of a file are rendered: words for messages, name.
 _FACTS = (
     ("axes", "coordinate_system"),
     ("a unit in metres", "unit_metres"),
@@ -56,7 +56,7 @@ _FACTS = (
 
 @dataclass(frozen=True)
 class MergeResult:
-    """Result of merging several files.
+    """The result of merging several files.
 
     Attributes:
         splat_count: splats of the file.
@@ -86,7 +86,7 @@ def merge(
     Tiles are copied bit for bit, without decoding, if the files agree on steps and levels of all attributes, SH
     degree, origin and extra columns, as parts of one file do (`extract`, or files that were encoded with the same
     steps); their codebooks get new ids. This takes memory for the codebooks of one file and some megabytes. Other files
-    are decoded and coded again together, as `csplat.out_of_core.encode_scene` does it, which costs quality once more;
+    are decoded and encoded again together, as `csplat.out_of_core.encode_scene` does it, which costs quality once more;
     `MergeResult.why` gives the reason. Pending data is kept in temporary files.
 
     Metadata and cameras are kept as far as all files have the same. If one file leaves axes or unit open, another
@@ -97,7 +97,7 @@ def merge(
         output: a path, which the file takes when it is complete, replacing an older one; or an open binary file.
         options: options of the encoder, if scenes are coded again; by default the preset "balanced" and extra columns.
         storage: as in `csplat.open`, for all files.
-        codebooks_max: with more than these together, scenes are coded again; a file can have no more than the default.
+        codebooks_max: with more codebooks together, scenes are encoded again; a file can have no more than the default.
 
     Examples:
         >>> import csplat
@@ -149,11 +149,11 @@ def _refuse_contradiction(words: str, values: Sequence[Any], names: Sequence[str
     Raises:
         InputError: two files have different values.
     """
-    said = [(value, name) for value, name in zip(values, names, strict=True) if value not in (None, UNSPECIFIED)]
-    for value, name in said[1:]:
-        if value != said[0][0]:
+    known = [(value, name) for value, name in zip(values, names, strict=True) if value not in (None, UNSPECIFIED)]
+    for value, name in known[1:]:
+        if value != known[0][0]:
             raise InputError(
-                f"scenes that differ in {words} cannot be one: {_text(said[0][0])} in {said[0][1]},"
+                f"scenes that differ in {words} cannot be one: {_text(known[0][0])} in {known[0][1]},"
                 f" {_text(value)} in {name}"
             )
 
@@ -271,7 +271,7 @@ _ID_END = _spec.CODEBOOK_HEAD_OFFSETS["codebook_id"] + _ID_SIZE
 
 
 class PayloadSpool:
-    """Payloads that wait in a file until theirs is written.
+    """Payloads that wait in a temporary file until they are written.
 
     Args:
         stream: a temporary file, open to write and read.
@@ -292,10 +292,10 @@ class PayloadSpool:
 
 
 class MergedCodebooks:
-    """Codebooks under ids from 0 on; one that several files have alike is there once.
+    """The codebooks of all files under new ids from 0 on; equal codebooks are stored once.
 
     Args:
-        spool: where they wait.
+        spool: keeps their payloads.
 
     Attributes:
         tables: their records.
@@ -323,7 +323,7 @@ class MergedCodebooks:
         return ids
 
     def _id(self, book: _spec.CodebookRecord, contents: Mapping[int, bytes]) -> int:
-        """The id of a codebook, known or new.
+        """Return the id of a codebook, known or new.
 
         Args:
             book: its record in its file.
@@ -335,7 +335,7 @@ class MergedCodebooks:
         if key not in self._known:
             id = self._known[key] = len(self.tables)
             self.tables.append(CodebookTable(id, book.kind, bands, book.size))
-            if id <= _ID_MAX:  # who has more cannot be written
+            if id <= _ID_MAX:  # a file with more cannot be written
                 for layer, content in contents.items():
                     payload = self._spool.put(_spec.CHUNK_CODEBOOK, _as_bytes(id) + content)
                     self.chunks.append(FileChunk(_spec.CHUNK_CODEBOOK, payload, id, layer))
@@ -345,13 +345,13 @@ class MergedCodebooks:
 def renumber_tiles(
     window: FileWindow, header: SceneHeader, ids: Mapping[int, int], spool: PayloadSpool, files: int
 ) -> list[FileTile]:
-    """Tiles of a file, with other ids of codebooks.
+    """Return the tiles of a file with new ids of codebooks.
 
     Args:
-        window, files: as of `ChunkPrefetcher`.
+        window, files: as in `ChunkPrefetcher`.
         header: its header.
         ids: the new ids by the old ones.
-        spool: where chunks wait that are rewritten; others are read when they are written.
+        spool: keeps rewritten chunks; others are read when they are written.
     """
     changed: dict[int, dict[int, LazyPayload]] = {}
     naming = [
@@ -372,7 +372,7 @@ def renumber_tiles(
 
 
 def _naming_layers(header: SceneHeader, tile: Tile, ids: Mapping[int, int]) -> set[int]:
-    """Layers of a tile that may name a codebook whose id is another one now."""
+    """Return the layers of a tile that may name a codebook whose id changes."""
     moved = {table for table in tile.tables if ids[table] != table}
     return {
         layer
@@ -385,7 +385,7 @@ def _naming_layers(header: SceneHeader, tile: Tile, ids: Mapping[int, int]) -> s
 def _rewrite_ids(
     window: FileWindow, header: SceneHeader, record: _spec.LayerRecord, ids: Mapping[int, int], spool: PayloadSpool
 ) -> LazyPayload | None:
-    """A chunk with other ids, put aside; `None` where it names no codebook."""
+    """Rewrite the ids in a chunk, and put it aside; return `None` if it names no codebook."""
     with window.store.named_errors():
         places = list(codebook_references(window.view, header, record))
     if not places:

@@ -1,4 +1,4 @@
-"""The same scene in other coordinates: turned, mirrored, scaled, moved, stretched.
+"""Transform scenes: rotate, mirror, scale, translate, stretch, and change their axes.
 
 A mirror image of a Gaussian is a Gaussian: its covariance M Σ Mᵀ does not tell M from -M, one of which is a rotation.
 Its colours follow by the parity of their SH bands. So axes of either handedness can be reached from any others.
@@ -24,24 +24,24 @@ from csplat.types import F32, F64
 _Rows = TypeVar("_Rows", F32, F64)
 
 _OPPOSITE = dict(zip("RLUDFB", "LRDUBF", strict=True))
-#: What the axes of a scene are taken for that does not name them: those of its cameras' makers, COLMAP and OpenCV.
+#: Axes assumed for a scene that does not specify any: those of COLMAP and OpenCV.
 DEFAULT_AXES = "RDF"
-_ORTHOGONAL = 1e-6  # of the entries of M Mᵀ - 1
-_WHOLE = 1e-9  # entries of a computed rotation that are as near to a whole number are that number
-_DIRECTIONS = 40
-_EVEN = 1e-6  # lengths in three directions that differ by less are one: files have them in float32
-_ROWS = 1024  # that are in float64 at a time: they stay in the cache
+_ORTHOGONAL = 1e-6  # tolerance for the entries of M Mᵀ - 1
+_WHOLE = 1e-9  # entries of a computed rotation this close to a whole number are rounded to it
+_DIRECTIONS = 40  # directions in which rotated SH bands are fitted
+_EVEN = 1e-6  # relative difference up to which a stretch counts as uniform: files have it in float32
+_ROWS = 1024  # rows converted to float64 at a time: they stay in the cache
 
 
 def axes_rotation(before: str, after: str) -> F64:
-    """The matrix that takes coordinates along some axes to those along others.
+    """Return the matrix that converts coordinates from some axes to others.
 
     Args:
         before: directions of +x, +y and +z, three letters as in `SplatModel`.
         after: the same of the other axes.
 
     Returns:
-        [3, 3] float64 of 0, 1 and -1; where one of the two is left-handed and the other is not, a mirror.
+        [3, 3] float64 of 0, 1 and -1; a reflection if only one of the two is left-handed.
 
     Examples:
         >>> import csplat.editing.transform
@@ -57,10 +57,10 @@ def axes_rotation(before: str, after: str) -> F64:
 
 
 def convert_axes(scene: SceneSource, axes: str) -> SceneSource:
-    """A scene along the axes that a format has.
+    """Convert a scene to the axes of a format.
 
-    Who names no axes is taken to have x to the right, y down and z forward, and is tilted then, where it says which way
-    is up.
+    A scene without axes is assumed to have x to the right, y down and z forward; if it specifies its up direction, it
+    is tilted accordingly.
 
     Args:
         scene: the scene.
@@ -79,17 +79,17 @@ def convert_axes(scene: SceneSource, axes: str) -> SceneSource:
 
 
 def rotate_scene(model: SplatModel, rotation: ArrayLike) -> SplatModel:
-    """The same scene turned about its zero, with all that has a direction: rotations, colours, origin, up, cameras.
+    """Rotate a scene about its zero: means, rotations, colours, origin, up and cameras.
 
-    Where the matrix only permutes and flips axes, means, rotations and scales are exact, and SH as well where z stays
-    on its line: turned back the arrays are the same, bit for bit.
+    If the matrix only permutes and flips axes, means, rotations and scales are exact, and SH as well if z stays on its
+    line: rotated back, the arrays are the same, bit for bit.
 
     Args:
         model: the scene, or some of its splats.
-        rotation: [3, 3] orthogonal, applied to columns; of a mirror cameras see mirror images of their pictures.
+        rotation: [3, 3] orthogonal, applied to columns; with a reflection, cameras see mirror images.
 
     Returns:
-        The scene. Axes that lie along no axes any more are not named; what was up by them stands in the metadata.
+        The scene. It has no named axes if they no longer lie along coordinate axes; the metadata has their up instead.
 
     Raises:
         InputError: the matrix is not orthogonal.
@@ -113,10 +113,10 @@ def rotate_scene(model: SplatModel, rotation: ArrayLike) -> SplatModel:
 
 
 def scale_scene(model: SplatModel, factor: float) -> SplatModel:
-    """The same scene in units that are so many times as short: all its lengths are multiplied.
+    """Multiply all lengths of a scene by a factor.
 
     Raises:
-        InputError: the factor is not above 0, or something leaves float32.
+        InputError: the factor is not above 0, or a value leaves float32.
     """
     if not 0.0 < factor < np.inf:
         raise InputError(f"the factor is {factor}, wanted one above 0")
@@ -137,14 +137,14 @@ def scale_scene(model: SplatModel, factor: float) -> SplatModel:
 
 
 def stretch_scene(model: SplatModel, matrix: ArrayLike) -> SplatModel:
-    """The same scene under any linear map: turned, and scaled in three directions, of which each may be another's.
+    """Apply any linear map to a scene: a rotation, and scaling by three factors along orthogonal directions.
 
     Args:
-        model: the scene, or some of its splats; its colours turn. Where lengths change by direction, cameras are lost.
-        matrix: [3, 3], applied to columns, not flat.
+        model: the scene, or some of its splats; colours rotate. Cameras are dropped unless the scaling is uniform.
+        matrix: [3, 3], applied to columns, of full rank.
 
     Raises:
-        InputError: something leaves float32.
+        InputError: a value leaves float32.
     """
     left, lengths, right = np.linalg.svd(np.asarray(matrix, np.float64))
     model = rotate_scene(model, _snapped(left @ right))
@@ -166,12 +166,12 @@ def stretch_scene(model: SplatModel, matrix: ArrayLike) -> SplatModel:
             origin=(x, y, z),
             means_double=doubles,
             cameras=None,
-            metadata={name: said for name, said in model.metadata.items() if name != VIEW},
+            metadata={name: value for name, value in model.metadata.items() if name != VIEW},
         )
 
 
 def translate_scene(model: SplatModel, offset: Direction) -> SplatModel:
-    """The same splats elsewhere: their means move, and not the origin, for which few formats have a place."""
+    """Translate a scene by changing its means, not its origin, which few formats can store."""
     step = np.array(offset, np.float64)
     doubles = None if model.means_double is None else model.means_double + step
     means = model.means + step if doubles is None else doubles - np.array(model.origin)
@@ -190,7 +190,7 @@ def _rotation_to(facts: SplatModel, axes: str) -> F64:
 
 
 def _tilt(start: F64, end: F64) -> F64:
-    """The smallest rotation that takes one unit vector to another."""
+    """Return the smallest rotation that takes one unit vector to another."""
     axis, cosine = np.cross(start, end), float(start @ end)
     if cosine < -1.0 + 1e-12:  # half a turn, about the axis that is farthest from them
         axis = np.eye(3)[int(np.abs(start).argmin())]
@@ -198,11 +198,11 @@ def _tilt(start: F64, end: F64) -> F64:
         return _snapped(2.0 * np.outer(axis, axis) / (axis @ axis) - np.eye(3))
     cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     left, _, right = np.linalg.svd(np.eye(3) + cross + cross @ cross / (1.0 + cosine))
-    return _snapped(left @ right)  # orthogonal, also where the vectors were unit to six digits
+    return _snapped(left @ right)  # orthogonal, even if the vectors are unit to six digits only
 
 
 def _applied(matrix: F64, rows: _Rows) -> _Rows:
-    """A square matrix times each row; bits stay as they are where it only permutes and flips."""
+    """Multiply each row by a square matrix; exact if it only permutes and flips."""
     order = np.abs(matrix).argmax(axis=1)
     signs: F64 = matrix[np.arange(len(matrix)), order]
     out = np.empty_like(rows)
@@ -210,7 +210,7 @@ def _applied(matrix: F64, rows: _Rows) -> _Rows:
         picked = rows if (order == np.arange(len(order))).all() else rows[..., order]
         np.multiply(picked, signs.astype(rows.dtype), out=out)
         return out
-    with np.errstate(over="ignore"):  # the model refuses what is infinite
+    with np.errstate(over="ignore"):  # the model refuses infinite values
         for start in range(0, len(rows), _ROWS):
             part = slice(start, start + _ROWS)
             out[part] = rows[part].astype(np.float64) @ matrix.T
@@ -218,7 +218,7 @@ def _applied(matrix: F64, rows: _Rows) -> _Rows:
 
 
 def _turned_shapes(model: SplatModel, matrix: F64) -> tuple[F32, F32]:
-    """Rotations and scales: either the axes of the splats are permuted with those of the scene, or both turn."""
+    """Return rotations and scales; if possible the axes of the splats are permuted with those of the scene."""
     proper = matrix * np.sign(np.linalg.det(matrix))
     order = np.abs(matrix).argmax(axis=1)
     whole = np.count_nonzero(matrix) == 3
@@ -231,7 +231,7 @@ def _turned_shapes(model: SplatModel, matrix: F64) -> tuple[F32, F32]:
 
 
 def _quat_of(matrix: F64) -> F64:
-    """Quaternions of rotations [..., 3, 3]: eigenvectors of largest eigenvalues (Bar-Itzhack 2000), at any angle."""
+    """Return quaternions of rotations [..., 3, 3], exact at any angle: largest eigenvectors (Bar-Itzhack 2000)."""
     a, b, c, d, e, f, g, h, i = np.moveaxis(matrix.reshape(*matrix.shape[:-2], 9), -1, 0)
     lower = np.zeros((*matrix.shape[:-2], 4, 4))
     entries = (a + e + i, h - f, a - e - i, c - g, b + d, e - a - i, d - b, c + g, f + h, i - a - e)
@@ -252,13 +252,13 @@ def _matrices(quats: F32) -> F64:
 
 
 def _product(quat: F64) -> F64:
-    """The matrix that multiplies quaternions by one from the left."""
+    """Return the matrix that multiplies quaternions by one from the left."""
     w, x, y, z = quat
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
 
 
 def _turned_sh(shN: F32, matrix: F64) -> F32:
-    """Colours at M v become what they were at v, band by band: bands do not mix."""
+    """Rotate SH band by band: colours at M v become those at v."""
     directions = sphere_lattice(_DIRECTIONS)
     there, before = sh_bands(directions), sh_bands(directions @ matrix)  # rows: v there is Mᵀ v before
     out = np.empty_like(shN)
@@ -307,7 +307,7 @@ def sh_bands(directions: F64) -> list[F64]:
 
 
 def _turned_facts(model: SplatModel, matrix: F64) -> dict[str, Any]:
-    """Axes, metadata and cameras."""
+    """Return the rotated axes, metadata and cameras, as fields of a model."""
     letters = model.coordinate_system
     fields = _with_cameras(model, lambda camera: _turned_camera(camera, matrix))
     up = up_of(model.metadata)
@@ -323,7 +323,7 @@ def _turned_facts(model: SplatModel, matrix: F64) -> dict[str, Any]:
 
 
 def _with_cameras(model: SplatModel, change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> dict[str, Any]:
-    """Fields of a model whose cameras are changed; a view that is no camera stays as it is."""
+    """Return the fields of a model whose cameras change; a view that is not a camera stays."""
     fields: dict[str, Any] = {}
     if model.cameras:
         fields["cameras"] = [change(camera) for camera in model.cameras]
@@ -336,7 +336,7 @@ def _with_cameras(model: SplatModel, change: Callable[[Mapping[str, Any]], dict[
 def _turned_camera(camera: Mapping[str, Any], matrix: F64) -> dict[str, Any]:
     view, K = np.array(camera["viewmat"], np.float64), np.array(camera["K"], np.float64)
     view[:3, :3] = view[:3, :3] @ matrix.T
-    if np.linalg.det(matrix) < 0.0:  # left and right change places, so that it stays a rotation
+    if np.linalg.det(matrix) < 0.0:  # left and right are exchanged, so that it stays a rotation
         view[0] *= -1.0
         K[0, 2] = camera["W"] - K[0, 2]
     return {**camera, "viewmat": view.tolist(), "K": K.tolist()}

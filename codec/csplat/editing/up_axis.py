@@ -1,4 +1,4 @@
-"""The up direction of a scene, and how the scene states it (spec 5.4).
+"""Read and set the up direction of a scene (spec 5.4).
 
 The axes of a scene specify where +x, +y and +z point; they can name up only along one of these. The member `up` of the
 metadata names any direction, and takes precedence over them.
@@ -19,13 +19,13 @@ Direction = tuple[float, float, float]
 #: The key of the metadata for the up direction.
 UP = "up"
 
-_DIGITS = 6  # a millionth of a radian: the same text on machines whose last bits differ
-_UNIT = 1e-5  # how far from 1 the length of a unit vector of six digits may lie
-_CONTRADICTS = math.cos(math.radians(45.0))  # beyond that angle another letter of the axes is up
+_DIGITS = 6  # decimals: the same text on machines whose last bits differ
+_UNIT = 1e-5  # tolerance for the length of a unit vector of six digits
+_CONTRADICTS = math.cos(math.radians(45.0))  # cosine; beyond that angle another axis is closer to up
 
 
 def up_of(metadata: Mapping[str, Any], coordinate_system: str = UNSPECIFIED) -> Direction | None:
-    """Return the direction that is up according to a scene; `None` if it has none, or none that is understood.
+    """Return the direction that is up according to a scene; `None` if it has no valid one.
 
     Args:
         metadata: metadata of the scene; its `up` comes first.
@@ -38,7 +38,7 @@ def up_of(metadata: Mapping[str, Any], coordinate_system: str = UNSPECIFIED) -> 
 
 
 def up_of_axes(coordinate_system: str) -> Direction | None:
-    """The axis, or its opposite, that three letters call up; `None` if there are none."""
+    """Return the up direction that three letters specify; `None` if there are none."""
     if coordinate_system == UNSPECIFIED:
         return None
     x, y, z = ({"U": 1.0, "D": -1.0}.get(letter, 0.0) for letter in coordinate_system)
@@ -46,13 +46,13 @@ def up_of_axes(coordinate_system: str) -> Direction | None:
 
 
 def unit_up(values: object) -> Direction:
-    """A direction at unit length, to six digits.
+    """Bring a direction to unit length, rounded to six digits.
 
     Args:
         values: three finite numbers, not all 0.
 
     Raises:
-        InputError: they are something else.
+        InputError: they are not.
     """
     numbers = list(values) if isinstance(values, Sequence) and not isinstance(values, str) else []
     if len(numbers) == 3 and all(type(value) in (int, float) and abs(value) < math.inf for value in numbers):

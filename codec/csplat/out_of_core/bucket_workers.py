@@ -29,11 +29,12 @@ from csplat.system import map_in_processes
 
 @dataclass(frozen=True, eq=False)
 class BucketCoding:
-    """State that all buckets share.
+    """The decisions that all buckets share.
 
     Attributes:
         layout: layout of the splats.
-        plan: complete. books: as decided on the sample, without its splats' entries.
+        plan: parameters of the encoding, complete.
+        books: codebooks chosen on the sample, without the entries of its splats.
     """
 
     layout: SplatLayout
@@ -47,56 +48,56 @@ def code_bucket(folder: Path, bucket: Bucket, coding: BucketCoding) -> None:
     Args:
         folder: the working folder.
         bucket: the bucket to code.
-        coding: the decisions that all buckets share.
+        coding: decisions that all buckets share.
 
     Raises:
-        InputError: values that no lattice can hold, or a damaged file.
+        InputError: a value fits no lattice, or a file is damaged.
         OSError: a file cannot be read or written.
     """
-    if _said_path(folder, bucket).exists():
+    if _record_path(folder, bucket).exists():
         return
     model = clip_scales(read_splats(bucket_path(folder, bucket.place), coding.layout, bucket.rows))
     tables = assign_splats(coding.books, model, coding.plan, threads=1)
-    said, size = [], 0
+    records, size = [], 0
     with atomic_writer(_chunks_path(folder, bucket)) as stream:
         for tile in cut_scene(model, coding.plan):
             coded = encode_tile(model, tile, coding.plan, tables)
-            said.append(_said(coded, size))
+            records.append(_record(coded, size))
             for payload in coded.tile.layers.values():
                 assert isinstance(payload, bytes)
                 stream.write(payload)
                 size += len(payload)
-    text = json.dumps(said).encode()
-    with atomic_writer(_said_path(folder, bucket)) as stream:  # last: if it is there, everything is
+    text = json.dumps(records).encode()
+    with atomic_writer(_record_path(folder, bucket)) as stream:  # last: if it is there, everything is
         stream.write(zlib.crc32(text).to_bytes(4, "little") + text)
 
 
 def coded_bucket(folder: Path, bucket: Bucket) -> list[EncodedTile] | None:
-    """The tiles of a bucket; `None` if it is not coded yet.
+    """Return the tiles of a bucket; `None` if it is not coded yet.
 
     Raises:
         InputError: a file is damaged.
         OSError: it cannot be read.
     """
-    path = _said_path(folder, bucket)
+    path = _record_path(folder, bucket)
     if not path.exists():
         return None
     data = path.read_bytes()
     if zlib.crc32(data[4:]).to_bytes(4, "little") != data[:4]:
         raise damaged_file(path)
-    return [_tile(said, _chunks_path(folder, bucket)) for said in json.loads(data[4:])]
+    return [_tile(record, _chunks_path(folder, bucket)) for record in json.loads(data[4:])]
 
 
 def _chunks_path(folder: Path, bucket: Bucket) -> Path:
     return folder / f"chunks-{bucket.number:06}"
 
 
-def _said_path(folder: Path, bucket: Bucket) -> Path:
+def _record_path(folder: Path, bucket: Bucket) -> Path:
     return folder / f"tiles-{bucket.number:06}"
 
 
-def _said(coded: EncodedTile, start: int) -> dict[str, Any]:
-    """Everything of a coded tile but its payloads, JSON-compatible."""
+def _record(coded: EncodedTile, start: int) -> dict[str, Any]:
+    """Return a coded tile without its payloads, JSON-compatible."""
     layers, at = {}, start
     for layer, payload in coded.tile.layers.items():
         assert isinstance(payload, bytes)
@@ -106,15 +107,15 @@ def _said(coded: EncodedTile, start: int) -> dict[str, Any]:
     return {"tile": tile, "errors": asdict(coded.errors), "coarsened": sorted(coded.coarsened)}
 
 
-def _tile(said: Mapping[str, Any], chunks: Path) -> EncodedTile:
-    fields = dict(said["tile"])
+def _tile(record: Mapping[str, Any], chunks: Path) -> EncodedTile:
+    fields = dict(record["tile"])
     fields["layers"] = {
         int(layer): LazyPayload(size, crc, partial(_read_payload, chunks, offset, size, crc))
         for layer, (offset, size, crc) in fields["layers"].items()
     }
     for name in ("corner", "extent", "tables"):
         fields[name] = tuple(fields[name])
-    errors, coarsened = ErrorSums(**said["errors"]), frozenset(said["coarsened"])
+    errors, coarsened = ErrorSums(**record["errors"]), frozenset(record["coarsened"])
     return EncodedTile(FileTile(**fields), np.zeros(0, np.intp), errors, coarsened)
 
 
@@ -128,12 +129,12 @@ def _read_payload(path: Path, offset: int, size: int, crc: int) -> bytes:
 
 
 def code_here(folder: Path, buckets: Sequence[Bucket], coding: BucketCoding, workers: int) -> Iterator[Bucket]:
-    """Code buckets on this machine, and give each when it is done.
+    """Code buckets on this machine, and yield each when it is done.
 
     Args:
         folder: the working folder.
         buckets: the buckets that are not done.
-        coding: the decisions that all buckets share.
+        coding: decisions that all buckets share.
         workers: number of processes; 1: only this one.
 
     Raises:
@@ -152,7 +153,7 @@ def _code(shared: tuple[Path, BucketCoding], bucket: Bucket) -> None:
 def code_on_cluster(folder: Path, buckets: Sequence[Bucket], coding: BucketCoding, address: str) -> Iterator[Bucket]:
     """Code buckets on a Dask cluster, whose workers see the working folder under the same name.
 
-    Dask runs again what a lost worker had begun.
+    Dask repeats the work of a lost worker.
 
     Args:
         folder, buckets, coding: as in `code_here`.

@@ -28,22 +28,22 @@ from csplat.system import default_memory_bytes
 from csplat.types import Progress, null_progress
 
 _MB = 1_000_000
-_PROGRAM = 120 * _MB  # a process that has loaded the encoder
+_PROGRAM = 120 * _MB  # memory of a process that has loaded the encoder
 _PER_ROW = 2.2  # memory for coding a bucket or sample beyond its arrays, as a multiple of their size
 _WHOLE_ROW = 3.0  # the same for a scene that is encoded in memory
-_CODED = 0.3  # bytes of a file per byte of its splats, at most
-_ROOM = 96 * _MB  # splats that wait for being written to their buckets
+_CODED = 0.3  # maximum size of a file, as a multiple of its arrays' size
+_PENDING = 96 * _MB  # splats that wait to be written to their buckets
 
 
 @dataclass(frozen=True)
 class ResourceNeeds:
-    """Resources that an encoding takes.
+    """The resources that an encoding takes.
 
     Attributes:
         in_memory: True if the scene stays in memory.
         workers: processes that code buckets.
-        memory_bytes: memory of all processes together, about.
-        disk_bytes: size of the working folder and the file, at most.
+        memory_bytes: approximate memory of all processes together.
+        disk_bytes: maximum size of the working folder and the file.
     """
 
     in_memory: bool
@@ -60,11 +60,11 @@ def estimate_needs(
     Args:
         scene: the scene; its blocks are not read.
         options: options of the encoder.
-        memory_bytes: a bound; `None`: half of what is free.
+        memory_bytes: memory limit; `None`: half of the free memory.
         by_disk: use buckets on disk for a scene of several buckets, even if it would fit in memory.
 
     Raises:
-        InputError: the bound is too low for any way.
+        InputError: the limit is too low.
     """
     bound = default_memory_bytes() if memory_bytes is None else memory_bytes
     row = _layout(scene, options).row_bytes
@@ -77,7 +77,7 @@ def estimate_needs(
     if options.shape_codebook_size:
         raise InputError(f"a codebook of shapes wants the scene in memory, about {whole / _MB:,.0f} MB")
     worker = _PROGRAM + int(BUCKET_SPLATS * row * _PER_ROW)
-    here = worker + _ROOM
+    here = worker + _PENDING
     if here > bound:
         raise _too_low(bound, here)
     workers = max(1, min(options.thread_count, (bound - _PROGRAM) // worker))
@@ -157,7 +157,7 @@ def encode_scene(
 
 @dataclass(eq=False)
 class _Encoding:
-    """The stages of one encoding by way of the disk, each of which is skipped if the folder has it."""
+    """The stages of an encoding on disk; those that the working folder has are skipped."""
 
     scene: SceneSource
     target: Path
@@ -171,7 +171,7 @@ class _Encoding:
         work = self.work
         if "counts" not in work.state:
             work.clear_buckets()
-            self._check_room()
+            self._check_space()
             self._sort()
         if "contrast" not in work.state:
             buckets = work.buckets
@@ -187,7 +187,7 @@ class _Encoding:
         work.remove()
         return report
 
-    def _check_room(self) -> None:
+    def _check_space(self) -> None:
         work = self.work
         try:
             check_free_space(work.folder, self.needs.disk_bytes, "this scene is encoded: --work names another folder")
@@ -197,12 +197,12 @@ class _Encoding:
             raise
 
     def _sort(self) -> None:
-        """Two passes over the scene: what it is like, and its splats into their buckets."""
+        """Pass over the scene twice: to survey it, and to sort its splats into buckets."""
         work, survey = self.work, self.work.survey
         if survey is None:
             survey = take_survey(with_progress(self.scene, "looking", self.progress), work.layout)
             work.keep(survey)
-        writer = BucketWriter(work.folder, work.layout, survey.curve, _ROOM)
+        writer = BucketWriter(work.folder, work.layout, survey.curve, _PENDING)
         del survey
         for block in with_progress(self.scene, "sorting", self.progress).blocks():
             writer.add(block)
@@ -210,7 +210,7 @@ class _Encoding:
         work.note(counts=writer.counts.tolist())
 
     def _decide(self) -> tuple[EncodePlan, FileCodebooks]:
-        """Decide on the sample; what comes back has no splats."""
+        """Choose parameters and codebooks on the sample; return them without its splats."""
         work, survey = self.work, self.work.survey
         assert survey is not None
         sample = EncodePlan.of(survey.sample, self.options, contrast=work.state["contrast"], progress=self.progress)
@@ -263,11 +263,11 @@ class _Encoding:
 
 
 def take_survey(scene: SceneSource, layout: SplatLayout) -> Survey:
-    """Look at a scene of more than `BUCKET_SPLATS` splats, and take a sample that has the arrays of the layout.
+    """Survey a scene of more than `BUCKET_SPLATS` splats, and take a sample that has the arrays of the layout.
 
     Raises:
         CsplatError: its blocks cannot be read.
-        OSError: likewise.
+        OSError: as above.
     """
     rows = sample_rows(scene.count)
     arrays, largest = layout.empty(len(rows)), 0.0

@@ -39,7 +39,7 @@ class SplatLayout:
     facts: SplatModel
 
     def arrays(self, model: SplatModel) -> list[NDArray[Any]]:
-        """The arrays of a model, in the order of a frame."""
+        """Return the arrays of a model, in the order of a frame."""
         doubles = [] if model.means_double is None else [model.means_double]
         return [
             *(getattr(model, name) for name in _ARRAYS),
@@ -53,11 +53,11 @@ class SplatLayout:
         return sum(array.dtype.itemsize * int(np.prod(array.shape[1:])) for array in self.arrays(self.facts))
 
     def empty(self, count: int) -> list[NDArray[Any]]:
-        """Arrays of that many splats, to be filled."""
+        """Allocate arrays for some splats."""
         return [np.empty((count, *array.shape[1:]), array.dtype) for array in self.arrays(self.facts)]
 
     def model(self, arrays: Sequence[NDArray[Any]]) -> SplatModel:
-        """A model of these arrays."""
+        """Make a model of these arrays."""
         named: dict[str, Any] = dict(zip(_ARRAYS, arrays, strict=False))
         rest = list(arrays[len(_ARRAYS) :])
         doubles = None if self.facts.means_double is None else rest.pop(0)
@@ -66,11 +66,12 @@ class SplatLayout:
 
 @dataclass(frozen=True)
 class Bucket:
-    """Splats that are coded together.
+    """A bucket: splats that are coded together.
 
     Attributes:
         number: index among all buckets.
-        place: index of the file that holds its splats. start, stop: its rows in that file.
+        place: index of the file that holds its splats.
+        start, stop: its rows in that file.
     """
 
     number: int
@@ -86,7 +87,7 @@ class Bucket:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Results of one pass over all splats of a scene.
+    """The results of one pass over all splats of a scene.
 
     Attributes:
         sample: some of its splats, in the scene's order.
@@ -107,13 +108,13 @@ class BucketWriter:
         folder: folder of the files; it exists, and holds none of them.
         layout: layout of the splats.
         curve: the curve that determines a splat's bucket.
-        room_bytes: bytes of splats that wait for being written, at most.
+        pending_bytes_max: maximum size of the splats that wait to be written.
     """
 
     folder: Path
     layout: SplatLayout
     curve: BucketCurve
-    room_bytes: int
+    pending_bytes_max: int
     counts: NDArray[np.int64] = field(init=False)
     _waiting: list[list[list[NDArray[Any]]]] = field(init=False)
     _waiting_bytes: int = field(init=False, default=0)
@@ -123,7 +124,7 @@ class BucketWriter:
         self._waiting = [[] for _ in range(self.curve.count)]
 
     def add(self, model: SplatModel) -> None:
-        """Take some splats, those of a bucket in the order in which they come.
+        """Add splats; those of a bucket keep their order.
 
         Raises:
             OSError: they cannot be written.
@@ -139,14 +140,14 @@ class BucketWriter:
             start = end
         self.counts += sizes
         self._waiting_bytes += sum(array.nbytes for array in arrays)
-        if self._waiting_bytes > self.room_bytes:
+        if self._waiting_bytes > self.pending_bytes_max:
             self.flush()
 
     def flush(self) -> None:
-        """Write what waits.
+        """Write all pending splats.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: they cannot be written.
         """
         for place, waiting in enumerate(self._waiting):
             if waiting:
@@ -157,7 +158,7 @@ class BucketWriter:
 
 
 def bucket_path(folder: Path, place: int) -> Path:
-    """The file of a bucket."""
+    """Return the file of a bucket."""
     return folder / f"bucket-{place:06}"
 
 
@@ -206,7 +207,7 @@ def _append(stream: Any, arrays: Sequence[NDArray[Any]]) -> None:
 
 
 def _sizes(stream: Any, path: Path, layout: SplatLayout) -> Iterator[int]:
-    """Rows of each frame."""
+    """Yield the number of rows of each frame."""
     size, at = path.stat().st_size, 0
     while at < size:
         stream.seek(at)
@@ -232,7 +233,7 @@ def _read_frame(stream: Any, path: Path, frame: Sequence[NDArray[Any]]) -> None:
 
 
 def damaged_file(path: Path) -> InputError:
-    """Return the error for a file of the working folder that is not as it was written."""
+    """Return the error for a damaged file of the working folder."""
     return InputError(f"{path} is damaged: remove {path.parent.name} and begin again")
 
 
@@ -242,7 +243,7 @@ _SAMPLE = "sample"
 
 @dataclass(eq=False)
 class WorkingFolder:
-    """A working folder.
+    """A working folder: the state of an encoding that can be resumed.
 
     Attributes:
         folder: path of the folder.
@@ -257,11 +258,11 @@ class WorkingFolder:
 
     @classmethod
     def begun(cls, folder: Path, layout: SplatLayout, key: dict[str, Any], *, resume: bool) -> WorkingFolder:
-        """Make a folder, or go on in one.
+        """Make a folder, or resume in one.
 
         Raises:
-            InputError: the folder is there and `resume` is not said, or is about another scene or other options, or
-                holds something else.
+            InputError: the folder exists and `resume` is False, or it belongs to another scene or other options, or
+                has other content.
             OSError: it cannot be made or read.
         """
         work = cls(folder, layout)
@@ -285,7 +286,7 @@ class WorkingFolder:
         return work
 
     def note(self, **done: Any) -> None:
-        """Write down what is done.
+        """Record progress.
 
         Raises:
             OSError: it cannot be written.
@@ -304,20 +305,20 @@ class WorkingFolder:
         """
         if "curve" not in self.state:
             return None
-        said = self.state["curve"]
-        curve = BucketCurve(np.array(said["corner"]), said["scale"], np.array(said["bounds"], np.int64))
+        stored = self.state["curve"]
+        curve = BucketCurve(np.array(stored["corner"]), stored["scale"], np.array(stored["bounds"], np.int64))
         return Survey(read_splats(self.folder / _SAMPLE, self.layout), self.state["largest"], curve)
 
     def keep(self, survey: Survey) -> None:
-        """Write down the first pass.
+        """Record the result of the first pass.
 
         Raises:
             OSError: it cannot be written.
         """
         write_splats(self.folder / _SAMPLE, self.layout, survey.sample)
         curve = survey.curve
-        said = {"corner": curve.corner.tolist(), "scale": curve.scale, "bounds": curve.bounds.tolist()}
-        self.note(curve=said, largest=survey.largest)
+        stored = {"corner": curve.corner.tolist(), "scale": curve.scale, "bounds": curve.bounds.tolist()}
+        self.note(curve=stored, largest=survey.largest)
 
     @property
     def buckets(self) -> list[Bucket]:
@@ -328,7 +329,7 @@ class WorkingFolder:
         return [Bucket(number, place, part.start, part.stop) for number, (place, part) in enumerate(parts)]
 
     def clear_buckets(self) -> None:
-        """Remove what an interrupted second pass left."""
+        """Remove the files of an interrupted second pass."""
         for path in self.folder.glob("bucket-*"):
             path.unlink()
 
