@@ -10,7 +10,7 @@ The files of `chapters/` hold a section of the specification each. A table is a 
 | scene | the scene that the file holds; default: one tile of two splats |
 | base | name of the scene, if several vectors have it: `rich`, or a key of the table `scenes` of the file |
 | code | error code |
-| set | fields to overwrite afterwards, and their values (`_value`); sizes and checksums of the container follow |
+| set | fields to overwrite afterwards, and their values (`_value`); checksums are repaired |
 | swap | two layer records that change places |
 | cut | bytes missing at the end of the last chunk, or the field in which it ends and how many of its bytes are left |
 | at, within | field to blame, and byte in it; default: the first that is overwritten |

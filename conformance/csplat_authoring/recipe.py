@@ -1,4 +1,4 @@
-"""Recipes of vectors: a scene, or a file made invalid: a scene declared wrongly, or fields overwritten."""
+"""Recipes of vectors: files that hold a scene, and files with a defect."""
 
 from __future__ import annotations
 
