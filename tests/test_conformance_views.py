@@ -150,8 +150,8 @@ def test_vectors_are_checked_without_the_renderer_too(monkeypatch, capsys):
 @pytest.mark.usefixtures("ellipsoids")
 def test_a_picture_that_looks_different_is_out_of_date(monkeypatch, capsys):
     assert 0 == recipes.main()
-    right = recipes.reference_picture
-    monkeypatch.setattr(recipes, "reference_picture", lambda *args: 255 - right(*args))
+    right = recipes.reference_render
+    monkeypatch.setattr(recipes, "reference_render", lambda *args: 255 - right(*args))
 
     assert 1 == recipes.main()
     assert "ellipsoids.0.png" in capsys.readouterr().err

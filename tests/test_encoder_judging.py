@@ -346,7 +346,7 @@ def test_a_picture_that_is_no_number_is_no_picture(altered):
 
 def test_sizes_and_figures_of_others_stand_next_to_the_picture(altered, monkeypatch):
     def message(table, psnr=41.2, **fields):
-        monkeypatch.setattr("csplat_conformance.encoders.render_checks.figures_of", lambda name: table.get(name, {}))
+        monkeypatch.setattr("csplat_conformance.encoders.render_checks.peer_figures", lambda name: table.get(name, {}))
         return altered(lambda scene: scene, ("L4",), lambda *_: psnr, **fields).outcomes[0]
 
     ours, spz = {"bytes": 4800, "psnr": 40.9}, {"bytes": 7900, "psnr": 39.1}

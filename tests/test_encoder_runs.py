@@ -314,7 +314,7 @@ def test_errors_are_proved_by_the_encoders_own_index(monkeypatch, tmp_path):
         ran.append(args[-1])
         return verify_bounds(*args)
 
-    monkeypatch.setattr("csplat_conformance.encoders.error_checks.prove", seen)
+    monkeypatch.setattr("csplat_conformance.encoders.error_checks.verify_bounds", seen)
     (tmp_path / "in.ply").write_bytes(INPUTS["nasty/duplicates"].make())
     result = csplat.encode(csplat.read_ply(tmp_path / "in.ply"))
 
