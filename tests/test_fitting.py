@@ -34,9 +34,10 @@ def fit(make_model, monkeypatch):
             drafts.append(len(data))
             settings = {"codebook_size": ENTRIES, "sh_degree": model.sh_degree}
             made = SimpleNamespace(data=data, report=SimpleNamespace(options=settings))
-            return SimpleNamespace(coded=lambda _: SimpleNamespace(write=lambda: made))
+            return SimpleNamespace(write=lambda: made)
 
-        monkeypatch.setattr(tuned_file, "Draft", SimpleNamespace(of=draft))
+        monkeypatch.setattr(tuned_file, "EncodePlan", SimpleNamespace(of=draft))
+        monkeypatch.setattr(tuned_file, "encode_tiles", lambda planned, **_: planned)
         whole = make_model(9000, 1)
 
         def choose(count):

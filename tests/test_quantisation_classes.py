@@ -29,7 +29,7 @@ COUNT = 5_000  # splats, enough for several classes
 
 
 def unequal(model, seed=0, spread=3.0):
-    """Curvatures that differ from splat to splat by orders of magnitude."""
+    """Return blocks that differ from splat to splat by orders of magnitude."""
     rng = np.random.default_rng(seed)
     size = rng.lognormal(0.0, spread, len(model))
     roots = rng.normal(size=(len(model), 6, 3))

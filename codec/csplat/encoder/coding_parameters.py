@@ -36,7 +36,7 @@ _STATISTICS_SAMPLE = 1 << 16  # splats
 _RUNS = 16  # runs of neighbours among the sampled splats
 _NEIGHBOUR_DISTANCE = 8  # places in Morton order
 _CORE = 0.8  # fraction of the splats within the scene's reach
-_CODE_BITS = 16  # of a Morton code, per axis
+_CODE_BITS = 16  # bits of a Morton code per axis
 _CELLS_MAX = 1e38  # cells per scene unit, within float32
 
 

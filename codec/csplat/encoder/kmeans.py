@@ -29,7 +29,7 @@ from csplat.encoder.weights import ErrorMetric, doubled_triangles, matrix_produc
 from csplat.errors import InputError
 from csplat.types import F32, F64, I16, I32, I64, U32
 
-_Find = Callable[[F32, int], tuple[I64, F32]]  # of rows [x, 1] and the number of the first one
+_Find = Callable[[F32, int], tuple[I64, F32]]  # takes rows [x, 1] and the number of the first one
 Floats = NDArray[Any]
 
 _SEED_ROUNDS = 8  # in which the first entries are drawn
@@ -39,7 +39,7 @@ _GROUPED_ROWS = 4096  # points that share one sort by group
 _GROUP_ITERATIONS = 4
 _BLAS = threading.Lock()  # the thread count of a BLAS is per process: one search at a time
 _CANDIDATES = 96  # entries tried for a point: its own and that one's neighbours
-_REFINE_ROUNDS = 2  # of assigning points and moving entries
+_REFINE_ROUNDS = 2  # assignments of points, each followed by a move of the entries
 _METRIC_BLOCK = 1 << 12  # points per block of temporaries
 _RIDGE = 1e-3  # fraction of the mean diagonal: holds an entry in place if its points do not determine it
 
@@ -278,7 +278,7 @@ def _check_points(points: I16 | I32, weights: F32 | None) -> F64:
 
 
 def _priority_sample(w: F64, count: int, rng: np.random.Generator) -> tuple[I64, F64]:
-    """Priority sampling: an unbiased weighted sample that keeps every heavy row.
+    """Draw an unbiased weighted sample that keeps every heavy row.
 
     Duffield, Lund, Thorup, "Priority sampling for estimation of arbitrary subset sums".
     """
@@ -496,12 +496,12 @@ def _assign_by_metric(
     """Minimise the error over the candidates: w xᵀMx is constant, the rest is linear in Mx and M."""
     near = _neighbours(entries, tried)
     size, channels = entries.shape[1:]
-    above_diagonal, below_diagonal = np.triu_indices(size)
+    upper_i, upper_j = np.triu_indices(size)
     wide = entries.astype(np.float64)
     table = np.concatenate(
         [
             -2.0 * wide.reshape(len(wide), -1),
-            np.einsum("kpc,kpc->kp", wide[:, above_diagonal], wide[:, below_diagonal]),
+            np.einsum("kpc,kpc->kp", wide[:, upper_i], wide[:, upper_j]),
         ],
         axis=1,
     )
@@ -544,10 +544,10 @@ def _neighbours(entries: Floats, tried: int) -> I64:
 def _solve_entries(points: Floats, metric: ErrorMetric, entries: I32, index: I64) -> I32:
     """Return the entries [K, D, C] that minimise the sums of the points' errors, rounded."""
     count, size, channels = entries.shape
-    above_diagonal, below_diagonal = np.triu_indices(size)
+    upper_i, upper_j = np.triu_indices(size)
     weights = metric.weights.astype(np.float64)
     matrices = np.zeros((count, size, size))
-    for place, (i, j) in enumerate(zip(above_diagonal, below_diagonal, strict=True)):
+    for place, (i, j) in enumerate(zip(upper_i, upper_j, strict=True)):
         sums = np.bincount(index, weights * metric.triangles[:, place], count)
         matrices[:, i, j] = matrices[:, j, i] = sums
     wanted = np.empty((count, size, channels))

@@ -30,7 +30,7 @@ _CLASS_SPLATS_MIN = 500  # splats; a smaller class joins others
 _SAMPLE = 1 << 15  # splats from which the steps of classes are computed
 _BLOCK = 1 << 16  # splats per block of temporaries
 _COMMON = 0.999  # quantile of the errors above which they are clipped
-_ROUNDS = 30  # of k-means, at most
+_ROUNDS_MAX = 30  # iterations of k-means
 _FINER, _COARSER = 4.0, 6.0  # octaves from the chosen steps, at most
 _SCALE_STEP_MAX = 1.0  # log scale
 _LEVELS_MAX = 255  # opacity or rotation levels, if no option sets more
@@ -67,7 +67,7 @@ class QuantisationClasses:
 def choose_classes(
     model: SplatModel, blocks: GaussNewtonBlocks | None, parameters: CodingParameters, options: EncodeOptions
 ) -> tuple[CodingParameters, QuantisationClasses | None]:
-    """Sort the splats into classes, at about the error of renders that the chosen steps have, or less.
+    """Sort the splats into classes; the error of renders stays about that of the chosen steps, or less.
 
     Args:
         model: the scene.
@@ -124,7 +124,7 @@ def _cluster_octaves(errors: F64, integers: F64, count: int) -> F64:
     places = np.empty(len(sample), np.uint8)
     places[np.argsort(energy, kind="stable")] = np.arange(len(sample)) * count // len(sample)
     octaves = _octaves(sample, places, integers)
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS_MAX):
         before, places = places, _assign_classes(sample, integers, octaves)
         if (places == before).all():
             break

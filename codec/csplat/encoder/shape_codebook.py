@@ -44,10 +44,10 @@ SHAPE_CODEBOOK_ID = _spec.SH_DEGREE_MAX + 1
 
 _TRACE_STEPS = 2048  # lattice steps of a trace: searches are exact up to norms of about 2,300
 _USERS_MIN = 6  # splats per entry, below which an entry costs more bytes than it saves
-_ROUNDS = 2  # of clustering; escapes of one round have no weight in the next
-_METRIC_ROUNDS = 2  # of assignment under the metric, and moving the entries
+_ROUNDS = 2  # clusterings; escapes of one round have no weight in the next
+_METRIC_ROUNDS = 2  # assignments under the metric, each followed by a move of the entries
 _CANDIDATES = 64  # entries tried for a splat under the metric
-_SUMMAND_MAX = 0.7  # of the log scales: beyond it, the metric is not linear
+_SUMMAND_MAX = 0.7  # log scale; beyond it, the metric is not linear
 _LOG_SIZE_MAX = 30.0  # log sizes are clipped to this, where the error is already enormous
 _ESCAPES = 0.05  # fraction of the splats, if the cost of errors is unknown
 _OFF_DIAGONAL_ROOTS = np.sqrt([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # an entry off the diagonal occurs twice

@@ -338,7 +338,7 @@ def _exceeds(values: F32, limit: float) -> Mask:
 
 
 def _halve(coordinate: F32, tile_splats: int) -> list[Rows]:
-    """Split at a multiple of the tile size, so that tiles are full; the first half comes last, to be popped first."""
+    """Split at a multiple of the tile size, so that tiles are full; return the first half last, to be popped first."""
     parts = math.ceil(len(coordinate) / tile_splats)
     share = len(coordinate) * (parts // 2) // parts
     order = np.argpartition(coordinate, share)

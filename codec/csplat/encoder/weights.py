@@ -144,12 +144,12 @@ class ErrorMetric:
     def errors(self, difference: Floats, rows: Rows | slice) -> F64:
         """Return the errors [n] of the points `rows` for the differences [n, D, C]."""
         triangles, weights = self.triangles[rows], self.weights[rows]
-        above, beside = np.triu_indices(self.size)
+        upper_i, upper_j = np.triu_indices(self.size)
         found = np.empty(len(difference))
         for at in range(0, len(difference), _METRIC_BLOCK):
             part = slice(at, at + _METRIC_BLOCK)
             d = difference[part].astype(np.float64)
-            products = np.einsum("npc,npc->np", d[:, above], d[:, beside])
+            products = np.einsum("npc,npc->np", d[:, upper_i], d[:, upper_j])
             found[part] = np.einsum("np,np->n", products, doubled_triangles(triangles[part])) * weights[part]
         return found
 
@@ -298,18 +298,18 @@ def rounding_errors(model: SplatModel, blocks: GaussNewtonBlocks, parameters: Co
 def matrix_products(triangles: Floats, points: Floats) -> F64:
     """Return the product of each matrix and its point, [n, D, C]."""
     size = points.shape[1]
-    above, beside = np.triu_indices(size)
+    upper_i, upper_j = np.triu_indices(size)
     matrices = np.empty((len(points), size, size))
-    matrices[:, above, beside] = triangles
-    matrices[:, beside, above] = triangles
+    matrices[:, upper_i, upper_j] = triangles
+    matrices[:, upper_j, upper_i] = triangles
     found: F64 = np.einsum("nij,njc->nic", matrices, points.astype(np.float64))
     return found
 
 
 def doubled_triangles(triangles: Floats) -> F64:
     """Return the triangles with their off-diagonal entries doubled."""
-    above, beside = np.triu_indices(_matrix_size(triangles))
-    return np.asarray(triangles * np.where(above == beside, 1.0, 2.0), np.float64)
+    upper_i, upper_j = np.triu_indices(_matrix_size(triangles))
+    return np.asarray(triangles * np.where(upper_i == upper_j, 1.0, 2.0), np.float64)
 
 
 def _checked_metric(name: str, weights: F32, found: Floats, size: int) -> ErrorMetric:
