@@ -138,7 +138,7 @@ def measure_sensitivity(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Sensitivity:
-    """Measure what images depend on.
+    """Measure how much renders depend on each splat.
 
     Args:
         model: the scene.
@@ -152,7 +152,7 @@ def measure_sensitivity(
 
     Raises:
         InputError: there is no camera.
-        LimitError: an image has more than `rasterise.MAX_INTERSECTIONS`.
+        LimitError: a render has more than `rasteriser.MAX_INTERSECTIONS`.
     """
     if not cameras:
         raise InputError("measuring sensitivity wants a camera at least")
@@ -165,7 +165,7 @@ def measure_sensitivity(
 
 
 class _Derivatives(Rasteriser):
-    """Renders views and adds up the derivatives of each. Owns the sums."""
+    """A rasteriser that sums the derivatives of views. Owns the sums."""
 
     def __init__(self, model: SplatModel, *, metric: bool, magnitudes: bool, dtype: Any, threads: int | None) -> None:
         super().__init__("standard", dtype, gradients=True, threads=threads)
@@ -207,7 +207,7 @@ class _Derivatives(Rasteriser):
         self._pixel_count += camera.W * camera.H
 
     def result(self) -> Sensitivity:
-        """Divide by the pixels, and take the largest of each group."""
+        """Divide by the number of pixels, and take the maximum of each group."""
         pixels = max(1, self._pixel_count)
         self._metric /= np.float32(pixels)
         shape_matrices, squares, net, sizes = (
@@ -320,7 +320,7 @@ _PLANES = 10
 @parallel_kernel(relaxed=True)
 def sum_derivatives(lane: int, lanes: int, starts: Any, used: Any, ids: Any, slots: Any, shape: Any, box: Any,
                     forms: Any, tiles_x: int, limits: Any, rgb: Any, records: Any) -> None:  # fmt: skip
-    """One record for every splat in every tile; parallel over tiles, vectorised over the 16 pixels of a row.
+    """Compute one record for every splat and tile; parallel over tiles, vectorised over the 16 pixels of a row.
 
     Args:
         lane: see `blend_backward`.
@@ -399,7 +399,10 @@ def sum_derivatives(lane: int, lanes: int, starts: Any, used: Any, ids: Any, slo
 
 @relaxed_kernel
 def _moments(body: Any, count: int, form: Any, sums: Any) -> None:
-    """The sums of one splat over pixels of a tile; `form` is as in `covariance_forms`, then h at the tile's middle."""
+    """Sum over the pixels of a tile for one splat: the equations at the top of this module, (u, v, w) being h.
+
+    `form` holds the splat's row of `covariance_forms`, then h at the middle of the tile.
+    """
     zero = form[0] - form[0]
     ax, ay, bx, by, cx, cy = form[0], form[1], form[2], form[3], form[4], form[5]
     oxx, oyy, ozz, oxy, oxz, oyz = form[6], form[7], form[8], form[9], form[10], form[11]

@@ -33,7 +33,7 @@ _FORMAT = "csplat sensitivity 1"
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 _CHANNELS = 3.0
 _SHAPE = 6.0  # entries of a covariance
-_FLOOR = 0.01  # fraction of the median: the weight of splats that no view saw; other views may see them
+_FLOOR = 0.01  # fraction of the median; weight of splats that no view shows, because other views may show them
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ class StoredSensitivity:
         )
 
     def _curvatures(self) -> GaussNewtonBlocks:
-        """Return the same by attribute, not only in ratios, with nothing in place of the values that no view saw."""
+        """Return the absolute curvatures by attribute, 0 for splats that no view shows."""
         opacity, shape, means = (self.groups[f"{name}_squares"] / _CHANNELS for name in ("opacity", "shape", "means"))
         return GaussNewtonBlocks(
             opacity, self.shape_matrices * (shape / _SHAPE)[:, None], means, self.groups["colour_squares"]
@@ -192,14 +192,14 @@ def read_sensitivity(path: str | Path, model: SplatModel) -> StoredSensitivity:
 
 
 def _packed(metric: NDArray[np.float32]) -> NDArray[np.float16]:
-    """Upper triangles of the bands above 0, over the mean of their diagonals."""
+    """Return the upper triangles of the bands above 0, divided by the mean of their diagonals."""
     rows, columns = np.triu_indices(_order(metric))
     mean = metric[:, (rows == columns) & (rows > 0)].mean(axis=1, dtype=np.float64)
     return _over_mean(metric[:, rows > 0], mean).astype(np.float16)
 
 
 def _over_mean(triangles: NDArray[Any], mean: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Triangles over the mean of their diagonals; the plain norm serves what no view saw."""
+    """Return triangles divided by the mean of their diagonals; the unit matrix for splats that no view shows."""
     seen = mean > 0.0
     scaled = np.empty(triangles.shape, np.float32)
     np.divide(triangles, np.where(seen, mean, 1.0)[:, None], out=scaled, casting="same_kind")

@@ -34,7 +34,7 @@ from csplat_trainer.data.dataset import (
 from csplat_trainer.data.image_files import abbreviate, describe_masks_among, describe_missing, find_images, find_masks
 from csplat_trainer.data.lens import UNDISTORTER, Lens
 
-#: With models in numbered folders, or one in itself; the last only if there is no other.
+#: Folders with models in numbered folders, or with a model; the last is used only if there is no other.
 _MODEL_FOLDERS = (("sparse", "colmap/sparse"), ("distorted/sparse",))
 _IMAGE_FOLDERS = ("images", "input", ".")
 _UNDISTORTED_FIRST = "distorted"  # convert.py of 3DGS: images/ belongs to sparse/0, input/ to this folder's model
@@ -65,9 +65,9 @@ def read_colmap(
     Args:
         folder: the set's.
         model: the sparse model's.
-        size: of the images that are wanted; chooses among the folders of images.
+        size: requested size of the images; determines the folder of images.
         images: the folder of images, by name; `None`: the smallest that is large enough.
-        test_every: see `split_every`; used where there is no test.txt.
+        test_every: see `split_every`; used if there are no lists of images.
 
     Raises:
         InputError: a file is damaged, or no image is there.
@@ -177,7 +177,7 @@ def _folders(folder: Path, model: Path, images: str | None) -> tuple[str, ...]:
 
 
 def _agree(cameras: dict[int, Lens], others: dict[int, Lens]) -> bool:
-    """Report whether cameras are the same, but for the digits that text leaves out."""
+    """Return True if cameras are the same up to the digits that text omits."""
 
     def numbers(some: dict[int, Lens]) -> list[tuple[float, ...]]:
         return [(number, lens.width, lens.height, lens.fx, lens.cx) for number, lens in sorted(some.items())]
@@ -215,9 +215,9 @@ def _relative(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
 
 
-_UNIT_TOLERANCE = 0.01  # of a quaternion's length; text files may hold few digits
+_UNIT_TOLERANCE = 0.01  # tolerance of a quaternion's length; text files may hold few digits
 
-# By their numbers in binary files.
+# Camera models, by their numbers in binary files.
 _MODELS = (
     "SIMPLE_PINHOLE",
     "PINHOLE",
@@ -279,7 +279,7 @@ def read_cameras(path: Path, used: Collection[int] | None = None) -> dict[int, L
     """Read cameras.bin or cameras.txt.
 
     Args:
-        path: the file; its ending tells which.
+        path: the file; its suffix determines the form.
         used: ids of the cameras to read: others may have any lens; `None`: all.
 
     Raises:
@@ -300,10 +300,10 @@ def read_cameras(path: Path, used: Collection[int] | None = None) -> dict[int, L
     for _ in range(data.count(24)):
         number, model, width, height = data.unpack("<iiQQ")
         name = _MODELS[model] if 0 <= model < len(_MODELS) else f"of number {model}"
-        # How many parameters others have is of no interest: they are refused.
+        # Other models are refused: their number of parameters does not matter.
         parameter_count = len(_LAYOUTS.get(name, "").split())
         values = [float(value) for value in data.unpack(f"<{parameter_count}d")]
-        if used is None or number in used or not parameter_count:  # of a lens without a name the end is not known
+        if used is None or number in used or not parameter_count:  # the length of an unknown model is not known
             cameras[number] = _lens(name, float(width), float(height), values, f"{path}, camera {number}")
     data.end()
     return cameras
@@ -319,7 +319,7 @@ def read_images(path: Path) -> tuple[list[ColmapImage], list[str]]:
     Raises:
         InputError: the file is damaged.
     """
-    found: list[tuple[str, int, Sequence[float], str]] = []  # name, camera, pose, and where it stands
+    found: list[tuple[str, int, Sequence[float], str]] = []  # name, camera, pose, place in the file
     notes: list[str] = []
     if path.suffix == ".txt":
         lines, notes = _image_lines(path)
@@ -432,20 +432,20 @@ class _BinaryFile:
 
 
 def _lines(path: Path) -> Iterator[tuple[list[str], str]]:
-    """Give the words of each line that is neither empty nor a comment, and where it stands."""
+    """Yield the words of each line that is neither empty nor a comment, and its place in the file."""
     for number, line in enumerate(read_text(path).split("\n"), 1):
         if line.strip() and not line.lstrip().startswith("#"):
             yield line.split(), f"{path}, line {number}"
 
 
 def _image_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
-    """Tell the lines of poses in images.txt from the lines of keypoints that follow them.
+    """Separate the lines of poses in images.txt from the lines of keypoints that follow them.
 
-    COLMAP writes two lines for each image, of which the second, empty or three numbers for each keypoint, is often
-    left out by people who write known poses.
+    COLMAP writes two lines for each image. The second, empty or three numbers for each keypoint, is often omitted in
+    hand-written files with known poses.
 
     Returns:
-        The lines of poses, each with where it stands; and a line for the report if any has no second one.
+        The lines of poses, each with its place in the file; and a line for the report if any has no second one.
     """
     written = [
         (line, f"{path}, line {number}")
@@ -478,7 +478,7 @@ def _image_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
 
 
 def _is_keypoints(words: list[str]) -> bool:
-    """Report whether a line holds x, y and the id of a point, any number of times."""
+    """Return True if a line holds x, y and the id of a point, any number of times."""
     if len(words) % 3:
         return False
     try:
@@ -493,7 +493,7 @@ def _is_pose(line: str) -> bool:
 
 
 def _numbers(words: list[str], where: str) -> list[float]:
-    """Read numbers, those that are none among them: C++ programs on Windows write `-nan(ind)` and `1.#IND`."""
+    """Parse numbers, NaN among them, which C++ programs on Windows write as `-nan(ind)` and `1.#IND`."""
     words = [_NO_NUMBER.sub("nan", word) for word in words]
     try:
         return [float(word) for word in words]

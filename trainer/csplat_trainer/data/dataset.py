@@ -35,13 +35,13 @@ class DataSet:
 
     Attributes:
         name: kind and place, for messages: `COLMAP set /data/garden`.
-        train: images to learn from, at least one.
-        test: images that were held out; none if the set is too small or names none.
+        train: training images, at least one.
+        test: test images, which are held out; none if the set is too small or names none.
         points: [P, 3] float32, points of the scene, relative to `origin`; `None` if the set has none.
         points_rgb: [P, 3] float32 in 0..1, their colours; `None` if they have none of their own.
-        report: what was found, left out and changed, a line each.
+        report: lines on what was found, left out and changed.
         coordinate_system: as in `SplatModel`, if there is a convention for this kind of set.
-        up: direction that is up; `None` if neither the kind of set nor its cameras determine it.
+        up: up direction; `None` if neither the kind of set nor its cameras determine it.
         test_every: every Nth image was held out; `None` if the set names its test images.
         size: width and height that the images are scaled to; `None`: they are not.
         images: the folder of images that was requested; `None`: the reader chose.
@@ -87,7 +87,7 @@ class DataSet:
 
     @property
     def inliers(self) -> list[PosedImage]:
-        """Training images that determine where the scene lies: all but outliers, or all if only outliers are left."""
+        """Training images that determine the place of the scene: all except outliers, or all if there are no others."""
         outliers = {id(image) for image in self.outliers}
         return [image for image in self.train if id(image) not in outliers] or self.train
 
@@ -103,12 +103,12 @@ class DataSet:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """An image that is known but not read.
+    """An image of a data set that is not read yet, and its camera.
 
     Attributes:
-        name: as the set writes it.
-        path: the file.
-        lens: how it was taken.
+        name: name of the image in the set's files.
+        path: the image file.
+        lens: lens of the camera.
         viewmat: [4, 4] float64, world to camera, OpenCV axes.
         mask: path of an image that is black for pixels that do not count.
     """
@@ -125,12 +125,12 @@ class UnreadDataSet:
     """Result of a reader: everything but the pixels.
 
     Attributes:
-        kind: `Blender set`, …
+        kind: kind of the set, as `Blender set`.
         train: shots to train on.
         test: shots that are held out.
         points: [P, 3] float64 or `None`.
         points_rgb: [P, 3] float32 in 0..1 or `None`.
-        report: lines for the user.
+        report: lines on what was found.
         test_every: as in `DataSet`.
         coordinate_system: as in `DataSet`.
         val: validation shots.
@@ -148,13 +148,13 @@ class UnreadDataSet:
 
 
 def near_plane(shots: Sequence[Shot], points: F64 | None = None) -> float:
-    """A near plane that suits a set: a small part of the distance to what its cameras look at.
+    """Return the near plane for a data set: a small fraction of the distance to the cameras' subject.
 
-    Scene units are arbitrary where poses come from photographs; the renderer's default, which it
-    never exceeds, may lie beyond the scene.
+    Scene units are arbitrary if poses were computed from images: the renderer's default, which is an upper limit
+    here, may be beyond the scene.
 
     Args:
-        shots: at least one; outliers do not count.
+        shots: at least one; outliers are ignored.
         points: [P, 3], points of the scene, if they are known.
     """
     viewmats = np.stack([shot.viewmat for shot in shots])
@@ -177,7 +177,7 @@ def read_split_lists(folders: Sequence[Path]) -> tuple[dict[str, list[str]], str
     Text files are called `test.txt` or `test_list.txt`, and so for `val` and `train`.
 
     Args:
-        folders: to look in; the first that has any counts.
+        folders: folders to look in; the first that has lists is used.
 
     Returns:
         Lines by `train`, `val` and `test`, and the files' names.
@@ -211,7 +211,7 @@ def _list_files(folder: Path, role: str) -> list[Path]:
 
 
 def _names_in(line: str, known: Container[str]) -> list[str]:
-    """Return the names of a line of a list: the line itself, or what is between commas and in quotes; no comments."""
+    """Return the names in a line of a list: the line, or its parts between commas, without quotes; no comments."""
     line = line.strip()
     if line in known or normalise_name(line) in known:
         return [line]
@@ -225,7 +225,7 @@ def split_every(shots: Sequence[Shot], every: int, report: list[str]) -> tuple[l
 
     Args:
         shots: all images.
-        every: N: 8 is the custom; 0 holds out none.
+        every: N, usually 8; 0 holds out none.
         report: a line is appended if any is held out.
 
     Returns:
@@ -248,13 +248,13 @@ def split_listed(
 ) -> tuple[list[Shot], list[Shot], list[Shot]]:
     """Split images by lists of names.
 
-    A list that names none of the images decides nothing. An image on two lists is for test rather than validation, and
-    for validation rather than training. An image on none is for training, unless training images are listed: then it
-    is left out.
+    A list that names none of the images is ignored. An image on two lists is a test image rather than a validation
+    image, and a validation image rather than a training image. An image on no list is a training image, unless
+    training images are listed: then it is left out.
 
     Args:
         shots: all images.
-        lists: names, or lines of a file, by `train`, `val` and `test`, of which one is there at least.
+        lists: names, or lines of a file, by `train`, `val` and `test`, at least one of them.
         where: the file that has the lists, for messages.
         report: lines are appended on what each list names.
 
@@ -299,7 +299,7 @@ _ON_ITS_SIDE = {5: (1, True), 6: (-1, False), 7: (-1, True), 8: (1, False)}
 
 
 def open_shot(shot: Shot, head: ImageHeader, size: tuple[int, int] | None, near: float) -> PosedImage:
-    """The image of a shot, undistorted, RGBA if the file has transparency; pixels and mask are not read yet.
+    """Return the image of a shot, undistorted, RGBA if the file has transparency; pixels and mask are not read yet.
 
     Args:
         shot: the shot to convert.
@@ -308,7 +308,7 @@ def open_shot(shot: Shot, head: ImageHeader, size: tuple[int, int] | None, near:
         near: the camera's near plane, scene units.
 
     Raises:
-        InputError: its lens cannot be undone.
+        InputError: the distortion of its lens cannot be undone.
     """
     width, height = shown_size(shot.path, head.size, shot.lens)
     lens = shot.lens.scaled(width, height)
@@ -324,7 +324,7 @@ def open_shot(shot: Shot, head: ImageHeader, size: tuple[int, int] | None, near:
 
 
 def shown_size(path: Path, size: tuple[int, int], lens: Lens) -> tuple[int, int]:
-    """Width and height of an image: as stored, or turned by EXIF where its lens is that of the image as shown.
+    """Return width and height of an image: as stored, or turned by EXIF if its lens is that of the turned image.
 
     Args:
         path: the file.
@@ -346,7 +346,7 @@ def _fits_sideways(size: tuple[int, int], lens: Lens) -> bool:
 def _is_turned(image: Image.Image, lens: Lens) -> bool:
     """Return True if EXIF lays an image on its side, and its lens is that of the image as it is shown.
 
-    Programs that find poses read pixels as they are stored, or as they are shown: the size that they give tells which.
+    Programs that compute poses read pixels either as stored or as shown: the image size in their files tells which.
     """
     sideways = _fits_sideways(image.size, lens)
     return sideways and image.getexif().get(ExifTags.Base.Orientation) in _ON_ITS_SIDE
@@ -395,7 +395,7 @@ def _read_mask(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | N
 
 
 def _undistort(pixels: U8, lens: Lens, straight: Lens) -> U8:
-    """Straighten an image, linear between pixels, colours weighted by their alpha."""
+    """Undistort an image, linearly between pixels, colours weighted by their alpha."""
     height, width = pixels.shape[:2]
     v, u = np.mgrid[0:height, 0:width] + 0.5
     x, y = distorted(u, v, lens, straight)
@@ -438,7 +438,7 @@ def read_point_cloud(path: Path) -> tuple[F64, F32]:
         As `finite_points`.
 
     Raises:
-        InputError: it is no whole PLY, or has no points.
+        InputError: it is not a complete PLY, or has no points.
     """
     findings: list[Finding] = []
     try:

@@ -19,19 +19,19 @@ from csplat_trainer.data.image_pixels import ImageHeader, image_size, mask_value
 from csplat_trainer.data.lens import Lens, undistorted_lens
 
 _ROUNDING = 1.0  # pixels by which each side of a scaled-down image may be rounded
-_NEARLY = 0.02  # relative, of scales across and down: beyond it an image is turned, or a mask is another image's
+_NEARLY = 0.02  # relative difference of scales across and down, beyond which an image is turned or a mask is wrong
 _MIDDLE = (0.25, 0.75)  # fractions of the image: principal points outside this range are reported
-_SMALL_RANGE = 1.0 / 8.0  # fraction of the 16-bit range: images of 12 bits are as dark as that
+_SMALL_RANGE = 1.0 / 8.0  # fraction of the 16-bit range; 12-bit images use less
 _SAME = 1e-9  # relative difference of positions; coordinates of maps are a million times the distance of cameras
-_FEW = 4  # cameras; fewer need not look anywhere in common
+_FEW = 4  # cameras; fewer need not have a common subject
 _AIMED = 0.98  # median cosine, see `convergence`
-_PARALLEL = 0.05  # least mean square of what is across to lines of sight that are not parallel
-_MEETING = 0.1  # of their distance: lines of sight that pass a point so near meet there
-_SHOTS, _POINTS = 64, 4096  # shots and points of a set, at most, that are checked for belonging together
+_PARALLEL = 0.05  # least mean square across lines of sight that are not parallel
+_MEETING = 0.1  # fraction of the distance to a point; lines of sight that pass it nearer meet there
+_SHOTS, _POINTS = 64, 4096  # largest numbers of shots and points that are checked for visibility
 
 
 def check_shots(shots: Sequence[Shot], heads: Mapping[Path, ImageHeader]) -> None:
-    """Check lenses against reason, images against their cameras' sizes, and masks against their images'.
+    """Check that lenses are plausible, and that images have their cameras' sizes and masks their images'.
 
     Args:
         shots: all shots of a set.
@@ -60,7 +60,7 @@ def describe_images(shots: Sequence[Shot], heads: Mapping[Path, ImageHeader]) ->
     """Report pixels, turns and masks that could mean something else.
 
     Raises:
-        InputError: a file that is looked at is damaged.
+        InputError: a file that is read is damaged.
     """
     notes = []
     for stored_as in sorted({head.stored_as for head in heads.values()} - {""}):
@@ -102,7 +102,7 @@ def describe_images(shots: Sequence[Shot], heads: Mapping[Path, ImageHeader]) ->
 
 
 def describe_lenses(shots: Sequence[Shot]) -> list[str]:
-    """Report what is undone, and principal points far from the middle."""
+    """Report distortions that are undone, and principal points far from the middle."""
     notes = []
     lenses = list({shot.lens: None for shot in shots})
     bent = [(lens, undistorted_lens(lens)) for lens in lenses if lens.distorts]
@@ -124,7 +124,7 @@ def describe_lenses(shots: Sequence[Shot]) -> list[str]:
 
 
 def describe_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | None) -> list[str]:
-    """Report cameras that are all at one place, see none of the points, or look as inverted poses do.
+    """Report cameras that are all at one place, see none of the points, or look like inverted poses.
 
     Args:
         shots: all training and test images.
@@ -156,7 +156,7 @@ def describe_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | No
 
 
 def _is_panorama(viewmats: NDArray[np.float64]) -> bool:
-    """Report whether the lines of sight meet in a point, which lies behind the cameras."""
+    """Return True if the lines of sight meet in a point behind the cameras."""
     axes = viewmats[:, 2, :3]
     positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     positions = positions - positions.mean(axis=0)

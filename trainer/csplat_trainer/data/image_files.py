@@ -1,14 +1,14 @@
 r"""Find the image files that a data set names.
 
-Programs that write poses often run on another machine than the one that keeps the images: names differ in separators,
-endings, case and folders. A name is looked for exactly as it is written. Only if that fails it is read more loosely, by
+Programs that write poses often run on another machine than the one with the images: names differ in separators,
+suffixes, case and folders. A name is first searched exactly as written. If that fails, it is matched more loosely, by
 one rule after the other, and every rule that was needed is reported:
 
 1. as written;
 2. `\` as `/`, without a drive letter and spaces around it;
 3. as a URL: without `file:`, `%20` as a space;
 4. in another case or Unicode form;
-5. with another ending of images, or with one if there is none (Blender's names), in any case;
+5. with another image suffix, or with one if there is none (Blender's names), in any case;
 6. without its leading folders, if rules 1 to 5 find nothing at all;
 7. in a folder below, if rule 6 finds nothing either.
 
@@ -31,7 +31,7 @@ from csplat.errors import InputError, counted
 from csplat_trainer.data.image_pixels import image_size
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".avif", ".tif", ".tiff", ".bmp", ".jp2")
-_SHOWN = 5  # names in a message, at most
+_SHOWN = 5  # largest number of names in a message
 
 _FOLDER_WORDS = ("without leading folders", "in folders below")  # rules 6 and 7
 
@@ -39,7 +39,7 @@ _Key = Callable[[str], str]
 
 
 class NoImagesError(InputError):
-    """A set names images, and none of them is there."""
+    """Error: none of the images that a set names is there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ def normalise_name(name: str) -> str:
 
 
 def describe_missing(missing: Sequence[str], count: int, where: str) -> list[str]:
-    """Report images that are not there: a line, or none if all are."""
+    """Report missing images: one line, or none if all are there."""
     if not missing:
         return []
     return [f"{where}: {len(missing)} of {counted(count, 'image')} are missing and left out: {abbreviate(missing)}"]
@@ -79,8 +79,8 @@ def find_images(
         names: as the set writes them, at least one.
         where: the file that names them, for messages.
         folders: to try, relative to `root`, in this order; `.` is `root` itself, and comes last where leading folders
-            of the names are left out. Each stands for smaller images next to it, too: `images` for `images_2`,
-            `images_4`, …
+            of the names are left out. Each includes folders of smaller images next to it: `images` includes
+            `images_2`, `images_4`, …
         size: wanted width and height: the smallest of such folders that is large enough is taken; `None`: the first.
 
     Raises:
@@ -110,7 +110,7 @@ def find_masks(root: Path, names: Sequence[str]) -> FoundImages | None:
         names: of the images, as the set writes them.
 
     Returns:
-        The masks by names of images; `None` where there is no such folder.
+        The masks by names of images; `None` if there is no such folder.
 
     Raises:
         InputError: as `match_names`.
@@ -184,7 +184,7 @@ def match_names(
 
 
 def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[tuple[_Key, _Key]]]]:
-    """Give the rules in their order: words, and keys of listed and of known names that are equal where names match."""
+    """Yield the rules in order: a description, and keys of listed and of known names, equal if names match."""
 
     def decoded(name: str) -> str:
         return normalise_name(unquote(re.sub(r"^file:(//)?(?=/)", "", name)))
@@ -295,7 +295,7 @@ def _is_large(found: FoundImages, size: tuple[int, int]) -> bool:
 
 
 def _images_below(folder: Path) -> Iterator[str]:
-    """Give the images below a folder, sorted, relative to it; hidden ones and those of macOS' archives are left out."""
+    """Yield the images below a folder, sorted, relative to it, without hidden ones and those of macOS' archives."""
     for place, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith((".", "__MACOSX")))
         for name in sorted(files):

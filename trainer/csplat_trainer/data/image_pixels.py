@@ -1,14 +1,14 @@
-"""Image files: their heads, their pixels as RGB or RGBA in 8 bits, and the values of masks.
+"""Image files: their headers, their pixels as RGB or RGBA in 8 bits, and the values of masks.
 
-Every way of storing pixels that pillow opens is read for what it means, or refused by name:
+Every pixel format that pillow opens is converted by its meaning, or refused by name:
 
 | stored as | read as |
 |---|---|
 | 8 bits, grey or RGB, with alpha or without; palettes; CMYK, YCbCr, LAB | pillow's conversion |
 | 1 bit | 0 and 1 |
 | 16 bits RGB | the upper 8 bits |
-| 16 bits grey | 0 to 65535 stand for 0 to 1 |
-| floats, one channel | 0 to 1; refused where values lie beyond |
+| 16 bits grey | 0 to 65535 are 0 to 1 |
+| floats, one channel | 0 to 1; refused if values are outside |
 | 32 bits grey, signed integers, several channels of more than 8 bits in planes | refused |
 """
 
@@ -26,21 +26,21 @@ from csplat.errors import InputError
 from csplat.file_source import describe_substitute
 from csplat.types import F64, U8
 
-#: A mask's values from which on pixels count.
+#: Least value of a mask for pixels that count.
 MASK_THRESHOLD = 128
 
 _WITH_ALPHA = ("RGBA", "LA", "PA", "RGBa", "La")
 _CONVERTED = (*_WITH_ALPHA, "1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LAB", "HSV")
 _GREY_16 = ("I;16", "I;16L", "I;16B", "I;16N")
-_GREY_16_IN_32 = ("PNG", "PPM")  # files whose grey of 16 bits pillow holds in 32
+_GREY_16_IN_32 = ("PNG", "PPM")  # formats whose 16-bit grey pillow stores in 32 bits
 _FLOAT = "F"
 _DEEP = ";16"  # in pillow's names of raw data of which it keeps the upper 8 bits
 _FLOAT_TOLERANCE = 1e-3  # of a range of 0 to 1, for files that were resampled
 _WHITE_IS_ZERO, _IN_PLANES = 0, 2  # TIFF 6.0: PhotometricInterpretation, PlanarConfiguration
-_OPAQUE = 250  # alpha that is 1 but for rounding
+_OPAQUE = 250  # least alpha that is 1 up to rounding
 _HEAD_SIZE = 64
 
-# By the first bytes and where they lie: what people have images in and pillow does not open.
+# Common image formats that pillow does not open: offset and value of their first bytes.
 _UNREAD = (
     (0, b"\x76\x2f\x31\x01", "an OpenEXR file, which is not read"),
     (0, b"#?", "a Radiance HDR file, which is not read"),
@@ -57,16 +57,15 @@ _RAW = (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2")  # pillo
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """The head of an image file.
+    """The header of an image file.
 
     Attributes:
         path: the file.
         size: width and height as stored.
-        stored_as: how pixels are stored where that leaves a choice of what they mean: `16-bit grey`, `16-bit colours`,
-            `floats`; else "".
-        has_alpha: whether there is transparency.
-        orientation: of EXIF, 1 to 8; 1 is upright. Of a TIFF always 1: pillow turns it.
-        frame_count: images in the file, of which the first is read.
+        stored_as: pixel format if its meaning is ambiguous: `16-bit grey`, `16-bit colours`, `floats`; else "".
+        has_alpha: True if there is transparency.
+        orientation: orientation by EXIF, 1 to 8; 1 is upright. For a TIFF always 1: pillow turns it.
+        frame_count: number of images in the file; the first is read.
     """
 
     path: Path
@@ -83,7 +82,7 @@ class MaskValues:
 
     Attributes:
         values: [H, W] uint8; pixels count from `MASK_THRESHOLD` on.
-        taken_as: how the file was understood where it is no image of black and white; else "".
+        taken_as: how the file was understood if it is not black and white; else "".
     """
 
     values: U8
@@ -92,7 +91,7 @@ class MaskValues:
 
 @contextmanager
 def open_image(path: Path) -> Iterator[Image.Image]:
-    """Open an image and read its head. Faults in the rest are reported in the same way.
+    """Open an image and read its header. Errors in the rest are reported in the same way.
 
     Raises:
         InputError: the file is no image, or of a kind that is not read.
@@ -109,7 +108,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
 
 
 def read_image_header(path: Path) -> ImageHeader:
-    """Read the head of an image file; pixels are not decoded.
+    """Read the header of an image file; pixels are not decoded.
 
     Raises:
         InputError: the file is no image, or its pixels are of a kind that is refused.
@@ -120,24 +119,24 @@ def read_image_header(path: Path) -> ImageHeader:
         orientation = 1
         if image.format != "TIFF":
             orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1)
-        # Phones append images for depth or brightness to a JPEG ("MPO"): nobody means them.
+        # Phones append images for depth or brightness to a JPEG ("MPO"); they are ignored.
         frame_count = 1 if image.format == "MPO" else int(getattr(image, "n_frames", 1))
         return ImageHeader(path, image.size, stored_as, has_alpha, orientation, frame_count)
 
 
 def opaque_images(heads: Iterable[ImageHeader]) -> list[ImageHeader]:
-    """Find out whether images have an alpha channel that says nothing, as exporters of photographs write.
+    """Find images whose alpha channel is redundant, as some exporters write.
 
-    Alpha is decoded until an image has some transparency: then that of all counts.
+    Alpha is decoded until an image has some transparency: then alpha is kept for all images.
 
     Args:
-        heads: of the files of a set.
+        heads: headers of the files of a set.
 
     Returns:
         All images with an alpha channel if it is 1 all over all of them; else none.
 
     Raises:
-        InputError: a file that is looked at is damaged.
+        InputError: a file that is read is damaged.
     """
     with_alpha = [head for head in heads if head.has_alpha]
     for head in with_alpha:
@@ -148,7 +147,7 @@ def opaque_images(heads: Iterable[ImageHeader]) -> list[ImageHeader]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file; its pixels are not read."""
+    """Return width and height of an image file; its pixels are not read."""
     with open_image(path) as image:
         return image.size
 
@@ -161,7 +160,7 @@ def rgb_pixels(image: Image.Image, path: Path) -> U8:
         path: its file, for messages.
 
     Returns:
-        [H, W, 3], or [H, W, 4] where the file has transparency.
+        [H, W, 3], or [H, W, 4] if the file has transparency.
 
     Raises:
         InputError: pixels are of a kind that is refused, or floats lie beyond 0 to 1.
@@ -172,16 +171,16 @@ def rgb_pixels(image: Image.Image, path: Path) -> U8:
     stored = np.asarray(image)
     grey = np.rint(255.0 * _unit_grey(image, path)).astype(np.uint8)
     channels = [grey, grey, grey]
-    if "transparency" in image.info:  # one grey value that is seen through
+    if "transparency" in image.info:  # one grey value that is transparent
         channels.append(np.where(stored == image.info["transparency"], 0, 255).astype(np.uint8))
     return np.stack(channels, axis=2)
 
 
 def mask_values(image: Image.Image, path: Path) -> MaskValues:
-    """Decode a mask: white where its image counts.
+    """Decode a mask: white for pixels that count.
 
-    Where colours are alike all over and alpha is not, alpha is the mask. Where no pixel is brighter than half and there
-    are at most two values, 0 and another, as in masks of 0 and 1 and in label images, pixels other than 0 count.
+    If all colours are the same and alpha is not, alpha is the mask. If no pixel is brighter than half and there are at
+    most two values, 0 and another, as in masks of 0 and 1 and in label images, pixels other than 0 count.
 
     Raises:
         InputError: as `rgb_pixels`; or no pixel is brighter than half and there are more than two values.
@@ -221,7 +220,7 @@ def _has_alpha(image: Image.Image) -> bool:
 
 
 def _stored_as(image: Image.Image, path: Path) -> str:
-    """Name how pixels are stored where that leaves a choice of what they mean; else "".
+    """Return the pixel format if its meaning is ambiguous; else "".
 
     Raises:
         InputError: they are of a kind that is refused.
@@ -257,7 +256,7 @@ def _unit_grey(image: Image.Image, path: Path) -> F64:
 
 
 def _grey_mask(image: Image.Image, path: Path) -> U8:
-    """Bring a mask of more than 8 bits to 8: labels and values up to 255 stay what they are, others are scaled."""
+    """Convert a mask of more than 8 bits to 8: labels and values up to 255 are kept, others are scaled."""
     stored = np.asarray(image)
     low, high = float(stored.min()), float(stored.max())
     if low >= 0.0 and high <= 255.0 and (image.mode != _FLOAT or high > 1.0):
@@ -268,7 +267,7 @@ def _grey_mask(image: Image.Image, path: Path) -> U8:
 
 
 def _refuse_by_name(path: Path) -> None:
-    """Refuse a file that pillow does not know, if its first bytes tell what it is."""
+    """Refuse a file that pillow does not open, by the name of its format if its first bytes identify it."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_SIZE)

@@ -1,4 +1,4 @@
-"""Lenses: the place in the photograph of a straightened image's pixel, and the pinhole to straighten to.
+"""Lenses: the position of an undistorted image's pixel in the original, and the pinhole of the undistorted image.
 
 A lens maps directions (x, y), with z = 1 ahead, to the plane of the image in two steps: a projection (perspective,
 equidistant as fisheyes have it, or the FOV model), then a distortion, of OpenCV's form in all of them:
@@ -77,13 +77,13 @@ class Lens:
 
 @lru_cache(maxsize=64)  # images of a set share a few lenses
 def undistorted_lens(lens: Lens) -> Lens:
-    """Find the pinhole that a lens's images are straightened to.
+    """Return the pinhole camera of a lens's undistorted images.
 
     The focal lengths grow, in steps of half a per cent, until every pixel of the straight image lies within the
-    distorted one, and none twice: nothing has to be invented at the border. A fisheye's border is cut off.
+    distorted one, and none twice: no pixel at the border is undefined. A fisheye's border is cut off.
 
     Raises:
-        InputError: no reasonable zoom achieves that: the numbers describe no such lens.
+        InputError: no reasonable zoom achieves that: the parameters do not describe such a lens.
     """
     zoom = 1.0
     while zoom <= _MAX_ZOOM:
@@ -101,13 +101,13 @@ def undistorted_lens(lens: Lens) -> Lens:
 
 
 def distorted(u: F64, v: F64, lens: Lens, straight: Lens) -> tuple[F64, F64]:
-    """Find where pixels of the straight image lie in the distorted one.
+    """Return the positions of pixels of the undistorted image in the distorted one.
 
     Args:
         u: horizontal pixel coordinates, of any shape.
         v: vertical pixel coordinates, of the same shape.
-        lens: lens of the photograph.
-        straight: the pinhole of the straight image.
+        lens: lens of the original.
+        straight: pinhole of the undistorted image.
     """
     x, y = (u - straight.cx) / straight.fx, (v - straight.cy) / straight.fy
     if lens.projection != "perspective":
@@ -126,7 +126,7 @@ def distorted(u: F64, v: F64, lens: Lens, straight: Lens) -> tuple[F64, F64]:
 
 
 def _projection_factor(r: F64, lens: Lens) -> F64:
-    """The radius that a projection gives a direction, over the tangent of its angle, which is `r`."""
+    """Return the projected radius of a direction, divided by the tangent of its angle, `r`."""
     tangent, scale = (2.0 * math.tan(lens.omega / 2.0), lens.omega) if lens.projection == "fov" else (1.0, 1.0)
     if abs(scale) < _SMALL:
         return np.ones_like(r)
@@ -135,7 +135,7 @@ def _projection_factor(r: F64, lens: Lens) -> F64:
 
 
 def _polynomial(factors: tuple[float, ...], r2: F64) -> F64:
-    """factors[0] r² + factors[1] r⁴ + …, by Horner's rule; zeros at the end cost nothing."""
+    """Return factors[0] r² + factors[1] r⁴ + …, by Horner's rule; zeros at the end cost nothing."""
     last = max((i for i, factor in enumerate(factors) if factor != 0.0), default=0)
     total = r2 * (factors[last] if factors else 0.0)
     for factor in reversed(factors[:last]):
@@ -144,7 +144,7 @@ def _polynomial(factors: tuple[float, ...], r2: F64) -> F64:
 
 
 def _border(lens: Lens, count: int) -> tuple[F64, F64]:
-    """Centres of pixels along the four sides, `count` of each."""
+    """Return centres of pixels along the four sides, `count` of each."""
     u = np.linspace(0.5, lens.width - 0.5, count)
     v = np.linspace(0.5, lens.height - 0.5, count)
     ends_u, ends_v = np.repeat(u[[0, -1]], count), np.repeat(v[[0, -1]], count)
@@ -153,14 +153,14 @@ def _border(lens: Lens, count: int) -> tuple[F64, F64]:
 
 def _border_is_inside(lens: Lens, straight: Lens) -> bool:
     x, y = distorted(*_border(lens, _BORDER_POINTS), lens, straight)
-    margin = 0.5 - 1e-6  # half a pixel beyond the centres the border's colour still holds
+    margin = 0.5 - 1e-6  # up to half a pixel beyond the centres the border's colour is valid
     inside = (x >= 0.5 - margin) & (x <= lens.width - 0.5 + margin)
     inside &= (y >= 0.5 - margin) & (y <= lens.height - 0.5 + margin)
     return bool(inside.all())
 
 
 def _is_one_to_one(lens: Lens, straight: Lens) -> bool:
-    """Return True if distances from the principal point keep their order in the photograph: polynomials may not."""
+    """Return True if the order of distances from the principal point is kept, which polynomials may violate."""
     u, v = _border(lens, _RAYS)
     along = np.linspace(0.0, 1.0, _RAY_POINTS)[:, None]
     x, y = distorted(lens.cx + along * (u - lens.cx), lens.cy + along * (v - lens.cy), lens, straight)

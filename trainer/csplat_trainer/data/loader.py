@@ -23,7 +23,7 @@ from csplat_trainer.data.image_pixels import opaque_images, read_image_header
 from csplat_trainer.data.transforms import read_blender, read_transforms
 
 _MAX_NAMED = 3  # folders in a message, at most
-_AGREES = math.cos(math.radians(30.0))  # of the custom of a kind of set with its cameras
+_AGREES = math.cos(math.radians(30.0))  # least cosine of the usual up direction with that of the cameras
 
 
 def load(
@@ -34,7 +34,7 @@ def load(
     test_every: int = 8,
     near: float | None = None,
 ) -> DataSet:
-    """Find the posed images of a data set. Their pixels are read when they are asked for, or by `DataSet.read`.
+    """Find the posed images of a data set. Their pixels are read on first access, or by `DataSet.read`.
 
     | recognised by | kind |
     |---|---|
@@ -42,21 +42,21 @@ def load(
     | `transforms.json` | instant-ngp, nerfstudio |
     | `sparse/0/cameras.bin` or `.txt` | COLMAP, as Mip-NeRF 360, Tanks and Temples, Deep Blending are laid out |
 
-    What files state is checked against what they hold: `checks`. Lenses are straightened: `lens`.
+    Statements of the files are checked against their contents (`dataset_checks`), and images are undistorted (`lens`).
 
     Args:
         path: its folder, or the `transforms.json`.
-        size: width and height to bring all images to, each axis by itself; `None`: as they are.
-        images: the folder of images, `images_4`; `None`: as the set says, of COLMAP sets with `size` the smallest
-            that is large enough.
-        test_every: which share is held out where the set names no test images; 0: none.
-        near: near plane of the cameras, scene units; `None`: one that suits the set.
+        size: width and height to which all images are scaled, each axis by itself; `None`: unchanged.
+        images: the folder of images, such as `images_4`; `None`: the set's own; for COLMAP sets with `size` the
+            smallest that is large enough.
+        test_every: every Nth image is held out if the set names no test images; 0: none.
+        near: near plane of the cameras, scene units; `None`: derived from the set.
 
     Returns:
         All images, undistorted, with their cameras.
 
     Raises:
-        InputError: there is no data set, it is damaged, or it holds no images.
+        InputError: there is no data set, it is damaged, or it has no images.
     """
     path = Path(path)
     if size is not None and not all(1 <= side <= MAX_IMAGE_SIZE for side in size):
@@ -125,12 +125,11 @@ def load(
 
 
 def _choose_axes(custom: str, shots: Sequence[Shot]) -> tuple[str, Direction | None, str]:
-    """The axes of a set, which way is up, and that in words.
+    """Return the axes of a set, its up direction, and a line for the report.
 
     Args:
-        custom: axes that sets of this kind have. Some people keep other coordinates in its files: then the cameras
-            say up.
-        shots: all of the set.
+        custom: usual axes of sets of this kind. Some files have other coordinates: then the cameras determine up.
+        shots: all shots of the set.
     """
     level, usual = estimate_level([shot.viewmat for shot in shots]), up_of_axes(custom)
     if level is None:
@@ -172,7 +171,7 @@ def _read(path: Path, size: tuple[int, int] | None, images: str | None, test_eve
 
 
 def _suggest_place(path: Path) -> str:
-    """Say where a data set is instead, as far as that is to be seen."""
+    """Return a hint where the data set may be instead, or ""."""
     folders = [*sorted(path.glob("*/")), *sorted(path.glob("*/*/"))]
     names = ("transforms_train.json", "transforms.json")
     sets = [one for one in folders if any((one / name).is_file() for name in names) or find_model(one)]
@@ -189,7 +188,7 @@ def _suggest_place(path: Path) -> str:
 
 Origin = tuple[float, float, float]
 
-_NEAR_SIZES = 256.0  # sizes of the scene; farther from 0, a step of float32 is more than 1.5e-5 of that size
+_NEAR_SIZES = 256.0  # sizes of the scene; farther from 0, a step of float32 exceeds 1.5e-5 of that size
 
 
 def choose_origin(found: UnreadDataSet) -> tuple[UnreadDataSet, Origin]:
@@ -238,7 +237,7 @@ def choose_origin(found: UnreadDataSet) -> tuple[UnreadDataSet, Origin]:
 def describe_outliers(data: DataSet) -> str:
     """Name the cameras that are far away from all others, in a sentence; return "" if there are none.
 
-    They stay training, validation or test images: a training image that shows nothing has no effect.
+    They remain training, validation or test images: a training image that shows nothing has no effect.
     """
     if not data.outliers:
         return ""
@@ -259,9 +258,9 @@ def _relative_to(shot: Shot, origin: F64) -> Shot:
     return replace(shot, viewmat=viewmat)
 
 
-_TURNED = 0.03  # least mean square, across the weakest direction but one, of the axes that point to the right
+_TURNED = 0.03  # least second eigenvalue of the cameras' right axes: cameras are turned to several sides
 _TILT_MAX = 20.0  # degrees; cameras that were held less level determine nothing
-_UNDECIDED = 0.1  # cosine with the cameras' mean up below which they look down: up is then where they look away from
+_UNDECIDED = 0.1  # cosine with the cameras' mean up below which they look down: up is then opposite to their view
 
 
 @dataclass(frozen=True)
@@ -282,14 +281,14 @@ class Level:
     by_horizons: bool
 
     def __str__(self) -> str:
-        """The same in words, for people."""
+        """Return the estimate in words."""
         words = " ".join(f"{value:g}" for value in self.up)
         how = "their horizons lie" if self.by_horizons else "their own up lies"
         return f"up is {words} by the cameras: {how} within {self.tilt_degrees:.1f} degrees of that, for half of them"
 
 
 def estimate_level(viewmats: Sequence[F64]) -> Level | None:
-    """Find up from the cameras of a set.
+    """Estimate up from the cameras of a set.
 
     Args:
         viewmats: [4, 4] each, world to camera, OpenCV axes: rows are right, down, forward. At least one.

@@ -1,4 +1,4 @@
-"""Readers of `transforms*.json`: NeRF-synthetic (Blender) sets, and instant-ngp's and its kin.
+"""Readers of `transforms*.json`: NeRF-synthetic (Blender) sets, and those of instant-ngp and nerfstudio.
 
 Both hold camera-to-world matrices with OpenGL axes: x to the right, y up, z backwards.
 """
@@ -53,11 +53,11 @@ def read_blender(folder: Path, images: str | None = None) -> UnreadDataSet:
     """Read a set with `transforms_train.json` and, mostly, `transforms_test.json` next to it.
 
     Args:
-        folder: where they lie. The images of `transforms_val.json` are for validation.
-        images: the folder of images, by name; `None`: as the files say.
+        folder: the folder of the files. The images of `transforms_val.json` are validation images.
+        images: the folder of images, by name; `None`: from the files.
 
     Raises:
-        InputError: a file is not what it is called, or no image is there.
+        InputError: a file has another content than its name suggests, or no image is found.
     """
     report: list[str] = []
     train_path = folder / "transforms_train.json"
@@ -80,11 +80,11 @@ def read_transforms(path: Path, test_every: int, images: str | None = None) -> U
 
     Args:
         path: the file.
-        test_every: see `split_every`; used where the file lists neither training, validation nor test images.
-        images: the folder of images, by name; `None`: as the file says.
+        test_every: see `split_every`; used if the file lists neither training, validation nor test images.
+        images: the folder of images, by name; `None`: from the file.
 
     Raises:
-        InputError: the file is not what it is called, or no image is there.
+        InputError: the file has another content than its name suggests, or no image is found.
     """
     document, report = _load(path), list[str]()
     shots = _shots(document, path, images, report)
@@ -114,12 +114,12 @@ def _check_distinct(shots: Sequence[Shot], folder: Path) -> None:
 
 @dataclass(frozen=True)
 class _Frame:
-    """An image as a list of frames has it.
+    """An entry of a list of frames.
 
     Attributes:
         name: its file_path.
-        number: where it is in the list.
-        values: all that the list says of it.
+        number: its index in the list.
+        values: all its values.
     """
 
     name: str
@@ -204,18 +204,18 @@ def _frames(document: Mapping[str, Any], field: str, path: Path, report: list[st
 
 
 def _is_lost(frame: Mapping[str, Any]) -> bool:
-    """Report whether a frame's pose is null, or holds a number that is not finite, as where tracking was lost."""
+    """Return True if a frame's pose is null, or holds a number that is not finite, as when tracking was lost."""
     if "transform_matrix" not in frame:
         return False
     matrix = frame["transform_matrix"]
     try:
         return matrix is None or not np.isfinite(np.array(matrix, np.float64)).all()
     except (TypeError, ValueError, OverflowError):
-        return False  # what it is instead is said later
+        return False  # other contents are reported later
 
 
 def _folders(names: Sequence[str], images: str | None) -> list[str]:
-    """Name the folders to look for images in: as the file says, then what is left of that without leading folders."""
+    """Return the folders to search for images: that of the file's names, then its last part, then the usual ones."""
     if images is not None:
         return [images]
     own = PurePosixPath(normalise_name(names[0])).parent
@@ -272,7 +272,7 @@ def _points(
 def _points_next_to(train: Sequence[Shot], folder: Path, report: list[str]) -> tuple[F64 | None, F32 | None]:
     """Read the points that 3DGS and its kin put next to a set of Blender's.
 
-    Where images have transparency they are not read: programs write random points there, and the outline says more.
+    If images have transparency, points are not read: programs write random ones, and the silhouette is better.
     """
     cloud = next((path for name in _POINT_CLOUDS if (path := folder / name).is_file()), None)
     if cloud is None:
@@ -324,9 +324,9 @@ def _lens(values: Mapping[str, Any], image: Path, where: str) -> Lens:
     cx, cy = finite_number(values, "cx", where, width / 2.0), finite_number(values, "cy", where, height / 2.0)
     k1, k2, k3, k4, k5, k6 = (finite_number(values, f"k{i}", where, 0.0) for i in range(1, 7))
     p1, p2 = finite_number(values, "p1", where, 0.0), finite_number(values, "p2", where, 0.0)
-    # OpenCV's rational model divides by k4 to k6; other programs go on multiplying: only the model's name tells which.
-    apart = {"k5": k5, "k6": k6} | ({"p1": p1, "p2": p2} if fisheye else {"k4": k4})
-    strange = [f"{key} is {value:g}" for key, value in apart.items() if value != 0.0]
+    # OpenCV's rational model divides by k4 to k6, other programs multiply: only the model's name tells which.
+    unsupported = {"k5": k5, "k6": k6} | ({"p1": p1, "p2": p2} if fisheye else {"k4": k4})
+    strange = [f"{key} is {value:g}" for key, value in unsupported.items() if value != 0.0]
     if strange and (fisheye or model.upper() != _RATIONAL):
         raise InputError(
             f"{where}: {strange[0]} with camera_model {model or 'not named'}, expected 0: k4 to k6 belong to "
