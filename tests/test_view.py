@@ -238,7 +238,7 @@ def test_directions_that_are_none_are_refused(up):
     ],
 )
 def test_the_page_is_told_what_the_user_says_of_up(words, wishes):
-    assert wishes == page_parameters(None, OrientationOptions(**words).upright())
+    assert wishes == page_parameters(None, OrientationOptions(**words).overrides())
 
 
 def refused(path):

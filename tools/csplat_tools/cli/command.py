@@ -1,4 +1,9 @@
-"""Build commands: groups of options, results, settings, and errors in one line."""
+"""Build commands from functions with groups of options, which are declared once and checked in one place.
+
+A command is a function whose parameters are arguments, options, and groups of options: subclasses of `OptionGroup`.
+`command` turns it into a function for typer: each group arrives as one typed value, and declares which of its options
+exclude each other or require another one. Expected errors end in one line and a status.
+"""
 
 from __future__ import annotations
 
@@ -29,14 +34,14 @@ from csplat_tools.file_streams import STANDARD_STREAM, check_name, check_outputs
 
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
-_WRONG_USE = 2
+_EXIT_USAGE = 2
 
 _AGAIN = "copy or download it again"
 _NEWER = "a newer csplat may know it"
-_BROKEN = ("the file contradicts itself", f"{_AGAIN}; `csplat verify` lists all that is wrong")
+_INVALID = ("the file contradicts itself", f"{_AGAIN}; `csplat verify` lists all that is wrong")
 _DAMAGED = ("the file is damaged", _AGAIN)
 #: By error code of the format: the defect, and the remedy. The viewer has the same in `tools/viewer/messages.mjs`.
-_WORDS = {
+_DEFECTS = {
     "E_MAGIC": ("not a .csplat file", "`csplat encode` makes one of a PLY"),
     "E_VERSION": ("written in another version of the format", _NEWER),
     "E_TRUNCATED": ("the file ends too early", _AGAIN),
@@ -63,7 +68,7 @@ _OS_ADVICE = {
 
 #: Base class of the errors that typer raises for a command line; typer exports only one of its subclasses.
 UsageError: type[Exception] = typer.BadParameter.__bases__[0]
-_SAYS_NOTHING = re.compile(r"^Invalid value: |(?<=: )Value error, |\.$")  # empty phrases of typer's messages
+_EMPTY_PHRASES = re.compile(r"^Invalid value: |(?<=: )Value error, |\.$")  # in typer's messages
 
 #: Options with their new names; the old ones are refused for one version.
 RENAMED_OPTIONS = {"--keep-all": "--no-prune", "--max-loss": "--max-psnr-drop", "--aside": "--validation-count"}
@@ -103,21 +108,21 @@ def report_errors(command: Callable[P, T]) -> Callable[P, T]:
 
 
 def usage_message(error: Any) -> str:
-    """Return in one line what is wrong with a command line; an option that was renamed is named with its new name."""
+    """Return the message of an error in a command line, in one line; for a renamed option, with its new name."""
     renamed = RENAMED_OPTIONS.get(getattr(error, "option_name", None) or "")
     if renamed is not None:
         return f"{error.option_name} is called {renamed} now"
-    return " ".join(_SAYS_NOTHING.sub("", error.format_message()).split())
+    return " ".join(_EMPTY_PHRASES.sub("", error.format_message()).split())
 
 
 def refuse_command_line(error: Any) -> NoReturn:
-    """Print in one line what is wrong with a command line, in the form of other errors, and exit with status 2."""
+    """Print the error in a command line, in the form of other errors, and exit with status 2."""
     message = usage_message(error)
     if message:  # empty for a command line without arguments: help is printed already
-        of = error.ctx.command_path if error.ctx is not None else "csplat"
-        helps = f"`{of} --help`" if error.ctx is not None else "`csplat COMMAND --help`"
-        note(f"error: {of}: {message}; {helps} says what is possible (E_USAGE)")
-    sys.exit(_WRONG_USE)
+        command = error.ctx.command_path if error.ctx is not None else "csplat"
+        helps = f"`{command} --help`" if error.ctx is not None else "`csplat COMMAND --help`"
+        note(f"error: {command}: {message}; {helps} says what is possible (E_USAGE)")
+    sys.exit(_EXIT_USAGE)
 
 
 def _fail(message: str) -> NoReturn:
@@ -127,7 +132,7 @@ def _fail(message: str) -> NoReturn:
 
 def _csplat_error(error: CsplatError) -> str:
     """Return the message of an error: the file, the defect in plain words, the details, the remedy, and the code."""
-    what, advice = _WORDS.get(error.code, ("", "") if isinstance(error, InputError) else _BROKEN)
+    what, advice = _DEFECTS.get(error.code, ("", "") if isinstance(error, InputError) else _INVALID)
     message = str(error)
     parts = [error.path] if error.path is not None and Path(error.path).name not in message else []
     parts += [part for part in (what, message) if part]
@@ -211,16 +216,16 @@ def parse_settings(texts: Sequence[str], kinds: Sequence[str], taken: Collection
 
 
 def describe_settings(kinds: Sequence[str], taken: Collection[str]) -> str:
-    """Return the names of the settings, with their descriptions from the dataclasses' docstrings, for `--help-all`."""
+    """Describe the settings by the docstrings of their dataclasses, for `--help-all`."""
     lines = []
     try:
         found = _imported(kinds)
     except InputError as error:
         return f"Settings of --set: {error}"
     for kind in found:
-        told = dict(re.findall(r"^    (\w+): (.*(?:\n        .*)*)", inspect.getdoc(kind) or "", re.MULTILINE))
+        texts = dict(re.findall(r"^    (\w+): (.*(?:\n        .*)*)", inspect.getdoc(kind) or "", re.MULTILINE))
         for name, _ in _names(kind, taken):
-            lines.append(f"  {name.replace('_', '-')}: {' '.join(told.get(name, '').split())}")
+            lines.append(f"  {name.replace('_', '-')}: {' '.join(texts.get(name, '').split())}")
     return "Settings of --set NAME=VALUE,...:\n" + "\n".join(lines)
 
 
@@ -272,7 +277,7 @@ class OptionGroup:
 
 @dataclass(frozen=True)
 class OutputOptions(OptionGroup):
-    """Options that tell where results go, the same for every command."""
+    """Options of the results, the same for every command."""
 
     force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False
     report: Annotated[str | None, typer.Option(metavar="FILE.json", help="Write the result as JSON.")] = None
@@ -286,26 +291,25 @@ class OutputOptions(OptionGroup):
         named: Mapping[str, str | None] | None = None,
         force: bool = False,
     ) -> None:
-        """Refuse files before any work is done for them.
+        """Refuse unusable files before any work is done for them.
 
         Args:
             outputs: files that the command writes, or `-`; `None` for one that is not requested.
             inputs: files that it reads; none of them may be written.
-            named: other files that it writes, by option; they cannot be `-`, and their names must not end like those
-                of other kinds of files.
+            named: other files that it writes, by option; not `-`, nor files with the ending of another kind.
             force: existing files may be replaced, even without --force.
 
         Raises:
-            InputError: a file exists, two are the same, or one has a name for another kind of file.
+            InputError: a file exists, two are the same, or one has the ending of another kind of file.
             OSError: an input does not exist, or the folder of an output.
             typer.BadParameter: two outputs would go to standard output, or one that cannot.
         """
         files = {"--report": self.report, **(named or {})}
         for name, path in files.items():
             if path == STANDARD_STREAM:
-                raise typer.BadParameter(f"{name} wants the name of a file")
+                raise typer.BadParameter(f"{name} requires the name of a file")
         if self.as_json and STANDARD_STREAM in outputs:
-            raise typer.BadParameter("--json and - both want standard output")
+            raise typer.BadParameter("--json and - both use standard output")
         check_outputs((*outputs, *files.values()), force=self.force or force, inputs=inputs)
         for name, path in files.items():
             if path is not None and name in _ENDINGS:
@@ -330,16 +334,16 @@ class OutputOptions(OptionGroup):
         for line in () if self.quiet else lines:
             note(line)
 
-    def announce_time(self, expected: Callable[[], float], sooner: str) -> None:
-        """Announce how long the work takes if it is long, so that people may choose otherwise.
+    def announce_time(self, estimate: Callable[[], float], faster: str) -> None:
+        """Announce the time of long work, so that people may choose otherwise.
 
         Args:
-            expected: estimates the seconds; not called with `--quiet`.
-            sooner: advice on what takes less time.
+            estimate: returns the seconds; not called with `--quiet`.
+            faster: advice on what takes less time.
         """
-        seconds = 0.0 if self.quiet else expected()
+        seconds = 0.0 if self.quiet else estimate()
         if seconds > LONG_WORK_SECONDS:
-            note(f"this takes about {format_estimate(seconds)} here; {sooner}")
+            note(f"this takes about {format_estimate(seconds)} here; {faster}")
 
     def print_findings(self, findings: Sequence[Finding], name: str = "") -> None:
         """Print unusual findings in a file, unless `--quiet` is given; repairs are printed in any case.
@@ -359,7 +363,9 @@ class OutputOptions(OptionGroup):
 
 _Set = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="NAME=VALUE,...", hidden=True, help="Settings that have no option; see below."),
+    typer.Option(
+        "--set", metavar="NAME=VALUE,...", hidden=True, help="Settings without an option of their own; see below."
+    ),
 ]
 _ReadAs = Annotated[
     str | None,
@@ -367,7 +373,7 @@ _ReadAs = Annotated[
         "--from",
         metavar="FORMAT",
         hidden=True,
-        help="Read scenes as this one of `csplat formats` where their content does not say what they are.",
+        help="Format of scenes, one of `csplat formats`, if their content does not identify it.",
     ),
 ]
 _READ_AS = "read_as"
@@ -401,13 +407,13 @@ def command(
         reads: the command reads scenes in any format, and takes `--from`.
     """
 
-    def made(function: Callable[..., None]) -> Callable[..., None]:
+    def build(function: Callable[..., None]) -> Callable[..., None]:
         hints = get_type_hints(function, include_extras=True)
         own = [one.replace(annotation=hints[one.name]) for one in inspect.signature(function).parameters.values()]
         own.sort(key=lambda one: one.annotation is OutputOptions)  # the group that every command has comes last
         groups: dict[str, type[OptionGroup]] = {one.name: one.annotation for one in own if _is_group(one.annotation)}
         exclusive = [*one_of, *(names for kind in groups.values() for names in kind.one_of)]
-        wanting = {name: those for kind in groups.values() for name, those in kind.needs.items()} | dict(needs or {})
+        required = {name: those for kind in groups.values() for name, those in kind.needs.items()} | dict(needs or {})
         flat = [one for each in own for one in (_fields(groups[each.name]) if each.name in groups else _own(each))]
         options = {one.name: _spelling(one) for one in flat}
         defaults = {one.name: one.default for one in flat}
@@ -415,7 +421,7 @@ def command(
         def parsed(**given: Any) -> dict[str, Any]:
             given.pop(_HELP_ALL, None)
             given.pop(_READ_AS, None)
-            _check({name for name in given if given[name] != defaults[name]}, options, exclusive, wanting)
+            _check({name for name in given if given[name] != defaults[name]}, options, exclusive, required)
             if settings:
                 given["settings"] = parse_settings(given["settings"] or (), settings, options)
             if _ALIAS in given:
@@ -438,16 +444,16 @@ def command(
         flat += [_keyword(_READ_AS, None, _ReadAs)] * reads
         flat.append(_help_all(functools.partial(_more_help, function, settings, options)))
         shown = {one.name: options.get(one.name, "") for one in flat if not _is_hidden(one)}
-        told = [_saying_what_excludes_it(one, shown, exclusive) for one in flat]
+        described = [_with_exclusions(one, shown, exclusive) for one in flat]
         for each in (run, parsed):
-            taking: Any = each  # attributes, as all functions
-            taking.__signature__ = inspect.Signature(told)
-            taking.__annotations__ = {one.name: one.annotation for one in told} | {"return": None}
+            target: Any = each  # functions have attributes
+            target.__signature__ = inspect.Signature(described)
+            target.__annotations__ = {one.name: one.annotation for one in described} | {"return": None}
         run.__doc__ = _MORE.split(function.__doc__ or "")[0]
         run.parsed = parsed  # type: ignore[attr-defined]  # likewise
         return report_errors(run)
 
-    return made
+    return build
 
 
 def chosen(kind: Callable[..., T], **values: Any) -> T:
@@ -507,7 +513,7 @@ def _fields(kind: type[OptionGroup]) -> list[inspect.Parameter]:
 
 
 def _own(one: inspect.Parameter) -> list[inspect.Parameter]:
-    """Return a parameter as typer is to see it; for the output two: the argument and `-o`."""
+    """Return a parameter for typer; for the output two: the argument and `-o`."""
     one = one.replace(kind=inspect.Parameter.KEYWORD_ONLY)
     if one.annotation is LibrarySettings:
         return [one.replace(default=None, annotation=_Set)]
@@ -530,7 +536,7 @@ def _one_output(output: str | None, alias: str | None, source: str | None, besid
 
 
 def _spelling(one: inspect.Parameter) -> str:
-    """Return an option as users write it; empty for an argument."""
+    """Return the spelling of an option; empty for an argument."""
     info = next(iter(getattr(one.annotation, "__metadata__", ())), None)
     if not isinstance(info, OptionInfo):
         return ""
@@ -540,10 +546,10 @@ def _spelling(one: inspect.Parameter) -> str:
     return declared[0].partition("/")[0] if declared else "--" + one.name.replace("_", "-")
 
 
-def _saying_what_excludes_it(
+def _with_exclusions(
     one: inspect.Parameter, shown: Mapping[str, str], exclusive: Sequence[tuple[str, ...]]
 ) -> inspect.Parameter:
-    """Return an option whose help names the other one that it excludes; for three and more the panel's name does that.
+    """Return an option whose help names the one that it excludes; for three or more the panel's name does that.
 
     If an option excludes many others, only its own help names them.
 

@@ -65,7 +65,7 @@ class RunOptions(OptionGroup):
         """Refuse unusable paths of reports before anything is run; XML may go to a terminal."""
         to_stdout = self.junit == STANDARD_STREAM
         if to_stdout and out.as_json:
-            raise typer.BadParameter("--json and --junit - both want standard output")
+            raise typer.BadParameter("--json and --junit - both use standard output")
         out.check(None if to_stdout else self.junit)
 
     def publish(self, report: ConformanceReport, out: OutputOptions, nothing: str) -> None:

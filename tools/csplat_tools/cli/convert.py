@@ -121,7 +121,7 @@ def convert(
         out.check(str(folder) if made_anew else output, inputs=(source,))
     with out.bar() as progress:
         made = convert_file(
-            source, output, write_as=write_as, level=level, overrides=upright.upright(),
+            source, output, write_as=write_as, level=level, overrides=upright.overrides(),
             filters=changes.filters(sh_degree), no_loss=no_loss, dry_run=dry_run, progress=progress,
         )  # fmt: skip
     out.print_findings(made.findings)

@@ -38,7 +38,7 @@ def decode(
     check_name(output, ".ply", "decode", source)
     with out.bar() as progress:
         count, degree = decode_file(
-            source, output, sh_degree=sh_degree, absolute=absolute, max_splats=max_splats, overrides=upright.upright(),
-            progress=progress,
+            source, output, sh_degree=sh_degree, absolute=absolute, max_splats=max_splats,
+            overrides=upright.overrides(), progress=progress,
         )  # fmt: skip
     out.publish({"splats": count, "sh_degree": degree})

@@ -111,7 +111,7 @@ def render(
     require_renderer()
     read = load_model(source, sh_degree=sh_degree)
     out.print_findings(read.findings)
-    model = upright.upright().apply(read.model)
+    model = upright.overrides().apply(read.model)
     report: list[str] = []
     cameras = find_cameras(model, views.cameras, orbit, shots, pixels, split=split, report=report)
     out.remark(*report)

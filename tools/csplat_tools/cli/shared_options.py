@@ -96,7 +96,7 @@ Near = Annotated[
 
 @dataclass(frozen=True)
 class OrientationOptions(OptionGroup):
-    """Options of the scene's orientation, which override what the scene declares."""
+    """Options of the scene's orientation, which override its own."""
 
     up: Annotated[str | None, typer.Option(metavar="-y|X,Y,Z", help="Direction that is up.")] = None
     axes: Annotated[
@@ -105,10 +105,10 @@ class OrientationOptions(OptionGroup):
 
     def parse(self) -> None:
         """Refuse an invalid direction or axes."""
-        self.upright()
+        self.overrides()
 
-    def upright(self) -> MetadataOverrides:
-        """Return the up direction and axes that the options specify, as overrides of the scene's own."""
+    def overrides(self) -> MetadataOverrides:
+        """Return the given up direction and axes, as overrides of the scene's own."""
         up = None if self.up is None else parse_up(self.up)
         return MetadataOverrides(None if self.axes is None else parse_axes(self.axes), up=up)
 
@@ -126,8 +126,8 @@ class OrientationOptions(OptionGroup):
             return None
         word = up_word(axis)
         output.remark(
-            f"the scene does not say which way is up; {word} seems to be"
-            + (", and is taken for it (encode --up writes it into a file)" if shown else f": --up {word} writes it")
+            f"the scene does not specify its up direction; {word} is estimated"
+            + (", and used (encode --up writes it into a file)" if shown else f": --up {word} writes it")
         )
         return axis
 
@@ -215,7 +215,7 @@ class ViewOptions(OptionGroup):
             output: prints remarks.
             near: near plane of the photographs; `None`: one that suits.
             every: as for `find_view_set`.
-            how: other arguments of `find_view_set`, passed on so that its defaults are defined in one place.
+            how: other arguments of `find_view_set`, which defines their defaults.
         """
         data = self.photographs(near)
         found = find_view_set(model, cameras=self.cameras, data=data, background=self.colour, every=every, **how)
@@ -224,8 +224,8 @@ class ViewOptions(OptionGroup):
         if axis is not None:
             word = up_word(axis)
             output.remark(
-                f"views are placed as if the scene had -y up, which it does not say; {word} seems to be:"
-                f" `csplat convert IN.ply OUT.ply --up {word}` says so, and other views have another PSNR"
+                f"views are placed for -y up, since the scene does not specify its up direction; {word} is estimated:"
+                f" `csplat convert IN.ply OUT.ply --up {word}` writes it, and changes views and PSNR"
             )
         return found
 
@@ -257,7 +257,7 @@ class VirtualViewOptions(OptionGroup):
 
 @dataclass(frozen=True)
 class SourceOptions(OrientationOptions):
-    """Options of reading a PLY, and metadata that it may lack."""
+    """Options of reading a scene, and metadata that it may lack."""
 
     strict: Annotated[
         bool, typer.Option("--strict", hidden=True, help="Refuse a PLY with defects instead of repairing it.")
@@ -281,7 +281,9 @@ class SourceOptions(OrientationOptions):
 
     def read(self) -> MetadataOverrides:
         """Return the metadata that the options specify."""
-        return replace(self.upright(), unit_metres=self.unit_metres, antialiased=self.antialiased, licence=self.licence)
+        return replace(
+            self.overrides(), unit_metres=self.unit_metres, antialiased=self.antialiased, licence=self.licence
+        )
 
 
 @dataclass(frozen=True)

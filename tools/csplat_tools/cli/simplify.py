@@ -97,7 +97,7 @@ def simplify(
     check_name(output, ".ply", "simplify", source)
     read = load_model(source)
     out.print_findings(read.findings)
-    model = upright.upright().apply(read.model)
+    model = upright.overrides().apply(read.model)
     prepare_renderer(quiet=out.quiet, simplify=True)
     given = virtual.given()
     around = views.find(model, out, seed=seed, **given)

@@ -181,7 +181,7 @@ def train(
         check_name(output, ".ply", "train", source)
     data = DataOptions(source, None if size is None else parse_size(size), images, test_every, near)
     files = Outputs(checkpoint, checkpoint_every, previews, preview_every, resume, lpips_weights)
-    overrides = upright.upright()
+    overrides = upright.overrides()
     if not to_file:
         out.publish(
             run_training(

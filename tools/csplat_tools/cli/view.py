@@ -55,7 +55,7 @@ def view(
       csplat view scene.csplat --no-browser --port 8000
     """
     out.check(inputs=(source, cameras))
-    wishes = page_parameters(cameras, upright.upright())
+    wishes = page_parameters(cameras, upright.overrides())
     with ExitStack() as stack:
         with out.bar() as progress:
             scene = stack.enter_context(open_viewer_scene(source, preset=preset, progress=progress))
@@ -96,7 +96,7 @@ def export_html(
       csplat export-html scene.ply scene.html --preset small --force
       csplat export-html scene.csplat scene.html --cameras views.json
     """
-    wishes = page_parameters(cameras, upright.upright())
+    wishes = page_parameters(cameras, upright.overrides())
     out.check(output, inputs=(source, cameras))
     check_name(output, ".html", "export-html", source)
     with out.bar() as progress, open_viewer_scene(source, preset=preset, progress=progress) as scene:

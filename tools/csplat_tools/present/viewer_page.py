@@ -1,4 +1,12 @@
-"""Export the viewer as one HTML page or one script."""
+"""Export the viewer, the JavaScript decoder and a scene as one HTML page; or the viewer as one script.
+
+A page that was opened as `file:` may not import modules from neighbouring files, and its worker may not import at all:
+the origin of such a page equals no other, not even that of its own blobs, which WebKit refuses to a worker's `import`,
+and Chromium to a worker that is a module. So the modules become functions of one classic script. The page runs it, and
+so does the worker, which is made from a blob of the same text; a function can read its own source. A policy in the page
+forbids the network. The page is ASCII: if a server declared another charset, the text would no longer match the digests
+in the policy.
+"""
 
 from __future__ import annotations
 
