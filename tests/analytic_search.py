@@ -27,13 +27,13 @@ class Found:
     Attributes:
         file: the chosen file.
         tried: every file that was made, in order.
-        judged: the files that the test views were shown.
+        scored: the files that the test views were shown.
         report: the report that users get.
     """
 
     file: AnalyticFile
     tried: list[AnalyticFile]
-    judged: list[AnalyticFile]
+    scored: list[AnalyticFile]
     report: SearchReport
 
 
@@ -67,7 +67,7 @@ def search(
     photographs = None if photo_psnr is None else _Judge(scene, Views(photo_psnr=photo_psnr))
     trials = CandidatePool(encoding, judge, validation_scorer, photographs, decode=lambda data: data)
     removal = None if no_prune else analytic_removal(scene, grades=grades, effort=effort)
-    whole = _Splats(scene, model, refits=False, gradable=grades)
+    whole = _Splats(scene, model, refits=False, classifiable=grades)
     goal = find_goal(asked, model, photographs)
     moves = TargetSearch(PrecisionSearch(trials, goal), CodingSearch(model, encoding, grades), whole, removal)
     try:
@@ -80,13 +80,13 @@ def search(
         encodes=len(trials.made), seconds=0.0,
     )  # fmt: skip
     made = [one.result.data for one in trials.made]
-    return Found(best.result.data, made, judge.shown, report)
+    return Found(best.result.data, made, judge.scored, report)
 
 
 def analytic_removal(scene: AnalyticScene, *, grades: bool = False, effort: int = 3) -> Pruner:
     """Return the object that decides how many splats may be pruned."""
     how = SimplifyOptions(effort=effort)
-    return _Removal(scene.model(), None, how, grades=grades, progress=None, psnr=None, scene=scene)
+    return _Removal(scene.model(), None, how, use_classes=grades, progress=None, psnr=None, scene=scene)
 
 
 @dataclass(eq=False)
@@ -96,11 +96,11 @@ class _Judge:
     scene: AnalyticScene
     views: Views
     cameras: tuple[int, ...] = tuple(range(8))
-    shown: list[AnalyticFile] = field(default_factory=list)
+    scored: list[AnalyticFile] = field(default_factory=list)
 
     def errors(self, model):
         if isinstance(model, AnalyticFile):
-            self.shown.append(model)
+            self.scored.append(model)
             error = self.scene.error_of(model.contents, self.views)
         elif isinstance(model, _Shown):
             error = self.scene.source_error(model.splats, self.scene.sh_degree, self.views, refitted=model.refitted)
@@ -125,15 +125,15 @@ class _Shown:
 
 @dataclass(eq=False)
 class _Splats:
-    """Splats that a file is to hold: today's `Part`."""
+    """Splats that a file is to hold: a `Subset`."""
 
     scene: AnalyticScene
     model: object
     refits: bool
-    gradable: bool
+    classifiable: bool
 
     @property
-    def shown(self):
+    def unquantised(self):
         return _Shown(len(self.model), self.refits)
 
     @property
@@ -149,12 +149,12 @@ class _Splats:
 
     fitted_psnr = psnr
 
-    def coded(self, options, *, graded, quick):
-        graded = graded and self.gradable and options.grades != 1 and self.scene.grading != 1.0
-        contents = Contents(options, len(self.model), self.refits, graded=graded, draft=quick and self.refits)
+    def coded(self, options, *, use_classes, quick):
+        use_classes = use_classes and self.classifiable and options.grades != 1 and self.scene.grading != 1.0
+        contents = Contents(options, len(self.model), self.refits, graded=use_classes, draft=quick and self.refits)
         return SimpleNamespace(write=lambda _: _encoded(AnalyticFile(self.scene, contents)))
 
-    def said(self, trial):  # noqa: ARG002  # the file does not record it
+    def options_entry(self, candidate):  # noqa: ARG002  # the file does not record it
         return None
 
 
@@ -173,10 +173,10 @@ class _Session:
     splats: int
     options: SimplifyOptions
     value_count: int = 1
-    sides: tuple[()] = ()
+    view_groups: tuple[()] = ()
 
-    def pruned(self, gone):
-        return np.arange(gone, self.splats)
+    def kept_rows(self, pruned_count):
+        return np.arange(pruned_count, self.splats)
 
 
 @dataclass(eq=False)
@@ -192,6 +192,6 @@ class _Removal(Pruner):
         order = PruningOrder(np.arange(count - 1), np.diff(errors), ())
         return _Session(order, count, self.options)
 
-    def fitted(self, left, allowed, seen):  # noqa: ARG002  # as the measured one is called
-        model = self.source.select(np.arange(len(self.source) - left, len(self.source)))
-        return _Splats(self.scene, model, refits=True, gradable=self.grades)
+    def refit(self, kept_count, allowed, psnr_of):  # noqa: ARG002  # as the measured one is called
+        model = self.source.select(np.arange(len(self.source) - kept_count, len(self.source)))
+        return _Splats(self.scene, model, refits=True, classifiable=self.use_classes)

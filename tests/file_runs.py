@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from trained import run_here, write_photographs
 
-from csplat_tools.training import trained_scene
-from csplat_tools.training.trained_scene import tuning_after
+from csplat_tools.training import training_run
+from csplat_tools.training.training_run import tuning_after
 
 
 class FileRuns:
@@ -35,7 +35,7 @@ class FileRuns:
         report = self.folder / f"{name}.json"
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(
-                trained_scene, "tuning_after", lambda **given: replace(tuning_after(**given), iterations=self.TUNED)
+                training_run, "tuning_after", lambda **given: replace(tuning_after(**given), iterations=self.TUNED)
             )
             messages = run_here("train", self.data, "-o", self.folder / name, *self.WORDS, "--report", report, *more)
         return json.loads(report.read_text()), messages

@@ -206,8 +206,7 @@ def test_an_ablation_takes_away_one_part_at_a_time_and_puts_it_back(tmp_path, mo
 
     def encode_to(source, *, psnr, options, no_prune, simplifying):
         tunes = (
-            subsets.quantisation_aware_refit is splat_refit.quantisation_aware_refit
-            and target_search.TUNING_GAINS > 0.0
+            subsets.quantisation_aware_refit is splat_refit.quantisation_aware_refit and target_search.REFIT_GAIN > 0.0
         )
         prices = math.isfinite(splat_refit.rate_exponent(0.05))
         has = (tunes, prices, options.grades != 1, simplifying.bands, simplifying.refit, not no_prune)

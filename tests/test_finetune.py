@@ -35,8 +35,8 @@ from csplat_render.rasteriser import Rasteriser
 from csplat_tools.cli.app import app
 from csplat_tools.cli.finetune import finetune as finetune_command
 from csplat_tools.optimise.pruning_order import SimplifyOptions
-from csplat_tools.training.tuned_file import smallest_reaching
 from csplat_tools.training.tuning_report import ply_splat_bytes
+from csplat_tools.training.tuning_run import smallest_reaching
 from csplat_trainer.losses import PhotometricLoss
 from csplat_trainer.posed_images import PosedImage
 from csplat_trainer.tuning import FinetuneOptions, TuningView, TuningViews, renders_of, split_views, tune

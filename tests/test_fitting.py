@@ -9,7 +9,7 @@ pytest.importorskip("numba", reason="tuning wants the extra [render]")
 pytest.importorskip("scipy", reason="tuning wants the extra [render]")
 
 from csplat.encoder import PRESETS, EncodeOptions
-from csplat_tools.training import tuned_file
+from csplat_tools.training import tuning_run
 from csplat_tools.training.tuning_inputs import TuningSubset
 
 USUAL = PRESETS["small"].quality[0]
@@ -36,14 +36,14 @@ def fit(make_model, monkeypatch):
             made = SimpleNamespace(data=data, report=SimpleNamespace(options=settings))
             return SimpleNamespace(write=lambda: made)
 
-        monkeypatch.setattr(tuned_file, "EncodePlan", SimpleNamespace(of=draft))
-        monkeypatch.setattr(tuned_file, "encode_tiles", lambda planned, **_: planned)
+        monkeypatch.setattr(tuning_run, "EncodePlan", SimpleNamespace(of=draft))
+        monkeypatch.setattr(tuning_run, "encode_tiles", lambda plan, **_: plan)
         whole = make_model(9000, 1)
 
         def choose(count):
             return TuningSubset(whole.select(np.arange(count)), np.arange(count), None, {})
 
-        chosen, encoding = tuned_file._fitting(
+        chosen, encoding = tuning_run._fit_to_size(
             choose(9000), options or EncodeOptions("small"), size_bytes, choose, None
         )
         return len(chosen.model), encoding, bytes_of(len(chosen.model), encoding, per_db), len(drafts)
@@ -81,5 +81,5 @@ def test_what_the_user_chose_stays(fit):
 
 def test_renders_are_as_good_as_the_scene_at_some_precision(fit):
     _, encoding, _, drafts = fit(10**7)
-    assert tuned_file._FINEST == encoding.attribute_psnr
+    assert tuning_run._FINEST == encoding.attribute_psnr
     assert 2 == drafts

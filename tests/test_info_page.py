@@ -159,7 +159,7 @@ def test_the_hardest_place_is_where_the_error_is():
     badly[31:39, 70:80] = 1.0
     place = HardestPlaceSearch()
     for number, seen in enumerate((source, badly, slightly)):
-        place.look(number, source, seen)
+        place.examine(number, source, seen)
     found = place.found()
     assert 1 == found.view
     assert (20, 30, 3) == found.source.shape == found.decoded.shape
@@ -192,5 +192,5 @@ def test_views_of_a_user_are_shown_as_they_are():
 
 def test_equal_pictures_have_a_place_too():
     place = HardestPlaceSearch()
-    place.look(0, np.zeros((8, 8, 3), np.float32), np.zeros((8, 8, 3), np.float32))
+    place.examine(0, np.zeros((8, 8, 3), np.float32), np.zeros((8, 8, 3), np.float32))
     assert 99.0 == place.found().psnr

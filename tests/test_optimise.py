@@ -27,9 +27,9 @@ from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import scene_frame
-from csplat_tools.optimise.candidates import CodingChoice, WholeScene, psnr_spread
+from csplat_tools.optimise.candidates import CodingChoice, WholeScene
 from csplat_tools.optimise.precision_search import (
-    TUNING_GAINS,
+    REFIT_GAIN,
     PrecisionSearch,
     SearchGoal,
     SearchWindow,
@@ -38,7 +38,7 @@ from csplat_tools.optimise.precision_search import (
 from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.optimise.rate_distortion import error_of_psnr
 from csplat_tools.optimise.scene_sensitivity import complete_importance, measure_importance
-from csplat_tools.optimise.search_report import SearchReport
+from csplat_tools.optimise.search_report import SearchReport, psnr_spread
 from csplat_tools.optimise.subsets import Pruner
 from csplat_tools.optimise.target_search import expected_renders
 from csplat_tools.optimise.targets import Target
@@ -107,41 +107,42 @@ def test_meet_gives_up_where_values_grow_no_more():
 @pytest.mark.parametrize(("fine", "stalls"), [(36.2, True), (37.5, False), (40.5, False)])
 def test_a_coding_that_more_precision_hardly_betters_is_no_choice(fine, stalls):
     part, coding = SimpleNamespace(psnr=45.0, refits=False), CodingChoice("codebook", 1 / 8)
-    alike = {"part": part, "coding": coding, "is_careful": True, "is_judged": False, "psnr": 40.0, "size_bytes": 9}
+    alike = {"subset": part, "coding": coding, "is_final": True, "is_scored": False, "psnr": 40.0, "size_bytes": 9}
     deflate = SimpleNamespace(deflate_level=10)
     files = [
-        SimpleNamespace(**alike, quality=at, decided_psnr=psnr, options=deflate) for at, psnr in ((50, 36), (54, fine))
+        SimpleNamespace(**alike, quality=at, validation_psnr=psnr, options=deflate)
+        for at, psnr in ((50, 36), (54, fine))
     ]
-    made = [SimpleNamespace(**{**alike, "is_judged": True}, quality=40, decided_psnr=40.0)]
+    made = [SimpleNamespace(**{**alike, "is_scored": True}, quality=40, validation_psnr=40.0)]
     solver = PrecisionSearch(SimpleNamespace(made=made, of=lambda *_: files), SearchGoal(psnr=40.0))
-    assert stalls == solver.is_stalled(files[0]) == math.isinf(solver.expected(files[1]))
+    assert stalls == solver.is_stalled(files[0]) == math.isinf(solver.expected_cost(files[1]))
 
 
 def test_what_views_that_judge_see_of_removal_says_where_a_file_has_to_stand():
     """Removal takes 0.45 of the allowed error on the validation views; what it leaves on the test views is added."""
-    allowed, gains = error_of_psnr(34.0), TUNING_GAINS
+    allowed, gains = error_of_psnr(34.0), REFIT_GAIN
     part = SimpleNamespace(refits=True, psnr=psnr_of_mse(0.45 * allowed) - gains)
 
-    def solver(judged):
-        trials = SimpleNamespace(made=[], judged_psnr=lambda _: psnr_of_mse(judged * allowed) - gains)
+    def solver(scored):
+        trials = SimpleNamespace(made=[], test_psnr=lambda _: psnr_of_mse(scored * allowed) - gains)
         return PrecisionSearch(trials, SearchGoal(psnr=34.0))
 
-    assert solver(0.8).level(part) == pytest.approx(psnr_of_mse((0.45 + 0.2) * allowed))
-    assert solver(0.45).level(part) == pytest.approx(34.0)
+    assert solver(0.8).validation_goal(part) == pytest.approx(psnr_of_mse((0.45 + 0.2) * allowed))
+    assert solver(0.45).validation_goal(part) == pytest.approx(34.0)
     assert [False, True] == [solver(share).is_hopeless(part) for share in (0.85, 0.95)]
-    assert not PrecisionSearch(solver(0.95).trials, SearchGoal(size_bytes=1000)).is_hopeless(part)
+    assert not PrecisionSearch(solver(0.95).candidates, SearchGoal(size_bytes=1000)).is_hopeless(part)
 
 
 def test_near_what_removal_took_a_decibel_is_dear():
     """Two files as far below the goal as each other: the one whose splats err more needs more precision."""
     part, better = (SimpleNamespace(refits=True, psnr=psnr) for psnr in (34.5, 40.0))
     packed = SimpleNamespace(deflate_level=12)
-    said = {"coding": CodingChoice("scalar"), "quality": 40.0, "options": packed, "is_careful": True, "is_judged": True}
-    seen = {"psnr": 33.8, "decided_psnr": 33.8, "size_bytes": 1000}
-    made = [SimpleNamespace(part=one, **said, **seen) for one in (part, better)]
-    trials = SimpleNamespace(made=made, of=lambda part, _coding: [one for one in made if one.part is part])
+    said = {"coding": CodingChoice("scalar"), "quality": 40.0, "options": packed, "is_final": True, "is_scored": True}
+    seen = {"psnr": 33.8, "validation_psnr": 33.8, "size_bytes": 1000}
+    made = [SimpleNamespace(subset=one, **said, **seen) for one in (part, better)]
+    trials = SimpleNamespace(made=made, of=lambda part, _coding: [one for one in made if one.subset is part])
     solver = PrecisionSearch(trials, SearchGoal(psnr=34.0))
-    assert solver.expected(made[0]) > solver.expected(made[1]) > math.log(1000)
+    assert solver.expected_cost(made[0]) > solver.expected_cost(made[1]) > math.log(1000)
 
 
 def test_spread_is_that_of_the_views():
@@ -309,16 +310,16 @@ def test_fitting_to_the_quantised_geometry_mends_it(scene):
     coarse = EncodeOptions(opacity_levels=8, scale_step=0.3, quat_levels=8, sh0_step=0.005, sh_step=0.005)
     bare, views = replace(scene, shN=scene.shN[:, :0]), with_validation_views(judged_by(cameras(40)))
     how = replace(SMALL, effort=3, view_size=(960, 720))
-    removal = Pruner(bare, views, how, grades=False, progress=None, psnr=None, left=300)
-    part, judge = removal.fitted(300, None, views.validation_scorer(bare).psnr), views.test_scorer(bare)
-    quick, fitted = (part.coded(coarse, graded=False, quick=quick).write().data for quick in (True, False))
+    removal = Pruner(bare, views, how, use_classes=False, progress=None, psnr=None, kept_count=300)
+    part, judge = removal.refit(300, None, views.validation_scorer(bare).psnr), views.test_scorer(bare)
+    quick, fitted = (part.coded(coarse, use_classes=False, quick=quick).write().data for quick in (True, False))
     assert judge.psnr(decode(fitted)) > judge.psnr(decode(quick)) + 0.2
 
 
 def test_so_few_splats_are_fitted_as_are_asked_for(scene):
     views = with_validation_views(judged_by(cameras(40)))
-    removal = Pruner(scene, views, SMALL, grades=False, progress=None, psnr=30.0)
-    assert 3 == len(removal.fitted(3, None, lambda _: 20.0).rows)
+    removal = Pruner(scene, views, SMALL, use_classes=False, progress=None, psnr=30.0)
+    assert 3 == len(removal.refit(3, None, lambda _: 20.0).rows)
 
 
 def test_two_fits_say_how_fast_errors_grow():
@@ -427,10 +428,10 @@ def measured(unequal):
 @pytest.mark.slow
 def test_what_was_measured_grades_splats_and_makes_files_smaller_at_the_same_psnr(unequal, measured):
     judge, files = Scorer.of_source(unequal, cameras(6), BLACK), {}
-    for graded in (True, False):
-        options = EncodeOptions(attribute_psnr=48.0 if graded else 47.0)
+    for use_classes in (True, False):
+        options = EncodeOptions(attribute_psnr=48.0 if use_classes else 47.0)
         whole = WholeScene(unequal, None, measured, None)
-        files[graded] = whole.coded(options, graded=graded, quick=False).write()
+        files[use_classes] = whole.coded(options, use_classes=use_classes, quick=False).write()
     assert len(files[True].report.options["grades"]["splats"]) > 1
     assert "grades" not in files[False].report.options
     assert judge.psnr(decode(files[True].data)) >= judge.psnr(decode(files[False].data))
@@ -457,11 +458,11 @@ def test_sensitivity_is_measured_where_it_changes_something(scene, unequal, meas
         found, count = complete_importance(source, views, options, importance, inside=inside)
         return found is not None, count
 
-    taught = len(views.training)
+    training = len(views.training)
     assert {
-        "SH": (True, taught), "small, without SH": (False, 0), "SH that is left out": (False, 0),
+        "SH": (True, training), "small, without SH": (False, 0), "SH that is left out": (False, 0),
         "preset fast": (False, 0), "inside": (False, 0), "curvatures": (True, 0), "curvatures inside": (True, 0),
-        "one grade": (False, 0), "weights alone": (True, taught), "weights inside": (False, 0),
+        "one grade": (False, 0), "weights alone": (True, training), "weights inside": (False, 0),
     } == {
         "SH": views_used(scene), "small, without SH": views_used(bare),
         "SH that is left out": views_used(scene, EncodeOptions(sh_degree=0)),

@@ -23,7 +23,7 @@ from csplat_render.virtual_cameras import is_clear, sample_cloud, scene_frame
 from csplat_tools.cli.app import app
 from csplat_tools.cli.shared_options import parse_decibels
 from csplat_tools.optimise.pruning import simplify
-from csplat_tools.optimise.pruning_order import MeasuredViews, SimplifyOptions, find_pruning_order, total_removal
+from csplat_tools.optimise.pruning_order import MeasuredViews, SimplifyOptions, find_pruning_order, total_error
 from csplat_tools.optimise.splat_refit import RefitResult, choose_bands, coefficient_mask, drop_bands, refit_splats
 from csplat_tools.study import prune_share
 from csplat_tools.views import (
@@ -136,13 +136,13 @@ def test_what_is_invisible_goes_first_and_what_is_unseen_stays(source):
 def test_rounds_ask_one_side_after_the_other(source):
     """Each round measures one side again; the other side keeps its last errors until its turn."""
     parts = [camera_sequence(source, 4, (48, 36), seed=seed) for seed in (1, 2)]
-    sides = [MeasuredViews(cameras, measure_pruning_error(source, cameras, bands=False)) for cameras in parts]
-    order = find_pruning_order(source, sides, replace(SMALL, rounds=2), len(source) // 2)
+    view_groups = [MeasuredViews(cameras, measure_pruning_error(source, cameras, bands=False)) for cameras in parts]
+    order = find_pruning_order(source, view_groups, replace(SMALL, rounds=2), len(source) // 2)
     first = order.rounds[0].removed
     rows = order.kept(len(source), first)
-    keys = pruning_keys(source.opacities, total_removal(sides))
+    keys = pruning_keys(source.opacities, total_error(view_groups))
     np.testing.assert_array_equal(order.errors[:first], np.sort(np.maximum(keys, 0.0))[:first])
-    again = measure_pruning_error(source.select(rows), parts[0]).error + sides[1].removal.error[rows]
+    again = measure_pruning_error(source.select(rows), parts[0]).error + view_groups[1].pruning_error.error[rows]
     places = np.searchsorted(rows, order.rows[first:])
     np.testing.assert_allclose(order.errors[first:], again[places], rtol=1e-9)
 
@@ -284,19 +284,19 @@ def test_bands_that_are_worth_less_than_their_bits_go():
     bands = np.array([[0.3, 0.3, 0.3], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
     zeros = np.zeros(3)
     removal = PruningError(zeros, zeros, np.array([True, False, True]), bands, 1)
-    stays = choose_bands(removal, 1.0)
-    np.testing.assert_array_equal([[True, False, False], [True, True, True], [True, True, True]], stays)
-    free = coefficient_mask(stays)
+    kept_bands = choose_bands(removal, 1.0)
+    np.testing.assert_array_equal([[True, False, False], [True, True, True], [True, True, True]], kept_bands)
+    free = coefficient_mask(kept_bands)
     assert [3, 15, 15] == free.sum(axis=1).tolist()
 
 
 @pytest.mark.slow
 def test_bands_without_worth_are_zero_and_others_are_not(source, given):
     result = simplify(source, keep=0.4, views=given, options=SMALL)
-    stays = result.stays
-    assert stays is not None
-    assert 0 < np.count_nonzero(~stays) < stays.size
-    np.testing.assert_array_equal(result.model.shN, drop_bands(result.model, stays).shN)
+    kept_bands = result.kept_bands
+    assert kept_bands is not None
+    assert 0 < np.count_nonzero(~kept_bands) < kept_bands.size
+    np.testing.assert_array_equal(result.model.shN, drop_bands(result.model, kept_bands).shN)
     for band, count in result.report["zero_bands"].items():
         span = slice(int(band) ** 2 - 1, (int(band) + 1) ** 2 - 1)
         assert count == np.count_nonzero(~result.model.shN[:, span].any(axis=(1, 2)))

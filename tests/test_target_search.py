@@ -125,7 +125,7 @@ def test_a_plateau_is_crossed():
 def test_no_file_that_was_judged_reaches_a_psnr_with_fewer_bytes():
     def check(name, no_prune):
         found = found_in(name, no_prune=no_prune, psnr=38.0)
-        packed = [file for file in found.judged if file.contents.options.deflate_level is None]
+        packed = [file for file in found.scored if file.contents.options.deflate_level is None]
         smallest = min(len(file) for file in packed if file.psnr() >= 38.0)
         return "" if len(found.file) == smallest else f"{len(found.file)} bytes, one has {smallest}"
 
@@ -253,13 +253,13 @@ def test_judging_views_do_not_choose_the_file_of_a_size_or_a_loss(goal):
     one, other = (search(PLAIN, judging=judging, **goal) for judging in (Views(), Views(3.0, 5.0)))
     assert one.file.contents == other.file.contents
     assert one.report.psnr > other.report.psnr
-    assert {one.file} == set(one.judged)
+    assert {one.file} == set(one.scored)
 
 
 def test_of_a_psnr_the_file_is_one_that_judging_views_looked_at_and_they_do_not_look_at_all():
     found = found_in("plain", no_prune=False, psnr=38.0)
-    assert found.file in found.judged
-    assert len(set(found.judged)) < len(found.tried)
+    assert found.file in found.scored
+    assert len(set(found.scored)) < len(found.tried)
 
 
 # what is chosen
@@ -402,7 +402,7 @@ def test_the_report_names_every_file_that_was_tried():
     assert {"psnr": 38.0} == report.goal
     assert [len(file) for file in found.tried] == [one["size_bytes"] for one in report.tried]
     assert (len(found.tried), len(found.file)) == (report.encodes, report.size_bytes)
-    assert len(set(found.judged)) == sum(one["psnr"] is not None for one in report.tried)
+    assert len(set(found.scored)) == sum(one["psnr"] is not None for one in report.tried)
     assert report.psnr == pytest.approx(found.file.psnr())
     assert report.chosen in report.tried
     assert any(line.startswith("tried for these splats, too") for line in report.why)

@@ -213,7 +213,7 @@ def test_numbers_are_those_of_compare(capture, swept, tmp_path):
 
 @pytest.mark.slow
 def test_the_same_scene_gives_the_same_files_and_numbers(setting, measured):
-    again = tradeoff(setting, measured.wanted).as_json()
+    again = tradeoff(setting, measured.sweep).as_json()
     assert timeless(measured.as_json()) == timeless(again)
 
 

@@ -14,7 +14,7 @@ from csplat.training_record import TrainingRecord
 from csplat_render.camera import Camera, intrinsics, orbit, relative_to
 from csplat_render.rasteriser import Rasteriser
 from csplat_tools.cli.app import app
-from csplat_tools.training.trained_scene import tuning_after
+from csplat_tools.training.training_run import tuning_after
 from csplat_trainer.data import DataSet
 from csplat_trainer.engine import CpuEngine
 from csplat_trainer.initial_splats import measure_extent, place_splats

@@ -54,7 +54,7 @@ class HardestPlaceSearch:
         self._error = -1.0
         self._place: tuple[int, slice, slice, F32, F32] | None = None
 
-    def look(self, number: int, source: F32, decoded: F32) -> None:
+    def examine(self, number: int, source: F32, decoded: F32) -> None:
         """Examine a view, given by its number and the renders of source and decoded file, [H, W, 3] in 0..1."""
         errors: F64 = np.asarray(squared_error(source, decoded).sum(axis=2), np.float64)
         height, width = (max(1, side // _SHARE) for side in errors.shape)
@@ -91,21 +91,21 @@ def piece_images(place: ImagePiece, name: str) -> str:
     return image_row(words, name)
 
 
-def image_row(pictures: Mapping[str, U8], name: str) -> str:
+def image_row(images: Mapping[str, U8], name: str) -> str:
     """Return HTML that shows images side by side, reduced to a size for a page.
 
     Args:
-        pictures: [h, w, 3] uint8, by caption.
+        images: [h, w, 3] uint8, by caption.
         name: name of their subject, for the alternative text.
     """
-    images = ""
-    for word, pixels in pictures.items():
+    figures = ""
+    for word, pixels in images.items():
         small = _reduced(pixels)
-        images += (
+        figures += (
             f'<figure><img src="{_data_uri(small)}" width="{small.shape[1]}" height="{small.shape[0]}"'
             f' alt="{escape(f"{name}: {word}")}"><figcaption>{escape(word)}</figcaption></figure>'
         )
-    return f'<div class="pictures">{images}</div>'
+    return f'<div class="pictures">{figures}</div>'
 
 
 def _window_sums(values: F64, height: int, width: int) -> F64:
@@ -116,10 +116,10 @@ def _window_sums(values: F64, height: int, width: int) -> F64:
     return sums
 
 
-def _framed(picture: F32, rows: slice, columns: slice) -> U8:
+def _framed(image: F32, rows: slice, columns: slice) -> U8:
     """Return the whole view, reduced, with a frame that is visible on any background."""
-    shown = _reduced(to_uint8(picture)).copy()
-    factor = shown.shape[0] / picture.shape[0]
+    shown = _reduced(to_uint8(image)).copy()
+    factor = shown.shape[0] / image.shape[0]
     top, bottom, left, right = (round(factor * at) for at in (rows.start, rows.stop, columns.start, columns.stop))
     for inset, value in ((0, 0), (1, 255), (2, 0)):
         edge = np.zeros(shown.shape[:2], bool)

@@ -73,14 +73,14 @@ def _failures(records: Sequence[Record]) -> str:
 def _scenes(done: Sequence[Record], folder: Path) -> str:
     if not done:
         return ""
-    pictures = [_thumbnail_image(one, folder) for one in done[:_THUMBNAILS_MAX]] + [""] * len(done[_THUMBNAILS_MAX:])
-    heads = '<th scope="col"></th>' * any(pictures) + "".join(
+    thumbnails = [_thumbnail_image(one, folder) for one in done[:_THUMBNAILS_MAX]] + [""] * len(done[_THUMBNAILS_MAX:])
+    heads = '<th scope="col"></th>' * any(thumbnails) + "".join(
         f'<th scope="col"{_kind(place)}><button type="button">{escape(head)}</button></th>'
         for place, head in enumerate(_HEADS)
     )
     rows = "\n".join(
-        f"<tr>{f'<td>{picture}</td>' * any(pictures)}{_cells(one)}</tr>"
-        for one, picture in zip(done, pictures, strict=True)
+        f"<tr>{f'<td>{thumbnail}</td>' * any(thumbnails)}{_cells(one)}</tr>"
+        for one, thumbnail in zip(done, thumbnails, strict=True)
     )
     return (
         "<h2>Done</h2>\n<p>A click on a heading sorts.</p>\n"
@@ -168,10 +168,11 @@ def _jpeg(model: SplatModel) -> bytes:
 
     width, height = THUMBNAIL_SIZE
     camera = orbit_cameras(model, 1, _FINER * width, _FINER * height)[0]
-    said = TrainingRecord.of(model.metadata)
-    picture = to_uint8(render(model, camera, background=said.background if said else (0.0, 0.0, 0.0), mode="fast").rgb)
+    training = TrainingRecord.of(model.metadata)
+    background = training.background if training else (0.0, 0.0, 0.0)
+    thumbnail = to_uint8(render(model, camera, background=background, mode="fast").rgb)
     buffer = io.BytesIO()
-    Image.fromarray(picture).resize(THUMBNAIL_SIZE, Image.Resampling.BOX).save(
+    Image.fromarray(thumbnail).resize(THUMBNAIL_SIZE, Image.Resampling.BOX).save(
         buffer, "JPEG", quality=_JPEG_QUALITY, optimize=True
     )
     return buffer.getvalue()

@@ -198,8 +198,8 @@ def _prepared(
     Raises:
         CommandLineError: a command line is wrong.
     """
-    said = _checked(worker, command)
-    wanted = said["ending"] if ending is None else ending
+    answer = _checked(worker, command)
+    wanted = answer["ending"] if ending is None else ending
     if ending is None and not wanted:
         raise CommandLineError(f"csplat {command[0]} writes files of several kinds: --ending .spz names one")
     tasks = find_tasks(os.fspath(scenes), command[0], wanted, match=match, without=folder)
@@ -208,7 +208,7 @@ def _prepared(
         raise InputError(f"{taken.pop()} is written by the batch itself: name that output in a manifest")
     for options in {one.options for one in tasks if one.options}:
         _checked(worker, (*command, *options))
-    has = set(said["options"]) & set(_SET_BY_BATCH)
+    has = set(answer["options"]) & set(_SET_BY_BATCH)
     if "memory" in has and worker.ask("check", words=[*command, "--memory", "1GB"])["wrong"]:
         has -= {"memory", "resume"}  # not with these options
     return tasks, frozenset(has)
@@ -218,12 +218,12 @@ def _checked(worker: Worker, words: Sequence[str]) -> Mapping[str, Any]:
     if not words:
         raise CommandLineError("wanted a command behind --, as encode")
     try:
-        said = worker.ask("check", words=list(words))
+        answer = worker.ask("check", words=list(words))
     except WorkerLostError as error:
         raise InputError(f"no process could be started: {error}") from None
-    if said["wrong"]:
-        raise CommandLineError(said["wrong"])
-    return said
+    if answer["wrong"]:
+        raise CommandLineError(answer["wrong"])
+    return answer
 
 
 def _jobs(

@@ -15,9 +15,8 @@ from typing import Any
 from csplat.errors import CsplatError
 from csplat.system import NEW_GROUP_FLAGS, interrupt_process
 
-_PROGRAM = (
-    "csplat_tools.cli.batch_protocol"  # started by its name: `cli` is above this package and may not be imported here
-)
+#: The program of a process, started by its name: `cli` is above this package and may not be imported here.
+_PROGRAM = "csplat_tools.cli.batch_protocol"
 _PATIENCE = 10.0  # seconds that an interrupted process has to tidy up before it is killed
 
 Process = subprocess.Popen[str]

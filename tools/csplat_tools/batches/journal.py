@@ -146,11 +146,11 @@ def read_journal(folder: Path) -> tuple[dict[str, Record], set[str]]:
     with suppress(FileNotFoundError), (folder / JOURNAL).open("rb") as stream:
         for line in stream:
             try:
-                said = json.loads(line)
-                if said["state"] == _BEGUN:
-                    pending.update(said["outputs"])
+                entry = json.loads(line)
+                if entry["state"] == _BEGUN:
+                    pending.update(entry["outputs"])
                     continue
-                record = _record(said)
+                record = _record(entry)
             except (ValueError, KeyError, TypeError):
                 continue
             records[record.output] = record
@@ -158,8 +158,8 @@ def read_journal(folder: Path) -> tuple[dict[str, Record], set[str]]:
     return records, pending
 
 
-def _record(said: dict[str, Any]) -> Record:
+def _record(entry: dict[str, Any]) -> Record:
     known = {one.name for one in fields(Record)}
-    values: dict[str, Any] = {name: value for name, value in said.items() if name in known}
+    values: dict[str, Any] = {name: value for name, value in entry.items() if name in known}
     values |= {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
     return Record(**values)

@@ -72,14 +72,14 @@ class PlannedJob:
 
     Attributes:
         job: the scene.
-        look: the scene's file; `None`: it cannot be read.
+        file: the scene's file; `None`: it cannot be read.
         is_done: the output is there already, and nothing would be done.
         seconds: expected time; `None`: nothing is known of the command.
         memory_bytes: expected peak memory.
     """
 
     job: SceneJob
-    look: SceneFile | None
+    file: SceneFile | None
     is_done: bool
     seconds: float | None
     memory_bytes: int
@@ -149,11 +149,11 @@ def _ran(job: SceneJob, record: Record, worker: Worker, source: Path, output: Pa
     threads = () if job.threads is None or "--threads" in job.words else ("--threads", str(job.threads))
     resume = ("--resume",) if job.resumes and output.with_name(f"{output.name}.work").is_dir() else ()
     words = (job.command[0], str(source), str(output), *job.words[1:], *threads, *options, *resume)
-    picture = str(Path(job.folder) / THUMBNAILS / f"{job.task.output}.jpg")
+    thumbnail = str(Path(job.folder) / THUMBNAILS / f"{job.task.output}.jpg")
     try:
-        said = worker.ask(
+        answer = worker.ask(
             "run", words=[*words, "--json", "--quiet", "--force"],
-            thumbnail=picture if job.thumbnail and not is_url(job.task.output) else "",
+            thumbnail=thumbnail if job.thumbnail and not is_url(job.task.output) else "",
             scenes=[str(output), str(source)],
         )  # fmt: skip
     except WorkerLostError:
@@ -161,15 +161,18 @@ def _ran(job: SceneJob, record: Record, worker: Worker, source: Path, output: Pa
             remove_left(output, worker.pid)
         raise
     record = replace(
-        record, seconds=round(said["seconds"], 3), memory_bytes=said["memory_bytes"], remarks=tuple(said["remarks"])
+        record,
+        seconds=round(answer["seconds"], 3),
+        memory_bytes=answer["memory_bytes"],
+        remarks=tuple(answer["remarks"]),
     )
-    if said["status"]:
-        shown = said["error"].replace(str(source), job.task.source).replace(str(output), job.task.output)
+    if answer["status"]:
+        shown = answer["error"].replace(str(source), job.task.source).replace(str(output), job.task.output)
         shown = shown.removeprefix(f"{job.task.source}: ")
-        return replace(record, code=said["code"], error=shown)
+        return replace(record, code=answer["code"], error=shown)
     return replace(
         record, state="done", output_bytes=size_on_disk(output), output_sha256=content_hash(output),
-        splats=_count(said["result"], record.splats),
+        splats=_count(answer["result"], record.splats),
     )  # fmt: skip
 
 

@@ -130,8 +130,8 @@ def _planned_json(planned: list[PlannedJob]) -> list[dict[str, object]]:
             "output": one.job.task.output,
             "command": list(one.job.words),
             "done": one.is_done,
-            "splats": None if one.look is None else one.look.splats,
-            "source_bytes": None if one.look is None else one.look.size_bytes,
+            "splats": None if one.file is None else one.file.splats,
+            "source_bytes": None if one.file is None else one.file.size_bytes,
             "seconds": one.seconds,
             "memory_bytes": one.memory_bytes,
         }
@@ -143,7 +143,7 @@ def _planned_text(planned: list[PlannedJob]) -> str:
     """Return a table of the planned work, and the total time."""
     rows = []
     for one in planned:
-        seen = one.look
+        seen = one.file
         splats = "?" if seen is None or seen.splats is None else f"{seen.splats:,}"
         size = "cannot be read" if seen is None else format_bytes(seen.size_bytes)
         seconds = "?" if one.seconds is None else format_seconds(one.seconds)

@@ -125,7 +125,7 @@ def finetune(
     """
     require_trainer(plots=page is not None)
     from csplat_render.lpips import load_lpips
-    from csplat_tools.training import tuned_file as tuning
+    from csplat_tools.training import tuning_run as tuning
     from csplat_tools.training.tuning_report import format_tuning_report
     from csplat_trainer.training_options import Outputs
     from csplat_trainer.tuning.tuning_options import FinetuneOptions
@@ -138,7 +138,7 @@ def finetune(
     psnr = None if target_psnr is None else parse_decibels(target_psnr)
     if psnr is not None and not math.isfinite(psnr):
         raise typer.BadParameter(f"--target-psnr is {target_psnr}, wanted a finite number of dB")
-    cost = tuning.BYTE_COST[itself] if byte_cost is None else byte_cost
+    cost = tuning.RATE_WEIGHT[itself] if byte_cost is None else byte_cost
     rates = settings.of(FinetuneOptions)
     options = chosen(FinetuneOptions, iterations=iterations, seed=encoding.seed, byte_cost=cost, **rates)
     options = chosen(options.scaled, factor=tuning.LEARNING_FACTOR[itself] if lr_factor is None else lr_factor)

@@ -143,9 +143,9 @@ def train(
       csplat train capture -o scene.ply --resume run.npz --max-splats 60000
     """
     require_trainer(plots=plot is not None or page is not None)
-    from csplat_tools.training.trained_scene import run_training, run_training_to_file, tuning_after, tuning_checkpoint
-    from csplat_tools.training.tuned_file import SHAPE_ENTRIES, SPLAT_BYTES
+    from csplat_tools.training.training_run import run_training, run_training_to_file, tuning_after, tuning_checkpoint
     from csplat_tools.training.tuning_report import format_tuning_report
+    from csplat_tools.training.tuning_run import SHAPE_ENTRIES, SPLAT_BYTES
     from csplat_trainer.training_checkpoint import load_checkpoint
 
     to_file, size_bytes = Path(output).suffix == ".csplat", parse_bytes(target_size)

@@ -122,7 +122,7 @@ def _compare(data: bytes | mmap, source: str, progress: Progress | None) -> _Sou
     hardest, shown = HardestPlaceSearch(), display_cameras(loaded.model, views)
     scores = views.test_scorer(loaded.model).scores(model, progress=progress)
     showing = Scorer.of_source(loaded.model, shown, views.test_background)
-    showing.scores(model, ssim=False, on_view=hardest.look)
+    showing.scores(model, ssim=False, on_view=hardest.examine)
     place = hardest.found()
     assert place is not None
     facts = {

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
-import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import decode
@@ -35,15 +34,15 @@ class CodingChoice:
         share: entries of a codebook per splat; `None`: as in the options.
         degree: bands up to this one are kept; `None`: as in the options.
         adaptive: how much coarser unimportant splats are coded; `None`: as in the options.
-        graded: splats are sorted into quantisation classes by measurements, if there are any; False: measurements are
-            not used.
+        use_classes: splats are sorted into quantisation classes by measurements, if there are any; False: measurements
+            are not used.
     """
 
     sh: ShCoding | None
     share: float | None = None
     degree: int | None = None
     adaptive: float | None = None
-    graded: bool = True
+    use_classes: bool = True
 
     def options(self, encoding: EncodeOptions, splats: int) -> EncodeOptions:
         """Return the encoder's options with this coding, for a file of `splats` splats."""
@@ -61,7 +60,7 @@ def _options_of(coding: CodingChoice, encoding: EncodeOptions, splats: int) -> E
         codebook_size=size,
         sh_degree=encoding.sh_degree if coding.degree is None else coding.degree,
         adaptive=encoding.adaptive if coding.adaptive is None else coding.adaptive,
-        grades=encoding.grades if coding.graded else 1,
+        grades=encoding.grades if coding.use_classes else 1,
     )
 
 
@@ -74,13 +73,13 @@ class Subset(Protocol):
         ...
 
     @property
-    def shown(self) -> SplatModel:
+    def unquantised(self) -> SplatModel:
         """The splats that are quantised: SH bands may be left out."""
         ...
 
     @property
     def psnr(self) -> float:
-        """PSNR of `shown` on the validation views, dB; infinite for the source's own splats."""
+        """PSNR of `unquantised` on the validation views, dB; infinite for the source's own splats."""
         ...
 
     @property
@@ -89,15 +88,15 @@ class Subset(Protocol):
         ...
 
     @property
-    def gradable(self) -> bool:
+    def classifiable(self) -> bool:
         """True if the splats may be sorted into quantisation classes."""
         ...
 
-    def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> EncodedTiles:
+    def coded(self, options: EncodeOptions, *, use_classes: bool, quick: bool) -> EncodedTiles:
         """Quantise and code the splats; `quick` leaves out the refit through the quantisers."""
         ...
 
-    def said(self, trial: Candidate | None) -> Mapping[str, Any] | None:
+    def options_entry(self, candidate: Candidate | None) -> Mapping[str, Any] | None:
         """Return the entry for a file's options: the splats and, with a file, its quality; `None`: no entry."""
         ...
 
@@ -119,79 +118,80 @@ class WholeScene:
     progress: Progress | None
     psnr: float = math.inf
     refits: bool = False
-    gradable: bool = True
+    classifiable: bool = True
 
     @property
-    def shown(self) -> SplatModel:
+    def unquantised(self) -> SplatModel:
         """The whole scene."""
         return self.model
 
-    def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> EncodedTiles:  # noqa: ARG002  # the protocol's
+    def coded(self, options: EncodeOptions, *, use_classes: bool, quick: bool) -> EncodedTiles:  # noqa: ARG002  # the protocol's
         """Quantise and code the splats."""
-        weights = self.measured if graded and self.measured is not None else self.importance
-        draft = EncodePlan.of(self.model, options, importance=weights, progress=self.progress)
-        return encode_tiles(draft, progress=self.progress)
+        weights = self.measured if use_classes and self.measured is not None else self.importance
+        plan = EncodePlan.of(self.model, options, importance=weights, progress=self.progress)
+        return encode_tiles(plan, progress=self.progress)
 
-    def said(self, trial: Candidate | None) -> None:  # as the protocol has it
+    def options_entry(self, candidate: Candidate | None) -> None:  # the protocol's
         """Return no entry: the file holds the scene as it is."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Candidate:
-    """A candidate file.
+    """A candidate file. Owns its score on the test views, which is measured when first asked for.
 
     Attributes:
-        part, coding: its splats, and the coding of their colours.
+        subset, coding: its splats, and the coding of their colours.
         quality: the PSNR of each attribute for which it was made, dB; `None`: that of the options.
         options: options of the encoder.
-        is_careful: it is packed as tightly as the caller requires, and no refit was left out.
+        is_final: it is packed as tightly as the caller requires, and no refit was left out.
         result: the encoder's result.
-        judge: scorer by the source's renders in the test views.
-        decided_psnr: PSNR on the validation views, dB, by which files are compared.
+        test_scorer: scorer by the source's renders in the test views.
+        validation_psnr: PSNR on the validation views, dB, by which files are compared.
         photo_psnr: PSNR against the validation photographs, dB; NaN if there are none.
         decode: decodes its bytes.
     """
 
-    part: Subset
+    subset: Subset
     coding: CodingChoice
     quality: float | None
     options: EncodeOptions
-    is_careful: bool
+    is_final: bool
     result: EncodeResult = field(repr=False)
-    judge: Scorer = field(repr=False)
-    decided_psnr: float
+    test_scorer: Scorer = field(repr=False)
+    validation_psnr: float
     photo_psnr: float
     decode: Callable[[bytes], SplatModel] = field(default=decode, repr=False)
+    _errors: F64 | None = field(default=None, repr=False)
 
-    @cached_property
+    @property
     def errors(self) -> F64:
         """[V] mean squared error against the source, by test view."""
-        return self.judge.errors(self.decode(self.result.data))
+        if self._errors is None:
+            self._errors = self.test_scorer.errors(self.decode(self.result.data))
+        return self._errors
 
     @property
     def psnr(self) -> float:
         """PSNR of these errors, pooled, dB: targets refer to it, and files are not compared by it."""
-        return psnr_of_mse(self.judge.pooled(self.errors))
+        return psnr_of_mse(self.test_scorer.pooled(self.errors))
 
     @property
-    def is_judged(self) -> bool:
+    def is_scored(self) -> bool:
         """True if the file has been scored on the test views."""
-        return "errors" in vars(self)
+        return self._errors is not None
 
-    def let_judge(self) -> None:
+    def score_on_test_views(self) -> None:
         """Score the file on the test views: only then may it be written for a PSNR target."""
         _ = self.errors
 
     @property
     def is_packed(self) -> bool:
         """True if the file is packed as tightly as the caller requires."""
-        return self.is_careful or self.part.refits
+        return self.is_final or self.subset.refits
 
-    def told(self, result: EncodeResult) -> Candidate:
+    def with_result(self, result: EncodeResult) -> Candidate:
         """Return the file with another result, whose options have more entries; its score is kept."""
-        other = replace(self, result=result)
-        vars(other).update({name: vars(self)[name] for name in ("errors",) if name in vars(self)})
-        return other
+        return replace(self, result=result)
 
     @property
     def size_bytes(self) -> int:
@@ -204,7 +204,7 @@ class Candidate:
         return self.result.report.splat_count
 
     @property
-    def grades(self) -> int:
+    def class_count(self) -> int:
         """Number of quantisation classes of its splats."""
         return len(self.result.report.options.get("grades", {}).get("splats", [0]))
 
@@ -219,10 +219,10 @@ class Candidate:
             "sh_coding": options["sh_coding"],
             "sh_degree": options["sh_degree"],
             "codebook_size": options["codebook_size"],
-            "grades": self.grades,
+            "grades": self.class_count,
             "size_bytes": self.size_bytes,
-            "decided_psnr": round(self.decided_psnr, 3),
-            "psnr": round(self.psnr, 3) if self.is_judged else None,
+            "decided_psnr": round(self.validation_psnr, 3),
+            "psnr": round(self.psnr, 3) if self.is_scored else None,
         }
 
 
@@ -232,8 +232,9 @@ class CandidatePool:
 
     Attributes:
         encoding: the caller's options, which no choice overrides.
-        judge: scorer by the source's renders in the test views, on which a PSNR target is measured; it chooses nothing.
-        validation_scorer: scorer by those in the validation views, on which files are compared.
+        test_scorer: scorer by the source's renders in the test views: a PSNR target refers to them, and they choose
+            nothing.
+        validation_scorer: scorer by the source's renders in the validation views, by which files are compared.
         photographs: scorer by validation photographs, if the target is a loss against photographs.
         made: all files, in order.
         progress: progress callback, called with each file that is made.
@@ -241,28 +242,30 @@ class CandidatePool:
     """
 
     encoding: EncodeOptions
-    judge: Scorer
+    test_scorer: Scorer
     validation_scorer: Scorer
     photographs: Scorer | None = None
     made: list[Candidate] = field(default_factory=list)
     progress: Progress | None = None
     decode: Callable[[bytes], SplatModel] = decode
-    _judged: WeakKeyDictionary[Subset, float] = field(default_factory=WeakKeyDictionary, init=False)
+    _test_psnr: WeakKeyDictionary[Subset, float] = field(default_factory=WeakKeyDictionary, init=False)
 
     @property
-    def renders(self) -> int:
+    def render_count(self) -> int:
         """Number of renders made of the files."""
-        return sum(len(self.validation_scorer.cameras) + one.is_judged * len(self.judge.cameras) for one in self.made)
+        return sum(
+            len(self.validation_scorer.cameras) + one.is_scored * len(self.test_scorer.cameras) for one in self.made
+        )
 
-    def judged_psnr(self, part: Subset) -> float:
-        """Return the PSNR of a part before quantisation on the test views, dB: the error that pruning takes."""
-        if part not in self._judged:
-            self._judged[part] = self.judge.psnr(part.shown)
-        return self._judged[part]
+    def test_psnr(self, subset: Subset) -> float:
+        """Return the PSNR of a subset before quantisation on the test views, dB: the error that pruning takes."""
+        if subset not in self._test_psnr:
+            self._test_psnr[subset] = self.test_scorer.psnr(subset.unquantised)
+        return self._test_psnr[subset]
 
     def make(
         self,
-        part: Subset,
+        subset: Subset,
         coding: CodingChoice,
         quality: float | None,
         *,
@@ -272,54 +275,41 @@ class CandidatePool:
         """Make a file, or return the one that was made with the same arguments.
 
         Args:
-            part: its splats.
+            subset: its splats.
             coding: the coding of their colours.
             quality: PSNR of each attribute, dB; `None`: that of the options.
             quick: pack it less tightly if that is most of the work (the decoded splats are the same), and leave out
                 the refit through the quantisers.
             encoding: options of the encoder, instead of those that all files share.
         """
-        options = coding.options(encoding or self.encoding, len(part.model))
+        options = coding.options(encoding or self.encoding, len(subset.model))
         options = options if quality is None else replace(options, attribute_psnr=quality)
         packing = options.preset != "fast" and options.sh_coding != "codebook" and options.deflate_level is None
-        if quick and packing and not part.refits:
+        if quick and packing and not subset.refits:
             options = replace(options, deflate_level=_QUICK_LEVEL)
-        careful = not (quick and (part.refits or packing))
-        for trial in self.made:
-            alike = trial.part is part and trial.options == options and trial.coding.graded == coding.graded
-            if alike and trial.is_careful == careful:
-                return trial
+        final = not (quick and (subset.refits or packing))
+        for candidate in self.made:
+            is_same_kind = candidate.subset is subset and candidate.coding.use_classes == coding.use_classes
+            if is_same_kind and candidate.options == options and candidate.is_final == final:
+                return candidate
         tell, stage = self.progress or null_progress, f"file {len(self.made) + 1}"
         tell(stage, 0.0)
-        coded = part.coded(options, graded=coding.graded, quick=quick)
-        result = coded.write(part.said(None))
+        coded = subset.coded(options, use_classes=coding.use_classes, quick=quick)
+        result = coded.write(subset.options_entry(None))
         model = self.decode(result.data)
-        decided_psnr = self.validation_scorer.psnr(model)
+        validation_psnr = self.validation_scorer.psnr(model)
         photo_psnr = math.nan if self.photographs is None else self.photographs.psnr(model)
-        trial = Candidate(
-            part, coding, quality, options, careful, result, self.judge, decided_psnr, photo_psnr, self.decode
+        candidate = Candidate(
+            subset, coding, quality, options, final, result, self.test_scorer, validation_psnr, photo_psnr, self.decode
         )
-        said = part.said(trial)
-        self.made.append(trial if said is None else trial.told(coded.write(said)))
+        entry = subset.options_entry(candidate)
+        self.made.append(candidate if entry is None else candidate.with_result(coded.write(entry)))
         tell(stage, 1.0)
         return self.made[-1]
 
-    def of(self, part: Subset, coding: CodingChoice, *, careful: bool = False) -> list[Candidate]:
-        """Return files of given splats and coding, at any quality; with `careful`, only those that might be written."""
-        wanted = coding.options(self.encoding, len(part.model))
-        made = [one for one in self.made if one.part is part and one.quality is not None]
-        made = [one for one in made if one.coding.options(self.encoding, len(part.model)) == wanted]
-        return [one for one in made if one.is_careful] if careful else made
-
-
-def psnr_spread(errors: F64) -> float:
-    """Return one standard deviation of a PSNR over other choices of views, in dB, by jackknife.
-
-    Args:
-        errors: [V] mean squared error by view.
-    """
-    if len(errors) < 2 or errors.sum() == 0.0:
-        return math.nan
-    without = (errors.sum() - errors) / (len(errors) - 1)
-    decibels = 10.0 * np.log10(np.maximum(without, np.finfo(np.float64).tiny))
-    return float(np.sqrt((len(errors) - 1) * np.mean(np.square(decibels - decibels.mean()))))
+    def of(self, subset: Subset, coding: CodingChoice, *, final: bool = False) -> list[Candidate]:
+        """Return files of given splats and coding, at any quality; with `final`, only those that might be written."""
+        options = coding.options(self.encoding, len(subset.model))
+        made = [one for one in self.made if one.subset is subset and one.quality is not None]
+        made = [one for one in made if one.coding.options(self.encoding, len(subset.model)) == options]
+        return [one for one in made if one.is_final] if final else made

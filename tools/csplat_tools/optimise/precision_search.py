@@ -26,8 +26,15 @@ class SearchWindow:
     aim: float
 
 
+#: Least slope that is taken from two tries, as a fraction of the expected one: a smaller one may be noise.
+FLATTEST = 0.15
+
+_STEEPEST = 4.0  # largest slope that is taken from two tries, as a multiple of the expected one
+_LONG_STEP = 0.03  # fraction of the range: over a shorter distance, values that do not grow may be noise
+_BRACKET_MARGIN = 0.08  # fraction of a bracket: a trial is never nearer to its ends
+
 #: dB that a refit through the quantisers of a file gains, about: quick files count as better by this.
-TUNING_GAINS = 1.1
+REFIT_GAIN = 1.1
 
 _QUALITIES = (24.0, 110.0)  # range in which the PSNR of each attribute is searched, dB
 
@@ -39,7 +46,7 @@ _WITHIN = SearchWindow(-0.35, 0.0, -0.12)  # range of a size target, in the dB t
 _FEW, _SOME, _MANY = 3, 4, 6  # largest numbers of tries
 _JUMP = 0.25  # dB by which a file may be worse than one of less precision by chance
 _ROUGH = 16  # levels of opacity: with fewer, the PSNR of files jumps from one precision to the next
-_BESIDE = (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)  # dB of precision next to the one found that are tried if the PSNR jumps
+_NEIGHBOURS = (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)  # dB of precision from the one found, tried if the PSNR jumps
 _APART = 0.5  # least difference of two files from which the cost of a decibel is taken, dB
 _SLOPES = (0.02, 0.1)  # range of the fraction of the bytes that a decibel costs
 _PLATEAU = 1.5  # dB below the goal: files that are lower are predicted with the steepest slope
@@ -67,38 +74,38 @@ class SearchGoal:
     photo_slope: float = 1.0
     max_error: Mapping[str, float] = field(default_factory=dict)
 
-    def above(self, trial: Candidate, slope: float = BYTES_PER_DB) -> float:
+    def above(self, candidate: Candidate, slope: float = BYTES_PER_DB) -> float:
         """Return by how many dB a file is above the goal; for a size, the dB that its excess bytes are worth.
 
         Args:
-            trial: the file.
+            candidate: the file.
             slope: fraction of the bytes that a decibel costs.
         """
         if self.size_bytes is not None:
-            return math.log(trial.size_bytes / self.size_bytes) / slope
+            return math.log(candidate.size_bytes / self.size_bytes) / slope
         if self.photo_psnr is not None:
-            return (trial.photo_psnr - self.photo_psnr) / self.photo_slope
-        return trial.psnr - (self.psnr or 0.0)
+            return (candidate.photo_psnr - self.photo_psnr) / self.photo_slope
+        return candidate.psnr - (self.psnr or 0.0)
 
     @property
-    def is_judged(self) -> bool:
+    def uses_test_views(self) -> bool:
         """True if files are measured on the test views: the goal is a PSNR."""
         return self.size_bytes is None and self.photo_psnr is None
 
-    def is_met(self, trial: Candidate) -> bool:
+    def is_met(self, candidate: Candidate) -> bool:
         """Return True if a file meets the goal."""
-        errors = trial.result.report.errors
+        errors = candidate.result.report.errors
         if any(errors[name][0] > most for name, most in self.max_error.items() if name in errors):
             return False
-        above = self.above(trial)
+        above = self.above(candidate)
         return above <= 0.0 if self.size_bytes is not None else above >= 0.0
 
-    def best(self, trials: list[Candidate]) -> Candidate | None:
+    def best(self, candidates: list[Candidate]) -> Candidate | None:
         """Return the smallest file that meets the goal; for a size, the one with the best validation PSNR."""
-        good = [trial for trial in trials if self.is_met(trial)]
+        good = [candidate for candidate in candidates if self.is_met(candidate)]
         if self.size_bytes is not None:
-            return max(good, key=lambda trial: trial.decided_psnr, default=None)
-        return min(good, key=lambda trial: trial.size_bytes, default=None)
+            return max(good, key=lambda candidate: candidate.validation_psnr, default=None)
+        return min(good, key=lambda candidate: candidate.size_bytes, default=None)
 
 
 @dataclass(eq=False)
@@ -106,218 +113,215 @@ class PrecisionSearch:
     """The search for the precision at which files of given splats and coding meet the goal.
 
     Attributes:
-        trials: makes the files.
+        candidates: makes the files.
         goal: the goal.
     """
 
-    trials: CandidatePool
+    candidates: CandidatePool
     goal: SearchGoal
 
-    def near(self, part: Subset, coding: CodingChoice, start: float, tries: int = _FEW) -> Candidate:
+    def find_near(self, subset: Subset, coding: CodingChoice, start: float, tries: int = _FEW) -> Candidate:
         """Return a file near the goal, or the nearest of a few.
 
         Args:
-            part: its splats.
+            subset: its splats.
             coding: the coding of their colours.
             start: PSNR of each attribute for the first file, dB.
             tries: largest number of files.
         """
-        self._approach(part, coding, start, _NEAR, tries, self.about)
-        return self._nearest(part, coding)
+        self._approach(subset, coding, start, _NEAR, tries, self.margin)
+        return self._nearest(subset, coding)
 
-    def closer(self, trial: Candidate) -> Candidate:
+    def find_closer(self, candidate: Candidate) -> Candidate:
         """Return a file if it is close to the goal; else make one more of its kind, and return the nearest of all."""
-        if _CLOSE.low <= self.about(trial) <= _CLOSE.high:
-            return trial
-        assert trial.quality is not None
-        tries = len(self.trials.of(trial.part, trial.coding)) + 1
-        self._approach(trial.part, trial.coding, trial.quality, _CLOSE, tries, self.about)
-        return self._nearest(trial.part, trial.coding)
+        if _CLOSE.low <= self.margin(candidate) <= _CLOSE.high:
+            return candidate
+        assert candidate.quality is not None
+        tries = len(self.candidates.of(candidate.subset, candidate.coding)) + 1
+        self._approach(candidate.subset, candidate.coding, candidate.quality, _CLOSE, tries, self.margin)
+        return self._nearest(candidate.subset, candidate.coding)
 
-    def on(self, part: Subset, coding: CodingChoice) -> Candidate | None:
+    def find_on(self, subset: Subset, coding: CodingChoice) -> Candidate | None:
         """Return the best file that meets the goal, for splats and a coding with files near it; `None` if none does."""
-        known = self._nearest(part, coding)
+        known = self._nearest(subset, coding)
         assert known.quality is not None
         if self.goal.size_bytes is not None:
             start = known.quality - self.goal.above(known, self.slope(known))
-            self._approach(part, coding, start, _WITHIN, _MANY, self.goal.above, careful=True)
-            return self.goal.best(self.trials.of(part, coding, careful=True))
-        if part.refits:
-            start = known.quality - _quantisation_margin(known, self.about(known))
-            self._approach(part, coding, start, _ON_REFITTED, _SOME, self.goal.above, careful=True)
-            return self.goal.best(self.trials.of(part, coding, careful=True))
-        self._approach(part, coding, known.quality, _ON, _MANY, self.goal.above)
-        best = self.goal.best(self.trials.of(part, coding))
+            self._approach(subset, coding, start, _WITHIN, _MANY, self.goal.above, final=True)
+            return self.goal.best(self.candidates.of(subset, coding, final=True))
+        if subset.refits:
+            start = known.quality - _quantisation_margin(known, self.margin(known))
+            self._approach(subset, coding, start, _ON_REFITTED, _SOME, self.goal.above, final=True)
+            return self.goal.best(self.candidates.of(subset, coding, final=True))
+        self._approach(subset, coding, known.quality, _ON, _MANY, self.goal.above)
+        best = self.goal.best(self.candidates.of(subset, coding))
         if best is None:
             return None
-        packed = self.trials.make(part, coding, best.quality, quick=False)
+        packed = self.candidates.make(subset, coding, best.quality, quick=False)
         return packed if self.goal.is_met(packed) else None
 
-    def try_beside(self, best: Candidate) -> None:
+    def try_neighbours(self, best: Candidate) -> None:
         """Try precisions next to that of a file on the goal if the PSNR jumps, and pack the smallest that meets it."""
-        made, levels = self.trials.of(best.part, best.coding), best.result.report.options["opacity_levels"]
-        if self.goal.size_bytes is not None or best.part.refits or not (levels < _ROUGH or _jumps(made)):
+        made, levels = self.candidates.of(best.subset, best.coding), best.result.report.options["opacity_levels"]
+        if self.goal.size_bytes is not None or best.subset.refits or not (levels < _ROUGH or _jumps(made)):
             return
         assert best.quality is not None
-        draft = found = self.trials.make(best.part, best.coding, best.quality, quick=True)
-        for step in _BESIDE:
-            trial = self.trials.make(best.part, best.coding, clip_quality(best.quality + step), quick=True)
-            if trial.size_bytes < found.size_bytes and self.about(trial) > -_JUMP and self.goal.is_met(trial):
-                found = trial
-        if found is not draft:
-            self.trials.make(found.part, found.coding, found.quality, quick=False).let_judge()
+        quick = found = self.candidates.make(best.subset, best.coding, best.quality, quick=True)
+        for step in _NEIGHBOURS:
+            candidate = self.candidates.make(best.subset, best.coding, clip_quality(best.quality + step), quick=True)
+            is_smaller = candidate.size_bytes < found.size_bytes
+            if is_smaller and self.margin(candidate) > -_JUMP and self.goal.is_met(candidate):
+                found = candidate
+        if found is not quick:
+            self.candidates.make(found.subset, found.coding, found.quality, quick=False).score_on_test_views()
 
-    def cost(self, trial: Candidate) -> float:
-        """Return the expected cost of a file like this one on the goal, see `expected`; infinite if it is not near."""
-        above = self.about(trial)
+    def cost(self, candidate: Candidate) -> float:
+        """Return the expected cost, see `expected_cost`, of a file like this one on the goal; infinite if not near."""
+        above = self.margin(candidate)
         far = above < _NEAR.low if self.goal.size_bytes is None else above > _NEAR.high
-        return math.inf if far else self.expected(trial)
+        return math.inf if far else self.expected_cost(candidate)
 
-    def expected(self, trial: Candidate) -> float:
+    def expected_cost(self, candidate: Candidate) -> float:
         """Return the expected cost of a file like this one on the goal: a logarithm of bytes.
 
         The cost is infinite if no precision of its kind reaches the goal.
         """
-        if self.is_stalled(trial):
+        if self.is_stalled(candidate):
             return math.inf
-        level = self.level(trial.part) if self.goal.size_bytes is None else self._level_of_size()
-        above = trial.decided_psnr + self._gained(trial) - level
+        by_psnr = self.goal.size_bytes is None
+        goal = self.validation_goal(candidate.subset) if by_psnr else self._validation_goal_of_size()
+        above = candidate.validation_psnr + self._refit_gain(candidate) - goal
         far = min(above + _PLATEAU, 0.0)  # finer steps alone bring nothing so far up
-        above = min(_quantisation_margin(trial, above), max(above, _FORESEEN))
-        return math.log(trial.size_bytes) - self.slope(trial) * (above - far) - _SLOPES[1] * far
+        above = min(_quantisation_margin(candidate, above), max(above, _FORESEEN))
+        return math.log(candidate.size_bytes) - self.slope(candidate) * (above - far) - _SLOPES[1] * far
 
-    def about(self, trial: Candidate) -> float:
+    def margin(self, candidate: Candidate) -> float:
         """Return by how many dB a file is above the goal, as far as validation views tell.
 
         A quick file of refitted splats counts as better by the expected gain of the refit through its quantisers.
         """
-        if not self.goal.is_judged:
-            return self.goal.above(trial)
-        return trial.decided_psnr + self._gained(trial) - self.level(trial.part)
+        if not self.goal.uses_test_views:
+            return self.goal.above(candidate)
+        return candidate.validation_psnr + self._refit_gain(candidate) - self.validation_goal(candidate.subset)
 
-    def is_stalled(self, trial: Candidate) -> bool:
+    def is_stalled(self, candidate: Candidate) -> bool:
         """Return True if its kind of file is below a PSNR and more precision hardly helps: a codebook is too small."""
-        made = [one for one in self.trials.of(trial.part, trial.coding) if one.is_careful == trial.is_careful]
+        made = self.candidates.of(candidate.subset, candidate.coding)
+        made = [one for one in made if one.is_final == candidate.is_final]
         if self.goal.size_bytes is not None or len(made) < 2:
             return False
         coarse, fine = sorted(made, key=lambda one: one.quality or 0.0)[-2:]
-        apart, above = (fine.quality or 0.0) - (coarse.quality or 0.0), [self.about(one) for one in (coarse, fine)]
+        apart, above = (fine.quality or 0.0) - (coarse.quality or 0.0), [self.margin(one) for one in (coarse, fine)]
         if apart < _STALLED[0] or max(above) >= 0.0:
             return False
         gained = _quantisation_margin(fine, above[1]) - _quantisation_margin(coarse, above[0])
         return gained < _STALLED[1] * apart
 
-    def _gained(self, trial: Candidate) -> float:
-        return 0.0 if trial.is_careful or not trial.part.refits else TUNING_GAINS
+    def _refit_gain(self, candidate: Candidate) -> float:
+        return 0.0 if candidate.is_final or not candidate.subset.refits else REFIT_GAIN
 
-    def slope(self, trial: Candidate) -> float:
+    def slope(self, candidate: Candidate) -> float:
         """Return the fraction of the bytes that a decibel of quantisation error costs for files of this kind."""
-        for other in self.trials.of(trial.part, trial.coding):
-            apart = _quantisation_margin(other, other.decided_psnr - trial.decided_psnr)
-            alike = (other.is_careful, other.options.deflate_level) == (trial.is_careful, trial.options.deflate_level)
-            if abs(apart) > _APART and alike:
-                return min(max(math.log(other.size_bytes / trial.size_bytes) / apart, _SLOPES[0]), _SLOPES[1])
+        for other in self.candidates.of(candidate.subset, candidate.coding):
+            apart = _quantisation_margin(other, other.validation_psnr - candidate.validation_psnr)
+            is_alike = other.is_final == candidate.is_final
+            if abs(apart) > _APART and is_alike and other.options.deflate_level == candidate.options.deflate_level:
+                return min(max(math.log(other.size_bytes / candidate.size_bytes) / apart, _SLOPES[0]), _SLOPES[1])
         return BYTES_PER_DB
 
-    def level(self, part: Subset) -> float:
+    def validation_goal(self, subset: Subset) -> float:
         """Return the goal as a PSNR on the validation views, dB; their errors differ from those of the test views.
 
-        They differ most for errors of pruning, so the level depends on the splats.
+        They differ most for errors of pruning, so this goal depends on the splats.
         """
         goal = self.goal.psnr or 0.0
-        if not self.goal.is_judged:
+        if not self.goal.uses_test_views:
             return goal
-        made = [trial for trial in self.trials.made if trial.part is part]
-        judged = [trial for trial in made if trial.is_judged and (trial.is_careful or not part.refits)]
-        if part.refits and not judged:
-            return self._level_of_fit(part, error_of_psnr(goal))
-        nearest = min(judged or made[:1], key=lambda trial: abs(trial.psnr - goal))
-        return goal + nearest.decided_psnr - nearest.psnr
+        made = [candidate for candidate in self.candidates.made if candidate.subset is subset]
+        scored = [candidate for candidate in made if candidate.is_scored and (candidate.is_final or not subset.refits)]
+        if subset.refits and not scored:
+            return self._validation_goal_of_fit(subset, error_of_psnr(goal))
+        nearest = min(scored or made[:1], key=lambda candidate: abs(candidate.psnr - goal))
+        return goal + nearest.validation_psnr - nearest.psnr
 
-    def _level_of_fit(self, part: Subset, allowed: float) -> float:
-        """Return the level for refitted splats without a file yet: the pruning error plus the rest for quantisation.
+    def _validation_goal_of_fit(self, subset: Subset, allowed: float) -> float:
+        """Return the goal for refitted splats without a file yet: the pruning error plus the rest for quantisation.
 
         Errors of quantisation are alike in all views, and errors of pruning are not: these are measured on both kinds
         of views, reduced by the expected gain of the refit through the quantisers.
         """
-        decided, judged = (error_of_psnr(psnr + TUNING_GAINS) for psnr in (part.psnr, self.trials.judged_psnr(part)))
-        return psnr_of_mse(decided + max(allowed - judged, LEAST_QUANTISED * allowed))
+        validation, test = (
+            error_of_psnr(psnr + REFIT_GAIN) for psnr in (subset.psnr, self.candidates.test_psnr(subset))
+        )
+        return psnr_of_mse(validation + max(allowed - test, LEAST_QUANTISED * allowed))
 
-    def is_hopeless(self, part: Subset) -> bool:
+    def is_hopeless(self, subset: Subset) -> bool:
         """Return True if pruning takes nearly all of the error that a PSNR allows, measured on the test views."""
-        if not (self.goal.is_judged and part.refits):
+        if not (self.goal.uses_test_views and subset.refits):
             return False
-        judged = error_of_psnr(self.trials.judged_psnr(part) + TUNING_GAINS)
-        return judged > (1.0 - LEAST_QUANTISED) * error_of_psnr(self.goal.psnr or 0.0)
+        pruning = error_of_psnr(self.candidates.test_psnr(subset) + REFIT_GAIN)
+        return pruning > (1.0 - LEAST_QUANTISED) * error_of_psnr(self.goal.psnr or 0.0)
 
-    def _level_of_size(self) -> float:
-        return min(self.trials.made, key=lambda trial: abs(self.goal.above(trial))).decided_psnr
+    def _validation_goal_of_size(self) -> float:
+        return min(self.candidates.made, key=lambda candidate: abs(self.goal.above(candidate))).validation_psnr
 
     def _approach(
         self,
-        part: Subset,
+        subset: Subset,
         coding: CodingChoice,
         start: float,
         window: SearchWindow,
         tries: int,
         above: Callable[[Candidate], float],
         *,
-        careful: bool = False,
+        final: bool = False,
     ) -> None:
-        fewer = part.refits and self.goal.size_bytes is None
+        fewer = subset.refits and self.goal.size_bytes is None
 
-        def measured(trial: Candidate) -> float:
-            value = above(trial)
+        def measured(candidate: Candidate) -> float:
+            value = above(candidate)
             if not fewer:
                 return value
             # If pruning takes most of the error, a file whose total error is near enough is near enough.
-            quantised = _quantisation_margin(trial, value)
+            quantised = _quantisation_margin(candidate, value)
             return min(quantised, window.high) if 0.0 <= value <= _ON.high else quantised
 
         def measure(quality: float) -> float:
-            return measured(self.trials.make(part, coding, quality, quick=not careful))
+            return measured(self.candidates.make(subset, coding, quality, quick=not final))
 
-        made = self.trials.of(part, coding, careful=careful)
-        if part.refits and not careful:
-            made = [trial for trial in made if not trial.is_careful]
+        made = self.candidates.of(subset, coding, final=final)
+        if subset.refits and not final:
+            made = [candidate for candidate in made if not candidate.is_final]
         known = [(one.quality, measured(one)) for one in made if one.quality is not None]
-        slope, left = _GROWS.get(coding.sh or "", 1.0), max(0, tries - len(known))
+        slope, tries_left = _GROWS.get(coding.sh or "", 1.0), max(0, tries - len(known))
         find_in_window(
-            measure, window, start=start, slope=slope, bounds=_QUALITIES, tries=left, known=known,
-            flattest=_EVEN if fewer else FLATTEST, patience=1 if fewer and careful else 2,
+            measure, window, start=start, slope=slope, bounds=_QUALITIES, tries=tries_left, known=known,
+            flattest=_EVEN if fewer else FLATTEST, patience=1 if fewer and final else 2,
         )  # fmt: skip
 
-    def _nearest(self, part: Subset, coding: CodingChoice) -> Candidate:
-        return min(self.trials.of(part, coding), key=lambda trial: abs(self.about(trial)))
+    def _nearest(self, subset: Subset, coding: CodingChoice) -> Candidate:
+        return min(self.candidates.of(subset, coding), key=lambda candidate: abs(self.margin(candidate)))
 
 
-def _quantisation_margin(trial: Candidate, above: float) -> float:
+def _quantisation_margin(candidate: Candidate, above: float) -> float:
     """Return by how many dB the quantisation of a file is better than needed, if the whole file is `above` the goal.
 
     The error of pruning is the same at any precision; only the rest falls evenly with it, and the bytes follow that.
     """
-    total, goal = error_of_psnr(trial.decided_psnr), error_of_psnr(trial.decided_psnr - above)
-    removed = min(error_of_psnr(trial.part.psnr), (1.0 - LEAST_QUANTISED) * min(total, goal))
-    return 10.0 * math.log10((goal - removed) / (total - removed))
+    total, goal = error_of_psnr(candidate.validation_psnr), error_of_psnr(candidate.validation_psnr - above)
+    pruning = min(error_of_psnr(candidate.subset.psnr), (1.0 - LEAST_QUANTISED) * min(total, goal))
+    return 10.0 * math.log10((goal - pruning) / (total - pruning))
 
 
-def _jumps(trials: Sequence[Candidate]) -> bool:
+def _jumps(candidates: Sequence[Candidate]) -> bool:
     """Return True if a file is worse than another of less precision, by more than chance."""
-    ordered = [one.decided_psnr for one in sorted(trials, key=lambda trial: trial.quality or 0.0)]
+    ordered = [one.validation_psnr for one in sorted(candidates, key=lambda candidate: candidate.quality or 0.0)]
     return any(after < before - _JUMP for before, after in pairwise(ordered))
 
 
 def clip_quality(quality: float) -> float:
     """Clip a PSNR of attributes to the range of the search, dB."""
     return min(max(quality, _QUALITIES[0]), _QUALITIES[1])
-
-
-#: Least slope that is taken from two trials, as a fraction of the expected one: a smaller one may be noise.
-FLATTEST = 0.15
-
-_STEEPEST = 4.0  # largest slope that is taken from two trials, as a multiple of the expected one
-_LONG_STEP = 0.03  # fraction of the range: over a shorter distance, values that do not grow may be noise
-_BRACKET_MARGIN = 0.08  # fraction of a bracket: a trial is never nearer to its ends
 
 
 def find_in_window(

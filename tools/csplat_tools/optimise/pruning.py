@@ -24,7 +24,7 @@ from csplat_tools.optimise.pruning_order import (
     PruningOrder,
     SimplifyOptions,
     find_pruning_order,
-    total_removal,
+    total_error,
 )
 from csplat_tools.optimise.splat_refit import RefitResult, refit_with_bands
 from csplat_tools.optimise.targets import Target
@@ -35,6 +35,7 @@ from csplat_tools.views.sufficient_views import SufficientViews, find_sufficient
 
 _TRIES = 3  # largest number of fits on the way to a target PSNR
 _AGREE_ON = 0.5  # least fraction of the splats on whose removal views have to agree: fits need the views in any case
+_NEAR = 0.05  # dB: a result this near to the target PSNR is not improved
 _BANDS_WORTH = 1.0  # dB that leaving out SH bands may cost; a fit that loses more has failed
 
 
@@ -46,14 +47,14 @@ class Simplified:
         model: the scene.
         source_index: [N] int64, the source splat that each splat was.
         threshold: the largest error of a pruned splat: what a splat's bits are worth.
-        stays: [N, d], mask of the SH bands that are kept; None if bands were not chosen.
+        kept_bands: [N, d], mask of the SH bands that are kept; None if bands were not chosen.
         report: pruned splats by reason, predicted and measured errors, views, seconds; JSON-compatible.
     """
 
     model: SplatModel
     source_index: I64
     threshold: float
-    stays: NDArray[np.bool_] | None
+    kept_bands: NDArray[np.bool_] | None
     report: dict[str, Any]
 
 
@@ -64,51 +65,57 @@ class PruningSession:
     Attributes:
         source: the scene.
         options: options of the simplification.
-        around: all views of the scene.
-        views: the training views whose removal errors agree with those of held-out views, and the latter.
-        taught: views that splats are fitted to: the training views and, if they are virtual, at least as many others,
-            because a fit follows its views.
-        sides: the same views with the source's removal errors: two parts if they are virtual, else one.
-        wanted: [H, W, 3], the source's render of each view of `taught`.
+        view_set: all views of the scene.
+        views: the training views whose pruning errors agree with those of held-out views, and the held-out views.
+        training_cameras: views that splats are fitted to: the training views and, if they are virtual, at least the
+            same number of others, because a fit follows its views.
+        view_groups: the same views with the source's pruning errors: two groups if they are virtual, else one.
+        references: [H, W, 3], the source's render of each view of `training_cameras`.
         order: the pruning order.
-        checked: scorer by held-out views.
+        check_scorer: scorer by held-out views.
         seconds: time by stage.
     """
 
     source: SplatModel
     options: SimplifyOptions
-    around: ViewSet
+    view_set: ViewSet
     views: SufficientViews
-    taught: list[Camera]
-    sides: list[MeasuredViews]
-    wanted: list[F32]
+    training_cameras: list[Camera]
+    view_groups: list[MeasuredViews]
+    references: list[F32]
     order: PruningOrder
-    checked: Scorer
+    check_scorer: Scorer
     seconds: dict[str, float]
 
     @property
     def value_count(self) -> int:
-        """Pixels times channels of all views of `taught`."""
-        return sum(side.removal.value_count for side in self.sides)
+        """Pixels times channels of all views of `training_cameras`."""
+        return sum(group.pruning_error.value_count for group in self.view_groups)
 
-    def pruned(self, gone: int) -> I64:
-        """Return the source splats that are kept if the first `gone` of the order are pruned."""
-        return self.order.kept(len(self.source), gone)
+    def kept_rows(self, pruned_count: int) -> I64:
+        """Return the source splats that are kept if the first `pruned_count` of the order are pruned."""
+        return self.order.kept(len(self.source), pruned_count)
 
-    def threshold(self, gone: int) -> float:
-        """Return the largest removal error among the first `gone` splats."""
-        return float(self.order.errors[:gone].max(initial=0.0))
+    def threshold(self, pruned_count: int) -> float:
+        """Return the largest pruning error among the first `pruned_count` splats."""
+        return float(self.order.errors[:pruned_count].max(initial=0.0))
 
-    def fitted(self, rows: I64, progress: Progress | None = None) -> RefitResult:
-        """Refit the given splats of the source."""
-        left, deciding = self.source.select(rows), len(self.views.used)
-        return refit_with_bands(left, self.taught, self.wanted, self.options, deciding=deciding, progress=progress)
+    def refit(self, rows: I64, progress: Progress | None = None) -> RefitResult:
+        """Refit the given splats of the source, and choose their SH bands."""
+        return refit_with_bands(
+            self.source.select(rows),
+            self.training_cameras,
+            self.references,
+            self.options,
+            band_views=len(self.views.used),
+            progress=progress,
+        )
 
 
 def prepare_pruning(
     source: SplatModel,
     views: ViewSet | None,
-    left: int | None,
+    kept_count: int | None,
     options: SimplifyOptions,
     progress: Progress | None = None,
     *,
@@ -119,7 +126,7 @@ def prepare_pruning(
     Args:
         source: the scene.
         views: views of the scene; None for virtual views.
-        left: number of splats to keep; None if it is not known yet.
+        kept_count: number of splats to keep; None if it is not known yet.
         options: options of the simplification.
         progress: progress callback.
         allowed: approximate mean squared error of pruning at which the order may end.
@@ -127,27 +134,29 @@ def prepare_pruning(
     seconds = {}
     start = time.perf_counter()
     count, size = options.pictures(len(source))
-    around = views or find_view_set(source, background=options.background, count=count, size=size, seed=options.seed)
-    options = replace(options, background=around.background, view_size=size)
-    gone = max(_AGREE_ON, 0.0 if left is None else 1.0 - left / len(source))
-    found = find_sufficient_views(source, around, gone, size=size, threads=options.threads, progress=progress)
-    sides = [MeasuredViews(found.used, found.removal)]
-    if around.virtual:
+    view_set = views or find_view_set(source, background=options.background, count=count, size=size, seed=options.seed)
+    options = replace(options, background=view_set.background, view_size=size)
+    pruned_share = max(_AGREE_ON, 0.0 if kept_count is None else 1.0 - kept_count / len(source))
+    found = find_sufficient_views(source, view_set, pruned_share, size=size, threads=options.threads, progress=progress)
+    view_groups = [MeasuredViews(found.used, found.removal)]
+    if view_set.virtual:
         more = round(len(found.used) * max(1.0, options.work))
         cameras = camera_sequence(source, more, size, seed=options.seed + 1)
         removal = measure_pruning_error(
-            source, cameras, background=around.background, bands=False, threads=options.threads, progress=progress
+            source, cameras, background=view_set.background, bands=False, threads=options.threads, progress=progress
         )
-        sides.append(MeasuredViews(cameras, removal))
-    taught = [camera for side in sides for camera in side.cameras]
-    wanted = _render_all(source, taught, options)
-    checked = Scorer.of_source(source, found.check, around.background, threads=options.threads)
+        view_groups.append(MeasuredViews(cameras, removal))
+    training_cameras = [camera for group in view_groups for camera in group.cameras]
+    references = _render_all(source, training_cameras, options)
+    check_scorer = Scorer.of_source(source, found.check, view_set.background, threads=options.threads)
     seconds["views"] = time.perf_counter() - start
     start = time.perf_counter()
-    values = sum(side.removal.value_count for side in sides)
-    order = find_pruning_order(source, sides, options, left, progress, enough=allowed * values)
+    values = sum(group.pruning_error.value_count for group in view_groups)
+    order = find_pruning_order(source, view_groups, options, kept_count, progress, enough=allowed * values)
     seconds["rounds"] = time.perf_counter() - start
-    return PruningSession(source, options, around, found, taught, sides, wanted, order, checked, seconds)
+    return PruningSession(
+        source, options, view_set, found, training_cameras, view_groups, references, order, check_scorer, seconds
+    )
 
 
 def _render_all(source: SplatModel, cameras: Sequence[Camera], options: SimplifyOptions) -> list[F32]:
@@ -203,136 +212,156 @@ def simplify(
         raise InputError("a scene without splats cannot be simplified")
     if target.max_psnr_drop is not None and (views is None or not views.photographs):
         raise InputError("a loss against photographs wants photographs: name a data set")
-    left = None if target.keep is None else target.count(len(source))
-    session = prepare_pruning(source, views, left, options, progress)
+    kept_count = None if target.keep is None else target.count(len(source))
+    session = prepare_pruning(source, views, kept_count, options, progress)
     start = time.perf_counter()
-    if left is not None:
-        gone = min(len(source) - left, len(session.order.rows))
-        result = _prune_and_refit(session, gone, None, progress)
+    if kept_count is not None:
+        result = _prune_and_refit(session, min(len(source) - kept_count, len(session.order.rows)), None, progress)
     else:
-        result = _search_fewest(session, *find_scorer(session, target), progress)
+        result = _search_fewest(session, *_find_scorer(session, target), progress)
     session.seconds["fit"] = time.perf_counter() - start
-    return replace(result, report={**_report(session, result, target), **_test_scores(session, result.model)})
+    threshold = session.threshold(result.pruned_count)
+    report = {**_report(session, result, target), **_test_scores(session, result.model)}
+    return Simplified(result.model, result.rows, threshold, result.kept_bands, report)
 
 
-def find_scorer(session: PruningSession, target: Target) -> tuple[Scorer, float]:
-    """Return the validation scorer and the PSNR that is to be reached, dB; 99 if the target has none.
+@dataclass(frozen=True, eq=False)
+class _PrunedScene:
+    """A pruned and refitted scene with its scores; names that end in `pruned_psnr` are scores before the refit.
 
-    Args:
-        session: the views; validation views are not among the test views.
-        target: the target.
+    Attributes:
+        model, rows, kept_bands: as in `Simplified`; `rows` are the source splats.
+        pruned_count: number of pruned splats.
+        check_pruned_psnr, check_psnr: PSNR on held-out views, dB.
+        is_refused: the refit made held-out views worse, and was discarded.
+        validation_pruned_psnr, validation_psnr: PSNR on validation views, dB; `None` if not measured.
     """
-    around, threads = session.around, session.options.threads
+
+    model: SplatModel
+    rows: I64
+    kept_bands: NDArray[np.bool_] | None
+    pruned_count: int
+    check_pruned_psnr: float
+    check_psnr: float
+    is_refused: bool = False
+    validation_pruned_psnr: float | None = None
+    validation_psnr: float | None = None
+
+    def scores(self) -> dict[str, Any]:
+        """Return the scores for the report."""
+        scores = {
+            "check_psnr_pruned": self.check_pruned_psnr,
+            "check_psnr": self.check_psnr,
+            "refit_refused": self.is_refused or None,
+            "decided_psnr_pruned": self.validation_pruned_psnr,
+            "decided_psnr": self.validation_psnr,
+        }
+        return {name: value for name, value in scores.items() if value is not None}
+
+
+def _find_scorer(session: PruningSession, target: Target) -> tuple[Scorer, float]:
+    """Return the scorer by validation views, and the PSNR to reach, dB; the largest possible if there is no target."""
+    views, threads = session.view_set, session.options.threads
     if target.max_psnr_drop is not None:
-        validation_scorer = around.photograph_validation_scorer(threads=threads)
-        return validation_scorer, validation_scorer.psnr(session.source) - target.max_psnr_drop
-    return around.validation_scorer(session.source, threads=threads), PSNR_CAP if target.psnr is None else target.psnr
+        scorer = views.photograph_validation_scorer(threads=threads)
+        return scorer, scorer.psnr(session.source) - target.max_psnr_drop
+    return views.validation_scorer(session.source, threads=threads), PSNR_CAP if target.psnr is None else target.psnr
 
 
 def _test_scores(session: PruningSession, model: SplatModel) -> dict[str, Any]:
     """Return the scores of the result on the test views, for the report; empty if there are none."""
-    around, threads = session.around, session.options.threads
-    if not around.test:
+    views, threads = session.view_set, session.options.threads
+    if not views.test:
         return {}
-    said: dict[str, Any] = {
-        "psnr": around.test_scorer(session.source, threads=threads).psnr(model),
-        "judged_by": {"cameras": around.name, "views": len(around.test)},
+    scores: dict[str, Any] = {
+        "psnr": views.test_scorer(session.source, threads=threads).psnr(model),
+        "judged_by": {"cameras": views.name, "views": len(views.test)},
     }
-    if around.photographs:
-        judge = around.photograph_test_scorer(threads=threads)
-        said["photographs"] = {"source": judge.psnr(session.source), "psnr": judge.psnr(model)}
-    return said
+    if views.photographs:
+        scorer = views.photograph_test_scorer(threads=threads)
+        scores["photographs"] = {"source": scorer.psnr(session.source), "psnr": scorer.psnr(model)}
+    return scores
 
 
-def _prune_and_refit(session: PruningSession, gone: int, judge: Scorer | None, progress: Progress | None) -> Simplified:
+def _prune_and_refit(
+    session: PruningSession, pruned_count: int, scorer: Scorer | None, progress: Progress | None
+) -> _PrunedScene:
     """Prune and refit, and measure the result."""
-    rows, threshold = session.pruned(gone), session.threshold(gone)
-    pruned = session.source.select(rows)
-    fitted = session.fitted(rows, progress)
-    report: dict[str, Any] = {
-        "gone": gone,
-        "check_psnr_pruned": session.checked.psnr(pruned),
-        "check_psnr": session.checked.psnr(fitted.model),
-    }
-    model, stays = fitted.model, fitted.stays
-    worth = 0.0 if stays is None else _BANDS_WORTH
-    if report["check_psnr"] < report["check_psnr_pruned"] - worth and session.options.refit:
-        model, stays = pruned, None  # overfitted: held-out views are worse than before
-        report["check_psnr"], report["refit_refused"] = report["check_psnr_pruned"], True
-    if judge is not None:
-        report["decided_psnr_pruned"], report["decided_psnr"] = judge.psnr(pruned), judge.psnr(model)
-    return Simplified(model, rows, threshold, stays, report)
+    rows = session.kept_rows(pruned_count)
+    pruned, refit = session.source.select(rows), session.refit(rows, progress)
+    check_pruned, check = session.check_scorer.psnr(pruned), session.check_scorer.psnr(refit.model)
+    model, kept_bands = refit.model, refit.kept_bands
+    allowed = 0.0 if kept_bands is None else _BANDS_WORTH
+    is_refused = check < check_pruned - allowed and session.options.refit
+    if is_refused:  # overfitted: held-out views are worse than before
+        model, kept_bands, check = pruned, None, check_pruned
+    validation = (None, None) if scorer is None else (scorer.psnr(pruned), scorer.psnr(model))
+    return _PrunedScene(model, rows, kept_bands, pruned_count, check_pruned, check, is_refused, *validation)
 
 
-def _search_fewest(session: PruningSession, judge: Scorer, goal: float, progress: Progress | None) -> Simplified:
+def _search_fewest(session: PruningSession, scorer: Scorer, goal: float, progress: Progress | None) -> _PrunedScene:
     """Find the fewest splats that reach a PSNR: bisect along the order without a fit, then allow for the fit's gain."""
-    if judge.psnr(session.source) < goal:
+    if scorer.psnr(session.source) < goal:
         raise InputError(f"even the source is below the target of {goal:.2f} dB: its renders are not its pictures")
     best, gain = None, 0.0
     lowest = 0
     for _ in range(_TRIES):
-        gone = most_pruned(session, judge, goal - gain, lowest)
-        result = _prune_and_refit(session, gone, judge, progress)
-        reached = result.report["decided_psnr"]
+        pruned_count = _most_prunable(session, scorer, goal - gain, lowest)
+        result = _prune_and_refit(session, pruned_count, scorer, progress)
+        before, reached = result.validation_pruned_psnr, result.validation_psnr
+        assert before is not None
+        assert reached is not None
         if reached >= goal:
             if best is None or len(result.model) < len(best.model):
                 best = result
-            lowest = gone
-        if gone == 0 or abs(reached - goal) < 0.05:
+            lowest = pruned_count
+        if pruned_count == 0 or abs(reached - goal) < _NEAR:
             break
-        gain = reached - result.report["decided_psnr_pruned"] - (0.0 if reached >= goal else goal - reached)
+        gain = reached - before - (0.0 if reached >= goal else goal - reached)
     if best is not None:
         return best
-    return _unchanged(session, judge)
+    source, check = session.source, session.check_scorer.psnr(session.source)
+    return _PrunedScene(source, np.arange(len(source)), None, 0, check, check, validation_psnr=scorer.psnr(source))
 
 
-def most_pruned(session: PruningSession, judge: Scorer, goal: float, lowest: int = 0) -> int:
+def _most_prunable(session: PruningSession, scorer: Scorer, goal: float, lowest: int) -> int:
     """Return the number of splats that may be pruned before the PSNR, without a fit, falls below a goal.
 
     Args:
         session: the scene and its pruning order.
-        judge: the scorer.
+        scorer: scorer by validation views.
         goal: least PSNR, dB.
         lowest: a number of splats that is known to be possible.
     """
     low, high = lowest, len(session.order.rows)
     while high - low > max(1, len(session.source) // 200):
         middle = (low + high) // 2
-        if judge.psnr(session.source.select(session.pruned(middle))) >= goal:
+        if scorer.psnr(session.source.select(session.kept_rows(middle))) >= goal:
             low = middle
         else:
             high = middle
     return low
 
 
-def _unchanged(session: PruningSession, judge: Scorer) -> Simplified:
-    source = session.source
-    score = session.checked.psnr(source)
-    report = {"gone": 0, "check_psnr_pruned": score, "check_psnr": score}
-    report["decided_psnr"] = judge.psnr(source)
-    return Simplified(source, np.arange(len(source)), 0.0, None, report)
-
-
-def _report(session: PruningSession, result: Simplified, target: Target) -> dict[str, Any]:
+def _report(session: PruningSession, result: _PrunedScene, target: Target) -> dict[str, Any]:
     """Return the report: pruned splats by reason, views, rounds, predicted and measured errors."""
     source, views = session.source, session.views
-    stays = np.zeros(len(source), bool)
-    stays[result.source_index] = True
+    pruned = np.ones(len(source), bool)
+    pruned[result.rows] = False
     invisible = source.opacities < ALPHA_MIN
-    unseen = ~total_removal(session.sides).seen & ~invisible
-    removed_error = float(session.order.errors[: result.report["gone"]].sum())
-    predicted = removed_error / session.value_count
+    unseen = ~total_error(session.view_groups).seen & ~invisible
+    predicted = float(session.order.errors[: result.pruned_count].sum()) / session.value_count
     bands = {}
-    if result.stays is not None:
-        bands = {str(band + 1): int(np.count_nonzero(~result.stays[:, band])) for band in range(result.stays.shape[1])}
+    if result.kept_bands is not None:
+        bands = {str(band): int(np.count_nonzero(~kept)) for band, kept in enumerate(result.kept_bands.T, 1)}
     return {
         "target": target.as_json(),
         "splats_before": len(source),
         "splats": len(result.model),
         "removed": {
-            "invisible": int(np.count_nonzero(~stays & invisible)),
-            "unseen": int(np.count_nonzero(~stays & unseen)),
-            "least_error": int(np.count_nonzero(~stays & ~invisible & ~unseen)),
+            "invisible": int(np.count_nonzero(pruned & invisible)),
+            "unseen": int(np.count_nonzero(pruned & unseen)),
+            "least_error": int(np.count_nonzero(pruned & ~invisible & ~unseen)),
         },
         "unseen_share": float(np.mean(unseen)),
         "views": {
@@ -342,9 +371,9 @@ def _report(session: PruningSession, result: Simplified, target: Target) -> dict
             "size": [views.used[0].W, views.used[0].H],
         },
         "rounds": [vars(one) for one in session.order.rounds],
-        "largest_error_removed": result.threshold,
+        "largest_error_removed": session.threshold(result.pruned_count),
         "predicted_psnr": -10.0 * math.log10(predicted) if predicted > 0.0 else None,
         "zero_bands": bands,
         "seconds": {stage: round(value, 2) for stage, value in session.seconds.items()},
-        **{name: value for name, value in result.report.items() if name != "gone"},
+        **result.scores(),
     }

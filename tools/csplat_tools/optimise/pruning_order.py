@@ -20,7 +20,9 @@ from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_tools.views import VIEW_SIZE, default_views
 from csplat_tools.views.sufficient_views import pruning_keys
 
-_DEFAULT_EFFORT = 3  # default effort
+_DEFAULT_EFFORT = 3
+_LEAST_SHARE = 0.01  # fraction of the splats that is kept at the end of an order without a given target
+_ROUND_SHARE = 0.72  # fraction kept after each round of such an order: splats that hid another may have been pruned
 
 
 @dataclass(frozen=True)
@@ -87,10 +89,6 @@ class SimplifyOptions:
         return self.effort < _DEFAULT_EFFORT
 
 
-_LEAST_SHARE = 0.01  # fraction of the splats that is left at the end of an order without a given target
-_ROUND_SHARE = 0.72  # fraction left after each round of such an order: splats that hid another may have been pruned
-
-
 @dataclass(frozen=True)
 class PruningRound:
     """One round of pruning.
@@ -120,11 +118,11 @@ class PruningOrder:
     errors: F64
     rounds: tuple[PruningRound, ...]
 
-    def kept(self, splat_count: int, gone: int) -> I64:
-        """Return the source splats that are kept if `gone` are pruned, ascending."""
-        stays = np.ones(splat_count, bool)
-        stays[self.rows[:gone]] = False
-        return np.flatnonzero(stays)
+    def kept(self, splat_count: int, pruned_count: int) -> I64:
+        """Return the source splats that are kept if `pruned_count` are pruned, ascending."""
+        is_kept = np.ones(splat_count, bool)
+        is_kept[self.rows[:pruned_count]] = False
+        return np.flatnonzero(is_kept)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,22 +131,22 @@ class MeasuredViews:
 
     Attributes:
         cameras: the views.
-        removal: the removal errors of the splats that are left, as last measured in these views.
+        pruning_error: errors of removing each of the kept splats, as last measured in these views.
     """
 
     cameras: Sequence[Camera]
-    removal: PruningError
+    pruning_error: PruningError
 
     def of_rows(self, rows: NDArray[Any]) -> MeasuredViews:
         """Return the views with the errors of some of the splats."""
-        return replace(self, removal=self.removal.of_rows(rows))
+        return replace(self, pruning_error=self.pruning_error.of_rows(rows))
 
 
 def find_pruning_order(
     model: SplatModel,
-    sides: Sequence[MeasuredViews],
+    view_groups: Sequence[MeasuredViews],
     options: SimplifyOptions,
-    left: int | None,
+    kept_count: int | None,
     progress: Progress | None = None,
     *,
     enough: float = math.inf,
@@ -158,56 +156,56 @@ def find_pruning_order(
 
     Args:
         model: the source.
-        sides: views with the removal errors of the source. Rounds measure one side after the other, and the last
-            measurements of the others still count: with two sides, twice the views at the cost of one.
+        view_groups: views with the pruning errors of the source. Rounds measure one group after the other, and the last
+            measurements of the others still count: with two groups, twice the views at the cost of one.
         options: rounds, background, threads, `keep_unseen`.
-        left: number of splats to keep; None for an order that may be cut anywhere.
+        kept_count: number of splats to keep; None for an order that may be cut anywhere.
         progress: progress callback.
-        enough: an order without `left` ends with the round in which the sum of all errors exceeds this.
+        enough: an order without `kept_count` ends with the round in which the sum of all errors exceeds this.
         start: an order to continue.
     """
     count = len(model)
-    rows, sides = np.arange(count), list(sides)
-    gone, errors, rounds = list[I64](), list[F64](), list[PruningRound]()
+    rows, groups = np.arange(count), list(view_groups)
+    pruned, errors, rounds = list[I64](), list[F64](), list[PruningRound]()
     if start is not None:
-        gone, errors, rounds = [start.rows], [start.errors], list(start.rounds)
+        pruned, errors, rounds = [start.rows], [start.errors], list(start.rounds)
         rows = np.delete(rows, start.rows)
-        sides = [side.of_rows(rows) for side in sides]
-    for target in _targets(count, options, left, len(rows)):
-        if gone:
-            turn = (len(rounds) - 1) % len(sides)
-            removal = measure_pruning_error(
-                model.select(rows), sides[turn].cameras, background=options.background, bands=False,
+        groups = [group.of_rows(rows) for group in groups]
+    for target in _targets(count, options, kept_count, len(rows)):
+        if pruned:
+            turn = (len(rounds) - 1) % len(groups)
+            measured = measure_pruning_error(
+                model.select(rows), groups[turn].cameras, background=options.background, bands=False,
                 threads=options.threads, progress=progress,
             )  # fmt: skip
-            sides[turn] = replace(sides[turn], removal=removal)
-        keys = pruning_keys(model.opacities[rows], total_removal(sides), keep_unseen=options.keep_unseen)
+            groups[turn] = replace(groups[turn], pruning_error=measured)
+        keys = pruning_keys(model.opacities[rows], total_error(groups), keep_unseen=options.keep_unseen)
         order = np.argsort(keys, kind="stable")[: len(rows) - target]
         order = order[np.isfinite(keys[order])]
         if not len(order):
             break
-        gone.append(rows[order])
+        pruned.append(rows[order])
         errors.append(np.maximum(keys[order], 0.0))
         rounds.append(PruningRound(len(order), float(errors[-1][-1]), float(errors[-1].sum())))
         rows = np.delete(rows, order)
-        stays = np.delete(np.arange(len(keys)), order)
-        sides = [side.of_rows(stays) for side in sides]
-        if left is None and sum(one.predicted for one in rounds) > enough:
+        kept = np.delete(np.arange(len(keys)), order)
+        groups = [group.of_rows(kept) for group in groups]
+        if kept_count is None and sum(one.predicted for one in rounds) > enough:
             break
-    if not gone:
+    if not pruned:
         return PruningOrder(np.zeros(0, np.int64), np.zeros(0), ())
-    return PruningOrder(np.concatenate(gone), np.concatenate(errors), tuple(rounds))
+    return PruningOrder(np.concatenate(pruned), np.concatenate(errors), tuple(rounds))
 
 
-def total_removal(sides: Sequence[MeasuredViews]) -> PruningError:
-    """Return the sum of the removal errors over all sides."""
-    return functools.reduce(operator.add, [side.removal for side in sides])
+def total_error(view_groups: Sequence[MeasuredViews]) -> PruningError:
+    """Return the sum of the pruning errors over all groups of views."""
+    return functools.reduce(operator.add, [group.pruning_error for group in view_groups])
 
 
-def _targets(count: int, options: SimplifyOptions, left: int | None, now: int) -> list[int]:
-    """Return the number of splats left after each round, in decreasing order."""
-    last = max(1, round(count * _LEAST_SHARE)) if left is None else left
-    if left is not None:
+def _targets(count: int, options: SimplifyOptions, kept_count: int | None, now: int) -> list[int]:
+    """Return the number of splats kept after each round, in decreasing order."""
+    last = max(1, round(count * _LEAST_SHARE)) if kept_count is None else kept_count
+    if kept_count is not None:
         targets = [round(count + (last - count) * number / options.rounds) for number in range(1, options.rounds + 1)]
     else:
         targets = [now]

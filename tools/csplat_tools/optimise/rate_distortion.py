@@ -26,23 +26,23 @@ def error_of_psnr(psnr: float) -> float:
     return math.pow(10.0, -psnr / 10.0)
 
 
-def error_at_size(left: F64, removed: F64, quantised: float, slope: float) -> F64:
+def error_at_size(kept_count: F64, removed: F64, quantised: float, slope: float) -> F64:
     """Return the mean squared error of files of one size.
 
     Args:
-        left: number of kept splats, relative to the number at which quantisation costs `quantised`.
+        kept_count: number of kept splats, relative to the number at which quantisation costs `quantised`.
         removed: mean squared error of pruning the others.
         quantised: mean squared error of quantisation.
         slope: fraction of the bytes that a decibel costs.
     """
-    return np.asarray(removed + quantised * left ** (1.0 / rate_exponent(slope)))
+    return np.asarray(removed + quantised * kept_count ** (1.0 / rate_exponent(slope)))
 
 
-def log_bytes_at_error(left: F64, removed: F64, allowed: float, most: float, slope: float) -> F64:
+def log_bytes_at_error(kept_count: F64, removed: F64, allowed: float, most: float, slope: float) -> F64:
     """Return the log bytes of files with equal error, up to a constant; infinite if pruning takes too much of it.
 
     Args:
-        left: number of kept splats, in any unit.
+        kept_count: number of kept splats, in any unit.
         removed: mean squared error of pruning the others.
         allowed: mean squared error of the files.
         most: largest fraction of it that pruning may take: beyond, the rest for quantisation would be a small
@@ -51,7 +51,7 @@ def log_bytes_at_error(left: F64, removed: F64, allowed: float, most: float, slo
     """
     fits = removed <= most * allowed
     spare = np.where(fits, allowed - removed, 1.0)
-    return np.where(fits, np.log(left) - rate_exponent(slope) * np.log(spare), np.inf)
+    return np.where(fits, np.log(kept_count) - rate_exponent(slope) * np.log(spare), np.inf)
 
 
 def rate_exponent(slope: float) -> float:

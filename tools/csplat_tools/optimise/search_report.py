@@ -7,14 +7,18 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import numpy as np
+
 from csplat.encoder import EncodeResult
 from csplat.errors import counted
+from csplat.types import F64
 from csplat_render.metrics import psnr_of_mse
 from csplat_tools.console import format_bytes
-from csplat_tools.optimise.candidates import Candidate, CandidatePool, psnr_spread
+from csplat_tools.optimise.candidates import Candidate, CandidatePool
 from csplat_tools.optimise.targets import Target
 from csplat_tools.views import describe_views
 
+_FAR = 0.3  # dB: a PSNR that exceeds the target by more is explained
 _LESS = 1.0  # dB: a PSNR from elsewhere that is lower by more is pointed out
 
 
@@ -102,10 +106,10 @@ class SearchReport:
     def _elsewhere(self, psnr: float) -> list[str]:
         if not self.elsewhere:
             return []
-        shown = ", ".join(f"{found:.2f} {kind}" for kind, found in self.elsewhere.items())
+        scores = ", ".join(f"{found:.2f} {kind}" for kind, found in self.elsewhere.items())
         less = psnr - min(self.elsewhere.values())
         worse = f": up to {less:.1f} dB less than where it was judged" if less > _LESS else ""
-        return [f"from virtual views that nothing was chosen by, PSNR {shown}{worse}"]
+        return [f"from virtual views that nothing was chosen by, PSNR {scores}{worse}"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -121,9 +125,9 @@ class Optimised:
     report: SearchReport
 
     def __repr__(self) -> str:
-        said, psnr = self.result.report, self.report.psnr
+        encoded, psnr = self.result.report, self.report.psnr
         quality = "" if psnr is None else f", {psnr:.2f} dB"
-        return f"Optimised({said.size_bytes:,} bytes, {said.splat_count:,} splats{quality})"
+        return f"Optimised({encoded.size_bytes:,} bytes, {encoded.splat_count:,} splats{quality})"
 
     @property
     def data(self) -> bytes:
@@ -131,13 +135,10 @@ class Optimised:
         return self.result.data
 
 
-_FAR = 0.3  # dB: a PSNR that exceeds the target by more is explained
-
-
 def make_report(
     target: Target,
     found: Candidate,
-    trials: CandidatePool,
+    candidates: CandidatePool,
     *,
     splats_before: int,
     views_of: str,
@@ -149,7 +150,7 @@ def make_report(
     Args:
         target: the target.
         found: the chosen file.
-        trials: all files that were tried.
+        candidates: all files that were tried.
         splats_before: number of splats of the scene.
         views_of: source of the test views: `virtual`, or a name.
         remarks: further sentences for `why`.
@@ -175,45 +176,59 @@ def make_report(
         spread=None if math.isnan(spread) else round(spread, 3),
         views=len(errors),
         views_of=views_of,
-        renders=trials.renders,
+        renders=candidates.render_count,
         chosen=found.as_json(),
-        tried=tuple(trial.as_json() for trial in trials.made),
-        why=(*_why(target, found, trials, splats_before), *remarks),
+        tried=tuple(candidate.as_json() for candidate in candidates.made),
+        why=(*_why(target, found, candidates, splats_before), *remarks),
         sure=sure,
         **numbers,
     )
 
 
-def _why(target: Target, found: Candidate, trials: CandidatePool, splats_before: int) -> list[str]:
+def _why(target: Target, found: Candidate, candidates: CandidatePool, splats_before: int) -> list[str]:
     """Return sentences on the coding of SH, the alternatives, and the number of pruned splats."""
-    codings = list(dict.fromkeys(_coding(trial) for trial in trials.made if trial.part is found.part))
+    codings = list(dict.fromkeys(_coding(one) for one in candidates.made if one.subset is found.subset))
     if found.quality is None:
         lines = [f"{_coding(found)}, at the precision of the preset {found.options.preset}"]
     else:
         lines = [f"{_coding(found)}; each attribute keeps {found.quality:.1f} dB by itself: all steps follow from that"]
-    if found.grades > 1:
-        lines.append(f"splats are sorted into {found.grades} grades by what pictures lose, each with steps of its own")
+    if found.class_count > 1:
+        lines.append(
+            f"splats are sorted into {found.class_count} grades by what pictures lose, each with steps of its own"
+        )
     others = [coding for coding in codings if coding != _coding(found)]
     if others:
         expected = "look worse" if target.size_bytes is not None else "take more"
         lines.append(f"tried for these splats, too, and expected to {expected}: {'; '.join(others)}")
     if target.psnr is not None and found.psnr > target.psnr + _FAR:
         lines.append("no smaller file of those tried reaches the target")
-    gone = splats_before - found.splats
-    if gone:
-        share = 100.0 * gone / splats_before
-        lines.append(
-            f"{counted(gone, 'splat')} ({share:.0f} %) left out, the others fitted to what the source looks like"
-        )
+    pruned_count = splats_before - found.splats
+    if pruned_count:
+        share = 100.0 * pruned_count / splats_before
+        splats = f"{counted(pruned_count, 'splat')} ({share:.0f} %)"
+        lines.append(f"{splats} left out, the others fitted to what the source looks like")
     return lines
 
 
-def _coding(trial: Candidate) -> str:
-    options = trial.result.report.options
+def _coding(candidate: Candidate) -> str:
+    options = candidate.result.report.options
     if options["sh_coding"] == "none":
-        return "no SH bands" if trial.part.model.sh_degree else "no SH to code"
+        return "no SH bands" if candidate.subset.model.sh_degree else "no SH to code"
     bands = f"SH degree {options['sh_degree']}"
     if options["sh_coding"] == "codebook":
         return f"{bands} by a codebook of {options['codebook_size']}"
     adaptive = " by importance" if options["adaptive"] == 1.0 else ""
     return f"{bands} value by value{adaptive}"
+
+
+def psnr_spread(errors: F64) -> float:
+    """Return one standard deviation of a PSNR over other choices of views, in dB, by jackknife.
+
+    Args:
+        errors: [V] mean squared error by view.
+    """
+    if len(errors) < 2 or errors.sum() == 0.0:
+        return math.nan
+    without = (errors.sum() - errors) / (len(errors) - 1)
+    decibels = 10.0 * np.log10(np.maximum(without, np.finfo(np.float64).tiny))
+    return float(np.sqrt((len(errors) - 1) * np.mean(np.square(decibels - decibels.mean()))))

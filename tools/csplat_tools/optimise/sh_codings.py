@@ -25,10 +25,8 @@ _BANDS_DROPPED = (
 _NONE_DROPPED = 1.0  # dB above the goal below which fewer bands are not tried; without SH at all, enough for a try
 _FIRST_TRIES, _TRIES = 4, 2  # largest number of files to bring the first coding, and others, near the goal
 _CLOSER = 3  # files that may bring the best coding nearer to the goal
-_GRADED = 1.0  # dB that quantisation classes gain, about
-_CODEBOOK_GAIN = (
-    0.7  # dB by which a file with a codebook is better than one of values coded one by one, at the same precision
-)
+_CLASSES_GAIN = 1.0  # dB that quantisation classes gain, about
+_CODEBOOK_GAIN = 0.7  # dB by which a codebook is better than values coded one by one, at the same precision
 _UNSURE = (0.02, 0.04)  # uncertainty of an expected cost, as a fraction of the bytes: on the goal, and per dB off it
 _FAR_OFF = 1.5  # dB: a codebook whose file is below the goal by more is too small, one above it by more too large
 _CLOSE = 0.1  # fraction of the bytes: a codebook whose cost exceeds the best by less may win with another size
@@ -41,70 +39,72 @@ class CodingSearch:
     Attributes:
         source: the scene.
         encoding: the caller's options; those that are set are not chosen here.
-        gradable: measurements exist by which splats can be sorted into quantisation classes.
+        classifiable: measurements exist by which splats can be sorted into quantisation classes.
     """
 
     source: SplatModel
     encoding: EncodeOptions
-    gradable: bool
+    classifiable: bool
     _truncated: dict[int, float] = field(default_factory=dict, init=False)
 
-    def usual(self, part: Subset, psnr: float = _SHARE_AT[0]) -> list[CodingChoice]:
+    def usual_codings(self, subset: Subset, psnr: float = _SHARE_AT[0]) -> list[CodingChoice]:
         """Return one coding of each kind that is possible: values one by one, a codebook, or none.
 
         Args:
-            part: the splats.
+            subset: the splats.
             psnr: approximate PSNR of files near the goal, dB.
         """
         if not self._degree or self.encoding.sh_coding == "none":
             return [CodingChoice("none")]
-        coarse = self.gradable and not part.refits and self.encoding.adaptive is None
+        coarse = self.classifiable and not subset.refits and self.encoding.adaptive is None
         scalar = CodingChoice("scalar", adaptive=_ADAPTIVE if coarse else None)
         kinds = {
             "scalar": [scalar],
-            "codebook": [CodingChoice("codebook", _share(psnr) * (_FITTED if part.refits else 1.0))],
+            "codebook": [CodingChoice("codebook", _share(psnr) * (_FITTED if subset.refits else 1.0))],
         }
         if self.encoding.sh_coding != "auto":
             return kinds[self.encoding.sh_coding]
-        huge = float(np.abs(self.source.shN).max(initial=0.0)) > _LARGEST_SH
-        plain = huge or self.encoding.preset == "fast"  # making a codebook for each precision takes too long
-        return [scalar] if plain else [scalar, *kinds["codebook"]]
+        is_extreme = float(np.abs(self.source.shN).max(initial=0.0)) > _LARGEST_SH
+        if is_extreme or self.encoding.preset == "fast":  # making a codebook for each precision takes too long
+            return [scalar]
+        return [scalar, *kinds["codebook"]]
 
-    def best(self, solver: PrecisionSearch, part: Subset, start: float, *, brief: bool = False) -> list[Candidate]:
+    def best(self, search: PrecisionSearch, subset: Subset, start: float, *, brief: bool = False) -> list[Candidate]:
         """Try the codings that may be best.
 
         Args:
-            solver: brings files near the goal.
-            part: the splats.
+            search: brings files near the goal.
+            subset: the splats.
             start: PSNR of each attribute for the first file, dB.
             brief: try only one coding of each kind.
 
         Returns:
             One file of each coding that was tried, the least costly first.
         """
-        tried = _TriedCodings(solver, part, start)
-        first, *others = self.usual(part, solver.goal.psnr or _SHARE_AT[0])
+        tried = _TriedCodings(search, subset, start)
+        first, *others = self.usual_codings(subset, search.goal.psnr or _SHARE_AT[0])
         tried.add(first)
         if others:
-            others = self.usual(part, tried.found[first].decided_psnr - solver.about(tried.found[first]))[1:]
+            goal = tried.found[first].validation_psnr - search.margin(tried.found[first])
+            others = self.usual_codings(subset, goal)[1:]
         for coding in others:
             tried.add(coding, sized=self.encoding.codebook_size is None)
         if brief:
             return tried.ordered()
         if self.encoding.codebook_size is None:
             for book in [coding for coding in tried.found if coding.sh == "codebook"]:
-                close = tried.add(book) < tried.add(tried.best) + (0.0 if part.refits else _CLOSE) + 1e-9
-                if close or tried.is_off(book):
+                close = tried.add(book) < tried.add(tried.best) + (0.0 if subset.refits else _CLOSE) + 1e-9
+                if close or tried.is_far_off(book):
                     tried.resize(book)
         if tried.best.adaptive is not None:
             tried.add(replace(tried.best, adaptive=None))
-        if not part.refits:
+        if not subset.refits:
             tried.bring_closer()
             if self.encoding.sh_degree is None and self.encoding.sh_coding != "none":
-                for degree in self._degrees(solver):
+                for degree in self._degrees(search):
                     tried.add(CodingChoice("none", degree=0) if degree == 0 else replace(tried.best, degree=degree))
-        if self.gradable and part.gradable:
-            tried.add(replace(tried.best, graded=False, adaptive=None), finer=_GRADED)
+        if self.classifiable and subset.classifiable:
+            tried.add(replace(tried.best, use_classes=False, adaptive=None), finer=_CLASSES_GAIN)
         return tried.ordered()
 
     @property
@@ -112,19 +112,19 @@ class CodingSearch:
         fixed = self.encoding.sh_degree
         return self.source.sh_degree if fixed is None else min(fixed, self.source.sh_degree)
 
-    def _degrees(self, solver: PrecisionSearch) -> list[int]:
+    def _degrees(self, search: PrecisionSearch) -> list[int]:
         """Return the SH degrees worth a try below the full one, by the PSNR of the unquantised scene at each."""
-        wanted = solver.goal.psnr
-        if wanted is None:
-            wanted = max((trial.decided_psnr for trial in solver.trials.made), default=0.0)
+        goal = search.goal.psnr
+        if goal is None:
+            goal = max((candidate.validation_psnr for candidate in search.candidates.made), default=0.0)
         found: set[int] = set()
         for degree in reversed(range(self._degree)):
             if degree not in self._truncated:
-                self._truncated[degree] = solver.trials.validation_scorer.psnr(drop_bands(self.source, degree))
-            shown = self._truncated[degree]
-            if shown <= wanted + _NONE_DROPPED:
+                self._truncated[degree] = search.candidates.validation_scorer.psnr(drop_bands(self.source, degree))
+            reached = self._truncated[degree]
+            if reached <= goal + _NONE_DROPPED:
                 break  # fewer bands have a lower PSNR
-            if shown >= wanted + _BANDS_DROPPED:
+            if reached >= goal + _BANDS_DROPPED:
                 found = {degree}
             elif degree == 0:
                 found.add(degree)
@@ -136,26 +136,26 @@ class _TriedCodings:
     """One file of each coding that was tried for some splats: near the goal, or as near as was worth it.
 
     Attributes:
-        solver: brings files near the goal.
-        part: the splats.
+        search: brings files near the goal.
+        subset: the splats.
         start: PSNR of each attribute for the first file, dB.
         found: the files.
     """
 
-    solver: PrecisionSearch
-    part: Subset
+    search: PrecisionSearch
+    subset: Subset
     start: float
     found: dict[CodingChoice, Candidate] = field(default_factory=dict, init=False)
 
     @property
     def best(self) -> CodingChoice:
         """The coding with the least expected cost; for a PSNR, codings too far from the goal to tell come last."""
-        unknown = {coding: self.solver.goal.size_bytes is None and self.is_off(coding) for coding in self.found}
-        return min(self.found, key=lambda coding: (unknown[coding], self.solver.expected(self.found[coding])))
+        unknown = {coding: self.search.goal.size_bytes is None and self.is_far_off(coding) for coding in self.found}
+        return min(self.found, key=lambda coding: (unknown[coding], self.search.expected_cost(self.found[coding])))
 
     def ordered(self) -> list[Candidate]:
         """Return the files, the least costly first."""
-        return sorted(self.found.values(), key=self.solver.cost)
+        return sorted(self.found.values(), key=self.search.cost)
 
     def add(self, coding: CodingChoice, *, finer: float = 0.0, sized: bool = True) -> float:
         """Try a coding, with a second file if the first one is promising, and return its expected cost.
@@ -165,22 +165,22 @@ class _TriedCodings:
             finer: approximate precision that it needs in addition to that of the best one so far, dB.
             sized: a codebook of another size may be tried later instead of other steps.
         """
-        solver, found = self.solver, self.found
+        search, found = self.search, self.found
         if not found:
-            found[coding] = solver.near(self.part, coding, self.start, _FIRST_TRIES)
+            found[coding] = search.find_near(self.subset, coding, self.start, _FIRST_TRIES)
         elif coding not in found:
-            known, quality = solver.expected(found[self.best]), self._quality() + finer
+            known, quality = search.expected_cost(found[self.best]), self._quality() + finer
             if coding.sh == "codebook" and all(one.sh != "codebook" for one in found):
                 quality -= _CODEBOOK_GAIN
-            found[coding] = trial = solver.near(self.part, coding, quality, 1)
-            unsure = _UNSURE[0] + _UNSURE[1] * abs(solver.about(trial))
-            if solver.expected(trial) < known + unsure and not (sized and self.is_off(coding)):
-                found[coding] = solver.near(self.part, coding, quality, _TRIES)
-        return solver.expected(found[coding])
+            found[coding] = candidate = search.find_near(self.subset, coding, quality, 1)
+            unsure = _UNSURE[0] + _UNSURE[1] * abs(search.margin(candidate))
+            if search.expected_cost(candidate) < known + unsure and not (sized and self.is_far_off(coding)):
+                found[coding] = search.find_near(self.subset, coding, quality, _TRIES)
+        return search.expected_cost(found[coding])
 
     def resize(self, book: CodingChoice) -> None:
         """Try smaller or larger codebooks, step by step as long as it pays; only one way if one is far off the goal."""
-        above, stalled = self.solver.about(self.found[book]), self.solver.is_stalled(self.found[book])
+        above, stalled = self.search.margin(self.found[book]), self.search.is_stalled(self.found[book])
         ways = ((1 / _SHARE_STEP, above < -_FAR_OFF or stalled), (_SHARE_STEP, above > _FAR_OFF))
         for factor in [factor for factor, is_wrong in ways if not is_wrong]:
             coding, gained = book, False
@@ -188,7 +188,7 @@ class _TriedCodings:
                 # If a codebook is too small for any precision, so are smaller ones, even if their files do not show
                 # it yet: go on to larger ones.
                 pays = self.add(after) < self.add(coding)
-                if not pays and not (factor > 1.0 and self.solver.is_stalled(self.found[after])):
+                if not pays and not (factor > 1.0 and self.search.is_stalled(self.found[after])):
                     break
                 coding, gained = after, gained or pays
             if gained:
@@ -198,22 +198,22 @@ class _TriedCodings:
         """Make more files of the best coding, until one is near enough to the goal for its cost to be trusted."""
         for _ in range(_CLOSER):
             best = self.best
-            self.found[best] = self.solver.closer(self.found[best])
+            self.found[best] = self.search.find_closer(self.found[best])
 
-    def is_off(self, coding: CodingChoice) -> bool:
+    def is_far_off(self, coding: CodingChoice) -> bool:
         """Return True if another codebook size is likelier to bring a coding near the goal than other steps."""
         if coding.share is None:
             return False
-        above = self.solver.about(self.found[coding])
+        above = self.search.margin(self.found[coding])
         share = coding.share * (_SHARE_STEP if above < 0.0 else 1 / _SHARE_STEP)
-        is_far = abs(above) > _FAR_OFF or self.solver.is_stalled(self.found[coding])
+        is_far = abs(above) > _FAR_OFF or self.search.is_stalled(self.found[coding])
         return is_far and _SHARES[0] <= share <= _SHARES[1]
 
     def _quality(self) -> float:
         """Return the PSNR of each attribute at which the best coding so far would meet the goal, dB."""
-        known = min(self.found.values(), key=self.solver.cost)
+        known = min(self.found.values(), key=self.search.cost)
         assert known.quality is not None
-        return known.quality - self.solver.about(known)
+        return known.quality - self.search.margin(known)
 
 
 def _resized(book: CodingChoice, factor: float) -> CodingChoice | None:

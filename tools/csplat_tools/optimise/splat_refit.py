@@ -1,4 +1,11 @@
-"""Refit kept splats to renders of the source, and choose the SH bands that they need."""
+"""Refit kept splats to renders of the source by gradient descent, and choose the SH bands that they need.
+
+Neighbours of pruned splats have to cover more, and errors of quantised values can be made up for by other values:
+colours, opacities, scales and rotations are fitted together, one small view after the other. The step length is
+proportional to the error. Least squares over all views at once (linear for colours alone) overfit the training views;
+descent does not: after three passes over the views it gains as much on held-out views. Centres are fixed: if they move,
+too, scenes with few views get worse.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +30,43 @@ from csplat_tools.optimise.rate_distortion import LEAST_QUANTISED, rate_exponent
 from csplat_trainer.parameters import Parameters, adam_step, from_model
 from csplat_trainer.tuning.tuned_scene import RateTerm, TunedScene
 
+#: Steps of a fit, and of the one after bands were left out.
+FIT_STEPS, BAND_STEPS = 960, 160
+#: Largest errors of bands 1, 2, 3 that are not worth their bits, as fractions of the scene's error per splat. At the
+#: optimum, a bit reduces the error by the same amount wherever it is spent: a splat has some 30 quantised values, whose
+#: error is half of the whole, and each bit takes 2 ln 2 of its value's error; bands of 9, 15 and 21 values take one and
+#: a half bits for each value.
+BAND_COST = (0.25, 0.4, 0.55)
+
+
+def choose_bands(pruning_error: PruningError, error: float) -> Mask:
+    """Return a mask of the bands to keep, [N, d].
+
+    Args:
+        pruning_error: errors of removing each band from the scene.
+        error: squared error of the scene per splat, summed over the views of `pruning_error`.
+
+    All bands of a splat that no view saw are kept.
+    """
+    costs = np.array(BAND_COST[: pruning_error.bands.shape[1]])
+    kept_bands: Mask = (pruning_error.bands > error * costs) | ~pruning_error.seen[:, None]
+    return kept_bands
+
+
+def coefficient_mask(kept_bands: Mask) -> Mask:
+    """Return a mask of the SH coefficients beyond the first that belong to kept bands, [N, (d + 1)² − 1]."""
+    columns = [np.zeros((len(kept_bands), 0), bool)]
+    columns += [
+        np.repeat(kept_bands[:, band - 1 : band], 2 * band + 1, axis=1) for band in range(1, kept_bands.shape[1] + 1)
+    ]
+    return np.concatenate(columns, axis=1)
+
+
+def drop_bands(model: SplatModel, kept_bands: Mask) -> SplatModel:
+    """Return the scene with zeros in the bands that are not kept."""
+    return replace(model, shN=model.shN * coefficient_mask(kept_bands)[:, :, None].astype(np.float32))
+
+
 #: Learning rates of the first steps per unit of the root mean square error, which counts up to `_LARGEST_ERROR`.
 _RATES = {"logits": 1.95, "scales": 0.39, "quats": 0.023, "sh0": 0.1, "shN": 0.04}
 _SH_FACTOR = 2.0  # factor of the step length for scenes without SH; not used through quantisers
@@ -38,7 +82,7 @@ _SAMPLE = 8  # every Nth view is rendered to measure the error
 def refit_splats(
     model: SplatModel,
     cameras: Sequence[Camera],
-    wanted: Sequence[F32],
+    references: Sequence[F32],
     options: SimplifyOptions,
     *,
     steps: int,
@@ -50,7 +94,7 @@ def refit_splats(
     Args:
         model: the scene.
         cameras: the views.
-        wanted: [H, W, 3], the reference image of each view.
+        references: [H, W, 3], the reference image of each view.
         options: background, seed of the order of views, threads.
         steps: number of steps, one view each.
         free: [N, K], mask of the SH coefficients beyond the first that may change; None for all.
@@ -59,16 +103,16 @@ def refit_splats(
     Returns:
         The scene; splats that no view shows are unchanged.
     """
-    scene, teaching = _FloatValues.of(model, free), _TrainingViews(cameras, wanted, options, model.antialiased)
+    values, views = _FloatValues.of(model, free), _TrainingViews(cameras, references, options, model.antialiased)
     factor = 1.0 if model.sh_degree else _SH_FACTOR
-    _descend(scene, teaching, steps, factor * _step_length(teaching.rms(scene.seen())), progress)
-    return scene.moved(model)
+    _descend(values, views, steps, factor * _step_length(views.rms(values.splats())), progress)
+    return values.applied_to(model)
 
 
 def quantisation_aware_refit(
-    frozen: FixedQuantisation,
+    fixed: FixedQuantisation,
     cameras: Sequence[Camera],
-    wanted: Sequence[F32],
+    references: Sequence[F32],
     options: SimplifyOptions,
     *,
     steps: int,
@@ -77,29 +121,90 @@ def quantisation_aware_refit(
     """Refit splats through the quantisers of a file, so that renders are those of the decoded file; its bytes count.
 
     Args:
-        frozen: the encoder's quantisation.
-        cameras, wanted, options, steps, progress: as for `refit_splats`.
+        fixed: the encoder's quantisation.
+        cameras, references, options, steps, progress: as for `refit_splats`.
 
     Returns:
         Values that `FixedQuantisation.coded` takes.
     """
-    model, scene = frozen.encode_plan.model, _QuantisedValues(TunedScene(frozen))
-    scene.tuned.parameters.beta2 = _BETA2
-    teaching = _TrainingViews(cameras, wanted, options, model.antialiased)
-    rms, removed = teaching.rms(scene.seen()), teaching.rms(model)
-    quantised = max(rms**2 - removed**2, LEAST_QUANTISED * rms**2)
+    model, values = fixed.encode_plan.model, _QuantisedValues(TunedScene(fixed))
+    values.tuned.parameters.beta2 = _BETA2
+    views = _TrainingViews(cameras, references, options, model.antialiased)
+    rms, pruning_rms = views.rms(values.splats()), views.rms(model)
+    quantised = max(rms**2 - pruning_rms**2, LEAST_QUANTISED * rms**2)
     if math.isfinite(quantised):
-        values = sum(picture.size for picture in wanted) / len(wanted)
+        value_count = sum(image.size for image in references) / len(references)
         # Growth of the error per saved fraction of the bytes; half of it, because views give half of its gradient.
-        scene.price = 0.5 * quantised * values / rate_exponent(_SLOPE)
-    _descend(scene, teaching, steps, _step_length(rms), progress)
-    return scene.tuned.held.copy()
+        values.lambda_ = 0.5 * quantised * value_count / rate_exponent(_SLOPE)
+    _descend(values, views, steps, _step_length(rms), progress)
+    return values.tuned.held.copy()
+
+
+@dataclass(frozen=True, eq=False)
+class RefitResult:
+    """A refitted scene.
+
+    Attributes:
+        model: the scene.
+        kept_bands: [N, d], mask of the SH bands that are kept; None if bands were not chosen.
+    """
+
+    model: SplatModel
+    kept_bands: Mask | None
+
+
+def refit_with_bands(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    references: Sequence[F32],
+    options: SimplifyOptions,
+    *,
+    band_views: int | None = None,
+    progress: Progress | None = None,
+) -> RefitResult:
+    """Refit the splats; set bands to zero that are not worth their bits, and refit the others once more.
+
+    Args:
+        model: the scene, with the source's values.
+        cameras: the views.
+        references: [H, W, 3], the source's render of each view.
+        options: `refit` and `bands`, effort, background.
+        band_views: number of views, from the first on, by which bands are chosen; `None`: all.
+        progress: progress callback.
+    """
+    if options.refit:
+        model = refit_splats(model, cameras, references, options, steps=options.steps(FIT_STEPS), progress=progress)
+    if not options.bands or not model.sh_degree:
+        return RefitResult(model, None)
+    error = 0.0
+
+    def add(number: int, picture: NDArray[np.float32]) -> None:
+        nonlocal error
+        error += float(np.sum(squared_error(references[number], picture)))
+
+    pruning_error = measure_pruning_error(
+        model,
+        cameras[:band_views],
+        background=options.background,
+        on_render=add,
+        threads=options.threads,
+        progress=progress,
+    )
+    kept_bands = choose_bands(pruning_error, error / max(1, len(model)))
+    if not kept_bands.all():
+        model = drop_bands(model, kept_bands)
+        if options.refit:
+            free = coefficient_mask(kept_bands)
+            model = refit_splats(
+                model, cameras, references, options, steps=options.steps(BAND_STEPS), free=free, progress=progress
+            )
+    return RefitResult(model, kept_bands)
 
 
 class _FittedValues(Protocol):
     """The values that are fitted, and the splats that are rendered from them."""
 
-    def seen(self) -> UncheckedSplats: ...
+    def splats(self) -> UncheckedSplats: ...
 
     def step(self, gradients: Gradients, rates: dict[str, float]) -> None: ...
 
@@ -108,24 +213,24 @@ class _TrainingViews:
     """Training views with their reference images."""
 
     def __init__(
-        self, cameras: Sequence[Camera], wanted: Sequence[F32], options: SimplifyOptions, antialiased: bool
+        self, cameras: Sequence[Camera], references: Sequence[F32], options: SimplifyOptions, antialiased: bool
     ) -> None:
-        self.cameras, self.wanted, self.seed = cameras, wanted, options.seed
+        self.cameras, self.references, self.seed = cameras, references, options.seed
         self.rasteriser = Rasteriser(threads=options.threads)
         self._background, self._antialiased = options.background, antialiased
 
-    def wrong(self, splats: HasSplats, view: int) -> F32:
+    def error_image(self, splats: HasSplats, view: int) -> F32:
         """Return the error of a view's render, [H, W, 3]: positive if it is too bright."""
-        drawn = self.rasteriser.forward(
+        render = self.rasteriser.forward(
             splats, self.cameras[view], background=self._background, antialiased=self._antialiased
         )
         # Straight-through gradient of the clipping: a colour above 1 is pulled back only if the reference is darker.
-        return np.clip(drawn.rgb, 0.0, 1.0) - np.clip(self.wanted[view], 0.0, 1.0)
+        return np.clip(render.rgb, 0.0, 1.0) - np.clip(self.references[view], 0.0, 1.0)
 
     def rms(self, splats: HasSplats) -> float:
         """Return the root mean square error over a sample of the views."""
         sample = range(0, len(self.cameras), _SAMPLE)
-        errors = [np.mean(np.square(self.wrong(splats, view), dtype=np.float64)) for view in sample]
+        errors = [np.mean(np.square(self.error_image(splats, view), dtype=np.float64)) for view in sample]
         return math.sqrt(np.mean(errors))
 
 
@@ -135,16 +240,16 @@ def _step_length(rms: float) -> float:
 
 
 def _descend(
-    scene: _FittedValues, teaching: _TrainingViews, steps: int, length: float, progress: Progress | None
+    values: _FittedValues, views: _TrainingViews, steps: int, length: float, progress: Progress | None
 ) -> None:
     """Fit the values of a scene by Adam."""
-    count = len(teaching.cameras)
-    rng = np.random.default_rng(teaching.seed)
+    count = len(views.cameras)
+    rng = np.random.default_rng(views.seed)
     order = np.concatenate([rng.permutation(count) for _ in range(-(-steps // count))])
     for step, view in enumerate(order[:steps]):
-        gradients = teaching.rasteriser.backward(teaching.wrong(scene.seen(), view))
+        gradients = views.rasteriser.backward(views.error_image(values.splats(), view))
         share = max(_LAST_RATE, 0.5 + 0.5 * math.cos(math.pi * (step + 1) / steps))
-        scene.step(gradients, {name: length * share * rate for name, rate in _RATES.items()})
+        values.step(gradients, {name: length * share * rate for name, rate in _RATES.items()})
         if progress is not None:
             progress("adjusting splats", (step + 1) / steps)
 
@@ -163,7 +268,7 @@ class _FloatValues:
         parameters.beta2 = _BETA2
         return cls(model.means, parameters, free)
 
-    def seen(self) -> UncheckedSplats:
+    def splats(self) -> UncheckedSplats:
         v = self.parameters.values
         return UncheckedSplats(self.means, v["quats"], v["scales"], self.parameters.alphas, v["sh0"], v["shN"])
 
@@ -175,7 +280,7 @@ class _FloatValues:
             gradients.shN[:] *= self.free[:, :, None]  # in place: the rasteriser's buffer, valid until its next pass
         adam_step(self.parameters, slopes, rates)
 
-    def moved(self, before: SplatModel) -> SplatModel:
+    def applied_to(self, before: SplatModel) -> SplatModel:
         """Return the scene with the splats that changed; the others, and any that overflowed, are kept bit for bit.
 
         No step may follow: the optimiser's state is released.
@@ -207,15 +312,15 @@ def _values_to_fit(model: SplatModel) -> dict[str, F32]:
 
 @dataclass(eq=False)
 class _QuantisedValues:
-    """Values that pass through quantisers; `price`: squared error of a render that all bits together are worth."""
+    """Values that pass through quantisers; `lambda_`: squared error of a render that all bits together are worth."""
 
     tuned: TunedScene
-    price: float = 0.0
+    lambda_: float = 0.0
     _alphas: F32 | None = None
     _seen: Any = None
     _costs: RateTerm | None = None
 
-    def seen(self) -> UncheckedSplats:
+    def splats(self) -> UncheckedSplats:
         self._seen = None  # as large as the scene
         self._seen, self._alphas = self.tuned.dequantise()
         s = self._seen
@@ -225,105 +330,7 @@ class _QuantisedValues:
         assert self._alphas is not None
         if self.tuned.parameters.step % _COUNT_EVERY == 0:
             costs, splats = self.tuned.count(self._seen, 1.0), len(self._alphas)
-            costs.weight = self.price * splats / (costs.bits + _CENTRE_BITS * splats)
+            costs.weight = self.lambda_ * splats / (costs.bits + _CENTRE_BITS * splats)
             self._costs = costs
         rates = {**rates, "means": 0.0, "sizes": rates["scales"]}
-        self.tuned.step(gradients, self._seen, self._alphas, rates, self._costs if self.price else None)
-
-
-#: Steps of a fit, and of the one after bands were left out.
-FIT_STEPS, BAND_STEPS = 960, 160
-
-
-@dataclass(frozen=True, eq=False)
-class RefitResult:
-    """A refitted scene.
-
-    Attributes:
-        model: the scene.
-        stays: [N, d], mask of the SH bands that are kept; None if bands were not chosen.
-    """
-
-    model: SplatModel
-    stays: Mask | None
-
-
-def refit_with_bands(
-    model: SplatModel,
-    cameras: Sequence[Camera],
-    wanted: Sequence[F32],
-    options: SimplifyOptions,
-    *,
-    deciding: int | None = None,
-    progress: Progress | None = None,
-) -> RefitResult:
-    """Refit the splats; set bands to zero that are not worth their bits, and refit the others once more.
-
-    Args:
-        model: the scene, with the source's values.
-        cameras: the views.
-        wanted: [H, W, 3], the source's render of each view.
-        options: `refit` and `bands`, effort, background.
-        deciding: number of views, from the first on, by which bands are chosen; `None`: all.
-        progress: progress callback.
-    """
-    if options.refit:
-        model = refit_splats(model, cameras, wanted, options, steps=options.steps(FIT_STEPS), progress=progress)
-    if not options.bands or not model.sh_degree:
-        return RefitResult(model, None)
-    error = 0.0
-
-    def add(number: int, picture: NDArray[np.float32]) -> None:
-        nonlocal error
-        error += float(np.sum(squared_error(wanted[number], picture)))
-
-    removal = measure_pruning_error(
-        model,
-        cameras[:deciding],
-        background=options.background,
-        on_render=add,
-        threads=options.threads,
-        progress=progress,
-    )
-    stays = choose_bands(removal, error / max(1, len(model)))
-    if not stays.all():
-        model = drop_bands(model, stays)
-        if options.refit:
-            free = coefficient_mask(stays)
-            model = refit_splats(
-                model, cameras, wanted, options, steps=options.steps(BAND_STEPS), free=free, progress=progress
-            )
-    return RefitResult(model, stays)
-
-
-#: Largest errors of bands 1, 2, 3 that are not worth their bits, as fractions of the scene's error per splat. At the
-#: optimum, a bit reduces the error by the same amount wherever it is spent: a splat has some 30 quantised values, whose
-#: error is half of the whole, and each bit takes 2 ln 2 of its value's error; bands of 9, 15 and 21 values take one and
-#: a half bits for each value.
-BAND_COST = (0.25, 0.4, 0.55)
-
-
-def choose_bands(removal: PruningError, error: float) -> Mask:
-    """Return a mask of the bands to keep, [N, d].
-
-    Args:
-        removal: removal errors of the scene that the bands belong to.
-        error: squared error of the scene per splat, summed over the views of `removal`.
-
-    All bands of a splat that no view saw are kept.
-    """
-    costs = np.array(BAND_COST[: removal.bands.shape[1]])
-    stays: Mask = (removal.bands > error * costs) | ~removal.seen[:, None]
-    return stays
-
-
-def coefficient_mask(stays: Mask) -> Mask:
-    """Return a mask of the SH coefficients beyond the first that belong to kept bands, [N, (d + 1)² − 1]."""
-    columns = [np.zeros((len(stays), 0), bool)]
-    columns += [np.repeat(stays[:, band - 1 : band], 2 * band + 1, axis=1) for band in range(1, stays.shape[1] + 1)]
-    return np.concatenate(columns, axis=1)
-
-
-def drop_bands(model: SplatModel, stays: Mask) -> SplatModel:
-    """Return the scene with zeros in the bands that are not kept."""
-    return replace(model, shN=model.shN * coefficient_mask(stays)[:, :, None].astype(np.float32))
+        self.tuned.step(gradients, self._seen, self._alphas, rates, self._costs if self.lambda_ else None)

@@ -52,19 +52,23 @@ PsnrOf = Callable[[SplatModel], float]
 
 _USUAL_BYTES = (8.0, 11.0)  # bytes per splat of files of useful quality, without and with SH
 _FRAME_BYTES = 1_000  # bytes of a file without splats: header, index, options, declared errors
-_MOST_REMOVED = 0.7  # largest fraction of the error allowed by a PSNR that pruning may take
-_LEAST_REMOVED = 0.01  # least fraction of the error that is attributed to pruning
-_REFIT_GAIN, _REFIT_GAIN_GROWS = (
-    8.0,
-    1.0,
-)  # dB by which a refit reduces the pruning error, about, and more with twice the work
+_MOST_PRUNED = 0.7  # largest fraction of the error allowed by a PSNR that pruning may take
+_LEAST_PRUNED = 0.01  # least fraction of the error that is attributed to pruning
+_REFIT_GAIN = (8.0, 1.0)  # dB by which a refit reduces the pruning error, about, and more with twice the work
 _FAR = 2.0  # multiple of the error allowed by a PSNR at which an order ends: splats together err by more than the sum
 _FARTHER = 4.0  # multiple of its error to which an order that was too short is continued
 _CALIBRATIONS = 3  # largest number of times that a first number of splats is corrected by validation views
 _AGREED = 0.05  # fraction of the splats: a correction below this ends them
-_GROWS = 0.85  # power of the pruning error with which the error after a refit grows, about
-_GROW = (0.5, 1.1)  # range of that power if it is taken from two fits
+_ERROR_POWER = 0.85  # power of the pruning error with which the error after a refit grows, about
+_ERROR_POWERS = (0.5, 1.1)  # range of that power if it is taken from two fits
 _NOTHING = 1e-12  # least mean squared error, to divide by
+_LEAST_FOR_CLASSES = 4_000  # least number of splats for quantisation classes: fewer are too similar
+_LEAST_REST = 0.2  # fraction of the fit's error that is at least left to bands and quantisation
+_MOST_BANDS = 0.7  # fraction of the error left by the fit that leaving out bands may take at most
+_BAND_TRIES, _FEWER_BANDS = 2, 4.0  # if they take more: number of tries, each with the bound divided by this factor
+_CARRIED_STEPS = 480  # steps of a fit that starts from the result of another
+_FILE_STEPS = 480  # steps of a fit through the quantisers of a file
+_SENSITIVITY_VIEWS = (120, 40)  # number of views to measure the sensitivity of splats, without and with SH
 
 
 @dataclass(eq=False)
@@ -75,19 +79,19 @@ class Pruner:
         source: the scene.
         views: the training and validation views.
         options: options of pruning and fitting.
-        grades: kept splats may be sorted into quantisation classes.
+        use_classes: kept splats may be sorted into quantisation classes.
         progress: progress callback.
         psnr: target PSNR, dB: the order ends far below it; `None`: another kind of target.
-        left: number of splats to keep, if the target specifies it: the order is made for that number.
+        kept_count: number of splats to keep, if the target specifies it: the order is made for that number.
     """
 
     source: SplatModel
     views: ViewSet
     options: SimplifyOptions
-    grades: bool
+    use_classes: bool
     progress: Progress | None
     psnr: float | None
-    left: int | None = None
+    kept_count: int | None = None
     _session: PruningSession | None = field(default=None, init=False)
     _fitted: RefittedSubset | None = field(default=None, init=False)
     _before: tuple[int, float] | None = field(default=None, init=False)
@@ -98,7 +102,7 @@ class Pruner:
         if self._session is None:
             allowed = math.inf if self.psnr is None else _FAR * error_of_psnr(self.psnr)
             self._session = prepare_pruning(
-                self.source, self.views, self.left, self.options, self.progress, allowed=allowed
+                self.source, self.views, self.kept_count, self.options, self.progress, allowed=allowed
             )
         return self._session
 
@@ -108,23 +112,25 @@ class Pruner:
         if self._session is None:
             return 0
         views, later = self._session.views, max(0, len(self._session.order.rounds) - 1)
-        return len(self._session.taught) + len(views.used) * later + len(views.check)
+        return len(self._session.training_cameras) + len(views.used) * later + len(views.check)
 
-    def fitted(self, left: int, allowed: float | None, seen: PsnrOf) -> RefittedSubset:
-        """Return `left` splats, refitted, but at least those that are never pruned, such as unseen ones.
+    def refit(self, kept_count: int, allowed: float | None, psnr_of: PsnrOf) -> RefittedSubset:
+        """Return `kept_count` splats, refitted, but at least those that are never pruned, such as unseen ones.
 
         Args:
-            left: number of splats to keep.
-            allowed, seen: as for `RefittedSubset`.
+            kept_count: number of splats to keep.
+            allowed, psnr_of: as for `RefittedSubset`.
         """
-        gone = len(self.source) - left
-        if gone > len(self.session.order.rows):
-            self._extend(left, math.inf)
-        gone = min(gone, len(self.session.order.rows))
-        self._fitted = RefittedSubset(self.session, gone, allowed, seen, self.grades, self.progress, self._fitted)
+        pruned_count = len(self.source) - kept_count
+        if pruned_count > len(self.session.order.rows):
+            self._extend(kept_count, math.inf)
+        pruned_count = min(pruned_count, len(self.session.order.rows))
+        self._fitted = RefittedSubset(
+            self.session, pruned_count, allowed, psnr_of, self.use_classes, self.progress, self._fitted
+        )
         return self._fitted
 
-    def first_at_psnr(self, psnr: float, slope: float, seen: PsnrOf) -> int:
+    def first_at_psnr(self, psnr: float, slope: float, psnr_of: PsnrOf) -> int:
         """Return the number of splats to begin with for the smallest file of a PSNR.
 
         Validation views show more or less of the pruning error than training views; this is measured and corrected.
@@ -132,79 +138,83 @@ class Pruner:
         Args:
             psnr: target PSNR, dB.
             slope: fraction of the bytes that a decibel costs.
-            seen: measures the PSNR of some of the source's splats on the validation views, dB.
+            psnr_of: measures the PSNR of some of the source's splats on the validation views, dB.
         """
-        return self._calibrated(_at_psnr(psnr, slope), seen)
+        return self._calibrated(_at_psnr(psnr, slope), psnr_of)
 
-    def first_at_size(self, size_bytes: int, near: tuple[int, float] | None, slope: float, seen: PsnrOf) -> int:
+    def first_at_size(self, size_bytes: int, near: tuple[int, float] | None, slope: float, psnr_of: PsnrOf) -> int:
         """Return the number of splats to begin with for the best file of a size.
 
         Args:
             size_bytes: size of the file.
             near: number of splats and PSNR in dB of a file of about that size; `None`: there is none.
-            slope, seen: as for `first_at_psnr`.
+            slope, psnr_of: as for `first_at_psnr`.
         """
         if near is None:
             usual = (size_bytes - _FRAME_BYTES) / _USUAL_BYTES[self.source.sh_degree > 0]
             return max(1, min(len(self.source), int(usual)))
-        return self._calibrated(_at_size(near[0], error_of_psnr(near[1]), slope), seen)
+        return self._calibrated(_at_size(near[0], error_of_psnr(near[1]), slope), psnr_of)
 
-    def next_at_psnr(self, left: int, fitted_psnr: float, psnr: float, slope: float) -> tuple[int, float]:
+    def next_at_psnr(self, kept_count: int, fitted_psnr: float, psnr: float, slope: float) -> tuple[int, float]:
         """Predict the number of splats for the smallest file of a PSNR, and the saving as a logarithm of bytes.
 
         Args:
-            left: number of splats of the last fit.
+            kept_count: number of splats of the last fit.
             fitted_psnr: their PSNR before quantisation, dB.
             psnr, slope: as for `first_at_psnr`.
         """
-        removed = max(error_of_psnr(fitted_psnr), _LEAST_REMOVED * error_of_psnr(psnr))
-        before, self._before = self._before, (left, removed)
-        return self._next(_at_psnr(psnr, slope), (left, removed), self._growing(before, (left, removed)))
+        removed = max(error_of_psnr(fitted_psnr), _LEAST_PRUNED * error_of_psnr(psnr))
+        before, self._before = self._before, (kept_count, removed)
+        return self._next(
+            _at_psnr(psnr, slope), (kept_count, removed), self._error_growth(before, (kept_count, removed))
+        )
 
-    def next_at_size(self, left: int, fitted_psnr: float, psnr: float, slope: float) -> tuple[int, float]:
+    def next_at_size(self, kept_count: int, fitted_psnr: float, psnr: float, slope: float) -> tuple[int, float]:
         """Predict the number of splats for the best file of a size, and the gain as a logarithm of bytes.
 
         Args:
-            left: number of splats of a file of that size.
+            kept_count: number of splats of a file of that size.
             fitted_psnr: their PSNR before quantisation, dB.
             psnr: PSNR of the file, dB.
             slope: as for `first_at_psnr`.
         """
         error = error_of_psnr(psnr)
-        removed = max(min(error_of_psnr(fitted_psnr), error), _LEAST_REMOVED * error)
+        removed = max(min(error_of_psnr(fitted_psnr), error), _LEAST_PRUNED * error)
         quantised = max(error - removed, LEAST_QUANTISED * error)
-        return self._next(_at_size(left, quantised, slope), (left, removed), _GROWS)
+        return self._next(_at_size(kept_count, quantised, slope), (kept_count, removed), _ERROR_POWER)
 
     def _next(self, cost: Cost, known: tuple[int, float], power: float) -> tuple[int, float]:
         """Return the number of kept splats with the least cost, and by how much it is below the known one."""
-        left, least = self._least(cost, known, power)
-        return left, float(cost(*map(np.atleast_1d, known))[0]) - least
+        kept_count, least = self._least(cost, known, power)
+        return kept_count, float(cost(*map(np.atleast_1d, known))[0]) - least
 
-    def _calibrated(self, cost: Cost, seen: PsnrOf) -> int:
-        mends = error_of_psnr(self._mended)
-        left, _ = self._least(cost, None)
+    def _calibrated(self, cost: Cost, psnr_of: PsnrOf) -> int:
+        gain = error_of_psnr(self._refit_gain)
+        kept_count, _ = self._least(cost, None)
         for _ in range(_CALIBRATIONS):
-            if left == len(self.source):
+            if kept_count == len(self.source):
                 break
-            rows = self.session.pruned(len(self.source) - left)
-            seen_error = mends * error_of_psnr(seen(self.source.select(rows)))
-            before, (left, _) = left, self._least(cost, (left, seen_error))
-            if abs(left - before) <= _AGREED * before:
+            rows = self.session.kept_rows(len(self.source) - kept_count)
+            validation_error = gain * error_of_psnr(psnr_of(self.source.select(rows)))
+            before, (kept_count, _) = kept_count, self._least(cost, (kept_count, validation_error))
+            if abs(kept_count - before) <= _AGREED * before:
                 break
-        return left
+        return kept_count
 
-    def _growing(self, before: tuple[int, float] | None, known: tuple[int, float]) -> float:
+    def _error_growth(self, before: tuple[int, float] | None, known: tuple[int, float]) -> float:
         """Return the power with which the error after a refit grows with the pruning error, from two fits.
 
         Args:
             before, known: number of splats and mean squared error of two fits; `None`: there was only one.
         """
         if before is None or before[0] == known[0]:
-            return _GROWS
+            return _ERROR_POWER
         removed = math.log(self._error(known[0]) / self._error(before[0]))
-        return min(max(math.log(known[1] / before[1]) / removed, _GROW[0]), _GROW[1]) if removed else _GROWS
+        if not removed:
+            return _ERROR_POWER
+        return min(max(math.log(known[1] / before[1]) / removed, _ERROR_POWERS[0]), _ERROR_POWERS[1])
 
-    def _least(self, cost: Cost, known: tuple[int, float] | None, power: float = _GROWS) -> tuple[int, float]:
+    def _least(self, cost: Cost, known: tuple[int, float] | None, power: float = _ERROR_POWER) -> tuple[int, float]:
         """Return the number of kept splats with the least cost, and that cost.
 
         Args:
@@ -214,37 +224,38 @@ class Pruner:
         """
         while True:
             errors = self._errors()
-            left = len(self.source) - np.arange(len(errors), dtype=np.float64)
-            fitted = error_of_psnr(self._mended) * errors
+            kept_count = len(self.source) - np.arange(len(errors), dtype=np.float64)
+            fitted = error_of_psnr(self._refit_gain) * errors
             if known is not None:
                 fitted = known[1] * np.power(errors / self._error(known[0]), power)
-            costs = cost(left, fitted)
+            costs = cost(kept_count, fitted)
             best = int(np.argmin(costs))
-            if best < len(errors) - 1 or not self._goes_on():
-                return int(left[best]), float(costs[best])
+            if best < len(errors) - 1 or not self._try_extending():
+                return int(kept_count[best]), float(costs[best])
 
     @property
-    def _mended(self) -> float:
-        return _REFIT_GAIN + _REFIT_GAIN_GROWS * math.log2(self.options.work)
+    def _refit_gain(self) -> float:
+        return _REFIT_GAIN[0] + _REFIT_GAIN[1] * math.log2(self.options.work)
 
-    def _goes_on(self) -> bool:
+    def _try_extending(self) -> bool:
         """Continue the pruning order until its error is several times as large; return False if it cannot be."""
         before = self.session.order
         self._extend(None, _FARTHER * float(before.errors.sum()))
         return len(self.session.order.rows) > len(before.rows)
 
-    def _extend(self, left: int | None, enough: float) -> None:
+    def _extend(self, kept_count: int | None, enough: float) -> None:
         """Continue the pruning order, see `find_pruning_order`."""
         session = self.session
         order = find_pruning_order(
-            self.source, session.sides, session.options, left, self.progress, enough=enough, start=session.order
-        )
+            self.source, session.view_groups, session.options, kept_count, self.progress, enough=enough,
+            start=session.order,
+        )  # fmt: skip
         self._session = replace(session, order=order)
 
-    def _error(self, left: int) -> float:
-        """Return the predicted mean squared error of pruning all but `left` splats."""
+    def _error(self, kept_count: int) -> float:
+        """Return the predicted mean squared error of pruning all but `kept_count` splats."""
         errors = self._errors()
-        return max(float(errors[min(len(self.source) - left, len(errors) - 1)]), _NOTHING)
+        return max(float(errors[min(len(self.source) - kept_count, len(errors) - 1)]), _NOTHING)
 
     def _errors(self) -> F64:
         session = self.session
@@ -253,22 +264,13 @@ class Pruner:
 
 
 def _at_psnr(psnr: float, slope: float) -> Cost:
-    return lambda left, removed: log_bytes_at_error(left, removed, error_of_psnr(psnr), _MOST_REMOVED, slope)
+    return lambda kept_count, removed: log_bytes_at_error(kept_count, removed, error_of_psnr(psnr), _MOST_PRUNED, slope)
 
 
 def _at_size(splats: int, quantised: float, slope: float) -> Cost:
     # As a logarithm of bytes, as for a PSNR.
     power = rate_exponent(slope)
-    return lambda left, removed: power * np.log(error_at_size(left / splats, removed, quantised, slope))
-
-
-_GRADED = 4_000  # least number of splats for quantisation classes: fewer are too similar
-_LEAST_LEFT = 0.2  # fraction of the fit's error that is at least left to bands and quantisation
-_MOST_BANDS = 0.7  # fraction of the error left by the fit that leaving out bands may take at most
-_BAND_TRIES, _FEWER_BANDS = 2, 4.0  # if they take more: number of tries, each with the bound divided by this factor
-_CARRIED_STEPS = 480  # steps of a fit that starts from the result of another
-_FILE_STEPS = 480  # steps of a fit through the quantisers of a file
-_SENSITIVITY_VIEWS = (120, 40)  # number of views to measure the sensitivity of splats, without and with SH
+    return lambda kept_count, removed: power * np.log(error_at_size(kept_count / splats, removed, quantised, slope))
 
 
 @dataclass(eq=False)
@@ -277,20 +279,20 @@ class RefittedSubset:
 
     Attributes:
         session: the scene, its views, and the pruning order of its splats.
-        gone: number of pruned splats.
+        pruned_count: number of pruned splats.
         allowed: PSNR that files are to have on the validation views, dB: the error that the fit leaves below it
             determines which SH bands are worth their bits; `None`: the fit's own error does.
-        seen: measures the PSNR of some splats on the validation views, dB.
-        grades: the splats may be sorted into quantisation classes, if there are enough.
+        psnr_of: measures the PSNR of some splats on the validation views, dB.
+        use_classes: the splats may be sorted into quantisation classes, if there are enough.
         progress: progress callback.
         before: a fit with another number of splats, from which this one starts.
     """
 
     session: PruningSession
-    gone: int
+    pruned_count: int
     allowed: float | None
-    seen: PsnrOf
-    grades: bool
+    psnr_of: PsnrOf
+    use_classes: bool
     progress: Progress | None
     before: RefittedSubset | None = None
     refits: bool = True
@@ -301,12 +303,12 @@ class RefittedSubset:
     @cached_property
     def rows(self) -> I64:
         """[N] int64, the source splats that are kept."""
-        return self.session.pruned(self.gone)
+        return self.session.kept_rows(self.pruned_count)
 
     @property
-    def gradable(self) -> bool:
-        """True if the splats may be sorted into quantisation classes: `grades` is set, and there are enough."""
-        return self.grades and len(self.rows) >= _GRADED
+    def classifiable(self) -> bool:
+        """True if the splats may be sorted into quantisation classes: `use_classes` is set, and there are enough."""
+        return self.use_classes and len(self.rows) >= _LEAST_FOR_CLASSES
 
     @property
     def model(self) -> SplatModel:
@@ -316,7 +318,7 @@ class RefittedSubset:
     @cached_property
     def fitted_psnr(self) -> float:
         """PSNR of the refitted splats, with all bands, on the validation views, dB."""
-        return self.seen(self.model)
+        return self.psnr_of(self.model)
 
     @cached_property
     def banded(self) -> tuple[SplatModel, Mask | None]:
@@ -324,103 +326,102 @@ class RefittedSubset:
         session, model = self.session, self.model
         if not session.options.bands or not model.sh_degree:
             return model, None
-        error, most = error_of_psnr(session.checked.psnr(model)), math.inf
+        error, most = error_of_psnr(session.check_scorer.psnr(model)), math.inf
         if self.allowed is not None:  # training and validation views see errors of different size
             fitted, allowed = error_of_psnr(self.fitted_psnr), error_of_psnr(self.allowed)
-            error *= max(allowed / fitted - 1.0, _LEAST_LEFT)
-            most = max(fitted + _MOST_BANDS * (allowed - fitted), (1.0 + _LEAST_LEFT) * fitted)
-        banded, stays = self._left_out(error)
+            error *= max(allowed / fitted - 1.0, _LEAST_REST)
+            most = max(fitted + _MOST_BANDS * (allowed - fitted), (1.0 + _LEAST_REST) * fitted)
+        banded, kept_bands = self._without_bands(error)
         for _ in range(0 if self.allowed is None else _BAND_TRIES):
-            if error_of_psnr(self.seen(banded)) <= most:
+            if error_of_psnr(self.psnr_of(banded)) <= most:
                 break
             error /= _FEWER_BANDS
             del banded  # as large as the scene
-            banded, stays = self._left_out(error)
-        return banded, stays
+            banded, kept_bands = self._without_bands(error)
+        return banded, kept_bands
 
     @property
-    def shown(self) -> SplatModel:
+    def unquantised(self) -> SplatModel:
         """The splats that are quantised: refitted, without the bands that are left out."""
         return self.banded[0]
 
     @property
     def psnr(self) -> float:
-        """PSNR of `shown` on the validation views, dB."""
+        """PSNR of `unquantised` on the validation views, dB."""
         return self._banded_psnr  # pyright does not take a cached property for the protocol's
 
-    def coded(self, options: EncodeOptions, *, graded: bool, quick: bool) -> EncodedTiles:
-        """Quantise and code the splats; unless `quick`, they are refitted through the quantisers before."""
+    def coded(self, options: EncodeOptions, *, use_classes: bool, quick: bool) -> EncodedTiles:
+        """Quantise and code the splats; unless `quick`, refit them through the quantisers before."""
         session, refit = self.session, self.session.options.refit
         start = self.banded[0]
-        draft = EncodePlan.of(
-            start, options, importance=self._importance(options, graded=graded),
+        plan = EncodePlan.of(
+            start, options, importance=self._importance(options, use_classes=use_classes),
             origin=Origin(len(session.source), self.rows, refitted=refit, adjusted=refit),
             progress=self.progress,
         )  # fmt: skip
         if quick or not refit:
-            return encode_tiles(draft, progress=self.progress)
-        frozen = fix_quantisation(draft, session.source, self.progress)
-        held = quantisation_aware_refit(
-            frozen, session.taught, session.wanted, session.options, steps=session.options.steps(_FILE_STEPS),
-            progress=self.progress,
+            return encode_tiles(plan, progress=self.progress)
+        fixed = fix_quantisation(plan, session.source, self.progress)
+        values = quantisation_aware_refit(
+            fixed, session.training_cameras, session.references, session.options,
+            steps=session.options.steps(_FILE_STEPS), progress=self.progress,
         )  # fmt: skip
-        shown = [
-            replace(start, **vars(frozen.dequantise(values)), means_double=None) for values in (frozen.start(), held)
-        ]
-        if self.seen(shown[1]) < self.seen(shown[0]):  # steps of this length may be too long for a handful of splats
-            held, shown = frozen.start(), shown[:1]
-        self._check_psnr = session.checked.psnr(shown[-1])
-        return frozen.encode(held, self.progress)
+        models = [replace(start, **vars(fixed.dequantise(one)), means_double=None) for one in (fixed.start(), values)]
+        if self.psnr_of(models[1]) < self.psnr_of(models[0]):  # steps may be too long for a handful of splats
+            values, models = fixed.start(), models[:1]
+        self._check_psnr = session.check_scorer.psnr(models[-1])
+        return fixed.encode(values, self.progress)
 
-    def said(self, trial: Candidate | None) -> Mapping[str, Any]:
+    def options_entry(self, candidate: Candidate | None) -> Mapping[str, Any]:
         """Return the entry for a file's options: splats of the source, number of views, and PSNRs of the file."""
         session = self.session
-        said = {"splats": len(session.source), "views": len(session.taught)}
-        figures = {} if trial is None else {"decided_psnr": round(trial.decided_psnr, 3)}
-        if trial is not None and trial.is_careful:
+        entry = {"splats": len(session.source), "views": len(session.training_cameras)}
+        figures = {} if candidate is None else {"decided_psnr": round(candidate.validation_psnr, 3)}
+        if candidate is not None and candidate.is_final:
             figures["check_psnr"] = round(self._check_psnr, 3)
-        return {"simplified": {**said, **figures}}
+        return {"simplified": {**entry, **figures}}
 
     @cached_property
     def _banded_psnr(self) -> float:
-        return self.seen(self.banded[0])
+        return self.psnr_of(self.banded[0])
 
     @cached_property
     def _fitted(self) -> SplatModel:
         session, steps = self.session, FIT_STEPS
         start = session.source.select(self.rows)
-        if not (session.options.refit and self.gone):
+        if not (session.options.refit and self.pruned_count):
             return start
         if self.before is not None:
             start, steps = _with_values_of(self.before.model, self.before.rows, start, self.rows), _CARRIED_STEPS
         self.before = None  # as large as the scene, and perhaps not used elsewhere
-        return self._adjusted(start, steps)
+        return self._refitted(start, steps)
 
-    def _left_out(self, error: float) -> tuple[SplatModel, Mask]:
+    def _without_bands(self, error: float) -> tuple[SplatModel, Mask]:
         """Return the splats without the bands that are not worth their bits at a squared error, and the kept bands."""
         session, model = self.session, self.model
-        stays = choose_bands(self._removal, error * self._removal.value_count / max(1, len(model)))
-        banded = drop_bands(model, stays)
-        if session.options.refit and not stays.all():
-            banded = self._adjusted(banded, BAND_STEPS, coefficient_mask(stays))
-        return banded, stays
+        kept_bands = choose_bands(self._pruning_error, error * self._pruning_error.value_count / max(1, len(model)))
+        banded = drop_bands(model, kept_bands)
+        if session.options.refit and not kept_bands.all():
+            banded = self._refitted(banded, BAND_STEPS, coefficient_mask(kept_bands))
+        return banded, kept_bands
 
-    def _adjusted(self, model: SplatModel, steps: int, free: Mask | None = None) -> SplatModel:
+    def _refitted(self, model: SplatModel, steps: int, free: Mask | None = None) -> SplatModel:
         """Refit the splats; with `free`, only these SH coefficients beyond the first."""
         session = self.session
         return refit_splats(
-            model, session.taught, session.wanted, session.options, steps=session.options.steps(steps), free=free,
-            progress=self.progress,
+            model, session.training_cameras, session.references, session.options,
+            steps=session.options.steps(steps), free=free, progress=self.progress,
         )  # fmt: skip
 
-    def _importance(self, options: EncodeOptions, *, graded: bool) -> NDArray[Any] | Importance:
-        if graded and max_class_count(len(self.rows), options) > 1 and (self.gradable or options.grades is not None):
+    def _importance(self, options: EncodeOptions, *, use_classes: bool) -> NDArray[Any] | Importance:
+        has_classes = use_classes and max_class_count(len(self.rows), options) > 1
+        if has_classes and (self.classifiable or options.grades is not None):
             return self._measured
-        weights = self._removal.squared_weight
+        weights = self._pruning_error.squared_weight
         return replace(self._measured, blocks=None) if options.shape_codebook_size else weights
 
     @cached_property
-    def _removal(self) -> PruningError:
+    def _pruning_error(self) -> PruningError:
         """The error of removing each splat and each of its SH bands, and the weights of their colours."""
         session = self.session
         return measure_pruning_error(
@@ -436,7 +437,7 @@ class RefittedSubset:
             self.model, evenly_spaced(session.views.used, count), background=session.options.background,
             magnitudes=False, threads=session.options.threads, progress=self.progress,
         )  # fmt: skip
-        return replace(StoredSensitivity.of(self.model, found).importance(), sh=self._removal.squared_weight)
+        return replace(StoredSensitivity.of(self.model, found).importance(), sh=self._pruning_error.squared_weight)
 
 
 def _with_values_of(before: SplatModel, its_rows: I64, start: SplatModel, rows: I64) -> SplatModel:

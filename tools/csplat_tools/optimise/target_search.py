@@ -1,4 +1,10 @@
-"""Search for the smallest file at a PSNR or a loss, or the best one within a size."""
+"""Search for the smallest file at a PSNR or a loss, or the best one within a size.
+
+The search chooses the precision, from which all steps follow; the SH bands and their coding; quantisation classes; and
+the number of splats, which are refitted to renders of the source after pruning. Every kind of file is brought near the
+goal by a few tries, and compared by its expected cost there; the best are brought onto the goal, and compared with the
+presets' own files. Nothing is tried that is not expected to pay.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +23,7 @@ from csplat_render.metrics import PSNR_CAP, psnr_of_mse
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import scene_frame
 from csplat_tools.optimise.candidates import Candidate, CandidatePool, CodingChoice, Weights, WholeScene
-from csplat_tools.optimise.precision_search import TUNING_GAINS, PrecisionSearch, SearchGoal, clip_quality
+from csplat_tools.optimise.precision_search import REFIT_GAIN, PrecisionSearch, SearchGoal, clip_quality
 from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.optimise.rate_distortion import BYTES_PER_DB, error_of_psnr
 from csplat_tools.optimise.scene_sensitivity import complete_importance
@@ -32,6 +38,23 @@ from csplat_tools.views.view_sets import render_seconds
 #: and with it, a fixed part and one that grows with the effort (plane3 at 40 dB, effort 1, 3 and 7: as 0.6 to 1 to 4).
 _RENDERS = 520.0
 _RENDERS_WITH_PRUNING = (600.0, 2400.0)
+_ATTRIBUTE_GAIN = (5.0, 8.5)  # dB from the PSNR of all attributes to that of each alone, at 30 dB, without and with SH
+_ATTRIBUTE_GAIN_GROWS = (0.0, 0.22)  # dB that this grows with every dB above 30, without and with SH
+_USUAL = (7.0, 42.0)  # usual bytes per splat, and the PSNR of each attribute in such files
+_COUNTS = 3  # numbers of splats for which a fit is made; up to twice as many until there is a file
+_WORTH = 0.02  # fraction of the bytes: a number of splats that is predicted to save less is not worth a fit
+_CLOSE = 0.04  # fraction of the splats: a number that differs less from one that was tried is not worth a fit
+_SPARE = 0.7  # dB above the goal: a fit whose PSNR is lower leaves too little of the error to quantisation
+_FEWER = 0.7  # factor from one number of splats to a smaller one if none of its files fits the size
+_ALL_BUT = 0.02  # fraction of the splats: pruning fewer is not worth a fit
+_LEAST_REST = 0.15  # fraction of the allowed error that is at least left to quantisation
+_WITHIN_REACH = 0.1  # fraction of the bytes that another coding may save
+_PAYS = 0.01  # fraction of the bytes: a file that is expected to take this much more may turn out smaller
+_PAYS_FOR_REFIT = 0.03  # fraction of the bytes that pruned splats have to promise: their files take a fit each
+_COMMON = 0.1  # fraction of the bytes: largest excess of one refitted file that is expected of the others, too
+_FAR = 0.03  # fraction of the bytes: presets are not tried if files of all splats cost this much more than the best
+_BANDS_GROW = (34.0, 0.055)  # dB above which splats with SH are cheaper to keep, and by which fraction per dB
+_PRESETS = (-1.0, 2.5)  # dB above the goal: presets whose own files are expected in this range are tried
 _INSIDE_REMARK = (
     "virtual views decided which splats go: cameras inside of surroundings may see more of those than these do;"
     " --data, or --cameras with 40 of them, would decide by yours, --no-prune leaves all"
@@ -61,16 +84,16 @@ def search_target(
         InputError: the target is out of reach, no splat shows, or a loss is requested without photographs.
     """
     views = with_validation_views(views)
-    judge = views.test_scorer(source, threads=encoding.threads)
-    if views.name != VIRTUAL and _is_empty(judge):
+    test_scorer = views.test_scorer(source, threads=encoding.threads)
+    if views.name != VIRTUAL and _is_empty(test_scorer):
         raise InputError("no splat shows in the views given: are these cameras of this scene?")
     inside = views.virtual and scene_frame(source).kind == "surrounding"
-    removal = None
+    pruner = None
     if not _keeps_all(target, encoding, no_prune=no_prune):
         how = replace(simplifying or SimplifyOptions(), background=views.background, threads=encoding.threads)
-        left = None if target.keep is None else target.count(len(source))
-        removal = Pruner(
-            source, views, how, grades=not inside, progress=progress, psnr=target.psnr, left=left
+        kept_count = None if target.keep is None else target.count(len(source))
+        pruner = Pruner(
+            source, views, how, use_classes=not inside, progress=progress, psnr=target.psnr, kept_count=kept_count
         )  # fmt: skip
     photographs = None
     if target.max_psnr_drop is not None:
@@ -78,9 +101,11 @@ def search_target(
             raise InputError("a largest loss wants photographs (--data): it is lost against them")
         photographs = views.photograph_validation_scorer(threads=encoding.threads)
     validation_scorer = views.validation_scorer(source, threads=encoding.threads)
-    trials, sensitivity_views = CandidatePool(encoding, judge, validation_scorer, photographs, progress=progress), 0
-    if removal is not None and removal.left is not None:
-        found = TargetSearch.kept(trials, removal, removal.left)
+    candidates = CandidatePool(encoding, test_scorer, validation_scorer, photographs, progress=progress)
+    sensitivity_views = 0
+    if pruner is not None and pruner.kept_count is not None:
+        subset = pruner.refit(pruner.kept_count, None, validation_scorer.psnr)
+        found = candidates.make(subset, CodingChoice(None), None, quick=False)
     else:
         goal = find_goal(target, source, photographs)
         measured, sensitivity_views = complete_importance(
@@ -88,14 +113,14 @@ def search_target(
         )
         whole = WholeScene(source, importance, measured, progress)
         found = TargetSearch(
-            PrecisionSearch(trials, goal), CodingSearch(source, encoding, measured is not None), whole, removal
+            PrecisionSearch(candidates, goal), CodingSearch(source, encoding, measured is not None), whole, pruner
         ).best()
     photo = _photograph_psnr(source, found, views, encoding.threads) if views.photographs else {}
     report = make_report(
-        target, found, trials, splats_before=len(source), views_of=views.name,
-        remarks=[_INSIDE_REMARK] * (inside and found.splats < len(source)), encodes=len(trials.made), seconds=0.0,
+        target, found, candidates, splats_before=len(source), views_of=views.name,
+        remarks=[_INSIDE_REMARK] * (inside and found.splats < len(source)), encodes=len(candidates.made), seconds=0.0,
         photographs=photo, sensitivity_views=sensitivity_views,
-        removal_views=0 if removal is None else removal.view_count,
+        removal_views=0 if pruner is None else pruner.view_count,
         elsewhere=_psnr_elsewhere(source, found, views, encoding.threads),
         reached={name: found.result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
     )  # fmt: skip
@@ -115,8 +140,8 @@ def expected_seconds(
 
     Renders some test views to measure their time: the search costs about a fixed number of such renders on any machine.
     """
-    pictures = expected_renders(encoding, target, no_prune=no_prune, simplifying=simplifying)
-    return pictures * render_seconds(source, views.test, threads=encoding.threads)
+    renders = expected_renders(encoding, target, no_prune=no_prune, simplifying=simplifying)
+    return renders * render_seconds(source, views.test, threads=encoding.threads)
 
 
 def expected_renders(
@@ -148,25 +173,25 @@ def check_target(source: SplatModel, target: Target, encoding: EncodeOptions, *,
         raise InputError("a share of the splats is to stay, and all of them: give one of the two")
 
 
-def _is_empty(judge: Scorer) -> bool:
+def _is_empty(scorer: Scorer) -> bool:
     """Return True if every test image has a single colour."""
-    pictures = (judge.reference(number).rgb for number in range(len(judge.cameras)))
-    return all(np.ptp(picture, axis=(0, 1)).max() == 0.0 for picture in pictures)
+    images = (scorer.reference(number).rgb for number in range(len(scorer.cameras)))
+    return all(np.ptp(image, axis=(0, 1)).max() == 0.0 for image in images)
 
 
 def _psnr_elsewhere(source: SplatModel, found: Candidate, views: ViewSet, threads: int | None) -> dict[str, float]:
     """Return the PSNR from views that had no part in the search, by kind."""
-    model, judged = decode(found.result.data), extra_test_cameras(source).items()
+    model, groups = decode(found.result.data), extra_test_cameras(source).items()
     return {
         kind: round(Scorer.of_source(source, cameras, views.background, threads=threads).psnr(model), 3)
-        for kind, cameras in judged
+        for kind, cameras in groups
     }
 
 
 def _photograph_psnr(source: SplatModel, found: Candidate, views: ViewSet, threads: int | None) -> dict[str, float]:
     """Return the PSNR of file and source against the test photographs, dB."""
-    judge = views.photograph_test_scorer(threads=threads)
-    return {"file": judge.psnr(decode(found.result.data)), "source": judge.psnr(source)}
+    scorer = views.photograph_test_scorer(threads=threads)
+    return {"file": scorer.psnr(decode(found.result.data)), "source": scorer.psnr(source)}
 
 
 def find_goal(target: Target, source: SplatModel, photographs: Scorer | None) -> SearchGoal:
@@ -200,46 +225,21 @@ def loss_as_psnr(loss: float, photo_psnr: float) -> float:
     return photo_psnr - 10.0 * math.log10(10.0 ** (loss / 10.0) - 1.0)
 
 
-_ATTRIBUTE_GAIN = (5.0, 8.5)  # dB from the PSNR of all attributes to that of each alone, at 30 dB, without and with SH
-_ATTRIBUTE_GAIN_GROWS = (0.0, 0.22)  # dB that this grows with every dB above 30, without and with SH
-_USUAL = (7.0, 42.0)  # usual bytes per splat, and the PSNR of each attribute in such files
-_COUNTS = 3  # numbers of splats for which a fit is made; up to twice as many until there is a file
-_WORTH = 0.02  # fraction of the bytes: a number of splats that is predicted to save less is not worth a fit
-_CLOSE = 0.04  # fraction of the splats: a number that differs less from one that was tried is not worth a fit
-_SPARE = 0.7  # dB above the goal: a fit whose PSNR is lower leaves too little of the error to quantisation
-_FEWER = 0.7  # factor from one number of splats to a smaller one if none of its files fits the size
-_ALL_BUT = 0.02  # fraction of the splats: pruning fewer is not worth a fit
-_LEAST_LEFT = 0.15  # fraction of the allowed error that is at least left to quantisation
-_WITHIN_REACH = 0.1  # fraction of the bytes that another coding may save
-_PAYS = 0.01  # fraction of the bytes: a file that is expected to take this much more may turn out smaller
-_PAYS_DEARLY = 0.03  # fraction of the bytes that pruned splats have to promise: their files take a fit each
-_COMMON = 0.1  # fraction of the bytes: largest excess of one refitted file that is expected of the others, too
-_FAR = 0.03  # fraction of the bytes: presets are not tried if files of all splats cost this much more than the best
-_BANDS_GROW = (34.0, 0.055)  # dB above which splats with SH are cheaper to keep, and by which fraction per dB
-_PRESETS = (-1.0, 2.5)  # dB above the goal: presets whose own files are expected in this range are tried
-
-
 @dataclass(eq=False)
 class TargetSearch:
     """The search for the coding, the splats and the precision.
 
     Attributes:
-        solver: brings files near the goal, and onto it.
+        search: brings files near the goal, and onto it.
         codings: the possible codings of SH.
         whole: all splats.
-        removal: prunes splats; `None`: all are kept.
+        pruner: prunes splats; `None`: all are kept.
     """
 
-    solver: PrecisionSearch
+    search: PrecisionSearch
     codings: CodingSearch
     whole: WholeScene
-    removal: Pruner | None
-
-    @staticmethod
-    def kept(trials: CandidatePool, removal: Pruner, left: int) -> Candidate:
-        """Return the file of `left` splats at the precision of the options."""
-        part = removal.fitted(left, None, trials.validation_scorer.psnr)
-        return trials.make(part, CodingChoice(None), None, quick=False)
+    pruner: Pruner | None
 
     def best(self) -> Candidate:
         """Return the smallest file that meets a PSNR or a loss, or the best one of a size.
@@ -247,100 +247,103 @@ class TargetSearch:
         Raises:
             InputError: no file meets the goal.
         """
-        tried = self.codings.best(self.solver, self.whole, self._start(), brief=self.removal is not None)
-        if self.removal is not None:
-            if self.solver.goal.is_judged:
-                tried[0].let_judge()
-            cost, fitted = self.solver.cost, self._removed(self.removal, tried[0])
+        tried = self.codings.best(self.search, self.whole, self._start(), brief=self.pruner is not None)
+        if self.pruner is not None:
+            if self.search.goal.uses_test_views:
+                tried[0].score_on_test_views()
+            cost, fitted = self.search.cost, self._pruned_candidates(self.pruner, tried[0])
             if cost(tried[0]) < min(map(cost, fitted), default=math.inf) + _WITHIN_REACH:
-                tried = self.codings.best(self.solver, self.whole, tried[0].quality or 0.0)
+                tried = self.codings.best(self.search, self.whole, tried[0].quality or 0.0)
             tried += fitted
         found = self._on_goal(tried)
         if found:
-            self.solver.try_beside(min(found, key=lambda trial: trial.size_bytes))
-        self._presets(tried)
-        best = self.solver.goal.best([trial for trial in self.solver.trials.made if self._may_be_written(trial)])
+            self.search.try_neighbours(min(found, key=lambda candidate: candidate.size_bytes))
+        self._try_presets(tried)
+        best = self.search.goal.best([one for one in self.search.candidates.made if self._may_be_written(one)])
         if best is None:
             raise InputError(self._out_of_reach())
         return best
 
     def _on_goal(self, tried: Sequence[Candidate]) -> list[Candidate]:
         """Return files that meet the goal, made from the most promising; with more splats if all tried were too few."""
-        found, failed, dearer = list[Candidate](), list[Candidate](), 0.0
-        for trial in sorted(tried, key=self.solver.cost):
-            others = [one for one in tried if one.part.refits and one.splats > trial.splats]
-            if any(one.part is trial.part for one in failed) and others:
+        found, failed, excess = list[Candidate](), list[Candidate](), 0.0
+        for candidate in sorted(tried, key=self.search.cost):
+            others = [one for one in tried if one.subset.refits and one.splats > candidate.splats]
+            if any(one.subset is candidate.subset for one in failed) and others:
                 continue  # files of more splats come first
-            if self._pays(trial, found, dearer):
-                expected, on = self.solver.cost(trial), self.solver.on(trial.part, trial.coding)
-                if on is not None and trial.part.refits:
-                    dearer = max(dearer, min(math.log(on.size_bytes) - expected, _COMMON))
-                (failed if on is None else found).append(on or trial)
-        if failed and not any(one.part.refits for one in found):
-            on = self._of_more(max(failed, key=lambda trial: trial.splats))
+            if self._pays(candidate, found, excess):
+                expected, on = self.search.cost(candidate), self.search.find_on(candidate.subset, candidate.coding)
+                if on is not None and candidate.subset.refits:
+                    excess = max(excess, min(math.log(on.size_bytes) - expected, _COMMON))
+                (failed if on is None else found).append(on or candidate)
+        if failed and not any(one.subset.refits for one in found):
+            on = self._of_more(max(failed, key=lambda candidate: candidate.splats))
             found += [] if on is None else [on]
         return found
 
-    def _may_be_written(self, trial: Candidate) -> bool:
+    def _may_be_written(self, candidate: Candidate) -> bool:
         """Return True if a file is no draft and, if the goal is measured on the test views, has been scored on them."""
-        return trial.is_packed and (trial.is_judged or not self.solver.goal.is_judged)
+        return candidate.is_packed and (candidate.is_scored or not self.search.goal.uses_test_views)
 
     def _start(self) -> float:
         """Return the PSNR of each attribute for the first file, dB."""
-        goal, has_sh = self.solver.goal, self.codings.usual(self.whole) != [CodingChoice("none")]
+        goal, has_sh = self.search.goal, self.codings.usual_codings(self.whole) != [CodingChoice("none")]
         if goal.size_bytes is None:
             psnr = goal.psnr or 0.0
             return clip_quality(psnr + _ATTRIBUTE_GAIN[has_sh] + _ATTRIBUTE_GAIN_GROWS[has_sh] * (psnr - 30.0))
         per_splat = goal.size_bytes / len(self.whole.model)
         return clip_quality(_USUAL[1] + math.log(per_splat / _USUAL[0]) / BYTES_PER_DB)
 
-    def _removed(self, removal: Pruner, whole: Candidate) -> list[Candidate]:
+    def _pruned_candidates(self, pruner: Pruner, whole: Candidate) -> list[Candidate]:
         """Return files near the goal for several numbers of splats, each predicted from the files before."""
-        solver, goal, splats = self.solver, self.solver.goal, len(self.whole.model)
-        slope, found, seen = self._slope_of_counts(whole), list[Candidate](), solver.trials.validation_scorer.psnr
-        allowed = None if goal.psnr is None else solver.level(self.whole)
-        left = self._first_left(removal, whole, slope)
-        start = (whole.quality or 0.0) - solver.about(whole) - TUNING_GAINS
+        search, goal, splats = self.search, self.search.goal, len(self.whole.model)
+        slope, found = self._slope_of_counts(whole), list[Candidate]()
+        psnr_of = search.candidates.validation_scorer.psnr
+        allowed = None if goal.psnr is None else search.validation_goal(self.whole)
+        kept_count = self._first_kept_count(pruner, whole, slope)
+        start = (whole.quality or 0.0) - search.margin(whole) - REFIT_GAIN
         for number in range(2 * _COUNTS):
             if number >= _COUNTS and found:
                 break
-            if left > (1.0 - _ALL_BUT) * splats:
-                if found or removal.options.is_brief:
+            if kept_count > (1.0 - _ALL_BUT) * splats:
+                if found or pruner.options.is_brief:
                     break
-                left = splats  # all splats: they are still refitted through the quantisers of their files
-            part = removal.fitted(left, allowed, seen)
-            if allowed is not None and part.fitted_psnr < allowed + _SPARE:
+                kept_count = splats  # all splats: they are still refitted through the quantisers of their files
+            subset = pruner.refit(kept_count, allowed, psnr_of)
+            if allowed is not None and subset.fitted_psnr < allowed + _SPARE:
                 if found:
                     break
-                left, _ = removal.next_at_psnr(len(part.rows), part.fitted_psnr, allowed, slope)
+                kept_count, _ = pruner.next_at_psnr(len(subset.rows), subset.fitted_psnr, allowed, slope)
                 continue
-            if solver.is_hopeless(part):
-                left = _next_larger(left)
+            if search.is_hopeless(subset):
+                kept_count = _next_larger(kept_count)
                 continue
-            quality = start if goal.psnr is None else _raised_quality(start, goal.psnr, part.psnr)
-            tries = self.codings.best(solver, part, quality, brief=removal.options.is_brief)
-            trial = tries[0]
+            quality = start if goal.psnr is None else _raised_quality(start, goal.psnr, subset.psnr)
+            tries = self.codings.best(search, subset, quality, brief=pruner.options.is_brief)
+            candidate = tries[0]
             found += tries
-            if left == splats or removal.options.is_brief:
+            if kept_count == splats or pruner.options.is_brief:
                 break
-            if math.isinf(solver.cost(trial)):
+            if math.isinf(search.cost(candidate)):
                 # None of them is small enough for a size, or good enough for a PSNR.
                 if goal.size_bytes is None:
-                    left = _next_larger(left)
-                elif len(part.rows) > left or left == 1:
+                    kept_count = _next_larger(kept_count)
+                elif len(subset.rows) > kept_count or kept_count == 1:
                     break  # no more splats can be pruned: no view saw the others
                 else:
-                    left = int(left * _FEWER)
+                    kept_count = int(kept_count * _FEWER)
                 continue
             if goal.psnr is not None:
                 # The error of bands that are left out does not depend on the number of splats.
-                allowed = solver.level(part)
-                wanted = _subtracted(allowed, error_of_psnr(part.psnr) - error_of_psnr(part.fitted_psnr))
-                left, saved = removal.next_at_psnr(len(part.rows), part.fitted_psnr, wanted, slope)
+                allowed = search.validation_goal(subset)
+                goal_psnr = _subtracted(allowed, error_of_psnr(subset.psnr) - error_of_psnr(subset.fitted_psnr))
+                kept_count, saved = pruner.next_at_psnr(len(subset.rows), subset.fitted_psnr, goal_psnr, slope)
             else:
-                left, saved = removal.next_at_size(len(part.rows), part.fitted_psnr, trial.decided_psnr, slope)
-            saved -= solver.cost(trial) - min(map(solver.cost, found))
-            if saved < _WORTH or any(abs(one.splats - left) < _CLOSE * left for one in found):
+                kept_count, saved = pruner.next_at_size(
+                    len(subset.rows), subset.fitted_psnr, candidate.validation_psnr, slope
+                )
+            saved -= search.cost(candidate) - min(map(search.cost, found))
+            if saved < _WORTH or any(abs(one.splats - kept_count) < _CLOSE * kept_count for one in found):
                 break
         return found
 
@@ -350,73 +353,75 @@ class TargetSearch:
         The more SH a file needs, the fewer bytes the next splat takes compared with more important ones: it has fewer
         bands.
         """
-        above = (self.solver.goal.psnr or whole.decided_psnr) - _BANDS_GROW[0]
+        above = (self.search.goal.psnr or whole.validation_psnr) - _BANDS_GROW[0]
         has_sh = whole.coding.sh != "none"
-        return self.solver.slope(whole) * (1.0 + _BANDS_GROW[1] * max(above, 0.0) * has_sh)
+        return self.search.slope(whole) * (1.0 + _BANDS_GROW[1] * max(above, 0.0) * has_sh)
 
-    def _of_more(self, trial: Candidate) -> Candidate | None:
-        """Return a file that meets the goal with more splats than a trial that cannot; `None` if there is none."""
-        left = _next_larger(trial.splats)
-        all_stay = trial.part is self.whole or left > (1.0 - _ALL_BUT) * len(self.whole.model)
-        if self.removal is None or self.solver.goal.psnr is None or all_stay:
+    def _of_more(self, candidate: Candidate) -> Candidate | None:
+        """Return a file that meets the goal with more splats than a candidate that cannot; `None` if there is none."""
+        kept_count = _next_larger(candidate.splats)
+        keeps_all = candidate.subset is self.whole or kept_count > (1.0 - _ALL_BUT) * len(self.whole.model)
+        if self.pruner is None or self.search.goal.psnr is None or keeps_all:
             return None
-        part = self.removal.fitted(left, self.solver.level(self.whole), self.solver.trials.validation_scorer.psnr)
-        best = self.codings.best(self.solver, part, trial.quality or 0.0)[0]
-        return self.solver.on(best.part, best.coding)
+        psnr_of = self.search.candidates.validation_scorer.psnr
+        subset = self.pruner.refit(kept_count, self.search.validation_goal(self.whole), psnr_of)
+        best = self.codings.best(self.search, subset, candidate.quality or 0.0)[0]
+        return self.search.find_on(best.subset, best.coding)
 
-    def _first_left(self, removal: Pruner, whole: Candidate, slope: float) -> int:
+    def _first_kept_count(self, pruner: Pruner, whole: Candidate, slope: float) -> int:
         """Return the number of splats to begin with."""
-        goal, seen = self.solver.goal, self.solver.trials.validation_scorer.psnr
+        goal, psnr_of = self.search.goal, self.search.candidates.validation_scorer.psnr
         if goal.psnr is not None:
-            return removal.first_at_psnr(goal.psnr, slope, seen)
-        near = None if math.isinf(self.solver.cost(whole)) else (whole.splats, whole.decided_psnr)
-        return removal.first_at_size(goal.size_bytes or 0, near, slope, seen)
+            return pruner.first_at_psnr(goal.psnr, slope, psnr_of)
+        near = None if math.isinf(self.search.cost(whole)) else (whole.splats, whole.validation_psnr)
+        return pruner.first_at_size(goal.size_bytes or 0, near, slope, psnr_of)
 
-    def _pays(self, trial: Candidate, found: list[Candidate], dearer: float) -> bool:
+    def _pays(self, candidate: Candidate, found: list[Candidate], excess: float) -> bool:
         """Return True if a file near the goal is worth bringing onto it.
 
         Args:
-            trial: the file.
+            candidate: the file.
             found: files that meet the goal already.
-            dearer: logarithm by which a refitted file among them exceeded its expected cost.
+            excess: logarithm by which a refitted file among them exceeded its expected cost.
         """
-        best = self.solver.goal.best(found)
+        best = self.search.goal.best(found)
         if best is None:
             return True
-        again = any(one.part is trial.part for one in found)
+        again = any(one.subset is candidate.subset for one in found)
         # A file that meets a PSNR costs its bytes, even if fewer were predicted.
-        known = math.log(best.size_bytes) if self.solver.goal.size_bytes is None else self.solver.cost(best)
-        saved = known - self.solver.cost(trial) - dearer * trial.part.refits
-        return saved > (_PAYS_DEARLY if trial.part.refits else _PAYS if again else -_PAYS)
+        known = math.log(best.size_bytes) if self.search.goal.size_bytes is None else self.search.cost(best)
+        saved = known - self.search.cost(candidate) - excess * candidate.subset.refits
+        return saved > (_PAYS_FOR_REFIT if candidate.subset.refits else _PAYS if again else -_PAYS)
 
-    def _presets(self, tried: Sequence[Candidate]) -> None:
+    def _try_presets(self, tried: Sequence[Candidate]) -> None:
         """Make the presets' own files if they are expected near the goal: a search must not be worse than a preset."""
-        goal, plain = self.solver.goal, [trial for trial in tried if trial.part is self.whole]
-        if not goal.is_judged:
+        goal, plain = self.search.goal, [candidate for candidate in tried if candidate.subset is self.whole]
+        if not goal.uses_test_views:
             return
-        near = min(plain, key=lambda trial: (trial.coding.graded, self.solver.cost(trial)))
-        if self.solver.cost(near) > min(map(self.solver.cost, tried)) + _FAR:
+        near = min(plain, key=lambda candidate: (candidate.coding.use_classes, self.search.cost(candidate)))
+        if self.search.cost(near) > min(map(self.search.cost, tried)) + _FAR:
             return  # presets keep all splats in one class, too
-        lost = (near.quality or 0.0) - self.solver.about(near)
+        lost = (near.quality or 0.0) - self.search.margin(near)
         for name, preset in PRESETS.items():
             expected = preset.quality[near.coding.sh == "none"] - lost
             if _may_try_preset(name, self.codings.encoding.preset) and _PRESETS[0] <= expected <= _PRESETS[1]:
                 encoding = replace(self.codings.encoding, preset=name)
-                plainly = CodingChoice(None, graded=False)
-                self.solver.trials.make(self.whole, plainly, None, quick=False, encoding=encoding).let_judge()
+                coding = CodingChoice(None, use_classes=False)
+                made = self.search.candidates.make(self.whole, coding, None, quick=False, encoding=encoding)
+                made.score_on_test_views()
 
     def _out_of_reach(self) -> str:
-        goal, made = self.solver.goal, self.solver.trials.made
+        goal, made = self.search.goal, self.search.candidates.made
         if goal.size_bytes is not None:
-            kept = " with all splats" if self.removal is None else ""
-            smallest = min(trial.size_bytes for trial in made)
+            kept = " with all splats" if self.pruner is None else ""
+            smallest = min(candidate.size_bytes for candidate in made)
             return f"no file{kept} has {goal.size_bytes} bytes or fewer: of those tried one has {smallest}"
         if goal.photo_psnr is not None:
-            nearest = max(trial.photo_psnr for trial in made)
+            nearest = max(candidate.photo_psnr for candidate in made)
             return (
                 f"no file reaches {goal.photo_psnr:.2f} dB by the photographs that decide; the best has {nearest:.2f}"
             )
-        highest = max(trial.psnr for trial in made if trial.is_judged)
+        highest = max(candidate.psnr for candidate in made if candidate.is_scored)
         return f"no file reaches {goal.psnr or 0.0:.2f} dB; the best of those tried has {highest:.2f} dB"
 
 
@@ -433,10 +438,10 @@ def _next_larger(splats: int) -> int:
 def _subtracted(psnr: float, error: float) -> float:
     """Return the PSNR of the error that remains of a PSNR's allowance after another error is subtracted."""
     allowed = error_of_psnr(psnr)
-    return psnr_of_mse(max(allowed - max(error, 0.0), _LEAST_LEFT * allowed))
+    return psnr_of_mse(max(allowed - max(error, 0.0), _LEAST_REST * allowed))
 
 
 def _raised_quality(quality: float, psnr: float, fitted_psnr: float) -> float:
     """Return the PSNR of each attribute, raised because pruning has taken its part of the error already."""
-    left = max(_LEAST_LEFT, 1.0 - error_of_psnr(fitted_psnr) / error_of_psnr(psnr))
-    return clip_quality(quality + psnr_of_mse(left))
+    rest = max(_LEAST_REST, 1.0 - error_of_psnr(fitted_psnr) / error_of_psnr(psnr))
+    return clip_quality(quality + psnr_of_mse(rest))

@@ -157,11 +157,11 @@ def cluster_attributes(
         threads: number of threads; `None`: all processors. The result does not depend on it.
         progress: progress callback.
     """
-    wanted = {name: how.sizes[name] for name in ATTRIBUTES if name in how.sizes}
+    requested = {name: how.sizes[name] for name in ATTRIBUTES if name in how.sizes}
     model = _canonicalised(model, how)
     books, changes = dict[str, AttributeCodebook](), dict[str, Any]()
-    for number, (name, size) in enumerate(wanted.items()):
-        tell = partial(_tell, progress, number, len(wanted))
+    for number, (name, size) in enumerate(requested.items()):
+        tell = partial(_tell, progress, number, len(requested))
         tell(0.0)
         values: F32 = getattr(model, name)
         flat = values.reshape(len(model), -1).astype(np.float64) if values.size else np.zeros((0, 0))
@@ -273,10 +273,10 @@ def _assigned(values: F64, size: int, seed: int, threads: int | None, show: Call
     return cluster(points, weights, size, seed=seed, near_groups=near, threads=threads, progress=show)[1]
 
 
-def _error_share(values: F64, served: F64) -> float:
+def _error_share(values: F64, clustered: F64) -> float:
     """Return the squared error as a fraction of the squared distance from the mean; 0 if all values are equal."""
     spread = float(np.sum(np.square(values - values.mean(axis=0))))
-    return float(np.sum(np.square(values - served))) / spread if spread > 0.0 else 0.0
+    return float(np.sum(np.square(values - clustered))) / spread if spread > 0.0 else 0.0
 
 
 _FLOAT_BYTES = 4

@@ -30,15 +30,15 @@ class SourceRenders:
 
     Attributes:
         cameras: the views.
-        wanted: [H, W, 3], the source's render of each.
-        check: scorer by views that nothing is fitted to.
+        references: [H, W, 3], the source's render of each.
+        check_scorer: scorer by views that nothing is fitted to.
         background: red, green, blue behind everything.
         threads: number of threads; None for all. No result depends on it.
     """
 
     cameras: Sequence[Camera]
-    wanted: Sequence[F32]
-    check: Scorer
+    references: Sequence[F32]
+    check_scorer: Scorer
     background: tuple[float, float, float]
     threads: int | None
 
@@ -64,11 +64,11 @@ class SourceRenders:
             raise InputError("no view is left to learn colours from")
         used, aside = shrink_cameras(views.training), shrink_cameras(views.validation)
         draw = renderer(source, views.background, threads=threads)
-        wanted = [draw(camera).rgb for camera in used]
-        check = Scorer.of_source(source, aside, views.background, threads=threads)
-        return cls(used, wanted, check, views.background, threads)
+        references = [draw(camera).rgb for camera in used]
+        check_scorer = Scorer.of_source(source, aside, views.background, threads=threads)
+        return cls(used, references, check_scorer, views.background, threads)
 
-    def taught(self, model: SplatModel, sh_degree: int, progress: Progress | None = None) -> SplatModel:
+    def distilled(self, model: SplatModel, sh_degree: int, progress: Progress | None = None) -> SplatModel:
         """Return the scene with SH up to a degree, with colours fitted to the source's renders.
 
         Args:
@@ -83,7 +83,7 @@ class SourceRenders:
             raise InputError(f"SH of degree {model.sh_degree} cannot be brought to degree {sh_degree}")
         low = drop_bands(model, sh_degree)
         found, _ = fit_colours(
-            low, self.cameras, self.wanted, steps=_STEPS, least_gain=0.01, background=self.background,
+            low, self.cameras, self.references, steps=_STEPS, least_gain=0.01, background=self.background,
             antialiased=low.antialiased, threads=self.threads, progress=progress,
         )  # fmt: skip
         return replace(low, sh0=np.ascontiguousarray(found[:, 0]), shN=np.ascontiguousarray(found[:, 1:]))

@@ -68,13 +68,13 @@ class ReducedScene:
         model: the scene.
         source_index: [N] int64, the source splat that each splat was.
         clustered: its codebooks; None if nothing was clustered.
-        said: report of the steps, JSON-compatible.
+        report: report of the steps, JSON-compatible.
     """
 
     model: SplatModel
     source_index: I64
     clustered: Clustered | None
-    said: dict[str, Any]
+    report: dict[str, Any]
 
     @property
     def size_bytes(self) -> int:
@@ -102,31 +102,31 @@ def reduce_model(
     Raises:
         InputError: nothing would be left; or there is nothing to distil, or too few views to do it by.
     """
-    teacher = find_renders(source, reduction, views)
-    return reduce_with(source, reduction, teacher, progress)
+    renders = find_renders(source, reduction, views)
+    return reduce_with(source, reduction, renders, progress)
 
 
 def reduce_with(
-    source: SplatModel, reduction: Reduction, teacher: SourceRenders | None, progress: Progress | None
+    source: SplatModel, reduction: Reduction, renders: SourceRenders | None, progress: Progress | None
 ) -> ReducedScene:
     """Reduce a scene as `reduce_model` does, with given renders of the source; `None`: bands are only left out."""
     rows = np.arange(len(source), dtype=np.int64)
     model, degree = source, target_degree(source, reduction)
-    said: dict[str, Any] = {"splats": len(source)}
+    report: dict[str, Any] = {"splats": len(source)}
     if reduction.prune_opacity is not None:
         model, rows = prune_opacity(source, reduction.prune_opacity)
-        said["prune_opacity"] = reduction.prune_opacity
+        report["prune_opacity"] = reduction.prune_opacity
     if degree < source.sh_degree:
-        said |= {"sh_degree": degree, "sh": "distilled" if reduction.distil else "truncated"}
-    model = drop_bands(model, degree) if teacher is None else teacher.taught(model, degree, progress)
-    if teacher is not None:
-        said["views"] = len(teacher.cameras)
+        report |= {"sh_degree": degree, "sh": "distilled" if reduction.distil else "truncated"}
+    model = drop_bands(model, degree) if renders is None else renders.distilled(model, degree, progress)
+    if renders is not None:
+        report["views"] = len(renders.cameras)
     clustered = None
     if reduction.kmeans is not None:
         clustered = cluster_attributes(model, reduction.kmeans, threads=reduction.threads, progress=progress)
         model = clustered.model
-        said["kmeans"] = clustered.as_json()
-    return ReducedScene(model, rows, clustered, said)
+        report["kmeans"] = clustered.as_json()
+    return ReducedScene(model, rows, clustered, report)
 
 
 def target_degree(source: SplatModel, reduction: Reduction) -> int:
@@ -189,22 +189,22 @@ def encode_reduced(
         reduction = replace(reduction, sh_degree=encoding.sh_degree)
     degree = target_degree(source, reduction)
     encoding = replace(encoding, sh_degree=degree)
-    teacher = find_renders(source, reduction, views)
+    renders = find_renders(source, reduction, views)
     clusters = reduction.kmeans is not None
-    reduced = reduce_with(source, reduction, teacher if clusters else None, progress)
-    said, origin = dict(reduced.said), Origin(len(source), reduced.source_index, refitted=teacher is not None)
+    reduced = reduce_with(source, reduction, renders if clusters else None, progress)
+    report, origin = dict(reduced.report), Origin(len(source), reduced.source_index, refitted=renders is not None)
     model = _with_bands(reduced.model, source.sh_degree) if clusters else source.select(reduced.source_index)
-    draft = EncodePlan.of(model, encoding, origin=origin, progress=progress)
-    if teacher is not None and not clusters:
-        taught = _with_bands(teacher.taught(draft.scene, degree, progress), source.sh_degree)
-        draft = draft.with_colours(taught.sh0, taught.shN)
-    coded = encode_tiles(draft, progress=progress)
-    if teacher is not None or clusters:
+    plan = EncodePlan.of(model, encoding, origin=origin, progress=progress)
+    if renders is not None and not clusters:
+        distilled = _with_bands(renders.distilled(plan.scene, degree, progress), source.sh_degree)
+        plan = plan.with_colours(distilled.sh0, distilled.shN)
+    coded = encode_tiles(plan, progress=progress)
+    if renders is not None or clusters:
         decoded = decode(coded.write().data)
         coded = coded.against(source, decoded) if clusters else coded
-        if teacher is not None:
-            said |= {"views": len(teacher.cameras), "check_psnr": round(teacher.check.psnr(decoded), 3)}
-    return coded.write({_KEY: said})
+        if renders is not None:
+            report |= {"views": len(renders.cameras), "check_psnr": round(renders.check_scorer.psnr(decoded), 3)}
+    return coded.write({_KEY: report})
 
 
 def _with_bands(model: SplatModel, sh_degree: int) -> SplatModel:

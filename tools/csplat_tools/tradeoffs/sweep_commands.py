@@ -41,11 +41,11 @@ def target_command(setting: SweepSetting, name: str, preset: str, **options: Any
     return _line("encode", setting, name, *_options(options), "--preset", preset, *_views(setting))
 
 
-def finetune_command(setting: SweepSetting, name: str, wanted: SweepOptions, keep: float | None) -> str:
+def finetune_command(setting: SweepSetting, name: str, sweep: SweepOptions, keep: float | None) -> str:
     """Return the command for a file of `csplat finetune`."""
-    options = {"keep": keep, "iterations": None if wanted.iterations == SweepOptions.iterations else wanted.iterations}
+    options = {"keep": keep, "iterations": None if sweep.iterations == SweepOptions.iterations else sweep.iterations}
     itself = () if setting.views.photographs else ("--self",)
-    return _line("finetune", setting, name, *itself, *_options(options), "--preset", wanted.preset, *_views(setting))
+    return _line("finetune", setting, name, *itself, *_options(options), "--preset", sweep.preset, *_views(setting))
 
 
 def reduction_command(setting: SweepSetting, name: str, preset: str, reduction: Reduction) -> str:

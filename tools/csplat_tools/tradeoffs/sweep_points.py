@@ -245,7 +245,7 @@ class StageClock:
     def listening(self, report: Progress) -> Progress:
         """Return a callback that passes calls on, and records their times. Time before a stage's 0 is not counted."""
 
-        def told(stage: str, done: float) -> None:
+        def relay(stage: str, done: float) -> None:
             with self._lock:
                 now = self.clock()
                 if done > 0.0:
@@ -253,7 +253,7 @@ class StageClock:
                 self._last = now
             report(stage, done)
 
-        return told
+        return relay
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,39 +293,39 @@ class Measurer:
     def __init__(self, setting: SweepSetting, modes: Sequence[Mode], threads: int | None) -> None:
         self._setting, self._modes, self._threads = setting, modes, threads
         views = setting.views
-        self._judge = views.test_scorer(setting.source, threads=threads)
+        self._scorer = views.test_scorer(setting.source, threads=threads)
         shown = display_cameras(setting.source, views)
-        self._showing = (
+        self._shown_scorer = (
             None
             if shown is views.test
             else Scorer.of_source(setting.source, shown, views.test_background, threads=threads)
         )
         self._photographs = views.photograph_test_scorer(threads=threads) if views.photographs else None
         places = evenly_spaced(range(len(views.test)), TIMED_VIEWS)
-        self._timed = [(views.test[place], self._judge.reference(place).rgb) for place in places]
+        self._timed = [(views.test[place], self._scorer.reference(place).rgb) for place in places]
         self.source_modes: dict[str, ModeTime] = {mode: self._mode_time(setting.source, mode) for mode in modes}
         self.source_photographs = self._source_scores()
 
-    def measure(self, candidate: PlannedPoint, progress: Progress) -> SweepPoint:
+    def measure(self, point: PlannedPoint, progress: Progress) -> SweepPoint:
         """Make a file and measure it.
 
         Raises:
             CsplatError: the file cannot be made.
         """
         clock, start = StageClock(), time.perf_counter()
-        made = candidate.make(clock.listening(progress))
+        made = point.make(clock.listening(progress))
         encode_seconds = time.perf_counter() - start
         setting, header = self._setting, read_header(made.data)
         decoded, decode_seconds = self._decoded(made.data, None)
         hardest = HardestPlaceSearch()
         quality, photographs = self._compared(decoded, hardest)
-        if self._showing is not None:
-            self._showing.scores(decoded, ssim=False, on_view=hardest.look)
+        if self._shown_scorer is not None:
+            self._shown_scorer.scores(decoded, ssim=False, on_view=hardest.examine)
         modes: dict[str, ModeTime] = {mode: self._mode_time(decoded, mode) for mode in self._modes}
         return SweepPoint(
-            name=candidate.name,
-            family=candidate.family,
-            command=candidate.command,
+            name=point.name,
+            family=point.family,
+            command=point.command,
             settings=made.settings,
             size_bytes=len(made.data),
             sha256=hashlib.sha256(made.data).hexdigest(),
@@ -341,7 +341,7 @@ class Measurer:
             modes=modes,
             attribute_bytes=bytes_by_attribute(made.data, header),
             first_picture_bytes=fetched_bytes(header, 0),
-            partial=self._partial(made, header) if candidate.is_partial else (),
+            partial=self._partial(made, header) if point.is_partial else (),
             hardest=hardest.found(),
         )
 
@@ -373,39 +373,39 @@ class Measurer:
         distance = None if hardest is None else self._setting.distance
         each = list[ViewScore]()
 
-        def look(number: int, source: F32, other: F32) -> None:
+        def compare(number: int, source: F32, other: F32) -> None:
             if hardest is not None:
-                if self._showing is None:
-                    hardest.look(number, source, other)
+                if self._shown_scorer is None:
+                    hardest.examine(number, source, other)
                 if self._photographs is not None:
                     each.append(self._photographs.score(number, other, lpips=distance))
 
-        quality = self._judge.scores(decoded, lpips=distance, on_view=look)
+        quality = self._scorer.scores(decoded, lpips=distance, on_view=compare)
         return quality, Scores.of(each) if each else None
 
     def _source_scores(self) -> Scores | None:
-        judge, distance = self._photographs, self._setting.distance
-        if judge is None:
+        scorer, distance = self._photographs, self._setting.distance
+        if scorer is None:
             return None
         each = [
-            judge.score(number, self._judge.reference(number).rgb, lpips=distance)
-            for number in range(len(judge.cameras))
+            scorer.score(number, self._scorer.reference(number).rgb, lpips=distance)
+            for number in range(len(scorer.cameras))
         ]
         return Scores.of(each)
 
     def _mode_time(self, model: SplatModel, mode: Mode) -> ModeTime:
         """Time the renders of a model, after one that is not timed because it allocates."""
         shift = np.subtract(model.origin, self._setting.source.origin)
-        views = [(relative_to(shift, camera), wanted) for camera, wanted in self._timed]
-        draw = renderer(model, self._judge.background, mode=mode, threads=self._threads)
+        views = [(relative_to(shift, camera), reference) for camera, reference in self._timed]
+        draw = renderer(model, self._scorer.background, mode=mode, threads=self._threads)
         if mode != "exact":  # a render takes seconds, and buffers are not kept from one to the next
             draw(views[0][0])
         seconds, error, count = [], 0.0, 0
-        for camera, wanted in views:
+        for camera, reference in views:
             start = time.perf_counter()
-            picture = draw(camera).rgb
+            render = draw(camera).rgb
             seconds.append(time.perf_counter() - start)
-            squares = squared_error(wanted, picture)
+            squares = squared_error(reference, render)
             error, count = error + float(np.sum(squares)), count + squares.size
         return ModeTime(1000.0 * statistics.median(seconds), psnr_of_mse(error / count))
 
@@ -421,9 +421,9 @@ def fetched_bytes(header: SceneHeader, sh_degree: int) -> int:
         Bytes of header, index, the layers of all tiles up to this band and the codebooks that they need. Chunks of the
         whole file, such as declared errors and options, are not fetched, nor are extra columns.
     """
-    wanted = {id_ for id_ in _spec.LAYER_NAMES if id_ <= sh_degree}  # layer d holds band d, layer 0 everything before
-    tiles = sum(layer.size for tile in header.tiles for id_, layer in tile.layers.items() if id_ in wanted)
+    layers = {id_ for id_ in _spec.LAYER_NAMES if id_ <= sh_degree}  # layer d holds band d, layer 0 everything before
+    tiles = sum(layer.size for tile in header.tiles for id_, layer in tile.layers.items() if id_ in layers)
     codebooks = sum(
-        chunk.size for chunk in header.directory if chunk.type == _spec.CHUNK_CODEBOOK and chunk.layer in wanted
+        chunk.size for chunk in header.directory if chunk.type == _spec.CHUNK_CODEBOOK and chunk.layer in layers
     )
     return _spec.HEADER_SIZE + header.index_size + tiles + codebooks

@@ -31,9 +31,9 @@ from csplat_tools.tradeoffs.sweep_points import (
     SweepPoint,
     pareto_front,
 )
-from csplat_tools.training.tuned_file import (
-    BYTE_COST,
+from csplat_tools.training.tuning_run import (
     LEARNING_FACTOR,
+    RATE_WEIGHT,
     SHAPE_ENTRIES,
     VIEW_SIZE,
     VIEWS,
@@ -52,7 +52,7 @@ _COSTS = {
     "strategies": (1.2, 12.0, 4.0),
     "k-means": (1.2, 250.0, 6.0),
     "distilled": (1.2, 40.0, 80.0),
-    "targets": (1.2, 0.0, 362.5),  # 2,900 renders, see `optimiser`
+    "targets": (1.2, 0.0, 362.5),  # 2,900 renders, see `expected_renders`
     "simplify": (1.2, 40.0, 250.0),
     "finetune": (1.2, 100.0, 500.0),
 }
@@ -64,7 +64,7 @@ class Tradeoff:
 
     Attributes:
         setting: the scene and its views.
-        wanted: the options of the sweep.
+        sweep: the options of the sweep.
         points: all points, measured or failed, in the order of the sweep.
         source_modes: times of rendering the source, by mode of the renderer.
         source_photographs: the source's scores against photographs, if there are any.
@@ -72,7 +72,7 @@ class Tradeoff:
     """
 
     setting: SweepSetting
-    wanted: SweepOptions
+    sweep: SweepOptions
     points: Sequence[SweepPoint | SweepFailure]
     source_modes: dict[str, ModeTime]
     source_photographs: Scores | None
@@ -131,7 +131,7 @@ class Tradeoff:
 
 def tradeoff(
     scene: SplatModel | File | SweepSetting,
-    wanted: SweepOptions | None = None,
+    sweep: SweepOptions | None = None,
     *,
     cameras: str | None = None,
     data: DataOptions | None = None,
@@ -144,7 +144,7 @@ def tradeoff(
 
     Args:
         scene: a model, or a file; or the `SweepSetting` of an earlier sweep, instead of this and all other inputs.
-        wanted: the points to measure; `None`: presets, precision, strategies, targets and simplification.
+        sweep: the points to measure; `None`: presets, precision, strategies, targets and simplification.
         cameras, data, background: views by which files are chosen and scored, as for `find_view_set`; given by name,
             so that the report can contain the command for each file.
         lpips: a file of LPIPS weights, or `auto`; LPIPS is not computed if left out.
@@ -169,33 +169,33 @@ def tradeoff(
         setting = scene
     else:
         setting = read_setting(scene, cameras=cameras, data=data, background=background, lpips=lpips)
-    wanted = wanted or SweepOptions()
+    sweep = sweep or SweepOptions()
     report: Progress = progress or null_progress
-    tell = say or (lambda _line: None)
-    with thread_count(wanted.threads):
-        measurer = Measurer(setting, wanted.modes, wanted.threads)
-        tried = plan_points(setting, wanted)
+    show = say or (lambda _line: None)
+    with thread_count(sweep.threads):
+        measurer = Measurer(setting, sweep.modes, sweep.threads)
+        tried = plan_points(setting, sweep)
         if not tried:
             raise InputError("nothing to sweep: what is asked for has no values")
-        costs = [estimated_seconds(one.cost or one.family, setting, wanted, measurer.source_modes) for one in tried]
-        tell(f"{counted(len(tried), 'file')} to make and to measure: about {format_estimate(sum(costs))} here")
+        costs = [estimated_seconds(one.cost or one.family, setting, sweep, measurer.source_modes) for one in tried]
+        show(f"{counted(len(tried), 'file')} to make and to measure: about {format_estimate(sum(costs))} here")
         points = list[SweepPoint | SweepFailure]()
         for number, candidate in enumerate(tried):
             report("the sweep", sum(costs[:number]) / sum(costs))
             points.append(_measured(measurer, candidate, lambda _stage, done: report("this file", done)))
-            tell(_line(points[-1], number + 1, len(tried)))
+            show(_line(points[-1], number + 1, len(tried)))
     first = points[0]
     if isinstance(first, SweepFailure) and all(isinstance(one, SweepFailure) for one in points):
         raise InputError(f"no point could be measured; {first.name}: {first.error}")
-    machine = describe_machine(wanted.threads)
-    return Tradeoff(setting, wanted, points, measurer.source_modes, measurer.source_photographs, machine)
+    machine = describe_machine(sweep.threads)
+    return Tradeoff(setting, sweep, points, measurer.source_modes, measurer.source_photographs, machine)
 
 
-def estimated_seconds(kind: str, setting: SweepSetting, wanted: SweepOptions, modes: dict[str, ModeTime]) -> float:
+def estimated_seconds(kind: str, setting: SweepSetting, sweep: SweepOptions, modes: dict[str, ModeTime]) -> float:
     """Estimate the seconds that a point of a kind takes, by the number of splats and the time of a render."""
     each, by_splats, by_pictures = _COSTS[kind]
     milliseconds = next((one.milliseconds for name, one in modes.items() if name != "exact"), 100.0)
-    steps = wanted.iterations / SweepOptions.iterations if kind == "finetune" else 1.0
+    steps = sweep.iterations / SweepOptions.iterations if kind == "finetune" else 1.0
     return each + by_splats * len(setting.source) / 1e6 + by_pictures * steps * 8.0 * milliseconds / 1000.0
 
 
@@ -219,7 +219,7 @@ def _line(point: SweepPoint | SweepFailure, number: int, count: int) -> str:
 _MOST_DISTILLED = 2  # number of SH degrees that are distilled, 0 and 1: each takes as long as a simplification
 
 
-def plan_points(setting: SweepSetting, wanted: SweepOptions) -> list[PlannedPoint]:
+def plan_points(setting: SweepSetting, sweep: SweepOptions) -> list[PlannedPoint]:
     """List the candidates, quick ones first."""
     makers = {
         "presets": _presets,
@@ -229,112 +229,117 @@ def plan_points(setting: SweepSetting, wanted: SweepOptions) -> list[PlannedPoin
         "simplify": _simplified,
         "finetune": _tuned,
     }
-    return [one for family, list_of in makers.items() if family in wanted.what for one in list_of(setting, wanted)]
+    return [one for family, list_of in makers.items() if family in sweep.what for one in list_of(setting, sweep)]
 
 
-def _presets(setting: SweepSetting, wanted: SweepOptions) -> Iterator[PlannedPoint]:
+def _presets(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
     for preset in PRESETS:
-        options = EncodeOptions(preset=preset, threads=wanted.threads)
+        options = EncodeOptions(preset=preset, threads=sweep.threads)
         command = encode_command(setting, preset, preset)
         has_bands = setting.source.sh_degree > 0
         yield PlannedPoint(preset, "presets", command, partial(_encode, setting.source, options), is_partial=has_bands)
 
 
-def _precisions(setting: SweepSetting, wanted: SweepOptions) -> Iterator[PlannedPoint]:
-    for decibels in wanted.attribute_psnr:
+def _precisions(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
+    for decibels in sweep.attribute_psnr:
         name = f"attributes {decibels:g} dB"
-        options = EncodeOptions(preset=wanted.preset, attribute_psnr=decibels, threads=wanted.threads)
-        command = encode_command(setting, name, wanted.preset, attribute_psnr=decibels)
+        options = EncodeOptions(preset=sweep.preset, attribute_psnr=decibels, threads=sweep.threads)
+        command = encode_command(setting, name, sweep.preset, attribute_psnr=decibels)
         yield PlannedPoint(name, "precision", command, partial(_encode, setting.source, options))
 
 
-def _strategies(setting: SweepSetting, wanted: SweepOptions) -> Iterator[PlannedPoint]:
+def _strategies(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
     """Yield candidates that reduce bands, splats and values by simple rules; those that need renders come last."""
 
     def strategy(name: str, reduction: Reduction, cost: str = "strategies") -> PlannedPoint:
-        how = replace(reduction, threads=wanted.threads)
-        command = reduction_command(setting, name, wanted.preset, reduction)
-        return PlannedPoint(name, "strategies", command, partial(_reduce, setting, wanted, how), cost=cost)
+        how = replace(reduction, threads=sweep.threads)
+        command = reduction_command(setting, name, sweep.preset, reduction)
+        return PlannedPoint(name, "strategies", command, partial(_reduce, setting, sweep, how), cost=cost)
 
     degree = setting.source.sh_degree
     for kept in reversed(range(degree)):
-        options = EncodeOptions(preset=wanted.preset, sh_degree=kept, threads=wanted.threads)
-        command = encode_command(setting, f"SH {kept}", wanted.preset, sh_degree=kept)
+        options = EncodeOptions(preset=sweep.preset, sh_degree=kept, threads=sweep.threads)
+        command = encode_command(setting, f"SH {kept}", sweep.preset, sh_degree=kept)
         yield PlannedPoint(f"SH {kept}", "strategies", command, partial(_encode, setting.source, options))
-    for tau in wanted.opacities:
+    for tau in sweep.opacities:
         yield strategy(f"opacity > {tau:g}", Reduction(prune_opacity=tau))
-    if degree and wanted.opacities:
-        tau = wanted.opacities[-1]
+    if degree and sweep.opacities:
+        tau = sweep.opacities[-1]
         yield strategy(f"SH 0, opacity > {tau:g}", Reduction(prune_opacity=tau, sh_degree=0))
-    for entries in wanted.kmeans:
+    for entries in sweep.kmeans:
         yield strategy(f"k-means {entries:g}", Reduction(kmeans=parse_kmeans(f"{entries:g}")), "k-means")
     for kept in reversed(range(min(degree, _MOST_DISTILLED))):
         yield strategy(f"SH {kept}, distilled", Reduction(sh_degree=kept, distil=True), "distilled")
 
 
-def _targets(setting: SweepSetting, wanted: SweepOptions) -> Iterator[PlannedPoint]:
-    for psnr in wanted.psnr:
-        yield _target(setting, wanted, f"target {psnr:g} dB", psnr=psnr)
-    for size in wanted.sizes:
-        yield _target(setting, wanted, f"target {format_bytes(size)}", size=size)
+def _targets(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
+    for psnr in sweep.psnr:
+        yield _target(setting, sweep, f"target {psnr:g} dB", psnr=psnr)
+    for size in sweep.sizes:
+        yield _target(setting, sweep, f"target {format_bytes(size)}", size=size)
 
 
 def _target(
-    setting: SweepSetting, wanted: SweepOptions, name: str, psnr: float | None = None, size: int | None = None
+    setting: SweepSetting, sweep: SweepOptions, name: str, psnr: float | None = None, size: int | None = None
 ) -> PlannedPoint:
-    command = target_command(setting, name, wanted.preset, target_psnr=psnr, target_size=size)
-    return PlannedPoint(name, "targets", command, partial(_reach, setting, wanted, psnr=psnr, size=size))
+    command = target_command(setting, name, sweep.preset, target_psnr=psnr, target_size=size)
+    return PlannedPoint(name, "targets", command, partial(_reach, setting, sweep, psnr=psnr, size=size))
 
 
-def _simplified(setting: SweepSetting, wanted: SweepOptions) -> Iterator[PlannedPoint]:
-    for keep in wanted.keep:
-        command = target_command(setting, f"keep {keep:g}", wanted.preset, keep=keep)
-        yield PlannedPoint(f"keep {keep:g}", "simplify", command, partial(_reach, setting, wanted, keep=keep))
+def _simplified(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
+    for keep in sweep.keep:
+        command = target_command(setting, f"keep {keep:g}", sweep.preset, keep=keep)
+        yield PlannedPoint(f"keep {keep:g}", "simplify", command, partial(_reach, setting, sweep, keep=keep))
 
 
-def _tuned(setting: SweepSetting, wanted: SweepOptions) -> Iterator[PlannedPoint]:
-    one_keep = wanted.keep[len(wanted.keep) // 2 :][:1]  # the middle one alone: each takes minutes
+def _tuned(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
+    one_keep = sweep.keep[len(sweep.keep) // 2 :][:1]  # the middle one alone: each takes minutes
     for keep in (None, *one_keep):
         name = "tuned" if keep is None else f"tuned, keep {keep:g}"
-        command = finetune_command(setting, name, wanted, keep)
-        yield PlannedPoint(name, "finetune", command, partial(_tune, setting, wanted, keep))
+        command = finetune_command(setting, name, sweep, keep)
+        yield PlannedPoint(name, "finetune", command, partial(_tune, setting, sweep, keep))
 
 
 def _encode(source: SplatModel, options: EncodeOptions, progress: Progress) -> SweepFile:
     return _made(encode_with_report(source, options, progress=progress))
 
 
-def _reduce(setting: SweepSetting, wanted: SweepOptions, reduction: Reduction, progress: Progress) -> SweepFile:
+def _reduce(setting: SweepSetting, sweep: SweepOptions, reduction: Reduction, progress: Progress) -> SweepFile:
     return _made(
         encode_reduced(
-            setting.source, reduction, EncodeOptions(preset=wanted.preset, threads=wanted.threads),
+            setting.source, reduction, EncodeOptions(preset=sweep.preset, threads=sweep.threads),
             views=setting.views, progress=progress,
         )
     )  # fmt: skip
 
 
-def _reach(setting: SweepSetting, wanted: SweepOptions, progress: Progress, **asked: Any) -> SweepFile:
-    options = EncodeOptions(preset=wanted.preset, threads=wanted.threads)
-    found = encode_to(setting.source, views=setting.views, options=options, progress=progress, **asked)
+def _reach(setting: SweepSetting, sweep: SweepOptions, progress: Progress, **target: Any) -> SweepFile:
+    options = EncodeOptions(preset=sweep.preset, threads=sweep.threads)
+    found = encode_to(setting.source, views=setting.views, options=options, progress=progress, **target)
     return _made(found.result, target=found.report.as_json())
 
 
-def _made(result: EncodeResult, **said: Any) -> SweepFile:
-    return SweepFile(result.data, {"encoding": result.report.options, **said})
+def _made(result: EncodeResult, **settings: Any) -> SweepFile:
+    return SweepFile(result.data, {"encoding": result.report.options, **settings})
 
 
-def _tune(setting: SweepSetting, wanted: SweepOptions, keep: float | None, progress: Progress) -> SweepFile:
+def _tune(setting: SweepSetting, sweep: SweepOptions, keep: float | None, progress: Progress) -> SweepFile:
     """Make the file of `csplat finetune` with its default options."""
     itself = not setting.views.photographs
-    encoding = EncodeOptions(preset=wanted.preset, shape_codebook_size=SHAPE_ENTRIES, threads=wanted.threads)
-    options = FinetuneOptions(iterations=wanted.iterations, byte_cost=BYTE_COST[itself])
+    encoding = EncodeOptions(preset=sweep.preset, shape_codebook_size=SHAPE_ENTRIES, threads=sweep.threads)
+    options = FinetuneOptions(iterations=sweep.iterations, byte_cost=RATE_WEIGHT[itself])
     tuned = choose_and_finetune(
         setting.source, _tuning_views(setting), encoding, options.scaled(LEARNING_FACTOR[itself]), keep=keep,
         progress=progress,
     )  # fmt: skip
     made = tuned.made
-    said = {"steps": made.log["steps"], "best_step": made.log["best_iteration"], "keep": keep, **tuned.chosen.said}
-    return SweepFile(made.data, {"encoding": made.result.report.options, "finetune": said}, tuned.seconds)
+    settings = {
+        "steps": made.log["steps"],
+        "best_step": made.log["best_iteration"],
+        "keep": keep,
+        **tuned.subset.pruning,
+    }
+    return SweepFile(made.data, {"encoding": made.result.report.options, "finetune": settings}, tuned.seconds)
 
 
 def _tuning_views(setting: SweepSetting) -> ViewSet:

@@ -37,11 +37,11 @@ class ShownView:
 
     Attributes:
         name: name of the photograph, or number of the view.
-        pictures: [H, W, 3] uint8 each, by caption.
+        images: [H, W, 3] uint8 each, by caption.
     """
 
     name: str
-    pictures: Mapping[str, U8]
+    images: Mapping[str, U8]
 
 
 def show_views(
@@ -59,23 +59,23 @@ def show_views(
         return []
     places = evenly_spaced(range(len(views.test)), _VIEWS)
     views = replace(views, test=[views.test[place] for place in places])
-    judge = (
+    scorer = (
         views.photograph_test_scorer(threads=threads)
         if views.photographs
         else views.test_scorer(source, threads=threads)
     )
-    wanted = "photograph" if views.photographs else "the source"
+    reference = "photograph" if views.photographs else "the source"
     rows: list[dict[str, U8]] = [{} for _ in places]
     for name, model in models.items():
         if model is source and not views.photographs:
             continue  # it is the reference itself
 
-        def look(at: int, picture: NDArray[np.float32], seen: NDArray[np.float32], name: str = name) -> None:
-            rows[at].setdefault(wanted, to_uint8(picture))
-            rows[at][name] = to_uint8(seen)
+        def add(at: int, image: NDArray[np.float32], render: NDArray[np.float32], name: str = name) -> None:
+            rows[at].setdefault(reference, to_uint8(image))
+            rows[at][name] = to_uint8(render)
 
-        judge.scores(model, ssim=False, on_view=look)
-    names = [camera.image or f"view {place}" for place, camera in zip(places, judge.cameras, strict=True)]
+        scorer.scores(model, ssim=False, on_view=add)
+    names = [camera.image or f"view {place}" for place, camera in zip(places, scorer.cameras, strict=True)]
     return [ShownView(name, row) for name, row in zip(names, rows, strict=True)]
 
 
@@ -104,7 +104,7 @@ def make_training_page(
     parts = [
         _head(title, training, file),
         _scores(training, file),
-        _pictures(shown),
+        _images(shown),
         _steps(training),
         _tuning(file),
         _bytes(file),
@@ -142,8 +142,8 @@ def _scores(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) 
     return f"<h2>How near it comes</h2>\n<p>{escape(text)}</p>\n{table(('', *SCORES), score_rows(scores))}"
 
 
-def _pictures(shown: Sequence[ShownView]) -> str:
-    blocks = [f"<h3>{escape(one.name)}</h3>\n{image_row(one.pictures, one.name)}" for one in shown]
+def _images(shown: Sequence[ShownView]) -> str:
+    blocks = [f"<h3>{escape(one.name)}</h3>\n{image_row(one.images, one.name)}" for one in shown]
     text = "Views from which nothing was learnt, evenly spread. They are compressed for this page."
     return f"<h2>What it looks like</h2>\n<p>{text}</p>\n" + "\n".join(blocks) if blocks else ""
 
@@ -162,11 +162,11 @@ def _steps(training: Mapping[str, Any] | None) -> str:
             axes.plot(at, found, "o", color=_OTHER, label="photographs held out")
         axes.set(xlabel="step", ylabel="PSNR, dB")
         axes.legend(loc="lower right")
-        beside = axes.twinx()
-        beside.plot(steps, [one["splat_count"] for one in entries], ":", color=INK)
-        beside.set_ylabel("splats (dotted)")
-        beside.set_ylim(bottom=0)
-        beside.grid(visible=False)
+        right = axes.twinx()
+        right.plot(steps, [one["splat_count"] for one in entries], ":", color=INK)
+        right.set_ylabel("splats (dotted)")
+        right.set_ylim(bottom=0)
+        right.grid(visible=False)
 
     small = training["options"]["half_size"]
     text = f"<p>The first {small:.0%} of the steps saw photographs of half the size.</p>\n" if small else ""
@@ -174,27 +174,27 @@ def _steps(training: Mapping[str, Any] | None) -> str:
 
 
 def _tuning(file: Mapping[str, Any] | None) -> str:
-    looks = [] if file is None else file["log"]["looks"]
-    if len(looks) < 2:
+    validations = [] if file is None else file["log"]["looks"]
+    if len(validations) < 2:
         return ""
 
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
-        steps = [one["iteration"] for one in looks]
-        axes.plot(steps, [one["psnr"] for one in looks], "o-", color=_LINE, markersize=3)
+        steps = [one["iteration"] for one in validations]
+        axes.plot(steps, [one["psnr"] for one in validations], "o-", color=_LINE, markersize=3)
         axes.set(xlabel="step", ylabel="PSNR of views that decide, dB")
-        beside = axes.twinx()
-        beside.plot(steps, [one["size_bytes"] / 1e6 for one in looks], ":", color=INK)
-        beside.set_ylabel("MB of the file (dotted)")
-        beside.grid(visible=False)
+        right = axes.twinx()
+        right.plot(steps, [one["size_bytes"] / 1e6 for one in validations], ":", color=INK)
+        right.set_ylabel("MB of the file (dotted)")
+        right.grid(visible=False)
 
     text = "Values move, seen through the encoder's quantisers; what looked best for its bytes was kept."
     return f"<h2>The tuning</h2>\n<p>{escape(text)}</p>\n{_plot(draw, 'tuning')}"
 
 
 def _plot(draw: Any, name: str) -> str:
-    picture = draw_svg(draw, (_WIDE, _HIGH), name, inline=True)
-    return f'<figure class="plot"><div class="scroll">{picture}</div></figure>'
+    plot = draw_svg(draw, (_WIDE, _HIGH), name, inline=True)
+    return f'<figure class="plot"><div class="scroll">{plot}</div></figure>'
 
 
 def _bytes(file: Mapping[str, Any] | None) -> str:

@@ -33,13 +33,13 @@ class TuningSubset:
         model: the splats; refitted if others were pruned.
         rows: [N] int64, their indices in the source, ascending.
         importance: the importance of each.
-        said: report of the choice, JSON-compatible.
+        pruning: report on the pruned splats, JSON-compatible.
     """
 
     model: SplatModel
     rows: I64
     importance: NDArray[Any] | Importance
-    said: Mapping[str, Any] = field(default_factory=dict)
+    pruning: Mapping[str, Any] = field(default_factory=dict)
 
 
 def training_views(source: SplatModel, views: ViewSet, threads: int | None) -> TuningViews:
@@ -47,15 +47,19 @@ def training_views(source: SplatModel, views: ViewSet, threads: int | None) -> T
 
     Without validation views to decide which step was best, some training views do.
     """
-    behind = np.array(views.background, np.float32)
+    background = np.array(views.background, np.float32)
 
-    def looks(cameras: Sequence[Camera]) -> list[TuningView]:
+    def as_views(cameras: Sequence[Camera]) -> list[TuningView]:
         if views.photographs:
             return [TuningView(one.camera, one) for one in views.photographs_of(cameras)]
-        return renders_of(source, cameras, behind, threads)
+        return renders_of(source, cameras, background, threads)
 
-    teach = looks(views.training)
-    return TuningViews(teach, looks(views.validation), behind) if views.validation else split_views(teach, behind)
+    training = as_views(views.training)
+    return (
+        TuningViews(training, as_views(views.validation), background)
+        if views.validation
+        else split_views(training, background)
+    )
 
 
 def choose_splats(
@@ -84,35 +88,35 @@ def choose_splats(
         InputError: no view shows any splat; or the file is invalid, or belongs to another scene.
     """
     measuring = views.training[:VIEW_COUNT] if views.virtual else views.training
-    looking = [*views.training, *views.validation]
+    all_views = [*views.training, *views.validation]
 
-    def weighed(model: SplatModel) -> Sensitivity:
+    def measure(model: SplatModel) -> Sensitivity:
         return measure_views(
             model, measuring, views.background, matrices=True, magnitudes=False, threads=threads, progress=progress
         )
 
     given = _read_importance(importance, source)
     prune = bool(views.photographs) if prune_unseen is None else prune_unseen
-    found = weighed(source) if given is None and keep is None else None
-    if found is not None and not (prune and len(measuring) < len(looking)):
+    found = measure(source) if given is None and keep is None else None
+    if found is not None and not (prune and len(measuring) < len(all_views)):
         seen = found.seen
     else:
         seen = measure_pruning_error(
-            source, looking, background=views.background, bands=False, threads=threads, progress=progress
+            source, all_views, background=views.background, bands=False, threads=threads, progress=progress
         ).seen
     if not seen.any():
         raise InputError("no view shows any splat: scene and cameras do not belong together")
     rows = np.flatnonzero(seen) if prune else np.arange(len(source))
-    model, said = source.select(rows), {"unseen": len(source) - len(rows)}
+    model, pruning = source.select(rows), {"unseen": len(source) - len(rows)}
     if keep is not None:
-        teaching = with_validation_views(replace(views, training=measuring, test=()))
-        model, kept = _pruned(model, teaching, keep * len(source) / len(rows), threads, progress)
-        rows, said = rows[kept], {**said, "simplified_from": len(rows)}
+        simplify_views = with_validation_views(replace(views, training=measuring, test=()))
+        model, kept = _pruned(model, simplify_views, keep * len(source) / len(rows), threads, progress)
+        rows, pruning = rows[kept], {**pruning, "simplified_from": len(rows)}
     if given is not None:
-        return TuningSubset(model, rows, given.select(rows) if isinstance(given, Importance) else given[rows], said)
+        return TuningSubset(model, rows, given.select(rows) if isinstance(given, Importance) else given[rows], pruning)
     if found is not None:
-        return TuningSubset(model, rows, StoredSensitivity.of(source, found).importance().select(rows), said)
-    return TuningSubset(model, rows, StoredSensitivity.of(model, weighed(model)).importance(), said)
+        return TuningSubset(model, rows, StoredSensitivity.of(source, found).importance().select(rows), pruning)
+    return TuningSubset(model, rows, StoredSensitivity.of(model, measure(model)).importance(), pruning)
 
 
 def _read_importance(importance: str | None, source: SplatModel) -> NDArray[Any] | Importance | None:

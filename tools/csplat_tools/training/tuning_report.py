@@ -1,4 +1,4 @@
-"""Report on fine-tuning: sizes, scores of source and decoded file on held-out views, times, bytes."""
+"""Build the report on a tuned file: sizes, scores of source and decoded file on test views, times, bytes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from csplat.encoder import EncodeResult
 from csplat.errors import counted
 from csplat.model import SplatModel
 from csplat_render.metrics import Distance
+from csplat_render.scorer import Scorer
 from csplat_tools.console import format_bytes, format_table
 from csplat_tools.inspect.file_description import bytes_by_attribute
 from csplat_tools.scene_files import ply_splat_bytes
@@ -21,17 +22,17 @@ SCORES = {"psnr": 2, "psnr_mean": 2, "ssim": 4, "lpips": 4}
 
 
 @dataclass(frozen=True)
-class TestScores:
+class ModelScores:
     """Scores on test views, which were used neither for training nor for validation.
 
     Attributes:
-        by: kind of the reference images, in words.
-        views: number of views.
+        reference: kind of the reference images, in words.
+        view_count: number of views.
         scores: psnr (pooled), psnr_mean, ssim and lpips (or `None`) by name of the model.
     """
 
-    by: str
-    views: int
+    reference: str
+    view_count: int
     scores: Mapping[str, Mapping[str, float | None]]
 
 
@@ -43,7 +44,7 @@ def score_models(
     threads: int | None = None,
     *,
     known: Mapping[str, Mapping[str, float | None]] | None = None,
-) -> TestScores | None:
+) -> ModelScores | None:
     """Score models on test views: against photographs, else against renders of the source.
 
     Args:
@@ -59,26 +60,36 @@ def score_models(
     """
     if not views.test:
         return None
-    taken = bool(views.photographs)
-    judge = views.photograph_test_scorer(threads=threads) if taken else views.test_scorer(source, threads=threads)
+    has_photographs = bool(views.photographs)
+    scorer = (
+        views.photograph_test_scorer(threads=threads) if has_photographs else views.test_scorer(source, threads=threads)
+    )
     scores: dict[str, dict[str, float | None]] = {}
     for name, model in models.items():
         if known is not None and name in known:
             scores[name] = {score: known[name][score] for score in SCORES}
-        elif taken or model is not source:
-            found = judge.scores(model, lpips=lpips)
+        elif has_photographs or model is not source:
+            found = scorer.scores(model, lpips=lpips)
             scores[name] = {score: getattr(found, score) for score in SCORES}
-    return TestScores("held-out photographs" if taken else "renders of the source", len(views.test), scores)
+    reference = "held-out photographs" if has_photographs else "renders of the source"
+    return ModelScores(reference, len(views.test), scores)
+
+
+def reference_scorer(source: SplatModel, views: ViewSet, threads: int | None) -> Scorer:
+    """Return the scorer by test views: against photographs, else against renders of the source."""
+    if views.photographs:
+        return views.photograph_test_scorer(threads=threads)
+    return views.test_scorer(source, threads=threads)
 
 
 def make_tuning_report(
     source: SplatModel,
     plain: EncodeResult,
     result: EncodeResult,
-    judged: TestScores | None,
+    test: ModelScores | None,
     log: Mapping[str, Any],
     seconds: Mapping[str, float],
-    said: Mapping[str, Any],
+    pruning: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Build the report as JSON-compatible values.
 
@@ -86,10 +97,10 @@ def make_tuning_report(
         source: the scene before pruning.
         plain: the file with the same quantisation before tuning.
         result: the tuned file.
-        judged: scores on test views; `None` if there are none.
+        test: scores on test views; `None` if there are none.
         log: log of the tuning.
         seconds: time by stage.
-        said: report of the splats that were pruned.
+        pruning: report on the splats that were pruned.
     """
     shares = bytes_by_attribute(result.data, read_header(result.data))
     overhead = shares.pop("overhead")
@@ -97,7 +108,7 @@ def make_tuning_report(
     return {
         "source_splats": count,
         "splats": result.report.splat_count,
-        "unseen": said["unseen"],
+        "unseen": pruning["unseen"],
         "sh_degree": source.sh_degree,
         "size_bytes": size,
         "size_bytes_before_tuning": len(plain.data),
@@ -105,9 +116,9 @@ def make_tuning_report(
         "ratio": count * ply_splat_bytes(source.sh_degree) / size,
         "bytes_by_attribute": shares,
         "overhead_bytes": overhead,
-        "judged_by": None if judged is None else judged.by,
-        "judged_views": 0 if judged is None else judged.views,
-        "scores": {} if judged is None else {name: dict(one) for name, one in judged.scores.items()},
+        "judged_by": None if test is None else test.reference,
+        "judged_views": 0 if test is None else test.view_count,
+        "scores": {} if test is None else {name: dict(one) for name, one in test.scores.items()},
         "decoded_is_what_was_tuned": True,  # otherwise the run would have ended with an error
         "validation": {
             "views": log["validation_views"],
@@ -128,8 +139,8 @@ def make_tuning_report(
 def format_tuning_report(report: Mapping[str, Any]) -> str:
     """Return the report as text."""
     unseen = report["unseen"]
-    gone = report["source_splats"] - report["splats"] - unseen
-    words = [f"{unseen} that no view shows"] * bool(unseen) + [f"{gone} that pictures need least"] * bool(gone)
+    others = report["source_splats"] - report["splats"] - unseen
+    words = [f"{unseen} that no view shows"] * bool(unseen) + [f"{others} that pictures need least"] * bool(others)
     left_out = f" ({' and '.join(words)} are left out)" if words else ""
     size = f"{format_bytes(report['size_bytes'])}, {report['bytes_per_source_splat']:.2f} bytes per source splat"
     ratio = f"{report['ratio']:.1f} times smaller than a PLY of {ply_splat_bytes(report['sh_degree'])} bytes per splat"

@@ -61,8 +61,8 @@ _WITHOUT = {
     "adjustment through quantisers": _Without(
         instead=(
             (subsets, "quantisation_aware_refit", lambda frozen, *_, **__: frozen.start()),
-            (target_search, "TUNING_GAINS", 0.0),
-            (precision_search, "TUNING_GAINS", 0.0),
+            (target_search, "REFIT_GAIN", 0.0),
+            (precision_search, "REFIT_GAIN", 0.0),
         )
     ),
     "price of bits in it": _Without(instead=((splat_refit, "rate_exponent", lambda _: math.inf),)),

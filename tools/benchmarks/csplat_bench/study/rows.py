@@ -26,8 +26,8 @@ from csplat_tools.study import (
     raw_bytes,
     reduce_model,
 )
-from csplat_tools.training.tuned_file import BYTE_COST, SHAPE_ENTRIES
 from csplat_tools.training.tuning_inputs import training_views
+from csplat_tools.training.tuning_run import RATE_WEIGHT, SHAPE_ENTRIES
 from csplat_tools.views import ViewSet, with_validation_views
 from csplat_trainer.tuning import FinetuneOptions
 
@@ -174,7 +174,7 @@ def _tuned(subject: Subject, model: SplatModel, options: EncodeOptions) -> bytes
         raise InputError(f"{subject.name} has no photographs that a file could be tuned by")
     views = training_views(model, subject.photographs, None)
     options = replace(options, shape_codebook_size=SHAPE_ENTRIES)
-    return csplat_trainer.finetune(model, views, options, FinetuneOptions(byte_cost=BYTE_COST[False])).data
+    return csplat_trainer.finetune(model, views, options, FinetuneOptions(byte_cost=RATE_WEIGHT[False])).data
 
 
 def measure_taus(source: SplatModel, views: Views) -> list[Survivors]:

@@ -31,7 +31,7 @@ from csplat_trainer.tuning import Clock, Finetuned, FinetuneOptions, TuningStep
 #: matched almost exactly: what long steps lose of that, short ones take long to regain.
 LEARNING_FACTOR = {False: 1.0, True: 0.03}
 #: Rate weight of a bit per splat in the loss; for the scene's own renders, whose loss is smaller, it is smaller, too.
-BYTE_COST = {False: 1e-4, True: 2e-5}
+RATE_WEIGHT = {False: 1e-4, True: 2e-5}
 #: Entries of the codebook of shapes, which clustering by sensitivities and tuning make good use of; `encode`, which has
 #: neither, makes no such codebook by default.
 SHAPE_ENTRIES = 4096
@@ -41,16 +41,25 @@ SPLAT_BYTES = 10
 VIEWS, VIEW_SIZE = 480, (320, 240)
 
 _WITHIN = 1.02  # factor by which a draft may be too large: the rate weight saves that before renders get worse
-_FREE = 1.03  # factor by which a draft may be too small: finer steps are not worth the time
+_FINE_ENOUGH = 1.03  # factor by which a draft may be too small: finer steps are not worth the time
 _TRIES = 3  # largest number of splat counts, each predicted from the last file; of steps; of tunings
 _FIXED = 1.2  # power of a factor of bytes that gives the factor of splats: some bytes do not depend on splats
 _FEWER = 1.08  # divisor of the number of splats if a tuned file is too large
 _ENTRIES_DOUBLE = 6.0  # dB of all attributes at which twice the entries of an SH codebook pay
-_BYTE, _MOST_ENTRIES, _USERS = 255, 1 << 15, 3  # codebooks of more entries grow; up to this; least splats per entry
+_BYTE_ENTRIES, _MOST_ENTRIES, _SPLATS_PER_ENTRY = (
+    255,
+    1 << 15,
+    3,
+)  # codebooks of more entries grow; up to this; least splats per entry
 _FINEST = 70.0  # dB of an attribute at which renders are as good as the scene's
 
-_RENDERS_ASIDE = 8  # one in this many renders is held out for validation
-_MOST_ASIDE = 16  # largest number of them
+_PER_DOUBLING = 1.25  # dB that twice the bytes bring, about, if there is only one file
+_SLOPE_RANGE = (0.3, 12.0)  # range of this slope if it is taken from two files, dB per doubling
+_NEAR_ENOUGH = 0.1  # dB above the target that are near enough
+_SIZE_TRIES, _FARTHEST = 5, 2.0  # files after the first; largest change of size from the nearest file, in doublings
+
+_VALIDATION_EVERY = 8  # one in this many renders is held out for validation
+_MOST_VALIDATION = 16  # largest number of them
 
 
 def default_validation_count(count: int, *, cameras: str | None, data: object | None) -> int | None:
@@ -64,7 +73,7 @@ def default_validation_count(count: int, *, cameras: str | None, data: object | 
     """
     if data is not None:
         return 0
-    return min(_MOST_ASIDE, count // _RENDERS_ASIDE) if cameras is None else None
+    return min(_MOST_VALIDATION, count // _VALIDATION_EVERY) if cameras is None else None
 
 
 def run_finetuning(
@@ -125,16 +134,16 @@ def run_finetuning(
             if psnr is None:
                 tuned = make(size_bytes=size_bytes, files=files, keep=keep)
             else:
-                tuned = _reaching(psnr, make, quiet=quiet)
+                tuned = _tune_to_psnr(psnr, make, quiet=quiet)
         made, clock = tuned.made, Clock(tuned.seconds)
         write_bytes(output, made.data)
         if source_index is not None:
             write_array(source_index, made.result.source_index)
         with clock.stage("judging"):
             models = {"source": source, "before tuning": decode(made.plain.data), "file": made.decoded}
-            judged = score_models(source, models, views, lpips, threads, known=known)
+            scores = score_models(source, models, views, lpips, threads, known=known)
         shown = [] if page is None else show_views(source, models, views, threads)
-    facts = make_tuning_report(source, made.plain, made.result, judged, made.log, clock.seconds, tuned.chosen.said)
+    facts = make_tuning_report(source, made.plain, made.result, scores, made.log, clock.seconds, tuned.subset.pruning)
     report = {**facts, "log": made.log}
     if page is not None:
         write_training_page(page, output, training, report, shown)
@@ -146,12 +155,12 @@ class TunedSubset:
     """A tuned file of some of a scene's splats.
 
     Attributes:
-        chosen: the splats.
+        subset: the splats.
         made: the file.
         seconds: time by stage.
     """
 
-    chosen: TuningSubset
+    subset: TuningSubset
     made: Finetuned
     seconds: dict[str, float]
 
@@ -187,7 +196,7 @@ def choose_and_finetune(
         views: views that the file is to match.
         encoding: options of the encoder.
         options: options of the tuning.
-        size_bytes: largest size of the file: as many splats are kept as it has room for, and the tuning meets it.
+        size_bytes: largest size of the file: splats are kept as far as they fit in, and the tuning meets it.
         files: checkpoints.
         keep, prune_unseen, importance: as for `choose_splats`; with `size_bytes`, `keep` is an upper bound.
         progress, on_step: as for `csplat_trainer.finetune`.
@@ -205,17 +214,17 @@ def choose_and_finetune(
         )  # fmt: skip
 
     with clock.stage("choosing"):
-        looked = training_views(source, views, encoding.threads)
+        tuning_views = training_views(source, views, encoding.threads)
         chosen = choose(keep)
         if size_bytes is not None:
-            chosen, encoding = _fitting(
+            chosen, encoding = _fit_to_size(
                 chosen, encoding, size_bytes, lambda count: choose(count / len(source)), progress
             )
     outputs, tries = files or Outputs(), _TRIES
     while True:
         made = csplat_trainer.finetune(
-            chosen.model, looked, encoding, options, size_bytes=size_bytes, importance=chosen.importance,
-            source=source, origin=Origin(len(source), chosen.rows), metadata=chosen.said, outputs=outputs,
+            chosen.model, tuning_views, encoding, options, size_bytes=size_bytes, importance=chosen.importance,
+            source=source, origin=Origin(len(source), chosen.rows), metadata=chosen.pruning, outputs=outputs,
             progress=progress, on_step=on_step,
         )  # fmt: skip
         if size_bytes is None or len(made.data) <= size_bytes:
@@ -223,13 +232,13 @@ def choose_and_finetune(
         tries -= 1
         if not tries:
             raise InputError(f"the smallest file has {len(made.data):,} bytes, more than {size_bytes:,}")
-        outputs = replace(outputs, resume=None)  # that checkpoint is of the tuning of more splats
+        outputs = replace(outputs, resume=None)  # that checkpoint belongs to a tuning of more splats
         share = (size_bytes / len(made.data)) ** 2 / _FEWER
         with clock.stage("choosing"):
             chosen = choose(max(1, int(share * len(chosen.model))) / len(source))
 
 
-def _reaching(psnr: float, make: Callable[..., TunedSubset], *, quiet: bool) -> TunedSubset:
+def _tune_to_psnr(psnr: float, make: Callable[..., TunedSubset], *, quiet: bool) -> TunedSubset:
     """Make files until one reaches a PSNR; the seconds are those of all of them."""
     clock = Clock()
 
@@ -244,7 +253,7 @@ def _reaching(psnr: float, make: Callable[..., TunedSubset], *, quiet: bool) -> 
     return replace(smallest_reaching(psnr, made), seconds=clock.seconds)
 
 
-def _fitting(
+def _fit_to_size(
     chosen: TuningSubset,
     encoding: EncodeOptions,
     size_bytes: int,
@@ -253,39 +262,41 @@ def _fitting(
 ) -> tuple[TuningSubset, EncodeOptions]:
     """Return splats and options of a file that the tuning can bring to a size: fewer splats, or finer steps."""
 
-    def room(encoding: EncodeOptions) -> tuple[float, dict[str, Any]]:
+    def size_factor(encoding: EncodeOptions) -> tuple[float, dict[str, Any]]:
         """Return the factor from the size of a draft to the size allowed, and the options that the encoder chose."""
-        draft = EncodePlan.of(
+        plan = EncodePlan.of(
             chosen.model, encoding, importance=chosen.importance, allow_classes=False, progress=progress
         )
-        made = encode_tiles(draft, progress=progress).write()
+        made = encode_tiles(plan, progress=progress).write()
         return size_bytes / len(made.data), made.report.options
 
     for _ in range(_TRIES):
-        share, settings = room(encoding)
+        share, settings = size_factor(encoding)
         if share >= 1.0 / _WITHIN or len(chosen.model) == 1:
             break
         chosen = choose(max(1, round(share**_FIXED * len(chosen.model))))
     else:
-        share, settings = room(encoding)
+        share, settings = size_factor(encoding)
     if encoding.attribute_psnr is not None:
         return chosen, encoding
-    usual, free, finer, slope = encoding, share, 0.0, BYTES_PER_DB
+    usual, best_factor, finer, slope = encoding, share, 0.0, BYTES_PER_DB
     quality, entries = PRESETS[usual.preset].quality[0 if settings["sh_degree"] else 1], settings["codebook_size"]
     for _ in range(_TRIES):
         step = min(finer + math.log(share) / slope, _FINEST - quality) - finer
-        if free <= _FREE or step == 0.0 or finer + step <= 0.0:
+        if best_factor <= _FINE_ENOUGH or step == 0.0 or finer + step <= 0.0:
             break
         finer += step
-        trial = replace(usual, attribute_psnr=quality + finer)
-        if usual.codebook_size is None and entries > _BYTE:
-            more = min(round(entries * 2.0 ** (finer / _ENTRIES_DOUBLE)), _MOST_ENTRIES, len(chosen.model) // _USERS)
-            trial = replace(trial, codebook_size=max(entries, more))
-        left, _ = room(trial)
-        slope = min(max(math.log(share / left) / step, 0.5 * BYTES_PER_DB), 4.0 * BYTES_PER_DB)
-        share = left
-        if 1.0 / _WITHIN <= share < free:
-            encoding, free = trial, share
+        finer_options = replace(usual, attribute_psnr=quality + finer)
+        if usual.codebook_size is None and entries > _BYTE_ENTRIES:
+            more = min(
+                round(entries * 2.0 ** (finer / _ENTRIES_DOUBLE)), _MOST_ENTRIES, len(chosen.model) // _SPLATS_PER_ENTRY
+            )
+            finer_options = replace(finer_options, codebook_size=max(entries, more))
+        after, _ = size_factor(finer_options)
+        slope = min(max(math.log(share / after) / step, 0.5 * BYTES_PER_DB), 4.0 * BYTES_PER_DB)
+        share = after
+        if 1.0 / _WITHIN <= share < best_factor:
+            encoding, best_factor = finer_options, share
     return chosen, encoding
 
 
@@ -295,12 +306,6 @@ def _state(now: TuningStep) -> str:
         f" (best {now.best_psnr:.2f}), {now.size_bytes / 1e6:.3f} MB,"
         f" {now.seconds:.0f} s, {now.seconds_left:.0f} s left"
     )
-
-
-_PER_DOUBLING = 1.25  # dB that twice the bytes bring, about, if there is only one file
-_SLOPE_RANGE = (0.3, 12.0)  # range of this slope if it is taken from two files, dB per doubling
-_NEAR_ENOUGH = 0.1  # dB above the target that are near enough
-_SIZE_TRIES, _FARTHEST = 5, 2.0  # files after the first; largest change of size from the nearest file, in doublings
 
 
 class SizedFile(Protocol):

@@ -17,7 +17,7 @@ from csplat_tools.file_streams import write_model
 from csplat_tools.optional_packages import prepare_renderer
 from csplat_tools.scene_files import MetadataOverrides
 from csplat_tools.training.training_page import show_views, write_training_page
-from csplat_tools.training.tuned_file import BYTE_COST, default_validation_count, run_finetuning
+from csplat_tools.training.tuning_run import RATE_WEIGHT, default_validation_count, run_finetuning
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.losses import PerceptualLoss
@@ -133,7 +133,7 @@ def tuning_after(training: TrainOptions, byte_cost: float | None = None) -> Fine
     Raises:
         InputError: the weight is out of its range.
     """
-    usual = FinetuneOptions(seed=training.seed, byte_cost=BYTE_COST[False] if byte_cost is None else byte_cost)
+    usual = FinetuneOptions(seed=training.seed, byte_cost=RATE_WEIGHT[False] if byte_cost is None else byte_cost)
     tuning = usual.scaled(min(1.0, _BRIEF / training.iterations))
     steps = max(usual.iterations, round(_TUNING * training.iterations))
     return replace(tuning, iterations=steps, lr_exposure=training.lr_exposure)
