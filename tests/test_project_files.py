@@ -87,6 +87,17 @@ def test_generated_files_that_attributes_name_exist():
     assert [] == [one for one in patterns if not any(ROOT.glob(one))]
 
 
+def test_every_file_that_the_architecture_names_exists():
+    if not (ROOT / ".git").exists():
+        pytest.skip("not a checkout: git knows nothing of these files")
+    text = (ROOT / "ARCHITECTURE.md").read_text("utf-8")
+    named = set(re.findall(r"`([\w./-]+\.(?:py|mjs|md|toml|c|h))`", text))
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True)  # noqa: S607
+    found = {name for path in listed.stdout.split() for name in named if f"/{path}".endswith(f"/{name}")}
+    assert len(found) > 50
+    assert [] == sorted(name for name in named - found if "NAME" not in name)
+
+
 def prepare(root, *words):
     place = ROOT / "tools" / "release" / "prepare.py"
     spec = importlib.util.spec_from_file_location("prepare", place)
