@@ -50,7 +50,7 @@ class Views:
     """Views, and what they see.
 
     Attributes:
-        offset: dB by which they see errors larger than the views that decide.
+        offset: dB by which they see errors larger than the validation views.
         removal_offset: dB by which they see errors of removal larger still.
         photo_psnr: dB by which the source misses their photographs; `None`: they compare with the source.
     """
@@ -158,7 +158,7 @@ class AnalyticScene:
             "adaptive": asked.adaptive or 0.0,
             "deflate_level": asked.deflate_level or 12,
             "opacity_levels": 255,
-        } | ({"grades": {"splats": [contents.splats // 2] * 2}} if contents.graded else {})
+        } | ({"classes": {"splats": [contents.splats // 2] * 2}} if contents.graded else {})
 
     def size_of(self, contents: Contents, quality: Any = None) -> Any:
         """Return the size of a file in bytes, or of one file for each of some qualities."""

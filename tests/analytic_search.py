@@ -150,7 +150,7 @@ class _Splats:
     fitted_psnr = psnr
 
     def coded(self, options, *, use_classes, quick):
-        use_classes = use_classes and self.classifiable and options.grades != 1 and self.scene.grading != 1.0
+        use_classes = use_classes and self.classifiable and options.max_classes != 1 and self.scene.grading != 1.0
         contents = Contents(options, len(self.model), self.refits, graded=use_classes, draft=quick and self.refits)
         return SimpleNamespace(write=lambda _: _encoded(AnalyticFile(self.scene, contents)))
 

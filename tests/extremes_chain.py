@@ -22,7 +22,7 @@ from csplat_conformance.declared_bounds import BoundsVerification, Source, verif
 from csplat_render import Camera, render
 from csplat_render.conventions import RenderResult
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools.optimise import pruning
+from csplat_tools.optimise.pruning import simplify
 from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_trainer.training_loop import train
 from csplat_trainer.tuning import renders_of, split_views, tune
@@ -99,7 +99,7 @@ def chain_of(name: str) -> Chain:
 
 def _learn(source: SplatModel) -> Learnt:
     seen_from = cameras(9)
-    half = pruning(source, keep=0.5, views=views_of(seen_from), options=SimplifyOptions(rounds=1, effort=1)).model
+    half = simplify(source, keep=0.5, views=views_of(seen_from), options=SimplifyOptions(rounds=1, effort=1)).model
     options = replace(QUICK, iterations=40, refine_start=10, refine_every=10)
     trained = train(photographs_of(source, seen_from, source.means[:COUNT]), options)
     try:

@@ -209,7 +209,7 @@ def test_an_ablation_takes_away_one_part_at_a_time_and_puts_it_back(tmp_path, mo
             subsets.quantisation_aware_refit is splat_refit.quantisation_aware_refit and target_search.REFIT_GAIN > 0.0
         )
         prices = math.isfinite(splat_refit.rate_exponent(0.05))
-        has = (tunes, prices, options.grades != 1, simplifying.bands, simplifying.refit, not no_prune)
+        has = (tunes, prices, options.max_classes != 1, simplifying.bands, simplifying.refit, not no_prune)
         parts.append(has)
         report = SearchReport({"psnr": psnr}, 1000, 9, len(source), 3, 1.0, chosen={"psnr": psnr, "splats": 9})
         return SimpleNamespace(data=bytes(1000 + 100 * has.count(False)), report=report)

@@ -93,5 +93,5 @@ def test_tuning_corrects_exposures_too(make_model, uneven):
         tune(frozen, views, FinetuneOptions(iterations=200, validate_every=50, patience=0, lr_exposure=rate)).log
         for rate in (0.0, 0.05)
     )
-    assert corrected["looks"][-1]["psnr"] > plain["looks"][-1]["psnr"] + 0.5
+    assert corrected["validations"][-1]["psnr"] > plain["validations"][-1]["psnr"] + 0.5
     assert np.corrcoef(np.exp(np.array(corrected["exposures"])[:, 0].mean(axis=1)), GAINS)[0, 1] > 0.95

@@ -149,7 +149,7 @@ def test_pixels_that_do_not_count_teach_nothing(coarse, views):
 
     first, second = (tune(coarse, hidden(value), FEW) for value in (0, 250))
     assert np.array_equal(first.held.sh0, second.held.sh0)
-    assert first.log["looks"] == second.log["looks"]
+    assert first.log["validations"] == second.log["validations"]
 
 
 @pytest.mark.slow
@@ -192,17 +192,17 @@ def test_a_run_that_gains_nothing_ends_early(fine):
     frozen, views = fine
     options = replace(FEW, iterations=30, patience=2, byte_cost=0.0).scaled(5.0)
     log = tune(frozen, views, options).log
-    assert log["settled"]
+    assert log["converged"]
     assert 2 / 3 * 30 < log["steps"] < 30  # not before values have calmed down
-    assert not tune(frozen, views, replace(options, patience=0)).log["settled"]
+    assert not tune(frozen, views, replace(options, patience=0)).log["converged"]
 
 
 @pytest.mark.slow
 def test_a_run_whose_files_are_too_large_yet_goes_on(fine, monkeypatch):
     frozen, views = fine
     options = replace(FEW, iterations=30, patience=2, byte_cost=0.0).scaled(5.0)
-    assert tune(frozen, views, options, size_bytes=10**9).log["settled"]
-    monkeypatch.setattr(RateController, "overdrawn", lambda *_: 1e-3)
+    assert tune(frozen, views, options, size_bytes=10**9).log["converged"]
+    monkeypatch.setattr(RateController, "excess", lambda *_: 1e-3)
     assert 30 == tune(frozen, views, options, size_bytes=10**9).log["steps"]
 
 
@@ -374,7 +374,7 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path)
     rest = tune(frozen, views, FEW, resume=file)
     assert frozen.encode(whole.held).write().data == frozen.encode(rest.held).write().data
     assert whole.log["losses"] == rest.log["losses"]
-    assert whole.log["looks"] == rest.log["looks"]
+    assert whole.log["validations"] == rest.log["validations"]
 
 
 @pytest.mark.slow
@@ -385,7 +385,7 @@ def test_bytes_cost_what_keeps_a_file_to_its_size(source, views, tmp_path):
     for share, steps in ((0.93, 120), (1.5, 60)):
         tuned = tune(frozen, views, replace(options, iterations=steps), size_bytes=int(share * before))
         assert len(frozen.encode(tuned.held).write().data) <= share * before
-        best = next(look for look in tuned.log["looks"] if look["iteration"] == tuned.log["best_iteration"])
+        best = next(look for look in tuned.log["validations"] if look["iteration"] == tuned.log["best_iteration"])
         assert best["size_bytes"] == len(frozen.encode(tuned.held).write().data)
         costs.append(tuned.log["byte_cost"])
     assert costs[0] > options.byte_cost > costs[1]
@@ -653,7 +653,7 @@ def test_a_scene_can_be_tuned_to_its_own_renders_which_a_page_shows(capture, tmp
     )  # fmt: skip
     facts = json.loads(report.read_text())
     assert (301, 301) == (facts["source_splats"], facts["splats"])
-    assert (True, 2) == (facts["validation"]["kept_aside"], facts["validation"]["views"])
+    assert (True, 2) == (facts["validation"]["held_out"], facts["validation"]["views"])
     assert {"before tuning", "file"} == set(facts["scores"])
     assert facts["scores"]["file"]["psnr"] > facts["scores"]["before tuning"]["psnr"] + 0.2
     shown = page.read_text()
@@ -803,8 +803,8 @@ def test_defects_can_be_refused(capture, source, tmp_path):
 def test_without_held_out_photographs_nothing_is_scored(capture, tmp_path):
     words = ("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "s.csplat", *BRIEF)
     facts = json.loads(call(*words, "--test-every", 0, "--validation-count", 2, "--json", "-q").stdout)
-    assert ({}, None) == (facts["scores"], facts["judged_by"])
-    assert (True, 2) == (facts["validation"]["kept_aside"], facts["validation"]["views"])
+    assert ({}, None) == (facts["scores"], facts["test_reference"])
+    assert (True, 2) == (facts["validation"]["held_out"], facts["validation"]["views"])
     assert "photographs" not in call(*words, "--test-every", 0, "--force").stderr
 
 

@@ -160,7 +160,7 @@ def test_a_psnr_is_reached_by_fewer_splats_and_the_file_says_what_it_is(many, se
     decoded = decode_scene(found.data)
     assert 30.0 <= found.report.psnr <= 31.0  # files of so few splats jump
     assert found.report.psnr == pytest.approx(views.test_scorer(many).psnr(decoded.model), abs=1e-4)
-    assert found.report.chosen["decided_psnr"] == pytest.approx(
+    assert found.report.chosen["validation_psnr"] == pytest.approx(
         views.validation_scorer(many).psnr(decoded.model), abs=1e-3
     )
     assert (len(found.data), len(decoded.model)) == (found.report.size_bytes, found.report.splats)
@@ -400,7 +400,7 @@ def test_inside_of_surroundings_placed_views_measure_nothing_and_the_report_warn
     assert not any("surroundings" in line for line in kept.why)
 
 
-# grades
+# quantisation classes
 
 
 @pytest.fixture(scope="module")
@@ -432,8 +432,8 @@ def test_what_was_measured_grades_splats_and_makes_files_smaller_at_the_same_psn
         options = EncodeOptions(attribute_psnr=48.0 if use_classes else 47.0)
         whole = WholeScene(unequal, None, measured, None)
         files[use_classes] = whole.coded(options, use_classes=use_classes, quick=False).write()
-    assert len(files[True].report.options["grades"]["splats"]) > 1
-    assert "grades" not in files[False].report.options
+    assert len(files[True].report.options["classes"]["splats"]) > 1
+    assert "classes" not in files[False].report.options
     assert judge.psnr(decode(files[True].data)) >= judge.psnr(decode(files[False].data))
     assert len(files[True].data) < 0.97 * len(files[False].data)
 
@@ -443,7 +443,7 @@ def test_a_search_grades_by_what_it_measured_beside_an_importance_that_is_given(
     few = unequal.select(np.arange(5000))
     weights = np.linspace(1.0, 2.0, len(few))
     report = search(few, None, None, psnr=34.0, no_prune=True, importance=weights).report
-    assert {1, 2} == {one["grades"] for one in report.tried}
+    assert {1, 2} == {one["classes"] for one in report.tried}
     assert 26 == report.sensitivity_views
 
 
@@ -462,14 +462,14 @@ def test_sensitivity_is_measured_where_it_changes_something(scene, unequal, meas
     assert {
         "SH": (True, training), "small, without SH": (False, 0), "SH that is left out": (False, 0),
         "preset fast": (False, 0), "inside": (False, 0), "curvatures": (True, 0), "curvatures inside": (True, 0),
-        "one grade": (False, 0), "weights alone": (True, training), "weights inside": (False, 0),
+        "one class": (False, 0), "weights alone": (True, training), "weights inside": (False, 0),
     } == {
         "SH": views_used(scene), "small, without SH": views_used(bare),
         "SH that is left out": views_used(scene, EncodeOptions(sh_degree=0)),
         "preset fast": views_used(scene, EncodeOptions("fast")), "inside": views_used(scene, inside=True),
         "curvatures": views_used(unequal, importance=measured),
         "curvatures inside": views_used(unequal, importance=measured, inside=True),
-        "one grade": views_used(unequal, EncodeOptions(grades=1), measured),
+        "one class": views_used(unequal, EncodeOptions(max_classes=1), measured),
         "weights alone": views_used(scene, importance=Importance(np.ones(300))),
         "weights inside": views_used(unequal, importance=given, inside=True),
     }  # fmt: skip

@@ -122,7 +122,7 @@ def test_what_rounding_loses_is_foretold():
 def test_classes_have_steps_of_their_own(model):
     plain, _ = encoded(model)
     graded, _ = encoded(model, important(model))
-    said = graded.report.options["grades"]
+    said = graded.report.options["classes"]
     assert sum(said["splats"]) == COUNT
     assert len(said["splats"]) == graded.report.tile_count > plain.report.tile_count == 1
     for name in CLASSED_ATTRIBUTES:
@@ -147,13 +147,13 @@ def test_knobs_that_are_set_hold_for_all_splats(model):
     result, _ = encoded(model, important(model), scale_step=0.01, opacity_levels=100, position_bits=12)
     said = result.report.options
     assert (said["scale_step"], said["opacity_levels"]) == (float(np.float32(0.01)), 100)
-    assert set(said["grades"]["scales"]) == set(said["grades"]["means"]) == {0}
-    assert set(said["grades"]["opacities"]) == {1}
-    assert max(said["grades"]["sh0"]) > 0
+    assert set(said["classes"]["scales"]) == set(said["classes"]["means"]) == {0}
+    assert set(said["classes"]["opacities"]) == {1}
+    assert max(said["classes"]["sh0"]) > 0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{"grades": 1}, {"shape_codebook_size": 16}])
+@pytest.mark.parametrize("options", [{"max_classes": 1}, {"shape_codebook_size": 16}])
 def test_one_class_is_as_without_blocks(model, options):
     with_them, without = important(model), Importance(np.ones(COUNT))
     assert encoded(model, with_them, **options)[0].data == encoded(model, without, **options)[0].data
@@ -161,19 +161,19 @@ def test_one_class_is_as_without_blocks(model, options):
 
 def test_few_splats_are_in_one_class(make_model):
     few = make_model(200, 1)
-    assert "grades" not in encoded(few, important(few))[0].report.options
+    assert "classes" not in encoded(few, important(few))[0].report.options
 
 
 def test_without_errors_all_is_one_class(model):
     nothing = GaussNewtonBlocks(np.zeros(COUNT), np.zeros((COUNT, 21)), np.zeros(COUNT), np.zeros(COUNT))
     result, _ = encoded(model, Importance(np.ones(COUNT), blocks=nothing))
-    assert "grades" not in result.report.options
+    assert "classes" not in result.report.options
 
 
 def test_classes_can_be_ruled_out(model):
     frozen = fix_quantisation(EncodePlan.of(model, importance=important(model), allow_classes=False))
     assert frozen.encode_plan.classes is None
-    assert frozen.encode_plan.options.grades is None
+    assert frozen.encode_plan.options.max_classes is None
 
 
 def test_outliers_get_tiles_of_their_own(model):
@@ -256,8 +256,8 @@ def test_any_step_may_be_given(model):
 
 
 def test_the_preset_fast_has_one_class_by_default(model):
-    assert "grades" not in encoded(model, important(model), preset="fast")[0].report.options
-    assert "grades" in encoded(model, important(model), preset="fast", grades=2)[0].report.options
+    assert "classes" not in encoded(model, important(model), preset="fast")[0].report.options
+    assert "classes" in encoded(model, important(model), preset="fast", max_classes=2)[0].report.options
 
 
 @pytest.mark.parametrize(
@@ -278,7 +278,7 @@ def test_other_curvatures_are_refused(model, field, value):
 def test_the_bytes_do_not_depend_on_threads(model):
     one, two = (encode_with_report(model, EncodeOptions(threads=n), importance=important(model)) for n in (1, 2))
     assert one.data == two.data
-    assert "grades" in one.report.options
+    assert "classes" in one.report.options
 
 
 def test_javascript_reads_the_same(model, tmp_path):
@@ -358,8 +358,8 @@ def test_measured_weights_are_trusted_down_to_half_of_what_is_suggested(model):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("grades", [None, 2])
-def test_the_command_says_that_weights_alone_grade_nothing(model, tmp_path, grades):
+@pytest.mark.parametrize("most", [None, 2])
+def test_the_command_says_that_weights_alone_grade_nothing(model, tmp_path, most):
     from typer.testing import CliRunner
 
     from csplat_tools.cli.app import app
@@ -367,6 +367,6 @@ def test_the_command_says_that_weights_alone_grade_nothing(model, tmp_path, grad
     csplat.write_ply(tmp_path / "scene.ply", model)
     np.save(tmp_path / "weights.npy", np.ones(COUNT, np.float32))
     words = ["encode", tmp_path / "scene.ply", tmp_path / "a.csplat", "--importance", tmp_path / "weights.npy", "-q"]
-    done = CliRunner().invoke(app, [str(word) for word in [*words, *(["--grades", grades] if grades else [])]])
+    done = CliRunner().invoke(app, [str(word) for word in [*words, *(["--max-classes", most] if most else [])]])
     assert done.exit_code == 0
-    assert ("in one quantisation class" in done.stderr) == (grades is not None)
+    assert ("in one quantisation class" in done.stderr) == (most is not None)

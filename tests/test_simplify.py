@@ -220,8 +220,8 @@ def test_transparent_and_opaque_splats_stay_within_alpha(source):
 @pytest.mark.parametrize(("goal", "refit"), [(35.0, False), (28.0, True)])
 def test_a_target_psnr_is_reached(source, given, goal, refit):
     result = simplify(source, psnr=goal, views=given, options=replace(SMALL, bands=False, refit=refit))
-    assert result.report["decided_psnr"] >= goal
-    assert given.validation_scorer(source).psnr(result.model) == pytest.approx(result.report["decided_psnr"])
+    assert result.report["validation_psnr"] >= goal
+    assert given.validation_scorer(source).psnr(result.model) == pytest.approx(result.report["validation_psnr"])
     assert len(result.model) < len(source)
 
 
@@ -372,8 +372,8 @@ def test_the_command_takes_cameras_and_prints_json_and_says_how_long_it_takes(so
     assert result.exit_code == 0, result.output
     assert "this takes about 1 to 2 minutes here" in result.stderr
     report = json.loads(result.stdout)
-    assert report["decided_psnr"] >= 30.0
-    assert {"cameras": "cameras.json", "views": 10} == report["judged_by"]
+    assert report["validation_psnr"] >= 30.0
+    assert {"cameras": "cameras.json", "views": 10} == report["test_views"]
     assert report["views"]["used"] >= 10  # so few are all test views; training views are virtual, without equal ones
 
 

@@ -221,7 +221,7 @@ def test_a_loss_is_kept_to_and_its_file_hardly_larger_than_the_smallest(loss):
 
 def test_a_loss_that_no_file_keeps_to_is_refused():
     """Files err by as much as photographs do, at any precision."""
-    with pytest.raises(InputError, match=r"no file reaches 49.50 dB by the photographs that decide; the best has"):
+    with pytest.raises(InputError, match=r"no file reaches 49.50 dB by the validation photographs; the best has"):
         search(replace(PLAIN, ceiling=50.0), max_psnr_drop=0.5, photo_psnr=50.0)
 
 
@@ -307,8 +307,8 @@ def test_grades_are_chosen_where_they_make_files_smaller():
         search(scene, psnr=38.0, no_prune=True, grades=grades)
         for scene, grades in ((cheaper, True), (replace(PLAIN, grading=1.1), True), (cheaper, False))
     )
-    assert [2, 1, 1] == [found.report.chosen["grades"] for found in (graded, dearer, unknown)]
-    assert any("2 grades" in line for line in graded.report.why)
+    assert [2, 1, 1] == [found.report.chosen["classes"] for found in (graded, dearer, unknown)]
+    assert any("2 quantisation classes" in line for line in graded.report.why)
 
 
 @pytest.mark.parametrize(

@@ -105,7 +105,7 @@ def encode_by_importance(
 
 def _class_notes(options: EncodeOptions, weights: NDArray[Any] | Importance) -> tuple[str, ...]:
     """Return a note if quantisation classes were requested and the importance cannot provide them."""
-    if (options.grades or 1) == 1 or (isinstance(weights, Importance) and weights.blocks is not None):
+    if (options.max_classes or 1) == 1 or (isinstance(weights, Importance) and weights.blocks is not None):
         return ()
     return (_ONE_CLASS,)
 

@@ -47,8 +47,8 @@ class EncodeOptions:
             metric of shapes, otherwise 0.05.
         adaptive: how much coarser the SH of unimportant splats is, 0 (not at all) to 1 (their error grows as their
             importance falls). Default: 0 unless an importance is given.
-        grades: maximum number of quantisation classes, 1 to 5: splats whose errors are equally visible share steps.
-            Only if an importance holds Gauss-Newton blocks. Default: one per 2,500 splats; 1 with the preset "fast".
+        max_classes: maximum number of quantisation classes, 1 to 5: splats whose errors are equally visible share
+            steps. Requires an importance with Gauss-Newton blocks. Default: one per 2,500 splats; 1 with "fast".
         tile_splats: maximum number of splats per tile, 1 to 65536. Decoders spread tiles over cores: 16384 decodes
             scenes of few tiles 1.2 to 3.6 times as fast on four cores, for up to 1.2 % more bytes; 4096 costs 3 to 6 %.
         deflate_level: level of DEFLATE, 1 to 12 for libdeflate, 1 to 9 for zlib.
@@ -88,7 +88,7 @@ class EncodeOptions:
     shape_codebook_size: int | None = None
     shape_escape_fraction: float | None = None
     adaptive: float | None = None
-    grades: int | None = None
+    max_classes: int | None = None
     tile_splats: int = _spec.TILE_SPLATS_MAX
     deflate_level: int | None = None
     deflate: Deflate = "auto"
@@ -183,7 +183,7 @@ _RANGES: dict[str, tuple[type[int | float], float, float]] = {
     "shape_codebook_size": (int, 0, _spec.CODEBOOK_ENTRIES_MAX),
     "shape_escape_fraction": (float, 0, 1),
     "adaptive": (float, 0, 1),
-    "grades": (int, 1, 5),
+    "max_classes": (int, 1, 5),
     "tile_splats": (int, 1, _spec.TILE_SPLATS_MAX),
     "deflate_level": (int, 1, 12),
     "seed": (int, 0, math.inf),

@@ -404,7 +404,7 @@ def encoding_settings(plan: EncodePlan, tables: ShTables) -> dict[str, Any]:
         "adaptive": parameters.adaptive if parameters.sh_coding == "scalar" else 0.0,
         "codebook_size": 0 if tables.book is None else tables.book.size,
         **_shape_settings(plan.shapes),
-        **({} if plan.classes is None else {"grades": plan.classes.as_json()}),
+        **({} if plan.classes is None else {"classes": plan.classes.as_json()}),
         "deflate_level": parameters.deflate.level,
         "deflate": parameters.deflate.library,
         "seed": options.seed,

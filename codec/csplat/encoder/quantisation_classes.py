@@ -73,7 +73,7 @@ def choose_classes(
         model: the scene.
         blocks: Gauss-Newton blocks of the splats; None: all splats are in one class.
         parameters: the chosen steps.
-        options: `grades`, and options that set the steps of an attribute for all splats.
+        options: `max_classes`, and options that set the steps of an attribute for all splats.
 
     Returns:
         The parameters with the steps of the finest class, and the classes; or the unchanged parameters, and None.
@@ -102,7 +102,7 @@ def max_class_count(count: int, options: EncodeOptions) -> int:
     """Return the maximum number of classes for `count` splats with Gauss-Newton blocks."""
     if options.shape_codebook_size or not _free_attributes(options):
         return 1
-    most = options.grades or (1 if options.preset == "fast" else _CLASSES_MAX)
+    most = options.max_classes or (1 if options.preset == "fast" else _CLASSES_MAX)
     return max(1, min(most, round(count / _SPLATS_PER_CLASS)))
 
 

@@ -5,7 +5,7 @@ rendering         time of a picture and of its gradients; removal
 training          a step of training, stage by stage; lego
 viewer            culling, sorting, drawing; arrival, engines, owners
 compression       a whole compression of trained scenes, step by step, on held-out photographs
-distortion        rate against distortion compared with SPZ and SOG; grades, operating
+distortion        rate against distortion compared with SPZ and SOG; classes, operating
 targets           targets compared with presets and another build
 datasets          the scenes that papers report
 study             a published study of simple strategies, done again

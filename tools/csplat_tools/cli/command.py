@@ -71,7 +71,12 @@ UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 _EMPTY_PHRASES = re.compile(r"^Invalid value: |(?<=: )Value error, |\.$")  # in typer's messages
 
 #: Options with their new names; the old ones are refused for one version.
-RENAMED_OPTIONS = {"--keep-all": "--no-prune", "--max-loss": "--max-psnr-drop", "--aside": "--validation-count"}
+RENAMED_OPTIONS = {
+    "--aside": "--validation-count",
+    "--grades": "--max-classes",
+    "--keep-all": "--no-prune",
+    "--max-loss": "--max-psnr-drop",
+}
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -242,11 +242,11 @@ def encode(
       gunzip -c scene.ply.gz | csplat encode - - | wc -c
     """
     options = encoding.options(facts, settings)
-    if (options.grades or 1) > 1:
+    if (options.max_classes or 1) > 1:
         if options.shape_codebook_size:
-            raise typer.BadParameter("--grades with a codebook of shapes: its entries have one precision")
+            raise typer.BadParameter("--max-classes with a codebook of shapes: its entries have one precision")
         if not goal.is_rendered and importance is None:
-            raise typer.BadParameter("--grades says nothing without a target or --importance: views sort the splats")
+            raise typer.BadParameter("--max-classes requires a target or --importance: views sort the splats")
     try:  # errors of the target that do not depend on the scene
         goal.read(1.0)
     except InputError as error:

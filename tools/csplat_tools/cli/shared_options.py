@@ -296,7 +296,7 @@ class EncodingOptions(OptionGroup):
         typer.Option(metavar="DB", help="PSNR of each attribute; renders have 5 to 12 dB less."),
     ] = None
     sh_degree: Annotated[int | None, typer.Option(metavar="0..3", help="Leave out SH bands above this one.")] = None
-    grades: Annotated[
+    max_classes: Annotated[
         int | None,
         typer.Option(
             metavar="1..5",

@@ -133,10 +133,10 @@ def _lines(report: Mapping[str, Any]) -> list[str]:
     ]
     rows = [("the other views, before the fit", f"{report['check_psnr_pruned']:.2f}")]
     rows.append(("the other views, fitted", f"{report['check_psnr']:.2f}"))
-    if "decided_psnr" in report:
-        rows.append(("validation views", f"{report['decided_psnr']:.2f}"))
+    if "validation_psnr" in report:
+        rows.append(("validation views", f"{report['validation_psnr']:.2f}"))
     if "psnr" in report:
-        rows.append((f"{report['judged_by']['views']} test views", f"{report['psnr']:.2f}"))
+        rows.append((f"{report['test_views']['views']} test views", f"{report['psnr']:.2f}"))
     if "photographs" in report:
         scores = report["photographs"]
         rows.append(("held-out photographs, source", f"{scores['source']:.2f}"))

@@ -60,7 +60,7 @@ def _options_of(coding: CodingChoice, encoding: EncodeOptions, splats: int) -> E
         codebook_size=size,
         sh_degree=encoding.sh_degree if coding.degree is None else coding.degree,
         adaptive=encoding.adaptive if coding.adaptive is None else coding.adaptive,
-        grades=encoding.grades if coding.use_classes else 1,
+        max_classes=encoding.max_classes if coding.use_classes else 1,
     )
 
 
@@ -206,7 +206,7 @@ class Candidate:
     @property
     def class_count(self) -> int:
         """Number of quantisation classes of its splats."""
-        return len(self.result.report.options.get("grades", {}).get("splats", [0]))
+        return len(self.result.report.options.get("classes", {}).get("splats", [0]))
 
     def as_json(self) -> dict[str, Any]:
         """Return settings, size and PSNR as JSON-compatible values."""
@@ -219,9 +219,9 @@ class Candidate:
             "sh_coding": options["sh_coding"],
             "sh_degree": options["sh_degree"],
             "codebook_size": options["codebook_size"],
-            "grades": self.class_count,
+            "classes": self.class_count,
             "size_bytes": self.size_bytes,
-            "decided_psnr": round(self.validation_psnr, 3),
+            "validation_psnr": round(self.validation_psnr, 3),
             "psnr": round(self.psnr, 3) if self.is_scored else None,
         }
 

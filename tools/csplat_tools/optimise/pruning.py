@@ -253,8 +253,8 @@ class _PrunedScene:
             "check_psnr_pruned": self.check_pruned_psnr,
             "check_psnr": self.check_psnr,
             "refit_refused": self.is_refused or None,
-            "decided_psnr_pruned": self.validation_pruned_psnr,
-            "decided_psnr": self.validation_psnr,
+            "validation_psnr_pruned": self.validation_pruned_psnr,
+            "validation_psnr": self.validation_psnr,
         }
         return {name: value for name, value in scores.items() if value is not None}
 
@@ -275,7 +275,7 @@ def _test_scores(session: PruningSession, model: SplatModel) -> dict[str, Any]:
         return {}
     scores: dict[str, Any] = {
         "psnr": views.test_scorer(session.source, threads=threads).psnr(model),
-        "judged_by": {"cameras": views.name, "views": len(views.test)},
+        "test_views": {"cameras": views.name, "views": len(views.test)},
     }
     if views.photographs:
         scorer = views.photograph_test_scorer(threads=threads)

@@ -205,7 +205,7 @@ def complete_importance(
     if isinstance(importance, Importance) and importance.blocks is not None:
         return (importance if several else None), 0
     has_sh = source.sh_degree > 0 and encoding.sh_degree != 0 and encoding.sh_coding != "none"
-    quick = encoding.preset == "fast" and encoding.grades is None
+    quick = encoding.preset == "fast" and encoding.max_classes is None
     if inside or quick or not (several or has_sh):
         return None, 0
     seen_from = importance_views(source, views)

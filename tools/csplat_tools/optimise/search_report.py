@@ -84,12 +84,12 @@ class SearchReport:
             asked.append(f"{goal['psnr']:g} dB, of which it reaches {self.psnr:.2f}")
         if "keep" in goal:
             asked.append(f"{100.0 * goal['keep']:g} % of {counted(self.splats_before, 'splat')}")
-        if "max_loss" in goal:
-            asked.append(f"a loss of {goal['max_loss']:g} dB by the photographs that decide")
+        if "max_psnr_drop" in goal:
+            asked.append(f"a drop of {goal['max_psnr_drop']:g} dB against the validation photographs")
         lines = [f"target: {'; '.join(asked)}"]
         if self.photographs:
             file, source = self.photographs["file"], self.photographs["source"]
-            lines.append(f"photographs that judge: {file:.2f} dB, the source {source:.2f}")
+            lines.append(f"test photographs: {file:.2f} dB, the source {source:.2f}")
         lines += [f"chosen: {line}" for line in self.why]
         if self.psnr is not None:
             lines.append(f"PSNR {self.psnr:.2f} dB, {self.sure}")
@@ -194,7 +194,7 @@ def _why(target: Target, found: Candidate, candidates: CandidatePool, splats_bef
         lines = [f"{_coding(found)}; each attribute keeps {found.quality:.1f} dB by itself: all steps follow from that"]
     if found.class_count > 1:
         lines.append(
-            f"splats are sorted into {found.class_count} grades by what pictures lose, each with steps of its own"
+            f"splats are sorted into {found.class_count} quantisation classes by importance, each with its own steps"
         )
     others = [coding for coding in codings if coding != _coding(found)]
     if others:

@@ -376,7 +376,7 @@ class RefittedSubset:
         """Return the entry for a file's options: splats of the source, number of views, and PSNRs of the file."""
         session = self.session
         entry = {"splats": len(session.source), "views": len(session.training_cameras)}
-        figures = {} if candidate is None else {"decided_psnr": round(candidate.validation_psnr, 3)}
+        figures = {} if candidate is None else {"validation_psnr": round(candidate.validation_psnr, 3)}
         if candidate is not None and candidate.is_final:
             figures["check_psnr"] = round(self._check_psnr, 3)
         return {"simplified": {**entry, **figures}}
@@ -415,7 +415,7 @@ class RefittedSubset:
 
     def _importance(self, options: EncodeOptions, *, use_classes: bool) -> NDArray[Any] | Importance:
         has_classes = use_classes and max_class_count(len(self.rows), options) > 1
-        if has_classes and (self.classifiable or options.grades is not None):
+        if has_classes and (self.classifiable or options.max_classes is not None):
             return self._measured
         weights = self._pruning_error.squared_weight
         return replace(self._measured, blocks=None) if options.shape_codebook_size else weights

@@ -418,9 +418,7 @@ class TargetSearch:
             return f"no file{kept} has {goal.size_bytes} bytes or fewer: of those tried one has {smallest}"
         if goal.photo_psnr is not None:
             nearest = max(candidate.photo_psnr for candidate in made)
-            return (
-                f"no file reaches {goal.photo_psnr:.2f} dB by the photographs that decide; the best has {nearest:.2f}"
-            )
+            return f"no file reaches {goal.photo_psnr:.2f} dB by the validation photographs; the best has {nearest:.2f}"
         highest = max(candidate.psnr for candidate in made if candidate.is_scored)
         return f"no file reaches {goal.psnr or 0.0:.2f} dB; the best of those tried has {highest:.2f} dB"
 

@@ -79,11 +79,10 @@ class Target:
 
     def as_json(self) -> dict[str, Any]:
         """Return the values that are set, by name."""
-        given = {_JSON_KEYS.get(name, name): getattr(self, name) for name in _ASKED if getattr(self, name) is not None}
+        given = {name: getattr(self, name) for name in _ASKED if getattr(self, name) is not None}
         return {**given, "max_error": dict(self.max_error)} if self.max_error else given
 
 
-_JSON_KEYS = {"max_psnr_drop": "max_loss"}  # key in reports, if it is not the name of the field
 _ASKED = {"psnr": "a PSNR", "size_bytes": "a size", "max_psnr_drop": "a loss", "keep": "a share of the splats"}
 
 

@@ -106,7 +106,7 @@ def _pictures(tradeoff: Tradeoff) -> str:
             blocks.append(f"{head}\n{piece_images(point.hardest, point.name)}")
     virtual = tradeoff.setting.views.name == VIRTUAL
     text = f"The presets, and files of the dashed line. {IMAGES_NOTE}" + (
-        " The views are chosen because they show the scene well; they need not be those that judge." if virtual else ""
+        " The views are chosen because they show the scene well; they need not be test views." if virtual else ""
     )
     return f"<h2>The hardest places</h2>\n<p>{text}</p>\n" + "\n".join(blocks) if blocks else ""
 
@@ -122,7 +122,7 @@ def shown_points(tradeoff: Tradeoff) -> list[SweepPoint]:
 
 
 def _times(tradeoff: Tradeoff) -> str:
-    plots = _figure(tradeoff, "size-encode-time", "From the splats to the bytes, with the renders that decide.")
+    plots = _figure(tradeoff, "size-encode-time", "From the splats to the bytes, including renders for decisions.")
     plots += _figure(tradeoff, "quality-decode-time", "From the bytes in memory to float32 arrays.")
     stages = [
         (point.name, f"{point.encode_seconds:.2f}", ", ".join(f"{k} {v:.2f}" for k, v in point.stages.items()) or "-")

@@ -130,7 +130,7 @@ def _head(title: str, training: Mapping[str, Any] | None, file: Mapping[str, Any
 
 def _scores(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> str:
     if file is not None and file["scores"]:
-        scores, views, by = file["scores"], file["judged_views"], file["judged_by"]
+        scores, views, by = file["scores"], file["test_view_count"], file["test_reference"]
     elif training is not None and training["metrics"]:
         scores, views, by = {"trained scene": training["metrics"]}, training["metrics"]["views"], "held-out photographs"
     else:
@@ -174,7 +174,7 @@ def _steps(training: Mapping[str, Any] | None) -> str:
 
 
 def _tuning(file: Mapping[str, Any] | None) -> str:
-    validations = [] if file is None else file["log"]["looks"]
+    validations = [] if file is None else file["log"]["validations"]
     if len(validations) < 2:
         return ""
 
@@ -182,7 +182,7 @@ def _tuning(file: Mapping[str, Any] | None) -> str:
         axes = figure.add_subplot()
         steps = [one["iteration"] for one in validations]
         axes.plot(steps, [one["psnr"] for one in validations], "o-", color=_LINE, markersize=3)
-        axes.set(xlabel="step", ylabel="PSNR of views that decide, dB")
+        axes.set(xlabel="step", ylabel="PSNR of validation views, dB")
         right = axes.twinx()
         right.plot(steps, [one["size_bytes"] / 1e6 for one in validations], ":", color=INK)
         right.set_ylabel("MB of the file (dotted)")

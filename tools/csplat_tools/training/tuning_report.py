@@ -116,19 +116,19 @@ def make_tuning_report(
         "ratio": count * ply_splat_bytes(source.sh_degree) / size,
         "bytes_by_attribute": shares,
         "overhead_bytes": overhead,
-        "judged_by": None if test is None else test.reference,
-        "judged_views": 0 if test is None else test.view_count,
+        "test_reference": None if test is None else test.reference,
+        "test_view_count": 0 if test is None else test.view_count,
         "scores": {} if test is None else {name: dict(one) for name, one in test.scores.items()},
         "decoded_is_what_was_tuned": True,  # otherwise the run would have ended with an error
         "validation": {
             "views": log["validation_views"],
-            "kept_aside": log["kept_aside"],
+            "held_out": log["held_out"],
             "psnr_before": log["start_psnr"],
             "psnr": log["best_psnr"],
         },
         "steps": log["steps"],
         "best_step": log["best_iteration"],
-        "settled": log["settled"],
+        "converged": log["converged"],
         "seconds": dict(seconds),
         "seconds_without_judging": round(sum(v for k, v in seconds.items() if k != "judging"), 3),
         "peak_memory_bytes": log["peak_memory_bytes"],
@@ -146,13 +146,13 @@ def format_tuning_report(report: Mapping[str, Any]) -> str:
     ratio = f"{report['ratio']:.1f} times smaller than a PLY of {ply_splat_bytes(report['sh_degree'])} bytes per splat"
     lines = [f"{counted(report['source_splats'], 'splat')}{left_out}: {size}, {ratio}"]
     if report["scores"]:
-        header = (f"{report['judged_views']} {report['judged_by']}", *SCORES)
+        header = (f"{report['test_view_count']} {report['test_reference']}", *SCORES)
         lines += ["", format_table(header, score_rows(report["scores"]))]
     parts = [*report["bytes_by_attribute"].items(), ("everything else", report["overhead_bytes"])]
     rows_bytes = [(name, size, f"{size / report['source_splats']:.2f}") for name, size in parts]
     lines += ["", format_table(("bytes", "all", "per source splat"), rows_bytes)]
     times = ", ".join(f"{name} {seconds:.1f}" for name, seconds in report["seconds"].items())
-    stop = ", and nothing was gained any more" if report["settled"] else ""
+    stop = ", and nothing was gained any more" if report["converged"] else ""
     lines += [
         "",
         f"{counted(report['steps'], 'step')}{stop}; the best stood at {report['best_step']}; seconds: {times}",

@@ -247,7 +247,7 @@ def _tune_to_psnr(psnr: float, make: Callable[..., TunedSubset], *, quiet: bool)
         for stage, seconds in found.seconds.items():
             clock.seconds[stage] = round(clock.seconds.get(stage, 0.0) + seconds, 3)
         if not quiet:
-            note(f"{format_bytes(found.size_bytes)}: {found.psnr:.2f} dB on the views that decide")
+            note(f"{format_bytes(found.size_bytes)}: {found.psnr:.2f} dB on the validation views")
         return found
 
     return replace(smallest_reaching(psnr, made), seconds=clock.seconds)

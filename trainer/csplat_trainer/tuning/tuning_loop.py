@@ -150,7 +150,7 @@ class _TuningRun:
         self._rng = Generator(PCG64(options.seed))
         self._iteration, self._queue = 0, list[int]()
         self._sizes: dict[tuple[int, int], _ImageBuffers] = {}
-        self._log: dict[str, Any] = {"losses": [], "looks": [], "seconds": 0.0, "views": views.digest}
+        self._log: dict[str, Any] = {"losses": [], "validations": [], "seconds": 0.0, "views": views.digest}
         self._gains = ImageGains(len(views.train))
         self._numbers = {id(view): number for number, view in enumerate(views.train)}
         self._best: _BestValues | None = None
@@ -177,7 +177,7 @@ class _TuningRun:
         self._iteration = checkpoint.iteration
         self._queue = [index for index in checkpoint.queue if index < len(self._views.train)]
         self._log = checkpoint.log
-        for look in self._log["looks"]:
+        for look in self._log["validations"]:
             look.setdefault("size_bytes", 0)  # older checkpoints lack it if no size was requested
         self._gains = ImageGains(len(self._views.train), self._log.get("exposures", ()))
         self._best = _BestValues(checkpoint.best_held, *checkpoint.best)
@@ -295,7 +295,9 @@ class _TuningRun:
             excess = self._controller.excess(size_bytes, costs.bits)
             shrinks = excess > 0.0 and not self._controller.is_exhausted
             score = loss + excess
-        self._log["looks"].append({"iteration": self._iteration, "loss": loss, "psnr": psnr, "size_bytes": size_bytes})
+        self._log["validations"].append(
+            {"iteration": self._iteration, "loss": loss, "psnr": psnr, "size_bytes": size_bytes}
+        )
         if self._best is None or score < self._best.score * (1.0 - _MIN_GAIN):
             self._best = _BestValues(self._scene.held.copy(), score, psnr, self._iteration)
         elif self._options.has_calmed(self._iteration) and not shrinks:
@@ -310,7 +312,7 @@ class _TuningRun:
 
     def _progress(self, window: list[float], left: float) -> TuningStep:
         assert self._best is not None
-        look = self._log["looks"][-1]
+        look = self._log["validations"][-1]
         return TuningStep(
             self._iteration,
             self._options.iterations,
@@ -351,11 +353,11 @@ class _TuningRun:
             "options": asdict(self._options),
             "train_views": len(self._views.train),
             "validation_views": len(self._views.validation),
-            "kept_aside": self._views.is_held_out,
+            "held_out": self._views.is_held_out,
             "steps": self._iteration,
-            "settled": self._has_converged,
+            "converged": self._has_converged,
             "byte_cost": self._byte_cost,
-            "start_psnr": self._log["looks"][0]["psnr"],
+            "start_psnr": self._log["validations"][0]["psnr"],
             "best_psnr": self._best.psnr,
             "best_iteration": self._best.iteration,
             "peak_memory_bytes": peak_memory(),

@@ -66,7 +66,7 @@ _WITHOUT = {
         )
     ),
     "price of bits in it": _Without(instead=((splat_refit, "rate_exponent", lambda _: math.inf),)),
-    "grades": _Without(encoding={"grades": 1}),
+    "grades": _Without(encoding={"max_classes": 1}),
     "bands by splat": _Without(simplifying={"bands": False}, sh=True),
     "any fit": _Without(simplifying={"refit": False}),
     "removal": _Without(no_prune=True),

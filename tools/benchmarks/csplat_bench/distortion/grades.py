@@ -33,7 +33,7 @@ from csplat_tools.optimise.scene_sensitivity import importance_views, measure_im
 from csplat_tools.views import BLACK, find_view_set
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg"
-_EVEN = (38.0, 42.0, 46.0, 50.0, 54.0, 58.0, 62.0, 66.0)  # qualities of files without grades
+_EVEN = (38.0, 42.0, 46.0, 50.0, 54.0, 58.0, 62.0, 66.0)  # qualities of files with one class
 _GRADED = (46.0, 54.0, 62.0)
 _JUDGES = 20  # cameras at most
 _HEAD = ("scene", "kind", "measured by", "s", "judged by", *["of the bytes at dB"] * len(_GRADED))
