@@ -1,8 +1,12 @@
-"""Files that were encoded for a test, with what must hold of any file checked."""
+"""Files for tests: encoded with everything checked, or read along the axes of their format."""
+
+from __future__ import annotations
 
 import csplat
+from csplat.disk_files import local_file
 from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.encoder.error_bounds import measure_errors
+from csplat.formats import detect_format
 from csplat_conformance.validator import validate
 
 
@@ -15,3 +19,9 @@ def encoded(model, importance=None, **options):
         assert largest <= result.report.errors[name][0], name
         assert rms <= result.report.errors[name][1], name
     return result, decoded
+
+
+def checked(file):
+    """A scene along the axes of its file."""
+    with local_file(file) as path, detect_format(path).open(path) as scene:
+        return scene.model()

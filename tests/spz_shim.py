@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from filed import filed
+from checked import checked
 
 from csplat.editing.transform import axes_rotation, convert_axes, rotate_scene
 from csplat.errors import CsplatError
@@ -120,7 +120,7 @@ def save_spz_to_buffer(cloud, options):
 
 def load_spz(file, options):
     try:
-        return _cloud(filed(file), options.to_coord)
+        return _cloud(checked(file), options.to_coord)
     except (CsplatError, OSError):
         return GaussianCloud()
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from batch_worker import InThisProcess
-from interrupts import heed_interrupts
+from child_processes import heed_interrupts
 from typer.testing import CliRunner
 
 import csplat

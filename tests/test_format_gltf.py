@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from filed import filed
+from checked import checked
 
 import csplat
 from csplat.editing.transform import rotate_scene
@@ -64,7 +64,7 @@ def glb(said, data):
 
 
 def read(said, data):
-    return filed(glb(said, data))
+    return checked(glb(said, data))
 
 
 def test_values_are_those_of_the_file():
@@ -137,7 +137,7 @@ def test_a_far_translation_is_an_origin():
 def test_a_scene_comes_back(tmp_path, make_model, degree):
     model = make_model(50, degree, origin=(1.5, -2.0, 0.1), antialiased=True, metadata={"licence": "CC0"})
     csplat.write(tmp_path / "a.glb", model)
-    back = filed(tmp_path / "a.glb")
+    back = checked(tmp_path / "a.glb")
     assert ("LUF", True, "CC0") == (back.coordinate_system, back.antialiased, back.metadata["licence"])
     flipped = rotate_scene(back, np.diag([-1.0, -1.0, 1.0]))
     assert model.origin == flipped.origin
@@ -151,7 +151,7 @@ def test_a_scene_comes_back(tmp_path, make_model, degree):
 def test_lengths_are_written_in_metres(tmp_path, make_model):
     model = make_model(5, 0, unit_metres=0.5, coordinate_system="LUF")
     csplat.write(tmp_path / "a.glb", model)
-    back = filed(tmp_path / "a.glb")
+    back = checked(tmp_path / "a.glb")
     assert 1.0 == back.unit_metres
     assert (model.means * np.float32(0.5) == back.means).all()
     assert np.abs(model.scales + np.log(0.5) - back.scales).max() < 1e-6
@@ -177,12 +177,12 @@ def test_buffers_may_be_text_or_files_beside_it(tmp_path):
     def read_from(uri):
         said["buffers"][0]["uri"] = uri
         path.write_text(json.dumps(said))
-        return filed(path)
+        return checked(path)
 
     said["buffers"][0]["uri"] = "a%20b.bin"
     for encoding in ("utf-8-sig", "utf-16"):
         path.write_text(json.dumps(said), encoding=encoding)
-        assert 2 == len(filed(path))
+        assert 2 == len(checked(path))
     (path.parent / "lfs.bin").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
     with pytest.raises(InputError, match=r"lfs\.bin' is a pointer of Git LFS"):
         read_from("lfs.bin")
@@ -269,7 +269,7 @@ def test_a_mesh_that_is_shown_very_often_is_refused():
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_splats_that_are_not_finite_are_dropped_and_counted(tmp_path, name, value):
     arrays = many()
-    whole = filed(glb(*document(arrays)))
+    whole = checked(glb(*document(arrays)))
     arrays[name][3, 0] = value
     found, model = linted(tmp_path / "a.glb", *document(arrays))
     assert ("repair", 1) == (found["nonfinite-rows"].kind, found["nonfinite-rows"].count)
@@ -309,7 +309,7 @@ def test_huge_values_bytes_behind_the_end_and_other_scenes_are_told(tmp_path):
 def linted(path, said, data):
     """Lint a file; return the findings by id, and its splats along the axes of the file."""
     path.write_bytes(glb(said, data))
-    return {one.id: one for one in lint_file(path)}, filed(path)
+    return {one.id: one for one in lint_file(path)}, checked(path)
 
 
 def many(count=40, **changed):
@@ -323,7 +323,7 @@ def many(count=40, **changed):
 
 def test_logarithms_are_recognised_by_their_sign(tmp_path):
     arrays = many()
-    right = filed(glb(*document(arrays)))
+    right = checked(glb(*document(arrays)))
     logs = np.log(arrays[f"{PREFIX}:SCALE"])
     said, data = document(many(SCALE=logs), asset={"version": "2.0", "generator": "writer 1"})
     found, model = linted(tmp_path / "a.glb", said, data)
@@ -375,7 +375,7 @@ def test_rotations_of_length_0_are_told(tmp_path):
 @pytest.mark.parametrize("bands", [{}, BAND])
 def test_linear_colours_are_fitted_and_the_error_is_told(tmp_path, bands):
     said, data = document(TWO | {name: array * np.float32(0.02) for name, array in bands.items()})
-    raw = filed(glb(said, data))
+    raw = checked(glb(said, data))
     said["meshes"][0]["primitives"][0]["extensions"][PREFIX]["colorSpace"] = "lin_rec709_display"
     found, model = linted(tmp_path / "a.glb", said, data)
     assert "repair" == found["linear-colours"].kind
@@ -471,7 +471,7 @@ def test_spz_in_a_glb_is_read(tmp_path, make_model, name, degree):
     said, data = packed(tmp_path, model, name)
     said["nodes"][0]["translation"] = [10, 20, 30]
     found, back = linted(tmp_path / "a.glb", said, data)
-    alone = filed(tmp_path / "a.spz")
+    alone = checked(tmp_path / "a.spz")
     assert ["spz-axes"] == list(found)
     assert ("LUF", degree, 50) == (back.coordinate_system, back.sh_degree, len(back))
     assert np.allclose(alone.means + np.array([10, 20, 30]), back.means, atol=1e-5)
@@ -490,7 +490,7 @@ def test_spz_in_a_glb_is_turned_as_the_text_has_it_where_bounds_allow_it(tmp_pat
     for one in (said, packed(tmp_path, model, name, bounds=False)[0]):
         found, back = linted(tmp_path / "a.glb", one, data)
         assert {} == found
-        assert np.allclose(filed(tmp_path / "a.spz").means * flip, back.means)
+        assert np.allclose(checked(tmp_path / "a.spz").means * flip, back.means)
     found, back = linted(tmp_path / "a.glb", *packed(tmp_path, model, name, bounds=False, draft=True))
     assert "CesiumJS" in found["spz-axes"].text
 

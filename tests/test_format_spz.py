@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
+from checked import checked
 from conftest import of_peers
-from filed import filed
 
 import csplat
 from csplat.editing.transform import convert_axes
@@ -65,7 +65,7 @@ def word(index, *three):
 )
 def test_the_bytes_of_each_version_mean_what_the_format_says(version, positions, rotation, bare):
     data = [positions, b"\x33", bytes([0, 51, 255]), bytes([0, 160, 255]), rotation, bytes([0, 128, 255] * 3)]
-    model = filed(spz(version, data, degree=1, flags=1, bare=bare))
+    model = checked(spz(version, data, degree=1, flags=1, bare=bare))
     assert [[1.5, -2.0, 0.25]] == model.means.tolist()
     assert [[-10.0, 0.0, 5.9375]] == model.scales.tolist()
     assert [[-1.0, 0.0, 127 / 128]] * 3 == model.shN[0].tolist()
@@ -79,7 +79,7 @@ def test_the_bytes_of_each_version_mean_what_the_format_says(version, positions,
 
 @pytest.mark.parametrize("largest", range(4))
 def test_the_component_that_is_left_out_stands_in_its_place(largest):
-    model = filed(spz(3, [bytes(9), b"\1", bytes(3), bytes(3), word(largest, 73, 146, -219)]))
+    model = checked(spz(3, [bytes(9), b"\1", bytes(3), bytes(3), word(largest, 73, 146, -219)]))
     three = [sqrt(0.5) / 511 * value for value in (73, 146, -219)]
     xyzw = [*three[:largest], sqrt(1 - np.square(three).sum()), *three[largest:]]
     np.testing.assert_allclose([xyzw[3], *xyzw[:3]], model.quats[0], atol=1e-6)
@@ -88,23 +88,23 @@ def test_the_component_that_is_left_out_stands_in_its_place(largest):
 @pytest.mark.parametrize("version", [3, 4])
 def test_axes_of_an_extension_count_and_others_are_skipped(version):
     data = spz(version, splats(version), flags=2, extensions=AXES)
-    assert "RDF" == filed(data).coordinate_system
-    assert "RUB" == filed(spz(version, splats(version), extensions=AXES)).coordinate_system
+    assert "RDF" == checked(data).coordinate_system
+    assert "RUB" == checked(spz(version, splats(version), extensions=AXES)).coordinate_system
     with pytest.raises(InputError, match="axes number 17"):
-        filed(spz(version, splats(version), flags=2, extensions=AXES[:-4] + bytes([17, 0, 0, 0])))
+        checked(spz(version, splats(version), flags=2, extensions=AXES[:-4] + bytes([17, 0, 0, 0])))
 
 
 def test_a_file_of_two_gzip_members_is_read():
-    whole, bare = (filed(spz(3, splats(3), bare=bare)) for bare in (False, True))
+    whole, bare = (checked(spz(3, splats(3), bare=bare)) for bare in (False, True))
     data = spz(3, splats(3), bare=True)
-    halves = filed(gzip.compress(data[:50]) + gzip.compress(data[50:]))
+    halves = checked(gzip.compress(data[:50]) + gzip.compress(data[50:]))
     for model in (bare, halves):
         assert all((getattr(whole, name) == getattr(model, name)).all() for name in ("means", "quats", "scales", "sh0"))
 
 
 def test_a_file_without_splats_is_read():
-    assert 0 == len(filed(spz(4, [b""] * 6, degree=3)))
-    assert 0 == len(filed(spz(3, [b""] * 6, degree=3)))
+    assert 0 == len(checked(spz(4, [b""] * 6, degree=3)))
+    assert 0 == len(checked(spz(3, [b""] * 6, degree=3)))
 
 
 def test_bands_above_those_asked_for_are_left_out(tmp_path):
@@ -155,7 +155,7 @@ MANY = spz(4, [bytes(n * (1 << 22)) for n in (9, 1, 3, 3, 4)])
 def test_what_is_no_spz_or_too_much_is_refused(tmp_path, data, says):
     (tmp_path / "a.spz").write_bytes(data)
     with pytest.raises(InputError, match=says):
-        filed(tmp_path / "a.spz")
+        checked(tmp_path / "a.spz")
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
@@ -166,7 +166,7 @@ def test_a_damaged_file_is_refused_or_read(tmp_path, version):
     def read(data):
         path.write_bytes(data)
         try:
-            filed(path)
+            checked(path)
         except InputError as error:
             return str(error)
         return ""
@@ -192,7 +192,7 @@ def test_what_is_written_comes_back_within_half_a_step(tmp_path, make_model, nam
     model = csplat.SplatModel(**{**vars(model), "shN": shN, "sh0": np.clip(model.sh0, -3, 3)})
     csplat.write(tmp_path / name, model)
     assert (version, 200, 3, 12, 1) == fields(tmp_path / name)
-    found = filed(tmp_path / name)
+    found = checked(tmp_path / name)
     for array, step in {
         "means": 2**-12,
         "scales": 1 / 16,
@@ -212,7 +212,7 @@ def test_values_beyond_the_range_become_its_ends(tmp_path, make_model):
     scales, opacities = np.array([[-30, 30, 0]] * 2, "f4"), np.array([0, 1], "f4")
     model = csplat.SplatModel(**{**vars(model), "scales": scales, "opacities": opacities, "coordinate_system": "RUB"})
     csplat.write(tmp_path / "a.spz", model)
-    found = filed(tmp_path / "a.spz")
+    found = checked(tmp_path / "a.spz")
     assert [-10, 5.9375, 0] == found.scales[0].tolist()
     assert [0, 1] == found.opacities.tolist()
     assert [127 / 128, -1, 127 / 128] == found.shN[0, 0].tolist()
@@ -223,7 +223,7 @@ def test_positions_have_as_fine_a_step_as_splats_want_and_the_scene_allows(tmp_p
     def bits(reach, scale):
         means = np.linspace(-reach, reach, 30, dtype="f4").reshape(10, 3)
         csplat.write(tmp_path / "a.spz", make_model(10, 0, means=means, scales=np.full((10, 3), scale, "f4")))
-        found = filed(tmp_path / "a.spz").means * [1, -1, -1]
+        found = checked(tmp_path / "a.spz").means * [1, -1, -1]
         number = fields(tmp_path / "a.spz")[3]
         np.testing.assert_allclose(found, means, atol=2.0**-number / 2)
         return number
@@ -239,7 +239,7 @@ def test_positions_have_as_fine_a_step_as_splats_want_and_the_scene_allows(tmp_p
 def test_a_scene_without_axes_is_taken_as_right_down_forward(tmp_path, make_model):
     model = make_model(5, 3, means=np.arange(15, dtype="f4").reshape(5, 3))
     csplat.write(tmp_path / "a.spz", model)
-    found = filed(tmp_path / "a.spz")
+    found = checked(tmp_path / "a.spz")
     assert (model.means * [1, -1, -1]).tolist() == found.means.tolist()
     flips = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1]  # signs for flipped y and z, by coefficient
     np.testing.assert_allclose(np.clip(model.shN * np.c_[flips], -1, 127 / 128), found.shN, atol=1 / 64)

@@ -1,9 +1,12 @@
-"""Habits of the tests: no test replaces private parts of the product, and every skip has a reason."""
+"""Habits of the code base: no patched private parts, reasons for skips, areas of tests, language."""
+
+from __future__ import annotations
 
 import ast
 import re
 from pathlib import Path
 
+import areas
 import pytest
 
 TESTS = Path(__file__).resolve().parent
@@ -158,3 +161,88 @@ def test_every_skip_and_expected_failure_carries_its_reason(texts):
     trees = {file: nodes_of(text) for file, text in texts.items() if may_skip(text)}
     found = [f"{file}:{line}: {name}" for file, nodes in trees.items() for line, name in unexplained(nodes)]
     assert not found, "\n".join(found)
+
+
+@pytest.fixture
+def project(tmp_path):
+    """A project of one source in one area, recorded."""
+    file = tmp_path / "areas.toml"
+    file.write_text('# why\n[engines]\nguards = "drawing"\nsources = ["*.mjs"]\nhash = ""\n', encoding="utf-8")
+    (tmp_path / "loader.mjs").write_text("draw();\n", encoding="utf-8")
+    assert ["engines"] == areas.record(["engines"], file, tmp_path)
+    return file, tmp_path
+
+
+def test_an_area_runs_again_after_an_edit_of_its_sources(project):
+    file, root = project
+    assert "not area" == areas.expression(areas.load(file), root=root)
+    (root / "loader.mjs").write_text("draw(1);\n", encoding="utf-8")
+    assert "not area or area(name='engines')" == areas.expression(areas.load(file), root=root)
+
+
+def test_a_new_file_and_another_name_are_edits(project):
+    file, root = project
+    (root / "loader.mjs").rename(root / "other.mjs")
+    assert areas.load(file)[0].is_changed(root)
+
+
+def test_line_ends_are_no_edit(project):
+    file, root = project
+    (root / "loader.mjs").write_bytes(b"draw();\r\n")
+    assert not areas.load(file)[0].is_changed(root)
+
+
+def test_recording_keeps_what_else_the_file_holds(project):
+    file, root = project
+    assert [] == areas.record(["engines"], file, root)
+    assert file.read_text(encoding="utf-8").startswith('# why\n[engines]\nguards = "drawing"')
+
+
+def test_a_pattern_without_files_is_an_error(project):
+    file, root = project
+    (root / "loader.mjs").unlink()
+    with pytest.raises(ValueError, match=r"\*\.mjs matches no file"):
+        areas.load(file)[0].digest(root)
+
+
+def test_fast_tests_are_neither_slow_nor_of_an_area_and_want_no_shared_scenes():
+    assert "not slow and not area and not shared_data" == areas.expression([], fast=True)
+
+
+def test_markers_and_file_name_the_same_areas():
+    texts = [path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("test_*.py")]
+    used = {name for text in texts for name in re.findall(r'mark\.area\(name="(\w+)"\)', text)}
+    assert used == {area.name for area in areas.load()}
+
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("codec", "trainer", "tools", "conformance", "tests", "spec")
+
+#: What is counted in the Python files of the project, how, and how often it may be there at most. Lower a number when
+#: it falls; never raise one.
+CEILINGS = {
+    "docstrings that open with What, Whether, Of, …": (
+        r'^\s*r?"""(?:What|Who|Whom|Whose|Whether|Which|Where|Of|How|Why|When)\b',
+        1,  # generated from a string in spec/generate.py
+    ),
+    "comments that begin with of, as of or those": (r"# (?:of|as of|those) ", 38),
+    "so-manieth": (r"so-manieth", 0),
+    "as of, for as in": (r"\bas of `", 19),
+}
+
+
+@pytest.fixture(scope="module")
+def code():
+    """Return the text of each Python file of the project, by its path."""
+    paths = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py") if "node_modules" not in path.parts]
+    return {path.relative_to(ROOT).as_posix(): path.read_text("utf-8") for path in paths}
+
+
+@pytest.mark.parametrize("what", CEILINGS)
+def test_there_is_no_more_of_what_is_banned(code, what):
+    pattern, ceiling = CEILINGS[what]
+    expression = re.compile(pattern, re.MULTILINE)
+    found = {path: len(expression.findall(text)) for path, text in code.items() if path != "tests/test_habits.py"}
+    total = sum(found.values())
+    most = sorted(((count, path) for path, count in found.items() if count), reverse=True)[:5]
+    assert total <= ceiling, most

@@ -1,4 +1,6 @@
-"""LPIPS-Alex: the published distances, and where weights are looked for."""
+"""LPIPS and its convolution kernel."""
+
+from __future__ import annotations
 
 import importlib.util
 
@@ -10,6 +12,7 @@ pytest.importorskip("numba", reason="the convolution wants the extra [render]")
 from csplat.errors import InputError
 from csplat_render import lpips as module
 from csplat_render.lpips import Lpips, load_lpips, load_torch_lpips, save_lpips
+from csplat_render.metric_kernels import convolve, convolve_twin
 
 
 @pytest.fixture
@@ -120,3 +123,65 @@ def test_refuses_pictures_that_are_too_small_or_differ(random_weights):
     for x, y in ((a, a[1:]), (a[:30], a[:30]), (a[..., 0], a[..., 0]), (a.astype(np.uint8), a.astype(np.uint8))):
         with pytest.raises(InputError):
             random_weights(x, y)
+
+
+SHAPES_AND_STRIDES = [
+    # picture, kernel (height, width, in, out), stride, padding
+    ((13, 11, 3), (5, 3, 3, 4), 1, 2),
+    ((13, 11, 3), (5, 3, 3, 4), 4, 2),
+    ((13, 11, 3), (5, 3, 3, 4), 2, 0),
+    ((31, 31, 3), (11, 11, 3, 64), 4, 2),
+    ((9, 14, 64), (5, 5, 64, 192), 1, 2),
+    ((3, 3, 8), (3, 3, 8, 16), 1, 1),
+    ((1, 1, 8), (3, 3, 8, 16), 1, 1),
+    ((4, 7, 1), (4, 7, 1, 1), 1, 0),
+]
+
+
+def convolution_case(picture, kernel, seed=0):
+    rng = np.random.default_rng(seed)
+    weights = rng.standard_normal(kernel) / np.sqrt(np.prod(kernel[:3]))
+    return (
+        array.astype(np.float32) for array in (rng.standard_normal(picture), weights, rng.standard_normal(kernel[3]))
+    )
+
+
+@pytest.mark.area(name="rasteriser")
+@pytest.mark.parametrize(("picture", "kernel", "stride", "padding"), SHAPES_AND_STRIDES)
+def test_the_convolution_equals_its_twin(picture, kernel, stride, padding):
+    x, weights, bias = convolution_case(picture, kernel)
+    found = convolve(x, weights, bias, stride, padding)
+    wanted = convolve_twin(x, weights, bias, stride, padding)
+    assert found.dtype == np.float32
+    assert wanted.shape == found.shape
+    np.testing.assert_allclose(found, wanted, atol=2e-5)
+
+
+@pytest.mark.area(name="rasteriser")
+@pytest.mark.parametrize(("stride", "padding"), [(1, 2), (4, 2), (2, 0)])
+def test_the_twin_is_the_sum_written_out(stride, padding):
+    x, kernel, bias = convolution_case((13, 11, 3), (5, 3, 3, 4))
+    padded = np.pad(x, ((padding, padding), (padding, padding), (0, 0))).astype(np.float64)
+    rows, columns = (padded.shape[0] - 5) // stride + 1, (padded.shape[1] - 3) // stride + 1
+    expected = np.array(
+        [
+            [
+                np.einsum("hwi,hwio->o", padded[r * stride :][:5, c * stride :][:, :3], kernel.astype(np.float64))
+                for c in range(columns)
+            ]
+            for r in range(rows)
+        ]
+    )
+    np.testing.assert_allclose(convolve_twin(x, kernel, bias, stride, padding), expected + bias, atol=1e-12)
+
+
+@pytest.mark.area(name="rasteriser")
+def test_the_number_of_threads_changes_nothing():
+    from csplat_render.kernels import thread_count
+
+    x, weights, bias = convolution_case((33, 20, 8), (3, 3, 8, 24))
+    found = []
+    for threads in (1, 2):
+        with thread_count(threads):
+            found.append(convolve(x, weights, bias, 1, 1))
+    np.testing.assert_array_equal(*found)

@@ -1,5 +1,8 @@
-"""PSNR and SSIM: their conventions, against formulas written out another way."""
+"""Metrics of images: PSNR, SSIM with its kernels, FLIP."""
 
+from __future__ import annotations
+
+import importlib
 import math
 
 import numpy as np
@@ -8,7 +11,8 @@ import pytest
 pytest.importorskip("numba", reason="SSIM wants the extra [render]")
 
 from csplat.errors import InputError
-from csplat_render.metrics import PSNR_CAP, Scores, psnr, score_view, ssim
+from csplat_render.metric_kernels import RADIUS, WINDOW, blur_across, blur_down, blur_twin, mean_ssim, mean_ssim_twin
+from csplat_render.metrics import PSNR_CAP, Scores, flip, psnr, score_view, ssim
 
 
 def pictures(seed=0, height=30, width=41, noise=0.1):
@@ -102,3 +106,76 @@ def test_refuses_what_cannot_be_compared():
         Scores.of([])
     with pytest.raises(InputError, match="cover"):
         score_view(a, b, np.zeros((2, 2), bool))
+
+
+def noise_pair(height, width, dtype=np.float64):
+    rng = np.random.default_rng(height * width)
+    x = rng.random((height, width, 3))
+    return x.astype(dtype), np.clip(x + 0.2 * rng.standard_normal(x.shape), 0.0, 1.0).astype(dtype)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 40), (11, 11), (37, 21), (120, 160)])
+def test_the_mean_equals_its_twin(size):
+    x, y = noise_pair(*size)
+    assert mean_ssim(x, y) == pytest.approx(mean_ssim_twin(x, y), rel=1e-12)
+
+
+def test_flat_and_equal_pictures():
+    x, y = np.full((30, 20, 3), 0.5), np.full((30, 20, 3), 0.7)
+    assert mean_ssim(x, x) == pytest.approx(1.0, abs=1e-12)
+    assert mean_ssim(x, y) == pytest.approx(mean_ssim_twin(x, y), rel=1e-12)
+    assert mean_ssim(0.0 * x, 0.0 * x) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_both_passes_make_the_window(dtype):
+    x, _ = noise_pair(24, 17, dtype)
+    flat = x.reshape(24, 51)
+    taps = WINDOW[RADIUS:].astype(dtype)
+    across = np.zeros((24 + 2 * RADIUS, 51), dtype)
+    for r in range(24):
+        blur_across(np.pad(flat[r], 3 * RADIUS), taps, across[r + RADIUS])
+    found = np.empty_like(flat)
+    for r in range(24):
+        blur_down(across, r, taps, found[r])
+    tolerance = 1e-6 if dtype == np.float32 else 1e-14
+    np.testing.assert_allclose(found.reshape(x.shape), blur_twin(x.astype(np.float64)), atol=tolerance)
+
+
+def test_the_number_of_threads_changes_nothing():
+    from csplat_render.kernels import thread_count
+
+    x, y = noise_pair(61, 80)
+    found = []
+    for threads in (1, 2):
+        with thread_count(threads):
+            found.append(mean_ssim(x, y))
+    assert found[0] == found[1]
+
+
+def test_flip_is_zero_for_equal_pictures_and_grows():
+    pytest.importorskip("flip_evaluator", reason="an optional package: pip install 'csplat[flip]'")
+    a = np.random.default_rng(0).random((40, 50, 3)).astype(np.float32)
+    assert 0.0 == flip(a, a)
+    assert 0.0 < flip(a, 0.95 * a) < flip(a, 0.7 * a) <= 1.0
+    assert flip(a, 0.95 * a) == flip(a.astype(np.float64), (0.95 * a).astype(np.float64))
+
+
+def test_black_against_white_differs_fully():
+    pytest.importorskip("flip_evaluator", reason="an optional package: pip install 'csplat[flip]'")
+    black = np.zeros((30, 30, 3))
+    assert flip(black, black + 1.0) > 0.9
+
+
+def test_refuses_pictures_that_differ_in_shape():
+    with pytest.raises(InputError, match="FLIP"):
+        flip(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))
+
+
+def test_an_absent_package_is_named(monkeypatch):
+    def absent(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(importlib, "import_module", absent)
+    with pytest.raises(InputError, match="flip-evaluator"):
+        flip(np.zeros((4, 4, 3)), np.zeros((4, 4, 3)))

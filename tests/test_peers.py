@@ -10,9 +10,9 @@ import subprocess
 
 import numpy as np
 import pytest
+from checked import checked
 from chromium import absent
 from conftest import PEERS, of_peers
-from filed import filed
 
 import csplat
 from csplat.editing.transform import rotate_scene
@@ -249,7 +249,7 @@ def test_what_is_written_they_read(tmp_path, peer, format, scene):
 def test_files_of_splat_transform_hold_the_grid_that_they_were_made_of(name, forward):
     """The newer SPZ of its repository were turned when they were made."""
     path = of_peers(f"splat-transform/test/fixtures/splat/minimal{'' if name[0] == '.' else '-'}{name}")
-    model = filed(path)
+    model = checked(path)
     assert [[x, 0, forward * z] for z in (-1, 0) for x in (-1, 0)] == model.means.tolist()
     np.testing.assert_allclose(model.scales, np.log(0.1), atol=1 / 32)
     np.testing.assert_allclose(model.opacities, 0.9, atol=0.5 / 255)

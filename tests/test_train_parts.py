@@ -1,3 +1,7 @@
+"""Parts of training: loss, parameters, strategies."""
+
+from __future__ import annotations
+
 import json
 
 import numpy as np
@@ -5,6 +9,7 @@ import pytest
 
 from csplat.errors import InputError
 from csplat_render.camera import Camera, intrinsics, orbit
+from csplat_trainer.losses import LOSS_WEIGHTS, PhotometricLoss, photometric_loss_twin
 from csplat_trainer.parameters import GROUPS, Parameters, adam_step, from_model, to_model
 from csplat_trainer.posed_images import PosedImage, compose, halve
 from csplat_trainer.strategies import (
@@ -284,3 +289,69 @@ def test_those_go_that_pictures_need_least(make_model):
     prune_least_needed(parameters, pictures, np.ones(3, np.float32), 30, antialiased=False)
     wanted = [*range(5), *range(15, 40)]
     assert wanted == parameters.second["means"][:, 0].tolist()
+
+
+def random_pictures(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(height * width)
+    x = rng.random((height, width, 3), dtype=np.float32)
+    y = np.clip(x + 0.2 * rng.standard_normal((height, width, 3)), 0, 1).astype(np.float32)
+    return x, y
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 40), (37, 21), (64, 48)])
+@pytest.mark.parametrize("weights", LOSS_WEIGHTS.values(), ids=LOSS_WEIGHTS.keys())
+def test_the_loss_equals_its_twin(size, weights):
+    x, y = random_pictures(*size)
+    value, gradient = PhotometricLoss(*size, *weights)(x, y)
+    expected, slope = photometric_loss_twin(x, y, *weights)
+    assert value.loss == pytest.approx(expected.loss, rel=1e-5)
+    assert value.mse == pytest.approx(expected.mse, rel=1e-5)
+    assert np.abs(gradient - slope).max() <= 1e-5 * np.abs(slope).max()
+
+
+def test_the_twin_s_gradient_is_that_of_finite_differences():
+    x, y = (picture.astype(np.float64) for picture in random_pictures(13, 9))
+    _, slope = photometric_loss_twin(x, y)
+    direction = np.random.default_rng(1).standard_normal(x.shape)
+    step = 1e-6
+    up, down = (photometric_loss_twin(x + sign * step * direction, y)[0].loss for sign in (1, -1))
+    assert (slope * direction).sum() == pytest.approx((up - down) / (2 * step), rel=1e-6)
+
+
+def test_the_ssim_is_that_of_the_metrics():
+    from csplat_render.metrics import ssim
+
+    x, y = random_pictures(40, 30)
+    value, _ = PhotometricLoss(40, 30)(x, y)
+    assert value.ssim == pytest.approx(ssim(y, x), abs=1e-5)
+
+
+def test_equal_pictures_have_no_loss_and_no_gradient():
+    x, _ = random_pictures(20, 20)
+    value, gradient = PhotometricLoss(20, 20)(x, x.copy())
+    assert (value.l1, value.mse) == (0.0, 0.0)
+    assert value.ssim == pytest.approx(1.0, abs=1e-6)
+    assert np.abs(gradient).max() <= 1e-6
+
+
+def test_the_next_call_does_not_remember_the_last():
+    x, y = random_pictures(24, 24)
+    loss = PhotometricLoss(24, 24)
+    first = loss(x, y)[1].copy()
+    loss(y, x)
+    assert np.array_equal(first, loss(x, y)[1])
+
+
+@pytest.mark.parametrize("weights", LOSS_WEIGHTS.values(), ids=LOSS_WEIGHTS.keys())
+def test_pixels_that_do_not_count_change_nothing(weights):
+    x, y = random_pictures(32, 24)
+    mask = np.ones((32, 24), bool)
+    mask[5:20, 3:12] = False
+    other = np.where(mask[..., None], y, 1.0 - y)
+    value, gradient = PhotometricLoss(32, 24, *weights)(x, y.copy(), mask)
+    again, slope = PhotometricLoss(32, 24, *weights)(x, other, mask)
+    assert again == value or np.isnan(value.ssim)
+    assert np.array_equal(gradient, slope)
+    assert not gradient[~mask].any()
+    assert gradient[mask].all()
+    assert value.mse == pytest.approx(float(np.square(x - y)[mask].mean()), rel=1e-5)

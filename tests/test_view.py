@@ -15,7 +15,7 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 import pytest
 import typer
-from interrupts import heed_interrupts
+from child_processes import heed_interrupts
 from typer.testing import CliRunner
 from viewer_pages import ViewerPage
 
