@@ -56,7 +56,7 @@ def main() -> None:
         for line in sys.stdin:
             requests.put(line)
         requests.put(None)
-        if busy.is_set():  # interrupts a waiting command, too
+        if busy.is_set():  # child_processes a waiting command, too
             interrupt_main_thread()
 
     threading.Thread(target=listen, daemon=True).start()
