@@ -5,7 +5,7 @@ from __future__ import annotations
 import csplat
 from csplat.disk_files import local_file
 from csplat.encoder import EncodeOptions, encode_with_report
-from csplat.encoder.error_bounds import measure_errors
+from csplat.encoder.error_bounds import measured_sums
 from csplat.formats import detect_format
 from csplat_conformance.validator import validate
 
@@ -19,6 +19,11 @@ def encoded(model, importance=None, **options):
         assert largest <= result.report.errors[name][0], name
         assert rms <= result.report.errors[name][1], name
     return result, decoded
+
+
+def measure_errors(source, decoded, source_index):
+    """(max, rms) by measure of the spec of a decoded model against its source."""
+    return measured_sums(source, decoded, source_index).bounds()
 
 
 def checked(file):

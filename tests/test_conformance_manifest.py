@@ -163,11 +163,11 @@ def blocks(scene):
 def streams(block):
     """Yield how each stream of a block is coded."""
     if block.indices:
-        yield block.index_how
+        yield block.index_coding
     if block.coding != _spec.CODING_CODEBOOK or block.summands:
-        yield block.how
+        yield block.stream_coding
     if block.coding == _spec.CODING_SPARSE:
-        assert block.mask_how.width == 1
+        assert block.mask_coding.width == 1
 
 
 def ids(names, legal):

@@ -15,8 +15,7 @@ from csplat_authoring.reference import expected
 from csplat_authoring.samples import (
     attributes,
     axis,
-    book,
-    coded,
+    codebook_block,
     means_rows,
     morton,
     offset,
@@ -25,6 +24,7 @@ from csplat_authoring.samples import (
     scene,
     signed,
     tile,
+    with_stream_codings,
 )
 from csplat_authoring.scene import Chunk, Codebook, Stream
 
@@ -81,7 +81,8 @@ def test_one_codebook_for_all_bands(escaped):
         3: signed(rows_of(3, 1, 21, -9, 9)),
     }
     blocks = {
-        SH0 + band: book(4, indices if band == 1 else (), escapes[band] if escaped else None) for band in (1, 2, 3)
+        SH0 + band: codebook_block(4, indices if band == 1 else (), escapes[band] if escaped else None)
+        for band in (1, 2, 3)
     }
     described = scene(3, (tile(1, 4, 0, blocks), tile(2, 3, 3)))
     described = replace(
@@ -106,7 +107,7 @@ def test_tiles_longer_than_a_run_of_the_decoder():
     def described(rows):
         some = {name: replace(block, rows=[block.rows[row] for row in rows]) for name, block in blocks.items()}
         escaped = [escapes[place[row]] for row in rows if index[row] == 5]
-        some[SH0 + 1] = book(4, tuple(index[rows].tolist()), signed(escaped, Stream(2)))
+        some[SH0 + 1] = codebook_block(4, tuple(index[rows].tolist()), signed(escaped, Stream(2)))
         made = scene(1, (tile(3, len(rows), 0, some), tile(2, 3, 1)))
         codebooks = (Codebook(4, _spec.CODEBOOK_KIND_SH, entries, (1, 1)),)
         return replace(made, attributes=attributes(1, ycocg=True), codebooks=codebooks)
@@ -126,7 +127,7 @@ def test_tiles_longer_than_a_run_of_the_decoder():
 @pytest.mark.parametrize("coder", ["stored", "deflate_fixed", "deflate_dynamic"])
 def test_every_transform_and_coder(how, coder):
     described = scene(1, (tile(1, 6, 1),))
-    assert_decodes(coded(described, lambda stream: replace(stream, transforms=how, coder=coder)))
+    assert_decodes(with_stream_codings(described, lambda stream: replace(stream, transforms=how, coder=coder)))
 
 
 @pytest.mark.parametrize("width", [2, 3, 7])

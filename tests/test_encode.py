@@ -8,13 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from checked import measure_errors
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import csplat
 from csplat import SplatModel
 from csplat.encoder import PRESETS, EncodeOptions, encode, encode_with_report
-from csplat.encoder.error_bounds import ErrorSums, measure_errors
+from csplat.encoder.error_bounds import ErrorSums
 from csplat.errors import CsplatError, InputError
 
 PRESET_NAMES = tuple(PRESETS)

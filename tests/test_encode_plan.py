@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from checked import measure_errors
 
 from csplat import EncodeOptions, decode, encode
 from csplat.decoder import decode_scene, read_declared_bounds, read_options
 from csplat.encoder import EncodePlan, Origin, encode_tiles, encode_with_report, fix_quantisation
-from csplat.encoder.error_bounds import measure_errors
 from csplat.errors import InputError
 from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_tools.inspect.file_description import describe_file

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from checked import measure_errors
 
-from csplat.encoder.error_bounds import ErrorSums, measure_errors
+from csplat.encoder.error_bounds import ErrorSums
 from csplat.errors import InputError
 from csplat.model import normalise_quats
 

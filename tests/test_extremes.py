@@ -25,11 +25,11 @@ pytest.importorskip("numba", reason="pictures need numba: pip install 'csplat[re
 pytest.importorskip("scipy", reason="training needs scipy: pip install 'csplat[render]'")
 
 # Importing it needs what is looked for above.
+from checked import measure_errors
 from extremes_chain import LEARNT, assert_finite, chain_of
 
 from csplat import decode, read_ply, write_ply
 from csplat.decoder import read_declared_bounds, read_header
-from csplat.encoder.error_bounds import measure_errors
 from csplat.errors import LimitError
 from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_render import render

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from checked import measure_errors
 
 from csplat import EncodeOptions, decode, encode, read_ply
 from csplat.decoder import decode_scene, read_declared_bounds, read_options
 from csplat.encoder import EncodePlan, Origin, encode_with_report, fix_quantisation
-from csplat.encoder.error_bounds import measure_errors
 from csplat.errors import InputError
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")

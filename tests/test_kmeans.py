@@ -19,7 +19,7 @@ from csplat.encoder.kmeans import (
     refine_by_metric,
     search_nearest,
 )
-from csplat.encoder.weights import ErrorMetric
+from csplat.encoder.splat_importance import ErrorMetric
 from csplat.errors import InputError
 
 

@@ -131,7 +131,7 @@ def check_references(path):
                 for at, id in codebook_references(memoryview(data), header, layer):
                     assert id == int.from_bytes(data[at : at + 2], "little")
                     here.add(id)
-        assert here <= set(tile.tables)
+        assert here <= set(tile.codebook_ids)
         found |= here
     # A stream that is stepped over wrongly does not end where its chunk does: E_STREAM.
     if "codebook" in path.stem and header.codebooks:

@@ -15,11 +15,11 @@ import extremes
 from analytic_model import AnalyticScene
 from analytic_search import analytic_removal
 from captures import around, cameras, crowded, found_within, judged_by, photographed, shell, views_of
+from checked import measure_errors
 
 from csplat import EncodeOptions, decode
 from csplat.decoder import decode_scene
 from csplat.encoder import Importance
-from csplat.encoder.error_bounds import measure_errors
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_conformance.declared_bounds import Source, verify_bounds

@@ -6,11 +6,11 @@ from itertools import cycle
 
 import numpy as np
 import pytest
+from checked import measure_errors
 
 from csplat import _spec
 from csplat.decoder import decode_scene, read_header
 from csplat.encoder import EncodeOptions, encode, encode_with_report
-from csplat.encoder.error_bounds import measure_errors
 from csplat.errors import CsplatError, InputError
 from csplat.model import normalise_quats
 from csplat_conformance.declared_bounds import Source, verify_bounds

@@ -18,8 +18,8 @@ from csplat.encoder.error_bounds import covariance_entries
 from csplat.encoder.quantisation import opacity_levels, quantise_colour, quat_levels
 from csplat.encoder.quantisation_classes import choose_classes
 from csplat.encoder.shape_codebook import quantise_shape
+from csplat.encoder.splat_importance import CLASSED_ATTRIBUTES, GaussNewtonBlocks, apply_weight_floor, rounding_errors
 from csplat.encoder.tiling import cut_scene
-from csplat.encoder.weights import CLASSED_ATTRIBUTES, GaussNewtonBlocks, apply_weight_floor, rounding_errors
 from csplat.errors import InputError
 from csplat.model import normalise_quats
 from csplat_trainer.tuning.tuned_scene import TunedScene, cost_slopes

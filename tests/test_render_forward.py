@@ -13,11 +13,10 @@ pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 from oracle import cropped, difference
 
 from csplat.errors import InputError
-from csplat.model import SplatModel
+from csplat.model import SH_C0, SplatModel
 from csplat.ply import read_ply
 from csplat_render import Camera, render
 from csplat_render.conventions import ALPHA_CAP, DILATION, UncheckedSplats
-from csplat_render.projection import SH_C0
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.reference_rasteriser import render_exact
 

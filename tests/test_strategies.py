@@ -6,10 +6,11 @@ import sys
 
 import numpy as np
 import pytest
+from checked import measure_errors
 
 from csplat import EncodeOptions, decode
 from csplat.decoder import decode_scene
-from csplat.encoder.error_bounds import covariance_errors, measure_errors
+from csplat.encoder.error_bounds import covariance_errors
 from csplat.errors import InputError
 from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_tools.study import (

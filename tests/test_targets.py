@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from checked import measure_errors
 from typer.testing import CliRunner
 
 from csplat import EncodeOptions, decode, write_ply
 from csplat.encoder import encode_with_report
-from csplat.encoder.error_bounds import measure_errors
 from csplat.errors import InputError
 from csplat_tools.cli.app import app
 from csplat_tools.console import parse_size_bytes

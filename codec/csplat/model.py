@@ -21,6 +21,9 @@ from csplat.types import F32, F64
 #: Highest spherical-harmonics degree of a model.
 MAX_SH_DEGREE = 3
 
+#: The basis function of SH degree 0: colour of a channel per coefficient.
+SH_C0 = 0.28209479177387814
+
 #: A quaternion counts as unit when its length lies within this of 1.
 QUAT_LENGTH_TOLERANCE = 1e-3
 

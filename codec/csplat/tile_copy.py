@@ -10,13 +10,20 @@ from itertools import accumulate
 
 from csplat import _spec
 from csplat.byte_store import FileWindow
-from csplat.decoder.container import SceneHeader, Tile, open_chunk
+from csplat.decoder.container import TILE_FLAGS, SceneHeader, Tile, open_chunk
 from csplat.disk_files import BinaryWriter, open_writer
-from csplat.encoder.container import CodebookTable, FileChunk, FileTile, LazyPayload, Payload, SceneFields, file_pieces
+from csplat.encoder.container import (
+    FileChunk,
+    FileTile,
+    IndexedCodebook,
+    LazyPayload,
+    Payload,
+    SceneFields,
+    file_pieces,
+)
 
 #: Chunks that are copied with a part of a file; declared bounds and options are about the whole.
 _KEPT = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
-_TILE_FLAGS = sum(getattr(_spec, f"CHUNK_FLAG_{name.upper()}") for name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
 _ALL = 1 << 26  # maximum size of the data fetched together from all files, bytes
 
 
@@ -46,17 +53,17 @@ def write_extract(
         tiles: in the order of the file.
         output: a path or an open binary file.
     """
-    tables = {table for tile in tiles for table in tile.tables}
+    codebook_ids = {identity for tile in tiles for identity in tile.codebook_ids}
     kept = [
         record
         for record in header.directory
-        if record.type in _KEPT or (record.type == _spec.CHUNK_CODEBOOK and record.id in tables)
+        if record.type in _KEPT or (record.type == _spec.CHUNK_CODEBOOK and record.id in codebook_ids)
     ]
     copies = TileCopier(window)
     copied = [copies.of(tile) for tile in tiles]
     copies.begin(kept)
     chunks = [FileChunk(one.type, chunk_payload(window, one), one.id, one.layer) for one in kept]
-    fields = scene_fields(window, header, tables, chunks)
+    fields = scene_fields(window, header, codebook_ids, chunks)
     size = 0
     with open_writer(output) as stream:
         for part in file_pieces(fields, copied):
@@ -121,7 +128,7 @@ class TileCopier:
             layers[layer] = LazyPayload(record.size - _spec.CHUNK_HEADER_SIZE, record.crc, read)
             places.append(record)
         return FileTile(
-            tile.splat_count, tile.exponent, tile.corner, tile.extent, tile.max_scale, layers, tile.tables
+            tile.splat_count, tile.exponent, tile.corner, tile.extent, tile.max_scale, layers, tile.codebook_ids
         )  # fmt: skip
 
     def begin(self, extra: Sequence[_spec.DirectoryRecord]) -> None:
@@ -144,28 +151,28 @@ def chunk_payload(window: FileWindow, record: _spec.DirectoryRecord | _spec.Laye
     """Return the payload of a fetched chunk, its CRC and header checked."""
     with window.store.named_errors():
         if isinstance(record, _spec.LayerRecord):
-            cursor = open_chunk(window.view, record, _spec.CHUNK_TILE, _TILE_FLAGS, "TLE-1")
+            cursor = open_chunk(window.view, record, _spec.CHUNK_TILE, TILE_FLAGS, "TLE-1")
         else:
             cursor = open_chunk(window.view, record, record.type, record.flags, "CHK-3")
     return bytes(window.view[cursor.at : cursor.end])
 
 
 def scene_fields(
-    window: FileWindow, header: SceneHeader, tables: Container[int], chunks: Sequence[FileChunk]
+    window: FileWindow, header: SceneHeader, codebook_ids: Container[int], chunks: Sequence[FileChunk]
 ) -> SceneFields:
     """Return the scene fields of a file, with other chunks.
 
     Args:
         window: the file's header and index.
         header: the same, read.
-        tables: ids of the codebooks that are used.
+        codebook_ids: ids of the codebooks that are used.
         chunks: chunks in addition to the tiles.
     """
     head = _spec.unpack_index_head(window.view, _spec.HEADER_SIZE)
     at = _spec.HEADER_SIZE + head.head_size + head.attribute_count * head.attribute_size
     at += head.codebook_count * head.codebook_size
     extras = [_spec.unpack_extra_record(window.view, at + i * head.extra_size) for i in range(head.extra_count)]
-    books = [book for book in header.codebooks if book.codebook_id in tables]
+    books = [book for book in header.codebooks if book.codebook_id in codebook_ids]
     return SceneFields(
         sh_degree=header.sh_degree,
         scene_flags=header.antialiased * _spec.SCENE_FLAG_ANTIALIASED | header.flat * _spec.SCENE_FLAG_FLAT,
@@ -175,7 +182,7 @@ def scene_fields(
         attributes=header.attributes,
         extras=extras,
         codebooks=[
-            CodebookTable(book.codebook_id, book.kind, (book.band_first, book.band_last), book.size) for book in books
+            IndexedCodebook(book.codebook_id, book.kind, (book.band_first, book.band_last), book.size) for book in books
         ],
         chunks=chunks,
     )

@@ -99,11 +99,6 @@ def build(scene: Scene) -> Built:
     return replace(unsealed, data=unsealed.patched({}))
 
 
-def chunk_names(scene: Scene) -> list[str]:
-    """Return the names of the chunks in the order that the spec recommends (4.3.6)."""
-    return list(_chunks(scene))
-
-
 def _header(index_size: int, file_size: int) -> list[Any]:
     version = (_spec.VERSION_MAJOR, _spec.VERSION_MINOR)
     return [_spec.MAGIC, *version, _spec.PROFILE_BASE, 0, 0, index_size, file_size, 0]
@@ -169,18 +164,18 @@ def _tile_record(
     out: _Records, scene: Scene, i: int, tile: Tile, chunks: dict[str, Writer], offsets: dict[str, int]
 ) -> None:
     used = {b.codebook for b in tile.blocks.values() if b.coding == _spec.CODING_CODEBOOK}
-    tables = sorted(used) if tile.tables is None else tile.tables
+    codebook_ids = sorted(used) if tile.codebook_ids is None else tile.codebook_ids
     columns = zip(*tile.blocks[_spec.ATTRIBUTE_MEANS].rows, strict=True)
     extent = tuple(max(column) for column in columns)
-    head: list[Any] = [tile.splat_count, 0, len(tile.layers), len(tables), tile.exponent, 0]
+    head: list[Any] = [tile.splat_count, 0, len(tile.layers), len(codebook_ids), tile.exponent, 0]
     scale = max_scale(scene, tile) if _spec.ATTRIBUTE_SCALES in tile.blocks else 0.0
     out.structure(f"tile[{i}]", "tile_record", [*head, tile.corner, extent, scale])
     for layer in tile.layers:
         name = f"TILE.{i}.{layer}"
         where = [len(chunks[name].data), offsets[name], 0]
         out.structure(f"tile[{i}].layer[{layer}]", "layer_record", [layer, 0, 0, *where])
-    for k, table in enumerate(tables):
-        out.value(f"tile[{i}].table[{k}]", "H", table)
+    for k, identity in enumerate(codebook_ids):
+        out.value(f"tile[{i}].table[{k}]", "H", identity)
 
 
 # Chunks --------------------------------------------------------------------------------------------
@@ -228,7 +223,7 @@ def _framed(kind: bytes, flags: int, payload: Writer) -> Writer:
 def _ancillary(chunk: Chunk) -> Writer:
     out = Writer()
     if chunk.text is not None:
-        _stream(out, "stream", list(chunk.text), chunk.how)
+        _stream(out, "stream", list(chunk.text), chunk.stream_coding)
     elif chunk.errors is not None:
         stated = chunk.errors
         head = [stated.source_count, stated.pruned_count, stated.source_sh_degree, stated.flags]
@@ -245,7 +240,7 @@ def _ancillary(chunk: Chunk) -> Writer:
 def _codebook(book: Codebook, layer: int) -> Writer:
     out = Writer()
     out.structure("head", "codebook_head", [book.id, layer, 0])
-    _stream(out, "entries", transpose(book.entries[layer]), book.how)
+    _stream(out, "entries", transpose(book.entries[layer]), book.stream_coding)
     _tail(out, book.tail)
     return out
 
@@ -288,17 +283,17 @@ def _block(out: Writer, name: str, scene: Scene, attribute: int, block: Block, p
     elif block.coding == _spec.CODING_SPARSE:
         out.structure(f"{name}.params", "sparse_params", [block.exponent, 0, len(block.rows)])
         whole = sum(bit << i for i, bit in enumerate(block.mask))
-        _stream(out, f"{name}.mask", [*whole.to_bytes(-(-len(block.mask) // 8), "little")], block.mask_how)
-        _stream(out, f"{name}.stream", transpose(block.rows), block.how)
+        _stream(out, f"{name}.mask", [*whole.to_bytes(-(-len(block.mask) // 8), "little")], block.mask_coding)
+        _stream(out, f"{name}.stream", transpose(block.rows), block.stream_coding)
     elif block.coding == _spec.CODING_MORTON:
         out.structure(f"{name}.params", "morton_params", [block.bits, 0, 0])
-        _stream(out, f"{name}.stream", [_morton(row) for row in block.rows], block.how)
+        _stream(out, f"{name}.stream", [_morton(row) for row in block.rows], block.stream_coding)
     elif block.coding == _spec.CODING_CODEBOOK:
         _codebook_block(out, name, scene, attribute, block)
     else:
         if block.coding == _spec.CODING_RAW:
             out.structure(f"{name}.params", "raw_params", [place, 0])
-        _stream(out, f"{name}.stream", transpose(block.rows), block.how)
+        _stream(out, f"{name}.stream", transpose(block.rows), block.stream_coding)
     if block.tail:
         out.raw(f"{name}.tail", block.tail)
 
@@ -310,19 +305,19 @@ def _lattice(out: Writer, name: str, block: Block) -> None:
         offsets = block.offsets or tuple(min(column) for column in columns)
         out.value(f"{name}.offsets", f"{len(offsets)}i", offsets)
         columns = [[v - offset for v in column] for column, offset in zip(columns, offsets, strict=True)]
-    _stream(out, f"{name}.stream", [v for column in columns for v in column], block.how)
+    _stream(out, f"{name}.stream", [v for column in columns for v in column], block.stream_coding)
 
 
 def _codebook_block(out: Writer, name: str, scene: Scene, attribute: int, block: Block) -> None:
     escapes = len(block.escape.rows) if block.escape else 0
     out.structure(f"{name}.params", "codebook_params", [block.codebook, 0, escapes])
     if block.indices:
-        _stream(out, f"{name}.indices", block.indices, block.index_how)
+        _stream(out, f"{name}.indices", block.indices, block.index_coding)
     if block.summands:
         (offset,) = block.offsets or (min(block.summands),)
         out.structure(f"{name}.summand", "lattice_params", [0, 0])
         out.value(f"{name}.summand.offset", "i", offset)
-        _stream(out, f"{name}.summand.stream", [v - offset for v in block.summands], block.how)
+        _stream(out, f"{name}.summand.stream", [v - offset for v in block.summands], block.stream_coding)
     if block.escape:
         _block(out, f"{name}.escape", scene, attribute, block.escape, 0)
 
@@ -331,24 +326,26 @@ def _morton(row: Sequence[int]) -> int:
     return sum((q >> b & 1) << 3 * b + axis for axis, q in enumerate(row) for b in range(q.bit_length()))
 
 
-def _stream(out: Writer, name: str, values: Sequence[int], how: Stream) -> None:
-    packed = coders.apply_transforms(values, how.width, how.transforms) if how.packed is None else how.packed
-    coded = _coded(packed, how) if how.coded is None else how.coded
-    transforms = bytes(how.transforms).ljust(_spec.TRANSFORMS_MAX, b"\0")
-    coder = _CODERS[how.coder.split("_")[0]]
-    head = [how.width, coder, transforms, 0, len(values), len(packed), len(coded)]
+def _stream(out: Writer, name: str, values: Sequence[int], coding: Stream) -> None:
+    packed = (
+        coders.apply_transforms(values, coding.width, coding.transforms) if coding.packed is None else coding.packed
+    )
+    coded = _coded(packed, coding) if coding.coded is None else coding.coded
+    transforms = bytes(coding.transforms).ljust(_spec.TRANSFORMS_MAX, b"\0")
+    coder = _CODERS[coding.coder.split("_")[0]]
+    head = [coding.width, coder, transforms, 0, len(values), len(packed), len(coded)]
     out.structure(name, "stream_head", head)
     out.raw(f"{name}.coded", coded)
 
 
-def _coded(packed: bytes, how: Stream) -> bytes:
-    if how.coder == "stored":
+def _coded(packed: bytes, coding: Stream) -> bytes:
+    if coding.coder == "stored":
         return packed
     coder = {
         "deflate_stored": coders.deflate_stored,
         "deflate_fixed": coders.deflate_fixed,
         "deflate_dynamic": coders.deflate_dynamic,
-    }[how.coder]
+    }[coding.coder]
     return coder(packed)
 
 

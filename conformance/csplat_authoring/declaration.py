@@ -277,11 +277,11 @@ def _block(table: dict[str, Any]) -> Block:
         elif key != "coding":
             values[key] = tuple(value) if isinstance(value, list) else value
     if coding == "morton":
-        values.setdefault("how", PAIRS)
+        values.setdefault("stream_coding", PAIRS)
     return Block(_CODINGS[coding], **values)
 
 
-_STREAMS: Final = {"stream": "how", "mask_stream": "mask_how", "index_stream": "index_how"}
+_STREAMS: Final = {"stream": "stream_coding", "mask_stream": "mask_coding", "index_stream": "index_coding"}
 
 
 def _stream(table: dict[str, Any], plain: Stream = PLAIN) -> Stream:
@@ -320,7 +320,7 @@ def _chunk(table: dict[str, Any]) -> Chunk:
             records = tuple((_MEASURES[measure], largest, rms) for measure, largest, rms in value["records"])
             values[key] = StatedErrors(**(value | {"records": records}))
         elif key == "stream":
-            values["how"] = _stream(value)
+            values["stream_coding"] = _stream(value)
         else:
             values[key] = value.encode("latin-1") if isinstance(value, str) else value
     return Chunk(**values)

@@ -61,47 +61,49 @@ def quat_rows(seed: int, n: int, m: int = _LEVELS_QUATS) -> list[list[int]]:
     return rows_of(seed, n, 3, -(m * 2 // 3), m * 2 // 3)
 
 
-def levels(values: Sequence[int], how: Stream = PLAIN) -> Block:
+def levels(values: Sequence[int], stream_coding: Stream = PLAIN) -> Block:
     """Return a block coded LEVELS."""
-    return Block(_spec.CODING_LEVELS, [[value] for value in values], how)
+    return Block(_spec.CODING_LEVELS, [[value] for value in values], stream_coding)
 
 
-def morton(rows: Rows, bits: int, how: Stream = PAIRS) -> Block:
+def morton(rows: Rows, bits: int, stream_coding: Stream = PAIRS) -> Block:
     """Return a block coded MORTON."""
-    return Block(_spec.CODING_MORTON, rows, how, bits=bits)
+    return Block(_spec.CODING_MORTON, rows, stream_coding, bits=bits)
 
 
-def axis(rows: Rows, how: Stream = PLAIN) -> Block:
+def axis(rows: Rows, stream_coding: Stream = PLAIN) -> Block:
     """Return a block coded AXIS."""
-    return Block(_spec.CODING_AXIS, rows, how)
+    return Block(_spec.CODING_AXIS, rows, stream_coding)
 
 
-def offset(rows: Rows, how: Stream = PLAIN, exponent: int = 0, offsets: tuple[int, ...] = ()) -> Block:
+def offset(rows: Rows, stream_coding: Stream = PLAIN, exponent: int = 0, offsets: tuple[int, ...] = ()) -> Block:
     """Return a block coded OFFSET; the offsets are the columns' minima unless given."""
-    return Block(_spec.CODING_OFFSET, rows, how, exponent=exponent, offsets=offsets)
+    return Block(_spec.CODING_OFFSET, rows, stream_coding, exponent=exponent, offsets=offsets)
 
 
-def signed(rows: Rows, how: Stream = PLAIN, exponent: int = 0) -> Block:
+def signed(rows: Rows, stream_coding: Stream = PLAIN, exponent: int = 0) -> Block:
     """Return a block coded SIGNED."""
-    return Block(_spec.CODING_SIGNED, rows, how, exponent=exponent)
+    return Block(_spec.CODING_SIGNED, rows, stream_coding, exponent=exponent)
 
 
 def sparse(
-    mask: tuple[int, ...], rows: Rows, how: Stream = PLAIN, mask_how: Stream = PLAIN, exponent: int = 0
+    mask: tuple[int, ...], rows: Rows, stream_coding: Stream = PLAIN, mask_coding: Stream = PLAIN, exponent: int = 0
 ) -> Block:
     """Return a block coded SPARSE: a bit per splat, and the rows of those whose bit is 1."""
-    return Block(_spec.CODING_SPARSE, rows, how, exponent=exponent, mask=mask, mask_how=mask_how)
+    return Block(_spec.CODING_SPARSE, rows, stream_coding, exponent=exponent, mask=mask, mask_coding=mask_coding)
 
 
-def book(
+def codebook_block(
     codebook: int,
     indices: tuple[int, ...] = (),
     escape: Block | None = None,
-    how: Stream = PLAIN,
+    index_coding: Stream = PLAIN,
     **rest: Any,
 ) -> Block:
     """Return a block coded CODEBOOK; without indices it is not the first of its codebook."""
-    return Block(_spec.CODING_CODEBOOK, codebook=codebook, indices=indices, index_how=how, escape=escape, **rest)
+    return Block(
+        _spec.CODING_CODEBOOK, codebook=codebook, indices=indices, index_coding=index_coding, escape=escape, **rest
+    )
 
 
 def sh_attribute(band: int) -> int:
@@ -109,7 +111,7 @@ def sh_attribute(band: int) -> int:
     return SH0 + band
 
 
-def single(step: float) -> float:
+def as_binary32(step: float) -> float:
     """Return the binary32 value nearest to a step."""
     return float(np.float32(step))
 
@@ -119,12 +121,12 @@ def attributes(degree: int = 0, ycocg: bool = False, chroma_shift: int = 0) -> d
     colour = _spec.MAPPING_YCOCG if ycocg else _spec.MAPPING_LATTICE
     result = {
         OPACITIES: Attribute(_spec.MAPPING_LINEAR, levels=_LEVELS_OPACITIES),
-        SCALES: Attribute(_spec.MAPPING_LATTICE, single(0.1)),
+        SCALES: Attribute(_spec.MAPPING_LATTICE, as_binary32(0.1)),
         QUATS: Attribute(_spec.MAPPING_UNIT_W, levels=_LEVELS_QUATS),
         MEANS: Attribute(_spec.MAPPING_LATTICE, 0.001),
     }
     for band in range(degree + 1):
-        result[SH0 + band] = Attribute(colour, single(0.03 / (band + 1)), chroma_shift=chroma_shift)
+        result[SH0 + band] = Attribute(colour, as_binary32(0.03 / (band + 1)), chroma_shift=chroma_shift)
     return result
 
 
@@ -151,13 +153,16 @@ def scene(degree: int = 0, tiles: Sequence[Tile] | None = None, **rest: Any) -> 
     return Scene(**(values | rest))
 
 
-def coded(scene: Scene, how: Callable[[Stream], Stream]) -> Scene:
+def with_stream_codings(original: Scene, change: Callable[[Stream], Stream]) -> Scene:
     """Return the scene with the coding of every stream of a tile changed."""
     tiles = []
-    for one in scene.tiles:
-        blocks = {attribute: replace(block, how=how(block.how)) for attribute, block in one.blocks.items()}
+    for one in original.tiles:
+        blocks = {
+            attribute: replace(block, stream_coding=change(block.stream_coding))
+            for attribute, block in one.blocks.items()
+        }
         tiles.append(replace(one, blocks=blocks))
-    return replace(scene, tiles=tuple(tiles))
+    return replace(original, tiles=tuple(tiles))
 
 
 def rich_scene() -> Scene:
@@ -175,10 +180,10 @@ def rich_scene() -> Scene:
         3,
         0,
         {
-            SCALES: book(2, (0, 2, 1), summands=(-50, -40, -60)),
-            QUATS: book(2),
-            SH0 + 1: book(7, (0, 4, 3), escape1),
-            SH0 + 2: book(7, (), escape2),
+            SCALES: codebook_block(2, (0, 2, 1), summands=(-50, -40, -60)),
+            QUATS: codebook_block(2),
+            SH0 + 1: codebook_block(7, (0, 4, 3), escape1),
+            SH0 + 2: codebook_block(7, (), escape2),
         },
         extras=(Block(_spec.CODING_RAW, [[5], [0], [65535]], Stream(2)),),
     )

@@ -48,15 +48,15 @@ class Block:
         coding: registry value.
         rows: [n, C] integers: q of LEVELS, MORTON and AXIS, lattice integers of OFFSET and SIGNED, bits of RAW;
             for SPARSE, only of the splats that the mask names.
-        how: coding of the stream of these.
+        stream_coding: coding of the stream of these.
         exponent: exponent, for OFFSET, SIGNED and SPARSE.
         offsets: offsets, for OFFSET one per column; for SHAPE's summand one.
         mask: mask, for SPARSE, a bit per splat.
-        mask_how: coding of its stream.
+        mask_coding: coding of its stream.
         bits: bits per axis, for MORTON.
         codebook: id, for CODEBOOK.
         indices: n of them; none in a block that is not the first of its codebook.
-        index_how: coding of their stream.
+        index_coding: coding of their stream.
         summands: n common summands, of kind SHAPE in the block of the scales.
         escape: the block of the escaped splats.
         tail: bytes after the block.
@@ -64,15 +64,15 @@ class Block:
 
     coding: int
     rows: Rows = ()
-    how: Stream = PLAIN
+    stream_coding: Stream = PLAIN
     exponent: int = 0
     offsets: tuple[int, ...] = ()
     mask: tuple[int, ...] = ()
-    mask_how: Stream = PLAIN
+    mask_coding: Stream = PLAIN
     bits: int = 0
     codebook: int = 0
     indices: tuple[int, ...] = ()
-    index_how: Stream = PLAIN
+    index_coding: Stream = PLAIN
     summands: tuple[int, ...] = ()
     escape: Block | None = None
     tail: bytes = b""
@@ -87,7 +87,7 @@ class Tile:
         corner: lattice integers.
         exponent: exponent of the means.
         extras: blocks RAW, one per extra column.
-        tables: ids of codebooks, or None for those that the blocks use.
+        codebook_ids: ids of codebooks, or None for those that the blocks use.
         order: attributes of layer 0 as their blocks follow one another.
         tails: layer to bytes after the last block.
         unknown: layers that this version does not have, and their payloads.
@@ -97,7 +97,7 @@ class Tile:
     corner: tuple[int, int, int] = (0, 0, 0)
     exponent: int = 0
     extras: tuple[Block, ...] = ()
-    tables: tuple[int, ...] | None = None
+    codebook_ids: tuple[int, ...] | None = None
     order: tuple[int, ...] = _LAYER_0
     tails: tuple[tuple[int, bytes], ...] = ()
     unknown: tuple[tuple[int, bytes], ...] = ()
@@ -133,7 +133,7 @@ class Codebook:
         kind: registry value.
         entries: layer to rows [size, C].
         bands: first and last SH band; zeros for other kinds.
-        how: coding of the entries, the same for all chunks.
+        stream_coding: coding of the entries, the same for all chunks.
         tail: bytes after the stream of each chunk.
     """
 
@@ -141,7 +141,7 @@ class Codebook:
     kind: int
     entries: Mapping[int, Rows]
     bands: tuple[int, int] = (0, 0)
-    how: Stream = PAIRS
+    stream_coding: Stream = PAIRS
     tail: bytes = b""
 
     @property
@@ -175,7 +175,7 @@ class Chunk:
 
     type: bytes
     text: bytes | None = None
-    how: Stream = PLAIN
+    stream_coding: Stream = PLAIN
     errors: StatedErrors | None = None
     payload: bytes = b""
     flags: int | None = None

@@ -36,11 +36,11 @@ from typing import Any
 
 import numpy as np
 
+from csplat.model import SH_C0
 from csplat_render.binning import TILE
 from csplat_render.conventions import COMPENSATION_MIN, DILATION, LOG_SCALE_LIMIT
 from csplat_render.kernels import device_function, parallel_kernel
 
-SH_C0 = 0.28209479177387814
 _C1 = 0.4886025119029199
 _C20, _C21, _C22, _C23, _C24 = (
     1.0925484305920792,

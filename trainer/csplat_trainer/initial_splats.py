@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from csplat.errors import InputError
+from csplat.model import SH_C0
 from csplat.types import F32, F64
 from csplat_render.camera import Camera
 from csplat_trainer.parameters import ParameterArrays
 from csplat_trainer.posed_images import PosedImage
-
-SH_C0 = 0.28209479177387814
 
 _OPACITY = 0.5  # of each initial splat
 _BATCH = 20_000  # points drawn at a time

@@ -26,14 +26,13 @@ from csplat.errors import InputError, counted, missing_package
 from csplat.formats import Format
 from csplat.interop import from_gsplat
 from csplat.lint import Finding, too_many_bands
-from csplat.model import MAX_SH_DEGREE, SplatModel
+from csplat.model import MAX_SH_DEGREE, SH_C0, SplatModel
 from csplat.ply.columns import AttributeArrays, RowStatistics, choose_thickness, list_findings, survey_arrays
 from csplat.ply.comments import CommentMetadata, split_origin
 from csplat.scene_source import SceneSource, join_blocks, source_from_model
 
 _MAGICS = (b"PK\x03\x04", b"\x80")  # of a zip, and of a pickle, which torch wrote before 1.6
 _NAMED = 5  # names in a message
-_SH_C0 = 0.28209479177387814
 #: Values that INRIA's `GaussianModel.capture` returns after the SH degree in use (scene/gaussian_model.py).
 _INRIA = ("means", "sh0", "shN", "scales", "quats", "opacities")
 _HOLDERS = ("pipeline", "state_dict", "model")  # keys that may hold splatfacto's tensors; else the top level does
@@ -175,7 +174,7 @@ def _model_of(content: object, size: int, sh_degree: int | None) -> _CheckpointP
         return part
     # Without SH splatfacto trains logits of colours.
     colours = 1.0 / (1.0 + np.exp(-part.model.sh0.astype(np.float64)))
-    return part._replace(model=replace(part.model, sh0=((colours - 0.5) / _SH_C0).astype(np.float32)))
+    return part._replace(model=replace(part.model, sh0=((colours - 0.5) / SH_C0).astype(np.float32)))
 
 
 def _inria_tensors(content: object) -> dict[str, Any] | None:

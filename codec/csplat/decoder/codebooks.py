@@ -73,7 +73,7 @@ def read_codebooks(view: memoryview, header: SceneHeader, tiles: Iterable[Tile],
 def check_unnamed_codebooks(view: memoryview, header: SceneHeader) -> None:
     """Read the codebooks that no tile names, to check them."""
     records = {book.codebook_id: book for book in header.codebooks}
-    named = {table for tile in header.tiles for table in tile.tables}
+    named = {identity for tile in header.tiles for identity in tile.codebook_ids}
     for record in _codebook_chunks(header):
         if record.id not in named:
             _read_chunk(view, header, record, records[record.id])
@@ -85,7 +85,7 @@ def _codebook_chunks(header: SceneHeader) -> list[_spec.DirectoryRecord]:
 
 def wanted_codebooks(header: SceneHeader, tiles: Iterable[Tile], degree: int) -> list[_spec.DirectoryRecord]:
     """Return the records of those chunks of codebooks that some tiles name, their bands up to `degree`."""
-    ids = {table for tile in tiles for table in tile.tables}
+    ids = {identity for tile in tiles for identity in tile.codebook_ids}
     chunks = [record for record in _codebook_chunks(header) if record.id in ids and record.layer <= degree]
     return sorted(chunks, key=lambda record: (record.id, record.layer))
 

@@ -18,6 +18,9 @@ from csplat import _spec
 from csplat.errors import FormatError, InputError, UnsupportedError
 from csplat.file_source import File, describe_substitute, map_file
 
+#: All flags that the specification defines for a chunk of a tile.
+TILE_FLAGS = sum(flag for flag, name in _spec.CHUNK_FLAG_NAMES.items() if name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
+
 _CRC_SIZE = 4
 _STAND_IN_SIZE = 64  # bytes from which content of another kind is recognised
 
@@ -37,7 +40,7 @@ class ExtraColumn:
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """A tile record with its layer records and table ids (spec 4.3.5).
+    """A tile record with its layer records and codebook ids (spec 4.3.5).
 
     Attributes:
         index: place of the record in the index.
@@ -49,7 +52,7 @@ class Tile:
         extent: largest minus smallest lattice integer.
         max_scale: largest of its scales (natural logarithm).
         layers: layer records by layer id, including those of unknown layers.
-        tables: ids of the codebooks it may use.
+        codebook_ids: ids of the codebooks it may use.
     """
 
     index: int
@@ -61,7 +64,7 @@ class Tile:
     extent: tuple[int, int, int]
     max_scale: float
     layers: dict[int, _spec.LayerRecord]
-    tables: tuple[int, ...]
+    codebook_ids: tuple[int, ...]
 
     def corners(self, step: float) -> tuple[list[float], list[float]]:
         """Return the corners of the box around its centres (spec 4.3.5), scene units.

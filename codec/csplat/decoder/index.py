@@ -462,7 +462,7 @@ def read_tiles(
     for index in range(head.tile_count):
         tile, size = _read_tile(view, at, end, index, start, head)
         _check_tile(tile, means_step)
-        _check_tables(tile, known, at + size - 2 * len(tile.tables))
+        _check_codebook_ids(tile, known, at + size - 2 * len(tile.codebook_ids))
         tiles.append(tile)
         start += tile.splat_count
         at += size
@@ -561,7 +561,7 @@ def _read_tile(view: memoryview, at: int, end: int, index: int, start: int, head
         extent=record.extent,
         max_scale=record.max_scale,
         layers=_read_layers(view, layers_at, record.layer_count, head),
-        tables=tuple(int.from_bytes(raw[i : i + 2], "little") for i in range(0, len(raw), 2)),
+        codebook_ids=tuple(int.from_bytes(raw[i : i + 2], "little") for i in range(0, len(raw), 2)),
     )
     return tile, after - at
 
@@ -646,11 +646,11 @@ def _check_tile(tile: Tile, means_step: float) -> None:
         )
 
 
-def _check_tables(tile: Tile, known: set[int], at: int) -> None:
+def _check_codebook_ids(tile: Tile, known: set[int], at: int) -> None:
     last = -1
-    for i, table in enumerate(tile.tables):
-        if table <= last or table not in known:
+    for i, identity in enumerate(tile.codebook_ids):
+        if identity <= last or identity not in known:
             raise FormatError(
-                _spec.ERROR_INDEX, at + 2 * i, "TIL-6", "table id", found=table, wanted="ids of codebooks, ascending"
+                _spec.ERROR_INDEX, at + 2 * i, "TIL-6", "table id", found=identity, wanted="ids of codebooks, ascending"
             )
-        last = table
+        last = identity

@@ -27,11 +27,9 @@ from csplat.decoder.blocks import (
     runs,
 )
 from csplat.decoder.codebooks import attribute_columns
-from csplat.decoder.container import Cursor, SceneHeader, Tile, check_reserved, open_chunk
+from csplat.decoder.container import TILE_FLAGS, Cursor, SceneHeader, Tile, check_reserved, open_chunk
 from csplat.decoder.entropy import Ints, read_stream
 from csplat.errors import FormatError
-
-_TILE_FLAGS = sum(flag for flag, name in _spec.CHUNK_FLAG_NAMES.items() if name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
 
 _ESCAPE_CODINGS = (_spec.CODING_OFFSET, _spec.CODING_SIGNED)
 
@@ -77,7 +75,7 @@ def read_tile(
     context = TileContext(header, tile, books)
     result = TileBlocks(tile)
     for layer in wanted_layers(tile, degree):
-        cursor = open_chunk(view, layer, _spec.CHUNK_TILE, _TILE_FLAGS, "TLE-3")
+        cursor = open_chunk(view, layer, _spec.CHUNK_TILE, TILE_FLAGS, "TLE-3")
         if layer.layer not in _spec.LAYER_NAMES:
             continue  # ANC-2
         if layer.layer == _spec.LAYER_EXTRA:
@@ -114,7 +112,7 @@ def codebook_references(view: memoryview, header: SceneHeader, layer: _spec.Laye
     Raises:
         FormatError: the chunk's frame or a structure breaks a clause; streams are not decoded.
     """
-    cursor = open_chunk(view, layer, _spec.CHUNK_TILE, _TILE_FLAGS, "TLE-3")
+    cursor = open_chunk(view, layer, _spec.CHUNK_TILE, TILE_FLAGS, "TLE-3")
     cursor.take(_spec.TILE_HEAD_SIZE)
     for attribute in (record.attribute for record in header.attributes):
         if _spec.ATTRIBUTE_LAYER[attribute] != layer.layer:
@@ -251,7 +249,7 @@ def read_codebook_block(cursor: Cursor, context: TileContext, attribute: int, at
     check_reserved(params, params_at, _spec.CODEBOOK_PARAMS_OFFSETS)
     book = context.books.get(params.codebook_id)
     columns = attribute_columns(book.record, attribute) if book else None
-    if book is None or columns is None or params.codebook_id not in context.tile.tables:
+    if book is None or columns is None or params.codebook_id not in context.tile.codebook_ids:
         raise FormatError(
             _spec.ERROR_CODEBOOK,
             params_at,

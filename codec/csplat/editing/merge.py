@@ -26,9 +26,9 @@ from csplat.decoder.tiles import codebook_references
 from csplat.disk_files import BinaryWriter, open_writer
 from csplat.encoder import EncodeOptions
 from csplat.encoder.container import (
-    CodebookTable,
     FileChunk,
     FileTile,
+    IndexedCodebook,
     LazyPayload,
     SceneFields,
     chunk_crc,
@@ -124,8 +124,8 @@ def merge(
         books = MergedCodebooks(spool)
         if not why:
             ids = [books.take(one, scene.header) for one, scene in zip(windows, scenes, strict=True)]
-            if len(books.tables) > codebooks_max:
-                why = f"they have {len(books.tables):,} codebooks together, and a file at most {codebooks_max:,}"
+            if len(books.records) > codebooks_max:
+                why = f"they have {len(books.records):,} codebooks together, and a file at most {codebooks_max:,}"
         if why:
             return _encode_again(scenes, output, options or EncodeOptions(keep_extra=True), why)
         tiles = [
@@ -137,7 +137,7 @@ def merge(
             fields[0],
             axes=next((one.axes for one in fields if any(one.axes)), fields[0].axes),
             unit_metres=next((one.unit_metres for one in fields if one.unit_metres), 0.0),
-            codebooks=books.tables,
+            codebooks=books.records,
             chunks=[*_agreed_chunks(scenes), *books.chunks],
         )
         return _write_merged(together, tiles, output)
@@ -298,19 +298,19 @@ class MergedCodebooks:
         spool: keeps their payloads.
 
     Attributes:
-        tables: their records.
+        records: their index records.
         chunks: their chunks.
     """
 
     def __init__(self, spool: PayloadSpool) -> None:
-        self.tables: list[CodebookTable] = []
+        self.records: list[IndexedCodebook] = []
         self.chunks: list[FileChunk] = []
         self._spool = spool
         self._known: dict[tuple[object, ...], int] = {}
 
     def take(self, window: FileWindow, header: SceneHeader) -> dict[int, int]:
         """Add the codebooks of a file that its tiles name; return the new ids by the old ones."""
-        used = {table for tile in header.tiles for table in tile.tables}
+        used = {identity for tile in header.tiles for identity in tile.codebook_ids}
         chunks = [one for one in header.directory if one.type == _spec.CHUNK_CODEBOOK and one.id in used]
         window.fetch((one.offset, one.size) for one in chunks)
         ids = {}
@@ -333,8 +333,8 @@ class MergedCodebooks:
         digests = (hashlib.sha256(content).digest() for content in contents.values())
         key = (book.kind, bands, book.size, *digests)
         if key not in self._known:
-            id = self._known[key] = len(self.tables)
-            self.tables.append(CodebookTable(id, book.kind, bands, book.size))
+            id = self._known[key] = len(self.records)
+            self.records.append(IndexedCodebook(id, book.kind, bands, book.size))
             if id <= _ID_MAX:  # a file with more cannot be written
                 for layer, content in contents.items():
                     payload = self._spool.put(_spec.CHUNK_CODEBOOK, _as_bytes(id) + content)
@@ -368,12 +368,14 @@ def renumber_tiles(
     window.forget()
     copies = TileCopier(window, files)
     tiles = [copies.of(tile, changed.get(tile.index)) for tile in header.tiles]
-    return [replace(tile, tables=tuple(sorted({ids[table] for table in tile.tables}))) for tile in tiles]
+    return [
+        replace(tile, codebook_ids=tuple(sorted({ids[identity] for identity in tile.codebook_ids}))) for tile in tiles
+    ]
 
 
 def _naming_layers(header: SceneHeader, tile: Tile, ids: Mapping[int, int]) -> set[int]:
     """Return the layers of a tile that may name a codebook whose id changes."""
-    moved = {table for table in tile.tables if ids[table] != table}
+    moved = {identity for identity in tile.codebook_ids if ids[identity] != identity}
     return {
         layer
         for book in header.codebooks

@@ -20,7 +20,7 @@ from csplat.encoder.pipeline import (
 )
 from csplat.encoder.quantisation import canonicalise_shape
 from csplat.encoder.quantisation_classes import max_class_count
-from csplat.encoder.weights import GaussNewtonBlocks, Importance, apply_weight_floor
+from csplat.encoder.splat_importance import GaussNewtonBlocks, Importance, apply_weight_floor
 
 __all__ = [
     "PRESETS",

@@ -19,11 +19,8 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.encoder.encode_options import PRESETS, EncodeOptions
 from csplat.encoder.entropy import DeflateSettings, deflate_library, morton_codes
-from csplat.model import SplatModel
+from csplat.model import SH_C0, SplatModel
 from csplat.types import F32, F64
-
-#: Colour of a channel per degree-0 coefficient.
-COLOUR_PER_SH0 = 0.28209479177387814
 
 _EXTENT_SAMPLE = 1 << 16  # splats from which the extent is estimated
 _EDGE = 0.02  # fraction of the splats on either side of an axis that are outside the extent
@@ -337,7 +334,7 @@ def _reach(means: F32) -> tuple[F64, float]:
 
 
 def _rms(squares: float, weights: float) -> float:
-    return COLOUR_PER_SH0 * float(np.sqrt(squares / weights)) if weights else 0.2
+    return SH_C0 * float(np.sqrt(squares / weights)) if weights else 0.2
 
 
 def _contrast(model: SplatModel, sample: F64, reach: float) -> tuple[float, float]:

@@ -55,11 +55,11 @@ class FileTile:
     extent: tuple[int, int, int]
     max_scale: float
     layers: Mapping[int, Payload]
-    tables: tuple[int, ...] = ()
+    codebook_ids: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
-class CodebookTable:
+class IndexedCodebook:
     """Index record of a codebook."""
 
     id: int
@@ -79,7 +79,7 @@ class SceneFields:
     origin: tuple[float, float, float]
     attributes: Sequence[_spec.AttributeRecord]
     extras: Sequence[_spec.ExtraRecord] = ()
-    codebooks: Sequence[CodebookTable] = ()
+    codebooks: Sequence[IndexedCodebook] = ()
     chunks: Sequence[FileChunk] = field(default=())
 
 
@@ -158,7 +158,8 @@ def _index_size(scene: SceneFields, tiles: Sequence[FileTile]) -> int:
         + len(scene.extras) * _spec.EXTRA_RECORD_SIZE
         + len(scene.chunks) * _spec.DIRECTORY_RECORD_SIZE
         + sum(
-            _spec.TILE_RECORD_SIZE + len(tile.layers) * _spec.LAYER_RECORD_SIZE + 2 * len(tile.tables) for tile in tiles
+            _spec.TILE_RECORD_SIZE + len(tile.layers) * _spec.LAYER_RECORD_SIZE + 2 * len(tile.codebook_ids)
+            for tile in tiles
         )
         + 4
     )
@@ -205,7 +206,7 @@ def _index(
                     splat_count=tile.splat_count,
                     level=0,
                     layer_count=len(tile.layers),
-                    table_count=len(tile.tables),
+                    table_count=len(tile.codebook_ids),
                     exponent=tile.exponent,
                     reserved_0=0,
                     corner=tile.corner,
@@ -215,7 +216,7 @@ def _index(
             )
         )
         parts += [_spec.pack_layer_record(layers[number, layer]) for layer in sorted(tile.layers)]
-        parts += [table.to_bytes(2, "little") for table in tile.tables]
+        parts += [identity.to_bytes(2, "little") for identity in tile.codebook_ids]
     index = b"".join(parts)
     return index + zlib.crc32(index).to_bytes(4, "little")
 

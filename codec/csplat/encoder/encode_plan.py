@@ -27,13 +27,21 @@ from csplat.encoder.error_bounds import SCALE_MOST
 from csplat.encoder.quantisation_classes import QuantisationClasses, choose_classes
 from csplat.encoder.sh_codebook import (
     FileCodebooks,
-    ShBook,
+    ShCodebook,
     assign_splats,
     choose_sh_coding,
     final_parameters,
     largest_sh,
 )
-from csplat.encoder.shape_codebook import ShapeTables, choose_shapes, dequantised_shapes
+from csplat.encoder.shape_codebook import ShapeCodebook, choose_shapes, dequantised_shapes
+from csplat.encoder.splat_importance import (
+    Importance,
+    checked_blocks,
+    sh_metric,
+    shape_metric,
+    shape_weights,
+    splat_weights,
+)
 from csplat.encoder.tiling import (
     BUCKET_SPLATS,
     TileSplats,
@@ -44,7 +52,6 @@ from csplat.encoder.tiling import (
     dequantised_opacities,
     sample_rows,
 )
-from csplat.encoder.weights import Importance, checked_blocks, sh_metric, shape_metric, shape_weights, splat_weights
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
 from csplat.types import F32, I64, Progress, null_progress
@@ -95,7 +102,7 @@ class EncodePlan:
     parameters: CodingParameters
     tiles: Sequence[TileSplats]
     extras: Sequence[_spec.ExtraRecord]
-    shapes: ShapeTables | None
+    shapes: ShapeCodebook | None
     classes: QuantisationClasses | None
     sample: EncodePlan | None = None
     buckets: Sequence[NDArray[np.intp]] = ()
@@ -215,17 +222,17 @@ class EncodePlan:
         self, parameters: CodingParameters, codebooks: FileCodebooks
     ) -> tuple[CodingParameters, FileCodebooks]:
         """Apply the choices made on the sample to all splats."""
-        tables, count = codebooks.tables, len(self.model)
-        index = None if tables.book is None else np.empty(count, np.int32)
-        weights = None if tables.weights is None else np.empty(count, np.float32)
+        sh_plan, count = codebooks.sh_plan, len(self.model)
+        index = None if sh_plan.book is None else np.empty(count, np.int32)
+        weights = None if sh_plan.weights is None else np.empty(count, np.float32)
         for rows in self.buckets if index is not None or weights is not None else ():
             part = assign_splats(codebooks, self.model.select(rows), parameters, self.options.thread_count)
             if weights is not None and part.weights is not None:
                 weights[rows] = part.weights
             if index is not None and part.book is not None:
                 index[rows] = part.book.index
-        book = None if tables.book is None or index is None else ShBook(tables.book.entries, index)
-        return parameters, replace(codebooks, tables=replace(tables, weights=weights, book=book))
+        book = None if sh_plan.book is None or index is None else ShCodebook(sh_plan.book.entries, index)
+        return parameters, replace(codebooks, sh_plan=replace(sh_plan, weights=weights, book=book))
 
 
 def trial_rows(model: SplatModel, tiles: Sequence[TileSplats], classes: QuantisationClasses | None) -> NDArray[np.intp]:

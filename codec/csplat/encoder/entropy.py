@@ -108,7 +108,7 @@ def smooth_stream(values: Integers, deflate: DeflateSettings) -> bytes:
         return min(unsigned_stream(values, deflate), unsigned_stream(values, deflate, signed_delta=True), key=len)
     low = values.astype(np.uint8)
     differences = np.diff(low)  # modulo 256; a zigzag renames symbols and does not change the entropy
-    return unsigned_stream(values, deflate, signed_delta=_entropy(differences) < _entropy(low))
+    return unsigned_stream(values, deflate, signed_delta=_byte_entropy(differences) < _byte_entropy(low))
 
 
 def signed_stream(values: Integers, deflate: DeflateSettings) -> bytes:
@@ -167,6 +167,12 @@ def signed_or_sparse_block(attribute: int, integers: Integers, exponent: int, de
         return plain
     sparse = sparse_block(attribute, integers, exponent, deflate)
     return sparse if len(sparse) < len(plain) else plain
+
+
+def order_0_entropy(counts: NDArray[np.integer]) -> float:
+    """Return bits per symbol, given how often each symbol occurs, at least once."""
+    shares = counts / max(1, counts.sum())
+    return -float((shares * np.log2(shares)).sum())
 
 
 def codebook_block(
@@ -274,11 +280,9 @@ def _zigzag(values: Integers) -> Integers:
     return ((values << 1) ^ (values >> (bits - 1))).view(f"u{values.itemsize}")
 
 
-def _entropy(symbols: NDArray[np.uint8]) -> float:
-    """Return the order-0 entropy, bits per symbol."""
-    shares = np.bincount(symbols, minlength=1) / max(1, len(symbols))
-    shares = shares[shares > 0]
-    return -float((shares * np.log2(shares)).sum())
+def _byte_entropy(symbols: NDArray[np.uint8]) -> float:
+    counts = np.bincount(symbols)
+    return order_0_entropy(counts[counts > 0])
 
 
 def _byte_planes(values: Integers, width: int) -> NDArray[np.uint8]:

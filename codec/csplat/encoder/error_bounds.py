@@ -1,6 +1,6 @@
 """Errors of decoded splats: the bounds that a file declares, and their verification (spec 5.5).
 
-The functions on columns measure tile by tile while encoding; `measure_errors` compares two models.
+The functions on columns measure tile by tile while encoding; `measured_sums` compares two models.
 """
 
 from __future__ import annotations
@@ -128,9 +128,7 @@ def covariance_errors(
     return float(np.sqrt(largest)), squares
 
 
-def measure_errors(
-    source: SplatModel, decoded: SplatModel, source_index: NDArray[Any]
-) -> dict[str, tuple[float, float]]:
+def measured_sums(source: SplatModel, decoded: SplatModel, source_index: NDArray[Any]) -> ErrorSums:
     """Measure every attribute of a decoded model against its source.
 
     Args:
@@ -139,17 +137,12 @@ def measure_errors(
         source_index: [len(decoded)] integers, which source splat each decoded one is.
 
     Returns:
-        (max, rms) by measure of the spec: means, covariance, opacities, sh0, sh1, sh2, sh3. Bands that only one of
-        the two has are measured against 0.
+        Sums by measure of the spec: means, covariance, opacities, sh0, sh1, sh2, sh3. Bands that only one of the two
+        models has are measured against 0.
 
     Raises:
         InputError: an index of another length, or that leaves the source.
     """
-    return measured_sums(source, decoded, source_index).bounds()
-
-
-def measured_sums(source: SplatModel, decoded: SplatModel, source_index: NDArray[Any]) -> ErrorSums:
-    """Return the sums behind `measure_errors`."""
     index = np.asarray(source_index)
     if index.shape != (len(decoded),):
         raise InputError(f"source index has shape {index.shape}, wanted ({len(decoded)},)")

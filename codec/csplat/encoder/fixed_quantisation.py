@@ -28,8 +28,8 @@ from csplat.encoder.quantisation import (
     quat_levels,
     quat_values,
 )
-from csplat.encoder.sh_codebook import FileCodebooks, ShBook, ShTables, make_codebooks, sh_coarseness
-from csplat.encoder.shape_codebook import ShapeTables, dequantised_shapes
+from csplat.encoder.sh_codebook import FileCodebooks, ShCodebook, ShCodingPlan, make_codebooks, sh_coarseness
+from csplat.encoder.shape_codebook import ShapeCodebook, dequantised_shapes
 from csplat.encoder.tiling import dequantised_means, dequantised_opacities, quantise_and_sort
 from csplat.errors import InputError
 from csplat.model import SplatModel
@@ -83,14 +83,14 @@ class FixedQuantisation:
 
     Attributes:
         encode_plan: the plan, with splats in tile order and canonical axis order.
-        tables: SH coding.
+        sh_plan: SH coding.
         source: the scene that declared errors are measured against.
         low, high: [N, 3] float32, the box of each splat's tile, which its mean must not leave.
         zero: [N, K] bool, SH coefficients that stay zero, if there is no SH codebook; else None.
     """
 
     encode_plan: EncodePlan
-    tables: ShTables
+    sh_plan: ShCodingPlan
     source: SplatModel
     low: F32
     high: F32
@@ -107,12 +107,12 @@ class FixedQuantisation:
         return self.encode_plan.origin.source_index
 
     @property
-    def book(self) -> ShBook | None:
+    def book(self) -> ShCodebook | None:
         """The SH codebook, if there is one."""
-        return self.tables.book
+        return self.sh_plan.book
 
     @property
-    def shapes(self) -> ShapeTables | None:
+    def shapes(self) -> ShapeCodebook | None:
         """The shape codebook, if there is one."""
         return self.encode_plan.shapes
 
@@ -155,10 +155,10 @@ class FixedQuantisation:
         """
         shapes, quats, scales = self._shape_values(values)
         model, kept = self.encode_plan.model, values.sh.shape[1]
-        shN, codebooks = np.zeros_like(model.shN), FileCodebooks(self.tables)
+        shN, codebooks = np.zeros_like(model.shN), FileCodebooks(self.sh_plan)
         if self.book is not None:
             shN[self.book.escaped, :kept] = values.sh[self.book.size :]
-            codebooks = make_codebooks(self.tables, self._requantised(self.book, values.sh), self.parameters)
+            codebooks = make_codebooks(self.sh_plan, self._requantised(self.book, values.sh), self.parameters)
         else:
             shN[:, :kept] = values.sh
         model = replace(model, means_double=None)
@@ -204,7 +204,7 @@ class FixedQuantisation:
             return decoded
         decoded = np.empty_like(sh)
         for tile in self.encode_plan.tiles:
-            coarse = sh_coarseness(tile.rows, parameters, self.tables)
+            coarse = sh_coarseness(tile.rows, parameters, self.sh_plan)
             decoded[tile.rows] = quantise_sh(sh[tile.rows], parameters, coarse)[2]
         return decoded
 
@@ -234,11 +234,11 @@ class FixedQuantisation:
         shapes, quats, scales = self._shape_values(values)
         return dequantised_shapes(quats, scales, self.encode_plan.tiles, self.parameters, shapes)
 
-    def _dequantise_escapes(self, book: ShBook, sh: F32) -> F32:
+    def _dequantise_escapes(self, book: ShCodebook, sh: F32) -> F32:
         own = sh[book.size :]
         return quantise_sh(own, self.parameters, np.full(len(own), self.parameters.escape_coarse, np.int32))[2]
 
-    def _shape_values(self, values: FreeValues) -> tuple[ShapeTables | None, F32, F32]:
+    def _shape_values(self, values: FreeValues) -> tuple[ShapeCodebook | None, F32, F32]:
         """Return the shape codebook of these values, and the quats and scales of the escaped splats, by splat."""
         if self.shapes is None:
             return None, values.quats, values.scales
@@ -249,10 +249,10 @@ class FixedQuantisation:
         by_splat = np.zeros_like(self.encode_plan.model.quats), np.zeros_like(self.encode_plan.model.scales)
         by_splat[0][:, 0] = 1.0
         by_splat[0][own], by_splat[1][own] = values.quats[size:], values.scales[size:]
-        return ShapeTables(entries, self.shapes.index, summand), *by_splat
+        return ShapeCodebook(entries, self.shapes.index, summand), *by_splat
 
-    def _requantised(self, book: ShBook, sh: F32) -> ShBook:
-        return ShBook(_entry_integers(sh[: book.size], self.parameters), book.index)
+    def _requantised(self, book: ShCodebook, sh: F32) -> ShCodebook:
+        return ShCodebook(_entry_integers(sh[: book.size], self.parameters), book.index)
 
 
 def fix_quantisation(
@@ -279,11 +279,11 @@ def fix_quantisation(
     rows = [quantise_and_sort(plan.model, tile, parameters).rows for tile in plan.tiles]
     order = np.concatenate(rows).astype(np.int64)
     plan = replace(_reordered(plan, order, [len(part) for part in rows]), parameters=parameters)
-    tables, means = codebooks.tables.select(order), plan.model.means
+    sh_plan, means = codebooks.sh_plan.select(order), plan.model.means
     low, high = np.empty_like(means), np.empty_like(means)
     for tile in plan.tiles:
         low[tile.rows], high[tile.rows] = means[tile.rows].min(axis=0), means[tile.rows].max(axis=0)
-    return FixedQuantisation(plan, tables, source, low, high, _zero_coefficients(plan, tables))
+    return FixedQuantisation(plan, sh_plan, source, low, high, _zero_coefficients(plan, sh_plan))
 
 
 def _reordered(plan: EncodePlan, order: I64, counts: Sequence[int]) -> EncodePlan:
@@ -306,14 +306,14 @@ def _reordered(plan: EncodePlan, order: I64, counts: Sequence[int]) -> EncodePla
     )
 
 
-def _zero_coefficients(plan: EncodePlan, tables: ShTables) -> NDArray[np.bool_] | None:
+def _zero_coefficients(plan: EncodePlan, sh_plan: ShCodingPlan) -> NDArray[np.bool_] | None:
     parameters = plan.parameters
     kept = parameters.sh_coefficients
-    if tables.book is not None or not kept:
+    if sh_plan.book is not None or not kept:
         return None
     zero = np.empty((len(plan.model), kept), np.bool_)
     for tile in plan.tiles:
-        coarse = sh_coarseness(tile.rows, parameters, tables)
+        coarse = sh_coarseness(tile.rows, parameters, sh_plan)
         columns, _, _ = quantise_sh(plan.model.shN[tile.rows, :kept], parameters, coarse)
         for band in range(1, parameters.sh_degree + 1):
             span = band_slice(band)

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.weights import ErrorMetric, doubled_triangles, matrix_products
+from csplat.encoder.splat_importance import ErrorMetric, doubled_triangles, matrix_products
 from csplat.errors import InputError
 from csplat.types import F32, F64, I16, I32, I64, U32
 

@@ -37,17 +37,17 @@ from csplat.encoder.quantisation import (
     opacity_values,
     quantise_colour,
 )
-from csplat.encoder.sh_codebook import FileCodebooks, ShTables, encode_sh
+from csplat.encoder.sh_codebook import FileCodebooks, ShCodingPlan, encode_sh
 from csplat.encoder.shape_codebook import (
     SHAPE_CODEBOOK_ID,
+    ShapeCodebook,
     ShapePart,
-    ShapeTables,
     quantise_shape,
     shape_blocks,
     shape_codebook_chunk,
 )
+from csplat.encoder.splat_importance import Importance
 from csplat.encoder.tiling import QuantisedTile, TileSplats, quantise_and_sort, take_rows
-from csplat.encoder.weights import Importance
 from csplat.errors import InputError, counted
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.types import F32, Progress
@@ -208,7 +208,7 @@ class EncodedTiles:
         Raises:
             InputError: an error is too large to be declared.
         """
-        settings = {**(metadata or {}), **encoding_settings(self.plan, self.codebooks.tables)}
+        settings = {**(metadata or {}), **encoding_settings(self.plan, self.codebooks.sh_plan)}
         chunks = file_chunks(self.plan, self.errors, settings)
         data = write_file(scene_fields(self.plan, self.codebooks, chunks), [part.tile for part in self.tiles])
         notes = make_notes(self.tiles, strict=self.plan.parameters.lattice.strict)
@@ -238,7 +238,7 @@ def encode_tiles(
     if codebooks is None:
         parameters, codebooks = plan.choose_sh_coding(progress)
         plan = replace(plan, parameters=parameters)
-    tiles = _encode_all(plan, codebooks.tables, progress)
+    tiles = _encode_all(plan, codebooks.sh_plan, progress)
     errors = errors or ErrorSums.total(part.errors for part in tiles)
     if plan.shapes is not None:
         record, chunk = shape_codebook_chunk(plan.shapes, plan.parameters.deflate)
@@ -246,12 +246,12 @@ def encode_tiles(
     return EncodedTiles(plan, codebooks, tiles, errors)
 
 
-def _encode_all(plan: EncodePlan, tables: ShTables, progress: Progress | None) -> list[EncodedTile]:
+def _encode_all(plan: EncodePlan, sh_plan: ShCodingPlan, progress: Progress | None) -> list[EncodedTile]:
     threads, done = plan.options.thread_count, 0
 
     def encode_one(tile: TileSplats) -> EncodedTile:
         nonlocal done
-        encoded = encode_tile(plan.model, tile, plan.parameters, tables, plan.shapes)
+        encoded = encode_tile(plan.model, tile, plan.parameters, sh_plan, plan.shapes)
         done += len(tile.rows)
         if progress is not None:
             progress("tiles", done / max(1, len(plan.model)))
@@ -283,8 +283,8 @@ def encode_tile(
     model: SplatModel,
     tile: TileSplats,
     parameters: CodingParameters,
-    tables: ShTables,
-    shapes: ShapeTables | None = None,
+    sh_plan: ShCodingPlan,
+    shapes: ShapeCodebook | None = None,
 ) -> EncodedTile:
     """Quantise, code and measure one tile (spec 5.2).
 
@@ -292,7 +292,7 @@ def encode_tile(
         model: the whole scene.
         tile: the tile's rows and steps.
         parameters: the file's lattices and codings.
-        tables: SH coding of the whole file.
+        sh_plan: SH coding of the whole file.
         shapes: shape codebook of the whole file, if there is one.
     """
     result = _TileResult(parameters, tile.factors)
@@ -306,17 +306,17 @@ def encode_tile(
     layers: dict[int, list[bytes]] = {_spec.ATTRIBUTE_LAYER[_spec.ATTRIBUTE_SH0]: result.blocks}
     used: tuple[int, ...] = () if part is None else (SHAPE_CODEBOOK_ID,)
     if model.sh_degree:
-        sh = encode_sh(model.shN, rows, parameters, tables)
+        sh = encode_sh(model.shN, rows, parameters, sh_plan)
         layers |= {layer: [block] for layer, block in sh.blocks.items()}
-        used = (*sh.tables, *used)
+        used = (*sh.codebook_ids, *used)
         if sh.exponent:
             result.coarsened.add("shN")
         for measure, errors in sh.errors.items():
             result.add_errors(measure, errors)
-    if tables.extras:
+    if sh_plan.extras:
         layers[_spec.LAYER_EXTRA] = [
             entropy.raw_block(column, take_rows(model.extra[name], rows), parameters.deflate)
-            for column, name in enumerate(tables.extras)
+            for column, name in enumerate(sh_plan.extras)
         ]
     corner, extent = quantised.corner, quantised.q.max(axis=1)
     file_tile = FileTile(
@@ -326,7 +326,7 @@ def encode_tile(
         extent=(int(extent[0]), int(extent[1]), int(extent[2])),
         max_scale=max_scale,
         layers={layer: tile_payload(layer, parts) for layer, parts in layers.items()},
-        tables=used,
+        codebook_ids=used,
     )
     return EncodedTile(
         file_tile, rows, ErrorSums(len(rows), result.largest, result.squares), frozenset(result.coarsened)
@@ -384,7 +384,7 @@ class _TileResult:
         self.add_errors("sh0", value_errors(source, colour.decoded))
 
 
-def encoding_settings(plan: EncodePlan, tables: ShTables) -> dict[str, Any]:
+def encoding_settings(plan: EncodePlan, sh_plan: ShCodingPlan) -> dict[str, Any]:
     """Return the options of the caller and the choices of the encoder, JSON-compatible: the OPTS chunk."""
     parameters, options = plan.parameters, plan.options
     return {
@@ -402,7 +402,7 @@ def encoding_settings(plan: EncodePlan, tables: ShTables) -> dict[str, Any]:
         "sh_coding": parameters.sh_coding,
         "chroma_shift": parameters.chroma_shift,
         "adaptive": parameters.adaptive if parameters.sh_coding == "scalar" else 0.0,
-        "codebook_size": 0 if tables.book is None else tables.book.size,
+        "codebook_size": 0 if sh_plan.book is None else sh_plan.book.size,
         **_shape_settings(plan.shapes),
         **({} if plan.classes is None else {"classes": plan.classes.as_json()}),
         "deflate_level": parameters.deflate.level,
@@ -411,7 +411,7 @@ def encoding_settings(plan: EncodePlan, tables: ShTables) -> dict[str, Any]:
     }
 
 
-def _shape_settings(shapes: ShapeTables | None) -> dict[str, Any]:
+def _shape_settings(shapes: ShapeCodebook | None) -> dict[str, Any]:
     if shapes is None:
         return {}
     return {"shape_codebook_size": shapes.size, "shape_escape_fraction": float(shapes.escaped.mean())}

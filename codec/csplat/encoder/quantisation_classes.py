@@ -20,7 +20,7 @@ import numpy as np
 
 from csplat.encoder.coding_parameters import CodingParameters, StepFactors
 from csplat.encoder.encode_options import EncodeOptions
-from csplat.encoder.weights import CLASSED_ATTRIBUTES, GaussNewtonBlocks, apply_weight_floor, rounding_errors
+from csplat.encoder.splat_importance import CLASSED_ATTRIBUTES, GaussNewtonBlocks, apply_weight_floor, rounding_errors
 from csplat.model import SplatModel
 from csplat.types import F64, U8
 

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.encoder import entropy
 from csplat.encoder.coding_parameters import CodingParameters, band_slice
-from csplat.encoder.container import CodebookTable, FileChunk
+from csplat.encoder.container import FileChunk, IndexedCodebook
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.entropy import signed_stream
 from csplat.encoder.kmeans import assign, cluster, rank_by_frequency, refine_by_metric
 from csplat.encoder.quantisation import colour_integers, colour_lifted, largest_exact, lattice_values, quantise_sh
-from csplat.encoder.weights import ErrorMetric, splat_weights
+from csplat.encoder.splat_importance import ErrorMetric, splat_weights
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F32, F64, I16, I32, U32, Progress
@@ -44,7 +44,7 @@ _CODEBOOK_ID = 0
 
 
 @dataclass(frozen=True, eq=False)
-class ShBook:
+class ShCodebook:
     """An SH codebook and its users.
 
     Attributes:
@@ -65,9 +65,9 @@ class ShBook:
         """Splats that bypass the codebook, ascending."""
         return np.flatnonzero(self.index == self.size)
 
-    def select(self, order: NDArray[Any]) -> ShBook:
+    def select(self, order: NDArray[Any]) -> ShCodebook:
         """Return the codebook with the users `order`."""
-        return ShBook(self.entries, self.index[order])
+        return ShCodebook(self.entries, self.index[order])
 
     def dequantise(self, parameters: CodingParameters) -> F32:
         """Return SH of all splats as decoded, [N, K, 3]; rows of escaped splats have no meaning."""
@@ -76,7 +76,7 @@ class ShBook:
 
 
 @dataclass(frozen=True)
-class ShTables:
+class ShCodingPlan:
     """SH coding of the whole file, as its tiles need it.
 
     Attributes:
@@ -90,13 +90,13 @@ class ShTables:
 
     weights: F32 | None = None
     reference: float = 1.0
-    book: ShBook | None = None
+    book: ShCodebook | None = None
     ids: Sequence[int] = ()
     layers: Sequence[int] = ()
     extras: Sequence[str] = ()
 
-    def select(self, order: NDArray[Any]) -> ShTables:
-        """Return the tables of the splats `order`."""
+    def select(self, order: NDArray[Any]) -> ShCodingPlan:
+        """Return the plan of the splats `order`."""
         weights = None if self.weights is None else self.weights[order]
         return replace(self, weights=weights, book=None if self.book is None else self.book.select(order))
 
@@ -118,10 +118,10 @@ class AssignmentRule:
 
 @dataclass(frozen=True)
 class FileCodebooks:
-    """SH tables, index records and chunks of the codebooks, and the rule for splats not yet assigned."""
+    """SH plan, index records and chunks of the codebooks, and the rule for splats not yet assigned."""
 
-    tables: ShTables
-    records: Sequence[CodebookTable] = ()
+    sh_plan: ShCodingPlan
+    records: Sequence[IndexedCodebook] = ()
     chunks: Sequence[FileChunk] = ()
     rule: AssignmentRule | None = None
 
@@ -134,13 +134,13 @@ class EncodedSh:
         blocks: block of each layer; a band of zeros has none.
         errors: largest error and sum of squares by measure.
         exponent: the tile's lattice is coarser by 2**exponent.
-        tables: ids of the codebooks used.
+        codebook_ids: ids of the codebooks used.
     """
 
     blocks: Mapping[int, bytes]
     errors: Mapping[str, tuple[float, float]]
     exponent: int
-    tables: tuple[int, ...] = ()
+    codebook_ids: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -202,8 +202,8 @@ def choose_sh_coding(
     Returns:
         The parameters with SH coding and step, and the codebooks.
     """
-    tables = ShTables(weights, _reference_weight(weights), extras=tuple(model.extra) if options.keep_extra else ())
-    scalar = replace(parameters, sh_coding="scalar" if parameters.sh_degree else "none"), FileCodebooks(tables)
+    sh_plan = ShCodingPlan(weights, _reference_weight(weights), extras=tuple(model.extra) if options.keep_extra else ())
+    scalar = replace(parameters, sh_coding="scalar" if parameters.sh_degree else "none"), FileCodebooks(sh_plan)
     if parameters.sh_coding not in ("auto", "codebook") or weights is None or not len(model):
         return scalar
     fine = replace(parameters, sh_coding="codebook", sh_step=parameters.codebook_step)
@@ -214,7 +214,7 @@ def choose_sh_coding(
     trained = _train(model, error_weights, fine, options, progress)
     rgb = trained.entries.reshape(len(trained.entries), -1, 3).transpose(2, 1, 0).astype(np.float32)
     columns = colour_integers(np.ascontiguousarray(rgb), fine.chroma_shift)
-    codebooks = replace(make_codebooks(tables, ShBook(columns, trained.index), fine), rule=trained.rule)
+    codebooks = replace(make_codebooks(sh_plan, ShCodebook(columns, trained.index), fine), rule=trained.rule)
     if is_open and not _codebook_pays(model, error_weights, trained, codebooks, trial[:_TRIAL_SPLATS], parameters):
         return scalar
     return fine, codebooks
@@ -233,7 +233,9 @@ def largest_sh(shN: F32) -> float:
     return float(max(shN.max(initial=0.0), -shN.min(initial=0.0)))
 
 
-def assign_splats(codebooks: FileCodebooks, model: SplatModel, parameters: CodingParameters, threads: int) -> ShTables:
+def assign_splats(
+    codebooks: FileCodebooks, model: SplatModel, parameters: CodingParameters, threads: int
+) -> ShCodingPlan:
     """Assign splats that took no part in training.
 
     Args:
@@ -242,19 +244,19 @@ def assign_splats(codebooks: FileCodebooks, model: SplatModel, parameters: Codin
         parameters: the final parameters.
         threads: threads of the search; no effect on the result.
     """
-    tables, rule = codebooks.tables, codebooks.rule
-    weights = None if tables.weights is None else splat_weights(model, None)
-    if rule is None or tables.book is None or weights is None:
-        return replace(tables, weights=weights)
+    sh_plan, rule = codebooks.sh_plan, codebooks.rule
+    weights = None if sh_plan.weights is None else splat_weights(model, None)
+    if rule is None or sh_plan.book is None or weights is None:
+        return replace(sh_plan, weights=weights)
     points = _lattice_points(model.shN, parameters)
     index = assign(points, rule.entries, near_groups=rule.near_groups, threads=threads).astype(np.int32)
     errors = _errors(model.shN, index, rule.entries, parameters, _ErrorWeights(weights, None, measured=False))
-    index[errors >= rule.threshold] = tables.book.size
-    return replace(tables, weights=weights, book=ShBook(tables.book.entries, index))
+    index[errors >= rule.threshold] = sh_plan.book.size
+    return replace(sh_plan, weights=weights, book=ShCodebook(sh_plan.book.entries, index))
 
 
-def make_codebooks(tables: ShTables, book: ShBook, parameters: CodingParameters) -> FileCodebooks:
-    """Make the tables, the index record and the chunks of a codebook."""
+def make_codebooks(sh_plan: ShCodingPlan, book: ShCodebook, parameters: CodingParameters) -> FileCodebooks:
+    """Make the plan, the index record and the chunks of a codebook."""
     bands = range(1, parameters.sh_degree + 1)
     chunks = []
     for band in bands:
@@ -262,28 +264,28 @@ def make_codebooks(tables: ShTables, book: ShBook, parameters: CodingParameters)
         columns = np.ascontiguousarray(book.entries[:, band_slice(band)]).reshape(-1)
         stream = signed_stream(columns, parameters.deflate)
         chunks.append(FileChunk(_spec.CHUNK_CODEBOOK, head + stream, _CODEBOOK_ID, band))
-    record = CodebookTable(_CODEBOOK_ID, _spec.CODEBOOK_KIND_SH, (1, parameters.sh_degree), book.size)
-    tables = replace(tables, book=book, ids=(_CODEBOOK_ID,), layers=tuple(bands))
-    return FileCodebooks(tables, (record,), tuple(chunks))
+    record = IndexedCodebook(_CODEBOOK_ID, _spec.CODEBOOK_KIND_SH, (1, parameters.sh_degree), book.size)
+    sh_plan = replace(sh_plan, book=book, ids=(_CODEBOOK_ID,), layers=tuple(bands))
+    return FileCodebooks(sh_plan, (record,), tuple(chunks))
 
 
-def sh_coarseness(rows: Rows, parameters: CodingParameters, tables: ShTables) -> I32 | None:
+def sh_coarseness(rows: Rows, parameters: CodingParameters, sh_plan: ShCodingPlan) -> I32 | None:
     """Return the power of two by which the SH of each splat is coarser than the lattice, or None for 0."""
-    if tables.weights is None or parameters.adaptive == 0.0:
+    if sh_plan.weights is None or parameters.adaptive == 0.0:
         return None
     with np.errstate(divide="ignore"):
-        ratio = np.log2(tables.reference / tables.weights[rows].astype(np.float64))
+        ratio = np.log2(sh_plan.reference / sh_plan.weights[rows].astype(np.float64))
     return np.clip(np.rint(0.5 * parameters.adaptive * ratio), 0, _COARSEST).astype(np.int32)
 
 
-def encode_sh(shN: F32, rows: Rows, parameters: CodingParameters, tables: ShTables) -> EncodedSh:
+def encode_sh(shN: F32, rows: Rows, parameters: CodingParameters, sh_plan: ShCodingPlan) -> EncodedSh:
     """Encode the bands 1 to `parameters.sh_degree` of a tile.
 
     Args:
         shN: [N, K, 3], of the whole model, whose degree may be higher.
         rows: [n], the tile's splats in decoding order.
         parameters: steps and codings.
-        tables: SH coding of the whole file.
+        sh_plan: SH coding of the whole file.
     """
     source = np.take(shN, rows, axis=0)
     kept = parameters.sh_coefficients
@@ -291,14 +293,14 @@ def encode_sh(shN: F32, rows: Rows, parameters: CodingParameters, tables: ShTabl
     sums.add(source[:, kept:], np.float32(0), kept)
     layers: dict[int, bytes] = {}
     exponent = 0
-    if tables.book is not None:
-        layers = _encode_by_codebook(source[:, :kept], tables.book.select(rows), parameters, tables.ids[0], sums)
+    if sh_plan.book is not None:
+        layers = _encode_by_codebook(source[:, :kept], sh_plan.book.select(rows), parameters, sh_plan.ids[0], sums)
     elif kept:
-        coarse = sh_coarseness(rows, parameters, tables)
+        coarse = sh_coarseness(rows, parameters, sh_plan)
         columns, exponent, decoded = quantise_sh(source[:, :kept], parameters, coarse)
         sums.add(source[:, :kept], decoded, 0)
         layers = dict(_scalar_blocks(columns, exponent, parameters))
-    return EncodedSh(layers, sums.by_band(), exponent, tuple(tables.ids))
+    return EncodedSh(layers, sums.by_band(), exponent, tuple(sh_plan.ids))
 
 
 def _scalar_blocks(columns: NDArray[Any], exponent: int, parameters: CodingParameters) -> Iterator[tuple[int, bytes]]:
@@ -312,7 +314,7 @@ def _scalar_blocks(columns: NDArray[Any], exponent: int, parameters: CodingParam
 
 
 def _encode_by_codebook(
-    source: F32, book: ShBook, parameters: CodingParameters, id_: int, sums: _BandSums
+    source: F32, book: ShCodebook, parameters: CodingParameters, id_: int, sums: _BandSums
 ) -> dict[int, bytes]:
     """Return blocks with the indices in band 1, and the escaped splats' own values in every band."""
     decoded, escaped = book.dequantise(parameters), book.escaped

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.encoder import entropy
 from csplat.encoder.coding_parameters import SAME_STEPS, CodingParameters, StepFactors
-from csplat.encoder.container import CodebookTable, FileChunk
+from csplat.encoder.container import FileChunk, IndexedCodebook
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.entropy import DeflateSettings, signed_stream
 from csplat.encoder.error_bounds import covariance_entries
@@ -31,8 +31,8 @@ from csplat.encoder.quantisation import (
     quat_levels,
     quat_values,
 )
+from csplat.encoder.splat_importance import ErrorMetric
 from csplat.encoder.tiling import TileSplats, quantise_and_sort
-from csplat.encoder.weights import ErrorMetric
 from csplat.model import SplatModel
 from csplat.types import F32, F64, I16, I32, I64, Mask, Progress
 
@@ -59,7 +59,7 @@ _FLATTEST = 1e-30  # fraction of the trace: rounding may leave an eigenvalue at 
 
 
 @dataclass(frozen=True, eq=False)
-class ShapeTables:
+class ShapeCodebook:
     """A shape codebook and its users.
 
     Attributes:
@@ -91,9 +91,9 @@ class ShapeTables:
         entries = np.take(self.entries, index[assigned], axis=1)
         return ShapePart(index, self.size, assigned, entries[:3] + summand[assigned], entries[3:], summand)
 
-    def select(self, order: NDArray[Any]) -> ShapeTables:
+    def select(self, order: NDArray[Any]) -> ShapeCodebook:
         """Return the codebook with the users `order`."""
-        return ShapeTables(self.entries, self.index[order], self.summand[order])
+        return ShapeCodebook(self.entries, self.index[order], self.summand[order])
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ def choose_shapes(
     parameters: CodingParameters,
     options: EncodeOptions,
     progress: Progress,
-) -> ShapeTables | None:
+) -> ShapeCodebook | None:
     """Train a codebook, and assign splats to it.
 
     Args:
@@ -159,7 +159,7 @@ def choose_shapes(
     if fraction is None and metric is None:
         fraction = _ESCAPES
     training = shapes.weights * shapes.fits
-    tables: ShapeTables | None = None
+    codebook: ShapeCodebook | None = None
     for step in range(_ROUNDS):
         progress("shapes", step / _ROUNDS)
         entries, index = _cluster(shapes, training, size, parameters, options.seed, options.thread_count)
@@ -170,12 +170,12 @@ def choose_shapes(
             assigned = _all_but_worst(shapes, errors, fraction)
         if not assigned.any():
             return None
-        tables = _rank_entries(entries, index, summand, assigned)
+        codebook = _rank_entries(entries, index, summand, assigned)
         training = shapes.weights * assigned
-    assert tables is not None
-    tables = _keep_where_smaller(model, tables, tiles, parameters)
+    assert codebook is not None
+    codebook = _keep_where_smaller(model, codebook, tiles, parameters)
     progress("shapes", 1.0)
-    return tables
+    return codebook
 
 
 def quantise_shape(
@@ -209,7 +209,7 @@ def dequantised_shapes(
     scales: F32,
     tiles: Sequence[TileSplats],
     parameters: CodingParameters,
-    shapes: ShapeTables | None = None,
+    shapes: ShapeCodebook | None = None,
 ) -> tuple[F32, F32]:
     """Return rotations [N, 4] and log scales [N, 3] as decoded."""
     decoded = np.empty_like(quats), np.empty_like(scales)
@@ -244,11 +244,11 @@ def shape_blocks(
     ]
 
 
-def shape_codebook_chunk(tables: ShapeTables, deflate: DeflateSettings) -> tuple[CodebookTable, FileChunk]:
+def shape_codebook_chunk(codebook: ShapeCodebook, deflate: DeflateSettings) -> tuple[IndexedCodebook, FileChunk]:
     """Return index record and chunk of the codebook."""
     head = _spec.pack_codebook_head(_spec.CodebookHead(SHAPE_CODEBOOK_ID, 0, 0))
-    stream = signed_stream(np.ascontiguousarray(tables.entries).reshape(-1), deflate)
-    record = CodebookTable(SHAPE_CODEBOOK_ID, _spec.CODEBOOK_KIND_SHAPE, (0, 0), tables.size)
+    stream = signed_stream(np.ascontiguousarray(codebook.entries).reshape(-1), deflate)
+    record = IndexedCodebook(SHAPE_CODEBOOK_ID, _spec.CODEBOOK_KIND_SHAPE, (0, 0), codebook.size)
     return record, FileChunk(_spec.CHUNK_CODEBOOK, head + stream, SHAPE_CODEBOOK_ID)
 
 
@@ -420,29 +420,26 @@ def _all_but_worst(shapes: _ShapeInput, errors: F64, fraction: float) -> Mask:
 
 
 def _entropy(values: NDArray[Any]) -> float:
-    """Return the order-0 entropy, bits per value."""
-    _, counts = np.unique(values, return_counts=True)
-    shares = counts / max(1, counts.sum())
-    return -float((shares * np.log2(shares)).sum())
+    return entropy.order_0_entropy(np.unique(values, return_counts=True)[1])
 
 
-def _rank_entries(entries: I32, index: I64, summand: I32, assigned: Mask) -> ShapeTables:
+def _rank_entries(entries: I32, index: I64, summand: I32, assigned: Mask) -> ShapeCodebook:
     """Drop unused entries, and number the others by their number of users."""
     used, place = np.unique(index[assigned], return_inverse=True)
     ranked, order = rank_by_frequency(place.astype(np.uint32), np.ascontiguousarray(entries[:, used].T))
     full = np.full(len(index), len(used), np.int32)
     full[assigned] = ranked.astype(np.int32)
-    return ShapeTables(np.ascontiguousarray(order.T), full, np.where(assigned, summand, 0).astype(np.int32))
+    return ShapeCodebook(np.ascontiguousarray(order.T), full, np.where(assigned, summand, 0).astype(np.int32))
 
 
 def _keep_where_smaller(
-    model: SplatModel, tables: ShapeTables, tiles: Sequence[TileSplats], parameters: CodingParameters
-) -> ShapeTables | None:
+    model: SplatModel, codebook: ShapeCodebook, tiles: Sequence[TileSplats], parameters: CodingParameters
+) -> ShapeCodebook | None:
     """Escape all splats of the tiles that are not smaller with the codebook; None if the file is not."""
-    escaped, saved = tables.escaped, 0
+    escaped, saved = codebook.escaped, 0
     for tile in tiles:
         rows = quantise_and_sort(model, tile, parameters).rows
-        part = tables.part(rows)
+        part = codebook.part(rows)
         if part is None:
             continue
         quats, scales = model.quats[rows], model.scales[rows]
@@ -457,7 +454,7 @@ def _keep_where_smaller(
             escaped[tile.rows] = True
     if escaped.all():
         return None
-    kept = _rank_entries(tables.entries, tables.index.astype(np.int64), tables.summand, ~escaped)
+    kept = _rank_entries(codebook.entries, codebook.index.astype(np.int64), codebook.summand, ~escaped)
     return kept if saved > len(shape_codebook_chunk(kept, parameters.deflate)[1].payload) + _OVERHEAD else None
 
 

@@ -16,10 +16,10 @@ from csplat.encoder.entropy import morton_codes
 from csplat.errors import InputError, counted
 from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
-from csplat.model import SplatModel, normalise_quats
-from csplat.ply.columns import SH_C0, RowStatistics, count_huge_rows, list_findings
+from csplat.model import SH_C0, SplatModel, normalise_quats
+from csplat.ply.columns import RowStatistics, count_huge_rows, list_findings
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
-from csplat.types import F32, F64, I64
+from csplat.types import F32, F64, I64, U8
 
 Rows = NDArray[Any]
 
@@ -100,9 +100,14 @@ def _log_scales(scales: F32) -> F32:
     return logs
 
 
+def round_to_bytes(values: F32) -> U8:
+    """Round to integers within 0 to 255."""
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
 def sh0_from_bytes(colours: NDArray[np.uint8]) -> F32:
     """Return the SH coefficients of degree 0 of colours [N, 3]."""
-    return (np.divide(colours, 255, dtype=np.float32) - np.float32(0.5)) / SH_C0
+    return (np.divide(colours, 255, dtype=np.float32) - np.float32(0.5)) / np.float32(SH_C0)
 
 
 # glTF, .splat and .ksplat store values after activation: scales of at least 0, opacities from 0 to 1. Some writers omit

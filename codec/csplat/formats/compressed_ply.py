@@ -20,14 +20,13 @@ from csplat.errors import InputError, counted
 from csplat.formats.common import crossed_bounds, decode_smallest_three, encode_smallest_three, sorted_along_curve
 from csplat.formats.format import Format
 from csplat.lint import Finding, too_many_bands, trailing_bytes
-from csplat.model import MAX_SH_DEGREE, SplatModel
+from csplat.model import MAX_SH_DEGREE, SH_C0, SplatModel
 from csplat.ply.comments import format_comments, parse_comments
 from csplat.ply.ply_header import read_ply_header
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, U8, U32
 
 _CHUNK = 256  # splats that share bounds
-_SH_C0 = 0.28209479177387814
 _LARGEST_LOG = 20.0  # log scales are clipped to it: larger ones would take all steps of their chunk
 _LARGEST_BOUND = 9e37  # largest colour bound: a coefficient is 3.5 times that, and float32 ends at 3.4e38
 _BANDS = (9, 24, 45, 72)  # number of SH columns, degrees 1 to 4
@@ -199,7 +198,7 @@ def _unpack(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None, 
             rotation >> 30, (three / np.float32(1023) - np.float32(0.5)) * np.float32(2**0.5)
         ),
         "opacities": ((colour & 255) / 255.0).astype(np.float32),
-        "sh0": ((channels - 0.5) / _SH_C0).astype(np.float32),
+        "sh0": ((channels - 0.5) / SH_C0).astype(np.float32),
         "shN": np.ascontiguousarray(shN),
     }
 
@@ -240,7 +239,7 @@ def _pack_words(model: SplatModel) -> tuple[F32, U32]:
     for column, values, bits in (
         (0, model.means, (11, 10, 11)),
         (2, np.clip(model.scales, -_LARGEST_LOG, _LARGEST_LOG), (11, 10, 11)),
-        (3, (model.sh0 * _SH_C0 + 0.5).astype(np.float32), (8, 8, 8)),
+        (3, (model.sh0 * SH_C0 + 0.5).astype(np.float32), (8, 8, 8)),
     ):
         words[:, column], low, high = _pack(values, bits)
         bounds += [low, high]

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from csplat.disk_files import atomic_writer
 from csplat.errors import InputError, counted
 from csplat.file_source import map_file
-from csplat.formats.common import finite_scene, sh0_from_bytes
+from csplat.formats.common import finite_scene, round_to_bytes, sh0_from_bytes
 from csplat.formats.format import Format
-from csplat.model import SplatModel, normalise_quats
-from csplat.ply.columns import SH_C0
+from csplat.model import SH_C0, SplatModel, normalise_quats
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32
 
@@ -94,9 +93,9 @@ def _write(path: Path, scene: SceneSource) -> None:
             rows = np.empty(len(model), _ROW)
             rows["means"] = model.means
             rows["scales"] = np.exp(np.minimum(model.scales, _LARGEST_LOG))
-            rows["colours"][:, :3] = _bytes((model.sh0 * SH_C0 + np.float32(0.5)) * np.float32(255))
-            rows["colours"][:, 3] = _bytes(model.opacities * np.float32(255))
-            rows["quats"] = _bytes(_with_negative_largest(model.quats) * np.float32(128) + np.float32(128))
+            rows["colours"][:, :3] = round_to_bytes((model.sh0 * np.float32(SH_C0) + np.float32(0.5)) * np.float32(255))
+            rows["colours"][:, 3] = round_to_bytes(model.opacities * np.float32(255))
+            rows["quats"] = round_to_bytes(_with_negative_largest(model.quats) * np.float32(128) + np.float32(128))
             stream.write(rows.tobytes())
 
 
@@ -104,10 +103,6 @@ def _with_negative_largest(quats: F32) -> F32:
     """Make the largest component negative: -1 has a byte, 1 has none, and some viewers do not normalise."""
     largest = np.take_along_axis(quats, np.abs(quats).argmax(axis=1)[:, None], axis=1)
     return np.where(largest > 0, -quats, quats)
-
-
-def _bytes(values: F32) -> NDArray[np.uint8]:
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 FORMAT = Format(

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from csplat.disk_files import atomic_writer
 from csplat.editing.transform import convert_axes
 from csplat.errors import InputError
-from csplat.formats.common import decode_smallest_three, encode_smallest_three
+from csplat.formats.common import decode_smallest_three, encode_smallest_three, round_to_bytes
 from csplat.formats.format import Format
 from csplat.lint import Finding, too_many_bands, trailing_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats
@@ -352,20 +352,16 @@ def _encode_block(model: SplatModel, bits: int) -> tuple[U8, ...]:
     rest = np.rint(model.shN * np.float32(128 / _SH_STEP)) * np.float32(_SH_STEP) + np.float32(128)
     return (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),
-        _round_to_bytes(model.opacities[:, None] * np.float32(255)),
-        _round_to_bytes(model.sh0 * (_COLOUR * np.float32(255)) + np.float32(127.5)),
+        round_to_bytes(model.opacities[:, None] * np.float32(255)),
+        round_to_bytes(model.sh0 * (_COLOUR * np.float32(255)) + np.float32(127.5)),
         _scale_codes(model.scales),
         _encode_rotations(model.quats),
-        _round_to_bytes(rest).reshape(len(model), 3 * model.shN.shape[1]),
+        round_to_bytes(rest).reshape(len(model), 3 * model.shN.shape[1]),
     )
 
 
 def _scale_codes(scales: F32) -> U8:
-    return _round_to_bytes(scales * np.float32(16) + np.float32(160))
-
-
-def _round_to_bytes(values: F32) -> U8:
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    return round_to_bytes(scales * np.float32(16) + np.float32(160))
 
 
 def _encode_rotations(quats: F32) -> U8:

@@ -57,11 +57,11 @@ def code_bucket(folder: Path, bucket: Bucket, coding: BucketCoding) -> None:
     if _record_path(folder, bucket).exists():
         return
     model = clip_scales(read_splats(bucket_path(folder, bucket.place), coding.layout, bucket.rows))
-    tables = assign_splats(coding.books, model, coding.plan, threads=1)
+    sh_plan = assign_splats(coding.books, model, coding.plan, threads=1)
     records, size = [], 0
     with atomic_writer(_chunks_path(folder, bucket)) as stream:
         for tile in cut_scene(model, coding.plan):
-            coded = encode_tile(model, tile, coding.plan, tables)
+            coded = encode_tile(model, tile, coding.plan, sh_plan)
             records.append(_record(coded, size))
             for payload in coded.tile.layers.values():
                 assert isinstance(payload, bytes)
@@ -104,16 +104,18 @@ def _record(coded: EncodedTile, start: int) -> dict[str, Any]:
         layers[layer] = (at, len(payload), chunk_crc(_spec.CHUNK_TILE, payload))
         at += len(payload)
     tile = {**asdict(replace(coded.tile, layers={})), "layers": layers}
+    tile["tables"] = tile.pop("codebook_ids")
     return {"tile": tile, "errors": asdict(coded.errors), "coarsened": sorted(coded.coarsened)}
 
 
 def _tile(record: Mapping[str, Any], chunks: Path) -> EncodedTile:
     fields = dict(record["tile"])
+    fields["codebook_ids"] = fields.pop("tables")
     fields["layers"] = {
         int(layer): LazyPayload(size, crc, partial(_read_payload, chunks, offset, size, crc))
         for layer, (offset, size, crc) in fields["layers"].items()
     }
-    for name in ("corner", "extent", "tables"):
+    for name in ("corner", "extent", "codebook_ids"):
         fields[name] = tuple(fields[name])
     errors, coarsened = ErrorSums(**record["errors"]), frozenset(record["coarsened"])
     return EncodedTile(FileTile(**fields), np.zeros(0, np.intp), errors, coarsened)

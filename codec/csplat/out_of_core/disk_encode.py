@@ -220,12 +220,12 @@ class _Encoding:
         return self._without_splats(plan, books)
 
     def _without_splats(self, plan: CodingParameters, books: FileCodebooks) -> tuple[EncodePlan, FileCodebooks]:
-        facts, tables = self.work.layout.facts, books.tables
+        facts, sh_plan = self.work.layout.facts, books.sh_plan
         none = np.zeros(0, np.intp)
         origin = Origin(self.scene.count, none)
         extras = extra_records(facts, self.options)
         draft = EncodePlan(facts, self.options, origin, None, plan, [], extras, None, None)
-        return draft, replace(books, tables=tables.select(none))
+        return draft, replace(books, sh_plan=sh_plan.select(none))
 
     def _code(self, coding: BucketCoding) -> None:
         folder, buckets = self.work.folder, self.work.buckets
@@ -250,7 +250,7 @@ class _Encoding:
         for bucket in self.work.buckets:
             tiles += coded_bucket(self.work.folder, bucket) or ()
         errors = ErrorSums.total(part.errors for part in tiles)
-        settings = encoding_settings(draft, books.tables)
+        settings = encoding_settings(draft, books.sh_plan)
         fields = scene_fields(draft, books, file_chunks(draft, errors, settings))
         size, payloads = 0, sum(len(payload) for part in tiles for payload in part.tile.layers.values())
         with atomic_writer(self.target) as stream:

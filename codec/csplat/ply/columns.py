@@ -16,14 +16,11 @@ from numpy.typing import NDArray
 
 from csplat.errors import counted
 from csplat.lint import Finding
-from csplat.model import QUAT_LENGTH_TOLERANCE, normalise_quats
+from csplat.model import QUAT_LENGTH_TOLERANCE, SH_C0, normalise_quats
 from csplat.ply.column_names import ColumnMap, colour_finding, float_columns, plain_name
 from csplat.types import F32, F64
 
 Rows = NDArray[Any]  # one block of the file: 1-D, structured, contiguous
-
-#: The basis function of SH degree 0.
-SH_C0 = np.float32(0.28209479177387814)
 
 #: Logits whose float32 sigmoids are exactly 0 and 1, also after a round trip through decimal text.
 LOGIT_OF_0 = -110.0
@@ -381,7 +378,7 @@ def _repair(part: AttributeArrays, columns: ColumnMap, statistics: RowStatistics
         _fuse_filter(part.scales, alphas, widths)
     part.opacities[:] = alphas
     if columns.colour_range:
-        part.sh0[:] = (part.sh0 / np.float32(columns.colour_range) - np.float32(0.5)) / SH_C0
+        part.sh0[:] = (part.sh0 / np.float32(columns.colour_range) - np.float32(0.5)) / np.float32(SH_C0)
     _repair_quats(part.quats, statistics)
     statistics.huge += count_huge_rows(part.scales[:, :scale_count], part.sh0, part.shN)
     return len(part.opacities)

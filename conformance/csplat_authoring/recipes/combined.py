@@ -17,7 +17,7 @@ from csplat_authoring.samples import (
     SH0,
     attributes,
     axis,
-    book,
+    codebook_block,
     integers,
     levels,
     means_rows,
@@ -132,8 +132,8 @@ def _tile_of_widths(k: int, ways: Iterator[Stream]) -> Tile:
 
 def _all_codebooks() -> Scene:
     books = (
-        Codebook(2, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(2, 3, 6, -40, 40)}, how=Stream(4, (1, 2, 3, 4))),
-        Codebook(4, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(5, 2, 6, -40, 40)}, how=Stream(2, (2, 3))),
+        Codebook(2, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(2, 3, 6, -40, 40)}, stream_coding=Stream(4, (1, 2, 3, 4))),
+        Codebook(4, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(5, 2, 6, -40, 40)}, stream_coding=Stream(2, (2, 3))),
         Codebook(6, _spec.CODEBOOK_KIND_SH, {1: rows_of(8, 3, 9, -50, 50)}, (1, 1), Stream(3)),
         Codebook(
             7,
@@ -157,13 +157,13 @@ def _apart() -> Tile:
     """Return a tile whose codebooks all have escapes."""
     wide = Stream(2)
     changes = {
-        SCALES: book(
+        SCALES: codebook_block(
             2, (2, 3, 0, 3), signed(rows_of(1, 2, 3, -300, 300), wide), Stream(4, (1, 3)), summands=(-9, 0, 4, 0)
         ),
-        QUATS: book(2, (), signed(rows_of(2, 2, 3, -60, 60))),
-        sh_attribute(1): book(6, (3, 0, 3, 1), offset(rows_of(4, 2, 9, -9, 900), wide), Stream(3)),
-        sh_attribute(2): book(7, (0, 3, 1, 2), signed(rows_of(5, 1, 15, -99, 99))),
-        sh_attribute(3): book(7, (), offset(rows_of(6, 1, 21, -99, 99))),
+        QUATS: codebook_block(2, (), signed(rows_of(2, 2, 3, -60, 60))),
+        sh_attribute(1): codebook_block(6, (3, 0, 3, 1), offset(rows_of(4, 2, 9, -9, 900), wide), Stream(3)),
+        sh_attribute(2): codebook_block(7, (0, 3, 1, 2), signed(rows_of(5, 1, 15, -99, 99))),
+        sh_attribute(3): codebook_block(7, (), offset(rows_of(6, 1, 21, -99, 99))),
     }
     return tile(60, _N, 0, changes, extras=(_raw(1),))
 
@@ -171,11 +171,13 @@ def _apart() -> Tile:
 def _together() -> Tile:
     """Return a tile of another codebook of shapes; bands 2 and 3 are coded plainly."""
     changes = {
-        SCALES: book(4, (1, 2, 0, 0), offset(rows_of(7, 1, 3, -20, 20)), summands=(-40, 0, -60, -20), offsets=(-60,)),
-        QUATS: book(4, (), signed(rows_of(8, 1, 3, -50, 50))),
+        SCALES: codebook_block(
+            4, (1, 2, 0, 0), offset(rows_of(7, 1, 3, -20, 20)), summands=(-40, 0, -60, -20), offsets=(-60,)
+        ),
+        QUATS: codebook_block(4, (), signed(rows_of(8, 1, 3, -50, 50))),
         sh_attribute(2): offset(rows_of(9, _N, 15, -20, 20)),
         sh_attribute(3): signed(rows_of(10, _N, 21, -20, 20)),
-        sh_attribute(1): book(6, (0, 1, 1, 0)),
+        sh_attribute(1): codebook_block(6, (0, 1, 1, 0)),
     }
     return tile(70, _N, 0, dict(sorted(changes.items())), exponent=-1, extras=(_raw(2),))
 
@@ -184,7 +186,9 @@ def _escaped_bands() -> Scene:
     entries = {band: rows_of(band, 2, 3 * (2 * band + 1), -99, 99) for band in (1, 2, 3)}
     table = Codebook(1, _spec.CODEBOOK_KIND_SH, entries, (1, 3), Stream(1))
     rows = {band: rows_of(band + 5, 2, 3 * (2 * band + 1), -120, 120) for band in entries}
-    changes = {sh_attribute(band): book(1, (1, 2, 0, 2) if band == 1 else (), signed(rows[band])) for band in rows}
+    changes = {
+        sh_attribute(band): codebook_block(1, (1, 2, 0, 2) if band == 1 else (), signed(rows[band])) for band in rows
+    }
     return replace(scene(3, [tile(80, _N, 0, changes)]), codebooks=(table,))
 
 
@@ -199,13 +203,15 @@ def _different_tiles() -> Scene:
     """Return tiles of 1, 2, 9 and 40 splats, of other layers, exponents, codings and tables."""
     shape = Codebook(4, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(1, 5, 6, -40, 40)})
     shapes = {
-        SCALES: book(4, tuple(integers(3, 40, 0, 4)), summands=tuple(integers(5, 40, -60, 0)), offsets=(-60,)),
-        QUATS: book(4),
+        SCALES: codebook_block(
+            4, tuple(integers(3, 40, 0, 4)), summands=tuple(integers(5, 40, -60, 0)), offsets=(-60,)
+        ),
+        QUATS: codebook_block(4),
     }
     tiles = (
         tile(1, 1, 0, {SCALES: signed(rows_of(1, 1, 3, -90, -1), exponent=-2)}, corner=(0, 0, 0)),
         tile(2, 2, 3, corner=(-(2**40), 2**40, 0), exponent=7),
-        tile(3, 9, 0, {sh_attribute(2): offset(rows_of(2, 9, 15, -60, 60), exponent=4)}, tables=(4,)),
+        tile(3, 9, 0, {sh_attribute(2): offset(rows_of(2, 9, 15, -60, 60), exponent=4)}, codebook_ids=(4,)),
         tile(4, 40, 1, {**shapes, MEANS: morton(means_rows(4, 40, 500), 9, Stream(4, (1, 3, 4)))}),
     )
     return replace(scene(3, tiles), codebooks=(shape,), attributes=attributes(3, ycocg=True, chroma_shift=3))

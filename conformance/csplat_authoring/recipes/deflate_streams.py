@@ -60,10 +60,10 @@ def _place(case: DeflateCase) -> str:
 
 def _scene(case: DeflateCase) -> Scene:
     """Return a scene that has the stream: as opacities, or if it is long as band 3."""
-    how = Stream(coder="deflate", coded=case.coded)
+    stream_coding = Stream(coder="deflate", coded=case.coded)
     if len(case.output) < _FAR:
         n = len(case.output)
-        return scene(tiles=[tile(n=n, changes={OPACITIES: levels(list(case.output), how)})])
+        return scene(tiles=[tile(n=n, changes={OPACITIES: levels(list(case.output), stream_coding)})])
     elements = [int.from_bytes(case.output[at : at + _WIDTH], "little") for at in range(0, len(case.output), _WIDTH)]
     n = len(elements) // 21
     rows = [elements[i::n] for i in range(n)]
@@ -71,7 +71,7 @@ def _scene(case: DeflateCase) -> Scene:
     changes = {SH0 + band: signed([[0] * (6 * band + 3)] * n, few) for band in range(3)}
     changes |= {attribute: signed([[0] * 3] * n, few) for attribute in (SCALES, QUATS)}
     changes |= {OPACITIES: levels([9] * n, few), MEANS: axis([[0] * 3] * n, few)}
-    return scene(3, [tile(n=n, degree=3, changes=changes | {_SH3: signed(rows, replace(how, width=_WIDTH))})])
+    return scene(3, [tile(n=n, degree=3, changes=changes | {_SH3: signed(rows, replace(stream_coding, width=_WIDTH))})])
 
 
 def sound_streams() -> list[DeflateCase]:

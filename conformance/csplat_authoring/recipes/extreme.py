@@ -16,8 +16,7 @@ from csplat_authoring.samples import (
     SH0,
     attributes,
     axis,
-    book,
-    coded,
+    codebook_block,
     integers,
     levels,
     means_rows,
@@ -28,6 +27,7 @@ from csplat_authoring.samples import (
     sh_attribute,
     signed,
     tile,
+    with_stream_codings,
 )
 from csplat_authoring.scene import PLAIN, Attribute, Block, Chunk, Codebook, Extra, Scene, StatedErrors, Stream
 
@@ -43,21 +43,24 @@ def extreme_stream_recipes() -> list[Recipe]:
 def _codebooks() -> list[Recipe]:
     n = _spec.CODEBOOK_ENTRIES_MAX
     entries = [[3, -4, 5, 1, 2, 3]] * (n - 1) + [[7] * 6]
-    flat = Codebook(65535, _spec.CODEBOOK_KIND_SHAPE, {0: entries}, how=Stream(1, _RUNS))
+    flat = Codebook(65535, _spec.CODEBOOK_KIND_SHAPE, {0: entries}, stream_coding=Stream(1, _RUNS))
     own = signed([[1, 2, 3]])
-    wide = {SCALES: book(65535, (n - 1, n, 0), own, Stream(3), summands=(5, 0, 6)), QUATS: book(65535, (), own)}
+    wide = {
+        SCALES: codebook_block(65535, (n - 1, n, 0), own, Stream(3), summands=(5, 0, 6)),
+        QUATS: codebook_block(65535, (), own),
+    }
     unused = (
         Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[1, 2, 3, 4, 5, 6]]}),
         Codebook(2, _spec.CODEBOOK_KIND_SH, {1: rows_of(1, 2, 9, -1, 1)}, (1, 1)),
     )
     shape = Codebook(9, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(3, 2, 6, -9, 9)})
     every = {
-        SCALES: book(9, (2, 2, 2), signed([[1, 2, 3]] * 3), summands=(0, 0, 0)),
-        QUATS: book(9, (), signed([[4, 5, 6]] * 3)),
+        SCALES: codebook_block(9, (2, 2, 2), signed([[1, 2, 3]] * 3), summands=(0, 0, 0)),
+        QUATS: codebook_block(9, (), signed([[4, 5, 6]] * 3)),
     }
     ignored = {
-        SCALES: book(9, (2, 0, 1), signed([[1, 2, 3]]), summands=(77, 0, 5), offsets=(0,)),
-        QUATS: book(9, (), signed([[4, 5, 6]])),
+        SCALES: codebook_block(9, (2, 0, 1), signed([[1, 2, 3]]), summands=(77, 0, 5), offsets=(0,)),
+        QUATS: codebook_block(9, (), signed([[4, 5, 6]])),
     }
     largest = _spec.COLUMN_MAX
     turns = {0: [[1, 2, 3, *turn] for turn in ([1, 2, 3], [127, -127, 0], [0, 127, 127])]}
@@ -67,9 +70,15 @@ def _codebooks() -> list[Recipe]:
         Codebook(3, _spec.CODEBOOK_KIND_SH, bounds, (1, 1), Stream(4)),
     )
     zeros = (0, 0, 0)
-    first = {SCALES: book(2, zeros, summands=(4, 5, 6)), QUATS: book(2), sh_attribute(1): book(3, zeros)}
-    shifted = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[2**22 + 2, 2**22 + 3, 2**22 + 1, 4, 5, 6]]}, how=Stream(4))
-    back = {SCALES: book(1, (0, 0, 0), summands=(-(2**22), 1 - 2**22, -(2**22))), QUATS: book(1)}
+    first = {
+        SCALES: codebook_block(2, zeros, summands=(4, 5, 6)),
+        QUATS: codebook_block(2),
+        sh_attribute(1): codebook_block(3, zeros),
+    }
+    shifted = Codebook(
+        1, _spec.CODEBOOK_KIND_SHAPE, {0: [[2**22 + 2, 2**22 + 3, 2**22 + 1, 4, 5, 6]]}, stream_coding=Stream(4)
+    )
+    back = {SCALES: codebook_block(1, (0, 0, 0), summands=(-(2**22), 1 - 2**22, -(2**22))), QUATS: codebook_block(1)}
     return [
         _extreme(
             "codebook_of_65536",
@@ -81,7 +90,7 @@ def _codebooks() -> list[Recipe]:
             "codebooks_unused",
             "codebooks that no block uses, listed by the tile all the same",
             "TIL-6 DIR-5",
-            scene(1, [tile(degree=1, tables=(1, 2))], codebooks=unused),
+            scene(1, [tile(degree=1, codebook_ids=(1, 2))], codebooks=unused),
         ),
         _extreme(
             "codebook_all_escaped",
@@ -119,8 +128,8 @@ def _streams() -> list[Recipe]:
     values = [7, 8, 9]
 
     def with_coded(name: str, why: str, data: bytes) -> Recipe:
-        how = Stream(coder="deflate", coded=data)
-        return _extreme(name, why, "COD-2", _with({OPACITIES: levels(values, how)}))
+        stream_coding = Stream(coder="deflate", coded=data)
+        return _extreme(name, why, "COD-2", _with({OPACITIES: levels(values, stream_coding)}))
 
     empties = b"\x00\x00\x00\xff\xff" * 50 + deflate_stored(bytes(values))
     single = Stream(1, _RUNS, packed=bytes([7, 8, 9, 0, 0, 0, 0, 0, 0]))
@@ -171,8 +180,8 @@ def _texts() -> list[Recipe]:
     long_number = Stream(1, _RUNS)
     other = b'{"a":{"a":1},"A":"\\ud83d\\ude00","\\u0000":-0.0e-0,"\xc3\xa9":1e308}'
 
-    def meta(name: str, why: str, text: bytes, how: Stream = PLAIN) -> Recipe:
-        return _extreme(name, why, "JSN-1", scene(chunks=(Chunk(_spec.CHUNK_METADATA, text, how),)))
+    def meta(name: str, why: str, text: bytes, stream_coding: Stream = PLAIN) -> Recipe:
+        return _extreme(name, why, "JSN-1", scene(chunks=(Chunk(_spec.CHUNK_METADATA, text, stream_coding),)))
 
     nothing = StatedErrors(2, 0, 255, 0, ())
     return [
@@ -197,7 +206,9 @@ def _texts() -> list[Recipe]:
 
 def _seeded() -> Scene:
     made = scene(3, [tile(77, 40, 3)], attributes=attributes(3, True, 2))
-    changed = coded(made, lambda how: replace(how, width=2, transforms=(1, 2, 3), coder="deflate_dynamic"))
+    changed = with_stream_codings(
+        made, lambda coding: replace(coding, width=2, transforms=(1, 2, 3), coder="deflate_dynamic")
+    )
     blocks = changed.tiles[0].blocks | {OPACITIES: levels(integers(5, 40, 0, 255), Stream(1, _RUNS))}
     return replace(changed, tiles=(replace(changed.tiles[0], blocks=blocks),))
 
@@ -356,9 +367,11 @@ def _bounds() -> Scene:
             2,
             1,
             {
-                SCALES: book(2, (0, 0), summands=(_COLUMN, _COLUMN), escape=None),
-                QUATS: book(2),
-                sh1: book(0, (0, 1), offset([[_COLUMN] * 3 + [5, -5] * 3], offsets=(_COLUMN,) * 3 + (0, -5) * 3)),
+                SCALES: codebook_block(2, (0, 0), summands=(_COLUMN, _COLUMN), escape=None),
+                QUATS: codebook_block(2),
+                sh1: codebook_block(
+                    0, (0, 1), offset([[_COLUMN] * 3 + [5, -5] * 3], offsets=(_COLUMN,) * 3 + (0, -5) * 3)
+                ),
             },
         ),
         tile(
@@ -366,9 +379,9 @@ def _bounds() -> Scene:
             2,
             1,
             {
-                SCALES: book(2, (1, 1), summands=(-_COLUMN, -_COLUMN)),
-                QUATS: book(2),
-                sh1: book(0, (1, 0), offset([[-_COLUMN] * 3 + [0] * 6])),
+                SCALES: codebook_block(2, (1, 1), summands=(-_COLUMN, -_COLUMN)),
+                QUATS: codebook_block(2),
+                sh1: codebook_block(0, (1, 0), offset([[-_COLUMN] * 3 + [0] * 6])),
             },
         ),
     )
@@ -381,18 +394,18 @@ def _bounds() -> Scene:
 def _summands() -> Scene:
     """Entries as far below 0 as they can be."""
     far = 2**31
-    table = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[-far, -far, -far, 1, 2, 3]]}, how=Stream(4))
+    table = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[-far, -far, -far, 1, 2, 3]]}, stream_coding=Stream(4))
     summands = (far + _COLUMN, far - _COLUMN + 1)
-    first = replace(book(1, (0, 0), summands=summands, offsets=(_COLUMN,)), how=Stream(4))
+    first = replace(codebook_block(1, (0, 0), summands=summands, offsets=(_COLUMN,)), stream_coding=Stream(4))
     fine = Attribute(_spec.MAPPING_LATTICE, 2.0**-30)
-    one = tile(changes={SCALES: first, QUATS: book(1)})
+    one = tile(changes={SCALES: first, QUATS: codebook_block(1)})
     return scene(tiles=[one], codebooks=(table,), attributes=attributes() | {SCALES: fine})
 
 
 def _many() -> Scene:
     """16,400 splats; every index and escape in long runs."""
     n, border = 16_400, 16_384
-    how = Stream(1, _RUNS)
+    stream_coding = Stream(1, _RUNS)
     shapes = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, {0: [[-9, -1, 0, 1, 2, 3], [9, 1, 0, 4, 5, 6]]})
     bands = Codebook(3, _spec.CODEBOOK_KIND_SH, {1: [[*range(9)], [*range(9, 0, -1)]]}, (1, 1))
     escaped = {0, border - 1, border, n - 1}
@@ -405,14 +418,18 @@ def _many() -> Scene:
 
     same = tile(1, 1, 1)
     blocks = {
-        a: replace(b, rows=[list(b.rows[0])] * n, how=replace(b.how, transforms=_RUNS)) for a, b in same.blocks.items()
+        a: replace(b, rows=[list(b.rows[0])] * n, stream_coding=replace(b.stream_coding, transforms=_RUNS))
+        for a, b in same.blocks.items()
     }
     blocks |= {
         SCALES: replace(
-            book(2, indices(7000), signed(rows(3)), how, summands=tuple(-(i // 4000) for i in range(n))), how=how
+            codebook_block(
+                2, indices(7000), signed(rows(3)), stream_coding, summands=tuple(-(i // 4000) for i in range(n))
+            ),
+            stream_coding=stream_coding,
         ),
-        QUATS: book(2, (), signed(rows(3))),
-        sh_attribute(1): book(3, indices(6000), signed(rows(9)), how),
+        QUATS: codebook_block(2, (), signed(rows(3))),
+        sh_attribute(1): codebook_block(3, indices(6000), signed(rows(9)), stream_coding),
     }
     return scene(1, [replace(same, blocks=blocks)], codebooks=(shapes, bands))
 

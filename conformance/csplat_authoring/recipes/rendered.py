@@ -15,6 +15,7 @@ from csplat_authoring.samples import (
     QUATS,
     SCALES,
     SH0,
+    as_binary32,
     attributes,
     axis,
     integers,
@@ -25,7 +26,6 @@ from csplat_authoring.samples import (
     rows_of,
     sh_attribute,
     signed,
-    single,
 )
 from csplat_authoring.scene import PAIRS, Attribute, Scene, Tile
 
@@ -33,7 +33,7 @@ _SIDE = 128  # pixels
 _NEAR = 0.2  # scene units
 _PSNR = 45.0  # dB: rounding to 8 bits costs 59, a cut at three standard deviations is seen at 40
 _MEANS_STEP, _MEANS_CELLS = 1 / 128, 256  # a box of two scene units
-_SCALES_STEP = single(0.05)
+_SCALES_STEP = as_binary32(0.05)
 
 _Vec = tuple[float, float, float]
 

@@ -14,8 +14,7 @@ from csplat_authoring.samples import (
     QUATS,
     SCALES,
     SH0,
-    book,
-    coded,
+    codebook_block,
     offset,
     rich_scene,
     rows_of,
@@ -23,6 +22,7 @@ from csplat_authoring.samples import (
     signed,
     sparse,
     tile,
+    with_stream_codings,
 )
 from csplat_authoring.scene import Attribute, Block, Codebook, Scene, Stream
 
@@ -64,8 +64,10 @@ def _full_tile() -> Scene:
     same = tile(1, 1)
     full = {a: replace(b, rows=[list(b.rows[0])] * n) for a, b in same.blocks.items()}
     full |= {QUATS: signed([[1, 2, 3]] * (n - 1) + [[9, 9, 9]])}
-    full |= {SH0 + 1: sparse((1,) * n, [[5] * 9] * n, mask_how=Stream(1, (_RUNS,)))}
-    return coded(scene(1, tiles=[replace(same, blocks=full)]), lambda how: replace(how, transforms=(_RUNS,)))
+    full |= {SH0 + 1: sparse((1,) * n, [[5] * 9] * n, mask_coding=Stream(1, (_RUNS,)))}
+    return with_stream_codings(
+        scene(1, tiles=[replace(same, blocks=full)]), lambda coding: replace(coding, transforms=(_RUNS,))
+    )
 
 
 _DELTA, _ZIGZAG, _PLANES, _RUNS = (
@@ -83,19 +85,21 @@ def valid_stream_recipes() -> list[Recipe]:
 
 def _streams() -> list[Recipe]:
     base = scene(1, [tile(4, 6, 1)])
-    wide = coded(replace(base), lambda _: Stream(2))
+    wide = with_stream_codings(replace(base), lambda _: Stream(2))
     result = []
     every = (_DELTA, _ZIGZAG, _PLANES, _RUNS)
     for chosen in [c for k in range(5) for c in combinations(every, k)]:
         name = "_".join(_spec.TRANSFORM_NAMES[t] for t in chosen) or "none"
-        made = coded(wide, lambda how, chosen=chosen: replace(how, transforms=chosen))  # type: ignore[misc]  # a bound default
+        made = with_stream_codings(wide, lambda coding, chosen=chosen: replace(coding, transforms=chosen))  # type: ignore[misc]  # a bound default
         result.append(
             _valid(f"transforms_{name}", "every stream of the file, two bytes wide", "STR-3 STR-4 STR-5 TRF-1", made)
         )
     for name in ("deflate_stored", "deflate_fixed", "deflate_dynamic"):
-        made = coded(base, lambda how, name=name: replace(how, coder=name))  # type: ignore[misc]  # a bound default
+        made = with_stream_codings(base, lambda coding, name=name: replace(coding, coder=name))  # type: ignore[misc]  # a bound default
         result.append(_valid(f"coder_{name}", "each block type of RFC 1951", "COD-2 COD-4", made))
-    made = coded(wide, lambda how: replace(how, transforms=(_PLANES, _RUNS), coder="deflate_dynamic"))
+    made = with_stream_codings(
+        wide, lambda coding: replace(coding, transforms=(_PLANES, _RUNS), coder="deflate_dynamic")
+    )
     result.append(_valid("run_length_deflate", "runs of byte planes, then DEFLATE", "COD-2 STR-5 TRF-1", made))
     return result
 
@@ -105,7 +109,9 @@ def _codebooks() -> list[Recipe]:
     for first, last in ((1, 1), (2, 2), (3, 3), (1, 2), (2, 3), (1, 3)):
         entries = {band: rows_of(band, 3, 3 * (2 * band + 1), -99, 99) for band in range(first, last + 1)}
         made = Codebook(900, _spec.CODEBOOK_KIND_SH, entries, (first, last), Stream(1, (_DELTA, _ZIGZAG)))
-        changes = {SH0 + first: book(900, (0, 2, 1, 1))} | {SH0 + b: book(900) for b in range(first + 1, last + 1)}
+        changes = {SH0 + first: codebook_block(900, (0, 2, 1, 1))} | {
+            SH0 + b: codebook_block(900) for b in range(first + 1, last + 1)
+        }
         others = {
             SH0 + b: signed(rows_of(b, 4, 3 * (2 * b + 1), -9, 9))
             for b in range(1, 4)
@@ -120,18 +126,22 @@ def _codebooks() -> list[Recipe]:
 
 def _shapes() -> list[Recipe]:
     shape = Codebook(5, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(1, 3, 6, -40, 40)})
-    plain = tile(3, 4, 0, {SCALES: book(5, (2, 0, 1, 0), summands=(-9, 4, 0, 7)), QUATS: book(5)})
+    plain = tile(3, 4, 0, {SCALES: codebook_block(5, (2, 0, 1, 0), summands=(-9, 4, 0, 7)), QUATS: codebook_block(5)})
     escapes = tile(
         3,
         4,
         0,
         {
-            SCALES: book(5, (3, 0, 1, 3), offset(rows_of(8, 2, 3, -30, 30)), summands=(0, 4, -300, 0), offsets=(-300,)),
-            QUATS: book(5, (), signed(rows_of(9, 2, 3, -60, 60))),
+            SCALES: codebook_block(
+                5, (3, 0, 1, 3), offset(rows_of(8, 2, 3, -30, 30)), summands=(0, 4, -300, 0), offsets=(-300,)
+            ),
+            QUATS: codebook_block(5, (), signed(rows_of(9, 2, 3, -60, 60))),
         },
     )
-    escapes = replace(escapes, blocks=escapes.blocks | {SCALES: replace(escapes.blocks[SCALES], how=Stream(2))})
-    half = tile(3, 4, 0, {SCALES: book(5, (2, 0, 1, 0), summands=(-9, 4, 0, 7))})
+    escapes = replace(
+        escapes, blocks=escapes.blocks | {SCALES: replace(escapes.blocks[SCALES], stream_coding=Stream(2))}
+    )
+    half = tile(3, 4, 0, {SCALES: codebook_block(5, (2, 0, 1, 0), summands=(-9, 4, 0, 7))})
     return [
         _valid(
             "codebook_shape",

@@ -24,6 +24,7 @@ from csplat.decoder import SceneHeader, TileReader
 from csplat.file_source import PageReleaser
 from csplat.model import SplatModel
 from csplat.scene_source import SceneSource, join_blocks
+from csplat.splat_file import tile_boxes
 from csplat.system import CAN_FORK, default_memory_bytes, map_in_processes
 from csplat.types import F64, I8, I64, Progress
 from csplat_conformance.declared_bounds.bounds_verification import (
@@ -318,12 +319,6 @@ def _invert_index(source_index: NDArray[Any], source_count: int) -> NDArray[Any]
 _OCTANT_CENTRES = np.array([[x, y, z] for x in (0.25, 0.75) for y in (0.25, 0.75) for z in (0.25, 0.75)])
 
 
-def _tile_boxes(header: SceneHeader) -> F64:
-    """Return the boxes around the centres of each tile's splats (spec 4.3.5), [T, 2, 3]."""
-    step = header.attribute(_spec.ATTRIBUTE_MEANS).step
-    return np.array([tile.corners(step) for tile in header.tiles], np.float64).reshape(-1, 2, 3)
-
-
 @dataclass(frozen=True, eq=False)
 class CellTree:
     """A tree of axis-aligned planes that cuts space into cells; node k has the nodes 2k + 1 below and 2k + 2 above.
@@ -339,7 +334,7 @@ class CellTree:
     @classmethod
     def of(cls, header: SceneHeader, count: int, most: int) -> CellTree:
         """Cut space so that each cell has about `most` of `count` splats; tiles tell how splats are distributed."""
-        boxes = _tile_boxes(header)
+        boxes = tile_boxes(header)
         points = (boxes[:, None, 0] + _OCTANT_CENTRES * (boxes[:, None, 1] - boxes[:, None, 0])).reshape(-1, 3)
         weights = np.repeat([float(tile.splat_count) for tile in header.tiles], len(_OCTANT_CENTRES))
         depth = max(0, int(np.ceil(np.log2(max(1.0, count / most))))) if len(points) else 0
@@ -455,7 +450,7 @@ class PartnerSearch:
     def _boxes(self) -> tuple[F64, F64]:
         """Boxes of the tiles, [T, 2, 3], and the distances within which partners of their splats are expected, [T]."""
         tiles, step = self.opened.header.tiles, self.opened.header.attribute(_spec.ATTRIBUTE_MEANS).step
-        boxes = _tile_boxes(self.opened.header)
+        boxes = tile_boxes(self.opened.header)
         # The diagonal of a cell, and the rounding of the centre to float32 and back.
         return boxes, np.array([np.ldexp(step, tile.exponent) for tile in tiles]) + np.abs(boxes).max((1, 2)) * 2.0**-21
 

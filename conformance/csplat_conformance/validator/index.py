@@ -492,20 +492,20 @@ _SH_LAYERS = range(1, _spec.SH_DEGREE_MAX + 1)
 
 @dataclass
 class Tile:
-    """A tile record with its layers and tables.
+    """A tile record with its layers and codebook ids.
 
     Attributes:
         place: index of the tile, from 0.
         record: the tile record.
         chunks: TILE chunks in the order of the layer records.
-        tables: ids of the codebooks that the tile lists.
+        codebook_ids: ids of the codebooks that the tile lists.
         box_sound: whether corner, extent and exponent obey TIL-7 to TIL-9.
     """
 
     place: int
     record: PlacedRecord[_spec.TileRecord]
     chunks: list[Chunk] = field(default_factory=list)
-    tables: set[int] = field(default_factory=set)
+    codebook_ids: set[int] = field(default_factory=set)
     box_sound: bool = True
 
     @property
@@ -564,7 +564,7 @@ def _read_tile(view: memoryview, at: int, number: int, index: Index, findings: F
     _check_tile_box(findings, tile, index)
     at += index.size_of("tile")
     _read_layers(view, at, tile, index, findings)
-    _read_tables(view, at + placed.record.layer_count * index.size_of("layer"), tile, index, findings)
+    _read_codebook_ids(view, at + placed.record.layer_count * index.size_of("layer"), tile, index, findings)
     return tile
 
 
@@ -614,15 +614,15 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, findings: 
         findings.add("TIL-5", start, f"{tile.record.name}.layer", message)
 
 
-def _read_tables(view: memoryview, at: int, tile: Tile, index: Index, findings: Findings) -> None:
+def _read_codebook_ids(view: memoryview, at: int, tile: Tile, index: Index, findings: Findings) -> None:
     last = -1
     for k in range(tile.record.record.table_count):
-        table = int.from_bytes(view[at : at + 2], "little")
+        identity = int.from_bytes(view[at : at + 2], "little")
         name = f"{tile.record.name}.table[{k}]"
-        if table <= last:
-            findings.add("TIL-6", at, name, f"{table} after {last}, wanted ascending ids")
-        elif table not in index.codebook_ids:
-            findings.add("TIL-6", at, name, f"{table} is the id of no codebook")
-        tile.tables.add(table)
-        last = max(last, table)
+        if identity <= last:
+            findings.add("TIL-6", at, name, f"{identity} after {last}, wanted ascending ids")
+        elif identity not in index.codebook_ids:
+            findings.add("TIL-6", at, name, f"{identity} is the id of no codebook")
+        tile.codebook_ids.add(identity)
+        last = max(last, identity)
         at += 2

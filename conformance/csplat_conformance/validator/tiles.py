@@ -336,7 +336,7 @@ def _find_book(reader: TileChecker, params: _CodebookParams, attribute: int) -> 
     book = reader.index.codebooks.get(identity)
     columns = None if book is None else attribute_columns(book, attribute)
     name = _spec.ATTRIBUTE_NAMES[attribute]
-    if identity not in reader.tile.tables:
+    if identity not in reader.tile.codebook_ids:
         reader.findings.add_field("CBK-1", params, "codebook_id", f"{identity} is not among the tile's table ids")
     elif identity not in reader.index.codebook_ids:
         reader.findings.add_field("CBK-1", params, "codebook_id", f"{identity} is the id of no codebook")

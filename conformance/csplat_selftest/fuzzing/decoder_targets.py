@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import csplat
 from csplat import _spec, decoder
@@ -50,50 +50,14 @@ class FuzzCase:
     notes: tuple[str, ...] = ()
 
 
-class FuzzTarget(Protocol):
-    """Something that reads files.
+class DecoderTarget:
+    """The Python decoder: it decodes within small limits, or refuses with a CsplatError.
 
     Attributes:
         name: on the command line.
         suffix: suffix of its files.
         watched: Python files, or folders of them, whose coverage guides it.
     """
-
-    name: str
-    suffix: str
-    watched: Sequence[Path]
-
-    def seeds(self, paths: Iterable[Path]) -> list[Any]:
-        """Return what damaged files start from, and the given files too."""
-        ...
-
-    def case(self, rng: random.Random, corpus: Sequence[Any]) -> FuzzCase:
-        """Make a case from one or more entries of the corpus."""
-        ...
-
-    def attempt(self, data: bytes) -> tuple[str, str]:
-        """Let the target read a file: (name for the tally, what is wrong or an empty string)."""
-        ...
-
-    def smaller(self, data: bytes, corpus: Sequence[Any]) -> Generator[bytes, bytes | None, None]:
-        """Yield simpler files that may show the same; each is made from the last that did, which is sent back."""
-        ...
-
-    def memory(self) -> str:
-        """Say whether another process holds too much memory; an empty string if not."""
-        ...
-
-    def coverage(self) -> str:
-        """Return what is known of the coverage of another process, or an empty string."""
-        ...
-
-    def close(self) -> None:
-        """End what was started."""
-        ...
-
-
-class DecoderTarget:
-    """The Python decoder: it decodes within small limits, or refuses with a CsplatError."""
 
     name = "decoder"
     suffix = ".csplat"

@@ -31,8 +31,8 @@ from csplat.formats.common import RangeStatistics, classify_opacities, classify_
 from csplat.formats.gltf.gltf_document import Accessor, GltfDocument, JsonPath, PlacedPrimitive, open_document
 from csplat.formats.spz import ANTIALIASED, SpzArrays, decode_block, decode_means, read_spz_file
 from csplat.lint import Finding, too_many_bands, trailing_bytes
-from csplat.model import SplatModel, normalise_quats
-from csplat.ply.columns import SH_C0, RowStatistics, alpha_of_logits, count_huge_rows, list_findings
+from csplat.model import SH_C0, SplatModel, normalise_quats
+from csplat.ply.columns import RowStatistics, alpha_of_logits, count_huge_rows, list_findings
 from csplat.ply.comments import CommentMetadata, parse_comments
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, F64
@@ -475,7 +475,9 @@ def _fit_blocks(model: SplatModel) -> Iterator[tuple[F32, F32, F32]]:
     """Yield coefficients [n, K, 3] of some splats, with their fitted and their exact colours [n, D, 3]."""
     directions = sphere_lattice(_DIRECTIONS)
     bands = [factor * band for factor, band in zip(_FACTORS, sh_bands(directions), strict=True)]
-    wide = np.concatenate([np.full((len(directions), 1), np.float64(SH_C0)), *bands[: model.sh_degree]], axis=1)
+    wide = np.concatenate(
+        [np.full((len(directions), 1), np.float64(np.float32(SH_C0))), *bands[: model.sh_degree]], axis=1
+    )
     inverse, basis = np.linalg.pinv(wide).astype(np.float32), wide.astype(np.float32)
     for start in range(0, len(model), _ROWS):
         rows = slice(start, start + _ROWS)

@@ -17,12 +17,11 @@ from csplat.editing.transform import convert_axes, scale_scene
 from csplat.errors import InputError
 from csplat.formats.gltf.gltf_document import BIN, GLB_HEAD, JSON, MAGIC
 from csplat.formats.gltf.gltf_reader import AXES, COLOURS, EXTENSION, sh_names
-from csplat.model import SplatModel
+from csplat.model import SH_C0, SplatModel
 from csplat.ply.comments import format_comments
 from csplat.scene_source import SceneSource
 from csplat.types import F32, F64
 
-_SH_C0 = 0.28209479177387814
 _FLOAT, _BYTE, _ARRAY_BUFFER = 5126, 5121, 34962
 _LARGEST_FILE = (1 << 32) - 1  # bytes of a .glb: its length is a u32
 
@@ -103,7 +102,7 @@ def _attributes(model: SplatModel) -> dict[str, NDArray[Any]]:
 
 def _point_colours(model: SplatModel) -> NDArray[np.uint8]:
     """Return colours for programs that draw points only: linear RGB and alpha, [N, 4] bytes."""
-    srgb = np.clip(model.sh0 * np.float32(_SH_C0) + np.float32(0.5), 0.0, 1.0)
+    srgb = np.clip(model.sh0 * np.float32(SH_C0) + np.float32(0.5), 0.0, 1.0)
     linear: F32 = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.rint(255.0 * np.concatenate([linear, model.opacities[:, None]], axis=1)).astype(np.uint8)
 

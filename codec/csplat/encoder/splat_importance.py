@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.coding_parameters import COLOUR_PER_SH0, CodingParameters
+from csplat.encoder.coding_parameters import CodingParameters
 from csplat.encoder.error_bounds import rotation_rows
 from csplat.errors import InputError
-from csplat.model import SplatModel
+from csplat.model import SH_C0, SplatModel
 from csplat.types import F32, F64
 
 Floats = NDArray[Any]
@@ -126,7 +126,7 @@ class ErrorMetric:
     @property
     def size(self) -> int:
         """D, the size of a matrix."""
-        return _matrix_size(self.triangles)
+        return matrix_size(self.triangles)
 
     def first(self, size: int) -> ErrorMetric:
         """Return the metric of the first `size` coordinates of a point."""
@@ -276,7 +276,7 @@ def rounding_errors(model: SplatModel, blocks: GaussNewtonBlocks, parameters: Co
     errors = np.empty((len(model), len(CLASSED_ATTRIBUTES)))
     squared_levels = float(parameters.opacity_levels) ** 2
     # Squared error that the RGB channels get from rounding Y, Co and Cg, in squared steps.
-    rgb = COLOUR_PER_SH0**2 * (1.0 + 4.0**parameters.chroma_shift * (1.0 / 4.0 + 1.0 / 6.0))
+    rgb = SH_C0**2 * (1.0 + 4.0**parameters.chroma_shift * (1.0 / 4.0 + 1.0 / 6.0))
     # A component of a quaternion errs by half the angle.
     angle = 2.0 / (parameters.quat_levels * np.sqrt(2.0))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -308,7 +308,7 @@ def matrix_products(triangles: Floats, points: Floats) -> F64:
 
 def doubled_triangles(triangles: Floats) -> F64:
     """Return the triangles with their off-diagonal entries doubled."""
-    upper_i, upper_j = np.triu_indices(_matrix_size(triangles))
+    upper_i, upper_j = np.triu_indices(matrix_size(triangles))
     return np.asarray(triangles * np.where(upper_i == upper_j, 1.0, 2.0), np.float64)
 
 
@@ -321,7 +321,7 @@ def _checked_metric(name: str, weights: F32, found: Floats, size: int) -> ErrorM
     return ErrorMetric(weights, found)
 
 
-def _matrix_size(triangles: Floats) -> int:
+def matrix_size(triangles: Floats) -> int:
     """Return D of triangles [N, D (D + 1) / 2]."""
     return (math.isqrt(8 * int(triangles.shape[1]) + 1) - 1) // 2
 
