@@ -111,9 +111,9 @@ def _learn(source: SplatModel) -> Learnt:
 
 def _tune(source: SplatModel, seen_from: list[Camera]) -> SplatModel:
     views = split_views(renders_of(source, seen_from, BLACK, None), BLACK, validation_count=2)
-    frozen = fix_quantisation(EncodePlan.of(source, COARSE))
-    result = tune(frozen, views, replace(SHORT, iterations=20))
-    return decode(frozen.encode(result.held).write().data)
+    fixed = fix_quantisation(EncodePlan.of(source, COARSE))
+    result = tune(fixed, views, replace(SHORT, iterations=20))
+    return decode(fixed.encode(result.best_values).write().data)
 
 
 def assert_finite(model: SplatModel) -> None:

@@ -22,7 +22,7 @@ from csplat_trainer.data import DataSet
 from csplat_trainer.posed_images import PosedImage
 from csplat_trainer.training_loop import train
 from csplat_trainer.training_options import TrainOptions, TrainResult
-from csplat_trainer.tuning import FinetuneOptions, FinetuneResult, renders_of, split_views, tune
+from csplat_trainer.tuning import FinetuneOptions, TuningResult, renders_of, split_views, tune
 
 SMALL = (160, 120)
 FEW = SimplifyOptions(views=10, view_size=(60, 45))
@@ -77,24 +77,24 @@ def trained(name: str) -> TrainResult:
 
 
 @cache
-def tuned(name: str, count: int = 52) -> tuple[FixedQuantisation, FinetuneResult, Scorer]:
+def tuned(name: str, count: int = 52) -> tuple[FixedQuantisation, TuningResult, Scorer]:
     """Tune the scene as a file to `count` images but four; return it and a judge of those four."""
     source = learnt_from(name)
     views = split_views(
         renders_of(source, virtual_cameras(source, count, 48, 36), BLACK, None), BLACK, validation_count=4
     )
-    frozen = fix_quantisation(EncodePlan.of(source, COARSE))
+    fixed = fix_quantisation(EncodePlan.of(source, COARSE))
     aside = Scorer(
         [view.camera for view in views.validation],
         [ReferenceImage(view.reference.astype(np.float32)) for view in views.validation],
     )
-    return frozen, tune(frozen, views, SHORT), aside
+    return fixed, tune(fixed, views, SHORT), aside
 
 
 def before_and_after(name: str) -> tuple[SplatModel, SplatModel]:
     """Return what the file decodes to without and with tuning."""
-    frozen, result, _ = tuned(name)
-    before, after = (decode(frozen.encode(held).write().data) for held in (frozen.start(), result.held))
+    fixed, result, _ = tuned(name)
+    before, after = (decode(fixed.encode(values).write().data) for values in (fixed.start(), result.best_values))
     return before, after
 
 

@@ -61,20 +61,20 @@ def test_integers_take_whole_bytes_by_the_range_of_their_column():
 
 
 @pytest.mark.parametrize("options", [BOOKS, EncodeOptions(attribute_psnr=28.0, sh_coding="scalar")])
-def test_integers_of_a_frozen_scene_are_as_many_as_its_file_holds(source, options):
-    frozen = fix_quantisation(EncodePlan.of(source, options))
-    colours, shapes = books_of(frozen)
+def test_integers_of_a_fixed_quantisation_are_as_many_as_its_file_holds(source, options):
+    fixed = fix_quantisation(EncodePlan.of(source, options))
+    colours, shapes = books_of(fixed)
     n = len(source)
     rows = n if colours is None else colours.entries + colours.escaped
     by_shape = n if shapes is None else shapes.entries + shapes.escaped
     wanted = n * (3 + 1 + 3) + rows * 45 + by_shape * 6
     wanted += (0 if colours is None else n) + (0 if shapes is None else 2 * n)  # indices, and the splats' own sizes
-    assert wanted == sum(array.size for array in integer_columns(frozen, frozen.start()))
+    assert wanted == sum(array.size for array in integer_columns(fixed, fixed.start()))
 
 
 def test_a_file_is_smaller_than_its_integers(source):
-    frozen = fix_quantisation(EncodePlan.of(source, EncodeOptions(attribute_psnr=45.0, sh_coding="scalar")))
-    assert len(frozen.encode(frozen.start()).write().data) < integer_bytes(integer_columns(frozen, frozen.start()))
+    fixed = fix_quantisation(EncodePlan.of(source, EncodeOptions(attribute_psnr=45.0, sh_coding="scalar")))
+    assert len(fixed.encode(fixed.start()).write().data) < integer_bytes(integer_columns(fixed, fixed.start()))
 
 
 # controls
@@ -84,25 +84,25 @@ def test_without_quantisers_the_values_themselves_are_seen_and_move_freely(sourc
     plain = fix_quantisation(
         EncodePlan.of(source, EncodeOptions(preset="fast", attribute_psnr=30.0, sh_coding="scalar"))
     )
-    frozen = Unquantised.freeing(plain)
-    start = frozen.start()
+    fixed = Unquantised.freeing(plain)
+    start = fixed.start()
     for name in ("means", "scales", "opacities", "sh0"):
-        assert np.array_equal(getattr(source, name)[frozen.source_index], getattr(frozen.dequantise(start), name)) or (
+        assert np.array_equal(getattr(source, name)[fixed.source_index], getattr(fixed.dequantise(start), name)) or (
             name == "scales"  # in their gauge
         )
-    assert not np.array_equal(plain.dequantise(plain.start()).sh0, frozen.dequantise(start).sh0)
+    assert not np.array_equal(plain.dequantise(plain.start()).sh0, fixed.dequantise(start).sh0)
     start.means += 100.0
     moved = start.means.copy()
-    frozen.constrain(start)
+    fixed.constrain(start)
     assert np.array_equal(moved, start.means)
 
 
 def test_the_control_learns(source):
     wanted = renders_of(source, cameras(10), BLACK, None)
     off = replace(source, sh0=source.sh0 + np.float32(0.3))
-    frozen = Unquantised.freeing(fix_quantisation(EncodePlan.of(off, EncodeOptions(preset="fast", sh_coding="scalar"))))
+    fixed = Unquantised.freeing(fix_quantisation(EncodePlan.of(off, EncodeOptions(preset="fast", sh_coding="scalar"))))
     options = FinetuneOptions(iterations=60, warm_up=10, validate_every=20, byte_cost=0.0)
-    log = tune(frozen, split_views(wanted, BLACK, validation_count=2), options).log
+    log = tune(fixed, split_views(wanted, BLACK, validation_count=2), options).log
     assert log["best_psnr"] > log["start_psnr"] + 3.0
 
 

@@ -149,8 +149,8 @@ def test_errors_are_stated_against_a_scene_that_was_not_drafted(make_model):
 def test_values_that_were_not_touched_freeze_to_the_same_splats(make_model):
     model = make_model(300, 2)
     plan = EncodePlan.of(model, EncodeOptions(sh_coding="scalar"))
-    frozen = fix_quantisation(plan)
-    plain, thawed = encode_tiles(plan).write(), frozen.encode(frozen.start()).write()
+    fixed = fix_quantisation(plan)
+    plain, thawed = encode_tiles(plan).write(), fixed.encode(fixed.start()).write()
     assert np.array_equal(plain.source_index, thawed.source_index)
     one, other = decode(plain.data), decode(thawed.data)
     for name in ("means", "opacities", *COLOURS):

@@ -86,11 +86,11 @@ def test_a_gpu_learns_none(uneven):
 @pytest.mark.slow
 def test_tuning_corrects_exposures_too(make_model, uneven):
     scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))  # that was photographed
-    frozen = fix_quantisation(EncodePlan.of(scene, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)))
+    fixed = fix_quantisation(EncodePlan.of(scene, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)))
     teach, judge = ([TuningView(one.camera, one) for one in part] for part in (uneven.train, uneven.test))
     views = TuningViews(teach, judge, np.zeros(3, np.float32))
     plain, corrected = (
-        tune(frozen, views, FinetuneOptions(iterations=200, validate_every=50, patience=0, lr_exposure=rate)).log
+        tune(fixed, views, FinetuneOptions(iterations=200, validate_every=50, patience=0, lr_exposure=rate)).log
         for rate in (0.0, 0.05)
     )
     assert corrected["validations"][-1]["psnr"] > plain["validations"][-1]["psnr"] + 0.5

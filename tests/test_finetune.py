@@ -105,8 +105,8 @@ def test_photographs_of_a_data_set_teach_in_front_of_what_was_behind_the_scene(c
 def fine():
     """Few splats, coded so finely that tuning gains nothing, and views of them."""
     few = shell(3).select(slice(0, 40))
-    frozen = fix_quantisation(EncodePlan.of(few, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar")))
-    return frozen, split_views(renders_of(few, cameras(8), BLACK, None), BLACK, validation_count=3)
+    fixed = fix_quantisation(EncodePlan.of(few, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar")))
+    return fixed, split_views(renders_of(few, cameras(8), BLACK, None), BLACK, validation_count=3)
 
 
 # learning
@@ -124,10 +124,10 @@ def fine():
     ids=["codebook", "scalar", "shapes", "no SH"],
 )
 def test_a_tuned_file_looks_better_than_one_that_is_not_and_is_hardly_larger(source, views, encoding):
-    frozen = fix_quantisation(EncodePlan.of(source, encoding))
-    before = frozen.encode(frozen.start()).write().data
-    tuned = tune(frozen, views, QUICK)
-    after = frozen.encode(tuned.held).write().data
+    fixed = fix_quantisation(EncodePlan.of(source, encoding))
+    before = fixed.encode(fixed.start()).write().data
+    tuned = tune(fixed, views, QUICK)
+    after = fixed.encode(tuned.best_values).write().data
     assert psnr(decode(after), views.validation) > psnr(decode(before), views.validation) + 0.5
     assert len(after) < 1.1 * len(before)
 
@@ -148,18 +148,18 @@ def test_pixels_that_do_not_count_teach_nothing(coarse, views):
         return TuningViews(shown, shown[:2], BLACK)
 
     first, second = (tune(coarse, hidden(value), FEW) for value in (0, 250))
-    assert np.array_equal(first.held.sh0, second.held.sh0)
+    assert np.array_equal(first.best_values.sh0, second.best_values.sh0)
     assert first.log["validations"] == second.log["validations"]
 
 
 @pytest.mark.slow
 def test_the_decoded_file_scores_what_was_scored_while_tuning(coarse, views):
-    frozen, tuned = coarse, tune(coarse, views, FEW)
-    decoded = decode(frozen.encode(tuned.held).write().data)
+    fixed, tuned = coarse, tune(coarse, views, FEW)
+    decoded = decode(fixed.encode(tuned.best_values).write().data)
     rasteriser, error = Rasteriser(), []
-    rows = np.argsort(frozen.source_index)
-    order = np.argsort(frozen.encode(tuned.held).write().source_index)
-    seen = frozen.dequantise(tuned.held)
+    rows = np.argsort(fixed.source_index)
+    order = np.argsort(fixed.encode(tuned.best_values).write().source_index)
+    seen = fixed.dequantise(tuned.best_values)
     for name in ("means", "shN"):
         assert np.array_equal(getattr(decoded, name)[order], getattr(seen, name)[rows])
     splats = UncheckedSplats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
@@ -171,39 +171,39 @@ def test_the_decoded_file_scores_what_was_scored_while_tuning(coarse, views):
 
 @pytest.mark.slow
 def test_costly_bytes_make_small_files(source, views):
-    sizes, frozen = [], fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar")))
+    sizes, fixed = [], fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar")))
     for cost in (0.0, 1e-3, 1e-2):
-        tuned = tune(frozen, views, replace(QUICK, byte_cost=cost))
-        sizes.append(len(frozen.encode(tuned.held).write().data))
+        tuned = tune(fixed, views, replace(QUICK, byte_cost=cost))
+        sizes.append(len(fixed.encode(tuned.best_values).write().data))
     assert sizes[0] > sizes[1] > sizes[2]
 
 
 @pytest.mark.slow
 def test_what_does_not_get_better_stays_as_it_was(fine):
-    frozen, views = fine
-    tuned = tune(frozen, views, replace(FEW.scaled(5.0), byte_cost=0.0))
+    fixed, views = fine
+    tuned = tune(fixed, views, replace(FEW.scaled(5.0), byte_cost=0.0))
     assert 0 == tuned.log["best_iteration"]
-    start = frozen.start()
-    assert np.array_equal(start.sh, tuned.held.sh)
+    start = fixed.start()
+    assert np.array_equal(start.sh, tuned.best_values.sh)
 
 
 @pytest.mark.slow
 def test_a_run_that_gains_nothing_ends_early(fine):
-    frozen, views = fine
+    fixed, views = fine
     options = replace(FEW, iterations=30, patience=2, byte_cost=0.0).scaled(5.0)
-    log = tune(frozen, views, options).log
+    log = tune(fixed, views, options).log
     assert log["converged"]
     assert 2 / 3 * 30 < log["steps"] < 30  # not before values have calmed down
-    assert not tune(frozen, views, replace(options, patience=0)).log["converged"]
+    assert not tune(fixed, views, replace(options, patience=0)).log["converged"]
 
 
 @pytest.mark.slow
 def test_a_run_whose_files_are_too_large_yet_goes_on(fine, monkeypatch):
-    frozen, views = fine
+    fixed, views = fine
     options = replace(FEW, iterations=30, patience=2, byte_cost=0.0).scaled(5.0)
-    assert tune(frozen, views, options, size_bytes=10**9).log["converged"]
+    assert tune(fixed, views, options, size_bytes=10**9).log["converged"]
     monkeypatch.setattr(RateController, "excess", lambda *_: 1e-3)
-    assert 30 == tune(frozen, views, options, size_bytes=10**9).log["steps"]
+    assert 30 == tune(fixed, views, options, size_bytes=10**9).log["steps"]
 
 
 # gradients
@@ -212,10 +212,10 @@ def test_a_run_whose_files_are_too_large_yet_goes_on(fine, monkeypatch):
 @pytest.mark.area(name="rasteriser")
 def test_gradients_of_entries_are_those_of_all_their_users(source, views):
     """A sum over users, against finite differences of the loss by an entry's values."""
-    frozen = fix_quantisation(
+    fixed = fix_quantisation(
         EncodePlan.of(source, EncodeOptions(attribute_psnr=60.0, sh_coding="codebook", codebook_size=16))
     )
-    scene, view = TunedScene(frozen), views.train[0]
+    scene, view = TunedScene(fixed), views.train[0]
     loss, rasteriser = PhotometricLoss(H, W, 1.0, 0.0), Rasteriser(dtype=np.float64)
     seen, _ = scene.dequantise()
     wanted = np.zeros((H, W, 3), np.float32)
@@ -229,7 +229,7 @@ def test_gradients_of_entries_are_those_of_all_their_users(source, views):
     gradients = rasteriser.backward(slope.astype(np.float64))
     by_row = scene._by_row(gradients.shN.astype(np.float32))
     entry = int(np.argmax(np.abs(by_row[:16]).sum(axis=(1, 2))))
-    users, h = frozen.book.index == entry, 1e-3
+    users, h = fixed.book.index == entry, 1e-3
     assert users.sum() > 1
     for k in range(3):
         high, low = (seen.shN.astype(np.float64) for _ in range(2))
@@ -283,21 +283,21 @@ def test_costs_are_the_entropy_and_their_slopes_point_away_from_what_is_common()
 
 
 def test_costs_take_the_integers_that_are_coded(source):
-    frozen = fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar", chroma_shift=1)))
-    scene = TunedScene(frozen)
+    fixed = fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar", chroma_shift=1)))
+    scene = TunedScene(fixed)
     seen, _ = scene.dequantise()
-    found = colour_integers_of(seen.shN, frozen.parameters.sh_step, 1)
+    found = colour_integers_of(seen.shN, fixed.parameters.sh_step, 1)
     from csplat.encoder.quantisation import quantise_sh
 
-    columns, _, _ = quantise_sh(frozen.start().sh, frozen.parameters, None)
+    columns, _, _ = quantise_sh(fixed.start().sh, fixed.parameters, None)
     assert np.array_equal(columns.transpose(2, 1, 0), found)
 
 
 @pytest.mark.parametrize("group", ["scales", "sh0", "logits", "quats", "shN"])
 def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, group):
     """A made-up cost, quadratic in the integers, has slopes that finite differences know."""
-    frozen = fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)))
-    scene = TunedScene(frozen)
+    fixed = fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)))
+    scene = TunedScene(fixed)
     seen, _ = scene.dequantise()
     stored = scene.stream_values(seen)
     name = {"logits": "opacities"}.get(group, group)
@@ -309,7 +309,7 @@ def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, g
     costs.add_to(steps, stored)
     for other, slopes in steps.items():
         assert slopes.any() == (other == group)
-    plan = frozen.parameters
+    plan = fixed.parameters
     if group == "scales":
         assert np.allclose(steps["scales"], 0.01 * stored.scales / plan.scale_step**2, rtol=1e-4)
     elif group == "quats":
@@ -337,7 +337,7 @@ def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, g
 def test_a_weight_of_bytes_is_loss_per_bit_and_splat(coarse):
     scene = TunedScene(coarse)
     seen, _ = scene.dequantise()
-    costs = RateTerm.count(scene.frozen, scene.stream_values(seen), 2e-4)
+    costs = RateTerm.count(scene.fixed, scene.stream_values(seen), 2e-4)
     assert costs.loss == pytest.approx(2e-4 * costs.bits / 300)
     assert 5 < costs.bits / 300 < 200
 
@@ -349,15 +349,15 @@ def test_a_weight_of_bytes_is_loss_per_bit_and_splat(coarse):
 def test_the_same_seed_makes_the_same_bytes_at_any_number_of_threads(source, views):
     files = []
     for seed, threads in ((1, 1), (1, 2), (2, 1)):
-        frozen = fix_quantisation(EncodePlan.of(source, COARSE))
-        tuned = tune(frozen, views, replace(FEW, seed=seed), threads=threads)
-        files.append(frozen.encode(tuned.held).write().data)
+        fixed = fix_quantisation(EncodePlan.of(source, COARSE))
+        tuned = tune(fixed, views, replace(FEW, seed=seed), threads=threads)
+        files.append(fixed.encode(tuned.best_values).write().data)
     assert files[0] == files[1]
     assert files[0] != files[2]
 
 
 def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path):
-    frozen = fix_quantisation(
+    fixed = fix_quantisation(
         EncodePlan.of(
             source, EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32)
         )
@@ -369,34 +369,34 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path)
         if now.iteration == 8:
             middle.append(file.read_bytes())  # the one of step 6
 
-    whole = tune(frozen, views, FEW, progress=keep, checkpoint=file, checkpoint_every=3)
+    whole = tune(fixed, views, FEW, progress=keep, checkpoint=file, checkpoint_every=3)
     file.write_bytes(middle[0])
-    rest = tune(frozen, views, FEW, resume=file)
-    assert frozen.encode(whole.held).write().data == frozen.encode(rest.held).write().data
+    rest = tune(fixed, views, FEW, resume=file)
+    assert fixed.encode(whole.best_values).write().data == fixed.encode(rest.best_values).write().data
     assert whole.log["losses"] == rest.log["losses"]
     assert whole.log["validations"] == rest.log["validations"]
 
 
 @pytest.mark.slow
 def test_bytes_cost_what_keeps_a_file_to_its_size(source, views, tmp_path):
-    frozen = fix_quantisation(EncodePlan.of(source, EncodeOptions(attribute_psnr=34.0)))
-    before = len(frozen.encode(frozen.start()).write().data)
+    fixed = fix_quantisation(EncodePlan.of(source, EncodeOptions(attribute_psnr=34.0)))
+    before = len(fixed.encode(fixed.start()).write().data)
     options, costs = replace(QUICK, byte_cost=4e-3), []
     for share, steps in ((0.93, 120), (1.5, 60)):
-        tuned = tune(frozen, views, replace(options, iterations=steps), size_bytes=int(share * before))
-        assert len(frozen.encode(tuned.held).write().data) <= share * before
+        tuned = tune(fixed, views, replace(options, iterations=steps), size_bytes=int(share * before))
+        assert len(fixed.encode(tuned.best_values).write().data) <= share * before
         best = next(look for look in tuned.log["validations"] if look["iteration"] == tuned.log["best_iteration"])
-        assert best["size_bytes"] == len(frozen.encode(tuned.held).write().data)
+        assert best["size_bytes"] == len(fixed.encode(tuned.best_values).write().data)
         costs.append(tuned.log["byte_cost"])
     assert costs[0] > options.byte_cost > costs[1]
     file = tmp_path / "run.npz"
     half = replace(FEW, iterations=8)
-    tune(frozen, views, half, size_bytes=before, checkpoint=file)
-    whole, rest = (tune(frozen, views, half, size_bytes=before, resume=one) for one in (None, file))
-    assert frozen.encode(whole.held).write().data == frozen.encode(rest.held).write().data
+    tune(fixed, views, half, size_bytes=before, checkpoint=file)
+    whole, rest = (tune(fixed, views, half, size_bytes=before, resume=one) for one in (None, file))
+    assert fixed.encode(whole.best_values).write().data == fixed.encode(rest.best_values).write().data
     assert whole.log["byte_cost"] == rest.log["byte_cost"]
     with pytest.raises(InputError, match="another target"):
-        tune(frozen, views, half, resume=file)
+        tune(fixed, views, half, resume=file)
 
 
 def test_a_file_that_is_too_large_adds_its_excess_to_the_loss():
@@ -418,26 +418,26 @@ def test_bytes_that_are_free_at_first_are_dear_in_time():
 
 
 def test_a_checkpoint_of_other_views_or_options_is_refused(coarse, views, tmp_path):
-    frozen, file = coarse, tmp_path / "c.npz"
-    tune(frozen, views, replace(QUICK, iterations=5), checkpoint=file)
+    fixed, file = coarse, tmp_path / "c.npz"
+    tune(fixed, views, replace(QUICK, iterations=5), checkpoint=file)
     with pytest.raises(InputError, match="another byte_cost"):
-        tune(frozen, views, replace(QUICK, byte_cost=0.5), resume=file)
+        tune(fixed, views, replace(QUICK, byte_cost=0.5), resume=file)
     with pytest.raises(InputError, match="other views"):
-        tune(frozen, replace(views, train=views.train[1:]), QUICK, resume=file)
+        tune(fixed, replace(views, train=views.train[1:]), QUICK, resume=file)
     with pytest.raises(InputError, match="other views"):
-        tune(frozen, replace(views, background=views.background + np.float32(0.5)), QUICK, resume=file)
+        tune(fixed, replace(views, background=views.background + np.float32(0.5)), QUICK, resume=file)
 
 
 def test_a_checkpoint_that_does_not_name_an_option_had_it_as_usual(coarse, views, tmp_path):
-    file, frozen = tmp_path / "run.npz", coarse
-    tune(frozen, views, replace(QUICK, iterations=5), checkpoint=file)
+    file, fixed = tmp_path / "run.npz", coarse
+    tune(fixed, views, replace(QUICK, iterations=5), checkpoint=file)
     arrays = dict(np.load(file))
     facts = json.loads(arrays["facts"].tobytes())
     del facts["options"]["lr_exposure"]
     np.savez(file, **{**arrays, "facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)})
-    assert 6 == len(tune(frozen, views, replace(QUICK, iterations=6), resume=file).log["losses"])
+    assert 6 == len(tune(fixed, views, replace(QUICK, iterations=6), resume=file).log["losses"])
     with pytest.raises(InputError, match=r"another lr_exposure: 0\.0"):
-        tune(frozen, views, replace(QUICK, iterations=6, lr_exposure=0.01), resume=file)
+        tune(fixed, views, replace(QUICK, iterations=6, lr_exposure=0.01), resume=file)
 
 
 def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, coarse, views, tmp_path):
@@ -483,7 +483,7 @@ def test_refuses_options_out_of_range(wrong):
 
 def test_learning_rates_rise_and_fall():
     options = FinetuneOptions(iterations=1000, warm_up=100, decay=0.01)
-    shares = [options.share(step) for step in range(1, 1001)]
+    shares = [options.learning_rate_factor(step) for step in range(1, 1001)]
     assert shares[0] == pytest.approx(1 / 101)
     assert 90 < int(np.argmax(shares)) < 110
     assert shares[-1] == pytest.approx(0.01, rel=0.01)
@@ -492,14 +492,17 @@ def test_learning_rates_rise_and_fall():
 
 
 def test_every_learning_rate_rises_with_the_others(coarse, views, tmp_path):
-    frozen, file, moved = coarse, tmp_path / "c.npz", []
-    start = {name: values.copy() for name, values in TunedScene(frozen).parameters.values.items() if values.size}
+    fixed, file, moved = coarse, tmp_path / "c.npz", []
+    start = {name: values.copy() for name, values in TunedScene(fixed).parameters.values.items() if values.size}
     for warm_up in (0, 100):
         options = FinetuneOptions(iterations=1, warm_up=warm_up, byte_cost=0.0)
-        tune(frozen, views, options, checkpoint=file)
+        tune(fixed, views, options, checkpoint=file)
         with np.load(file) as stored:
             moved.append(
-                {name: np.abs(stored[f"values_{name}"] - start[name]).max() / options.share(1) for name in start}
+                {
+                    name: np.abs(stored[f"values_{name}"] - start[name]).max() / options.learning_rate_factor(1)
+                    for name in start
+                }
             )
     assert {"means", "quats", "scales", "logits", "sh0", "shN"} <= moved[0].keys()
     for name in start:
@@ -514,18 +517,18 @@ def test_renders_that_teach_are_those_of_the_source(source):
         view = renders_of(model, [camera], BLACK, None)[0]
         found = view.image(BLACK, np.empty((H, W, 3), np.float32))
         assert np.allclose(found, np.clip(wanted, -6e4, 6e4), rtol=6e-4, atol=1e-6)
-    with pytest.raises(InputError, match="wanted picture has shape"):
+    with pytest.raises(InputError, match="reference image has shape"):
         TuningView(camera, np.zeros((1, 1, 3), np.float32))
 
 
-def test_views_that_judge_teach_unless_they_are_kept_aside():
+def test_validation_views_are_training_views_unless_they_are_held_out():
     views = [TuningView(camera, np.zeros((H, W, 3), np.float32)) for camera in cameras(20)]
     together, apart = split_views(views, BLACK), split_views(views, BLACK, validation_count=4)
     assert (20, 16, False) == (len(together.train), len(together.validation), together.is_held_out)
     assert (16, 4, True) == (len(apart.train), len(apart.validation), apart.is_held_out)
     with pytest.raises(InputError, match="leave none"):
         split_views(views, BLACK, validation_count=20)
-    with pytest.raises(InputError, match="at least one view"):
+    with pytest.raises(InputError, match="at least one training view"):
         TuningViews([], [], BLACK)
 
 
@@ -906,8 +909,8 @@ def test_a_trained_scene_loses_less_when_tuned(data_dir):
     model = train(data, TrainOptions(max_splats=1500, iterations=500, sh_degree=1)).model
     white = np.ones(3, np.float32)
     views = split_views([TuningView(picture.camera, picture) for picture in data.train], white)
-    frozen = fix_quantisation(EncodePlan.of(model, EncodeOptions(preset="small", attribute_psnr=34.0)))
-    tuned = tune(frozen, views, FinetuneOptions(iterations=400))
+    fixed = fix_quantisation(EncodePlan.of(model, EncodeOptions(preset="small", attribute_psnr=34.0)))
+    tuned = tune(fixed, views, FinetuneOptions(iterations=400))
     held_out = [TuningView(one.camera, one) for one in data.test[::10]]
 
     def score(scene):
@@ -920,4 +923,4 @@ def test_a_trained_scene_loses_less_when_tuned(data_dir):
 
     plain = decode(encode(model, EncodeOptions(preset="small", attribute_psnr=34.0)))
     best, lost = score(model), score(plain)
-    assert score(decode(frozen.encode(tuned.held).write().data)) > lost + 0.6 * (best - lost)
+    assert score(decode(fixed.encode(tuned.best_values).write().data)) > lost + 0.6 * (best - lost)

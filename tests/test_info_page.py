@@ -18,7 +18,7 @@ pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'cspl
 from captures import cameras, shell
 
 from csplat import EncodeOptions, encode, read_ply, write_ply
-from csplat_render.virtual_cameras import detail, sample_cloud, scene_frame
+from csplat_render.scene_frame import detail, sample_cloud, scene_frame
 from csplat_tools.cli.app import app
 from csplat_tools.hardest_place import HardestPlaceSearch
 from csplat_tools.html_report import Bar, draw_bars

@@ -25,8 +25,8 @@ from csplat.model import SplatModel
 from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.metrics import psnr_of_mse
+from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
-from csplat_render.virtual_cameras import scene_frame
 from csplat_tools.optimise.candidates import CodingChoice, WholeScene
 from csplat_tools.optimise.precision_search import (
     REFIT_GAIN,

@@ -7,7 +7,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render.camera import intrinsics, look_at, orbit
 from csplat_render.camera_paths import orbit_cameras
-from csplat_render.virtual_cameras import scene_frame
+from csplat_render.scene_frame import scene_frame
 
 pytestmark = pytest.mark.slow  # two CPU seconds together
 

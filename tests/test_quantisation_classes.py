@@ -171,9 +171,9 @@ def test_without_errors_all_is_one_class(model):
 
 
 def test_classes_can_be_ruled_out(model):
-    frozen = fix_quantisation(EncodePlan.of(model, importance=important(model), allow_classes=False))
-    assert frozen.encode_plan.classes is None
-    assert frozen.encode_plan.options.max_classes is None
+    fixed = fix_quantisation(EncodePlan.of(model, importance=important(model), allow_classes=False))
+    assert fixed.encode_plan.classes is None
+    assert fixed.encode_plan.options.max_classes is None
 
 
 def test_outliers_get_tiles_of_their_own(model):
@@ -195,11 +195,11 @@ def test_the_scene_of_a_draft_is_what_a_decoder_sees(model):
 
 
 def test_fixed_values_of_several_classes_are_as_decoded(model):
-    frozen = fix_quantisation(EncodePlan.of(model, importance=important(model)))
-    held = frozen.start()
-    result = frozen.encode(held).write()
-    decoded, seen = csplat.decode(result.data), frozen.dequantise(held)
-    order = np.argsort(frozen.source_index)[result.source_index]
+    fixed = fix_quantisation(EncodePlan.of(model, importance=important(model)))
+    values = fixed.start()
+    result = fixed.encode(values).write()
+    decoded, seen = csplat.decode(result.data), fixed.dequantise(values)
+    order = np.argsort(fixed.source_index)[result.source_index]
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(seen, name)[order], getattr(decoded, name))
 
@@ -207,17 +207,17 @@ def test_fixed_values_of_several_classes_are_as_decoded(model):
 def test_integers_of_each_class_are_counted_as_they_are_coded(make_model):
     """Counts are those of the encoder: integers divided by the multiple of their class."""
     model = make_model(8_000, 0)  # counts of fewer differ by more than a thousandth
-    frozen = fix_quantisation(EncodePlan.of(model, EncodeOptions(sh_coding="none"), importance=important(model)))
-    scene, plan, tiles = TunedScene(frozen), frozen.parameters, frozen.encode_plan.tiles
-    held, bits = scene.held, 0.0
+    fixed = fix_quantisation(EncodePlan.of(model, EncodeOptions(sh_coding="none"), importance=important(model)))
+    scene, plan, tiles = TunedScene(fixed), fixed.parameters, fixed.encode_plan.tiles
+    values, bits = scene.free_values, 0.0
     classes = list(dict.fromkeys(tile.factors for tile in tiles))
     assert len(classes) > 1
     for factors in classes:
         rows = np.concatenate([tile.rows for tile in tiles if tile.factors == factors])
-        shape = quantise_shape(held.quats[rows], held.scales[rows], plan, None, factors)
-        alpha = opacity_levels(held.opacities[rows], plan.opacity_levels, square=True, multiple=factors.opacities)
+        shape = quantise_shape(values.quats[rows], values.scales[rows], plan, None, factors)
+        alpha = opacity_levels(values.opacities[rows], plan.opacity_levels, square=True, multiple=factors.opacities)
         colour = quantise_colour(
-            np.ascontiguousarray(held.sh0[rows].T), plan.sh0_step, plan.chroma_shift, factors.sh0
+            np.ascontiguousarray(values.sh0[rows].T), plan.sh0_step, plan.chroma_shift, factors.sh0
         ).columns
         for columns in (shape.scales, shape.quats // factors.quats, alpha[None] // factors.opacities, colour):
             bits += cost_slopes([columns.T])[1]

@@ -15,7 +15,7 @@ pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.reference_rasteriser import Decisions, render_exact
-from csplat_render.virtual_cameras import scene_frame
+from csplat_render.scene_frame import scene_frame
 from csplat_tools.cli.app import app
 from csplat_tools.importance_file import encoder_importance
 from csplat_trainer.sensitivity import measure_sensitivity

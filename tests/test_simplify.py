@@ -18,8 +18,9 @@ from csplat.model import SplatModel
 from csplat.ply import read_ply, write_ply
 from csplat_render.camera_files import save_cameras
 from csplat_render.pruning_error import PruningError, measure_pruning_error
+from csplat_render.scene_frame import sample_cloud, scene_frame
 from csplat_render.scorer import Scorer, renderer
-from csplat_render.virtual_cameras import is_clear, sample_cloud, scene_frame
+from csplat_render.virtual_cameras import is_clear
 from csplat_tools.cli.app import app
 from csplat_tools.cli.shared_options import parse_decibels
 from csplat_tools.optimise.pruning import simplify

@@ -6,7 +6,7 @@ import pytest
 from csplat import decode, encode, read_ply
 from csplat.model import SplatModel
 from csplat_render.camera_paths import orbit_cameras
-from csplat_render.virtual_cameras import estimate_up, with_estimated_up
+from csplat_render.up_estimate import estimate_up, with_estimated_up
 from csplat_tools.cli.shared_options import parse_up, up_word
 from csplat_tools.views import display_cameras, find_view_set
 

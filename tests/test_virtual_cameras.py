@@ -12,15 +12,8 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat_render.camera_files import load_cameras
 from csplat_render.camera_paths import orbit_cameras
-from csplat_render.virtual_cameras import (
-    OBJECT_DISTANCES,
-    SURROUNDING_DISTANCES,
-    covered_fraction,
-    sample_cloud,
-    scene_frame,
-    virtual_cameras,
-    weighted_quantiles,
-)
+from csplat_render.scene_frame import covered_fraction, sample_cloud, scene_frame, weighted_quantiles
+from csplat_render.virtual_cameras import OBJECT_DISTANCES, SURROUNDING_DISTANCES, virtual_cameras
 
 
 def model_of(means, size=0.03, **fields):

@@ -14,7 +14,7 @@ from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, enco
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import Progress
-from csplat_render.virtual_cameras import scene_frame
+from csplat_render.scene_frame import scene_frame
 from csplat_trainer.sensitivity_file import StoredSensitivity, read_sensitivity
 
 _ZIP = b"PK"  # first bytes of a .npz file

@@ -173,7 +173,7 @@ def gather_batch(
     Args:
         ids: see `blend`, as shape and box.
         begin: first of `ids`.
-        end: last of `ids`, plus 1; at most CHECK of them.
+        end: last of `ids`, plus 1; at most BATCH of them.
         shape: see `blend`.
         box: see `blend`.
         X0: first column of the tile.
@@ -181,8 +181,8 @@ def gather_batch(
         low: first of the tile's rows that is not finished.
         high: last of them, plus 1.
         ys: [TILE] float64, see `pixel_centres`.
-        batch: [CHECK, NUMBERS], written.
-        rows: [CHECK, 2] int64, written: first row of the tile that each splat may touch, and last plus 1.
+        batch: [BATCH, BATCH_COLUMNS], written.
+        rows: [BATCH, 2] int64, written: first row of the tile that each splat may touch, and last plus 1.
     """
     for k in range(begin, end):
         i = ids[k]
@@ -205,8 +205,9 @@ def narrow_rows(count: int, batch: Any, rows: Any) -> None:
 
     Args:
         count: splats of the batch.
-        batch: [CHECK, NUMBERS], see `gather_batch`; the last column is the exponent of 2 below which nothing is drawn.
-        rows: [CHECK, 2] int64, changed.
+        batch: [BATCH, BATCH_COLUMNS], see `gather_batch`; the last column is the exponent of 2 below which nothing is
+            drawn.
+        rows: [BATCH, 2] int64, changed.
     """
     edge = np.float32(HALF_TILE - 0.5)
     for j in range(count):

@@ -21,16 +21,9 @@ from csplat.model import SplatModel
 from csplat.training_record import VIEW
 from csplat.types import F64, Mask
 from csplat_render.camera import Camera, camera_outliers, direction_at, intrinsics, look_at, orbit
-from csplat_render.virtual_cameras import (
-    FIELD_OF_VIEW,
-    HIDING,
-    Cloud,
-    SceneFrame,
-    detail,
-    sample_cloud,
-    scene_frame,
-    with_estimated_up,
-)
+from csplat_render.scene_frame import Cloud, SceneFrame, detail, sample_cloud, scene_frame
+from csplat_render.up_estimate import with_estimated_up
+from csplat_render.virtual_cameras import FIELD_OF_VIEW, HIDING
 
 ELEVATION = 20.0  # degrees above the horizon, for objects
 _MARGIN = 0.08  # fraction of half an image that is left free around an object

@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from csplat_trainer.data import DataSet, load
     from csplat_trainer.training_loop import train
     from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult
-    from csplat_trainer.tuning import Finetuned, FinetuneOptions, TuningViews, finetune
+    from csplat_trainer.tuning import FinetuneOptions, TunedFile, TuningViews, finetune
 
 __all__ = [
     "DataSet",
     "FinetuneOptions",
-    "Finetuned",
     "Outputs",
     "TrainOptions",
     "TrainResult",
+    "TunedFile",
     "TuningViews",
     "finetune",
     "load",
@@ -36,10 +36,10 @@ __all__ = [
 _MODULE_OF = {
     "DataSet": "csplat_trainer.data",
     "FinetuneOptions": "csplat_trainer.tuning",
-    "Finetuned": "csplat_trainer.tuning",
     "Outputs": "csplat_trainer.training_options",
     "TrainOptions": "csplat_trainer.training_options",
     "TrainResult": "csplat_trainer.training_options",
+    "TunedFile": "csplat_trainer.tuning",
     "TuningViews": "csplat_trainer.tuning",
     "finetune": "csplat_trainer.tuning",
     "load": "csplat_trainer.data",

@@ -23,7 +23,7 @@ from csplat.types import F32
 from csplat_render.camera import Camera, central_camera
 from csplat_render.lpips import Lpips, load_lpips
 from csplat_render.metrics import psnr_of_mse
-from csplat_render.virtual_cameras import scene_frame
+from csplat_render.scene_frame import scene_frame
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.engine import CpuEngine, Engine
 from csplat_trainer.image_gains import ImageGain, ImageGains

@@ -11,7 +11,7 @@ import typer
 from csplat.disk_files import read_array
 from csplat.errors import InputError, counted
 from csplat_tools.cli.command import OutputOptions, command
-from csplat_tools.cli.shared_options import Lpips, ModeWord, SplitOption, ViewOptions, parse_bytes
+from csplat_tools.cli.shared_options import LpipsOption, ModeOption, SplitOption, ViewOptions, parse_bytes
 from csplat_tools.console import format_bytes, format_table
 from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.inspect.comparison import AttributeErrors
@@ -30,7 +30,7 @@ _PAIRING = {
     "order": "pairs by their order",
     "search": "pairs found within the stated errors",
 }
-_WORDS = {
+_SCORE_EXPLANATIONS = {
     "psnr": "of the squared error over all views; at 30 dB people see a difference, at 40 they hardly do",
     "psnr_mean": "mean of the views' own",
     "psnr_worst": "of the view that came out worst",
@@ -57,8 +57,8 @@ def compare(
     amplify: Annotated[
         float, typer.Option(metavar="FACTOR", min=0.0, help="Factor of the differences shown. Default: 10.")
     ] = 10.0,
-    lpips: Lpips = None,
-    mode: ModeWord = "standard",
+    lpips: LpipsOption = None,
+    mode: ModeOption = "standard",
     memory: Annotated[
         str | None, typer.Option(metavar="2GB", help="Memory to use. Default: half of what is free.")
     ] = None,
@@ -164,7 +164,7 @@ def _quality(compared: Comparison) -> str:
     rows = [(name, text) for name, text in values.items() if text is not None]
     views = describe_views(len(quality.each), compared.cameras)
     head, *others = format_table(("pictures", views), rows).splitlines()
-    lines = [head, *(f"{line}  {_WORDS[name]}" for line, (name, _) in zip(others, rows, strict=True))]
+    lines = [head, *(f"{line}  {_SCORE_EXPLANATIONS[name]}" for line, (name, _) in zip(others, rows, strict=True))]
     lines += _ignored(compared)
     if compared.a.facts.antialiased != compared.b.facts.antialiased:
         lines.append(f"only {'A' if compared.a.facts.antialiased else 'B'} is antialiased, and was rendered so")

@@ -15,7 +15,7 @@ from csplat.encoder import EncodeOptions
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat.types import Progress
-from csplat_render.virtual_cameras import estimate_up
+from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli.command import LibrarySettings, OptionGroup, OutputOptions, command
 from csplat_tools.cli.shared_options import (
     EFFORT,

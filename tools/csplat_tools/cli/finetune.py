@@ -17,7 +17,7 @@ from csplat_tools.cli.shared_options import (
     CheckpointEvery,
     EncodingOptions,
     Importance,
-    Lpips,
+    LpipsOption,
     Near,
     Resume,
     SourceIndex,
@@ -96,7 +96,7 @@ def finetune(
             metavar="FACTOR", hidden=True, help="Factor of all learning rates. Default: 1; with --self, 0.03."
         ),
     ] = None,
-    lpips: Lpips = None,
+    lpips: LpipsOption = None,
     page: Annotated[
         str | None, typer.Option(metavar="FILE.html", help="Write an HTML report: scores, curve, renders.")
     ] = None,

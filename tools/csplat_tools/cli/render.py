@@ -11,10 +11,10 @@ from typing import Annotated, ClassVar
 import typer
 
 from csplat.errors import counted
-from csplat_render.virtual_cameras import estimate_up
+from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli.command import OutputOptions, command
 from csplat_tools.cli.shared_options import (
-    ModeWord,
+    ModeOption,
     OrientationOptions,
     SceneArgument,
     ShDegree,
@@ -68,7 +68,7 @@ def render(
     fps: Annotated[
         float, typer.Option(metavar="RATE", min=0.1, max=MAX_FPS, help="Frames per second of a film.")
     ] = DEFAULT_FPS,
-    mode: ModeWord = "standard",
+    mode: ModeOption = "standard",
     sh_degree: ShDegree = None,
     depth: Annotated[bool, typer.Option("--depth", help="Write NAME.depth.npy too, float32, scene units.")] = False,
     alpha: Annotated[bool, typer.Option("--alpha", help="Write NAME.alpha.png too.")] = False,

@@ -15,7 +15,7 @@ from csplat.encoder import PRESETS, EncodeOptions, PresetName
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_axes
 from csplat_render import Mode
-from csplat_render.virtual_cameras import estimate_up
+from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli.command import LibrarySettings, OptionGroup, OutputOptions, chosen
 from csplat_tools.console import parse_size_bytes
 from csplat_tools.scene_files import MetadataOverrides
@@ -42,10 +42,10 @@ EFFORT: dict[str, Any] = {
 Threads = Annotated[
     int | None, typer.Option(min=1, hidden=True, help="Threads, which do not change the result. Default: one per core.")
 ]
-ModeWord = Annotated[
+ModeOption = Annotated[
     Mode, typer.Option(metavar="exact|standard|fast", help="Accuracy of the renderer against its speed.")
 ]
-Lpips = Annotated[
+LpipsOption = Annotated[
     str | None, typer.Option(metavar="WEIGHTS.npz", help="Compute LPIPS (Alex) with these weights, or with `auto`.")
 ]
 ShDegree = Annotated[int | None, typer.Option(metavar="0..3", min=0, max=3, help="Leave out SH bands above this one.")]

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from csplat_tools.cli.command import OutputOptions, chosen, command
-from csplat_tools.cli.shared_options import Lpips, Preset, Threads, ViewOptions
+from csplat_tools.cli.shared_options import LpipsOption, Preset, Threads, ViewOptions
 from csplat_tools.console import note
 from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.optional_packages import prepare_renderer, require_images, require_plots, require_renderer
@@ -43,7 +43,7 @@ def tradeoff(
         str,
         typer.Option(metavar="exact|standard|fast,...", hidden=True, help="Modes of the renderer that are timed."),
     ] = ",".join(SweepOptions.modes),
-    lpips: Lpips = None,
+    lpips: LpipsOption = None,
     threads: Threads = None,
 ) -> None:
     """Measure size against quality for all that can be chosen when a scene is encoded.

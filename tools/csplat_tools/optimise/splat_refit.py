@@ -137,7 +137,7 @@ def quantisation_aware_refit(
         # Growth of the error per saved fraction of the bytes; half of it, because views give half of its gradient.
         values.lambda_ = 0.5 * quantised * value_count / rate_exponent(_SLOPE)
     _descend(values, views, steps, _step_length(rms), progress)
-    return values.tuned.held.copy()
+    return values.tuned.free_values.copy()
 
 
 @dataclass(frozen=True, eq=False)

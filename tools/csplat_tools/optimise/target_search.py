@@ -20,8 +20,8 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import Progress
 from csplat_render.metrics import PSNR_CAP, psnr_of_mse
+from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
-from csplat_render.virtual_cameras import scene_frame
 from csplat_tools.optimise.candidates import Candidate, CandidatePool, CodingChoice, Weights, WholeScene
 from csplat_tools.optimise.precision_search import REFIT_GAIN, PrecisionSearch, SearchGoal, clip_quality
 from csplat_tools.optimise.pruning_order import SimplifyOptions

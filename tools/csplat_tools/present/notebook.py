@@ -12,7 +12,8 @@ import numpy as np
 
 from csplat.encoder import EncodeOptions, encode
 from csplat.model import SplatModel
-from csplat_render.virtual_cameras import estimate_up, surface_areas, visible_opacity
+from csplat_render.scene_frame import surface_areas, visible_opacity
+from csplat_render.up_estimate import estimate_up
 from csplat_tools.present.viewer_page import export_page
 from csplat_tools.present.viewer_server import estimated_up_parameters
 

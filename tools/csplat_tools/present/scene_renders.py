@@ -152,7 +152,7 @@ def render_film(
     Args:
         model: the scene.
         cameras: the views, at least one, of one size.
-        path: path of the file; its ending determines the format, see `film`.
+        path: path of the file; its ending determines the format, see `check_film`.
         fps: frames per second.
         background, mode, prepare, progress: see `render_folder`.
         force: an existing file may be replaced.

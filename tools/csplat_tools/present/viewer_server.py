@@ -30,7 +30,7 @@ from csplat.lint import Finding
 from csplat.model import UNSPECIFIED
 from csplat.types import Progress
 from csplat_render.camera_files import load_cameras
-from csplat_render.virtual_cameras import estimate_up
+from csplat_render.up_estimate import estimate_up
 from csplat_tools.file_streams import STANDARD_STREAM, is_csplat, local_path, mapped_csplat
 from csplat_tools.present.viewer_page import PAGE, web_files
 from csplat_tools.scene_files import MetadataOverrides, read_source

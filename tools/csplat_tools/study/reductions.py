@@ -13,7 +13,7 @@ from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.scene_source import drop_bands
 from csplat.types import I64, Progress
-from csplat_render.virtual_cameras import surface_areas
+from csplat_render.scene_frame import surface_areas
 from csplat_tools.study.attribute_codebooks import Clustered, KMeans, attribute_floats, cluster_attributes, raw_bytes
 from csplat_tools.views import ViewSet, find_view_set
 

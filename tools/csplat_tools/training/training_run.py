@@ -128,7 +128,7 @@ def tuning_after(training: TrainOptions, byte_cost: float | None = None) -> Fine
 
     Args:
         training: options of the training.
-        byte_cost: rate weight of a bit per splat in the loss; `None`: the default.
+        byte_cost: lambda, the rate weight: loss per bit and splat; `None`: the default.
 
     Raises:
         InputError: the weight is out of its range.

@@ -25,12 +25,13 @@ from csplat_tools.training.tuning_inputs import TuningSubset, choose_splats, tra
 from csplat_tools.training.tuning_report import make_tuning_report, score_models
 from csplat_tools.views import ViewSet
 from csplat_trainer.training_options import Outputs
-from csplat_trainer.tuning import Clock, Finetuned, FinetuneOptions, TuningStep
+from csplat_trainer.tuning import FinetuneOptions, StageTimer, TunedFile, TuningStep
 
 #: Factor of the learning rates; True: the scene's own renders are the reference instead of photographs. Those can be
 #: matched almost exactly: what long steps lose of that, short ones take long to regain.
 LEARNING_FACTOR = {False: 1.0, True: 0.03}
-#: Rate weight of a bit per splat in the loss; for the scene's own renders, whose loss is smaller, it is smaller, too.
+#: Default of lambda, the rate weight: loss per bit and splat. It is smaller for the scene's own renders, whose loss is
+#: smaller.
 RATE_WEIGHT = {False: 1e-4, True: 2e-5}
 #: Entries of the codebook of shapes, which clustering by sensitivities and tuning make good use of; `encode`, which has
 #: neither, makes no such codebook by default.
@@ -135,15 +136,15 @@ def run_finetuning(
                 tuned = make(size_bytes=size_bytes, files=files, keep=keep)
             else:
                 tuned = _tune_to_psnr(psnr, make, quiet=quiet)
-        made, clock = tuned.made, Clock(tuned.seconds)
+        made, timer = tuned.made, StageTimer(tuned.seconds)
         write_bytes(output, made.data)
         if source_index is not None:
             write_array(source_index, made.result.source_index)
-        with clock.stage("judging"):
+        with timer.stage("judging"):
             models = {"source": source, "before tuning": decode(made.plain.data), "file": made.decoded}
             scores = score_models(source, models, views, lpips, threads, known=known)
         shown = [] if page is None else show_views(source, models, views, threads)
-    facts = make_tuning_report(source, made.plain, made.result, scores, made.log, clock.seconds, tuned.subset.pruning)
+    facts = make_tuning_report(source, made.plain, made.result, scores, made.log, timer.seconds, tuned.subset.pruning)
     report = {**facts, "log": made.log}
     if page is not None:
         write_training_page(page, output, training, report, shown)
@@ -161,7 +162,7 @@ class TunedSubset:
     """
 
     subset: TuningSubset
-    made: Finetuned
+    made: TunedFile
     seconds: dict[str, float]
 
     @property
@@ -205,7 +206,7 @@ def choose_and_finetune(
         InputError: no file of the scene is small enough.
         CsplatError: as for `choose_splats` and `csplat_trainer.finetune`.
     """
-    clock = Clock()
+    timer = StageTimer()
 
     def choose(share: float | None) -> TuningSubset:
         return choose_splats(
@@ -213,7 +214,7 @@ def choose_and_finetune(
             progress=progress,
         )  # fmt: skip
 
-    with clock.stage("choosing"):
+    with timer.stage("choosing"):
         tuning_views = training_views(source, views, encoding.threads)
         chosen = choose(keep)
         if size_bytes is not None:
@@ -228,29 +229,29 @@ def choose_and_finetune(
             progress=progress, on_step=on_step,
         )  # fmt: skip
         if size_bytes is None or len(made.data) <= size_bytes:
-            return TunedSubset(chosen, made, {**clock.seconds, **made.seconds})
+            return TunedSubset(chosen, made, {**timer.seconds, **made.seconds})
         tries -= 1
         if not tries:
             raise InputError(f"the smallest file has {len(made.data):,} bytes, more than {size_bytes:,}")
         outputs = replace(outputs, resume=None)  # that checkpoint belongs to a tuning of more splats
         share = (size_bytes / len(made.data)) ** 2 / _FEWER
-        with clock.stage("choosing"):
+        with timer.stage("choosing"):
             chosen = choose(max(1, int(share * len(chosen.model))) / len(source))
 
 
 def _tune_to_psnr(psnr: float, make: Callable[..., TunedSubset], *, quiet: bool) -> TunedSubset:
     """Make files until one reaches a PSNR; the seconds are those of all of them."""
-    clock = Clock()
+    timer = StageTimer()
 
     def made(size_bytes: int | None) -> TunedSubset:
         found = make(size_bytes=size_bytes)
         for stage, seconds in found.seconds.items():
-            clock.seconds[stage] = round(clock.seconds.get(stage, 0.0) + seconds, 3)
+            timer.seconds[stage] = round(timer.seconds.get(stage, 0.0) + seconds, 3)
         if not quiet:
             note(f"{format_bytes(found.size_bytes)}: {found.psnr:.2f} dB on the validation views")
         return found
 
-    return replace(smallest_reaching(psnr, made), seconds=clock.seconds)
+    return replace(smallest_reaching(psnr, made), seconds=timer.seconds)
 
 
 def _fit_to_size(

@@ -28,16 +28,10 @@ from csplat.training_record import TrainingRecord
 from csplat_render import Camera, Mode
 from csplat_render.camera import relative_to, resized
 from csplat_render.camera_files import load_cameras
+from csplat_render.scene_frame import detail, sample_cloud, scene_frame
 from csplat_render.scorer import Renderable, Scorer, renderer
-from csplat_render.virtual_cameras import (
-    HIDING,
-    detail,
-    farthest_points,
-    sample_cloud,
-    scene_frame,
-    virtual_cameras,
-    with_estimated_up,
-)
+from csplat_render.up_estimate import with_estimated_up
+from csplat_render.virtual_cameras import HIDING, farthest_points, virtual_cameras
 from csplat_tools.optional_packages import require_photographs
 from csplat_tools.views import virtual_views
 from csplat_tools.views.virtual_views import HELD_OUT_COUNT, camera_sequence, default_views, evenly_spaced

@@ -18,16 +18,8 @@ from csplat.model import SplatModel
 from csplat.types import F64
 from csplat_render import Camera
 from csplat_render.camera import direction_at, intrinsics, look_at, relative_to
-from csplat_render.virtual_cameras import (
-    FIELD_OF_VIEW,
-    HIDING,
-    SceneFrame,
-    detail,
-    is_clear,
-    sample_cloud,
-    scene_frame,
-    virtual_cameras,
-)
+from csplat_render.scene_frame import SceneFrame, detail, sample_cloud, scene_frame
+from csplat_render.virtual_cameras import FIELD_OF_VIEW, HIDING, is_clear, virtual_cameras
 
 T = TypeVar("T")
 

@@ -131,7 +131,7 @@ def _choose_axes(custom: str, shots: Sequence[Shot]) -> tuple[str, Direction | N
         custom: usual axes of sets of this kind. Some files have other coordinates: then the cameras determine up.
         shots: all shots of the set.
     """
-    level, usual = estimate_level([shot.viewmat for shot in shots]), up_of_axes(custom)
+    level, usual = estimate_up_of_cameras([shot.viewmat for shot in shots]), up_of_axes(custom)
     if level is None:
         return custom, usual, "" if usual else "which way is up is not known: the cameras were held at all angles"
     if usual is None:
@@ -264,7 +264,7 @@ _UNDECIDED = 0.1  # cosine with the cameras' mean up below which they look down:
 
 
 @dataclass(frozen=True)
-class Level:
+class UpEstimate:
     """Up direction according to the cameras of a set.
 
     Attributes:
@@ -287,7 +287,7 @@ class Level:
         return f"up is {words} by the cameras: {how} within {self.tilt_degrees:.1f} degrees of that, for half of them"
 
 
-def estimate_level(viewmats: Sequence[F64]) -> Level | None:
+def estimate_up_of_cameras(viewmats: Sequence[F64]) -> UpEstimate | None:
     """Estimate up from the cameras of a set.
 
     Args:
@@ -300,21 +300,21 @@ def estimate_level(viewmats: Sequence[F64]) -> Level | None:
     right, own_up, forward = rotations[:, 0], -rotations[:, 1], rotations[:, 2]
     values, directions = np.linalg.eigh(np.mean(right[:, :, None] * right[:, None, :], axis=0))
     mean_up = np.mean(own_up, axis=0)
-    found: list[Level] = []
+    found: list[UpEstimate] = []
     if values[1] > _TURNED:
         up = directions[:, 0]
         towards = float(np.sum(up * mean_up))
         if abs(towards) < _UNDECIDED:
             towards = -float(np.sum(up * np.mean(forward, axis=0)))
         up = up if towards >= 0.0 else -up
-        found.append(_measure_level(up, np.arcsin(np.clip(np.sum(right * up, axis=1), -1.0, 1.0)), by_horizons=True))
+        found.append(_measure_up(up, np.arcsin(np.clip(np.sum(right * up, axis=1), -1.0, 1.0)), by_horizons=True))
     length = float(np.sqrt(np.sum(mean_up**2)))
     if length > _UNDECIDED:
         up = mean_up / length
-        found.append(_measure_level(up, np.arccos(np.clip(np.sum(own_up * up, axis=1), -1.0, 1.0)), by_horizons=False))
+        found.append(_measure_up(up, np.arccos(np.clip(np.sum(own_up * up, axis=1), -1.0, 1.0)), by_horizons=False))
     return next((one for one in found if one.tilt_degrees <= _TILT_MAX), None)
 
 
-def _measure_level(up: F64, angles: F64, *, by_horizons: bool) -> Level:
+def _measure_up(up: F64, angles: F64, *, by_horizons: bool) -> UpEstimate:
     tilt = float(np.degrees(np.median(np.abs(angles))))
-    return Level(unit_up([float(value) for value in up]), tilt, by_horizons)
+    return UpEstimate(unit_up([float(value) for value in up]), tilt, by_horizons)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from csplat_trainer.tuning.tuned_encoding import Clock, Finetuned, finetune
-from csplat_trainer.tuning.tuning_loop import FinetuneResult, TuningStep, tune
-from csplat_trainer.tuning.tuning_options import FinetuneOptions, TuningView, TuningViews, renders_of, split_views
+from csplat_trainer.tuning.tuned_encoding import StageTimer, TunedFile, finetune
+from csplat_trainer.tuning.tuning_loop import TuningResult, TuningStep, tune
+from csplat_trainer.tuning.tuning_options import FinetuneOptions
+from csplat_trainer.tuning.tuning_views import TuningView, TuningViews, renders_of, split_views
 
 __all__ = [
-    "Clock",
     "FinetuneOptions",
-    "FinetuneResult",
-    "Finetuned",
+    "StageTimer",
+    "TunedFile",
+    "TuningResult",
     "TuningStep",
     "TuningView",
     "TuningViews",

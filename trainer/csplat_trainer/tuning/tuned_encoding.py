@@ -23,18 +23,19 @@ from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.training_options import Outputs
 from csplat_trainer.tuning.tuning_loop import TuningStep, tune
-from csplat_trainer.tuning.tuning_options import FinetuneOptions, TuningView, TuningViews, split_views
+from csplat_trainer.tuning.tuning_options import FinetuneOptions
+from csplat_trainer.tuning.tuning_views import TuningView, TuningViews, split_views
 
 
 @dataclass(frozen=True, eq=False)
-class Finetuned:
+class TunedFile:
     """A tuned file.
 
     Attributes:
         result: result of the encoder.
         decoded: values that a decoder returns from it, which are the tuned ones, bit for bit.
         plain: the file of the same decisions without tuning.
-        log: JSON-compatible: options, losses, evaluations on the validation views (`looks`), times.
+        log: JSON-compatible: options, losses, evaluations on the validation views (`validations`), times.
         seconds: duration of `encoding` and `tuning`.
     """
 
@@ -51,7 +52,7 @@ class Finetuned:
 
 
 @dataclass
-class Clock:
+class StageTimer:
     """Seconds by stage."""
 
     seconds: dict[str, float] = field(default_factory=dict)
@@ -78,7 +79,7 @@ def finetune(
     outputs: Outputs | None = None,
     progress: Callable[[str, float], None] | None = None,
     on_step: Callable[[TuningStep], None] | None = None,
-) -> Finetuned:
+) -> TunedFile:
     """Encode a scene, and optimise the values in the file for what a decoder shows; `csplat finetune` calls it.
 
     The same scene, views and options give the same bytes on the same machine, at any number of threads.
@@ -111,17 +112,17 @@ def finetune(
         RuntimeError: the file does not hold the tuned values: a fault of csplat.
     """
     check_model("finetune", model)
-    clock, encoding, options = Clock(), encoding or EncodeOptions(), options or FinetuneOptions()
+    timer, encoding, options = StageTimer(), encoding or EncodeOptions(), options or FinetuneOptions()
     if isinstance(views, DataSet):
         views = _views_of(views, model)
     if importance is None:
         importance = _measured(model, views, encoding, progress)
-    with clock.stage("encoding"):
+    with timer.stage("encoding"):
         draft = EncodePlan.of(
             model, encoding, importance=importance, origin=origin, allow_classes=False, progress=progress
         )
-        frozen = fix_quantisation(draft, source or model, progress)
-        coded = frozen.encode(frozen.start())
+        fixed = fix_quantisation(draft, source or model, progress)
+        coded = fixed.encode(fixed.start())
         plain = coded.write()
 
     def tuning_metadata(steps: int) -> dict[str, Any]:
@@ -140,16 +141,16 @@ def finetune(
             on_step(now)
 
     files = outputs or Outputs()
-    with clock.stage("tuning"):
+    with timer.stage("tuning"):
         tuned = tune(
-            frozen, views, options, size_bytes=size_bytes, progress=show, checkpoint=files.checkpoint,
+            fixed, views, options, size_bytes=size_bytes, progress=show, checkpoint=files.checkpoint,
             checkpoint_every=files.checkpoint_every, resume=files.resume, threads=encoding.threads,
         )  # fmt: skip
-    with clock.stage("encoding"):
-        result = frozen.encode(tuned.held).write(tuning_metadata(tuned.log["best_iteration"]))
+    with timer.stage("encoding"):
+        result = fixed.encode(tuned.best_values).write(tuning_metadata(tuned.log["best_iteration"]))
         decoded = decode(result.data)
-    _check_identity(frozen.dequantise(tuned.held), frozen.source_index, result, decoded)
-    return Finetuned(result, decoded, plain, tuned.log, clock.seconds)
+    _check_identity(fixed.dequantise(tuned.best_values), fixed.source_index, result, decoded)
+    return TunedFile(result, decoded, plain, tuned.log, timer.seconds)
 
 
 def _views_of(data: DataSet, model: SplatModel) -> TuningViews:

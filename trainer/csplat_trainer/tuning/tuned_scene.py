@@ -29,21 +29,21 @@ _ALPHAS = (1e-6, 1.0 - 1e-6)  # range of the opacities that logits are computed 
 
 
 class TunedScene:
-    """Values of a frozen scene, with Adam's memory, which gradients of renders update.
+    """Values of a fixed quantisation, with Adam's memory, which gradients of renders update.
 
     Args:
-        frozen: the encoder's decisions.
+        fixed: the encoder's decisions.
         parameters: state to continue from; `None`: the values that the encoder found.
 
     Attributes:
-        frozen: as given.
+        fixed: as given.
         parameters: named as in training, but `quats`, `scales`, `shN` hold the rows of `FreeValues`; and `sizes`.
     """
 
-    def __init__(self, frozen: FixedQuantisation, parameters: Parameters | None = None) -> None:
-        self.frozen = frozen
-        self.parameters = parameters or Parameters.starting_at(_values(frozen.start()))
-        values, book, shapes = self.parameters.values, frozen.book, frozen.shapes
+    def __init__(self, fixed: FixedQuantisation, parameters: Parameters | None = None) -> None:
+        self.fixed = fixed
+        self.parameters = parameters or Parameters.starting_at(_values(fixed.start()))
+        values, book, shapes = self.parameters.values, fixed.book, fixed.shapes
         self._users = None if book is None else _users(book.index, book.size)
         self._escaped = np.zeros(0, np.int64) if book is None else book.escaped
         self._rows_gradient = np.zeros_like(values["shN"] if book else values["shN"][:0])
@@ -51,30 +51,30 @@ class TunedScene:
         self._own_shape = np.zeros(0, np.int64) if shapes is None else np.flatnonzero(shapes.escaped)
 
     @property
-    def held(self) -> FreeValues:
+    def free_values(self) -> FreeValues:
         """The values for the encoder; all arrays except the opacities are the parameters' own."""
-        return self._held(sigmoid(self.parameters.values["logits"]))
+        return self._free_values(sigmoid(self.parameters.values["logits"]))
 
-    def _held(self, alphas: F32) -> FreeValues:
+    def _free_values(self, alphas: F32) -> FreeValues:
         v = self.parameters.values
         return FreeValues(v["means"], v["quats"], v["scales"], alphas, v["sh0"], v["shN"], v["sizes"])
 
     def dequantise(self) -> tuple[DecodedValues, F32]:
         """Return the values that a decoder will return, and the opacities before they were quantised."""
-        held = self.held
-        return self.frozen.dequantise(held), held.opacities
+        values = self.free_values
+        return self.fixed.dequantise(values), values.opacities
 
     def stream_values(self, seen: DecodedValues) -> StreamValues:
         """Return the contents of the file's streams, as a decoder will return them."""
-        sh = self.frozen.dequantise_sh_rows(self.parameters.values["shN"]) if self.frozen.book is not None else seen.shN
-        if self.frozen.shapes is None:
+        sh = self.fixed.dequantise_sh_rows(self.parameters.values["shN"]) if self.fixed.book is not None else seen.shN
+        if self.fixed.shapes is None:
             return StreamValues(seen.quats, seen.scales, self.parameters.values["sizes"], seen.opacities, seen.sh0, sh)
-        quats, scales, sizes = self.frozen.dequantise_shape_rows(self._held(seen.opacities), seen)
+        quats, scales, sizes = self.fixed.dequantise_shape_rows(self._free_values(seen.opacities), seen)
         return StreamValues(quats, scales, sizes, seen.opacities, seen.sh0, sh)
 
     def count(self, seen: DecodedValues, weight: float) -> RateTerm:
-        """Count the bits of the file's integers; `weight` is in loss per bit and splat."""
-        return RateTerm.count(self.frozen, self.stream_values(seen), weight)
+        """Count the bits of the file's integers; `weight` is lambda, the rate weight: loss per bit and splat."""
+        return RateTerm.count(self.fixed, self.stream_values(seen), weight)
 
     def step(
         self, gradients: Gradients, seen: DecodedValues, alphas: F32, rates: dict[str, float], costs: RateTerm | None
@@ -100,11 +100,11 @@ class TunedScene:
         if costs is not None:
             costs.add_to(steps, self.stream_values(seen))
         adam_step(self.parameters, steps, rates)
-        self.frozen.constrain(self._held(alphas))
+        self.fixed.constrain(self._free_values(alphas))
 
     def _by_row(self, by_splat: F32) -> F32:
         """Return the gradients of the file's rows of SH, given those of all splats [N, K, 3]."""
-        book = self.frozen.book
+        book = self.fixed.book
         if book is None or self._users is None:
             return by_splat
         rows, (order, starts) = self._rows_gradient, self._users
@@ -114,7 +114,7 @@ class TunedScene:
 
     def _by_shape(self, gradients: Gradients) -> tuple[F32, F32, F32]:
         """Return the gradients of the file's rotations and scales, and of the splats' own sizes."""
-        shapes = self.frozen.shapes
+        shapes = self.fixed.shapes
         if shapes is None or self._shape_users is None:
             return gradients.quats, gradients.scales, np.zeros(0, np.float32)
         own, (order, starts) = self._own_shape, self._shape_users
@@ -125,16 +125,16 @@ class TunedScene:
         return quats, scales, gradients.scales.sum(axis=1)
 
 
-def _values(held: FreeValues) -> ParameterArrays:
-    alpha = np.clip(held.opacities.astype(np.float64), *_ALPHAS)
+def _values(start: FreeValues) -> ParameterArrays:
+    alpha = np.clip(start.opacities.astype(np.float64), *_ALPHAS)
     return {
-        "means": held.means,
-        "quats": held.quats,
-        "scales": held.scales,
+        "means": start.means,
+        "quats": start.quats,
+        "scales": start.scales,
         "logits": np.log(alpha / (1.0 - alpha)).astype(np.float32),
-        "sh0": held.sh0,
-        "shN": held.sh,
-        "sizes": held.sizes,
+        "sh0": start.sh0,
+        "shN": start.sh,
+        "sizes": start.sizes,
     }
 
 
@@ -199,30 +199,30 @@ class RateTerm:
     """The rate term of the loss: bits of the file's integers, and their slopes by attribute.
 
     Attributes:
-        frozen: lattices.
-        weight: loss per bit and splat.
+        fixed: lattices.
+        weight: lambda, the rate weight: loss per bit and splat.
         tables: by attribute, and quantisation class if there are several: slopes in bits per step,
             [columns, 2 · 128 + 1].
         bits: bits of all integers, by their order-0 entropy, without centres and indices, which hardly change.
     """
 
-    frozen: FixedQuantisation
+    fixed: FixedQuantisation
     weight: float
     tables: dict[str, F32]
     bits: float = 0.0
 
     @classmethod
-    def count(cls, frozen: FixedQuantisation, stored: StreamValues, weight: float) -> RateTerm:
+    def count(cls, fixed: FixedQuantisation, stored: StreamValues, weight: float) -> RateTerm:
         """Count the integers of a scene.
 
         Args:
-            frozen: the encoder's decisions.
+            fixed: the encoder's decisions.
             stored: contents of the streams.
-            weight: loss per bit and splat.
+            weight: lambda, the rate weight: loss per bit and splat.
         """
-        costs = cls(frozen, weight, {})
-        plan = frozen.parameters
-        for number, grade in enumerate(_class_steps(frozen)):
+        costs = cls(fixed, weight, {})
+        plan = fixed.parameters
+        for number, grade in enumerate(_class_steps(fixed)):
             rows = grade.rows
             columns = {
                 "scales": _integers(stored.scales[rows], grade.scale_step),
@@ -247,7 +247,7 @@ class RateTerm:
     @property
     def loss(self) -> float:
         """Weight times bits per splat."""
-        return self.weight * self.bits / len(self.frozen.source_index)
+        return self.weight * self.bits / len(self.fixed.source_index)
 
     def add_to(self, steps: ParameterArrays, stored: StreamValues) -> None:
         """Add the slopes to gradients.
@@ -256,10 +256,10 @@ class RateTerm:
             steps: gradients of the loss by group; changed in place.
             stored: contents of the streams.
         """
-        plan, tables = self.frozen.parameters, self.tables
+        plan, tables = self.fixed.parameters, self.tables
         per_bit = np.float32(self.weight / len(stored.opacities))
         shift = plan.chroma_shift
-        for number, grade in enumerate(_class_steps(self.frozen)):
+        for number, grade in enumerate(_class_steps(self.fixed)):
             rows = grade.rows
             scales, quats, opacities, sh0 = (
                 tables[_table_name(name, number)] for name in ("scales", "quats", "opacities", "sh0")
@@ -288,9 +288,9 @@ class _ClassSteps:
     sh0_step: float
 
 
-def _class_steps(frozen: FixedQuantisation) -> list[_ClassSteps]:
-    plan, tiles = frozen.parameters, frozen.encode_plan.tiles
-    begins = [0] if frozen.encode_plan.classes is None else [
+def _class_steps(fixed: FixedQuantisation) -> list[_ClassSteps]:
+    plan, tiles = fixed.parameters, fixed.encode_plan.tiles
+    begins = [0] if fixed.encode_plan.classes is None else [
         number for number, tile in enumerate(tiles) if not number or tile.factors != tiles[number - 1].factors
     ]  # fmt: skip
     found = []

@@ -1,6 +1,7 @@
-"""`tune`: optimise the values of a frozen scene until renders of its file match the reference images.
+"""`tune`: optimise the values of a fixed quantisation until renders of its file match the reference images.
 
-A target size is held by the rate weight, the loss per bit and splat: `RateController` adjusts it to the number of bits.
+A target size is reached by lambda, the rate weight: loss per bit and splat. `RateController` adjusts it to the number
+of bits.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ from csplat_trainer.losses import LOSS_WEIGHTS, PhotometricLoss
 from csplat_trainer.parameters import GROUPS, Parameters
 from csplat_trainer.training_report import peak_memory
 from csplat_trainer.tuning.tuned_scene import RateTerm, TunedScene
-from csplat_trainer.tuning.tuning_options import FinetuneOptions, TuningView, TuningViews
+from csplat_trainer.tuning.tuning_options import FinetuneOptions
+from csplat_trainer.tuning.tuning_views import TuningView, TuningViews
 
 _COUNT_EVERY = 50  # steps between counts of the integers
 _MIN_GAIN = 2e-4  # smallest relative difference of the score that counts as a gain
@@ -61,20 +63,20 @@ class TuningStep:
 
 
 @dataclass(frozen=True, eq=False)
-class FinetuneResult:
+class TuningResult:
     """Result of a run.
 
     Attributes:
-        held: the values that scored best on the validation views, those of the start if none did.
-        log: JSON-compatible: options, losses, evaluations (`looks`), times.
+        best_values: the values that scored best on the validation views, those of the start if none did.
+        log: JSON-compatible: options, losses, evaluations (`validations`), times.
     """
 
-    held: FreeValues
+    best_values: FreeValues
     log: dict[str, Any]
 
 
 def tune(
-    frozen: FixedQuantisation,
+    fixed: FixedQuantisation,
     views: TuningViews,
     options: FinetuneOptions | None = None,
     *,
@@ -84,13 +86,13 @@ def tune(
     checkpoint_every: int = 0,
     resume: str | Path | None = None,
     threads: int | None = None,
-) -> FinetuneResult:
-    """Fine-tune a frozen scene.
+) -> TuningResult:
+    """Fine-tune a fixed quantisation.
 
     The same scene, views and options give the same values on the same machine, at any number of threads.
 
     Args:
-        frozen: the encoder's decisions.
+        fixed: the encoder's decisions.
         views: the reference images of the file.
         options: options of the tuning.
         size_bytes: largest size of the file: the rate weight is then adjusted to keep to it, beginning with
@@ -98,15 +100,15 @@ def tune(
         progress: called every `log_every` steps.
         checkpoint: file for checkpoints, each of which replaces the last; `None`: none are written.
         checkpoint_every: steps between checkpoints; 0: only at the end.
-        resume: a checkpoint of the same frozen scene to continue from.
+        resume: a checkpoint of the same fixed quantisation to continue from.
         threads: number of threads; `None` for all.
 
     Raises:
         InputError: a checkpoint is damaged, or of another scene, views or options; or a loss or a value is not finite.
     """
-    run = _TuningRun(frozen, views, options or FinetuneOptions(), threads, size_bytes)
+    run = _TuningRun(fixed, views, options or FinetuneOptions(), threads, size_bytes)
     if resume is not None:
-        run.resume(load_finetune(resume, frozen))
+        run.resume(load_finetune(resume, fixed))
     return run.run(progress, checkpoint, checkpoint_every)
 
 
@@ -114,7 +116,7 @@ def tune(
 class _BestValues:
     """The values of the best evaluation so far, and the number of later evaluations that count."""
 
-    held: FreeValues
+    values: FreeValues
     score: float
     psnr: float
     iteration: int = 0
@@ -134,19 +136,17 @@ class _TuningRun:
 
     def __init__(
         self,
-        frozen: FixedQuantisation,
+        fixed: FixedQuantisation,
         views: TuningViews,
         options: FinetuneOptions,
         threads: int | None,
         size_bytes: int | None,
     ) -> None:
         self._views, self._options = views, options
-        self._scene = TunedScene(frozen)
+        self._scene = TunedScene(fixed)
         self._rasteriser = Rasteriser(threads=threads)
-        self._antialiased = frozen.encode_plan.model.antialiased
-        self._extent = float(
-            np.exp(np.clip(np.median(np.median(frozen.encode_plan.model.scales, axis=1)), -80.0, 80.0))
-        )
+        self._antialiased = fixed.encode_plan.model.antialiased
+        self._extent = float(np.exp(np.clip(np.median(np.median(fixed.encode_plan.model.scales, axis=1)), -80.0, 80.0)))
         self._rng = Generator(PCG64(options.seed))
         self._iteration, self._queue = 0, list[int]()
         self._sizes: dict[tuple[int, int], _ImageBuffers] = {}
@@ -172,7 +172,7 @@ class _TuningRun:
         for name, value in asdict(self._options).items():
             if name != "iterations" and before[name] != value:
                 raise InputError(f"the checkpoint is of a run with another {name}: {before[name]}")
-        self._scene = TunedScene(self._scene.frozen, checkpoint.parameters)
+        self._scene = TunedScene(self._scene.fixed, checkpoint.parameters)
         self._rng.bit_generator.state = checkpoint.rng_state
         self._iteration = checkpoint.iteration
         self._queue = [index for index in checkpoint.queue if index < len(self._views.train)]
@@ -180,14 +180,14 @@ class _TuningRun:
         for look in self._log["validations"]:
             look.setdefault("size_bytes", 0)  # older checkpoints lack it if no size was requested
         self._gains = ImageGains(len(self._views.train), self._log.get("exposures", ()))
-        self._best = _BestValues(checkpoint.best_held, *checkpoint.best)
+        self._best = _BestValues(checkpoint.best_values, *checkpoint.best)
         self._controller = controller
         if checkpoint.costs:
-            self._rate_term = RateTerm(self._scene.frozen, self._byte_cost, checkpoint.costs)
+            self._rate_term = RateTerm(self._scene.fixed, self._byte_cost, checkpoint.costs)
 
     def run(
         self, progress: Callable[[TuningStep], None] | None, checkpoint: str | Path | None, checkpoint_every: int
-    ) -> FinetuneResult:
+    ) -> TuningResult:
         options = self._options
         begin, first, spent = time.perf_counter(), self._iteration, float(self._log["seconds"])
         if self._best is None:
@@ -211,7 +211,7 @@ class _TuningRun:
         if checkpoint is not None:
             self._save(checkpoint)
         assert self._best is not None
-        return FinetuneResult(self._best.held, self._full_log())
+        return TuningResult(self._best.values, self._full_log())
 
     @property
     def _has_converged(self) -> bool:
@@ -233,7 +233,7 @@ class _TuningRun:
                 self._controller.update(self._rate_term.bits, done, self._options.byte_cost)
         rendered = self._render(seen, view)
         buffers = self._buffers(view)
-        rate = self._options.lr_exposure * self._options.share(self._iteration)
+        rate = self._options.lr_exposure * self._options.learning_rate_factor(self._iteration)
         gain = ImageGain(self._gains, number, rate) if self._options.lr_exposure else None
         shown = rendered if gain is None else gain.apply(rendered)
         value, slope = buffers.loss(shown, view.image(self._views.background, buffers.reference), view.mask)
@@ -249,20 +249,20 @@ class _TuningRun:
 
     @property
     def _byte_cost(self) -> float:
-        """The present rate weight: loss per bit and splat."""
+        """Lambda at present, the rate weight: loss per bit and splat."""
         return self._options.byte_cost if self._controller is None else self._controller.byte_cost
 
     def _rates(self) -> dict[str, float]:
         options = self._options
-        share = options.share(self._iteration)
+        factor = options.learning_rate_factor(self._iteration)
         return {
-            "means": options.lr_means * self._extent * share,
-            "quats": options.lr_quats * share,
-            "scales": options.lr_scales * share,
-            "sizes": options.lr_scales * share,
-            "logits": options.lr_opacities * share,
-            "sh0": options.lr_sh0 * share,
-            "shN": (options.lr_shN if self._scene.frozen.book is None else options.lr_entries) * share,
+            "means": options.lr_means * self._extent * factor,
+            "quats": options.lr_quats * factor,
+            "scales": options.lr_scales * factor,
+            "sizes": options.lr_scales * factor,
+            "logits": options.lr_opacities * factor,
+            "sh0": options.lr_sh0 * factor,
+            "shN": (options.lr_shN if self._scene.fixed.book is None else options.lr_entries) * factor,
         }
 
     def _render(self, seen: DecodedValues, view: TuningView) -> F32:
@@ -287,7 +287,7 @@ class _TuningRun:
             count += rendered.size if view.mask is None else 3 * int(view.mask.sum())
         costs = self._scene.count(seen, self._options.byte_cost)
         psnr = psnr_of_mse(error / count)
-        size_bytes = len(self._scene.frozen.encode(self._scene.held).write().data)
+        size_bytes = len(self._scene.fixed.encode(self._scene.free_values).write().data)
         shrinks = False
         if self._controller is None:
             score = loss + costs.loss
@@ -299,7 +299,7 @@ class _TuningRun:
             {"iteration": self._iteration, "loss": loss, "psnr": psnr, "size_bytes": size_bytes}
         )
         if self._best is None or score < self._best.score * (1.0 - _MIN_GAIN):
-            self._best = _BestValues(self._scene.held.copy(), score, psnr, self._iteration)
+            self._best = _BestValues(self._scene.free_values.copy(), score, psnr, self._iteration)
         elif self._options.has_calmed(self._iteration) and not shrinks:
             self._best.since += 1
 
@@ -340,11 +340,11 @@ class _TuningRun:
                 self._queue,
                 asdict(self._options),
                 self._log,
-                self._best.held,
+                self._best.values,
                 {} if self._rate_term is None else self._rate_term.tables,
                 best,
             ),
-            self._scene.frozen,
+            self._scene.fixed,
         )
 
     def _full_log(self) -> dict[str, Any]:
@@ -381,7 +381,7 @@ class RateController:
 
     Attributes:
         size_bytes: largest size of the file.
-        byte_cost: rate weight at present: loss per bit and splat.
+        byte_cost: lambda at present, the rate weight: loss per bit and splat.
         first_bits: bits of the integers at the start of the run; 0: not known yet.
         goal_bits: bits of the integers of a file of that size, estimated from the last file.
     """
@@ -457,7 +457,7 @@ class FinetuneCheckpoint:
         queue: indices of the images that remain in this epoch.
         options: options of the run, as a dictionary.
         log: log so far.
-        best_held: the best values so far.
+        best_values: the best values so far.
         costs: slopes of the rate by attribute, from the last count; empty before the first.
         best: score and PSNR of the best values on the validation views, their step, number of evaluations since.
     """
@@ -468,17 +468,17 @@ class FinetuneCheckpoint:
     queue: list[int]
     options: dict[str, Any]
     log: dict[str, Any]
-    best_held: FreeValues
+    best_values: FreeValues
     costs: dict[str, NDArray[np.float32]]
     best: tuple[float, float, int, int]
 
 
-def save_finetune(path: str | Path, checkpoint: FinetuneCheckpoint, frozen: FixedQuantisation) -> None:
+def save_finetune(path: str | Path, checkpoint: FinetuneCheckpoint, fixed: FixedQuantisation) -> None:
     """Write a checkpoint; the file gets its name only when it is complete."""
     facts = {
         "kind": _KIND,
         "version": _VERSION,
-        "frozen": fingerprint(frozen),
+        "frozen": fingerprint(fixed),
         "iteration": checkpoint.iteration,
         "step": checkpoint.parameters.step,
         "rng_state": checkpoint.rng_state,
@@ -490,14 +490,14 @@ def save_finetune(path: str | Path, checkpoint: FinetuneCheckpoint, frozen: Fixe
     arrays: dict[str, NDArray[Any]] = {"facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)}
     for kind in ("values", "first", "second"):
         arrays |= {f"{kind}_{name}": getattr(checkpoint.parameters, kind)[name] for name in _GROUPS}
-    arrays |= {f"best_{name}": getattr(checkpoint.best_held, name) for name in _FREE_VALUES}
+    arrays |= {f"best_{name}": getattr(checkpoint.best_values, name) for name in _FREE_VALUES}
     arrays |= {f"costs_{name}": table for name, table in checkpoint.costs.items()}
     with atomic_writer(str(path)) as stream:
         np.savez(stream, allow_pickle=False, **arrays)
 
 
-def load_finetune(path: str | Path, frozen: FixedQuantisation) -> FinetuneCheckpoint:
-    """Read a checkpoint of a frozen scene.
+def load_finetune(path: str | Path, fixed: FixedQuantisation) -> FinetuneCheckpoint:
+    """Read a checkpoint of a fixed quantisation.
 
     Raises:
         InputError: the file is not a checkpoint, was written by another version, or for another scene or other options
@@ -511,7 +511,7 @@ def load_finetune(path: str | Path, frozen: FixedQuantisation) -> FinetuneCheckp
     if facts.get("version") != _VERSION:
         raise InputError(f"{path} is a checkpoint of version {facts.get('version')}, wanted {_VERSION}")
     stored.check(facts, _FACTS)
-    if facts["frozen"] != fingerprint(frozen):
+    if facts["frozen"] != fingerprint(fixed):
         raise InputError(f"{path} belongs to another scene, or to other options of the encoder")
     if len(facts["best"]) != _BEST_COUNT or not all(isinstance(one, (int, float)) for one in facts["best"]):
         stored.refuse(f"its best look is {facts['best']}")
@@ -532,22 +532,22 @@ def load_finetune(path: str | Path, frozen: FixedQuantisation) -> FinetuneCheckp
         costs,
         (score, psnr, iteration, since),
     )
-    _check(path, checkpoint, frozen.start())
+    _check(path, checkpoint, fixed.start())
     return checkpoint
 
 
-def fingerprint(frozen: FixedQuantisation) -> str:
+def fingerprint(fixed: FixedQuantisation) -> str:
     """Return a digest of the encoder's decisions, and of the values that they were made for."""
-    digest, start = hashlib.sha256(repr(frozen.parameters).encode()), frozen.start()
-    index = () if frozen.book is None else (frozen.book.index,)
-    for array in (frozen.source_index, *index, *(getattr(start, name) for name in _FREE_VALUES)):
+    digest, start = hashlib.sha256(repr(fixed.parameters).encode()), fixed.start()
+    index = () if fixed.book is None else (fixed.book.index,)
+    for array in (fixed.source_index, *index, *(getattr(start, name) for name in _FREE_VALUES)):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 
 def _check(path: str | Path, checkpoint: FinetuneCheckpoint, start: FreeValues) -> None:
     shapes = {name: getattr(start, name).shape for name in _FREE_VALUES}
-    found: dict[str, list[NDArray[Any]]] = {name: [getattr(checkpoint.best_held, name)] for name in _FREE_VALUES}
+    found: dict[str, list[NDArray[Any]]] = {name: [getattr(checkpoint.best_values, name)] for name in _FREE_VALUES}
     parameters = checkpoint.parameters
     for part in (parameters.values, parameters.first, parameters.second):
         for name in _GROUPS:

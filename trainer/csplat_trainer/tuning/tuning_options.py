@@ -1,22 +1,11 @@
-"""`FinetuneOptions`, checked once; and the views of fine-tuning: images, or renders of the source."""
+"""`FinetuneOptions`, checked once."""
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat.model import SplatModel
-from csplat.types import F32
-from csplat_render.camera import Camera
-from csplat_render.rasteriser import Rasteriser
-from csplat_trainer.posed_images import PosedImage, compose
 from csplat_trainer.training_options import LOSSES, Loss
 
 
@@ -36,7 +25,7 @@ class FinetuneOptions:
         lr_shN: learning rate of the higher SH coefficients.
         lr_entries: learning rate of the codebook's entries.
         lr_exposure: as in `TrainOptions`; 0: gains and biases of images are not trained.
-        byte_cost: rate weight: loss per bit and splat; 0: the size of the file has no influence.
+        byte_cost: lambda, the rate weight: loss per bit and splat; 0: the size of the file has no influence.
         warm_up: steps in which Adam estimates the magnitude of gradients, and values hardly move.
         decay: fraction of the learning rates that remains at the end. It is tiny, because values that still move
             alternate between two integers.
@@ -76,7 +65,7 @@ class FinetuneOptions:
             if not (math.isfinite(value) and low <= value <= high):
                 raise InputError(f"{name} is {value}, wanted {low:g} to {high:g}")
 
-    def share(self, iteration: int) -> float:
+    def learning_rate_factor(self, iteration: int) -> float:
         """Return the factor of the learning rates at a step."""
         done = (iteration - 1) / self.iterations
         rising = min(1.0, iteration / (self.warm_up + 1))
@@ -84,7 +73,7 @@ class FinetuneOptions:
 
     def has_calmed(self, iteration: int) -> bool:
         """Return True if evaluations without a gain count."""
-        return iteration > 0.5 * self.iterations and self.share(iteration) <= _CALM
+        return iteration > 0.5 * self.iterations and self.learning_rate_factor(iteration) <= _CALM
 
     def scaled(self, factor: float) -> FinetuneOptions:
         """Return the same options with all learning rates times a factor."""
@@ -112,111 +101,3 @@ _RANGES: dict[str, tuple[float, float]] = {
     "patience": (0, 10**6),
     "log_every": (1, 10**7),
 }
-
-
-_MAX_VALIDATION = 16  # largest number of validation views that are training views too
-_FLOAT16_MAX = np.float32(6e4)  # largest value for float16
-
-
-@dataclass(frozen=True, eq=False)
-class TuningView:
-    """A camera and its reference image.
-
-    Attributes:
-        camera: relative to the scene's origin.
-        reference: the reference image: an image of a data set, or [H, W, 3] float16 or float32.
-
-    Raises:
-        InputError: the reference has another size than the camera's image.
-    """
-
-    camera: Camera
-    reference: PosedImage | NDArray[np.floating[Any]]
-
-    def __post_init__(self) -> None:
-        shape = (self.camera.H, self.camera.W, 3)
-        if not isinstance(self.reference, PosedImage) and self.reference.shape != shape:
-            raise InputError(f"a wanted picture has shape {list(self.reference.shape)}, wanted {list(shape)}")
-
-    @property
-    def mask(self) -> NDArray[np.bool_] | None:
-        """Pixels that count, [H, W]; `None`: all of them."""
-        return self.reference.mask if isinstance(self.reference, PosedImage) else None
-
-    def image(self, background: F32, out: F32) -> F32:
-        """Return the reference image, [H, W, 3] float32; `out` may be overwritten and returned."""
-        if isinstance(self.reference, PosedImage):
-            return compose(self.reference, background, out)
-        np.copyto(out, self.reference)
-        return out
-
-
-@dataclass(frozen=True, eq=False)
-class TuningViews:
-    """Training views, validation views, and the colour behind all of them.
-
-    Attributes:
-        train: at least one.
-        validation: at least one; they are among `train` unless they are held out.
-        background: [3].
-
-    Raises:
-        InputError: one of the two is empty.
-    """
-
-    train: Sequence[TuningView]
-    validation: Sequence[TuningView]
-    background: F32
-
-    def __post_init__(self) -> None:
-        if not self.train or not self.validation:
-            raise InputError("fine-tuning wants at least one view to learn from and one to decide by")
-
-    @property
-    def digest(self) -> str:
-        """Hash of the training cameras, the split and the background, which identifies these views."""
-        cameras = [(c.W, c.H, c.K.tolist(), c.viewmat.tolist()) for c in (one.camera for one in self.train)]
-        identity = repr((cameras, len(self.validation), self.is_held_out, self.background.tolist()))
-        return hashlib.sha256(identity.encode()).hexdigest()
-
-    @property
-    def is_held_out(self) -> bool:
-        """True if no validation view is a training view."""
-        return not any(one is other for one in self.validation for other in self.train)
-
-
-def split_views(views: Sequence[TuningView], background: F32, validation_count: int = 0) -> TuningViews:
-    """Split views into training and validation views.
-
-    A scene fits the images that it was trained on better than others. If some of them are held out here, they score
-    worse with every step, whatever is gained elsewhere; so by default all are training views, and some of them are
-    validation views, too.
-
-    Args:
-        views: the views, in the order in which they were taken.
-        background: [3], behind all of them.
-        validation_count: number of validation views that are held out: images that the scene was not trained on, or
-            renders of it. 0: none.
-
-    Raises:
-        InputError: `validation_count` leaves no training view.
-    """
-    if validation_count >= len(views):
-        raise InputError(f"{validation_count} of {len(views)} views to decide by leave none to learn from")
-    count = validation_count or min(len(views), _MAX_VALIDATION)
-    validation = {(2 * number + 1) * len(views) // (2 * count) for number in range(count)}
-    training = [view for number, view in enumerate(views) if not validation_count or number not in validation]
-    return TuningViews(training, [views[number] for number in sorted(validation)], background)
-
-
-def renders_of(source: SplatModel, cameras: Sequence[Camera], background: F32, threads: int | None) -> list[TuningView]:
-    """Return renders of a scene as views: the reference for its file if there are no images.
-
-    They are kept in float16, with a PSNR of at least 66 dB up to white; there are hundreds of them.
-    """
-    rasteriser = Rasteriser(gradients=False, threads=threads)
-    views = []
-    for camera in cameras:
-        seen = rasteriser.forward(source, camera, background=background, antialiased=source.antialiased).rgb
-        views.append(TuningView(camera, np.clip(seen, -_FLOAT16_MAX, _FLOAT16_MAX).astype(np.float16)))
-    return views

@@ -42,8 +42,9 @@ from csplat_bench.common.measuring import timed
 from csplat_bench.common.peers import find_splat_transform, judged, transform
 from csplat_bench.common.report import table, tell_machine, write_json
 from csplat_bench.common.scenes import MADE, NPM, Scene, find_scenes, given_cameras, judge_of
+from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
-from csplat_render.virtual_cameras import scene_frame, virtual_cameras
+from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.console import note
 
 _SCENES = "fox120k,fox60k_noreg,lego60k,plane3,statue,donut,jacket,horse,angel,st-peter"

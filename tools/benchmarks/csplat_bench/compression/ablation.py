@@ -26,19 +26,19 @@ def ablation(bench: Bench, tuned: Tuned) -> list[Step]:
     Returns:
         A row for each; its size is as `sizes` counts it.
     """
-    frozen, start, log = tuned.frozen, tuned.frozen.start(), tuned.seconds
-    before = frozen.dequantise(start)
-    pruned, size = frozen.encode_plan.model, len(tuned.chosen.model)
-    colours, shapes = books_of(frozen)
+    fixed, start, log = tuned.fixed, tuned.fixed.start(), tuned.seconds
+    before = fixed.dequantise(start)
+    pruned, size = fixed.encode_plan.model, len(tuned.chosen.model)
+    colours, shapes = books_of(fixed)
     coefficients = 3 * bench.source.shN.shape[1]
-    by_colour = _served_colours(frozen, before.shN)
-    by_both = _served_shapes(frozen, by_colour, before.quats, before.scales)
-    unordered = _unordered(frozen, tuned.held)
+    by_colour = _served_colours(fixed, before.shN)
+    by_both = _served_shapes(fixed, by_colour, before.quats, before.scales)
+    unordered = _unordered(fixed, tuned.best_values)
     files = {"unordered": decode(unordered.data), "file": decode(tuned.result.data)}
     assert _same_set(files["unordered"], files["file"]), "the order of the splats changed what they are"
     models = {
         "none": bench.source, "pruned": pruned, "colours": by_colour, "shapes": by_both,
-        "quantised": _as_model(frozen, start), "tuned": _as_model(frozen, tuned.held), **files,
+        "quantised": _as_model(fixed, start), "tuned": _as_model(fixed, tuned.best_values), **files,
     }  # fmt: skip
     scores = bench.judge(models)
     shape_seconds = log["of it shapes"]
@@ -49,8 +49,8 @@ def ablation(bench: Bench, tuned: Tuned) -> list[Step]:
          float_bytes(size, coefficients, colours, None), log["clustering"] - shape_seconds),
         ("+ shape codebook" + ("" if shapes else " (none made)"), "shapes", "floats",
          float_bytes(size, coefficients, colours, shapes), shape_seconds),
-        ("+ quantisation", "quantised", "integers", integer_bytes(integer_columns(frozen, start)), 0.0),
-        ("+ fine-tuning", "tuned", "integers", integer_bytes(integer_columns(frozen, tuned.held)), log["tuning"]),
+        ("+ quantisation", "quantised", "integers", integer_bytes(integer_columns(fixed, start)), 0.0),
+        ("+ fine-tuning", "tuned", "integers", integer_bytes(integer_columns(fixed, tuned.best_values)), log["tuning"]),
         ("+ entropy coding", "unordered", "file", len(unordered.data), log["encoding"]),
         ("+ Morton order", "file", "file", len(tuned.result.data), 0.0),
     ]  # fmt: skip
@@ -60,42 +60,42 @@ def ablation(bench: Bench, tuned: Tuned) -> list[Step]:
     ]
 
 
-def _served_colours(frozen: FixedQuantisation, shN: NDArray[np.float32]) -> SplatModel:
+def _served_colours(fixed: FixedQuantisation, shN: NDArray[np.float32]) -> SplatModel:
     """The scene before quantisation, SH by codebook if it has one."""
-    model = frozen.encode_plan.model
-    if frozen.book is None:
+    model = fixed.encode_plan.model
+    if fixed.book is None:
         return model
     served = np.zeros_like(model.shN)  # bands that are not kept are gone
     served[:, : shN.shape[1]] = shN
-    served[frozen.book.escaped] = model.shN[frozen.book.escaped]
+    served[fixed.book.escaped] = model.shN[fixed.book.escaped]
     return replace(model, shN=served)
 
 
 def _served_shapes(
-    frozen: FixedQuantisation, model: SplatModel, quats: NDArray[np.float32], scales: NDArray[np.float32]
+    fixed: FixedQuantisation, model: SplatModel, quats: NDArray[np.float32], scales: NDArray[np.float32]
 ) -> SplatModel:
     """The scene before quantisation, shapes by codebook if it has one."""
-    if frozen.shapes is None:
+    if fixed.shapes is None:
         return model
-    own = frozen.shapes.escaped[:, None]
+    own = fixed.shapes.escaped[:, None]
     return replace(model, quats=np.where(own, model.quats, quats), scales=np.where(own, model.scales, scales))
 
 
-def _as_model(frozen: FixedQuantisation, held: FreeValues) -> SplatModel:
+def _as_model(fixed: FixedQuantisation, values: FreeValues) -> SplatModel:
     """Return the model that a decoder will reconstruct, without writing a file."""
-    seen, model = frozen.dequantise(held), frozen.encode_plan.model
+    seen, model = fixed.dequantise(values), fixed.encode_plan.model
     shN = np.zeros_like(model.shN)
     shN[:, : seen.shN.shape[1]] = seen.shN
     arrays = {name: getattr(seen, name) for name in ARRAYS if name != "shN"}
     return replace(model, **arrays, shN=shN)
 
 
-def _unordered(frozen: FixedQuantisation, held: FreeValues) -> EncodeResult:
+def _unordered(fixed: FixedQuantisation, values: FreeValues) -> EncodeResult:
     """The same file with the splats of each tile in the order of the source, their centres coded axis by axis."""
-    plan = frozen.encode_plan
-    tiles = [replace(tile, rows=tile.rows[np.argsort(frozen.source_index[tile.rows])]) for tile in plan.tiles]
+    plan = fixed.encode_plan
+    tiles = [replace(tile, rows=tile.rows[np.argsort(fixed.source_index[tile.rows])]) for tile in plan.tiles]
     plan = replace(plan, tiles=tiles, parameters=replace(plan.parameters, morton=False))
-    return replace(frozen, encode_plan=plan).encode(held).write()
+    return replace(fixed, encode_plan=plan).encode(values).write()
 
 
 def _same_set(one: SplatModel, other: SplatModel) -> bool:

@@ -18,21 +18,21 @@ from csplat_trainer.tuning import tune
 
 
 class Unquantised(FixedQuantisation):
-    """A frozen scene whose quantisers do nothing: tuning it is training on, with the same steps and the same views."""
+    """A fixed quantisation that rounds nothing: tuning it is training on, with the same steps and the same views."""
 
     @classmethod
-    def freeing(cls, frozen: FixedQuantisation) -> Unquantised:
+    def freeing(cls, fixed: FixedQuantisation) -> Unquantised:
         """The same scene; it must have no codebooks."""
-        assert frozen.book is None
-        assert frozen.shapes is None
-        return cls(**{**vars(frozen), "zero": None})
+        assert fixed.book is None
+        assert fixed.shapes is None
+        return cls(**{**vars(fixed), "zero": None})
 
-    def constrain(self, held: FreeValues) -> None:
+    def constrain(self, values: FreeValues) -> None:
         """Leave values where they are: no file bounds them."""
 
-    def dequantise(self, held: FreeValues) -> DecodedValues:
+    def dequantise(self, values: FreeValues) -> DecodedValues:
         """The values themselves, in arrays of their own."""
-        here = held.copy()
+        here = values.copy()
         return DecodedValues(here.means, here.quats, here.scales, here.opacities, here.sh0, here.sh)
 
 
@@ -43,18 +43,18 @@ def control(bench: Bench) -> Control:
     """
     chosen, _ = bench.chosen()
     options = EncodeOptions(preset="fast", sh_coding="scalar", threads=bench.threads)
-    frozen = bench.frozen(chosen.model, chosen.rows, options, chosen.importance)
+    fixed = bench.fix_scene(chosen.model, chosen.rows, options, chosen.importance)
     tuning = replace(bench.tuning, byte_cost=0.0, patience=0)
-    run, timing = timed(tune, Unquantised.freeing(frozen), bench.views, tuning, threads=bench.threads)
-    held = run.held
+    run, timing = timed(tune, Unquantised.freeing(fixed), bench.views, tuning, threads=bench.threads)
+    values = run.best_values
     trained = replace(
-        frozen.encode_plan.model, means=held.means, quats=held.quats, scales=held.scales, opacities=held.opacities,
-        sh0=held.sh0, shN=held.sh,
+        fixed.encode_plan.model, means=values.means, quats=values.quats, scales=values.scales,
+        opacities=values.opacities, sh0=values.sh0, shN=values.sh,
     )  # fmt: skip
-    rows = np.searchsorted(chosen.rows, frozen.source_index)
+    rows = np.searchsorted(chosen.rows, fixed.source_index)
     told = chosen.importance
     weights = told.select(rows) if isinstance(told, Importance) else told[rows]
-    again = bench.frozen(trained, frozen.source_index, bench.encoding, weights)
+    again = bench.fix_scene(trained, fixed.source_index, bench.encoding, weights)
     data = again.encode(again.start()).write().data
     scores = bench.judge({"source": bench.source, "trained on": trained, "then a file": decode(data)})
     return {

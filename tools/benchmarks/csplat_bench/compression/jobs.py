@@ -98,6 +98,6 @@ def warm(bench: Bench) -> None:
     """Compile what a tuning runs: no row is to pay for it."""
     some = bench.source.select(slice(0, 500))
     options = EncodeOptions(sh_coding="codebook", codebook_size=16, threads=bench.threads)
-    frozen = fix_quantisation(EncodePlan.of(some, options, allow_classes=False))
-    tune(frozen, bench.views, FinetuneOptions(iterations=1), threads=bench.threads)
+    fixed = fix_quantisation(EncodePlan.of(some, options, allow_classes=False))
+    tune(fixed, bench.views, FinetuneOptions(iterations=1), threads=bench.threads)
     measure_sensitivity(some, bench.looks.training[:1], metric=True)

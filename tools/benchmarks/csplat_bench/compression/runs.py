@@ -36,7 +36,7 @@ from csplat_tools.inspect.file_description import bytes_by_attribute
 from csplat_tools.training.tuning_inputs import TuningSubset, choose_splats, training_views
 from csplat_tools.training.tuning_report import score_models
 from csplat_tools.views import DataOptions, find_view_set
-from csplat_trainer.tuning import Clock, FinetuneOptions, TuningViews, tune
+from csplat_trainer.tuning import FinetuneOptions, StageTimer, TuningViews, tune
 
 #: Splats, and the seconds that it took to choose them, by stage.
 Pick = tuple[TuningSubset, dict[str, float]]
@@ -44,20 +44,20 @@ Pick = tuple[TuningSubset, dict[str, float]]
 
 @dataclass(frozen=True, eq=False)
 class Tuned:
-    """A scene that was frozen and tuned.
+    """A tuned scene and the quantisation that it was tuned for.
 
     Attributes:
         chosen: its splats.
-        frozen: the encoder's decisions.
-        held: the values that were tuned.
+        fixed: the encoder's decisions.
+        best_values: the values that were tuned.
         plain: the file before tuning. result: the file.
         log: log of the tuning.
         seconds: time by stage, without judging.
     """
 
     chosen: TuningSubset
-    frozen: FixedQuantisation
-    held: FreeValues
+    fixed: FixedQuantisation
+    best_values: FreeValues
     plain: EncodeResult
     result: EncodeResult
     log: Mapping[str, Any]
@@ -113,19 +113,19 @@ class Bench:
         return self._picks[keep, told]
 
     def _pick(self, keep: float | None, *, told: bool) -> Pick:
-        clock = Clock()
-        with clock.stage("choosing"):
+        timer = StageTimer()
+        with timer.stage("choosing"):
             chosen = choose_splats(self.source, self.looks, keep=keep, threads=self.threads)
         if told:
-            return chosen, clock.seconds
-        clock = Clock()  # it would not have measured what it is not told
-        with clock.stage("choosing"):
+            return chosen, timer.seconds
+        timer = StageTimer()  # it would not have measured what it is not told
+        with timer.stage("choosing"):
             removal = measure_pruning_error(
                 chosen.model, self.looks.training, background=self.looks.background, threads=self.threads
             )
-        return replace(chosen, importance=removal.squared_weight), clock.seconds
+        return replace(chosen, importance=removal.squared_weight), timer.seconds
 
-    def frozen(
+    def fix_scene(
         self, model: SplatModel, rows: NDArray[np.int64], encoding: EncodeOptions,
         importance: NDArray[Any] | Importance, progress: _Stages | None = None,
     ) -> FixedQuantisation:  # fmt: skip
@@ -145,23 +145,25 @@ class Bench:
         """
         chosen, seconds = pick or self.chosen()
         views, stages = self.views, _Stages()
-        clock = Clock(dict(seconds))
-        with clock.stage("clustering"):
-            frozen = self.frozen(chosen.model, chosen.rows, encoding, chosen.importance, stages)
-        plain = frozen.encode(frozen.start()).write()  # not a part of the work: what it would have been without
-        with clock.stage("tuning"):
-            run = tune(frozen, views, self.tuning, threads=self.threads)
-        with clock.stage("encoding"):
-            result = frozen.encode(run.held).write()
-        return Tuned(chosen, frozen, run.held, plain, result, run.log, {**clock.seconds, "of it shapes": stages.shapes})
+        timer = StageTimer(dict(seconds))
+        with timer.stage("clustering"):
+            fixed = self.fix_scene(chosen.model, chosen.rows, encoding, chosen.importance, stages)
+        plain = fixed.encode(fixed.start()).write()  # not a part of the work: what it would have been without
+        with timer.stage("tuning"):
+            run = tune(fixed, views, self.tuning, threads=self.threads)
+        with timer.stage("encoding"):
+            result = fixed.encode(run.best_values).write()
+        return Tuned(
+            chosen, fixed, run.best_values, plain, result, run.log, {**timer.seconds, "of it shapes": stages.shapes}
+        )
 
     def row(self, tuned: Tuned) -> Row:
         """Return the row of a tuned file: sizes and scores before and after tuning."""
         before, after = decode(tuned.plain.data), decode(tuned.result.data)
         assert _same(tuned, after), "the decoded file is not what was tuned"
         scores = self.judge({"before": before, "after": after})
-        colours, shapes = books_of(tuned.frozen)
-        kept = len(tuned.frozen.source_index)
+        colours, shapes = books_of(tuned.fixed)
+        kept = len(tuned.fixed.source_index)
         described = bytes_by_attribute(tuned.result.data, read_header(tuned.result.data))
         return {
             "splats": kept,
@@ -201,8 +203,8 @@ class _Stages:
 
 def _same(tuned: Tuned, decoded: SplatModel) -> bool:
     """Return True if a decoded file equals the tuned values bit for bit."""
-    seen = tuned.frozen.dequantise(tuned.held)
-    places = np.argsort(tuned.frozen.source_index)[
-        np.searchsorted(np.sort(tuned.frozen.source_index), tuned.result.source_index)
+    seen = tuned.fixed.dequantise(tuned.best_values)
+    places = np.argsort(tuned.fixed.source_index)[
+        np.searchsorted(np.sort(tuned.fixed.source_index), tuned.result.source_index)
     ]
     return all(np.array_equal(getattr(decoded, name), getattr(seen, name)[places]) for name in ARRAYS)

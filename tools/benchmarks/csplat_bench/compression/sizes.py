@@ -32,9 +32,9 @@ class Book:
     escaped: int
 
 
-def books_of(frozen: FixedQuantisation) -> tuple[Book | None, Book | None]:
-    """The codebooks of a frozen scene, of SH and of shapes; `None` if the encoder made none."""
-    colours, shapes = frozen.book, frozen.shapes
+def books_of(fixed: FixedQuantisation) -> tuple[Book | None, Book | None]:
+    """The codebooks of a fixed quantisation, of SH and of shapes; `None` if the encoder made none."""
+    colours, shapes = fixed.book, fixed.shapes
     return (
         None if colours is None else Book(colours.size, len(colours.escaped)),
         None if shapes is None else Book(shapes.size, int(np.count_nonzero(shapes.escaped))),
@@ -86,18 +86,18 @@ def _whole_bytes(low: int, high: int) -> int:
     return (int(high - low).bit_length() + 7) // 8
 
 
-def integer_columns(frozen: FixedQuantisation, held: FreeValues) -> Sequence[NDArray[np.int64]]:
+def integer_columns(fixed: FixedQuantisation, values: FreeValues) -> Sequence[NDArray[np.int64]]:
     """Every integer that the file of some values holds, as arrays [n, C], in no order of meaning.
 
     Args:
-        frozen: the encoder's decisions.
-        held: values, constrained.
+        fixed: the encoder's decisions.
+        values: values, constrained.
     """
-    plan, seen = frozen.parameters, frozen.dequantise(held)
-    quats, scales, sizes = frozen.dequantise_shape_rows(held, seen)
-    sh = frozen.dequantise_sh_rows(held.sh)
+    plan, seen = fixed.parameters, fixed.dequantise(values)
+    quats, scales, sizes = fixed.dequantise_shape_rows(values, seen)
+    sh = fixed.dequantise_sh_rows(values.sh)
     columns = [
-        _lattice(seen.means[tile.rows], plan.lattice.step * 2.0**tile.exponent) for tile in frozen.encode_plan.tiles
+        _lattice(seen.means[tile.rows], plan.lattice.step * 2.0**tile.exponent) for tile in fixed.encode_plan.tiles
     ]
     columns += [
         _lattice(scales, plan.scale_step),
@@ -107,7 +107,7 @@ def integer_columns(frozen: FixedQuantisation, held: FreeValues) -> Sequence[NDA
         colour_integers_of(seen.sh0[:, None], plan.sh0_step, plan.chroma_shift).reshape(-1, 3).astype(np.int64),
         colour_integers_of(sh, plan.sh_step, plan.chroma_shift).reshape(len(sh), -1).astype(np.int64),
     ]
-    books = (frozen.book, frozen.shapes)
+    books = (fixed.book, fixed.shapes)
     return columns + [book.index[:, None].astype(np.int64) for book in books if book is not None]
 
 

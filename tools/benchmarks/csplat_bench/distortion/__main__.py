@@ -53,8 +53,8 @@ from csplat_bench.common.scenes import OUT as EVERYTHING
 from csplat_bench.distortion.known import GRADED, KeptPoint, Measured, Simplified
 from csplat_bench.distortion.plot import plot as draw
 from csplat_bench.distortion.tables import tables
+from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
-from csplat_render.virtual_cameras import scene_frame
 from csplat_tools.console import note
 from csplat_tools.optimise.scene_sensitivity import importance_views, measure_importance
 from csplat_tools.optimise.target_encoding import encode_to

@@ -60,7 +60,7 @@ _WITHOUT = {
     "nothing": _Without(),
     "adjustment through quantisers": _Without(
         instead=(
-            (subsets, "quantisation_aware_refit", lambda frozen, *_, **__: frozen.start()),
+            (subsets, "quantisation_aware_refit", lambda fixed, *_, **__: fixed.start()),
             (target_search, "REFIT_GAIN", 0.0),
             (precision_search, "REFIT_GAIN", 0.0),
         )

@@ -26,8 +26,8 @@ from csplat_bench.common.report import table, tell_machine
 from csplat_bench.common.scenes import Scene, cameras_of, find_scenes
 from csplat_render import Camera
 from csplat_render.camera_files import load_cameras
+from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
-from csplat_render.virtual_cameras import scene_frame
 from csplat_tools.console import note
 from csplat_tools.optimise.scene_sensitivity import importance_views, measure_importance
 from csplat_tools.views import BLACK, find_view_set
