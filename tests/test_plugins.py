@@ -65,6 +65,13 @@ def test_entry_points_are_read_only_for_formats_that_this_package_lacks(installe
     assert "False" == installed(statement, formats="lcc = other_plugin:FORMAT")
 
 
+def test_a_plug_in_that_cannot_be_loaded_is_left_out_with_a_warning(installed):
+    statement = "import warnings\nwith warnings.catch_warnings(record=True) as seen:\n"
+    statement += "    names = [one.name for one in csplat.formats.formats()]\nprint(names[0], seen[-1].message)"
+    found = installed(statement, formats="lcc = no_such_module:FORMAT")
+    assert "ply no_such_module:FORMAT, installed as 'lcc' of csplat.formats, cannot be loaded: No module" in found
+
+
 def test_notebooks_use_the_display_that_is_installed(installed):
     model = "csplat.SplatModel(np.zeros((2, 3), np.float32), np.array([[1, 0, 0, 0]] * 2, np.float32), "
     model += "np.zeros((2, 3), np.float32), np.ones(2, np.float32), np.zeros((2, 3), np.float32))"

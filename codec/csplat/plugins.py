@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -16,12 +17,15 @@ if TYPE_CHECKING:
 
 
 def load_plugins(group: str) -> dict[str, Any]:
-    """Load all entry points of a group, by name.
-
-    Raises:
-        ImportError: a package that is installed cannot be imported.
-    """
-    return {point.name: point.load() for point in _entry_points(group)}
+    """Load all entry points of a group, by name; warn of those that cannot be loaded, and leave them out."""
+    found = {}
+    for point in _entry_points(group):
+        try:
+            found[point.name] = point.load()
+        except Exception as error:  # noqa: BLE001  # a broken package of others must not stop the reading of a PLY
+            text = f"{point.value}, installed as {point.name!r} of {group}, cannot be loaded: {error}"
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
+    return found
 
 
 @cache
