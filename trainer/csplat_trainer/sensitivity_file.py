@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -12,7 +13,6 @@ from numpy.typing import NDArray
 
 from csplat.archives import read_archive
 from csplat.encoder import GaussNewtonBlocks, Importance
-from csplat.encoder.splat_importance import matrix_size
 from csplat.errors import InputError
 from csplat.model import SplatModel
 
@@ -193,7 +193,7 @@ def read_sensitivity(path: str | Path, model: SplatModel) -> StoredSensitivity:
 
 def _packed(metric: NDArray[np.float32]) -> NDArray[np.float16]:
     """Return the upper triangles of the bands above 0, divided by the mean of their diagonals."""
-    rows, columns = np.triu_indices(matrix_size(metric))
+    rows, columns = np.triu_indices(_matrix_size(metric))
     mean = metric[:, (rows == columns) & (rows > 0)].mean(axis=1, dtype=np.float64)
     return _over_mean(metric[:, rows > 0], mean).astype(np.float16)
 
@@ -203,6 +203,11 @@ def _over_mean(triangles: NDArray[Any], mean: NDArray[np.float64]) -> NDArray[np
     seen = mean > 0.0
     scaled = np.empty(triangles.shape, np.float32)
     np.divide(triangles, np.where(seen, mean, 1.0)[:, None], out=scaled, casting="same_kind")
-    rows, columns = np.triu_indices(matrix_size(triangles))
+    rows, columns = np.triu_indices(_matrix_size(triangles))
     scaled[~seen] = rows == columns
     return scaled
+
+
+def _matrix_size(triangles: NDArray[Any]) -> int:
+    """Return D of triangles [N, D (D + 1) / 2]."""
+    return (math.isqrt(8 * int(triangles.shape[1]) + 1) - 1) // 2

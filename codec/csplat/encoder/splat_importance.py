@@ -126,7 +126,7 @@ class ErrorMetric:
     @property
     def size(self) -> int:
         """D, the size of a matrix."""
-        return matrix_size(self.triangles)
+        return _matrix_size(self.triangles)
 
     def first(self, size: int) -> ErrorMetric:
         """Return the metric of the first `size` coordinates of a point."""
@@ -308,7 +308,7 @@ def matrix_products(triangles: Floats, points: Floats) -> F64:
 
 def doubled_triangles(triangles: Floats) -> F64:
     """Return the triangles with their off-diagonal entries doubled."""
-    upper_i, upper_j = np.triu_indices(matrix_size(triangles))
+    upper_i, upper_j = np.triu_indices(_matrix_size(triangles))
     return np.asarray(triangles * np.where(upper_i == upper_j, 1.0, 2.0), np.float64)
 
 
@@ -321,7 +321,7 @@ def _checked_metric(name: str, weights: F32, found: Floats, size: int) -> ErrorM
     return ErrorMetric(weights, found)
 
 
-def matrix_size(triangles: Floats) -> int:
+def _matrix_size(triangles: Floats) -> int:
     """Return D of triangles [N, D (D + 1) / 2]."""
     return (math.isqrt(8 * int(triangles.shape[1]) + 1) - 1) // 2
 
