@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from captures import cameras, views_of
 from extremes import COUNT, write_small_scene
-from extremes_learnt import BLACK, COARSE, QUICK, SHORT, photographs_of
+from extremes_learnt import BLACK, COARSE, QUICK, SHORT, images_of
 
 from csplat import decode, read_ply
 from csplat.decoder import read_declared_bounds, read_header
@@ -101,7 +101,7 @@ def _learn(source: SplatModel) -> Learnt:
     seen_from = cameras(9)
     half = simplify(source, keep=0.5, views=views_of(seen_from), options=SimplifyOptions(rounds=1, effort=1)).model
     options = replace(QUICK, iterations=40, refine_start=10, refine_every=10)
-    trained = train(photographs_of(source, seen_from, source.means[:COUNT]), options)
+    trained = train(images_of(source, seen_from, source.means[:COUNT]), options)
     try:
         tuned = _tune(source, seen_from)
     except InputError as error:

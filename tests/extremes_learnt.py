@@ -57,10 +57,10 @@ def half(name: str) -> Simplified:
 def photographs(name: str, points: np.ndarray | None = None) -> DataSet:
     """Return photographs of a condition in front of black, and points."""
     model = learnt_from(name)
-    return photographs_of(model, virtual_cameras(model, 12, 48, 40), points)
+    return images_of(model, virtual_cameras(model, 12, 48, 40), points)
 
 
-def photographs_of(model: SplatModel, cameras: list[Camera], points: np.ndarray | None = None) -> DataSet:
+def images_of(model: SplatModel, cameras: list[Camera], points: np.ndarray | None = None) -> DataSet:
     """Return photographs of a scene in front of black, three of four to be learnt from, and points."""
     rasteriser, shots = Rasteriser(gradients=False), []
     for camera in cameras:

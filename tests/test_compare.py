@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command_line import invoke
 
 from csplat import EncodeOptions, decode, encode, write_ply
 from csplat.encoder import encode_with_report
 from csplat.errors import InputError
-from csplat_tools.cli.app import app
 from csplat_tools.inspect.comparison import attribute_errors, estimate_psnr
 from csplat_tools.scene_files import LoadedModel, load_model
 from csplat_tools.views import comparison_cameras
@@ -59,10 +58,6 @@ def compare_models(source, other, cameras, **words):
 
 def loaded(model):
     return LoadedModel(model, 1000)
-
-
-def invoke(*words):
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 def call(*words):

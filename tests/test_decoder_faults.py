@@ -109,7 +109,7 @@ def test_a_decoder_that_leaves_ancillary_payloads_unread_passes_every_vector_on_
             open_chunk(view, record, record.type, record.flags, "CHK-6")
 
     def apply(stack):
-        for name in ("read_json", "read_serr"):
+        for name in ("json_chunk", "bounds_chunk"):
             stack.enter_context(mock.patch.object(decode_api, name, frames))
 
     about_chunks = [one for one in VECTOR_LIST if {"CHK", "JSN", "SER"} & {name[:3] for name in one.clauses}]

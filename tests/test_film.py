@@ -4,12 +4,11 @@ import sys
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command_line import invoke
 
 from csplat import write_ply
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat_tools.cli.app import app
 from csplat_tools.render_files import _durations, check_film, is_film, write_film
 
 pytest.importorskip("numba", reason="the renderer needs numba: pip install 'csplat[render]'")
@@ -46,10 +45,6 @@ def pictures(ply, tmp_path_factory):
 def read_picture(path):
     with Image.open(path) as picture:
         return np.asarray(picture).astype(int)
-
-
-def invoke(*words):
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 def frames_of(path):

@@ -13,7 +13,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 pytest.importorskip("numba", reason="fine-tuning needs numba: pip install 'csplat[render]'")
 pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
@@ -21,6 +20,7 @@ pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'cspl
 
 # Importing them needs what is looked for above.
 from captures import H, W, cameras, photograph, shell
+from command_line import invoke
 
 import csplat
 import csplat_trainer
@@ -32,7 +32,6 @@ from csplat_render import render
 from csplat_render.camera_files import save_cameras
 from csplat_render.conventions import UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
-from csplat_tools.cli.app import app
 from csplat_tools.cli.finetune import finetune as finetune_command
 from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.training.tuning_report import ply_splat_bytes
@@ -536,10 +535,6 @@ def test_validation_views_are_training_views_unless_they_are_held_out():
 
 BARE = ("--set", "sh-coding=none,shape-codebook-size=0")  # neither SH nor codebooks, which take time
 BRIEF = ("--preset", "fast", "--iterations", 1, *BARE)  # for tests in which learning does not matter, either
-
-
-def invoke(*words):
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 def call(*words):

@@ -461,5 +461,5 @@ def test_streamed_sog_is_not_written(tmp_path, make_model):
 def test_real_files_are_read(data_dir):
     for name, count, degree in (("angel.sog", 71_359, 0), ("statue", 289_444, 3)):
         with open_scene(data_dir / "sog" / name) as scene:
-            assert (count, degree) == (scene.count, scene.facts.sh_degree)
+            assert (count, degree) == (scene.count, scene.metadata_model.sh_degree)
             assert count == sum(map(len, scene.blocks()))

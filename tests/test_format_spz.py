@@ -114,7 +114,7 @@ def test_bands_above_those_asked_for_are_left_out(tmp_path):
         coefficients = (degree + 1) ** 2 - 1
         expected = np.frombuffer(parts[5], np.uint8).reshape(2, 24, 3)[:, :coefficients] / 128.0 - 1.0
         with open_scene(tmp_path / "a.spz", sh_degree=degree) as scene:
-            assert (2, degree) == (scene.count, scene.facts.sh_degree)
+            assert (2, degree) == (scene.count, scene.metadata_model.sh_degree)
         read = convert_axes(source_from_model(csplat.read(tmp_path / "a.spz", sh_degree=degree)), "RUB").model()
         assert np.array_equal(expected, read.shN)
 

@@ -34,7 +34,7 @@ def test_a_ply_in_blocks_is_the_ply_at_once(tmp_path, large):
     write_ply(tmp_path / "a.ply", large)
     with open_scene(tmp_path / "a.ply") as scene:
         assert len(large) == scene.count
-        assert 0 == len(scene.facts)
+        assert 0 == len(scene.metadata_model)
         assert [BLOCK_SPLATS, 1000] == [len(block) for block in scene.blocks()]
         same(read_ply(tmp_path / "a.ply"), scene.model())
         write_scene(tmp_path / "b.ply", scene)
@@ -57,7 +57,7 @@ def test_positions_in_doubles_keep_their_origin_in_every_block(tmp_path, large, 
     model = csplat.SplatModel(**{**vars(large), "origin": origin})
     write_ply(tmp_path / "a.ply", model, absolute=True)
     with open_scene(tmp_path / "a.ply") as scene:
-        assert origin == scene.facts.origin
+        assert origin == scene.metadata_model.origin
         same(read_ply(tmp_path / "a.ply"), scene.model())
 
 
@@ -189,7 +189,7 @@ def test_a_scene_in_memory_is_read_in_blocks(large):
     scene = source_from_model(large)
     assert [BLOCK_SPLATS, 1000] == [len(one) for one in scene.blocks()]
     same(large, scene.model())
-    assert 0 == len(SceneSource(0, scene.facts, lambda: iter(())).model())
+    assert 0 == len(SceneSource(0, scene.metadata_model, lambda: iter(())).model())
 
 
 def test_scenes_in_a_zip_are_named(tmp_path):

@@ -193,9 +193,9 @@ def test_a_size_that_starves_all_splats_is_met_by_fewer(search_at_size):
 @pytest.mark.slow
 def test_a_loss_against_photographs_lets_splats_go(many, photographs, search_at_loss):
     decoded, scores = decode(search_at_loss.data), search_at_loss.report.photographs
-    scorer = with_validation_views(photographs).photograph_validation_scorer()
+    scorer = with_validation_views(photographs).image_validation_scorer()
     assert scores["source"] < 28.0
-    assert scores["file"] == pytest.approx(photographs.photograph_test_scorer().psnr(decoded))
+    assert scores["file"] == pytest.approx(photographs.image_test_scorer().psnr(decoded))
     assert scores["file"] >= scores["source"] - 1.0  # other photographs decided:
     assert scorer.psnr(many) - 0.5 <= scorer.psnr(decoded) <= scorer.psnr(many) - 0.3
     assert search_at_loss.report.splats < 900
@@ -338,7 +338,7 @@ def test_no_view_that_judges_decides_or_teaches(many, photographs, kind):
     given = {"virtual": around(many), "cameras": judged_by(cameras(40)), "photographs": photographs}[kind]
     views = with_validation_views(given)
     validation_scorers = [views.validation_scorer(many)] + (
-        [views.photograph_validation_scorer()] if kind == "photographs" else []
+        [views.image_validation_scorer()] if kind == "photographs" else []
     )
     test, validation = (
         poses(views.test_scorer(many).cameras),

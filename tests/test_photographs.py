@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command_line import invoke
 
 from csplat import EncodeOptions, encode, read_ply, write_ply
 from csplat.errors import InputError
-from csplat_tools.cli.app import app
 
 pytest.importorskip("numba", reason="the renderer needs numba: pip install 'csplat[render]'")
 pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
@@ -22,13 +21,9 @@ from csplat_render import render  # noqa: E402
 from csplat_render.camera import intrinsics, look_at, relative_to  # noqa: E402
 from csplat_tools.inspect.comparison import compare  # noqa: E402
 from csplat_tools.views import DataOptions, find_view_set  # noqa: E402
-from csplat_trainer.posed_images import PosedImage, photograph_scorer  # noqa: E402
+from csplat_trainer.posed_images import PosedImage, image_scorer  # noqa: E402
 
 W, H = 64, 48
-
-
-def invoke(*words):
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 def call(*words):
@@ -167,7 +162,7 @@ def test_a_photograph_is_shown_in_front_of_the_background():
     pixels = np.zeros((1, 2, 4), np.uint8)
     pixels[0, 1] = (255, 0, 0, 51)
     picture = PosedImage(replace(cameras(1)[0], W=2, H=1), pixels)
-    reference = photograph_scorer([picture], (0.0, 1.0, 1.0)).reference(0)
+    reference = image_scorer([picture], (0.0, 1.0, 1.0)).reference(0)
     shown = reference.rgb
     assert [[False, False]] == reference.covered.tolist()
     assert np.float32 == shown.dtype
@@ -181,7 +176,7 @@ def test_pixels_that_do_not_count_are_not_judged(scene):
     mask = np.zeros((H, W), bool)
     mask[:, : W // 4] = True
     wanted[0][~mask] = 255
-    judge = photograph_scorer([PosedImage(taken[0], wanted[0], mask), PosedImage(taken[1], wanted[1])], (0.0, 0.0, 0.0))
+    judge = image_scorer([PosedImage(taken[0], wanted[0], mask), PosedImage(taken[1], wanted[1])], (0.0, 0.0, 0.0))
     squares = [np.square(one - two / 255.0) for one, two in zip(seen, wanted, strict=True)]
     errors = np.array([squares[0][mask].mean(), squares[1].mean()])
     expected = np.average(errors, weights=[mask.sum(), H * W])

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import invoke
 from typer.testing import CliRunner
 
 from csplat import EncodeOptions, encode, read_ply, write_ply
@@ -49,10 +50,6 @@ def cameras(tmp_path):
     path = tmp_path / "cameras.json"
     path.write_text(json.dumps([camera("images/left.jpg"), camera("images/right.jpg")]))
     return path
-
-
-def invoke(*words):
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 def call(*words):

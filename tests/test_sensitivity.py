@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats
@@ -13,10 +12,11 @@ from csplat.ply import read_ply, write_ply
 
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
+from command_line import invoke
+
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.reference_rasteriser import Decisions, render_exact
 from csplat_render.scene_frame import scene_frame
-from csplat_tools.cli.app import app
 from csplat_tools.importance_file import encoder_importance
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, read_sensitivity, write_sensitivity
@@ -350,10 +350,6 @@ def test_never_seen_splats_weigh_a_little(stored):
 # The command line.
 
 
-def run(*words):
-    return CliRunner().invoke(app, [str(word) for word in words])
-
-
 @pytest.fixture
 def camera_file(tmp_path):
     path = tmp_path / "cameras.json"
@@ -368,18 +364,18 @@ def test_the_command_measures_what_encode_takes(tmp_path, camera_file):
     model = replace(model, means=away)
     ply, npz, out, index = (tmp_path / name for name in ("s.ply", "s.npz", "s.csplat", "s.npy"))
     write_ply(ply, model)
-    done = run("sensitivity", ply, npz, "--cameras", camera_file, "--json", "--quiet")
+    done = invoke("sensitivity", ply, npz, "--cameras", camera_file, "--json", "--quiet")
     assert 0 == done.exit_code, done.stderr
     facts = json.loads(done.stdout)
     assert (400, 3, "cameras") == (facts["splats"], facts["views"], facts["source"])
     unseen = facts["unseen"]
     assert 40 <= unseen < 400
-    assert 1 == run("sensitivity", ply, npz, "--cameras", camera_file).exit_code  # not without --force
-    done = run("encode", ply, out, "--importance", npz, "--prune-unseen", "--source-index", index, "--json", "-q")
+    assert 1 == invoke("sensitivity", ply, npz, "--cameras", camera_file).exit_code  # not without --force
+    done = invoke("encode", ply, out, "--importance", npz, "--prune-unseen", "--source-index", index, "--json", "-q")
     assert 0 == done.exit_code, done.stderr
     assert 400 - unseen == json.loads(done.stdout)["splats"]
     assert set(range(400)) - set(np.load(index).tolist()) >= set(range(40))
-    checked = run("verify", out, "--source", ply, "--source-index", index)
+    checked = invoke("verify", out, "--source", ply, "--source-index", index)
     assert 0 == checked.exit_code, checked.stderr
 
 
@@ -399,7 +395,7 @@ def seen_in_part(tmp_path):
 def test_the_command_makes_views_where_there_are_none_and_says_how_long_it_takes(tmp_path, seen_in_part, monkeypatch):
     monkeypatch.setattr("csplat_tools.views.view_sets.render_seconds", lambda *_, **__: 1.0)
     views = ("--views", "20", "--view-size", "48x36")
-    done = run("sensitivity", seen_in_part, tmp_path / "s.npz", *views, "--no-matrices")
+    done = invoke("sensitivity", seen_in_part, tmp_path / "s.npz", *views, "--no-matrices")
     assert 0 == done.exit_code, done.stderr
     assert "20 virtual views" in done.stderr
     assert "this takes about 2 to 4 minutes here" in done.stderr  # 36 pictures: 16 more check
@@ -409,21 +405,23 @@ def test_the_command_makes_views_where_there_are_none_and_says_how_long_it_takes
 @pytest.mark.slow
 def test_pruning_says_how_much_of_it_other_views_would_have_seen(tmp_path, seen_in_part):
     npz, out = tmp_path / "s.npz", tmp_path / "o.csplat"
-    run("sensitivity", seen_in_part, npz, "--views", "2", "--no-matrices")
+    invoke("sensitivity", seen_in_part, npz, "--views", "2", "--no-matrices")
     missed = read_sensitivity(npz, read_ply(seen_in_part)).missed_share
     assert missed > 0.0
-    done = run("encode", seen_in_part, out, "--importance", npz, "--prune-unseen", "-q")
+    done = invoke("encode", seen_in_part, out, "--importance", npz, "--prune-unseen", "-q")
     assert f"{100 * missed:.1f} % of the splats are left out although" in done.stderr
-    assert "left out" not in run("encode", seen_in_part, out, "--importance", npz, "--force", "-q").stderr
+    assert "left out" not in invoke("encode", seen_in_part, out, "--importance", npz, "--force", "-q").stderr
 
 
 def test_mistakes_get_one_line(tmp_path, sample_path, camera_file):
     out = tmp_path / "out.npz"
-    assert 2 == run("sensitivity", sample_path, out, "--cameras", camera_file, "--data", tmp_path).exit_code
-    assert 2 == run("sensitivity", sample_path, "-").exit_code
-    assert 2 == run("encode", sample_path, tmp_path / "o.csplat", "--prune-unseen").exit_code
+    assert 2 == invoke("sensitivity", sample_path, out, "--cameras", camera_file, "--data", tmp_path).exit_code
+    assert 2 == invoke("sensitivity", sample_path, "-").exit_code
+    assert 2 == invoke("encode", sample_path, tmp_path / "o.csplat", "--prune-unseen").exit_code
     np.save(tmp_path / "w.npy", np.ones(3))
-    done = run("encode", sample_path, tmp_path / "o.csplat", "--importance", tmp_path / "w.npy", "--prune-unseen", "-q")
+    done = invoke(
+        "encode", sample_path, tmp_path / "o.csplat", "--importance", tmp_path / "w.npy", "--prune-unseen", "-q"
+    )
     assert 1 == done.exit_code
     assert 1 == len(done.stderr.splitlines())
 
@@ -431,7 +429,7 @@ def test_mistakes_get_one_line(tmp_path, sample_path, camera_file):
 def test_cameras_that_see_nothing_are_refused(tmp_path, camera_file):
     model = small_scene(20, 1)
     write_ply(tmp_path / "s.ply", replace(model, means=model.means + np.float32(1000.0)))
-    done = run("sensitivity", tmp_path / "s.ply", tmp_path / "s.npz", "--cameras", camera_file, "-q")
+    done = invoke("sensitivity", tmp_path / "s.ply", tmp_path / "s.npz", "--cameras", camera_file, "-q")
     assert 1 == done.exit_code
     assert "no view shows any splat" in done.stderr
     assert not (tmp_path / "s.npz").exists()

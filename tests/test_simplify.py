@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from typer import BadParameter
-from typer.testing import CliRunner
 
 pytest.importorskip("numba", reason="simplification wants the extra [render]")
 
 from captures import views_of
+from command_line import invoke
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
@@ -21,7 +21,6 @@ from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_render.scene_frame import sample_cloud, scene_frame
 from csplat_render.scorer import Scorer, renderer
 from csplat_render.virtual_cameras import is_clear
-from csplat_tools.cli.app import app
 from csplat_tools.cli.shared_options import parse_decibels
 from csplat_tools.optimise.pruning import simplify
 from csplat_tools.optimise.pruning_order import MeasuredViews, SimplifyOptions, find_pruning_order, total_error
@@ -37,7 +36,7 @@ from csplat_tools.views import (
     shrink_cameras,
 )
 from csplat_tools.views.sufficient_views import find_sufficient_views, pruning_keys
-from csplat_trainer.posed_images import PosedImage, photograph_scorer
+from csplat_trainer.posed_images import PosedImage, image_scorer
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
@@ -124,12 +123,12 @@ def test_views_are_added_until_others_agree(source):
 
 def test_what_is_invisible_goes_first_and_what_is_unseen_stays(source):
     found = find_sufficient_views(source, views_of(camera_sequence(source, 9, (48, 36))), 0.5)
-    keys = pruning_keys(source.opacities, found.removal)
+    keys = pruning_keys(source.opacities, found.pruning_error)
     assert (keys[:10] == -1.0).all()
-    unseen = ~found.removal.seen & (source.opacities > 0.01)
+    unseen = ~found.pruning_error.seen & (source.opacities > 0.01)
     assert np.isinf(keys[unseen]).all()
-    assert (pruning_keys(source.opacities, found.removal, keep_unseen=False)[unseen] < 0.0).all()
-    order = find_pruning_order(source, [MeasuredViews(found.used, found.removal)], SMALL, len(source) // 2)
+    assert (pruning_keys(source.opacities, found.pruning_error, keep_unseen=False)[unseen] < 0.0).all()
+    order = find_pruning_order(source, [MeasuredViews(found.used, found.pruning_error)], SMALL, len(source) // 2)
     assert set(order.rows[:10]) == set(range(10))
     assert len(order.rounds) == 2
 
@@ -233,7 +232,7 @@ def test_more_loss_lets_more_splats_go(source):
     noisy = [np.clip(p + 0.05 * rng.standard_normal(p.shape), 0, 1) for p in render_pictures(source, cameras)]
     pictures = [PosedImage(c, np.rint(255.0 * p).astype(np.uint8)) for c, p in zip(cameras, noisy, strict=True)]
     views = views_of(cameras, pictures)
-    judge = photograph_scorer(views.photographs_of(views.validation), views.background)
+    judge = image_scorer(views.images_of(views.validation), views.background)
     sizes = []
     for loss in (0.05, 1.0):
         result = simplify(source, max_psnr_drop=loss, views=views, options=replace(SMALL, bands=False, refit=False))
@@ -284,8 +283,8 @@ def test_the_result_does_not_depend_on_threads(source, given):
 def test_bands_that_are_worth_less_than_their_bits_go():
     bands = np.array([[0.3, 0.3, 0.3], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
     zeros = np.zeros(3)
-    removal = PruningError(zeros, zeros, np.array([True, False, True]), bands, 1)
-    kept_bands = choose_bands(removal, 1.0)
+    pruning_error = PruningError(zeros, zeros, np.array([True, False, True]), bands, 1)
+    kept_bands = choose_bands(pruning_error, 1.0)
     np.testing.assert_array_equal([[True, False, False], [True, True, True], [True, True, True]], kept_bands)
     free = coefficient_mask(kept_bands)
     assert [3, 15, 15] == free.sum(axis=1).tolist()
@@ -328,10 +327,6 @@ def test_decibels_are_read_with_and_without_their_unit():
 
 
 # the command
-
-
-def invoke(*words):
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 @pytest.mark.slow
@@ -405,8 +400,8 @@ def test_a_wrong_target_is_a_wrong_command_line(source, tmp_path, words):
 def test_views_of_many_splats_are_larger_and_fewer_and_steps_as_well():
     assert default_views(100_000) == (VIEW_COUNT, VIEW_SIZE)
     assert default_views(10_000_000) == (VIEW_COUNT // 2, (2 * VIEW_SIZE[0], 2 * VIEW_SIZE[1]))
-    assert SimplifyOptions().pictures(100) == default_views(100)
-    assert SimplifyOptions(views=3, view_size=(20, 10)).pictures(10_000_000) == (3, (20, 10))
+    assert SimplifyOptions().views_and_size(100) == default_views(100)
+    assert SimplifyOptions(views=3, view_size=(20, 10)).views_and_size(10_000_000) == (3, (20, 10))
     usual = SimplifyOptions().steps(400)
     assert SimplifyOptions(view_size=(480, 360)).steps(400) == usual // 2
     assert SimplifyOptions(view_size=(24, 18)).steps(400) == usual

@@ -122,7 +122,7 @@ def test_a_scene_stands_upright_in_the_axes_of_a_format(make_model, fields, up):
     model = make_model(5, 1, **fields, origin=(1.0, 2.0, 3.0))
     scene = convert_axes(source_from_model(model), "LUF")
     after = scene.model()
-    assert "LUF" == scene.facts.coordinate_system == after.coordinate_system
+    assert "LUF" == scene.metadata_model.coordinate_system == after.coordinate_system
     assert (0, 1, 0) == up_of(after.metadata, "LUF")
     heights = model.means @ np.array(up) / np.linalg.norm(up)
     assert np.abs(heights - after.means[:, 1]).max() < 1e-6

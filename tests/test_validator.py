@@ -17,8 +17,8 @@ from csplat_authoring.samples import attributes, rich_scene, scene, tile
 from csplat_authoring.scene import Attribute, Chunk, StatedErrors
 from csplat_conformance.manifest import load
 from csplat_conformance.validator import validate
-from csplat_conformance.validator.ancillary import JsonError, parse_json
-from csplat_conformance.validator.findings import CODES, VIOLATIONS_MAX
+from csplat_conformance.validator.json_text import JsonError, parse_json
+from csplat_conformance.validator.violation_log import CODES, VIOLATIONS_MAX
 from csplat_selftest.fuzzing.bit_flips import flip, flips, prefixes
 from csplat_selftest.fuzzing.damage import damaged_file
 

@@ -74,7 +74,7 @@ def test_photographs_have_one_role_each(sets, scene, kind, every, size):
     assert {size or (W, H)} == {(camera.W, camera.H) for camera in views.test}
     assert BLACK == views.background
     assert not views.virtual
-    assert numbers(views.test) == numbers(views.photograph_test_scorer().cameras)
+    assert numbers(views.test) == numbers(views.image_test_scorer().cameras)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_validation_photographs_of_a_set_decide(sets, scene, tmp_path):
         views = find_view_set(scene, data=data, validation_count=validation_count)
         roles = [list(range(8)), [8, 9, 10, 11], [12, 13, 14, 15]]
         assert roles == [numbers(role) for role in (views.training, views.validation, views.test)]
-    assert 4 == len(views.photograph_validation_scorer().references)
+    assert 4 == len(views.image_validation_scorer().references)
     assert (6, 2, 4) == tuple(map(len, poses(find_view_set(scene, data=data, validation_count=2))))
     assert (0, 0, 8) == tuple(map(len, poses(find_view_set(scene, data=data, split="train"))))
 
@@ -193,13 +193,13 @@ def test_no_command_decides_by_what_judges_and_all_say_the_same_of_the_same_scen
         """Run a command; return its JSON and check the roles of its views."""
         made.clear()
         result = json.loads(invoke(*words, *own, "--json").stdout)
-        assert any(views.photographs for views in made), words
+        assert any(views.images for views in made), words
         for views in made:
             roles = poses(views)
             assert sum(map(len, roles)) == len(set.union(*roles)), words
             for camera in (*views.training, *views.validation):
                 assert camera.image is None or int(camera.image[-6:-4]) % 5, words
-            assert not views.photographs or numbers(views.test) in ([0, 5, 10, 15], []), words
+            assert not views.images or numbers(views.test) in ([0, 5, 10, 15], []), words
         return result
 
     found["compare"] = run("compare", ply, ply)["photographs"]["a"]["psnr"]
@@ -213,8 +213,8 @@ def test_no_command_decides_by_what_judges_and_all_say_the_same_of_the_same_scen
     model = read_ply(ply)
     views = find_view_set(model, data=DataOptions(str(sets["rgba"]), (24, 20), test_every=5))
     draw = renderer(model, views.background)
-    photographs, behind = views.photographs_of(views.test), np.array(views.background, np.float32)
-    found["evaluate"] = evaluate(lambda camera: draw(camera).rgb, photographs, behind)["psnr"]
+    images, behind = views.images_of(views.test), np.array(views.background, np.float32)
+    found["evaluate"] = evaluate(lambda camera: draw(camera).rgb, images, behind)["psnr"]
     assert max(found.values()) - min(found.values()) < 0.01, found
     again = run("compare", ply, tmp_path / "half.ply")["photographs"]["b"]["psnr"]
     assert simplified["photographs"]["psnr"] == pytest.approx(again, abs=0.01)
@@ -222,9 +222,7 @@ def test_no_command_decides_by_what_judges_and_all_say_the_same_of_the_same_scen
 
 def test_another_origin_judges_alike(sets, scene):
     moved = replace(scene, means=scene.means - np.float32((10.0, -20.0, 5.0)), origin=(10.0, -20.0, 5.0))
-    scorers = [
-        find_view_set(one, data=DataOptions(str(sets["rgb"]))).photograph_test_scorer() for one in (scene, moved)
-    ]
+    scorers = [find_view_set(one, data=DataOptions(str(sets["rgb"]))).image_test_scorer() for one in (scene, moved)]
     assert scorers[0].psnr(scene) == pytest.approx(scorers[1].psnr(moved), abs=0.01)
     assert scorers[0].psnr(scene) == pytest.approx(scorers[0].psnr(moved), abs=0.01)
 
@@ -240,8 +238,8 @@ def test_a_set_in_coordinates_of_a_map_judges_alike(sets, scene, tmp_path):
         frame["transform_matrix"] = pose.tolist()
     (tmp_path / "set" / "transforms.json").write_text(json.dumps(document))
     far = replace(scene, origin=tuple(place))
-    wanted = find_view_set(scene, data=DataOptions(str(sets["rgb"]))).photograph_test_scorer().psnr(scene)
-    judge = find_view_set(far, data=DataOptions(str(tmp_path / "set"))).photograph_test_scorer()
+    wanted = find_view_set(scene, data=DataOptions(str(sets["rgb"]))).image_test_scorer().psnr(scene)
+    judge = find_view_set(far, data=DataOptions(str(tmp_path / "set"))).image_test_scorer()
     assert wanted == pytest.approx(judge.psnr(far), abs=0.01)
     own = cameras(3)
     save_cameras(tmp_path / "own.json", own)

@@ -126,15 +126,15 @@ class DiskStore(Store):
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("rb")
-        self._facts = os.fstat(self._file.fileno())
-        super().__init__(str(path), self._facts.st_size)
+        self._metadata_model = os.fstat(self._file.fileno())
+        super().__init__(str(path), self._metadata_model.st_size)
 
     def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
         return [read_at(self._file.fileno(), stop - start, start) for start, stop in ranges]
 
     def _is_other(self) -> bool:
         now = os.fstat(self._file.fileno())
-        return (now.st_size, now.st_mtime_ns) != (self._facts.st_size, self._facts.st_mtime_ns)
+        return (now.st_size, now.st_mtime_ns) != (self._metadata_model.st_size, self._metadata_model.st_mtime_ns)
 
     def close(self) -> None:
         """Close it."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import json
+import math
 import os
 import shutil
 import threading
@@ -88,6 +89,11 @@ def read_json(path: str | os.PathLike[str]) -> Any:
         return json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{os.fspath(path)} is not a JSON file: {error}") from error
+
+
+def finite_or_none(value: float | None) -> float | None:
+    """Return the value; `None` for NaN and infinities, which JSON does not have."""
+    return value if value is not None and math.isfinite(value) else None
 
 
 def check_free_space(folder: str | os.PathLike[str], wanted_bytes: int, what: str) -> None:

@@ -27,17 +27,17 @@ class SceneSource:
 
     Attributes:
         count: N.
-        facts: the scene without its splats: SH degree, axes, origin, antialiasing, metadata, names and types of extra
-            columns.
+        metadata_model: the scene without its splats: SH degree, axes, origin, antialiasing, metadata, names and types
+            of extra columns.
         blocks: yields all splats in order, from the first one at every call, in models of at most `BLOCK_SPLATS` splats
-            that agree with `facts` in everything else.
+            that agree with `metadata_model` in everything else.
         findings: findings so far; grows while the first blocks are read.
         format: name of the format that it is read from; "" if the scene is in memory.
         levels: splats of each level of detail, the finest first, if the file has several; this scene is one of them.
     """
 
     count: int
-    facts: SplatModel
+    metadata_model: SplatModel
     blocks: Callable[[], Iterator[SplatModel]]
     findings: list[Finding] = field(default_factory=list)
     format: str = ""
@@ -52,7 +52,7 @@ class SceneSource:
 
     def model(self) -> SplatModel:
         """Read all blocks into one model."""
-        return join_blocks(self.facts, list(self.blocks()))
+        return join_blocks(self.metadata_model, list(self.blocks()))
 
 
 def source_from_model(model: SplatModel) -> SceneSource:
@@ -65,19 +65,19 @@ def source_from_model(model: SplatModel) -> SceneSource:
     return SceneSource(len(model), model.select(slice(0, 0)), blocks)
 
 
-def join_blocks(facts: SplatModel, blocks: Sequence[SplatModel]) -> SplatModel:
+def join_blocks(metadata_model: SplatModel, blocks: Sequence[SplatModel]) -> SplatModel:
     """Concatenate blocks of a scene."""
     if len(blocks) < 2:
-        return blocks[0] if blocks else facts
+        return blocks[0] if blocks else metadata_model
     arrays: dict[str, Any] = {
         name: np.concatenate([getattr(one, name) for one in blocks])
         for name in ("means", "quats", "scales", "opacities", "sh0", "shN")
     }
     doubles = [one.means_double for one in blocks]
     return replace(
-        facts,
+        metadata_model,
         **arrays,
-        extra={name: np.concatenate([one.extra[name] for one in blocks]) for name in facts.extra},
+        extra={name: np.concatenate([one.extra[name] for one in blocks]) for name in metadata_model.extra},
         means_double=None if doubles[0] is None else np.concatenate([one for one in doubles if one is not None]),
     )
 

@@ -6,7 +6,7 @@ The decoder exits with status 0 and leaves in OUTDIR `header.json` and a file of
 little-endian, in C order: `integers.NAME.bin`, `floats.NAME.bin`, `extra.NAME.bin` (names of columns percent-encoded).
 Or it exits with status 1, its last line on standard output is JSON, `{"code": "E_CRC"}`, and OUTDIR stays empty.
 
-`run_program` starts any program with a time limit and returns how it end:
+`run_program` starts any program with a time limit and returns how it ended:
 
     >>> places = {"input": "a b.ply", "out": "x"}
     >>> end = run_program("my-tool {input} {out}", places, timeout_seconds=60)    # doctest: +SKIP

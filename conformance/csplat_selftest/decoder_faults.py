@@ -378,7 +378,7 @@ _NO_LIMITS = constants(
         ("CHROMA_SHIFT_MAX", "QUAT_LEVELS_MAX", "OPACITY_LEVELS_MAX", "COLUMN_MAX", "JSON_DEPTH_MAX"), 2**60
     )
 )
-_NOTHING_READ = together(replaced("read_json", nothing), replaced("read_serr", nothing))
+_NOTHING_READ = together(replaced("json_chunk", nothing), replaced("bounds_chunk", nothing))
 
 _REPLACEMENTS: Final = (
     DecoderFault("CRC ignored", "no CRC-32 is compared", "CHK-1", replaced("_check_crc", nothing)),

@@ -6,7 +6,6 @@ Progress is a bar on a terminal, otherwise a line now and then. There is one sta
 from __future__ import annotations
 
 import json
-import math
 import re
 import sys
 import threading
@@ -53,11 +52,6 @@ def print_data(text: str) -> None:
 def print_json(value: Any) -> None:
     """Print a value as JSON; NaN and infinities are refused, since JSON has none."""
     print_data(json.dumps(value, indent=2, allow_nan=False))
-
-
-def finite_or_none(value: float | None) -> float | None:
-    """Return the value; `None` for NaN and infinities, which JSON does not have."""
-    return value if value is not None and math.isfinite(value) else None
 
 
 def note(text: str) -> None:

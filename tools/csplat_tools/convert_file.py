@@ -120,7 +120,9 @@ def _key(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _map_blocks(scene: SceneSource, change: Callable[[SplatModel], SplatModel]) -> SceneSource:
     blocks = scene.blocks
-    return replace(scene, facts=change(scene.facts), blocks=lambda: (change(model) for model in blocks()))
+    return replace(
+        scene, metadata_model=change(scene.metadata_model), blocks=lambda: (change(model) for model in blocks())
+    )
 
 
 def _select(scene: SceneSource, keep: Callable[[SplatModel], Mask]) -> SceneSource:
@@ -263,16 +265,16 @@ def convert_file(
     sh_degree = None if filters is None else filters.sh_degree
     with local_path(source) as local, open_scene(local, read_as, level=level, sh_degree=sh_degree) as reader:
         scene = (overrides or MetadataOverrides()).apply_to_scene(reader)
-        before = scene.facts.coordinate_system
+        before = scene.metadata_model.coordinate_system
         scene = (filters or Filters()).apply(scene)
-        lost = writes.losses(scene.facts)
+        lost = writes.losses(scene.metadata_model)
         rounded = tuple(
-            name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.facts.sh_degree)
+            name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.metadata_model.sh_degree)
         )
         result = Conversion(
-            reader.format, writes.name, scene.count, scene.facts.sh_degree, size_on_disk(local),
-            writes.expected_bytes(scene.facts, scene.count), lost, rounded,
-            (before, writes.axes or scene.facts.coordinate_system), (),
+            reader.format, writes.name, scene.count, scene.metadata_model.sh_degree, size_on_disk(local),
+            writes.expected_bytes(scene.metadata_model, scene.count), lost, rounded,
+            (before, writes.axes or scene.metadata_model.coordinate_system), (),
         )  # fmt: skip
         if no_loss and (lost or rounded):
             raise InputError(f"{writes.title} does not keep all of {source}: {result.losses()}")
@@ -312,14 +314,14 @@ def decode_file(
     """
     with mapped_csplat(source) as data:
         opened = open_tiles(data, limits=None if max_splats is None else Limits(splats=max_splats))
-        decoded = SceneSource(opened.header.splat_count, opened.facts, opened.models)
+        decoded = SceneSource(opened.header.splat_count, opened.metadata_model, opened.models)
         # All bands are decoded, even if some are left out: damage anywhere gives no PLY.
         scene = Filters(sh_degree=sh_degree).apply((overrides or MetadataOverrides()).apply_to_scene(decoded))
         if is_one_way(target):
             for _ in with_progress(decoded, "checking", progress).blocks():
                 pass
         write_model(target, with_progress(scene, "decoding", progress), absolute=absolute)
-    return scene.count, scene.facts.sh_degree
+    return scene.count, scene.metadata_model.sh_degree
 
 
 def format_rows() -> list[tuple[str, ...]]:

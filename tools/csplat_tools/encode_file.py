@@ -133,8 +133,8 @@ def encode_out_of_core(
         if target == STANDARD_STREAM:
             raise InputError("the scene does not fit in memory, and is written by way of the disk: name a file")
         findings = [*reader.findings]
-        if reader.facts.extra and not options.keep_extra:
-            findings.append(dropped_columns(list(reader.facts.extra)))
+        if reader.metadata_model.extra and not options.keep_extra:
+            findings.append(dropped_columns(list(reader.metadata_model.extra)))
         refuse(findings, strict=strict)
         scene = (overrides or MetadataOverrides()).apply_to_scene(reader)
         try:
@@ -148,7 +148,7 @@ def encode_out_of_core(
             if folder.exists():
                 note(f"{folder} keeps what is done: --resume continues with it")
             raise
-        return OutOfCoreResult(scene.facts, report, tuple(findings))
+        return OutOfCoreResult(scene.metadata_model, report, tuple(findings))
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,11 @@ def estimate_cost(local: Path, options: EncodeOptions, scale: OutOfCoreOptions) 
     with open_scene(local, sh_degree=read_degree(options)) as reader:
         needs = estimate_needs(reader, options, scale.memory_bytes, by_disk=scale.out_of_core)
         count = reader.count
-        degree = reader.facts.sh_degree if options.sh_degree is None else min(options.sh_degree, reader.facts.sh_degree)
+        degree = (
+            reader.metadata_model.sh_degree
+            if options.sh_degree is None
+            else min(options.sh_degree, reader.metadata_model.sh_degree)
+        )
     read, code, book = _SECONDS[min(degree, 1) if options.preset == "fast" else degree]
     passes = 1 if needs.in_memory else 4
     seconds = count / 1e6 * (read * passes + code / needs.workers) + book * min(1.0, count / 5e5) / needs.workers

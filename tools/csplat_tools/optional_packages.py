@@ -9,7 +9,7 @@ from csplat.errors import missing_package
 from csplat_tools.console import note, progress_bar
 
 _SPIN_COUNT = "1000"  # see `_limit_spinning`
-_PHOTOGRAPHS = (
+_DATA_SETS = (
     ("numba", None),
     ("scipy", None),
     ("PIL", "pillow"),
@@ -65,7 +65,7 @@ def require_trainer(*, plots: bool = False) -> None:
         InputError: a package is not installed.
     """
     _limit_spinning()
-    require_photographs()
+    require_data_sets()
     if plots:
         require_plots()
 
@@ -97,13 +97,13 @@ def require_plots() -> None:
     _need("matplotlib")
 
 
-def require_photographs() -> None:
+def require_data_sets() -> None:
     """Import the packages for reading data sets.
 
     Raises:
         InputError: a package is not installed.
     """
-    for module, package in _PHOTOGRAPHS:
+    for module, package in _DATA_SETS:
         _need(module, package)
 
 

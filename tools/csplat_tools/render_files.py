@@ -25,10 +25,10 @@ def image_names(images: Sequence[str | None]) -> list[str]:
     """Return unique file names for renders, without ending.
 
     Args:
-        images: names of the cameras' photographs, such as `images/0007.jpg`, or `None`.
+        images: names of the cameras' images, such as `images/0007.jpg`, or `None`.
 
     Returns:
-        The names of the photographs; a number for a camera without one; both if the names are not unique.
+        The names of the images; a number for a camera without one; both if the names are not unique.
     """
     stems = [_stem(image) for image in images]
     numbers = [f"{number:0{_DIGITS}d}" for number in range(len(stems))]
@@ -70,19 +70,19 @@ def to_uint8(values: F32) -> U8:
     return result
 
 
-def side_by_side(a: F32, b: F32, amplification: float, photograph: F32 | None = None) -> U8:
+def side_by_side(a: F32, b: F32, amplification: float, image: F32 | None = None) -> U8:
     """Lay side by side two images and the amplified magnitude of their difference.
 
     Args:
         a, b: [H, W, 3], 0..1.
         amplification: factor by which the difference is multiplied.
-        photograph: [H, W, 3], placed before the others, if there is one.
+        image: [H, W, 3], placed before the others, if there is one.
 
     Returns:
-        [H, 3 W, 3], or [H, 4 W, 3] with a photograph.
+        [H, 3 W, 3], or [H, 4 W, 3] with an image.
     """
     difference = np.abs(b.astype(np.float32) - a) * np.float32(amplification)
-    shown = [a, b, difference] if photograph is None else [photograph, a, b, difference]
+    shown = [a, b, difference] if image is None else [image, a, b, difference]
     return np.concatenate([to_uint8(one) for one in shown], axis=1)
 
 

@@ -68,13 +68,13 @@ class LoadedModel:
         return len(self.model)
 
     @property
-    def facts(self) -> SplatModel:
+    def metadata_model(self) -> SplatModel:
         """The scene's metadata, as fields of the model itself."""
         return self.model
 
     def as_json(self) -> dict[str, Any]:
         """Return size and counts as JSON-compatible values."""
-        return _sizes(self.count, self.facts, self.size_bytes)
+        return _sizes(self.count, self.metadata_model, self.size_bytes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class OpenedScene:
                 if progress is not None:
                     progress("sampling the scene", rows.start / max(1, self.count))
                 parts.append(_plain(block.select(np.arange(-rows.start % every, len(block), every))))
-            self._sample.append(join_blocks(_plain(self.facts), parts))
+            self._sample.append(join_blocks(_plain(self.metadata_model), parts))
         return self._sample[0], every
 
     @property
@@ -120,28 +120,28 @@ class OpenedScene:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings while it was read."""
-        extra = list(self.facts.extra)
+        extra = list(self.metadata_model.extra)
         return (*self.scene.findings, *([dropped_columns(extra)] if extra and self.scene.format == "ply" else []))
 
     @property
-    def facts(self) -> SplatModel:
+    def metadata_model(self) -> SplatModel:
         """The scene's metadata, as a model without splats."""
-        return self.scene.facts
+        return self.scene.metadata_model
 
     def as_json(self) -> dict[str, Any]:
         """Return size and counts as JSON-compatible values."""
-        return _sizes(self.count, self.facts, self.size_bytes)
+        return _sizes(self.count, self.metadata_model, self.size_bytes)
 
 
 def _plain(model: SplatModel) -> SplatModel:
     return replace(drop_bands(model, 0), extra={}, means_double=None)
 
 
-def _sizes(count: int, facts: SplatModel, size_bytes: int) -> dict[str, Any]:
+def _sizes(count: int, metadata_model: SplatModel, size_bytes: int) -> dict[str, Any]:
     return {
         "size_bytes": size_bytes,
         "splats": count,
-        "sh_degree": facts.sh_degree,
+        "sh_degree": metadata_model.sh_degree,
         "bytes_per_splat": size_bytes / count if count else None,
     }
 
@@ -298,7 +298,7 @@ def _in_memory(opened: OpenedScene) -> LoadedModel:
 
 def _together_bytes(found: Sequence[OpenedScene]) -> float:
     """Estimate the bytes of memory for a comparison with all splats in memory."""
-    arrays = sum(one.count * ply_splat_bytes(one.facts.sh_degree) for one in found)
+    arrays = sum(one.count * ply_splat_bytes(one.metadata_model.sh_degree) for one in found)
     return _BASE_BYTES + arrays + _SPLAT_BYTES * max(one.count for one in found)
 
 
@@ -339,11 +339,11 @@ def with_progress(scene: SceneSource, stage: str, progress: Progress | None) -> 
 
 def without_extra_columns(scene: SceneSource) -> SceneSource:
     """Return the scene without the columns that splats do not have."""
-    if not scene.facts.extra:
+    if not scene.metadata_model.extra:
         return scene
     return replace(
         scene,
-        facts=replace(scene.facts, extra={}),
+        metadata_model=replace(scene.metadata_model, extra={}),
         blocks=lambda: (replace(model, extra={}) for model in scene.blocks()),
     )
 
@@ -376,4 +376,6 @@ class MetadataOverrides:
 
     def apply_to_scene(self, scene: SceneSource) -> SceneSource:
         """Return the scene with these overrides."""
-        return replace(scene, facts=self.apply(scene.facts), blocks=lambda: map(self.apply, scene.blocks()))
+        return replace(
+            scene, metadata_model=self.apply(scene.metadata_model), blocks=lambda: map(self.apply, scene.blocks())
+        )

@@ -24,7 +24,7 @@ _BATCHES = 400  # largest number of batches
 _MASK = 0.02  # alpha from which a pixel belongs to the object
 _MISSES = 0.02  # fraction of the images that may miss a point of the hull: rounding to pixels
 _NEIGHBOURS = 3  # number of neighbours whose distance determines a splat's size
-_BOX_SHARE = 0.9  # fraction of the middle camera's field of view at the distance of the focus
+_BOX_FRACTION = 0.9  # fraction of the middle camera's field of view at the distance of the focus
 _PHOTO_BOX = 1.5  # factor for photographs, which show the surroundings of their subject too
 
 
@@ -62,7 +62,7 @@ def measure_extent(images: Sequence[PosedImage]) -> SceneExtent:
     focus = np.linalg.solve(left, np.einsum("nij,nj->i", across, positions) + weight * guess)
     distance = float(np.median(np.linalg.norm(positions - focus, axis=1)))
     half_view = float(np.median([0.5 * min(c.W / c.K[0, 0], c.H / c.K[1, 1]) for c in cameras]))
-    half = distance * half_view * _BOX_SHARE
+    half = distance * half_view * _BOX_FRACTION
     if not any(image.has_alpha for image in images):
         half = distance * _PHOTO_BOX
     extent = 1.1 * float(spread)

@@ -174,7 +174,7 @@ def _compose(lane: int, lanes: int, pixels: U8, background: F32, out: F32) -> No
                     out[r, c, k] = np.float32(pixels[r, c, k]) * over
 
 
-def photograph_scorer(
+def image_scorer(
     images: Sequence[PosedImage],
     background: ArrayLike,
     *,
@@ -215,7 +215,7 @@ def evaluate(
     Returns:
         The fields of `csplat_render.metrics.Scores` for all images together.
     """
-    scorer = photograph_scorer(images, background)
+    scorer = image_scorer(images, background)
     each = [scorer.score(number, render(camera), lpips=lpips) for number, camera in enumerate(scorer.cameras)]
     return Scores.of(each).as_json()
 

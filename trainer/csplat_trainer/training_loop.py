@@ -42,7 +42,7 @@ _RESET_EVERY = 3000  # steps between resets of the opacities, gradient strategy
 _KEPT_AT_ONCE = 0.85  # fraction of the splats that a late pruning keeps
 _STEPS_BETWEEN = 100  # steps after each late pruning
 _LARGE_EXTENT = 50.0  # scene units; in larger scenes the weight of the mean standard deviation is reduced
-_FIRST_SHARE = 0.5  # fraction of the cap: initial number of splats of mcmc without points
+_FIRST_FRACTION = 0.5  # fraction of the cap: initial number of splats of mcmc without points
 
 
 def train(
@@ -116,8 +116,10 @@ class _TrainingRun:
             parameters = self._resume(load_checkpoint(outputs.resume))
         self._gains = ImageGains(len(data.train), self._log.get("exposures", ()))
         self._lpips = _lpips(options, outputs)
-        share = min(1.0, _LARGE_EXTENT / self._scene.extent)
-        self._engine = _engine(parameters, replace(options, scale_weight=share * options.scale_weight), self._lpips)
+        extent_factor = min(1.0, _LARGE_EXTENT / self._scene.extent)
+        self._engine = _engine(
+            parameters, replace(options, scale_weight=extent_factor * options.scale_weight), self._lpips
+        )
         self._behind = _COLOURS.get(options.background, data.background)
         self._background = np.array(self._behind, np.float32)
 
@@ -165,7 +167,7 @@ class _TrainingRun:
             count = options.max_splats
         if count == 0:
             points = 0 if data.points is None or options.init in ("hull", "box") else len(data.points)
-            count = points or max(1, int(_FIRST_SHARE * options.max_splats))
+            count = points or max(1, int(_FIRST_FRACTION * options.max_splats))
         return place_splats(
             data.inliers,
             scene,
@@ -237,7 +239,7 @@ class _TrainingRun:
         self._engine.parameters = parameters
 
     def _prune(self, times: int) -> None:
-        """Prune splats, so that the given number of equal prunings reaches the final share."""
+        """Prune splats, so that the given number of equal prunings reaches the final fraction."""
         options, parameters = self._options, self._engine.parameters
         wanted = options.final_share * self._log.setdefault("splats_before_thinning", len(parameters))
         count = len(parameters) * math.pow(wanted / len(parameters), 1.0 / times) if times > 1 else wanted

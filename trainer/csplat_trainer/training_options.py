@@ -163,7 +163,7 @@ class TrainOptions:
         The last one happens when two fifths of the steps after the last move of splats are left.
         """
         begin = min(self.refine_end, self.iterations - 1)
-        steps = max(1, int(_PRUNING_SHARE * (self.iterations - begin)))
+        steps = max(1, int(_PRUNING_FRACTION * (self.iterations - begin)))
         times = min(_MAX_PRUNINGS, steps)
         done, rest = divmod(iteration - begin, steps // times)
         return max(0, times + 1 - done) if self.final_share < 1.0 and rest == 0 and done > 0 else 0
@@ -201,7 +201,7 @@ class TrainOptions:
 
 _GROWTH = 1.05  # growth factor of the MCMC paper
 _MAX_PRUNINGS = 10  # largest number of prunings
-_PRUNING_SHARE = 0.6  # fraction of the steps after the last action of the strategy, over which prunings are spread
+_PRUNING_FRACTION = 0.6  # fraction of the steps after the last action of the strategy, over which prunings are spread
 _LAST_EXPOSURE = 0.05  # fraction of the learning rate of image gains that remains at the end
 
 _CHOICES = {

@@ -17,7 +17,7 @@ from csplat.decoder.codebooks import check_unnamed_codebooks, read_codebooks
 from csplat.decoder.container import SceneHeader, Tile, open_chunk, view_of
 from csplat.decoder.index import parse_header
 from csplat.decoder.limits import Limits, check_budget, float_bytes, integer_bytes
-from csplat.decoder.metadata import DeclaredBounds, read_json, read_serr
+from csplat.decoder.metadata import DeclaredBounds, bounds_chunk, json_chunk
 from csplat.decoder.reconstruct import (
     SplatArrays,
     empty_integers,
@@ -112,14 +112,14 @@ class TileReader:
     """An open file whose tiles are decoded on demand; all other chunks are checked already.
 
     Attributes:
-        facts: the scene without its splats.
+        metadata_model: the scene without its splats.
         options: the encoder's record of its options (`None`: there is none).
         declared_bounds: the file's declared error bounds (`None`: there are none).
         request: the file.
         threads: as in `decode`.
     """
 
-    facts: SplatModel
+    metadata_model: SplatModel
     options: dict[str, Any] | None
     declared_bounds: DeclaredBounds | None
     request: DecodeRequest
@@ -131,14 +131,14 @@ class TileReader:
         return self.request.header
 
     def models(self, tiles: Sequence[int] | None = None) -> Iterator[SplatModel]:
-        """Decode tiles one after the other into models with the metadata of `facts`.
+        """Decode tiles one after the other into models with the metadata of `metadata_model`.
 
         Args:
             tiles: indices of the tiles to decode, in the order requested; by default all.
         """
         header = self.header
         chosen = header.tiles if tiles is None else [header.tiles[index] for index in tiles]
-        texts = self.facts.metadata, self.facts.cameras
+        texts = self.metadata_model.metadata, self.metadata_model.cameras
         for _, arrays in _iterate(replace(self.request, tiles=chosen), self.threads):
             yield _model_of(header, arrays, texts)
 
@@ -337,14 +337,14 @@ def read_side_chunks(request: DecodeRequest) -> tuple[dict[str, Any] | None, Dec
             open_chunk(view, record, record.type, record.flags, "CHK-2")
     with np.errstate(all="ignore"):
         check_unnamed_codebooks(view, header)
-    options = read_json(view, header, _spec.CHUNK_OPTIONS, request.limits.json_bytes)
-    return options, read_serr(view, header)
+    options = json_chunk(view, header, _spec.CHUNK_OPTIONS, request.limits.json_bytes)
+    return options, bounds_chunk(view, header)
 
 
 def _read_texts(request: DecodeRequest) -> _Texts:
     view, header, json_bytes = request.view, request.header, request.limits.json_bytes
-    metadata = read_json(view, header, _spec.CHUNK_METADATA, json_bytes)
-    return metadata or {}, read_json(view, header, _spec.CHUNK_CAMERAS, json_bytes)
+    metadata = json_chunk(view, header, _spec.CHUNK_METADATA, json_bytes)
+    return metadata or {}, json_chunk(view, header, _spec.CHUNK_CAMERAS, json_bytes)
 
 
 def _write_all(request: DecodeRequest, write: Callable[[int, int, TileBlocks], None], threads: int | None) -> None:

@@ -89,10 +89,10 @@ def read_options(data: File, *, limits: Limits | None = None) -> dict[str, Any] 
 def read_declared_bounds(data: File) -> DeclaredBounds | None:
     """Return the content of the SERR chunk, `None` if there is none."""
     view = view_of(data)
-    return read_serr(view, parse_header(view, whole=True))
+    return bounds_chunk(view, parse_header(view, whole=True))
 
 
-def read_json(view: memoryview, header: SceneHeader, kind: bytes, json_bytes: int) -> Any:
+def json_chunk(view: memoryview, header: SceneHeader, kind: bytes, json_bytes: int) -> Any:
     """Return the value of the META, CAMS or OPTS chunk, `None` if the file has none.
 
     Args:
@@ -143,7 +143,7 @@ def parse_json(text: bytes, kind: type[dict[str, Any] | list[Any]], at: int) -> 
     return value
 
 
-def read_serr(view: memoryview, header: SceneHeader) -> DeclaredBounds | None:
+def bounds_chunk(view: memoryview, header: SceneHeader) -> DeclaredBounds | None:
     """Return the content of the SERR chunk, `None` if the file has none."""
     record = header.chunk(_spec.CHUNK_STATED_ERRORS)
     if record is None:
@@ -182,7 +182,7 @@ def read_serr(view: memoryview, header: SceneHeader) -> DeclaredBounds | None:
 
 def _read_text(data: File, kind: bytes, limits: Limits | None) -> Any:
     view = view_of(data)
-    return read_json(view, parse_header(view, whole=True), kind, (limits or Limits()).json_bytes)
+    return json_chunk(view, parse_header(view, whole=True), kind, (limits or Limits()).json_bytes)
 
 
 class _RefusedError(ValueError):

@@ -209,9 +209,9 @@ def _encode_again(
     scenes: Sequence[SplatFile], output: str | os.PathLike[str] | BinaryWriter, options: EncodeOptions, why: str
 ) -> MergeResult:
     """Decode tile by tile and encode anew, in memory if that is enough for it."""
-    facts = _facts(scenes)
-    whole = SceneSource(sum(map(len, scenes)), facts, partial(_blocks, scenes, facts))
-    dropped = {column.name for scene in scenes for column in scene.header.extras} - facts.extra.keys()
+    metadata_model = _metadata_model(scenes)
+    whole = SceneSource(sum(map(len, scenes)), metadata_model, partial(_blocks, scenes, metadata_model))
+    dropped = {column.name for scene in scenes for column in scene.header.extras} - metadata_model.extra.keys()
     with TemporaryDirectory(prefix="csplat-") as folder:
         path = Path(folder) / "merged.csplat"
         encode_scene(whole, path, options, folder=Path(folder) / "work")
@@ -220,7 +220,7 @@ def _encode_again(
         return MergeResult(whole.count, len(read_header(path).tiles), path.stat().st_size, why, tuple(sorted(dropped)))
 
 
-def _facts(scenes: Sequence[SplatFile]) -> SplatModel:
+def _metadata_model(scenes: Sequence[SplatFile]) -> SplatModel:
     """Return a model without splats for the scenes together: one origin, and the columns that all have."""
     headers = [scene.header for scene in scenes]
     origins = np.array([header.origin for header in headers])
@@ -251,18 +251,19 @@ def _facts(scenes: Sequence[SplatFile]) -> SplatModel:
     )
 
 
-def _blocks(scenes: Sequence[SplatFile], facts: SplatModel) -> Iterator[SplatModel]:
+def _blocks(scenes: Sequence[SplatFile], metadata_model: SplatModel) -> Iterator[SplatModel]:
     for scene in scenes:
         for tile in scene.tiles():
-            shN = np.zeros((len(tile.means), *facts.shN.shape[1:]), np.float32)
+            shN = np.zeros((len(tile.means), *metadata_model.shN.shape[1:]), np.float32)
             shN[:, : tile.shN.shape[1]] = tile.shN
             means, doubles = tile.means, None
-            if facts.means_double is not None:
+            if metadata_model.means_double is not None:
                 doubles = tile.means.astype(np.float64) + scene.header.origin
-                means = (doubles - facts.origin).astype(np.float32)
+                means = (doubles - metadata_model.origin).astype(np.float32)
             yield replace(
-                facts, means=means, quats=tile.quats, scales=tile.scales, opacities=tile.opacities, sh0=tile.sh0,
-                shN=shN, extra={name: tile.extra[name] for name in facts.extra}, means_double=doubles,
+                metadata_model, means=means, quats=tile.quats, scales=tile.scales, opacities=tile.opacities,
+                sh0=tile.sh0, shN=shN, extra={name: tile.extra[name] for name in metadata_model.extra},
+                means_double=doubles,
             )  # fmt: skip
 
 

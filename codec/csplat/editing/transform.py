@@ -66,7 +66,7 @@ def convert_axes(scene: SceneSource, axes: str) -> SceneSource:
         scene: the scene.
         axes: directions of +x, +y and +z, three letters.
     """
-    matrix = _rotation_to(scene.facts, axes)
+    matrix = _rotation_to(scene.metadata_model, axes)
 
     def placed(model: SplatModel) -> SplatModel:
         return replace(rotate_scene(model, matrix), coordinate_system=axes)
@@ -74,8 +74,8 @@ def convert_axes(scene: SceneSource, axes: str) -> SceneSource:
     def blocks() -> Iterator[SplatModel]:
         yield from map(placed, scene.blocks())
 
-    same = scene.facts.coordinate_system == axes
-    return scene if same else SceneSource(scene.count, placed(scene.facts), blocks, scene.findings)
+    same = scene.metadata_model.coordinate_system == axes
+    return scene if same else SceneSource(scene.count, placed(scene.metadata_model), blocks, scene.findings)
 
 
 def rotate_scene(model: SplatModel, rotation: ArrayLike) -> SplatModel:
@@ -179,10 +179,10 @@ def translate_scene(model: SplatModel, offset: Direction) -> SplatModel:
     return replace(model, means=means.astype(np.float32), means_double=doubles, **cameras)
 
 
-def _rotation_to(facts: SplatModel, axes: str) -> F64:
-    known = facts.coordinate_system != UNSPECIFIED
-    matrix = axes_rotation(facts.coordinate_system if known else DEFAULT_AXES, axes)
-    up, wanted = up_of(facts.metadata), up_of_axes(axes)
+def _rotation_to(metadata_model: SplatModel, axes: str) -> F64:
+    known = metadata_model.coordinate_system != UNSPECIFIED
+    matrix = axes_rotation(metadata_model.coordinate_system if known else DEFAULT_AXES, axes)
+    up, wanted = up_of(metadata_model.metadata), up_of_axes(axes)
     if known or up is None or wanted is None:
         return matrix
     tilted: F64 = _tilt(_applied(matrix, np.array(up, np.float64)), np.array(wanted)) @ matrix

@@ -306,10 +306,10 @@ def _open(
 
 
 def _with_fewer_bands(scene: SceneSource, sh_degree: int) -> SceneSource:
-    if sh_degree >= scene.facts.sh_degree:
+    if sh_degree >= scene.metadata_model.sh_degree:
         return scene
     return replace(
         scene,
-        facts=drop_bands(scene.facts, sh_degree),
+        metadata_model=drop_bands(scene.metadata_model, sh_degree),
         blocks=lambda: (drop_bands(model, sh_degree) for model in scene.blocks()),
     )

@@ -30,7 +30,7 @@ _SMALLEST = np.float32(1e-20)  # scene units; replaces a standard deviation of 0
 def finite_scene(
     blocks: Callable[[], Iterator[tuple[Rows, ...]]],
     decode: Callable[..., SplatModel],
-    facts: SplatModel,
+    metadata_model: SplatModel,
     *,
     zero_quat: int = 0,
 ) -> SceneSource:
@@ -39,7 +39,7 @@ def finite_scene(
     Args:
         blocks: yields rows, at most `BLOCK_SPLATS` at a time, together with arrays of the same length.
         decode: makes a model of natural logarithms of scales and such a tuple.
-        facts: as in `SceneSource`.
+        metadata_model: as in `SceneSource`.
         zero_quat: value of each component of a rotation of length 0 in the file.
 
     Returns:
@@ -74,7 +74,7 @@ def finite_scene(
                 scales = kept[0]["scales"].astype(np.float32)
                 yield decode(scales if are_logs else _log_scales(scales), *kept)
 
-    return SceneSource(kept, facts, models, findings)
+    return SceneSource(kept, metadata_model, models, findings)
 
 
 def _count_empty_rows(rows: Rows) -> int:
@@ -271,8 +271,8 @@ def sorted_along_curve(scene: SceneSource, folder: Path) -> Iterator[SceneSource
         OSError: the folder is full.
     """
     curve = _ZCurve.through(scene)
-    facts = replace(scene.facts, extra={}, means_double=None)
-    dtype = np.dtype([(name, "<f4", getattr(facts, name).shape[1:]) for name in ARRAYS])
+    metadata_model = replace(scene.metadata_model, extra={}, means_double=None)
+    dtype = np.dtype([(name, "<f4", getattr(metadata_model, name).shape[1:]) for name in ARRAYS])
     with tempfile.SpooledTemporaryFile(_IN_MEMORY, dir=str(folder)) as spool:
         runs = []  # for each block written, the offsets of its parts
         for model in scene.blocks():
@@ -284,7 +284,11 @@ def sorted_along_curve(scene: SceneSource, folder: Path) -> Iterator[SceneSource
             parts = np.searchsorted(codes[order], curve.splits)
             runs.append(spool.tell() + dtype.itemsize * np.concatenate([[0], parts, [len(model)]]))
             spool.write(rows.tobytes())
-        yield replace(scene, facts=facts, blocks=lambda: _fill_blocks(facts, _merge_runs(spool, runs, dtype, curve)))
+        yield replace(
+            scene,
+            metadata_model=metadata_model,
+            blocks=lambda: _fill_blocks(metadata_model, _merge_runs(spool, runs, dtype, curve)),
+        )
 
 
 def _merge_runs(spool: IO[bytes], runs: Sequence[I64], dtype: np.dtype[Any], curve: _ZCurve) -> Iterator[NDArray[Any]]:
@@ -298,20 +302,20 @@ def _merge_runs(spool: IO[bytes], runs: Sequence[I64], dtype: np.dtype[Any], cur
         yield rows[np.argsort(curve.codes(rows["means"]), kind="stable")]
 
 
-def _fill_blocks(facts: SplatModel, parts: Iterator[NDArray[Any]]) -> Iterator[SplatModel]:
+def _fill_blocks(metadata_model: SplatModel, parts: Iterator[NDArray[Any]]) -> Iterator[SplatModel]:
     left: list[NDArray[Any]] = []
     for rows in parts:
         left = [np.concatenate([*left, rows])]
         while len(left[0]) >= BLOCK_SPLATS:
-            yield _model_of_rows(facts, left[0][:BLOCK_SPLATS])
+            yield _model_of_rows(metadata_model, left[0][:BLOCK_SPLATS])
             left = [left[0][BLOCK_SPLATS:]]
     if left and len(left[0]):
-        yield _model_of_rows(facts, left[0])
+        yield _model_of_rows(metadata_model, left[0])
 
 
-def _model_of_rows(facts: SplatModel, rows: NDArray[Any]) -> SplatModel:
+def _model_of_rows(metadata_model: SplatModel, rows: NDArray[Any]) -> SplatModel:
     arrays: dict[str, Any] = {name: np.ascontiguousarray(rows[name]) for name in ARRAYS}
-    return replace(facts, **arrays)
+    return replace(metadata_model, **arrays)
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
         raise InputError(f"{path.name}: chunk {row} has {low} above {high}, expected at most that")
     try:
         metadata = parse_comments(comments)
-        facts = SplatModel(
+        metadata_model = SplatModel(
             **_unpack(np.zeros(0, vertex.dtype), bounds[:0], None, kept),
             origin=metadata.origin or (0.0, 0.0, 0.0),
             **metadata.fields(),
@@ -117,9 +117,9 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
             coefficients = None if sh is None else sh.read(path, start, stop)
             words = vertex.read(path, start, stop)
             chunk_bounds = bounds[start // _CHUNK : -(-stop // _CHUNK)]
-            yield replace(facts, **_unpack(words, chunk_bounds, coefficients, kept))
+            yield replace(metadata_model, **_unpack(words, chunk_bounds, coefficients, kept))
 
-    yield SceneSource(vertex.count, facts, blocks, [*findings, *metadata.findings])
+    yield SceneSource(vertex.count, metadata_model, blocks, [*findings, *metadata.findings])
 
 
 def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Finding]]:
@@ -216,8 +216,8 @@ def _sh_values() -> F32:
 
 def _write(path: Path, scene: SceneSource) -> None:
     """Write a scene sorted along a Z curve."""
-    rest = 3 * scene.facts.shN.shape[1]
-    header = _build_header(scene.facts, scene.count, rest)
+    rest = 3 * scene.metadata_model.shN.shape[1]
+    header = _build_header(scene.metadata_model, scene.count, rest)
     sizes = 4 * len(_BOUNDS + _COLOUR_BOUNDS) * -(-scene.count // _CHUNK), 4 * len(_PACKED_COLUMNS) * scene.count
     places = [len(header), len(header) + sizes[0], len(header) + sum(sizes)]
     with atomic_writer(path) as stream, sorted_along_curve(scene, path.parent) as ordered:
@@ -269,11 +269,11 @@ def _pack(values: F32, bits: tuple[int, int, int]) -> tuple[U32, F32, F32]:
     return words, low, high
 
 
-def _build_header(facts: SplatModel, count: int, rest: int) -> bytes:
+def _build_header(metadata_model: SplatModel, count: int, rest: int) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        *(f"comment {line}" for line in format_comments(facts, absolute=False)),
+        *(f"comment {line}" for line in format_comments(metadata_model, absolute=False)),
     ]
     lines += [f"element chunk {-(-count // _CHUNK)}", *(f"property float {name}" for name in _BOUNDS + _COLOUR_BOUNDS)]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED_COLUMNS)]

@@ -17,7 +17,7 @@ from csplat.scene_source import SceneSource
 @contextmanager
 def _open(path: Path) -> Iterator[SceneSource]:
     opened = open_tiles(path)
-    yield SceneSource(opened.header.splat_count, opened.facts, opened.models)
+    yield SceneSource(opened.header.splat_count, opened.metadata_model, opened.models)
 
 
 def _write(path: Path, scene: SceneSource) -> None:

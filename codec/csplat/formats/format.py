@@ -69,33 +69,33 @@ class Format:
         """Endings of file names, the usual one first; with their dots, in lower case."""
         return KINDS[self.name].suffixes
 
-    def expected_bytes(self, facts: SplatModel, count: int) -> int | None:
+    def expected_bytes(self, model: SplatModel, count: int) -> int | None:
         """Return the approximate size of a file; `None` if it depends on the scene."""
-        return round(count * self.splat_bytes[min(facts.sh_degree, self.degree)]) if self.splat_bytes else None
+        return round(count * self.splat_bytes[min(model.sh_degree, self.degree)]) if self.splat_bytes else None
 
-    def losses(self, facts: SplatModel) -> tuple[str, ...]:
+    def losses(self, model: SplatModel) -> tuple[str, ...]:
         """List the parts of a scene that this format cannot store, a few words each; precision is not one of them.
 
         Args:
-            facts: `facts` of a `SceneSource`, or a model.
+            model: `metadata_model` of a `SceneSource`, or a model.
         """
         lost = []
-        if facts.sh_degree > self.degree:
-            bands = range(self.degree + 1, facts.sh_degree + 1)
+        if model.sh_degree > self.degree:
+            bands = range(self.degree + 1, model.sh_degree + 1)
             lost.append(f"SH band{'s' if len(bands) > 1 else ''} {' and '.join(map(str, bands))}")
         for name, (words, is_there) in _PARTS.items():
-            if name not in self.carries and is_there(facts):
-                lost.append(f"{words} {', '.join(facts.extra)}" if name == "extra" else words)
+            if name not in self.carries and is_there(model):
+                lost.append(f"{words} {', '.join(model.extra)}" if name == "extra" else words)
         return tuple(lost)
 
 
 _PARTS: dict[str, tuple[str, Callable[[SplatModel], Any]]] = {
-    "antialiased": ("that it is antialiased", lambda facts: facts.antialiased),
-    "origin": ("the origin", lambda facts: any(facts.origin)),
-    "coordinate_system": ("the axes", lambda facts: facts.coordinate_system != UNSPECIFIED),
-    "unit_metres": ("the length of a unit", lambda facts: facts.unit_metres is not None),
-    "flat": ("that splats are discs", lambda facts: facts.flat),
-    "cameras": ("cameras", lambda facts: facts.cameras),
-    "metadata": ("metadata", lambda facts: facts.metadata),
-    "extra": ("extra columns", lambda facts: facts.extra),
+    "antialiased": ("that it is antialiased", lambda model: model.antialiased),
+    "origin": ("the origin", lambda model: any(model.origin)),
+    "coordinate_system": ("the axes", lambda model: model.coordinate_system != UNSPECIFIED),
+    "unit_metres": ("the length of a unit", lambda model: model.unit_metres is not None),
+    "flat": ("that splats are discs", lambda model: model.flat),
+    "cameras": ("cameras", lambda model: model.cameras),
+    "metadata": ("metadata", lambda model: model.metadata),
+    "extra": ("extra columns", lambda model: model.extra),
 }

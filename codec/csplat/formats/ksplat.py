@@ -113,8 +113,8 @@ def _open(path: Path) -> Iterator[SceneSource]:
         )
 
     no_rows = np.empty(0, _row_type(level, 0))
-    facts = decode(np.zeros((0, 3), np.float32), no_rows, np.zeros((0, 3)), np.zeros((0, 1)))
-    scene = finite_scene(blocks, decode, facts)
+    metadata_model = decode(np.zeros((0, 3), np.float32), no_rows, np.zeros((0, 3)), np.zeros((0, 1)))
+    scene = finite_scene(blocks, decode, metadata_model)
     scene.findings.extend(trailing_bytes(len(data) - end))
     yield scene
 

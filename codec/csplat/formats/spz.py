@@ -275,9 +275,9 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
 def write_spz(path: Path, scene: SceneSource, *, version: int) -> None:
     """Write version 3 or 4; otherwise as `Format.write`."""
     scene = convert_axes(scene, SPZ_AXES)
-    flags = ANTIALIASED if scene.facts.antialiased else 0
+    flags = ANTIALIASED if scene.metadata_model.antialiased else 0
     packed = SpzArrays(
-        path.name, version, scene.count, scene.facts.sh_degree, _choose_fraction_bits(path, scene), flags
+        path.name, version, scene.count, scene.metadata_model.sh_degree, _choose_fraction_bits(path, scene), flags
     )
     data = packed.allocate()
     for rows, block in scene.numbered():

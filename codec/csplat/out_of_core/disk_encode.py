@@ -87,7 +87,7 @@ def estimate_needs(
 
 def _layout(scene: SceneSource, options: EncodeOptions) -> SplatLayout:
     """Return the layout of the arrays that are carried."""
-    return SplatLayout(scene.facts if options.keep_extra else replace(scene.facts, extra={}))
+    return SplatLayout(scene.metadata_model if options.keep_extra else replace(scene.metadata_model, extra={}))
 
 
 def _too_low(bound: int, least: int) -> InputError:
@@ -220,11 +220,11 @@ class _Encoding:
         return self._without_splats(plan, books)
 
     def _without_splats(self, plan: CodingParameters, books: FileCodebooks) -> tuple[EncodePlan, FileCodebooks]:
-        facts, sh_plan = self.work.layout.facts, books.sh_plan
+        metadata_model, sh_plan = self.work.layout.metadata_model, books.sh_plan
         none = np.zeros(0, np.intp)
         origin = Origin(self.scene.count, none)
-        extras = extra_records(facts, self.options)
-        draft = EncodePlan(facts, self.options, origin, None, plan, [], extras, None, None)
+        extras = extra_records(metadata_model, self.options)
+        draft = EncodePlan(metadata_model, self.options, origin, None, plan, [], extras, None, None)
         return draft, replace(books, sh_plan=sh_plan.select(none))
 
     def _code(self, coding: BucketCoding) -> None:

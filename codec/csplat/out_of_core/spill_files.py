@@ -33,10 +33,10 @@ class SplatLayout:
     """Names and dtypes of a model's arrays.
 
     Attributes:
-        facts: a model without splats that holds everything else.
+        metadata_model: a model without splats that holds everything else.
     """
 
-    facts: SplatModel
+    metadata_model: SplatModel
 
     def arrays(self, model: SplatModel) -> list[NDArray[Any]]:
         """Return the arrays of a model, in the order of a frame."""
@@ -44,24 +44,29 @@ class SplatLayout:
         return [
             *(getattr(model, name) for name in _ARRAYS),
             *doubles,
-            *(model.extra[name] for name in self.facts.extra),
+            *(model.extra[name] for name in self.metadata_model.extra),
         ]
 
     @property
     def row_bytes(self) -> int:
         """Bytes of a splat."""
-        return sum(array.dtype.itemsize * int(np.prod(array.shape[1:])) for array in self.arrays(self.facts))
+        return sum(array.dtype.itemsize * int(np.prod(array.shape[1:])) for array in self.arrays(self.metadata_model))
 
     def empty(self, count: int) -> list[NDArray[Any]]:
         """Allocate arrays for some splats."""
-        return [np.empty((count, *array.shape[1:]), array.dtype) for array in self.arrays(self.facts)]
+        return [np.empty((count, *array.shape[1:]), array.dtype) for array in self.arrays(self.metadata_model)]
 
     def model(self, arrays: Sequence[NDArray[Any]]) -> SplatModel:
         """Make a model of these arrays."""
         named: dict[str, Any] = dict(zip(_ARRAYS, arrays, strict=False))
         rest = list(arrays[len(_ARRAYS) :])
-        doubles = None if self.facts.means_double is None else rest.pop(0)
-        return replace(self.facts, **named, means_double=doubles, extra=dict(zip(self.facts.extra, rest, strict=True)))
+        doubles = None if self.metadata_model.means_double is None else rest.pop(0)
+        return replace(
+            self.metadata_model,
+            **named,
+            means_double=doubles,
+            extra=dict(zip(self.metadata_model.extra, rest, strict=True)),
+        )
 
 
 @dataclass(frozen=True)

@@ -56,10 +56,10 @@ def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *,
 
 def write_scene_ply(file: str | os.PathLike[str] | BinaryWriter, scene: SceneSource, *, absolute: bool = False) -> None:
     """Write a scene block by block; otherwise as `write_ply`."""
-    dtype = _row_dtype(scene.facts, absolute=absolute)
+    dtype = _row_dtype(scene.metadata_model, absolute=absolute)
     step = max(1, _BLOCK_SIZE // dtype.itemsize)
     with open_writer(file) as stream:
-        stream.write(_header(scene.facts, scene.count, absolute=absolute))
+        stream.write(_header(scene.metadata_model, scene.count, absolute=absolute))
         rows = np.zeros(min(step, scene.count), dtype)
         for model in scene.blocks():
             for start in range(0, len(model), step):

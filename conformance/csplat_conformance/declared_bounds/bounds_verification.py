@@ -6,7 +6,6 @@ source within the declared maxima; rms and counts are then not verified.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import DeclaredBounds, SceneHeader
+from csplat.disk_files import finite_or_none
 from csplat.model import SplatModel
 from csplat.types import I64, Progress
 from csplat_conformance.declared_bounds.measurement import (
@@ -125,18 +125,14 @@ class BoundsVerification:
                 one.name: {
                     "stated_max": one.declared_max,
                     "stated_rms": one.declared_rms,
-                    "measured_max": _finite(one.measured_max),
-                    "measured_rms": _finite(one.measured_rms),
+                    "measured_max": finite_or_none(one.measured_max),
+                    "measured_rms": finite_or_none(one.measured_rms),
                     "holds": one.holds,
-                    "worst": None if one.worst is None else {**vars(one.worst), "found": _finite(one.worst.found)},
+                    "worst": one.worst and {**vars(one.worst), "found": finite_or_none(one.worst.found)},
                 }
                 for one in self.measures
             },
         }
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
 
 
 def verify_bounds(

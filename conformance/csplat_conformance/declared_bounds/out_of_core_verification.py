@@ -87,8 +87,10 @@ def fits_memory(opened: TileReader, source_count: int, source_bytes: int, memory
 
 
 def _splat_bytes(opened: TileReader) -> int:
-    facts = opened.facts
-    return 4 * (11 + 3 * (facts.sh_degree + 1) ** 2) + sum(column.itemsize for column in facts.extra.values())
+    metadata_model = opened.metadata_model
+    return 4 * (11 + 3 * (metadata_model.sh_degree + 1) ** 2) + sum(
+        column.itemsize for column in metadata_model.extra.values()
+    )
 
 
 def verify_out_of_core(
@@ -141,7 +143,7 @@ class _OutOfCoreComparison:
     @property
     def names(self) -> list[str]:
         """Names of the measures, in the order of the registry."""
-        return measure_names(self.scene.facts, self.opened.facts)
+        return measure_names(self.scene.metadata_model, self.opened.metadata_model)
 
     @property
     def source_count(self) -> int:
@@ -151,7 +153,7 @@ class _OutOfCoreComparison:
     @property
     def source_degree(self) -> int:
         """SH degree of the source."""
-        return self.scene.facts.sh_degree
+        return self.scene.metadata_model.sh_degree
 
     @property
     def _memory(self) -> int:
@@ -186,7 +188,7 @@ class _OutOfCoreComparison:
         for model in self.scene.blocks():
             self._report("reading the source", start / max(1, self.scene.count))
             block = Source.of(model)
-            self._reach = max(self._reach, block.reach(self.opened.facts.origin))
+            self._reach = max(self._reach, block.reach(self.opened.metadata_model.origin))
             yield start, block
             start += len(model)
 
@@ -199,7 +201,7 @@ class _OutOfCoreComparison:
 
     def matches(self, bounds: Mapping[str, float]) -> NDArray[Any]:
         """Implement `SplatComparison.matches`; [N] int8."""
-        header, origin = self.opened.header, self.opened.facts.origin
+        header, origin = self.opened.header, self.opened.metadata_model.origin
         workers, most = self._shares
         cells = CellTree.of(header, self.scene.count, most)
         for start, block in self._sources():
@@ -229,7 +231,7 @@ class _OutOfCoreComparison:
         sources, numbers = [], []
         for cell in self._spool.counts():
             for source, known in self._spool.sources(cell, self._most):
-                means = source.about(self.opened.facts.origin).means.astype(np.float64)
+                means = source.about(self.opened.metadata_model.origin).means.astype(np.float64)
                 near = np.unique(np.concatenate([nearest_points(means, point) for point in decoded.means]))
                 sources.append(source.select(near))
                 numbers.append(known[near])
@@ -267,7 +269,7 @@ class _OutOfCoreComparison:
         groups = self._groups()
         firsts = np.array([self.opened.header.tiles[group[0]].start for group in groups], np.int64)
         became = _invert_index(source_index, self.scene.count)
-        names = tuple(name for name in self.opened.facts.extra if name in self.scene.facts.extra)
+        names = tuple(name for name in self.opened.metadata_model.extra if name in self.scene.metadata_model.extra)
         for start, block in self._sources():
             splats = became[start : start + len(block)].astype(np.int64)
             kept = np.flatnonzero(splats < count)
@@ -275,8 +277,8 @@ class _OutOfCoreComparison:
             self._add(block, kept, keys, splats[kept], names)
         del became
         if self._spool is None:
-            empty = Source.of(self.scene.facts)
-            return PairErrors(measure_pairs(empty, self.opened.facts, np.empty(0, np.int64)), [], self._reach)
+            empty = Source.of(self.scene.metadata_model)
+            return PairErrors(measure_pairs(empty, self.opened.metadata_model, np.empty(0, np.int64)), [], self._reach)
         self._spool.flush()
         parts, lines = [], {}
         for key, group in enumerate(groups):
@@ -410,7 +412,7 @@ class PartnerSearch:
     def search_cell(self, cell: int, found: I8, *, far: bool) -> Iterator[tuple[I64, I8]]:
         """Yield splats that may have a partner in a cell, and the results for them."""
         for source, _ in self.spool.sources(cell, self.most):
-            columns = source.about(self.opened.facts.origin).means.T
+            columns = source.about(self.opened.metadata_model.origin).means.T
             low, high = (np.array([end(column) for column in columns], np.float64) for end in (np.min, np.max))
             for model, radii, splats in self._near(low, high, found, far=far):
                 threads = 1 if self.workers > 1 else None

@@ -13,7 +13,7 @@ Parts whose place or kind is unknown after a violation are listed as not checked
 
 from __future__ import annotations
 
-from csplat_conformance.validator.findings import Unread, Validation, Violation
 from csplat_conformance.validator.validation import validate
+from csplat_conformance.validator.violation_log import Unread, Validation, Violation
 
 __all__ = ["Unread", "Validation", "Violation", "validate"]

@@ -6,10 +6,10 @@ import numpy as np
 
 from csplat import _spec
 from csplat.types import I64
-from csplat_conformance.validator.findings import Findings, Payload
 from csplat_conformance.validator.index import Chunk, CodebookAt, Index
 from csplat_conformance.validator.streams import read_stream
 from csplat_conformance.validator.values import Place, check_integers
+from csplat_conformance.validator.violation_log import Payload, ViolationLog
 
 #: The entries, [size, C], of chunks that are sound, by codebook id and layer.
 CodebookEntries = dict[tuple[int, int], I64]
@@ -55,16 +55,16 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: CodebookE
     Raises:
         UnreadableError: the payload ends too early.
     """
-    findings = payload.findings
+    log = payload.log
     book = index.codebooks.get(chunk.identity)
     layers = () if book is None else range(book.record.band_first, book.record.band_last + 1)
     head = payload.structure(_spec.unpack_codebook_head, _spec.CODEBOOK_HEAD_SIZE, _spec.CODEBOOK_HEAD_OFFSETS, "head")
     for key, wanted in (("codebook_id", chunk.identity), ("layer", chunk.layer)):
         found = getattr(head.record, key)
         if found != wanted:
-            findings.add_field("CDB-1", head, key, f"{found}, its records say {wanted}")
+            log.add_field("CDB-1", head, key, f"{found}, its records say {wanted}")
     if book is None or chunk.layer not in layers:
-        findings.skip(f"{chunk.name} from byte {payload.at} on", "no sound codebook record asks for it")
+        log.skip(f"{chunk.name} from byte {payload.at} on", "no sound codebook record asks for it")
         return
     of_layer = [a for a in codebook_attributes(book) if _spec.ATTRIBUTE_LAYER[a] == chunk.layer]
     columns = sum(_spec.ATTRIBUTE_COLUMNS[a] for a in of_layer)
@@ -74,13 +74,13 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: CodebookE
         table = stream.elements.astype(np.int64).reshape(columns, size).T
         where = (stream.head.offset, f"{payload.name}/entries")
         # Otherwise every tile would report the invalid entries again.
-        if _check_entries(findings, index, book, of_layer, table, where):
+        if _check_entries(log, index, book, of_layer, table, where):
             books[chunk.identity, chunk.layer] = table
     payload.finish()
 
 
 def _check_entries(
-    findings: Findings, index: Index, book: CodebookAt, attributes: list[int], table: I64, where: Place
+    log: ViolationLog, index: Index, book: CodebookAt, attributes: list[int], table: I64, where: Place
 ) -> bool:
     """Check CBK-7 for entries, used or not. Scales are checked in the tile, with their summand."""
     sound = True
@@ -88,5 +88,5 @@ def _check_entries(
         columns = attribute_columns(book, attribute)
         if columns is None or attribute == _spec.ATTRIBUTE_SCALES:
             continue
-        sound &= check_integers(findings, index, attribute, table[:, columns].T, 0, where)
+        sound &= check_integers(log, index, attribute, table[:, columns].T, 0, where)
     return sound

@@ -10,7 +10,7 @@ from fractions import Fraction
 from typing import Any
 
 from csplat import _spec
-from csplat_conformance.validator.findings import Findings, Payload, PlacedRecord, read_record
+from csplat_conformance.validator.violation_log import Payload, PlacedRecord, ViolationLog, read_record
 
 #: Bytes of the fields that this version knows.
 _SIZES_MIN = {
@@ -75,13 +75,13 @@ def scaled_step(step: float, exponent: int, *, single: bool = False) -> float | 
     return float(product) if low <= product <= high else None
 
 
-def read_records(view: memoryview, end: int, findings: Findings) -> Index:
+def read_records(view: memoryview, end: int, log: ViolationLog) -> Index:
     """Read the records of the index before the directory.
 
     Args:
         view: the file.
         end: offset of the index's CRC by the header, not beyond the data.
-        findings: receives the violations.
+        log: receives the violations.
     """
     start = _spec.HEADER_SIZE
     head = read_record(view, _spec.unpack_index_head, _spec.INDEX_HEAD_OFFSETS, start, "index")
@@ -90,12 +90,12 @@ def read_records(view: memoryview, end: int, findings: Findings) -> Index:
     kinds = ("attribute", "codebook", "extra", "directory", "tile")
     needed = index.size_of("head") + sum(getattr(record, f"{kind}_count") * index.size_of(kind) for kind in kinds)
     if start + needed > end:
-        findings.add("IDX-2", start, "index", f"its counts ask for {needed} bytes at least, it has {end - start}")
-    _check_head(findings, head)
+        log.add("IDX-2", start, "index", f"its counts ask for {needed} bytes at least, it has {end - start}")
+    _check_head(log, head)
     at = start + index.size_of("head")
-    at = _read_attributes(view, at, end, index, findings)
-    at = _read_codebooks(view, at, end, index, findings)
-    index.end = _read_extras(view, at, end, index, findings)
+    at = _read_attributes(view, at, end, index, log)
+    at = _read_codebooks(view, at, end, index, log)
+    index.end = _read_extras(view, at, end, index, log)
     return index
 
 
@@ -106,26 +106,26 @@ def _count_fitting(index: Index, at: int, end: int, count: int, size: int) -> in
     return fitting
 
 
-def _check_head(findings: Findings, head: Head) -> None:
+def _check_head(log: ViolationLog, head: Head) -> None:
     record = head.record
-    findings.check_reserved(head)
+    log.check_reserved(head)
     for kind, least in _SIZES_MIN.items():
         size = getattr(record, f"{kind}_size")
         if size < least:
-            findings.add_field("IDX-8", head, f"{kind}_size", f"{size}, wanted {least} at least")
+            log.add_field("IDX-8", head, f"{kind}_size", f"{size}, wanted {least} at least")
     if record.sh_degree > _spec.SH_DEGREE_MAX:
-        findings.add_field("IDX-3", head, "sh_degree", f"{record.sh_degree}, wanted {_spec.SH_DEGREE_MAX} at most")
+        log.add_field("IDX-3", head, "sh_degree", f"{record.sh_degree}, wanted {_spec.SH_DEGREE_MAX} at most")
     unlisted = record.scene_flags & 0x0F & ~sum(_spec.SCENE_FLAG_NAMES)
     if unlisted:
-        findings.add_field("RES-1", head, "scene_flags", f"bits {unlisted:#04x} are reserved")
+        log.add_field("RES-1", head, "scene_flags", f"bits {unlisted:#04x} are reserved")
     letters = [_spec.DIRECTION_LETTER.get(axis) for axis in record.axes]
     if any(record.axes) and {_AXIS_OF_DIRECTION.get(letter or "") for letter in letters} != {0, 1, 2}:
-        findings.add_field("IDX-4", head, "axes", f"{list(record.axes)}, wanted zeros or directions along three lines")
+        log.add_field("IDX-4", head, "axes", f"{list(record.axes)}, wanted zeros or directions along three lines")
     if not 0.0 <= record.unit_metres < math.inf:
-        findings.add_field("IDX-5", head, "unit_metres", f"{record.unit_metres}, wanted 0, or positive and finite")
+        log.add_field("IDX-5", head, "unit_metres", f"{record.unit_metres}, wanted 0, or positive and finite")
     for axis, value in enumerate(record.origin):
         if not math.isfinite(value):
-            findings.add_field(
+            log.add_field(
                 "IDX-6", head, "origin", f"component {axis} is {value}, wanted a finite number", within=8 * axis
             )
 
@@ -133,47 +133,45 @@ def _check_head(findings: Findings, head: Head) -> None:
 # Attribute records ---------------------------------------------------------------------------------
 
 
-def _read_attributes(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> int:
+def _read_attributes(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> int:
     count = index.head.record.attribute_count
     bands = 0 if index.degree is None else index.degree
     wanted = [value for value, layer in _spec.ATTRIBUTE_LAYER.items() if layer <= bands]
     if index.degree is not None and count != len(wanted):
-        findings.add_field(
-            "ATT-1", index.head, "attribute_count", f"{count}, wanted {len(wanted)} for SH degree {bands}"
-        )
+        log.add_field("ATT-1", index.head, "attribute_count", f"{count}, wanted {len(wanted)} for SH degree {bands}")
     for i in range(_count_fitting(index, at, end, count, index.size_of("attribute"))):
         attribute = view[at]
         name = f"attribute[{_spec.ATTRIBUTE_NAMES.get(attribute, attribute)}]"
         placed = read_record(view, _spec.unpack_attribute_record, _spec.ATTRIBUTE_RECORD_OFFSETS, at, name)
-        findings.check_reserved(placed)
+        log.check_reserved(placed)
         if count == len(wanted) and index.degree is not None and attribute != wanted[i]:
-            findings.add_field("ATT-1", placed, "attribute", f"{attribute}, wanted {wanted[i]} in place {i}")
+            log.add_field("ATT-1", placed, "attribute", f"{attribute}, wanted {wanted[i]} in place {i}")
         if attribute in _spec.ATTRIBUTE_NAMES and attribute not in index.attributes:
             index.attributes[attribute] = placed
-            _check_attribute(findings, placed, index)
+            _check_attribute(log, placed, index)
         at += index.size_of("attribute")
     return at
 
 
-def _check_attribute(findings: Findings, placed: AttributeAt, index: Index) -> None:
+def _check_attribute(log: ViolationLog, placed: AttributeAt, index: Index) -> None:
     record = placed.record
     legal = _spec.ATTRIBUTE_MAPPINGS[record.attribute]
     if _spec.MAPPING_NAMES.get(record.mapping) not in legal:
-        findings.add_field("ATT-2", placed, "mapping", f"{record.mapping}, wanted {' or '.join(legal) or 'none'}")
+        log.add_field("ATT-2", placed, "mapping", f"{record.mapping}, wanted {' or '.join(legal) or 'none'}")
     if record.chroma_shift > _spec.CHROMA_SHIFT_MAX:
-        findings.add_field(
+        log.add_field(
             "ATT-8", placed, "chroma_shift", f"{record.chroma_shift}, wanted {_spec.CHROMA_SHIFT_MAX} at most"
         )
     if record.chroma_shift and record.mapping != _spec.MAPPING_YCOCG:
-        findings.add_field("ATT-9", placed, "chroma_shift", f"{record.chroma_shift}, wanted 0 without YCOCG")
+        log.add_field("ATT-9", placed, "chroma_shift", f"{record.chroma_shift}, wanted 0 without YCOCG")
     kind = _spec.ATTRIBUTE_KIND[record.attribute]
     if kind == "lattice":
-        _check_lattice(findings, placed, index)
+        _check_lattice(log, placed, index)
     elif kind == "levels":
-        _check_levels(findings, placed, index)
+        _check_levels(log, placed, index)
 
 
-def _check_levels(findings: Findings, placed: AttributeAt, index: Index) -> None:
+def _check_levels(log: ViolationLog, placed: AttributeAt, index: Index) -> None:
     record = placed.record
     clause, low, high = "ATT-4", _spec.QUAT_LEVELS_MIN, _spec.QUAT_LEVELS_MAX
     if record.attribute == _spec.ATTRIBUTE_OPACITIES:
@@ -181,19 +179,19 @@ def _check_levels(findings: Findings, placed: AttributeAt, index: Index) -> None
     if low <= record.levels <= high:
         index.levels[record.attribute] = record.levels
     else:
-        findings.add_field(clause, placed, "levels", f"{record.levels}, wanted {low} to {high}")
+        log.add_field(clause, placed, "levels", f"{record.levels}, wanted {low} to {high}")
     if record.step != 0.0 or math.copysign(1.0, record.step) < 0.0:
-        findings.add_field("ATT-7", placed, "step", f"{record.step} for an attribute of levels, wanted +0")
+        log.add_field("ATT-7", placed, "step", f"{record.step} for an attribute of levels, wanted +0")
 
 
-def _check_lattice(findings: Findings, placed: AttributeAt, index: Index) -> None:
+def _check_lattice(log: ViolationLog, placed: AttributeAt, index: Index) -> None:
     record = placed.record
     if record.levels:
-        findings.add_field("ATT-5", placed, "levels", f"{record.levels} for a lattice, wanted 0")
+        log.add_field("ATT-5", placed, "levels", f"{record.levels} for a lattice, wanted 0")
     if not 2.0**-1022 <= record.step < math.inf:
-        findings.add_field("ATT-6", placed, "step", f"{record.step}, wanted positive, finite and at least 2^-1022")
+        log.add_field("ATT-6", placed, "step", f"{record.step}, wanted positive, finite and at least 2^-1022")
     elif record.attribute != _spec.ATTRIBUTE_MEANS and not _is_single(Fraction(record.step)):
-        findings.add_field("ATT-10", placed, "step", f"{record.step}, wanted a binary32 value of at least 2^-126")
+        log.add_field("ATT-10", placed, "step", f"{record.step}, wanted a binary32 value of at least 2^-126")
     else:
         index.steps[record.attribute] = record.step
 
@@ -209,73 +207,73 @@ def _is_single(step: Fraction) -> bool:
 # Codebook records ----------------------------------------------------------------------------------
 
 
-def _read_codebooks(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> int:
+def _read_codebooks(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> int:
     last = -1
     for _ in range(_count_fitting(index, at, end, index.head.record.codebook_count, index.size_of("codebook"))):
         identity = int.from_bytes(view[at : at + 2], "little")
         name = f"codebook[{identity}]"
         placed = read_record(view, _spec.unpack_codebook_record, _spec.CODEBOOK_RECORD_OFFSETS, at, name)
-        findings.check_reserved(placed)
+        log.check_reserved(placed)
         if identity <= last:
-            findings.add_field("CBR-1", placed, "codebook_id", f"{identity} after {last}, wanted ascending ids")
+            log.add_field("CBR-1", placed, "codebook_id", f"{identity} after {last}, wanted ascending ids")
         last = identity
         index.codebook_ids.add(identity)
-        if _is_sound_codebook(findings, placed, index):
+        if _is_sound_codebook(log, placed, index):
             index.codebooks.setdefault(identity, placed)
         at += index.size_of("codebook")
     return at
 
 
-def _is_sound_codebook(findings: Findings, placed: CodebookAt, index: Index) -> bool:
+def _is_sound_codebook(log: ViolationLog, placed: CodebookAt, index: Index) -> bool:
     record = placed.record
-    before = len(findings.violations)
+    before = len(log.violations)
     first, last = record.band_first, record.band_last
     if record.kind not in _spec.CODEBOOK_KIND_NAMES:
-        findings.add_field("RES-2", placed, "kind", f"{record.kind} is no kind that this version uses")
+        log.add_field("RES-2", placed, "kind", f"{record.kind} is no kind that this version uses")
     elif record.kind == _spec.CODEBOOK_KIND_SH:
         highest = _spec.SH_DEGREE_MAX if index.degree is None else index.degree
         if not 1 <= first <= last <= highest:
-            findings.add_field("CBR-2", placed, "band_first", f"bands {first} to {last} in a scene of degree {highest}")
+            log.add_field("CBR-2", placed, "band_first", f"bands {first} to {last} in a scene of degree {highest}")
     elif first or last:
-        findings.add_field("CBR-2", placed, "band_first", f"bands {first} to {last} of a kind without bands, wanted 0")
+        log.add_field("CBR-2", placed, "band_first", f"bands {first} to {last} of a kind without bands, wanted 0")
     if not 1 <= record.size <= _spec.CODEBOOK_ENTRIES_MAX:
-        findings.add_field("CBR-4", placed, "size", f"{record.size} entries, wanted 1 to {_spec.CODEBOOK_ENTRIES_MAX}")
-    return len(findings.violations) == before
+        log.add_field("CBR-4", placed, "size", f"{record.size} entries, wanted 1 to {_spec.CODEBOOK_ENTRIES_MAX}")
+    return len(log.violations) == before
 
 
 # Extra column records ------------------------------------------------------------------------------
 
 
-def _read_extras(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> int:
+def _read_extras(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> int:
     names: set[str] = set()
     for i in range(_count_fitting(index, at, end, index.head.record.extra_count, index.size_of("extra"))):
         placed = read_record(view, _spec.unpack_extra_record, _spec.EXTRA_RECORD_OFFSETS, at, f"extra[{i}]")
         record = placed.record
         if record.dtype < _spec.ANCILLARY_ID_MIN and record.dtype not in _spec.EXTRA_DTYPE_NAMES:
-            findings.add_field("RES-2", placed, "dtype", f"{record.dtype} is no type of the registry")
+            log.add_field("RES-2", placed, "dtype", f"{record.dtype} is no type of the registry")
         if not 1 <= record.name_size <= _spec.EXTRA_NAME_MAX:
-            findings.add_field("EXR-1", placed, "name_size", f"{record.name_size}, wanted 1 to {_spec.EXTRA_NAME_MAX}")
+            log.add_field("EXR-1", placed, "name_size", f"{record.name_size}, wanted 1 to {_spec.EXTRA_NAME_MAX}")
         else:
-            _check_name(findings, placed, names)
+            _check_name(log, placed, names)
         index.extras.append(_spec.EXTRA_DTYPE_BYTES.get(record.dtype))
         at += index.size_of("extra")
     return at
 
 
-def _check_name(findings: Findings, placed: PlacedRecord[_spec.ExtraRecord], names: set[str]) -> None:
+def _check_name(log: ViolationLog, placed: PlacedRecord[_spec.ExtraRecord], names: set[str]) -> None:
     raw = placed.record.name[: placed.record.name_size]
     rest = placed.record.name[placed.record.name_size :]
     if any(rest):
-        findings.add_field("EXR-3", placed, "name", "bytes behind the name are not 0", within=len(raw))
+        log.add_field("EXR-3", placed, "name", "bytes behind the name are not 0", within=len(raw))
     try:
         name = raw.decode("utf-8")
     except UnicodeDecodeError as error:
-        findings.add_field("EXR-2", placed, "name", f"byte {error.start} is not UTF-8", within=error.start)
+        log.add_field("EXR-2", placed, "name", f"byte {error.start} is not UTF-8", within=error.start)
         return
     if any(ord(character) < 0x20 or ord(character) == 0x7F for character in name):
-        findings.add_field("EXR-2", placed, "name", f"a control character in {name!r}")
+        log.add_field("EXR-2", placed, "name", f"a control character in {name!r}")
     if name in names:
-        findings.add_field("EXR-2", placed, "name", f"a second column is called {name!r}")
+        log.add_field("EXR-2", placed, "name", f"a second column is called {name!r}")
     names.add(name)
 
 
@@ -329,15 +327,15 @@ def registered_flags(kind: bytes) -> int:
     return sum(bit for bit, name in _spec.CHUNK_FLAG_NAMES.items() if name in _spec.CHUNK_FLAGS[kind])
 
 
-def check_chunk_size(findings: Findings, chunk: Chunk) -> Chunk:
+def check_chunk_size(log: ViolationLog, chunk: Chunk) -> Chunk:
     """Check CHK-3 as far as a record alone shows it: a chunk has a header."""
     least = _spec.CHUNK_HEADER_SIZE
     if chunk.size < least:
-        findings.add_field("CHK-3", chunk.record, "size", f"{chunk.size} bytes, a chunk has {least} at least")
+        log.add_field("CHK-3", chunk.record, "size", f"{chunk.size} bytes, a chunk has {least} at least")
     return chunk
 
 
-def read_directory(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> list[Chunk]:
+def read_directory(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> list[Chunk]:
     """Read the directory records within the index and check DIR-1 to DIR-6."""
     start, chunks = at, list[Chunk]()
     count = index.head.record.directory_count
@@ -348,17 +346,15 @@ def read_directory(view: memoryview, at: int, end: int, index: Index, findings: 
         placed = read_record(
             view, _spec.unpack_directory_record, _spec.DIRECTORY_RECORD_OFFSETS, at, f"directory[{name}]"
         )
-        findings.check_reserved(placed)
-        chunks.append(
-            check_chunk_size(findings, Chunk(name, record.type, record.flags, placed, record.id, record.layer))
-        )
-        _check_type(findings, placed)
+        log.check_reserved(placed)
+        chunks.append(check_chunk_size(log, Chunk(name, record.type, record.flags, placed, record.id, record.layer)))
+        _check_type(log, placed)
         at += size
     index.complete &= len(chunks) == count
     index.end = at
-    _check_single(findings, chunks)
+    _check_single(log, chunks)
     if index.complete:
-        _check_codebook_chunks(findings, chunks, index, start)
+        _check_codebook_chunks(log, chunks, index, start)
     return chunks
 
 
@@ -370,43 +366,43 @@ def _chunk_name(record: _spec.DirectoryRecord, known: list[str]) -> str:
     return kind if kind not in known else f"{kind}#{known.count(kind)}"
 
 
-def _check_type(findings: Findings, placed: PlacedRecord[_spec.DirectoryRecord]) -> None:
+def _check_type(log: ViolationLog, placed: PlacedRecord[_spec.DirectoryRecord]) -> None:
     record = placed.record
     kind = record.type
     if kind == _spec.CHUNK_TILE:
-        findings.add_field("DIR-1", placed, "type", "TILE, which layer records name")
+        log.add_field("DIR-1", placed, "type", "TILE, which layer records name")
         return
     if not all(0x20 <= byte <= 0x7E for byte in kind):
-        findings.add_field("DIR-1", placed, "type", f"{kind!r}, wanted bytes 0x20 to 0x7E")
+        log.add_field("DIR-1", placed, "type", f"{kind!r}, wanted bytes 0x20 to 0x7E")
     flags = record.flags & 0x00FF  # the others are ancillary
     unlisted = flags & ~sum(_spec.CHUNK_FLAG_NAMES)
     if unlisted:
-        findings.add_field("RES-1", placed, "flags", f"bits {unlisted:#06x} are reserved")
+        log.add_field("RES-1", placed, "flags", f"bits {unlisted:#06x} are reserved")
     if kind in _spec.CHUNK_NAMES:
         if flags & ~unlisted != registered_flags(kind):
-            findings.add_field("CHK-4", placed, "flags", f"{record.flags:#06x}, wanted {registered_flags(kind):#06x}")
+            log.add_field("CHK-4", placed, "flags", f"{record.flags:#06x}, wanted {registered_flags(kind):#06x}")
     elif kind == _spec.CHUNK_TREE:
-        findings.add_field("RES-2", placed, "type", f"{kind.decode()} is reserved")
+        log.add_field("RES-2", placed, "type", f"{kind.decode()} is reserved")
     elif flags & _spec.CHUNK_FLAG_CRITICAL:
         if kind[:1].islower():
-            findings.add_field("DIR-6", placed, "flags", f"{kind!r} is private and critical")
-        findings.add_field("DIR-2", placed, "type", f"{kind!r} is critical and not known")
+            log.add_field("DIR-6", placed, "flags", f"{kind!r} is private and critical")
+        log.add_field("DIR-2", placed, "type", f"{kind!r} is critical and not known")
 
 
-def _check_single(findings: Findings, chunks: Sequence[Chunk]) -> None:
+def _check_single(log: ViolationLog, chunks: Sequence[Chunk]) -> None:
     seen = set()
     for chunk in chunks:
         if chunk.kind not in _SINGLE_CHUNKS:
             continue
         if chunk.kind in seen:
-            findings.add_field("DIR-4", chunk.record, "type", f"a second {chunk.kind.decode()}")
+            log.add_field("DIR-4", chunk.record, "type", f"a second {chunk.kind.decode()}")
         if chunk.identity or chunk.layer:
             where = f"id {chunk.identity} and layer {chunk.layer}"
-            findings.add_field("DIR-4", chunk.record, "type", f"{chunk.kind.decode()} with {where}, wanted 0 and 0")
+            log.add_field("DIR-4", chunk.record, "type", f"{chunk.kind.decode()} with {where}, wanted 0 and 0")
         seen.add(chunk.kind)
 
 
-def _check_codebook_chunks(findings: Findings, chunks: Sequence[Chunk], index: Index, start: int) -> None:
+def _check_codebook_chunks(log: ViolationLog, chunks: Sequence[Chunk], index: Index, start: int) -> None:
     if len(index.codebooks) != index.head.record.codebook_count:
         return  # some codebooks are unknown, and their violations were added
     wanted = {
@@ -419,19 +415,17 @@ def _check_codebook_chunks(findings: Findings, chunks: Sequence[Chunk], index: I
             continue
         key = (chunk.identity, chunk.layer)
         if key not in wanted:
-            findings.add_field(
-                "DIR-5", chunk.record, "type", "no codebook record asks for this chunk, or it is the second"
-            )
+            log.add_field("DIR-5", chunk.record, "type", "no codebook record asks for this chunk, or it is the second")
         wanted.discard(key)
     for identity, layer in sorted(wanted):
-        findings.add("DIR-5", start, "directory", f"no CODB chunk for codebook {identity}, layer {layer}")
+        log.add("DIR-5", start, "directory", f"no CODB chunk for codebook {identity}, layer {layer}")
 
 
-def check_coverage(findings: Findings, chunks: Sequence[Chunk], start: int, file_size: int, data_size: int) -> None:
+def check_coverage(log: ViolationLog, chunks: Sequence[Chunk], start: int, file_size: int, data_size: int) -> None:
     """Check COV-1, mark the chunks that can be read, and remark on an order that 4.3.6 does not recommend.
 
     Args:
-        findings: receives the violations.
+        log: receives the violations.
         chunks: all chunks of the file.
         start: end of the index.
         file_size: size of the file in the header.
@@ -441,16 +435,16 @@ def check_coverage(findings: Findings, chunks: Sequence[Chunk], start: int, file
     expected = covered = start
     for chunk in ordered:
         if chunk.offset != expected:
-            findings.add_field("COV-1", chunk.record, "offset", f"{chunk.offset}, the chunk before ends at {expected}")
+            log.add_field("COV-1", chunk.record, "offset", f"{chunk.offset}, the chunk before ends at {expected}")
         end = chunk.offset + chunk.size
         # A chunk that begins within another is not read: a file could name the same bytes a million times.
         chunk.whole = covered <= chunk.offset <= end - _spec.CHUNK_HEADER_SIZE and end <= min(data_size, file_size)
         if not chunk.whole:
-            findings.skip(chunk.name, "its bytes are not there, or another chunk's")
+            log.skip(chunk.name, "its bytes are not there, or another chunk's")
         expected = end
         covered = max(covered, end) if chunk.whole else covered
     if expected != file_size:
-        findings.add(
+        log.add(
             "COV-1",
             _spec.HEADER_OFFSETS["file_size"],
             "header.file_size",
@@ -458,33 +452,31 @@ def check_coverage(findings: Findings, chunks: Sequence[Chunk], start: int, file
         )
     ranks = [chunk.rank for chunk in ordered if chunk.layer < _LAYER_END]
     if ranks != sorted(ranks):
-        findings.remarks.append("the chunks are not in the order that is recommended (4.3.6)")
+        log.remarks.append("the chunks are not in the order that is recommended (4.3.6)")
 
 
-def check_frame(view: memoryview, chunk: Chunk, clause: str, findings: Findings) -> Payload:
+def check_frame(view: memoryview, chunk: Chunk, clause: str, log: ViolationLog) -> Payload:
     """Check header and CRC of a whole chunk (CHK-1, CHK-3) and return its payload.
 
     Args:
         view: the file.
         chunk: the chunk.
         clause: the clause that requires the payload to end with its last structure.
-        findings: receives the violations.
+        log: receives the violations.
     """
     at, end = chunk.offset, chunk.offset + chunk.size
     stored, computed = chunk.record.record.crc, zlib.crc32(view[at:end])
     if stored != computed:
-        findings.add(
-            "CHK-1", at, chunk.name, f"{chunk.record.path('crc')} is {stored:#010x}, computed {computed:#010x}"
-        )
+        log.add("CHK-1", at, chunk.name, f"{chunk.record.path('crc')} is {stored:#010x}, computed {computed:#010x}")
     header = read_record(view, _spec.unpack_chunk_header, _spec.CHUNK_HEADER_OFFSETS, at, f"{chunk.name}/header")
-    findings.check_reserved(header)
+    log.check_reserved(header)
     payload_size = chunk.size - _spec.CHUNK_HEADER_SIZE
     for key, wanted in (("type", chunk.kind), ("flags", chunk.flags), ("payload_size", payload_size)):
         found = getattr(header.record, key)
         if found != wanted:
-            findings.add_field("CHK-3", header, key, f"{found!r}, its record wants {wanted!r}")
+            log.add_field("CHK-3", header, key, f"{found!r}, its record wants {wanted!r}")
     # The payload ends by the size in the record, which COV-1 confirmed.
-    return Payload(view, at + _spec.CHUNK_HEADER_SIZE, end, chunk.name, clause, findings)
+    return Payload(view, at + _spec.CHUNK_HEADER_SIZE, end, chunk.name, clause, log)
 
 
 _SH_LAYERS = range(1, _spec.SH_DEGREE_MAX + 1)
@@ -514,7 +506,7 @@ class Tile:
         return self.record.record.splat_count
 
 
-def read_tiles(view: memoryview, at: int, end: int, index: Index, findings: Findings) -> list[Tile]:
+def read_tiles(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> list[Tile]:
     """Read the tile records, which fill the index up to its CRC (IDX-2), and compare their sum with N (IDX-7).
 
     Args:
@@ -522,7 +514,7 @@ def read_tiles(view: memoryview, at: int, end: int, index: Index, findings: Find
         at: offset of the first record.
         end: offset of the index's CRC.
         index: the records before them.
-        findings: receives the violations.
+        log: receives the violations.
     """
     tiles: list[Tile] = []
     head = index.head.record
@@ -532,16 +524,16 @@ def read_tiles(view: memoryview, at: int, end: int, index: Index, findings: Find
         size = _tile_size(view, at, end, index)
         if size > end - at:
             if not reported:
-                findings.add("IDX-2", at, f"tile[{len(tiles)}]", "the index ends within the tile")
-            findings.skip(f"tile[{len(tiles)}] and those after it", "the index ends before them")
+                log.add("IDX-2", at, f"tile[{len(tiles)}]", "the index ends within the tile")
+            log.skip(f"tile[{len(tiles)}] and those after it", "the index ends before them")
             return tiles
-        tiles.append(_read_tile(view, at, len(tiles), index, findings))
+        tiles.append(_read_tile(view, at, len(tiles), index, log))
         at += size
     if at != end:
-        findings.add("IDX-2", at, "index.rest", f"{end - at} bytes follow the last tile")
+        log.add("IDX-2", at, "index.rest", f"{end - at} bytes follow the last tile")
     total = sum(tile.count for tile in tiles)
     if total != head.splat_count:
-        findings.add_field("IDX-7", index.head, "splat_count", f"{head.splat_count}, the tiles have {total} splats")
+        log.add_field("IDX-7", index.head, "splat_count", f"{head.splat_count}, the tiles have {total} splats")
     return tiles
 
 
@@ -553,76 +545,76 @@ def _tile_size(view: memoryview, at: int, end: int, index: Index) -> int:
     return size + record.layer_count * index.size_of("layer") + 2 * record.table_count
 
 
-def _read_tile(view: memoryview, at: int, number: int, index: Index, findings: Findings) -> Tile:
+def _read_tile(view: memoryview, at: int, number: int, index: Index, log: ViolationLog) -> Tile:
     placed = read_record(view, _spec.unpack_tile_record, _spec.TILE_RECORD_OFFSETS, at, f"tile[{number}]")
-    findings.check_reserved(placed)
+    log.check_reserved(placed)
     tile = Tile(number, placed)
     if placed.record.level:
-        findings.add_field("RES-1", placed, "level", f"{placed.record.level} is reserved, wanted 0")
+        log.add_field("RES-1", placed, "level", f"{placed.record.level} is reserved, wanted 0")
     if not 1 <= tile.count <= _spec.TILE_SPLATS_MAX:
-        findings.add_field("TIL-1", placed, "splat_count", f"{tile.count}, wanted 1 to {_spec.TILE_SPLATS_MAX}")
-    _check_tile_box(findings, tile, index)
+        log.add_field("TIL-1", placed, "splat_count", f"{tile.count}, wanted 1 to {_spec.TILE_SPLATS_MAX}")
+    _check_tile_box(log, tile, index)
     at += index.size_of("tile")
-    _read_layers(view, at, tile, index, findings)
-    _read_codebook_ids(view, at + placed.record.layer_count * index.size_of("layer"), tile, index, findings)
+    _read_layers(view, at, tile, index, log)
+    _read_codebook_ids(view, at + placed.record.layer_count * index.size_of("layer"), tile, index, log)
     return tile
 
 
-def _check_tile_box(findings: Findings, tile: Tile, index: Index) -> None:
-    record, before = tile.record.record, len(findings.violations)
+def _check_tile_box(log: ViolationLog, tile: Tile, index: Index) -> None:
+    record, before = tile.record.record, len(log.violations)
     for axis, (corner, extent) in enumerate(zip(record.corner, record.extent, strict=True)):
         if max(abs(corner), abs(corner + extent)) > _spec.INTEGER_MAX:
             message = f"axis {axis} reaches from {corner} to {corner + extent}, beyond {_spec.INTEGER_MAX}"
-            findings.add_field("TIL-7", tile.record, "corner", message, within=8 * axis)
+            log.add_field("TIL-7", tile.record, "corner", message, within=8 * axis)
         if extent >= 1 << _spec.AXIS_BITS_MAX:
             message = f"axis {axis} has {extent}, wanted less than 2^{_spec.AXIS_BITS_MAX}"
-            findings.add_field("TIL-8", tile.record, "extent", message, within=4 * axis)
+            log.add_field("TIL-8", tile.record, "extent", message, within=4 * axis)
     step = index.steps.get(_spec.ATTRIBUTE_MEANS)
     if step is not None and scaled_step(step, record.exponent) is None:
         message = f"{step} x 2^{record.exponent} is not finite and at least 2^-1022"
-        findings.add_field("TIL-9", tile.record, "exponent", message)
-    tile.box_sound = len(findings.violations) == before
+        log.add_field("TIL-9", tile.record, "exponent", message)
+    tile.box_sound = len(log.violations) == before
 
 
-def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, findings: Findings) -> None:
+def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: ViolationLog) -> None:
     start, last = at, -1
     flags = registered_flags(_spec.CHUNK_TILE)
     for i in range(tile.record.record.layer_count):
         layer = view[at]
         name = f"{tile.record.name}.layer[{layer}]"
         placed = read_record(view, _spec.unpack_layer_record, _spec.LAYER_RECORD_OFFSETS, at, name)
-        findings.check_reserved(placed)
+        log.check_reserved(placed)
         if i == 0 and layer != _spec.LAYER_GEOMETRY:
-            findings.add_field("TIL-2", placed, "layer", f"the first is {layer}, wanted {_spec.LAYER_GEOMETRY}")
+            log.add_field("TIL-2", placed, "layer", f"the first is {layer}, wanted {_spec.LAYER_GEOMETRY}")
         elif layer <= last:
-            findings.add_field("TIL-2", placed, "layer", f"{layer} after {last}, wanted ascending layers")
+            log.add_field("TIL-2", placed, "layer", f"{layer} after {last}, wanted ascending layers")
         if layer < _spec.ANCILLARY_ID_MIN and layer not in _spec.LAYER_NAMES:
-            findings.add_field("RES-2", placed, "layer", f"{layer} is no layer that this version uses")
+            log.add_field("RES-2", placed, "layer", f"{layer} is no layer that this version uses")
         if index.degree is not None and layer in _SH_LAYERS and layer > index.degree:
-            findings.add_field("TIL-3", placed, "layer", f"band {layer} in a scene of degree {index.degree}")
+            log.add_field("TIL-3", placed, "layer", f"band {layer} in a scene of degree {index.degree}")
         chunk = Chunk(f"TILE.{tile.place}.{layer}", _spec.CHUNK_TILE, flags, placed, tile.place, layer)
-        tile.chunks.append(check_chunk_size(findings, chunk))
+        tile.chunks.append(check_chunk_size(log, chunk))
         last = max(last, layer)
         at += index.size_of("layer")
     if not tile.chunks:
-        findings.add("TIL-2", start, f"{tile.record.name}.layer", "no layer, wanted layer 0")
+        log.add("TIL-2", start, f"{tile.record.name}.layer", "no layer, wanted layer 0")
         return  # TIL-5 follows from this
     has_extra = any(chunk.layer == _spec.LAYER_EXTRA for chunk in tile.chunks)
     if has_extra != bool(index.head.record.extra_count):
         verb = "has" if has_extra else "lacks"
         message = f"the tile {verb} the extra layer, the scene has {index.head.record.extra_count} extra columns"
-        findings.add("TIL-5", start, f"{tile.record.name}.layer", message)
+        log.add("TIL-5", start, f"{tile.record.name}.layer", message)
 
 
-def _read_codebook_ids(view: memoryview, at: int, tile: Tile, index: Index, findings: Findings) -> None:
+def _read_codebook_ids(view: memoryview, at: int, tile: Tile, index: Index, log: ViolationLog) -> None:
     last = -1
     for k in range(tile.record.record.table_count):
         identity = int.from_bytes(view[at : at + 2], "little")
         name = f"{tile.record.name}.table[{k}]"
         if identity <= last:
-            findings.add("TIL-6", at, name, f"{identity} after {last}, wanted ascending ids")
+            log.add("TIL-6", at, name, f"{identity} after {last}, wanted ascending ids")
         elif identity not in index.codebook_ids:
-            findings.add("TIL-6", at, name, f"{identity} is the id of no codebook")
+            log.add("TIL-6", at, name, f"{identity} is the id of no codebook")
         tile.codebook_ids.add(identity)
         last = max(last, identity)
         at += 2

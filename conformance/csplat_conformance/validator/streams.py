@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat_conformance.validator.findings import Findings, Payload, PlacedRecord, UnreadableError
 from csplat_conformance.validator.inflate import CodedError, Inflater
+from csplat_conformance.validator.violation_log import Payload, PlacedRecord, UnreadableError, ViolationLog
 
 #: Elements of a stream: int64, or uint64 if they are eight bytes wide, as only RAW may be.
 Elements = NDArray[Any]
@@ -56,18 +56,18 @@ def read_stream(
     Raises:
         UnreadableError: the payload ends before the stream does.
     """
-    findings = payload.findings
+    log = payload.log
     head = payload.structure(_spec.unpack_stream_head, _spec.STREAM_HEAD_SIZE, _spec.STREAM_HEAD_OFFSETS, what)
-    sound = _check_counts(findings, head, count, width_max)
-    sound &= _check_transforms(findings, head)
-    sound &= _check_packed(findings, head, sound)
+    sound = _check_counts(log, head, count, width_max)
+    sound &= _check_transforms(log, head)
+    sound &= _check_packed(log, head, sound)
     if count is None and head.record.count > count_max:
-        findings.add_field("STR-8", head, "count", f"{head.record.count} bytes of text, the budget is {count_max}")
+        log.add_field("STR-8", head, "count", f"{head.record.count} bytes of text, the budget is {count_max}")
         sound = False
-    coder_known = _check_coder(findings, head)
+    coder_known = _check_coder(log, head)
     size = head.record.coded_size
     if size > payload.left:
-        findings.add_field("STR-6", head, "coded_size", f"{size} bytes, {payload.left} are left")
+        log.add_field("STR-6", head, "coded_size", f"{size} bytes, {payload.left} are left")
         raise UnreadableError
     at = payload.take(size, f"{what}.coded")
     if not coder_known:
@@ -81,63 +81,63 @@ def read_stream(
     try:
         packed, spare_bits = undo_coder(payload.view[at : at + size], head.record.coder, head.record.packed_size)
     except CodedError as error:
-        findings.add(error.clause, at + error.within, f"{payload.name}/{what}.coded", str(error))
+        log.add(error.clause, at + error.within, f"{payload.name}/{what}.coded", str(error))
         return Stream(head, None)
     if spare_bits:
-        findings.remarks.append(f"{payload.name}/{what}.coded: the unused bits after the final block are not 0 (6.2)")
-    return Stream(head, _elements(findings, head, packed, at, signed) if sound else None)
+        log.remarks.append(f"{payload.name}/{what}.coded: the unused bits after the final block are not 0 (6.2)")
+    return Stream(head, _elements(log, head, packed, at, signed) if sound else None)
 
 
-def _check_counts(findings: Findings, head: PlacedRecord[_spec.StreamHead], count: int | None, width_max: int) -> bool:
+def _check_counts(log: ViolationLog, head: PlacedRecord[_spec.StreamHead], count: int | None, width_max: int) -> bool:
     """Check STR-1 and STR-2."""
     sound = True
     found, width = head.record.count, head.record.width
     if found != (max(1, found) if count is None else count):
         wanted = "1 or more" if count is None else f"{count}, as its place requires"
-        findings.add_field("STR-1", head, "count", f"{found} elements, wanted {wanted}")
+        log.add_field("STR-1", head, "count", f"{found} elements, wanted {wanted}")
         sound = False
     if not 1 <= width <= width_max:
-        findings.add_field("STR-2", head, "width", f"elements of {width} bytes, wanted 1 to {width_max}")
+        log.add_field("STR-2", head, "width", f"elements of {width} bytes, wanted 1 to {width_max}")
         sound = False
     return sound
 
 
-def _check_transforms(findings: Findings, head: PlacedRecord[_spec.StreamHead]) -> bool:
+def _check_transforms(log: ViolationLog, head: PlacedRecord[_spec.StreamHead]) -> bool:
     """Check RES-2 and STR-3."""
     listed = head.record.transforms
     used = listed.rstrip(b"\0")
     unknown = [value for value in used if value not in _spec.TRANSFORM_NAMES]
     if unknown:
-        findings.add_field("RES-2", head, "transforms", f"{unknown[0]} is no transform of the registry")
+        log.add_field("RES-2", head, "transforms", f"{unknown[0]} is no transform of the registry")
         return False  # STR-3 assumes known ids
     if any(a >= b for a, b in pairwise(used)) or 0 in used:
-        findings.add_field("STR-3", head, "transforms", f"{list(listed)}, wanted strictly ascending values, then zeros")
+        log.add_field("STR-3", head, "transforms", f"{list(listed)}, wanted strictly ascending values, then zeros")
         return False
     return True
 
 
-def _check_packed(findings: Findings, head: PlacedRecord[_spec.StreamHead], sound: bool) -> bool:
+def _check_packed(log: ViolationLog, head: PlacedRecord[_spec.StreamHead], sound: bool) -> bool:
     """Check STR-4 and STR-5, if count, width and transforms are known."""
     if not sound:
         return False
     size, packed = head.record.count * head.record.width, head.record.packed_size
     if _spec.TRANSFORM_RUN_LENGTH not in head.record.transforms:
         if packed != size:
-            findings.add_field("STR-4", head, "packed_size", f"{packed} bytes, count x width is {size}")
+            log.add_field("STR-4", head, "packed_size", f"{packed} bytes, count x width is {size}")
             return False
     elif packed % 3 or not 3 <= packed <= 3 * size:
-        findings.add_field(
+        log.add_field(
             "STR-5", head, "packed_size", f"{packed} bytes of runs, wanted a multiple of 3 from 3 to {3 * size}"
         )
         return False
     return True
 
 
-def _check_coder(findings: Findings, head: PlacedRecord[_spec.StreamHead]) -> bool:
+def _check_coder(log: ViolationLog, head: PlacedRecord[_spec.StreamHead]) -> bool:
     """Check RES-2."""
     coder = head.record.coder
     if coder not in _spec.CODER_NAMES:
-        findings.add_field("RES-2", head, "coder", f"{coder} is no coder that this version uses")
+        log.add_field("RES-2", head, "coder", f"{coder} is no coder that this version uses")
         return False
     return True
 
@@ -146,7 +146,7 @@ def _check_coder(findings: Findings, head: PlacedRecord[_spec.StreamHead]) -> bo
 
 
 def _elements(
-    findings: Findings, head: PlacedRecord[_spec.StreamHead], packed: bytes, coded_at: int, signed: bool
+    log: ViolationLog, head: PlacedRecord[_spec.StreamHead], packed: bytes, coded_at: int, signed: bool
 ) -> Elements | None:
     record = head.record
     data = np.frombuffer(packed, np.uint8)
@@ -156,7 +156,7 @@ def _elements(
         total = int(lengths.sum())
         wanted = record.count * record.width
         if total != wanted:
-            findings.add("TRF-1", coded_at, head.path("coded"), f"the runs give {total} bytes, wanted {wanted}")
+            log.add("TRF-1", coded_at, head.path("coded"), f"the runs give {total} bytes, wanted {wanted}")
             return None
         data = np.repeat(runs[0], lengths)
     width, count = record.width, record.count

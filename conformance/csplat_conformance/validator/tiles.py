@@ -10,10 +10,10 @@ import numpy as np
 from csplat import _spec
 from csplat.types import I64
 from csplat_conformance.validator.codebooks import CodebookEntries, attribute_columns, first_attribute
-from csplat_conformance.validator.findings import Findings, Payload, PlacedRecord, UnreadableError
 from csplat_conformance.validator.index import Chunk, CodebookAt, Index, Tile, scaled_step
 from csplat_conformance.validator.streams import Elements, read_stream
 from csplat_conformance.validator.values import check_box, check_integers, check_max_scale
+from csplat_conformance.validator.violation_log import Payload, PlacedRecord, UnreadableError, ViolationLog
 
 BlockHead = PlacedRecord[_spec.BlockHead]
 
@@ -45,7 +45,7 @@ class TileChecker:
         index: index of the file.
         tile: the tile record.
         books: entries by codebook id and layer.
-        findings: receives the violations.
+        log: receives the violations.
         first: indices by codebook id.
         lost: layers with blocks that could not be read.
     """
@@ -54,7 +54,7 @@ class TileChecker:
     index: Index
     tile: Tile
     books: CodebookEntries
-    findings: Findings
+    log: ViolationLog
     first: dict[int, CodebookIndices] = field(default_factory=dict)
     lost: set[int] = field(default_factory=set)
 
@@ -64,19 +64,19 @@ class TileChecker:
         Raises:
             UnreadableError: the structure of the rest is unknown.
         """
-        findings = self.findings
+        log = self.log
         if chunk.layer >= _spec.ANCILLARY_ID_MIN:
             return  # ANC-2
         head = payload.structure(_spec.unpack_tile_head, _spec.TILE_HEAD_SIZE, _spec.TILE_HEAD_OFFSETS, "head")
         if head.record.layer != chunk.layer:
-            findings.add_field("TLE-1", head, "layer", f"{head.record.layer}, its record says {chunk.layer}")
+            log.add_field("TLE-1", head, "layer", f"{head.record.layer}, its record says {chunk.layer}")
         if chunk.layer not in _spec.LAYER_NAMES or not 1 <= self.tile.count <= _spec.TILE_SPLATS_MAX:
-            findings.skip(f"{chunk.name} from byte {payload.at} on", "layer or splat_count of its record is wrong")
+            log.skip(f"{chunk.name} from byte {payload.at} on", "layer or splat_count of its record is wrong")
             return
         blocks = self._wanted(chunk.layer)
         announced = head.record.block_count
         if announced != len(blocks):
-            findings.add_field("TLE-2", head, "block_count", f"{announced} blocks, wanted {len(blocks)}")
+            log.add_field("TLE-2", head, "block_count", f"{announced} blocks, wanted {len(blocks)}")
         for number, attribute in enumerate(blocks):
             if number >= announced and not payload.left:
                 return
@@ -96,14 +96,14 @@ class TileChecker:
         head = read_block_head(payload, name)
         if attribute != wanted:
             message = f"{attribute}, wanted {wanted} ({_spec.ATTRIBUTE_NAMES[wanted]}) in place {number}"
-            self.findings.add_field("TLE-2", head, "attribute", message)
+            self.log.add_field("TLE-2", head, "attribute", message)
             if attribute not in _spec.ATTRIBUTE_NAMES:
                 raise UnreadableError
         coding = head.record.coding
         if _spec.CODING_NAMES.get(coding) not in _spec.ATTRIBUTE_CODINGS[attribute]:
             code = "" if coding in _spec.CODING_NAMES else _spec.ERROR_UNSUPPORTED
             message = f"{coding}, wanted {' or '.join(_spec.ATTRIBUTE_CODINGS[attribute])}"
-            self.findings.add_field("BLK-1", head, "coding", message, code)
+            self.log.add_field("BLK-1", head, "coding", message, code)
             raise UnreadableError
         if coding == _spec.CODING_CODEBOOK:
             _read_codebook_block(self, payload, name, attribute, at)
@@ -124,16 +124,16 @@ class TileChecker:
         exponent, announced, count = params.record.exponent, params.record.present_count, self.tile.count
         sound = self.check_step(params, exponent, attribute)
         if not 1 <= announced <= count:
-            self.findings.add_field("SPA-1", params, "present_count", f"{announced}, wanted 1 to {count}")
+            self.log.add_field("SPA-1", params, "present_count", f"{announced}, wanted 1 to {count}")
         mask = read_stream(payload, f"{name}.mask", -(-count // 8), 1)
         where = (mask.head.offset, f"{payload.name}/{name}.mask")
         if mask.elements is not None:
             bits = int.from_bytes(bytes(mask.elements.astype(np.uint8)), "little")
             if bits >> count:
-                self.findings.add("SPA-3", *where, f"bits of the mask beyond the {count} splats are set")
+                self.log.add("SPA-3", *where, f"bits of the mask beyond the {count} splats are set")
             found = (bits & (1 << count) - 1).bit_count()
             if found != announced:
-                self.findings.add("SPA-2", *where, f"{found} bits are set, present_count is {announced}")
+                self.log.add("SPA-2", *where, f"{found} bits are set, present_count is {announced}")
         if not 1 <= announced <= count:
             raise UnreadableError
         columns = _spec.ATTRIBUTE_COLUMNS[attribute]
@@ -141,14 +141,14 @@ class TileChecker:
         if stream.elements is not None and sound:
             rows = stream.elements.astype(np.int64).reshape(columns, announced)
             where = (stream.head.offset, f"{payload.name}/{name}.stream")
-            check_integers(self.findings, self.index, attribute, rows, exponent, where)
+            check_integers(self.log, self.index, attribute, rows, exponent, where)
 
     def check_step(self, params: PlacedRecord[Any], exponent: int, attribute: int) -> bool:
         """Check LAT-1; return True if it holds."""
         step = self.index.steps.get(attribute)
         if step is None or scaled_step(step, exponent, single=True) is not None:
             return True
-        self.findings.add_field(
+        self.log.add_field(
             "LAT-1", params, "exponent", f"{step} x 2^{exponent} is not finite in binary32 and at least 2^-126"
         )
         return False
@@ -164,7 +164,7 @@ class TileChecker:
         at = record.at("max_scale")
         stored = bytes(self.view[at : at + 4])
         where = (at, record.path("max_scale"))
-        check_max_scale(self.findings, self.index, largest, exponent, stored, where)
+        check_max_scale(self.log, self.index, largest, exponent, stored, where)
 
     def _read_means(self, payload: Payload, name: str, coding: int) -> None:
         count, width_max = self.tile.count, _spec.CODING_WIDTH_MAX[coding]
@@ -178,25 +178,25 @@ class TileChecker:
             )
             bits = params.record.bits
             if not 1 <= bits <= _spec.MORTON_BITS_MAX:
-                self.findings.add_field("MOR-1", params, "bits", f"{bits}, wanted 1 to {_spec.MORTON_BITS_MAX}")
+                self.log.add_field("MOR-1", params, "bits", f"{bits}, wanted 1 to {_spec.MORTON_BITS_MAX}")
             stream = read_stream(payload, f"{name}.stream", count, width_max)
             rows = None if stream.elements is None else _axes(stream.elements.astype(np.int64))
             largest = 0 if stream.elements is None else int(stream.elements.max())
             if 1 <= bits <= _spec.MORTON_BITS_MAX and largest >> _MORTON_AXES * bits:
                 message = f"a code of {largest}, wanted less than 2^{_MORTON_AXES * bits}"
-                self.findings.add("MOR-2", stream.head.offset, f"{payload.name}/{name}.stream", message)
+                self.log.add("MOR-2", stream.head.offset, f"{payload.name}/{name}.stream", message)
                 rows = None
         else:
             stream = read_stream(payload, f"{name}.stream", _MORTON_AXES * count, width_max)
             rows = None if stream.elements is None else stream.elements.astype(np.int64).reshape(_MORTON_AXES, count)
             if rows is not None and int(rows.max()) >> _spec.AXIS_BITS_MAX:
                 message = f"an integer of {int(rows.max())}, wanted less than 2^{_spec.AXIS_BITS_MAX}"
-                self.findings.add("AXI-1", stream.head.offset, f"{payload.name}/{name}.stream", message)
+                self.log.add("AXI-1", stream.head.offset, f"{payload.name}/{name}.stream", message)
                 rows = None
         if rows is not None:
             record = self.tile.record
             check_box(
-                self.findings,
+                self.log,
                 self.index,
                 record.record,
                 rows,
@@ -210,12 +210,12 @@ class TileChecker:
             _spec.unpack_raw_params, _spec.RAW_PARAMS_SIZE, _spec.RAW_PARAMS_OFFSETS, f"{name}.params"
         )
         if params.record.column != number:
-            self.findings.add_field("RAW-1", params, "column", f"{params.record.column}, wanted {number}")
+            self.log.add_field("RAW-1", params, "column", f"{params.record.column}, wanted {number}")
         width_max = _spec.CODING_WIDTH_MAX[_spec.CODING_RAW]
         stream = read_stream(payload, f"{name}.stream", self.tile.count, width_max)
         size = self.index.extras[number] if number < len(self.index.extras) else None
         if size is not None and stream.head.record.width != size:
-            self.findings.add_field(
+            self.log.add_field(
                 "RAW-2", stream.head, "width", f"{stream.head.record.width}, the column has {size} bytes"
             )
 
@@ -247,7 +247,7 @@ def read_columns(
         return None, exponent
     rows = stream.elements.astype(np.int64).reshape(columns, count) + np.array(offsets, np.int64)[:, None]
     where = (stream.head.offset, f"{payload.name}/{name}.stream")
-    good = check_integers(reader.findings, reader.index, attribute, rows, exponent, where)
+    good = check_integers(reader.log, reader.index, attribute, rows, exponent, where)
     return (rows if good else None), exponent
 
 
@@ -258,7 +258,7 @@ def read_exponent(reader: TileChecker, payload: Payload, name: str, attribute: i
     )
     exponent = params.record.exponent
     if fixed and exponent:
-        reader.findings.add_field("LAT-2", params, "exponent", f"{exponent}, wanted 0")
+        reader.log.add_field("LAT-2", params, "exponent", f"{exponent}, wanted 0")
         return exponent, False
     return exponent, fixed or reader.check_step(params, exponent, attribute)
 
@@ -271,7 +271,7 @@ def read_offsets(payload: Payload, name: str, columns: int) -> tuple[list[int], 
     for i, offset in enumerate(offsets):
         if abs(offset) > _spec.COLUMN_MAX:
             message = f"offset {i} is {offset}, wanted {_spec.COLUMN_MAX} in magnitude at most"
-            payload.findings.add("LAT-3", at + 4 * i, f"{payload.name}/{name}", message)
+            payload.log.add("LAT-3", at + 4 * i, f"{payload.name}/{name}", message)
             sound = False
     return offsets, sound
 
@@ -324,7 +324,7 @@ def _read_codebook_block(reader: TileChecker, payload: Payload, name: str, attri
         return
     if summands is not None:
         rows += summands[~first.escaped]
-    sound = check_integers(reader.findings, reader.index, attribute, rows, 0, (at, f"{payload.name}/{name}"))
+    sound = check_integers(reader.log, reader.index, attribute, rows, 0, (at, f"{payload.name}/{name}"))
     if sound and has_summand and (escapes is not None or not first.escaped.any()):
         parts = [part for part in (rows, escapes) if part is not None and part.size]
         reader.check_scales(max(int(part.max()) for part in parts), 0)
@@ -337,11 +337,11 @@ def _find_book(reader: TileChecker, params: _CodebookParams, attribute: int) -> 
     columns = None if book is None else attribute_columns(book, attribute)
     name = _spec.ATTRIBUTE_NAMES[attribute]
     if identity not in reader.tile.codebook_ids:
-        reader.findings.add_field("CBK-1", params, "codebook_id", f"{identity} is not among the tile's table ids")
+        reader.log.add_field("CBK-1", params, "codebook_id", f"{identity} is not among the tile's table ids")
     elif identity not in reader.index.codebook_ids:
-        reader.findings.add_field("CBK-1", params, "codebook_id", f"{identity} is the id of no codebook")
+        reader.log.add_field("CBK-1", params, "codebook_id", f"{identity} is the id of no codebook")
     elif book is not None and columns is None:
-        reader.findings.add_field("CBK-1", params, "codebook_id", f"codebook {identity} does not serve {name}")
+        reader.log.add_field("CBK-1", params, "codebook_id", f"codebook {identity} does not serve {name}")
     if book is None or columns is None:
         raise UnreadableError
     return book, columns
@@ -351,20 +351,20 @@ def _read_indices(
     reader: TileChecker, payload: Payload, name: str, book: CodebookAt, params: _CodebookParams
 ) -> CodebookIndices:
     """Read indices and check CBK-2 and CBK-3."""
-    findings, size = reader.findings, book.record.size
+    log, size = reader.log, book.record.size
     stream = read_stream(payload, f"{name}.indices", reader.tile.count, _INDEX_WIDTH_MAX)
     indices = stream.elements
     if indices is not None and int(indices.max()) > size:
         message = f"an index of {int(indices.max())} into {size} entries, wanted {size} at most"
-        findings.add("CBK-2", stream.head.offset, f"{payload.name}/{name}.indices", message)
+        log.add("CBK-2", stream.head.offset, f"{payload.name}/{name}.indices", message)
         indices = None
     escaped = None if indices is None else np.asarray(indices == size)
     count = params.record.escape_count
     if escaped is not None and int(escaped.sum()) != count:
-        findings.add_field("CBK-3", params, "escape_count", f"{count}, the indices escape {int(escaped.sum())} splats")
+        log.add_field("CBK-3", params, "escape_count", f"{count}, the indices escape {int(escaped.sum())} splats")
         escaped = None
     elif escaped is None and count > reader.tile.count:
-        findings.add_field("CBK-3", params, "escape_count", f"{count} of a tile of {reader.tile.count} splats")
+        log.add_field("CBK-3", params, "escape_count", f"{count} of a tile of {reader.tile.count} splats")
     return CodebookIndices(indices, escaped, count)
 
 
@@ -377,11 +377,11 @@ def _find_indices(reader: TileChecker, book: CodebookAt, params: _CodebookParams
     if first is None:
         if _spec.ATTRIBUTE_LAYER[opener] not in reader.lost:
             message = f"codebook {identity}, and no block of {name} before it is coded with it"
-            reader.findings.add_field("CBK-4", params, "codebook_id", message)
+            reader.log.add_field("CBK-4", params, "codebook_id", message)
         return CodebookIndices(None, None, count)
     if first.escape_count != count:
         message = f"codebook {identity} with {count} escapes, the block of {name} has {first.escape_count}"
-        reader.findings.add_field("CBK-4", params, "codebook_id", message)
+        reader.log.add_field("CBK-4", params, "codebook_id", message)
         return CodebookIndices(first.indices, None, count)
     return first
 
@@ -406,16 +406,16 @@ def _read_escapes(
     head = read_block_head(payload, what)
     if head.record.attribute != attribute:
         message = f"{head.record.attribute}, wanted that of its block, {attribute}"
-        reader.findings.add_field("CBK-5", head, "attribute", message)
+        reader.log.add_field("CBK-5", head, "attribute", message)
     coding = head.record.coding
     legal = (_spec.CODING_SIGNED,) if attribute == _spec.ATTRIBUTE_QUATS else _ESCAPE_CODINGS
     if coding not in _spec.CODING_NAMES:
         message = f"{coding} is no coding that this version uses"
-        reader.findings.add_field("BLK-1", head, "coding", message, _spec.ERROR_UNSUPPORTED)
+        reader.log.add_field("BLK-1", head, "coding", message, _spec.ERROR_UNSUPPORTED)
         raise UnreadableError
     if coding not in legal:
         names = " or ".join(_spec.CODING_NAMES[one] for one in legal)
-        reader.findings.add_field("CBK-5", head, "coding", f"{_spec.CODING_NAMES[coding]}, wanted {names}")
+        reader.log.add_field("CBK-5", head, "coding", f"{_spec.CODING_NAMES[coding]}, wanted {names}")
         raise UnreadableError
     rows, _ = read_columns(reader, payload, what, attribute, coding, params.record.escape_count, escape=True)
     return rows

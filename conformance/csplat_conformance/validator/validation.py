@@ -11,17 +11,8 @@ from mmap import mmap
 from csplat import _spec
 from csplat.file_source import PageReleaser
 from csplat.types import null_progress
-from csplat_conformance.validator.ancillary import read_declared_bounds, read_text
+from csplat_conformance.validator.bounds_chunk import check_declared_bounds
 from csplat_conformance.validator.codebooks import CodebookEntries, read_codebook
-from csplat_conformance.validator.findings import (
-    Findings,
-    Payload,
-    PlacedRecord,
-    TooManyViolationsError,
-    UnreadableError,
-    Validation,
-    read_record,
-)
 from csplat_conformance.validator.index import (
     Chunk,
     Index,
@@ -32,7 +23,17 @@ from csplat_conformance.validator.index import (
     read_records,
     read_tiles,
 )
+from csplat_conformance.validator.json_text import check_text
 from csplat_conformance.validator.tiles import TileChecker
+from csplat_conformance.validator.violation_log import (
+    Payload,
+    PlacedRecord,
+    TooManyViolationsError,
+    UnreadableError,
+    Validation,
+    ViolationLog,
+    read_record,
+)
 
 _CRC_SIZE = 4
 _TEXT_CHUNKS = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS)
@@ -66,20 +67,20 @@ def validate(
         progress: called with the share of the tiles that were checked.
 
     Returns:
-        The findings. No content of a file raises an error.
+        The violations, remarks and unread parts. No content of a file raises an error.
     """
     view = memoryview(data).cast("B")
-    findings = Findings()
+    log = ViolationLog()
     counts = _Counts()
     with suppress(TooManyViolationsError):  # reported by the last remark
-        _check(view, findings, counts, json_bytes_max, splats_max, progress or null_progress)
+        _check(view, log, counts, json_bytes_max, splats_max, progress or null_progress)
     return Validation(
-        tuple(sorted(findings.violations, key=lambda one: one.offset)),
-        tuple(findings.remarks),
-        tuple(findings.unread),
+        tuple(sorted(log.violations, key=lambda one: one.offset)),
+        tuple(log.remarks),
+        tuple(log.unread),
         counts.splats,
         counts.tiles,
-        tuple(findings.checks),
+        tuple(log.checks),
     )
 
 
@@ -92,102 +93,102 @@ class _Counts:
 
 def _check(
     view: memoryview,
-    findings: Findings,
+    log: ViolationLog,
     counts: _Counts,
     json_bytes_max: int,
     splats_max: int | None,
     progress: Callable[[str, float], None],
 ) -> None:
-    header = _read_header(view, findings)
+    header = _read_header(view, log)
     if header is None:
-        findings.skip("everything behind the magic and the version", "this is no file of this version")
+        log.skip("everything behind the magic and the version", "this is no file of this version")
         return
-    _check_length(view, header.record.file_size, findings)
-    end = _index_end(view, header, findings)
+    _check_length(view, header.record.file_size, log)
+    end = _index_end(view, header, log)
     if end is None:
-        findings.skip("index and chunks", "the index is not whole")
+        log.skip("index and chunks", "the index is not whole")
         return
-    index = read_records(view, end - _CRC_SIZE, findings)
+    index = read_records(view, end - _CRC_SIZE, log)
     counts.splats = index.head.record.splat_count
-    directory = read_directory(view, index.end, end - _CRC_SIZE, index, findings) if index.complete else []
+    directory = read_directory(view, index.end, end - _CRC_SIZE, index, log) if index.complete else []
     tiles: list[Tile] = []
     if index.complete:
-        tiles = read_tiles(view, index.end, end - _CRC_SIZE, index, findings)
+        tiles = read_tiles(view, index.end, end - _CRC_SIZE, index, log)
         index.complete = len(tiles) == index.head.record.tile_count
     else:
-        findings.skip("directory and tiles", "the records before them leave the index")
+        log.skip("directory and tiles", "the records before them leave the index")
     counts.tiles = len(tiles)
     chunks = [*directory, *(chunk for tile in tiles for chunk in tile.chunks)]
     if index.complete:
-        check_coverage(findings, chunks, end, header.record.file_size, len(view))
+        check_coverage(log, chunks, end, header.record.file_size, len(view))
     else:
-        findings.skip("the chunks", "the index does not name all of them")
+        log.skip("the chunks", "the index does not name all of them")
         return
-    books = _read_directory_chunks(view, directory, index, json_bytes_max, findings)
+    books = _read_directory_chunks(view, directory, index, json_bytes_max, log)
     if splats_max is not None and sum(tile.count for tile in tiles) > splats_max:
-        findings.add_field("LIM-1", index.head, "splat_count", f"{counts.splats} splats, the budget is {splats_max}")
-        findings.skip("the tiles", "there are more splats than the budget allows")
+        log.add_field("LIM-1", index.head, "splat_count", f"{counts.splats} splats, the budget is {splats_max}")
+        log.skip("the tiles", "there are more splats than the budget allows")
         return
-    _read_tile_chunks(view, tiles, index, books, findings, progress)
+    _read_tile_chunks(view, tiles, index, books, log, progress)
 
 
 # Header --------------------------------------------------------------------------------------------
 
 
-def _read_header(view: memoryview, findings: Findings) -> Header | None:
+def _read_header(view: memoryview, log: ViolationLog) -> Header | None:
     """Check HDR-1 to HDR-4 and HDR-11; return `None` if nothing else can be checked."""
     magic = bytes(view[: len(_spec.MAGIC)])
     if len(view) < _spec.HEADER_SIZE:
         if _spec.MAGIC.startswith(magic):
-            findings.add("HDR-11", len(view), "header", f"the data ends here, a header has {_spec.HEADER_SIZE} bytes")
+            log.add("HDR-11", len(view), "header", f"the data ends here, a header has {_spec.HEADER_SIZE} bytes")
         else:
-            findings.add("HDR-11", 0, "header.magic", f"{magic.hex(' ')} is no magic", _spec.ERROR_MAGIC)
+            log.add("HDR-11", 0, "header.magic", f"{magic.hex(' ')} is no magic", _spec.ERROR_MAGIC)
         return None
     header = read_record(view, _spec.unpack_header, _spec.HEADER_OFFSETS, 0, "header")
     record = header.record
     if magic != _spec.MAGIC:
-        findings.add_field("HDR-1", header, "magic", f"{magic.hex(' ')}, wanted {_spec.MAGIC.hex(' ')}")
+        log.add_field("HDR-1", header, "magic", f"{magic.hex(' ')}, wanted {_spec.MAGIC.hex(' ')}")
         return None
     version = (record.version_major, record.version_minor)
     wanted = (_spec.VERSION_MAJOR, _spec.VERSION_MINOR)
     if version != wanted:
         message = f"{version[0]}.{version[1]}, this validator knows {wanted[0]}.{wanted[1]}"
-        findings.add_field("HDR-2", header, "version_major", message)
+        log.add_field("HDR-2", header, "version_major", message)
         return None
     end = _spec.HEADER_OFFSETS["header_crc"]
     computed = zlib.crc32(view[:end])
     if record.header_crc != computed:
-        findings.add_field("HDR-3", header, "header_crc", f"{record.header_crc:#010x}, computed {computed:#010x}")
-    findings.checks.append("header_crc")
+        log.add_field("HDR-3", header, "header_crc", f"{record.header_crc:#010x}, computed {computed:#010x}")
+    log.checks.append("header_crc")
     if record.profile not in _spec.PROFILE_NAMES:
-        findings.add_field("HDR-4", header, "profile", f"{record.profile} is no profile that this version uses")
-    findings.check_reserved(header)
+        log.add_field("HDR-4", header, "profile", f"{record.profile} is no profile that this version uses")
+    log.check_reserved(header)
     return header
 
 
-def _check_length(view: memoryview, size: int, findings: Findings) -> None:
+def _check_length(view: memoryview, size: int, log: ViolationLog) -> None:
     """Check HDR-5 and HDR-6."""
     if len(view) < size:
-        findings.add("HDR-5", len(view), "end of the data", f"{len(view)} bytes, the header states {size}")
+        log.add("HDR-5", len(view), "end of the data", f"{len(view)} bytes, the header states {size}")
     elif len(view) > size:
-        findings.add("HDR-6", size, "end of the file", f"{len(view) - size} bytes follow the {size} of the file")
+        log.add("HDR-6", size, "end of the file", f"{len(view) - size} bytes follow the {size} of the file")
 
 
-def _index_end(view: memoryview, header: Header, findings: Findings) -> int | None:
+def _index_end(view: memoryview, header: Header, log: ViolationLog) -> int | None:
     """Check HDR-7 and IDX-1; return the end of the index, `None` if its head does not fit or it leaves the data."""
     size, file_size = header.record.index_size, header.record.file_size
     least = _spec.INDEX_HEAD_SIZE + _CRC_SIZE
     end = _spec.HEADER_SIZE + size
     if size < least or end > file_size:
         message = f"{size}, wanted {least} to {file_size - _spec.HEADER_SIZE}"
-        findings.add_field("HDR-7", header, "index_size", message)
+        log.add_field("HDR-7", header, "index_size", message)
     if size < least or end > len(view):
         return None
     at = end - _CRC_SIZE
     stored, computed = int.from_bytes(view[at:end], "little"), zlib.crc32(view[_spec.HEADER_SIZE : at])
     if stored != computed:
-        findings.add("IDX-1", at, "index.crc", f"{stored:#010x}, computed {computed:#010x}")
-    findings.checks.append("index_crc")
+        log.add("IDX-1", at, "index.crc", f"{stored:#010x}, computed {computed:#010x}")
+    log.checks.append("index_crc")
     return end
 
 
@@ -195,20 +196,20 @@ def _index_end(view: memoryview, header: Header, findings: Findings) -> int | No
 
 
 def _read_directory_chunks(
-    view: memoryview, directory: list[Chunk], index: Index, json_bytes_max: int, findings: Findings
+    view: memoryview, directory: list[Chunk], index: Index, json_bytes_max: int, log: ViolationLog
 ) -> CodebookEntries:
     """Read every chunk of the directory, used or not, known or not (CHK-2)."""
     books: CodebookEntries = {}
     for chunk in directory:
         if not chunk.whole:
             continue
-        payload = check_frame(view, chunk, _END_CLAUSES.get(chunk.kind, "CHK-3"), findings)
+        payload = check_frame(view, chunk, _END_CLAUSES.get(chunk.kind, "CHK-3"), log)
         if chunk.kind in _TEXT_CHUNKS:
-            _read_payload(payload, findings, partial(read_text, payload, chunk.kind, json_bytes_max))
+            _read_payload(payload, log, partial(check_text, payload, chunk.kind, json_bytes_max))
         elif chunk.kind == _spec.CHUNK_STATED_ERRORS:
-            _read_payload(payload, findings, partial(read_declared_bounds, payload, index))
+            _read_payload(payload, log, partial(check_declared_bounds, payload, index))
         elif chunk.kind == _spec.CHUNK_CODEBOOK:
-            _read_payload(payload, findings, partial(read_codebook, payload, chunk, index, books))
+            _read_payload(payload, log, partial(read_codebook, payload, chunk, index, books))
     return books
 
 
@@ -217,31 +218,31 @@ def _read_tile_chunks(
     tiles: list[Tile],
     index: Index,
     books: CodebookEntries,
-    findings: Findings,
+    log: ViolationLog,
     progress: Callable[[str, float], None],
 ) -> None:
     let_go = PageReleaser(view)
     for tile in tiles:
         progress(_STAGE, tile.place / len(tiles))
         let_go.after(sum(chunk.size for chunk in tile.chunks))
-        reader = TileChecker(view, index, tile, books, findings)
+        reader = TileChecker(view, index, tile, books, log)
         for chunk in sorted(tile.chunks, key=lambda chunk: chunk.layer):
             if not chunk.whole:
                 reader.lost.add(chunk.layer)
                 continue
-            payload = check_frame(view, chunk, "TLE-3", findings)
-            if not _read_payload(payload, findings, partial(reader.read_layer, payload, chunk)):
+            payload = check_frame(view, chunk, "TLE-3", log)
+            if not _read_payload(payload, log, partial(reader.read_layer, payload, chunk)):
                 reader.lost.add(chunk.layer)
-    findings.checks.append("all_chunk_crcs")
-    findings.checks.append("all_values")
+    log.checks.append("all_chunk_crcs")
+    log.checks.append("all_values")
     progress(_STAGE, 1.0)
 
 
-def _read_payload(payload: Payload, findings: Findings, read: Callable[[], None]) -> bool:
+def _read_payload(payload: Payload, log: ViolationLog, read: Callable[[], None]) -> bool:
     """Read a payload; return False and list the rest as not checked if its structure is lost."""
     try:
         read()
     except UnreadableError:
-        findings.skip(f"{payload.name} from byte {payload.at} on", "what it holds cannot be told")
+        log.skip(f"{payload.name} from byte {payload.at} on", "what it holds cannot be told")
         return False
     return True

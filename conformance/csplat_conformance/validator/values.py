@@ -9,18 +9,18 @@ import numpy as np
 
 from csplat import _spec
 from csplat.types import I64
-from csplat_conformance.validator.findings import Findings
 from csplat_conformance.validator.index import Index, scaled_step
+from csplat_conformance.validator.violation_log import ViolationLog
 
 #: Offset in the file and name of the field that a message is about.
 Place = tuple[int, str]
 
 
-def check_integers(findings: Findings, index: Index, attribute: int, rows: I64, exponent: int, where: Place) -> bool:
+def check_integers(log: ViolationLog, index: Index, attribute: int, rows: I64, exponent: int, where: Place) -> bool:
     """Check the integers of a block, or of the part of it that comes from one stream or codebook.
 
     Args:
-        findings: receives the violations.
+        log: receives the violations.
         index: index of the file.
         attribute: registry value; not means.
         rows: [C, n] integers, before the lifting of 7.1.
@@ -30,39 +30,39 @@ def check_integers(findings: Findings, index: Index, attribute: int, rows: I64, 
     Returns:
         Whether all clauses hold that could be checked.
     """
-    before = len(findings.violations)
+    before = len(log.violations)
     placed, levels = index.attributes.get(attribute), index.levels.get(attribute)
     if placed is None or not rows.size:
         return placed is not None
     if _spec.ATTRIBUTE_KIND[attribute] == "lattice":
-        _check_lattice(findings, index, placed.record, rows, exponent, where)
+        _check_lattice(log, index, placed.record, rows, exponent, where)
     elif levels is not None:
         check = _check_quats if attribute == _spec.ATTRIBUTE_QUATS else _check_levels
-        check(findings, rows, levels, where)
-    return len(findings.violations) == before
+        check(log, rows, levels, where)
+    return len(log.violations) == before
 
 
-def _check_levels(findings: Findings, rows: I64, levels: int, where: Place) -> None:
+def _check_levels(log: ViolationLog, rows: I64, levels: int, where: Place) -> None:
     high = int(rows.max())
     if high > levels:
-        findings.add("LEV-1", *where, f"a level of {high}, wanted {levels} at most")
+        log.add("LEV-1", *where, f"a level of {high}, wanted {levels} at most")
 
 
-def _check_quats(findings: Findings, rows: I64, levels: int, where: Place) -> None:
+def _check_quats(log: ViolationLog, rows: I64, levels: int, where: Place) -> None:
     largest = max(abs(int(rows.min())), abs(int(rows.max())))
     if largest > levels:
-        findings.add("QUA-1", *where, f"a component of magnitude {largest}, wanted {levels} at most")
+        log.add("QUA-1", *where, f"a component of magnitude {largest}, wanted {levels} at most")
         if largest > _spec.QUAT_LEVELS_MAX:
             return  # squares could leave 64 bits
     radicands = 2 * levels * levels - np.square(rows).sum(axis=0)
     lowest = int(radicands.min())
     if lowest < 0 and largest <= levels:
         message = f"R is {lowest} for splat {int(radicands.argmin())}, wanted 0 or more"
-        findings.add("QUA-2", *where, message)
+        log.add("QUA-2", *where, message)
 
 
 def _check_lattice(
-    findings: Findings, index: Index, record: _spec.AttributeRecord, rows: I64, exponent: int, where: Place
+    log: ViolationLog, index: Index, record: _spec.AttributeRecord, rows: I64, exponent: int, where: Place
 ) -> None:
     third = len(rows) // 3
     for column, row in enumerate(rows):
@@ -70,7 +70,7 @@ def _check_lattice(
         largest = max(abs(int(row.min())), abs(int(row.max()))) << shift
         if largest > _spec.COLUMN_MAX:
             message = f"column {column} has an integer of magnitude {largest}, wanted {_spec.COLUMN_MAX} at most"
-            findings.add("LAT-4", *where, message)
+            log.add("LAT-4", *where, message)
             return
     step = index.steps.get(record.attribute)
     scale = None if step is None else scaled_step(step, exponent)
@@ -80,7 +80,7 @@ def _check_lattice(
         rows = _lifted(rows, record.chroma_shift)
     for extreme in (int(rows.min()), int(rows.max())):
         if not is_finite(extreme, scale):
-            findings.add("LAT-5", *where, f"{extreme} x {scale} is not finite in binary32")
+            log.add("LAT-5", *where, f"{extreme} x {scale} is not finite in binary32")
             return
 
 
@@ -105,12 +105,12 @@ def is_finite(n: int, scale: float) -> bool:
 
 
 def check_box(
-    findings: Findings, index: Index, record: Any, rows: I64, box: Place, stream: Place, *, sound: bool
+    log: ViolationLog, index: Index, record: Any, rows: I64, box: Place, stream: Place, *, sound: bool
 ) -> None:
     """Check TIL-10 and MEA-1.
 
     Args:
-        findings: receives the violations.
+        log: receives the violations.
         index: index of the file.
         record: the tile record.
         rows: [3, n], the integers q.
@@ -122,7 +122,7 @@ def check_box(
     for axis, (low, high, extent) in enumerate(zip(lows, highs, record.extent, strict=True)):
         if low != 0 or high != extent:
             message = f"axis {axis}: q reaches from {low} to {high}, wanted 0 to the extent {extent}"
-            findings.add("TIL-10", *box, message)
+            log.add("TIL-10", *box, message)
     step = index.steps.get(_spec.ATTRIBUTE_MEANS)
     scale = None if step is None or not sound else scaled_step(step, record.exponent)
     if scale is None:
@@ -130,11 +130,11 @@ def check_box(
     for corner, low, high in zip(record.corner, lows, highs, strict=True):
         for n in (corner + low, corner + high):
             if not is_finite(n, scale):
-                findings.add("MEA-1", *stream, f"{n} x {scale} is not finite in binary32")
+                log.add("MEA-1", *stream, f"{n} x {scale} is not finite in binary32")
                 return
 
 
-def check_max_scale(findings: Findings, index: Index, largest: int, exponent: int, stored: bytes, where: Place) -> None:
+def check_max_scale(log: ViolationLog, index: Index, largest: int, exponent: int, stored: bytes, where: Place) -> None:
     """Check TIL-11 bit for bit: NaN differs from everything, and +0 from −0."""
     step = index.steps.get(_spec.ATTRIBUTE_SCALES)
     scale = None if step is None else scaled_step(step, exponent)
@@ -143,4 +143,4 @@ def check_max_scale(findings: Findings, index: Index, largest: int, exponent: in
     wanted = value_bits(largest, scale)
     if wanted != stored:
         found, value = (float(np.frombuffer(raw, "<f4")[0]) for raw in (stored, wanted))
-        findings.add("TIL-11", *where, f"{found!r}, the largest scale is {value!r} ({largest} x {scale})")
+        log.add("TIL-11", *where, f"{found!r}, the largest scale is {value!r} ({largest} x {scale})")

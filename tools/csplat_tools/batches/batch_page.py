@@ -182,10 +182,10 @@ def _read_every_nth(path: Path) -> SplatModel:
     """Read a scene, or every Nth splat of a large one, scaled up to cover as much."""
     with open_scene(path) as scene:
         step = max(1, -(-scene.count // _SPLATS_MAX))
-        facts = replace(scene.facts, extra={}) if scene.facts.extra else scene.facts
+        metadata_model = replace(scene.metadata_model, extra={}) if scene.metadata_model.extra else scene.metadata_model
         blocks = []
         for place, block in scene.numbered():
             first = -place.start % step
             kept = block.select(slice(first, None, step))
             blocks.append(replace(kept, extra={}, scales=kept.scales + np.float32(0.5 * np.log(step))))
-        return join_blocks(facts, blocks)
+        return join_blocks(metadata_model, blocks)

@@ -125,8 +125,8 @@ def _format(compared: Comparison, a: str, b: str) -> str:
     else:
         parts.append(_attributes(compared.attributes))
     parts.append(_quality(compared))
-    if compared.photographs is not None:
-        parts.append(_photographs(compared.photographs))
+    if compared.image_scores is not None:
+        parts.append(_format_image_scores(compared.image_scores))
     parts.append(f"{compared.seconds:.1f} s")
     return "\n\n".join(parts)
 
@@ -136,7 +136,7 @@ def _sizes(compared: Comparison, a: str, b: str) -> str:
     for name, one in ((f"A  {a}", compared.a), (f"B  {b}", compared.b)):
         count = one.count
         per_splat = f"{one.size_bytes / count:.2f}" if count else "-"
-        rows.append((name, one.size_bytes, count, one.facts.sh_degree, per_splat))
+        rows.append((name, one.size_bytes, count, one.metadata_model.sh_degree, per_splat))
     table = format_table(("", "bytes", "splats", "SH", "bytes/splat"), rows)
     ratio = compared.ratio
     return f"{table}\nB is {ratio:.2f} times smaller than A" if ratio >= 1.0 else f"{table}\nB is larger than A"
@@ -166,12 +166,14 @@ def _quality(compared: Comparison) -> str:
     head, *others = format_table(("pictures", views), rows).splitlines()
     lines = [head, *(f"{line}  {_SCORE_EXPLANATIONS[name]}" for line, (name, _) in zip(others, rows, strict=True))]
     lines += _ignored(compared)
-    if compared.a.facts.antialiased != compared.b.facts.antialiased:
-        lines.append(f"only {'A' if compared.a.facts.antialiased else 'B'} is antialiased, and was rendered so")
+    if compared.a.metadata_model.antialiased != compared.b.metadata_model.antialiased:
+        lines.append(
+            f"only {'A' if compared.a.metadata_model.antialiased else 'B'} is antialiased, and was rendered so"
+        )
     return "\n".join(lines)
 
 
-def _photographs(scores: dict[str, Any]) -> str:
+def _format_image_scores(scores: dict[str, Any]) -> str:
     rows = []
     for name, digits in (("psnr", 2), ("psnr_mean", 2), ("psnr_covered", 2), ("ssim", 5), ("lpips", 5)):
         a, b = scores["a"][name], scores["b"][name]

@@ -210,7 +210,7 @@ def encoder(
         return
     levels = tuple(f"L{number}" for number in chosen(parse_levels, text=level))
     kept = _checked_folder(keep, force=out.force) if keep is not None else None
-    render_score, reason = _picture_judge(levels, quiet=out.quiet)
+    render_score, reason = _render_scorer(levels, quiet=out.quiet)
     choice = EncoderSuiteOptions(run.pattern, levels, run.timeout or ENCODER_SECONDS, min_psnr, run.jobs, kept)
     ours = f"{shlex.quote(sys.executable)} {_OURS}"
     with out.bar() as bar:
@@ -237,7 +237,7 @@ def _checked_folder(name: str, *, force: bool) -> Path:
     return folder
 
 
-def _picture_judge(levels: Sequence[str], *, quiet: bool) -> tuple[RenderScore | None, str]:
+def _render_scorer(levels: Sequence[str], *, quiet: bool) -> tuple[RenderScore | None, str]:
     """Return a function that measures the PSNR of renders, or `None` and the reason.
 
     Args:

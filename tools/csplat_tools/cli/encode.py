@@ -189,7 +189,7 @@ def encode(
     output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="The file to write, or -; else IN.csplat.")],
     encoding: EncodingOptions,
     goal: TargetOptions,
-    facts: SourceOptions,
+    source_options: SourceOptions,
     views: ViewOptions,
     virtual: VirtualViewOptions,
     room: LargeSceneOptions,
@@ -241,7 +241,7 @@ def encode(
       csplat encode city.ply city.csplat --memory 4GB --dry-run
       gunzip -c scene.ply.gz | csplat encode - - | wc -c
     """
-    options = encoding.options(facts, settings)
+    options = encoding.options(source_options, settings)
     if (options.max_classes or 1) > 1:
         if options.shape_codebook_size:
             raise typer.BadParameter("--max-classes with a codebook of shapes: its entries have one precision")
@@ -262,8 +262,8 @@ def encode(
     reaching: EncodeFunction = partial(_reach, goal, views, virtual, importance, out)
     with out.bar() as progress:
         encoded = encode_file(
-            source, output, options, overrides=facts.read(), strict=facts.strict, importance=importance,
-            prune_unseen=prune_unseen, source_index=source_index, scale=scale,
+            source, output, options, overrides=source_options.read(), strict=source_options.strict,
+            importance=importance, prune_unseen=prune_unseen, source_index=source_index, scale=scale,
             encoder=reaching if goal.is_rendered or goal.max_error is not None else None, progress=progress,
         )  # fmt: skip
     out.print_findings(encoded.findings)
@@ -276,7 +276,7 @@ def encode(
         psnr = None if out.quiet else _psnr(encoded, encoding.threads)
     about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(ESTIMATE_SIZE)}
     if not out.quiet and encoded.outcome is not None and len(encoded.source) <= ESTIMATE_SPLATS_MAX:
-        facts.take_estimated_up(estimate_up(encoded.source), out, shown=False)
+        source_options.take_estimated_up(estimate_up(encoded.source), out, shown=False)
     out.remark(_summary(encoded, psnr, source, output))
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
 

@@ -49,7 +49,7 @@ def finetune(
     source: Annotated[str, typer.Argument(metavar="IN.ply", help="A trained 3DGS scene.")],
     output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="The file to write.")],
     encoding: EncodingOptions,
-    facts: SourceOptions,
+    source_options: SourceOptions,
     views: ViewOptions,
     virtual: VirtualViewOptions,
     out: OutputOptions,
@@ -142,7 +142,7 @@ def finetune(
     rates = settings.of(FinetuneOptions)
     options = chosen(FinetuneOptions, iterations=iterations, seed=encoding.seed, byte_cost=cost, **rates)
     options = chosen(options.scaled, factor=tuning.LEARNING_FACTOR[itself] if lr_factor is None else lr_factor)
-    encoder = encoding.options(facts, settings)
+    encoder = encoding.options(source_options, settings)
     if encoder.shape_codebook_size is None:
         encoder = replace(encoder, shape_codebook_size=tuning.SHAPE_ENTRIES)
     # A checkpoint may take the place of the one that it goes on from.
@@ -156,14 +156,20 @@ def finetune(
     check_name(output, ".csplat", "finetune", source)
     distance = None if lpips is None else load_lpips(None if lpips == "auto" else lpips)
     degree = read_degree(encoder)
-    read = read_source(source, facts.read(), strict=facts.strict, keep_extra=facts.keep_extra, sh_degree=degree)
+    read = read_source(
+        source,
+        source_options.read(),
+        strict=source_options.strict,
+        keep_extra=source_options.keep_extra,
+        sh_degree=degree,
+    )
     out.print_findings(read.findings)
     given = {"count": tuning.VIEWS, "size": tuning.VIEW_SIZE, **virtual.given()}
     aside_count = validation_count or tuning.default_validation_count(
         given["count"], cameras=views.cameras, data=views.data
     )
     around = views.find(read.model, out, near=near, validation_count=aside_count, **given)
-    around.read_photographs()
+    around.read_images()
     report = tuning.run_finetuning(
         read.model, around, output, encoder, options, Outputs(checkpoint, checkpoint_every, resume=resume), keep=keep,
         prune_unseen=prune_unseen, importance=importance, source_index=source_index, lpips=distance,

@@ -65,37 +65,41 @@ def info(
         out.publish(*describe_other_format(source))
         return
     with mapped_csplat(source) as data:
-        facts = describe_file(data)
+        description = describe_file(data)
         if page is not None:
             from csplat_tools.inspect.file_report import write_page
 
             with out.bar() as progress:
-                write_page(page, source, data, facts, beside, progress=progress)
-    out.publish(facts.as_json(), _format(facts))
+                write_page(page, source, data, description, beside, progress=progress)
+    out.publish(description.as_json(), _format(description))
 
 
-def _format(facts: FileDescription) -> str:
-    size = facts.header.file_size
+def _format(description: FileDescription) -> str:
+    size = description.header.file_size
     parts = [
-        _scene(facts),
-        _sizes("attribute", facts.attributes, size, [describe_coding(one) for one in facts.attributes.values()]),
-        _sizes("layer", facts.layers, size, [counted(one.tiles, "tile") for one in facts.layers.values()]),
-        "other bytes: " + ", ".join(f"{name} {number}" for name, number in facts.overhead.items()),
+        _scene(description),
+        _sizes(
+            "attribute", description.attributes, size, [describe_coding(one) for one in description.attributes.values()]
+        ),
+        _sizes("layer", description.layers, size, [counted(one.tiles, "tile") for one in description.layers.values()]),
+        "other bytes: " + ", ".join(f"{name} {number}" for name, number in description.overhead.items()),
     ]
-    if facts.codebooks:
-        parts.append("\n".join(_codebook(one) for one in facts.codebooks))
-    if facts.declared_bounds is not None:
-        parts.append(_stated_errors(facts.declared_bounds))
+    if description.codebooks:
+        parts.append("\n".join(_codebook(one) for one in description.codebooks))
+    if description.declared_bounds is not None:
+        parts.append(_stated_errors(description.declared_bounds))
     parts += [
         f"{title}  {json.dumps(value, sort_keys=True)}"
-        for title, value in (("options ", facts.options), ("metadata", other_metadata(facts)))
+        for title, value in (("options ", description.options), ("metadata", other_metadata(description)))
         if value
     ]
     return "\n\n".join(parts)
 
 
-def _scene(facts: FileDescription) -> str:
-    return "\n".join([format_headline(facts), *(f"{name:12} {value}" for name, value in describe_scene(facts).items())])
+def _scene(description: FileDescription) -> str:
+    return "\n".join(
+        [format_headline(description), *(f"{name:12} {value}" for name, value in describe_scene(description).items())]
+    )
 
 
 def _sizes(

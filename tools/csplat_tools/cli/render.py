@@ -104,7 +104,7 @@ def render(
         raise typer.BadParameter("--depth and --alpha want a folder, not a film")
     pixels = None if views.size is None else parse_size(views.size)
     colour = views.colour
-    shots = views.photographs()
+    shots = views.data_options()
     out.check(output if film else None, inputs=(source, *views.inputs))
     if not film:
         check_name(output, ".webp", "render", source)

@@ -70,18 +70,20 @@ def sensitivity(
     with out.bar() as progress:
         measured = measure_scene(model, around, matrices=matrices, threads=threads, progress=progress)
     measured.write(output)
-    facts = measured.as_json()
-    out.remark(*_lines(facts))
-    out.publish(facts)
+    report = measured.as_json()
+    out.remark(*_lines(report))
+    out.publish(report)
 
 
-def _lines(facts: Mapping[str, Any]) -> list[str]:
-    unseen = f"no view saw {facts['unseen']} of them ({100.0 * facts['unseen_share']:.2f} %)"
-    lines = [f"{counted(facts['splats'], 'splat')} from {counted(facts['views'], facts['source'] + ' view')}; {unseen}"]
-    if facts["missed_share"] is not None:
-        lines.append(f"held-out views saw {100.0 * facts['missed_share']:.2f} % more of the splats")
+def _lines(report: Mapping[str, Any]) -> list[str]:
+    unseen = f"no view saw {report['unseen']} of them ({100.0 * report['unseen_share']:.2f} %)"
+    lines = [
+        f"{counted(report['splats'], 'splat')} from {counted(report['views'], report['source'] + ' view')}; {unseen}"
+    ]
+    if report["missed_share"] is not None:
+        lines.append(f"held-out views saw {100.0 * report['missed_share']:.2f} % more of the splats")
     rows = [
-        (label, *(f"{facts['quantiles'][name][q]:.3g}" for q in ("0.5", "0.9", "0.99", "1.0")))
+        (label, *(f"{report['quantiles'][name][q]:.3g}" for q in ("0.5", "0.9", "0.99", "1.0")))
         for name, label in _SHOWN.items()
     ]
     return [*lines, format_table(("sensitivity", "median", "90 %", "99 %", "largest"), rows)]

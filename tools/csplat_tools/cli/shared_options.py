@@ -196,7 +196,7 @@ class ViewOptions(OptionGroup):
         """Background colour, red, green, blue, 0 to 1; `None`: the default."""
         return None if self.background is None else parse_colour(self.background)
 
-    def photographs(self, near: float | None = None) -> DataOptions | None:
+    def data_options(self, near: float | None = None) -> DataOptions | None:
         """Return the options of the data set; `None` without one.
 
         Args:
@@ -217,7 +217,7 @@ class ViewOptions(OptionGroup):
             every: as for `find_view_set`.
             how: other arguments of `find_view_set`, which defines their defaults.
         """
-        data = self.photographs(near)
+        data = self.data_options(near)
         found = find_view_set(model, cameras=self.cameras, data=data, background=self.colour, every=every, **how)
         output.remark(*found.notes)
         axis = None if output.quiet or found.name != VIRTUAL else estimate_up(model, every)
@@ -313,18 +313,18 @@ class EncodingOptions(OptionGroup):
         typer.Option(min=1, hidden=True, help="Threads, which do not change the bytes. Default: one per core."),
     ] = None
 
-    def options(self, facts: SourceOptions, settings: LibrarySettings) -> EncodeOptions:
+    def options(self, source_options: SourceOptions, settings: LibrarySettings) -> EncodeOptions:
         """Return the options of the encoder.
 
         Args:
-            facts: specifies whether extra columns are carried.
+            source_options: specifies whether extra columns are carried.
             settings: values of `--set`.
 
         Raises:
             typer.BadParameter: an option is out of its range.
         """
         own = {one.name: getattr(self, one.name) for one in fields(self)}
-        return chosen(EncodeOptions, **own, **settings.of(EncodeOptions), keep_extra=facts.keep_extra)
+        return chosen(EncodeOptions, **own, **settings.of(EncodeOptions), keep_extra=source_options.keep_extra)
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -104,7 +104,9 @@ def simplify(
     options = replace(options, view_size=given.get("size"))
     passes = _PASSES[keep is None] * (0.5 + 0.5 * options.work)
     out.announce_time(
-        lambda: passes * total_render_seconds(model, shrink_cameras(around.training, options.pictures(len(model))[1])),
+        lambda: (
+            passes * total_render_seconds(model, shrink_cameras(around.training, options.views_and_size(len(model))[1]))
+        ),
         "fewer or smaller views take less: --help-all",
     )
     with out.bar() as progress:

@@ -82,7 +82,7 @@ def tradeoff(
 
     check_plots(plots, force=out.force)
     setting = read_setting(
-        source, cameras=views.cameras, data=views.photographs(), background=views.colour, lpips=lpips
+        source, cameras=views.cameras, data=views.data_options(), background=views.colour, lpips=lpips
     )
     prepare_renderer(quiet=out.quiet, simplify=bool(_SLOW & set(wanted.what)), ssim=True, lpips=lpips is not None)
     out.print_findings(setting.findings)

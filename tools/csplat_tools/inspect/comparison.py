@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from csplat import scene_source as scenes
 from csplat.decoder import DeclaredBounds, decode, open_tiles
-from csplat.disk_files import check_free_space
+from csplat.disk_files import check_free_space, finite_or_none
 from csplat.errors import CsplatError, InputError
 from csplat.model import SplatModel
 from csplat.scene_source import SceneSource
@@ -26,7 +26,6 @@ from csplat_render.camera import Camera, resized
 from csplat_render.lpips import load_lpips
 from csplat_render.metrics import Distance, Scores, ViewScore
 from csplat_render.scorer import OnView, Scorer
-from csplat_tools.console import finite_or_none
 from csplat_tools.file_streams import is_csplat
 from csplat_tools.optional_packages import require_images, require_renderer
 from csplat_tools.render_files import image_names, make_output_folder, side_by_side, write_png
@@ -89,7 +88,7 @@ class Comparison:
         quality: scores of B's renders against A's.
         ignored: number of splats of A that were not drawn because they hold NaN or infinities.
         cameras: source of the views: the name of a camera file or of a data set, or `virtual`.
-        photographs: scores of A's and B's renders against the photographs of a data set, as JSON of `Scores`, by the
+        image_scores: scores of A's and B's renders against the images of a data set, as JSON of `Scores`, by the
             keys `split`, `a` and `b`; `None` if there is no data set.
         background, mode: background colour and renderer mode.
         notes: remarks about the views.
@@ -102,7 +101,7 @@ class Comparison:
     quality: Scores
     ignored: int
     cameras: str
-    photographs: dict[str, Any] | None
+    image_scores: dict[str, Any] | None
     background: Colour
     mode: Mode
     notes: tuple[str, ...]
@@ -126,7 +125,7 @@ class Comparison:
             "cameras": self.cameras,
             "background": list(self.background),
             "mode": self.mode,
-            "photographs": self.photographs,
+            "photographs": self.image_scores,
             **self.quality.as_json(),
             "ignored": {"a": self.ignored, "b": self.quality.ignored},
             "views": [
@@ -158,17 +157,17 @@ def compare(
     Args:
         a: the source: a model, or a file in any format.
         b: the scene compared with it, likewise.
-        views: its test views are rendered; if they have photographs, A and B are scored against these, too. `None`:
+        views: its test views are rendered; if they have images, A and B are scored against these, too. `None`:
             the eight virtual views of `psnr`, 640×480, in front of black (`find_view_set`).
         source_index: [N] the splat of A that each splat of B is.
         lpips: a file of LPIPS weights, or `auto` for the usual places; LPIPS is not computed if left out.
-        pictures: a folder for one PNG per view: the photograph if there is one, A, B, and their amplified difference.
+        pictures: a folder for one PNG per view: the image if there is one, A, B, and their amplified difference.
         amplification: factor by which the difference is amplified.
         background: red, green, blue, 0..1; that of the views if left out.
         mode: mode of the renderer.
         force: existing files of `pictures` may be replaced.
         memory_bytes: approximate memory that may be taken; the disk is used if that is too little for both files.
-            `None`: half of the free memory. Photographs are not included.
+            `None`: half of the free memory. Images of the data set are not included.
         prepare: called when all inputs have been read and checked, before the first render.
         progress: called with the stage and the fraction of it that is done, 0 to 1.
 
@@ -192,21 +191,21 @@ def compare(
         views = views or _views(source, background, progress)
         if not views.test:
             raise InputError(f"{views.name} has no {views.split} views")
-        by_photographs = views.photograph_test_scorer(mode=mode) if views.photographs else None
+        image_scorer = views.image_test_scorer(mode=mode) if views.images else None
         viewers: list[OnView] = []
         if pictures is not None:
             names = image_names([camera.image for camera in views.test])
-            viewers.append(_ImageWriter(os.fspath(pictures), names, by_photographs, amplification, force=force))
+            viewers.append(_ImageWriter(os.fspath(pictures), names, image_scorer, amplification, force=force))
         first, second, errors = _measured(source, other, views.test, source_index, progress)
         if prepare is not None:
             prepare()
-        photograph_scores = None if by_photographs is None else _PhotographScores(by_photographs, distance)
-        viewers += [] if photograph_scores is None else [photograph_scores]
+        image_scores = None if image_scorer is None else _ImageScores(image_scorer, distance)
+        viewers += [] if image_scores is None else [image_scores]
         judge = views.test_scorer(first, mode=mode, background=background, progress=progress)
         quality = judge.scores(second, lpips=distance, on_view=_all_of(viewers), progress=progress)
         return Comparison(
             source, other, errors, quality, judge.reference(0).ignored, views.name,
-            None if photograph_scores is None else {"split": views.split, **photograph_scores.as_json()},
+            None if image_scores is None else {"split": views.split, **image_scores.as_json()},
             views.background, mode, views.notes, time.perf_counter() - start,
         )  # fmt: skip
 
@@ -263,7 +262,7 @@ def attribute_errors_out_of_core(
         if not is_csplat(other.path):
             return None
         # For a file that declares no errors and was refitted, all errors are measured.
-        nothing = DeclaredBounds(source.count, 0, source.facts.sh_degree, refitted=True, records=())
+        nothing = DeclaredBounds(source.count, 0, source.metadata_model.sh_degree, refitted=True, records=())
         opened = replace(open_tiles(other.path), declared_bounds=nothing)
         proof = verify_out_of_core(
             source.scene, opened, source_index, memory_bytes=source.memory_bytes, progress=progress
@@ -312,7 +311,7 @@ def _paired_blocks(
     """Yield blocks of the splats of two scenes of the same order, with the number of the first splat."""
     first = scenes.with_progress(a, "measuring splats", progress or null_progress).blocks()
     second = scenes.with_progress(b, "", null_progress).blocks()
-    start, ours, theirs = 0, a.facts, b.facts
+    start, ours, theirs = 0, a.metadata_model, b.metadata_model
     while start < a.count:
         ours, theirs = ours if len(ours) else next(first), theirs if len(theirs) else next(second)
         count = min(len(ours), len(theirs))
@@ -369,8 +368,8 @@ def _measured(
     return first, second, attribute_errors_out_of_core(source, other, source_index, progress=progress)
 
 
-class _PhotographScores:
-    """The scores of A's and B's renders against the photographs."""
+class _ImageScores:
+    """The scores of A's and B's renders against the images."""
 
     def __init__(self, judge: Scorer, distance: Distance | None) -> None:
         self._judge, self._distance = judge, distance
@@ -385,17 +384,17 @@ class _PhotographScores:
 
 
 class _ImageWriter:
-    """A writer of one PNG per view, named after its photograph."""
+    """A writer of one PNG per view, named after its image."""
 
     def __init__(
-        self, folder: str, names: Sequence[str], photographs: Scorer | None, amplification: float, *, force: bool
+        self, folder: str, names: Sequence[str], image_scorer: Scorer | None, amplification: float, *, force: bool
     ) -> None:
         self._files = [f"{name}.png" for name in names]
         self._target = make_output_folder(folder, self._files, force=force)
-        self._photographs, self._amplification = photographs, amplification
+        self._image_scorer, self._amplification = image_scorer, amplification
 
     def __call__(self, number: int, a: F32, b: F32) -> None:
-        shown = None if self._photographs is None else self._photographs.reference(number).rgb
+        shown = None if self._image_scorer is None else self._image_scorer.reference(number).rgb
         write_png(self._target / self._files[number], side_by_side(a, b, self._amplification, shown))
 
 

@@ -23,12 +23,13 @@ from csplat.decoder import (
     read_metadata,
     read_options,
 )
+from csplat.disk_files import finite_or_none
 from csplat.editing.up_axis import UP, up_of
 from csplat.errors import FormatError
 from csplat.formats import format_by_name, open_scene
 from csplat.model import SplatModel
 from csplat.training_record import TRAINING, VIEW, TrainingRecord
-from csplat_tools.console import finite_or_none, format_bytes
+from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import local_path
 from csplat_tools.scene_files import findings_as_json, size_on_disk
 
@@ -234,7 +235,7 @@ def describe_other_format(source: str) -> tuple[dict[str, Any], str]:
         OSError: the file cannot be read.
     """
     with local_path(source) as path, open_scene(path) as scene:
-        facts, size, count = scene.facts, size_on_disk(path), scene.count
+        metadata_model, size, count = scene.metadata_model, size_on_disk(path), scene.count
         per_splat = size / count if count else None
         report = {
             "format": scene.format,
@@ -242,24 +243,24 @@ def describe_other_format(source: str) -> tuple[dict[str, Any], str]:
             "bytes_per_splat": per_splat,
             "splats": count,
             "levels": list(scene.levels),
-            "sh_degree": facts.sh_degree,
-            "coordinate_system": facts.coordinate_system,
-            "origin": list(facts.origin),
-            "unit_metres": facts.unit_metres,
-            "antialiased": facts.antialiased,
-            "flat": facts.flat,
-            "extra": {name: str(column.dtype) for name, column in facts.extra.items()},
-            "metadata": dict(facts.metadata),
+            "sh_degree": metadata_model.sh_degree,
+            "coordinate_system": metadata_model.coordinate_system,
+            "origin": list(metadata_model.origin),
+            "unit_metres": metadata_model.unit_metres,
+            "antialiased": metadata_model.antialiased,
+            "flat": metadata_model.flat,
+            "extra": {name: str(column.dtype) for name, column in metadata_model.extra.items()},
+            "metadata": dict(metadata_model.metadata),
             "defects": findings_as_json(scene.findings),
         }
         average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
-        words = describe_placement(facts, count, facts.metadata)
+        words = describe_placement(metadata_model, count, metadata_model.metadata)
         if scene.levels:
             words["levels"] = f"{' / '.join(f'{one:,}' for one in scene.levels)} splats (csplat convert --level)"
-        if facts.extra:
-            words["extra"] = ", ".join(f"{name} ({column.dtype})" for name, column in facts.extra.items())
-        if facts.metadata:
-            words["metadata"] = json.dumps(facts.metadata, sort_keys=True)
+        if metadata_model.extra:
+            words["extra"] = ", ".join(f"{name} ({column.dtype})" for name, column in metadata_model.extra.items())
+        if metadata_model.metadata:
+            words["metadata"] = json.dumps(metadata_model.metadata, sort_keys=True)
         lines = [f"{format_by_name(scene.format).title}, {format_bytes(size)}{average}"]
         lines += [f"{name:12} {value}" for name, value in words.items()]
         lines += [str(one) for one in scene.findings if not one.usual]

@@ -63,7 +63,7 @@ _SCENE = {
 class _SourceComparison:
     """The comparison with the source, as text and HTML."""
 
-    facts: dict[str, str]
+    measurements: dict[str, str]
     images: str
 
 
@@ -71,7 +71,7 @@ def write_page(
     path: str,
     name: str,
     data: bytes | mmap,
-    facts: FileDescription,
+    description: FileDescription,
     source: str | None = None,
     *,
     progress: Progress | None = None,
@@ -82,7 +82,7 @@ def write_page(
         path: path of the report.
         name: name of the file that it describes, or `-`.
         data: the file.
-        facts: the file's description of itself.
+        description: the file's description of itself.
         source: a scene to compare it with, which requires the renderer.
         progress: progress callback of the comparison.
 
@@ -92,21 +92,21 @@ def write_page(
     """
     title = "standard input" if name == STANDARD_STREAM else PurePath(name).name
     comparison = None if source is None else _compare(data, source, progress)
-    write_bytes(path, make_page(title, facts, comparison).encode())
+    write_bytes(path, make_page(title, description, comparison).encode())
 
 
-def make_page(title: str, facts: FileDescription, comparison: _SourceComparison | None = None) -> str:
+def make_page(title: str, description: FileDescription, comparison: _SourceComparison | None = None) -> str:
     """Return the report as HTML: the same for the same file and source."""
-    count = facts.header.splat_count
+    summary = f"{description.header.splat_count:,} splats; {format_headline(description)}"
     return document(
         f"{title}: content",
         [
-            f'<h1>{escape(title)}</h1>\n<p class="quiet">{escape(f"{count:,} splats; {format_headline(facts)}")}</p>',
+            f'<h1>{escape(title)}</h1>\n<p class="quiet">{escape(summary)}</p>',
             _source(comparison),
-            _bytes(facts),
-            _layers(facts),
-            "" if facts.declared_bounds is None else _bounds(facts.declared_bounds),
-            _scene(facts),
+            _bytes(description),
+            _layers(description),
+            "" if description.declared_bounds is None else _bounds(description.declared_bounds),
+            _scene(description),
         ],
     )
 
@@ -125,14 +125,14 @@ def _compare(data: bytes | mmap, source: str, progress: Progress | None) -> _Sou
     showing.scores(model, ssim=False, on_view=hardest.examine)
     place = hardest.found()
     assert place is not None
-    facts = {
+    measurements = {
         "source": _source_text(source, loaded, len(data)),
         "PSNR": f"{scores.psnr:.2f} dB: likeness of renders of the file and of the source, from"
         f" {len(scores.each)} views all around; at 30 a difference is visible, at 40 hardly",
         "worst view": f"{scores.psnr_worst:.2f} dB",
         "SSIM": f"{scores.ssim:.4f}: likeness of structure, 1 at best",
     }
-    return _SourceComparison(facts, f"<p>{escape(IMAGES_NOTE)}</p>\n{piece_images(place, 'the file')}")
+    return _SourceComparison(measurements, f"<p>{escape(IMAGES_NOTE)}</p>\n{piece_images(place, 'the file')}")
 
 
 def _source_text(path: str, source: LoadedModel, size_bytes: int) -> str:
@@ -144,27 +144,32 @@ def _source_text(path: str, source: LoadedModel, size_bytes: int) -> str:
 def _source(comparison: _SourceComparison | None) -> str:
     if comparison is None:
         return ""
-    facts = definitions(comparison.facts)
-    return f"<h2>Compared with its source</h2>\n{facts}\n<h3>The hardest place</h3>\n{comparison.images}"
+    measurements = definitions(comparison.measurements)
+    return f"<h2>Compared with its source</h2>\n{measurements}\n<h3>The hardest place</h3>\n{comparison.images}"
 
 
-def _bytes(facts: FileDescription) -> str:
-    sizes = {name: one.size_bytes for name, one in facts.attributes.items()}
-    sizes["overhead"] = sum(facts.overhead.values())
+def _bytes(description: FileDescription) -> str:
+    sizes = {name: one.size_bytes for name, one in description.attributes.items()}
+    sizes["overhead"] = sum(description.overhead.values())
     rows = [
         (name, _ATTRIBUTES.get(name, ""), f"{one.size_bytes:,}", _bits(one.bits_per_splat), describe_coding(one))
-        for name, one in facts.attributes.items()
+        for name, one in description.attributes.items()
     ]
-    overhead = ", ".join(f"{name} {number}" for name, number in facts.overhead.items())
+    overhead = ", ".join(f"{name} {number}" for name, number in description.overhead.items())
     rows.append(("overhead", _ATTRIBUTES["overhead"], f"{sizes['overhead']:,}", "", overhead))
     head = ("attribute", "meaning", "bytes", "bits per splat", "coding")
     return f"<h2>Bytes by attribute</h2>\n{attribute_figure(sizes)}\n{table(head, rows, words=(1, 4))}"
 
 
-def _layers(facts: FileDescription) -> str:
+def _layers(description: FileDescription) -> str:
     rows = [
-        (name, _LAYERS.get(name, ""), f"{one.size_bytes:,}", f"{100.0 * one.size_bytes / facts.header.file_size:.1f} %")
-        for name, one in facts.layers.items()
+        (
+            name,
+            _LAYERS.get(name, ""),
+            f"{one.size_bytes:,}",
+            f"{100.0 * one.size_bytes / description.header.file_size:.1f} %",
+        )
+        for name, one in description.layers.items()
     ]
     head = ("layer", "content", "bytes", "share of the file")
     return f"<h2>Layers, in order of arrival</h2>\n{table(head, rows, words=(1,))}" if rows else ""
@@ -185,11 +190,12 @@ def _bounds(bounds: DeclaredBounds) -> str:
     return f"<h2>Declared error bounds</h2>\n<p>{escape(text)} {_CHECK}</p>\n{errors}"
 
 
-def _scene(facts: FileDescription) -> str:
+def _scene(description: FileDescription) -> str:
     words = {
-        (f"{name} ({_SCENE[name]})" if name in _SCENE else name): value for name, value in describe_scene(facts).items()
+        (f"{name} ({_SCENE[name]})" if name in _SCENE else name): value
+        for name, value in describe_scene(description).items()
     }
-    for title, value in (("options of the encoder", facts.options), ("metadata", other_metadata(facts))):
+    for title, value in (("options of the encoder", description.options), ("metadata", other_metadata(description))):
         if value:
             words[title] = json.dumps(value, sort_keys=True, ensure_ascii=False)
     return f"<h2>The scene</h2>\n{definitions(words)}"

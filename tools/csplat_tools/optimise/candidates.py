@@ -31,7 +31,7 @@ class CodingChoice:
 
     Attributes:
         sh: "codebook", "scalar" or "none"; `None`: as in the options, like the plain encoder.
-        share: entries of a codebook per splat; `None`: as in the options.
+        entries_per_splat: entries of a codebook per splat; `None`: as in the options.
         degree: bands up to this one are kept; `None`: as in the options.
         adaptive: how much coarser unimportant splats are coded; `None`: as in the options.
         use_classes: splats are sorted into quantisation classes by measurements, if there are any; False: measurements
@@ -39,7 +39,7 @@ class CodingChoice:
     """
 
     sh: ShCoding | None
-    share: float | None = None
+    entries_per_splat: float | None = None
     degree: int | None = None
     adaptive: float | None = None
     use_classes: bool = True
@@ -52,8 +52,8 @@ class CodingChoice:
 @lru_cache(maxsize=256)  # a search compares the options of its files a thousand times, and each is checked when made
 def _options_of(coding: CodingChoice, encoding: EncodeOptions, splats: int) -> EncodeOptions:
     size = encoding.codebook_size
-    if coding.sh == "codebook" and coding.share is not None and size is None:
-        size = 1 << round(math.log2(min(max(coding.share * splats, _ENTRIES[0]), _ENTRIES[1])))
+    if coding.sh == "codebook" and coding.entries_per_splat is not None and size is None:
+        size = 1 << round(math.log2(min(max(coding.entries_per_splat * splats, _ENTRIES[0]), _ENTRIES[1])))
     return replace(
         encoding,
         sh_coding=encoding.sh_coding if coding.sh is None else coding.sh,
@@ -147,7 +147,7 @@ class Candidate:
         result: the encoder's result.
         test_scorer: scorer by the source's renders in the test views.
         validation_psnr: PSNR on the validation views, dB, by which files are compared.
-        photo_psnr: PSNR against the validation photographs, dB; NaN if there are none.
+        photo_psnr: PSNR against the validation images, dB; NaN if there are none.
         decode: decodes its bytes.
     """
 
@@ -235,7 +235,7 @@ class CandidatePool:
         test_scorer: scorer by the source's renders in the test views: a PSNR target refers to them, and they choose
             nothing.
         validation_scorer: scorer by the source's renders in the validation views, by which files are compared.
-        photographs: scorer by validation photographs, if the target is a loss against photographs.
+        image_scorer: scorer by validation images, if the target is a loss against images.
         made: all files, in order.
         progress: progress callback, called with each file that is made.
         decode: decodes the bytes of a file; an encoder other than csplat's, such as a formula in tests, brings its own.
@@ -244,7 +244,7 @@ class CandidatePool:
     encoding: EncodeOptions
     test_scorer: Scorer
     validation_scorer: Scorer
-    photographs: Scorer | None = None
+    image_scorer: Scorer | None = None
     made: list[Candidate] = field(default_factory=list)
     progress: Progress | None = None
     decode: Callable[[bytes], SplatModel] = decode
@@ -298,7 +298,7 @@ class CandidatePool:
         result = coded.write(subset.options_entry(None))
         model = self.decode(result.data)
         validation_psnr = self.validation_scorer.psnr(model)
-        photo_psnr = math.nan if self.photographs is None else self.photographs.psnr(model)
+        photo_psnr = math.nan if self.image_scorer is None else self.image_scorer.psnr(model)
         candidate = Candidate(
             subset, coding, quality, options, final, result, self.test_scorer, validation_psnr, photo_psnr, self.decode
         )

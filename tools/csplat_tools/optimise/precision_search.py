@@ -381,9 +381,9 @@ def _next_place(
     below = max((point for point in points if point[1] < window.low), default=None)
     above = min((point for point in points if point[1] > window.high), default=None)
     if below is not None and above is not None and above[0] > below[0]:
-        share = (window.aim - below[1]) / (above[1] - below[1])
-        share = min(max(share, _BRACKET_MARGIN), 1.0 - _BRACKET_MARGIN)
-        return below[0] + share * (above[0] - below[0])
+        fraction = (window.aim - below[1]) / (above[1] - below[1])
+        fraction = min(max(fraction, _BRACKET_MARGIN), 1.0 - _BRACKET_MARGIN)
+        return below[0] + fraction * (above[0] - below[0])
     place, value = points[-1]
     if len(points) > 1 and points[-2][0] != place:
         seen = (value - points[-2][1]) / (place - points[-2][0])

@@ -34,7 +34,7 @@ from csplat_tools.views import ViewSet, camera_sequence, find_view_set
 from csplat_tools.views.sufficient_views import SufficientViews, find_sufficient_views
 
 _TRIES = 3  # largest number of fits on the way to a target PSNR
-_AGREE_ON = 0.5  # least fraction of the splats on whose removal views have to agree: fits need the views in any case
+_AGREE_ON = 0.5  # least fraction of the splats on whose pruning views have to agree: fits need the views in any case
 _NEAR = 0.05  # dB: a result this near to the target PSNR is not improved
 _BANDS_WORTH = 1.0  # dB that leaving out SH bands may cost; a fit that loses more has failed
 
@@ -133,19 +133,21 @@ def prepare_pruning(
     """
     seconds = {}
     start = time.perf_counter()
-    count, size = options.pictures(len(source))
+    count, size = options.views_and_size(len(source))
     view_set = views or find_view_set(source, background=options.background, count=count, size=size, seed=options.seed)
     options = replace(options, background=view_set.background, view_size=size)
-    pruned_share = max(_AGREE_ON, 0.0 if kept_count is None else 1.0 - kept_count / len(source))
-    found = find_sufficient_views(source, view_set, pruned_share, size=size, threads=options.threads, progress=progress)
-    view_groups = [MeasuredViews(found.used, found.removal)]
+    pruned_fraction = max(_AGREE_ON, 0.0 if kept_count is None else 1.0 - kept_count / len(source))
+    found = find_sufficient_views(
+        source, view_set, pruned_fraction, size=size, threads=options.threads, progress=progress
+    )
+    view_groups = [MeasuredViews(found.used, found.pruning_error)]
     if view_set.virtual:
         more = round(len(found.used) * max(1.0, options.work))
         cameras = camera_sequence(source, more, size, seed=options.seed + 1)
-        removal = measure_pruning_error(
+        pruning_error = measure_pruning_error(
             source, cameras, background=view_set.background, bands=False, threads=options.threads, progress=progress
         )
-        view_groups.append(MeasuredViews(cameras, removal))
+        view_groups.append(MeasuredViews(cameras, pruning_error))
     training_cameras = [camera for group in view_groups for camera in group.cameras]
     references = _render_all(source, training_cameras, options)
     check_scorer = Scorer.of_source(source, found.check, view_set.background, threads=options.threads)
@@ -210,7 +212,7 @@ def simplify(
     options = options or SimplifyOptions()
     if not len(source):
         raise InputError("a scene without splats cannot be simplified")
-    if target.max_psnr_drop is not None and (views is None or not views.photographs):
+    if target.max_psnr_drop is not None and (views is None or not views.images):
         raise InputError("a loss against photographs wants photographs: name a data set")
     kept_count = None if target.keep is None else target.count(len(source))
     session = prepare_pruning(source, views, kept_count, options, progress)
@@ -263,7 +265,7 @@ def _find_scorer(session: PruningSession, target: Target) -> tuple[Scorer, float
     """Return the scorer by validation views, and the PSNR to reach, dB; the largest possible if there is no target."""
     views, threads = session.view_set, session.options.threads
     if target.max_psnr_drop is not None:
-        scorer = views.photograph_validation_scorer(threads=threads)
+        scorer = views.image_validation_scorer(threads=threads)
         return scorer, scorer.psnr(session.source) - target.max_psnr_drop
     return views.validation_scorer(session.source, threads=threads), PSNR_CAP if target.psnr is None else target.psnr
 
@@ -277,8 +279,8 @@ def _test_scores(session: PruningSession, model: SplatModel) -> dict[str, Any]:
         "psnr": views.test_scorer(session.source, threads=threads).psnr(model),
         "test_views": {"cameras": views.name, "views": len(views.test)},
     }
-    if views.photographs:
-        scorer = views.photograph_test_scorer(threads=threads)
+    if views.images:
+        scorer = views.image_test_scorer(threads=threads)
         scores["photographs"] = {"source": scorer.psnr(session.source), "psnr": scorer.psnr(model)}
     return scores
 

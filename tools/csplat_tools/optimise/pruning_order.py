@@ -21,8 +21,8 @@ from csplat_tools.views import VIEW_SIZE, default_views
 from csplat_tools.views.sufficient_views import pruning_keys
 
 _DEFAULT_EFFORT = 3
-_LEAST_SHARE = 0.01  # fraction of the splats that is kept at the end of an order without a given target
-_ROUND_SHARE = 0.72  # fraction kept after each round of such an order: splats that hid another may have been pruned
+_LEAST_FRACTION = 0.01  # fraction of the splats that is kept at the end of an order without a given target
+_ROUND_FRACTION = 0.72  # fraction kept after each round of such an order: splats that hid another may have been pruned
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class SimplifyOptions:
         if self.view_size is not None and min(self.view_size) < 1:
             raise InputError(f"view_size is {self.view_size}, wanted pixels")
 
-    def pictures(self, splats: int) -> tuple[int, tuple[int, int]]:
+    def views_and_size(self, splats: int) -> tuple[int, tuple[int, int]]:
         """Return the largest number of training views, and the width and height of their renders, for N splats."""
         views, size = default_views(splats)
         return self.views or views, self.view_size or size
@@ -204,11 +204,11 @@ def total_error(view_groups: Sequence[MeasuredViews]) -> PruningError:
 
 def _targets(count: int, options: SimplifyOptions, kept_count: int | None, now: int) -> list[int]:
     """Return the number of splats kept after each round, in decreasing order."""
-    last = max(1, round(count * _LEAST_SHARE)) if kept_count is None else kept_count
+    last = max(1, round(count * _LEAST_FRACTION)) if kept_count is None else kept_count
     if kept_count is not None:
         targets = [round(count + (last - count) * number / options.rounds) for number in range(1, options.rounds + 1)]
     else:
         targets = [now]
         while targets[-1] > last:
-            targets.append(max(last, int(targets[-1] * _ROUND_SHARE)))
+            targets.append(max(last, int(targets[-1] * _ROUND_FRACTION)))
     return sorted({target for target in targets if target < now}, reverse=True)

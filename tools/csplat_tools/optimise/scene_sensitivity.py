@@ -22,7 +22,9 @@ from csplat_trainer.sensitivity import Sensitivity, measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, write_sensitivity
 
 _NOTHING = "a scene without splats has no sensitivities"
-_GONE = 0.4  # fraction of the splats on whose removal virtual views have to agree before there are enough views
+_PRUNED_FRACTION = (
+    0.4  # fraction of the splats on whose pruning virtual views have to agree before there are enough views
+)
 _GIVEN = 40  # number of cameras that suffice if cameras are given
 _VIRTUAL = {False: (120, 120), True: (80, 60)}  # by `has SH`: number of small virtual views, for small and large scenes
 _LARGE = 40_000  # splats of a large scene: for fewer, half of the views would change the size of files by a per cent
@@ -90,11 +92,11 @@ def measure_scene(
     cameras, check, source = (
         views.training or views.test,
         list[Camera](),
-        "training" if views.photographs else "cameras",
+        "training" if views.images else "cameras",
     )
     if views.virtual and views.training:
         size = (views.training[0].W, views.training[0].H)
-        found = find_sufficient_views(model, views, _GONE, size=size, threads=threads, progress=progress)
+        found = find_sufficient_views(model, views, _PRUNED_FRACTION, size=size, threads=threads, progress=progress)
         cameras, check, source = found.used, found.check, "virtual"
     measured = measure_views(model, cameras, views.background, matrices=matrices, threads=threads, progress=progress)
     missed = float("nan")

@@ -78,8 +78,8 @@ class SearchReport:
         goal = self.goal
         asked = [f"{name} within {bound:g}" for name, bound in goal.get("max_error", {}).items()]
         if "size_bytes" in goal:
-            share = 100.0 * self.size_bytes / goal["size_bytes"]
-            asked.append(f"{format_bytes(goal['size_bytes'])}, of which the file takes {share:.1f} %")
+            percentage = 100.0 * self.size_bytes / goal["size_bytes"]
+            asked.append(f"{format_bytes(goal['size_bytes'])}, of which the file takes {percentage:.1f} %")
         if "psnr" in goal:
             asked.append(f"{goal['psnr']:g} dB, of which it reaches {self.psnr:.2f}")
         if "keep" in goal:
@@ -204,8 +204,8 @@ def _why(target: Target, found: Candidate, candidates: CandidatePool, splats_bef
         lines.append("no smaller file of those tried reaches the target")
     pruned_count = splats_before - found.splats
     if pruned_count:
-        share = 100.0 * pruned_count / splats_before
-        splats = f"{counted(pruned_count, 'splat')} ({share:.0f} %)"
+        percentage = 100.0 * pruned_count / splats_before
+        splats = f"{counted(pruned_count, 'splat')} ({percentage:.0f} %)"
         lines.append(f"{splats} left out, the others fitted to what the source looks like")
     return lines
 

@@ -14,10 +14,10 @@ from csplat_tools.optimise.candidates import Candidate, CodingChoice, Subset
 from csplat_tools.optimise.precision_search import PrecisionSearch
 
 _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook: at some qualities its escapes cannot code them
-_SHARE_AT = (38.0, 1 / 64, 0.4)  # PSNR of a file in dB, usual codebook entries per splat there, octaves of them per dB
-_SHARE_STEP = 4.0  # factor from one codebook size to the next that is tried
+_USUAL_ENTRIES = (38.0, 1 / 64, 0.4)  # PSNR of a file in dB, usual codebook entries per splat there, octaves per dB
+_ENTRIES_STEP = 4.0  # factor from one codebook size to the next that is tried
 _FITTED = 2.0  # factor of the entries per splat after pruning: the splats that are kept differ more
-_SHARES = (1 / 4096, 1 / 4)  # least and most codebook entries per splat
+_ENTRIES_PER_SPLAT = (1 / 4096, 1 / 4)  # least and most codebook entries per splat
 _ADAPTIVE = 1.0  # `adaptive` that is tried instead of the preset's for SH coded one by one, if importance was measured
 _BANDS_DROPPED = (
     5.0  # dB above the goal that a scene without the upper bands has to reach: they take a third of the error
@@ -47,7 +47,7 @@ class CodingSearch:
     classifiable: bool
     _truncated: dict[int, float] = field(default_factory=dict, init=False)
 
-    def usual_codings(self, subset: Subset, psnr: float = _SHARE_AT[0]) -> list[CodingChoice]:
+    def usual_codings(self, subset: Subset, psnr: float = _USUAL_ENTRIES[0]) -> list[CodingChoice]:
         """Return one coding of each kind that is possible: values one by one, a codebook, or none.
 
         Args:
@@ -60,7 +60,9 @@ class CodingSearch:
         scalar = CodingChoice("scalar", adaptive=_ADAPTIVE if coarse else None)
         kinds = {
             "scalar": [scalar],
-            "codebook": [CodingChoice("codebook", _share(psnr) * (_FITTED if subset.refits else 1.0))],
+            "codebook": [
+                CodingChoice("codebook", _usual_entries_per_splat(psnr) * (_FITTED if subset.refits else 1.0))
+            ],
         }
         if self.encoding.sh_coding != "auto":
             return kinds[self.encoding.sh_coding]
@@ -82,7 +84,7 @@ class CodingSearch:
             One file of each coding that was tried, the least costly first.
         """
         tried = _TriedCodings(search, subset, start)
-        first, *others = self.usual_codings(subset, search.goal.psnr or _SHARE_AT[0])
+        first, *others = self.usual_codings(subset, search.goal.psnr or _USUAL_ENTRIES[0])
         tried.add(first)
         if others:
             goal = tried.found[first].validation_psnr - search.margin(tried.found[first])
@@ -181,7 +183,7 @@ class _TriedCodings:
     def resize(self, book: CodingChoice) -> None:
         """Try smaller or larger codebooks, step by step as long as it pays; only one way if one is far off the goal."""
         above, stalled = self.search.margin(self.found[book]), self.search.is_stalled(self.found[book])
-        ways = ((1 / _SHARE_STEP, above < -_FAR_OFF or stalled), (_SHARE_STEP, above > _FAR_OFF))
+        ways = ((1 / _ENTRIES_STEP, above < -_FAR_OFF or stalled), (_ENTRIES_STEP, above > _FAR_OFF))
         for factor in [factor for factor, is_wrong in ways if not is_wrong]:
             coding, gained = book, False
             while (after := _resized(coding, factor)) is not None:
@@ -202,12 +204,12 @@ class _TriedCodings:
 
     def is_far_off(self, coding: CodingChoice) -> bool:
         """Return True if another codebook size is likelier to bring a coding near the goal than other steps."""
-        if coding.share is None:
+        if coding.entries_per_splat is None:
             return False
         above = self.search.margin(self.found[coding])
-        share = coding.share * (_SHARE_STEP if above < 0.0 else 1 / _SHARE_STEP)
+        entries_per_splat = coding.entries_per_splat * (_ENTRIES_STEP if above < 0.0 else 1 / _ENTRIES_STEP)
         is_far = abs(above) > _FAR_OFF or self.search.is_stalled(self.found[coding])
-        return is_far and _SHARES[0] <= share <= _SHARES[1]
+        return is_far and _ENTRIES_PER_SPLAT[0] <= entries_per_splat <= _ENTRIES_PER_SPLAT[1]
 
     def _quality(self) -> float:
         """Return the PSNR of each attribute at which the best coding so far would meet the goal, dB."""
@@ -218,13 +220,17 @@ class _TriedCodings:
 
 def _resized(book: CodingChoice, factor: float) -> CodingChoice | None:
     """Return the coding with `factor` times the codebook entries, within limits; `None` if that changes too little."""
-    before = book.share or 0.0
-    share = min(max(before * factor, _SHARES[0]), _SHARES[1])
-    return replace(book, share=share) if abs(math.log2(share / before)) >= 1.0 else None
+    before = book.entries_per_splat or 0.0
+    entries_per_splat = min(max(before * factor, _ENTRIES_PER_SPLAT[0]), _ENTRIES_PER_SPLAT[1])
+    return (
+        replace(book, entries_per_splat=entries_per_splat)
+        if abs(math.log2(entries_per_splat / before)) >= 1.0
+        else None
+    )
 
 
-def _share(psnr: float) -> float:
+def _usual_entries_per_splat(psnr: float) -> float:
     """Return the codebook entries per splat that are usual at a PSNR."""
-    usual, share, octaves = _SHARE_AT
-    wanted = share * math.pow(2.0, octaves * (psnr - usual))
-    return min(max(wanted, _SHARES[0] * _SHARE_STEP), _SHARES[1] / _SHARE_STEP)
+    usual, entries_per_splat, octaves = _USUAL_ENTRIES
+    wanted = entries_per_splat * math.pow(2.0, octaves * (psnr - usual))
+    return min(max(wanted, _ENTRIES_PER_SPLAT[0] * _ENTRIES_STEP), _ENTRIES_PER_SPLAT[1] / _ENTRIES_STEP)

@@ -178,9 +178,9 @@ def refit_with_bands(
         return RefitResult(model, None)
     error = 0.0
 
-    def add(number: int, picture: NDArray[np.float32]) -> None:
+    def add(number: int, render: NDArray[np.float32]) -> None:
         nonlocal error
-        error += float(np.sum(squared_error(references[number], picture)))
+        error += float(np.sum(squared_error(references[number], render)))
 
     pruning_error = measure_pruning_error(
         model,
@@ -248,8 +248,8 @@ def _descend(
     order = np.concatenate([rng.permutation(count) for _ in range(-(-steps // count))])
     for step, view in enumerate(order[:steps]):
         gradients = views.rasteriser.backward(views.error_image(values.splats(), view))
-        share = max(_LAST_RATE, 0.5 + 0.5 * math.cos(math.pi * (step + 1) / steps))
-        values.step(gradients, {name: length * share * rate for name, rate in _RATES.items()})
+        rate_factor = max(_LAST_RATE, 0.5 + 0.5 * math.cos(math.pi * (step + 1) / steps))
+        values.step(gradients, {name: length * rate_factor * rate for name, rate in _RATES.items()})
         if progress is not None:
             progress("adjusting splats", (step + 1) / steps)
 

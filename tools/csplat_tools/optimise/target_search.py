@@ -81,7 +81,7 @@ def search_target(
         encoding, no_prune, importance, simplifying, progress: as for `encode_to`.
 
     Raises:
-        InputError: the target is out of reach, no splat shows, or a loss is requested without photographs.
+        InputError: the target is out of reach, no splat shows, or a loss is requested without images.
     """
     views = with_validation_views(views)
     test_scorer = views.test_scorer(source, threads=encoding.threads)
@@ -95,19 +95,19 @@ def search_target(
         pruner = Pruner(
             source, views, how, use_classes=not inside, progress=progress, psnr=target.psnr, kept_count=kept_count
         )  # fmt: skip
-    photographs = None
+    image_scorer = None
     if target.max_psnr_drop is not None:
-        if not views.photographs:
+        if not views.images:
             raise InputError("a largest loss wants photographs (--data): it is lost against them")
-        photographs = views.photograph_validation_scorer(threads=encoding.threads)
+        image_scorer = views.image_validation_scorer(threads=encoding.threads)
     validation_scorer = views.validation_scorer(source, threads=encoding.threads)
-    candidates = CandidatePool(encoding, test_scorer, validation_scorer, photographs, progress=progress)
+    candidates = CandidatePool(encoding, test_scorer, validation_scorer, image_scorer, progress=progress)
     sensitivity_views = 0
     if pruner is not None and pruner.kept_count is not None:
         subset = pruner.refit(pruner.kept_count, None, validation_scorer.psnr)
         found = candidates.make(subset, CodingChoice(None), None, quick=False)
     else:
-        goal = find_goal(target, source, photographs)
+        goal = find_goal(target, source, image_scorer)
         measured, sensitivity_views = complete_importance(
             source, views, encoding, importance, inside=inside, progress=progress
         )
@@ -115,7 +115,7 @@ def search_target(
         found = TargetSearch(
             PrecisionSearch(candidates, goal), CodingSearch(source, encoding, measured is not None), whole, pruner
         ).best()
-    photo = _photograph_psnr(source, found, views, encoding.threads) if views.photographs else {}
+    photo = _image_psnr(source, found, views, encoding.threads) if views.images else {}
     report = make_report(
         target, found, candidates, splats_before=len(source), views_of=views.name,
         remarks=[_INSIDE_REMARK] * (inside and found.splats < len(source)), encodes=len(candidates.made), seconds=0.0,
@@ -188,24 +188,24 @@ def _psnr_elsewhere(source: SplatModel, found: Candidate, views: ViewSet, thread
     }
 
 
-def _photograph_psnr(source: SplatModel, found: Candidate, views: ViewSet, threads: int | None) -> dict[str, float]:
-    """Return the PSNR of file and source against the test photographs, dB."""
-    scorer = views.photograph_test_scorer(threads=threads)
+def _image_psnr(source: SplatModel, found: Candidate, views: ViewSet, threads: int | None) -> dict[str, float]:
+    """Return the PSNR of file and source against the test images, dB."""
+    scorer = views.image_test_scorer(threads=threads)
     return {"file": scorer.psnr(decode(found.result.data)), "source": scorer.psnr(source)}
 
 
-def find_goal(target: Target, source: SplatModel, photographs: Scorer | None) -> SearchGoal:
+def find_goal(target: Target, source: SplatModel, image_scorer: Scorer | None) -> SearchGoal:
     """Return the goal of the search for a target.
 
     Args:
         target: a PSNR, a size or a loss.
         source: the scene.
-        photographs: the scorer by validation photographs, against which a loss is measured.
+        image_scorer: the scorer by validation images, against which a loss is measured.
     """
-    if target.max_psnr_drop is None or photographs is None:
+    if target.max_psnr_drop is None or image_scorer is None:
         return SearchGoal(target.psnr, target.size_bytes, max_error=target.max_error)
-    reached = photographs.psnr(source)
-    # The source's error against photographs is far larger than the loss: a file's own error is a small part of the sum.
+    reached = image_scorer.psnr(source)
+    # The source's error against images is far larger than the loss: a file's own error is a small part of the sum.
     slope = 1.0 - 10.0 ** (-target.max_psnr_drop / 10.0)
     return SearchGoal(
         min(loss_as_psnr(target.max_psnr_drop, reached), PSNR_CAP), None, reached - target.max_psnr_drop, slope
@@ -213,14 +213,14 @@ def find_goal(target: Target, source: SplatModel, photographs: Scorer | None) ->
 
 
 def loss_as_psnr(loss: float, photo_psnr: float) -> float:
-    """Return the PSNR against the source's renders at which the PSNR against photographs falls by a loss.
+    """Return the PSNR against the source's renders at which the PSNR against images falls by a loss.
 
-    The source has an error of its own against photographs; the error that a file adds is taken as independent of it,
+    The source has an error of its own against images; the error that a file adds is taken as independent of it,
     so that the two squared errors add up.
 
     Args:
         loss: dB, above 0.
-        photo_psnr: PSNR of the source against photographs, dB.
+        photo_psnr: PSNR of the source against images, dB.
     """
     return photo_psnr - 10.0 * math.log10(10.0 ** (loss / 10.0) - 1.0)
 

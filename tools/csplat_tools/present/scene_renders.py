@@ -71,8 +71,8 @@ def find_cameras(
         cameras = load_cameras(path, report, model.origin)
     elif data is not None:
         # An orbit requires the cameras' positions, not the size of their photographs.
-        photographs = data if orbit_count is None else replace(data, size=None)
-        found = find_view_set(model, data=photographs, count=0, split=split)
+        full_size = data if orbit_count is None else replace(data, size=None)
+        found = find_view_set(model, data=full_size, count=0, split=split)
         cameras = [*found.test, *(() if orbit_count is None else (*found.training, *found.validation))]
         if not cameras:
             raise InputError(f"{data.path} has no {split} views")

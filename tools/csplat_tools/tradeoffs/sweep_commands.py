@@ -44,7 +44,7 @@ def target_command(setting: SweepSetting, name: str, preset: str, **options: Any
 def finetune_command(setting: SweepSetting, name: str, sweep: SweepOptions, keep: float | None) -> str:
     """Return the command for a file of `csplat finetune`."""
     options = {"keep": keep, "iterations": None if sweep.iterations == SweepOptions.iterations else sweep.iterations}
-    itself = () if setting.views.photographs else ("--self",)
+    itself = () if setting.views.images else ("--self",)
     return _line("finetune", setting, name, *itself, *_options(options), "--preset", sweep.preset, *_views(setting))
 
 

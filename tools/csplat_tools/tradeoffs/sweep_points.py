@@ -121,7 +121,7 @@ class SweepPoint:
         splats, sh_degree: number of splats and SH degree of the file.
         source_splats, source_bytes: number of splats of the scene, and size of its PLY.
         quality: scores against the source's renders.
-        photographs: scores against held-out photographs, if there are any.
+        image_scores: scores against held-out photographs, if there are any.
         encode_seconds: time from the splats to the bytes.
         stages: seconds of its stages, as far as known.
         decode_seconds: time from the bytes to the splats, median of some runs.
@@ -143,7 +143,7 @@ class SweepPoint:
     source_splats: int
     source_bytes: int
     quality: Scores
-    photographs: Scores | None
+    image_scores: Scores | None
     encode_seconds: float
     stages: Mapping[str, float]
     decode_seconds: float
@@ -169,9 +169,9 @@ class SweepPoint:
         return self.quality.psnr
 
     @property
-    def photograph_psnr(self) -> float | None:
+    def image_psnr(self) -> float | None:
         """PSNR pooled over held-out photographs, dB; `None` without photographs."""
-        return None if self.photographs is None else self.photographs.psnr
+        return None if self.image_scores is None else self.image_scores.psnr
 
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
@@ -188,7 +188,7 @@ class SweepPoint:
             "splats": self.splats,
             "sh_degree": self.sh_degree,
             **{name: getattr(self.quality, name) for name in _QUALITY},
-            "photographs": None if self.photographs is None else self.photographs.as_json(),
+            "photographs": None if self.image_scores is None else self.image_scores.as_json(),
             "seconds": {
                 "encode": round(self.encode_seconds, 4),
                 "stages": {name: round(seconds, 4) for name, seconds in self.stages.items()},
@@ -287,7 +287,7 @@ class Measurer:
 
     Attributes:
         source_modes: times of rendering the source, by mode.
-        source_photographs: the source's scores against photographs, if there are any.
+        source_image_scores: the source's scores against photographs, if there are any.
     """
 
     def __init__(self, setting: SweepSetting, modes: Sequence[Mode], threads: int | None) -> None:
@@ -300,11 +300,11 @@ class Measurer:
             if shown is views.test
             else Scorer.of_source(setting.source, shown, views.test_background, threads=threads)
         )
-        self._photographs = views.photograph_test_scorer(threads=threads) if views.photographs else None
+        self._image_scorer = views.image_test_scorer(threads=threads) if views.images else None
         places = evenly_spaced(range(len(views.test)), TIMED_VIEWS)
         self._timed = [(views.test[place], self._scorer.reference(place).rgb) for place in places]
         self.source_modes: dict[str, ModeTime] = {mode: self._mode_time(setting.source, mode) for mode in modes}
-        self.source_photographs = self._source_scores()
+        self.source_image_scores = self._source_scores()
 
     def measure(self, point: PlannedPoint, progress: Progress) -> SweepPoint:
         """Make a file and measure it.
@@ -318,7 +318,7 @@ class Measurer:
         setting, header = self._setting, read_header(made.data)
         decoded, decode_seconds = self._decoded(made.data, None)
         hardest = HardestPlaceSearch()
-        quality, photographs = self._compared(decoded, hardest)
+        quality, image_scores = self._compared(decoded, hardest)
         if self._shown_scorer is not None:
             self._shown_scorer.scores(decoded, ssim=False, on_view=hardest.examine)
         modes: dict[str, ModeTime] = {mode: self._mode_time(decoded, mode) for mode in self._modes}
@@ -334,7 +334,7 @@ class Measurer:
             source_splats=len(setting.source),
             source_bytes=setting.source_bytes,
             quality=quality,
-            photographs=photographs,
+            image_scores=image_scores,
             encode_seconds=encode_seconds,
             stages=made.stages or clock.seconds,
             decode_seconds=decode_seconds,
@@ -377,14 +377,14 @@ class Measurer:
             if hardest is not None:
                 if self._shown_scorer is None:
                     hardest.examine(number, source, other)
-                if self._photographs is not None:
-                    each.append(self._photographs.score(number, other, lpips=distance))
+                if self._image_scorer is not None:
+                    each.append(self._image_scorer.score(number, other, lpips=distance))
 
         quality = self._scorer.scores(decoded, lpips=distance, on_view=compare)
         return quality, Scores.of(each) if each else None
 
     def _source_scores(self) -> Scores | None:
-        scorer, distance = self._photographs, self._setting.distance
+        scorer, distance = self._image_scorer, self._setting.distance
         if scorer is None:
             return None
         each = [

@@ -67,7 +67,7 @@ class Tradeoff:
         sweep: the options of the sweep.
         points: all points, measured or failed, in the order of the sweep.
         source_modes: times of rendering the source, by mode of the renderer.
-        source_photographs: the source's scores against photographs, if there are any.
+        source_image_scores: the source's scores against photographs, if there are any.
         machine: processor, system, versions.
     """
 
@@ -75,7 +75,7 @@ class Tradeoff:
     sweep: SweepOptions
     points: Sequence[SweepPoint | SweepFailure]
     source_modes: dict[str, ModeTime]
-    source_photographs: Scores | None
+    source_image_scores: Scores | None
     machine: dict[str, Any]
 
     @property
@@ -95,10 +95,10 @@ class Tradeoff:
         return [measured[place] for place in pareto_front([(one.size_bytes, one.psnr) for one in measured])]
 
     @property
-    def photograph_front(self) -> list[SweepPoint]:
+    def image_front(self) -> list[SweepPoint]:
         """The points that no other one beats in size and PSNR against photographs; empty without photographs."""
-        known = [one for one in self.measured if one.photograph_psnr is not None]
-        return [known[at] for at in pareto_front([(one.size_bytes, one.photograph_psnr or 0.0) for one in known])]
+        known = [one for one in self.measured if one.image_psnr is not None]
+        return [known[at] for at in pareto_front([(one.size_bytes, one.image_psnr or 0.0) for one in known])]
 
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
@@ -121,10 +121,10 @@ class Tradeoff:
             "times": f"single runs; decoding: the median of {DECODE_RUNS}; rendering: the median over views",
             "source": {
                 "render": {name: one.as_json() for name, one in self.source_modes.items()},
-                "photographs": None if self.source_photographs is None else self.source_photographs.as_json(),
+                "photographs": None if self.source_image_scores is None else self.source_image_scores.as_json(),
             },
             "pareto": [one.name for one in self.front],
-            "pareto_photographs": [one.name for one in self.photograph_front],
+            "pareto_photographs": [one.name for one in self.image_front],
             "points": [one.as_json() for one in self.points],
         }
 
@@ -188,15 +188,15 @@ def tradeoff(
     if isinstance(first, SweepFailure) and all(isinstance(one, SweepFailure) for one in points):
         raise InputError(f"no point could be measured; {first.name}: {first.error}")
     machine = describe_machine(sweep.threads)
-    return Tradeoff(setting, sweep, points, measurer.source_modes, measurer.source_photographs, machine)
+    return Tradeoff(setting, sweep, points, measurer.source_modes, measurer.source_image_scores, machine)
 
 
 def estimated_seconds(kind: str, setting: SweepSetting, sweep: SweepOptions, modes: dict[str, ModeTime]) -> float:
     """Estimate the seconds that a point of a kind takes, by the number of splats and the time of a render."""
-    each, by_splats, by_pictures = _COSTS[kind]
+    each, by_splats, by_renders = _COSTS[kind]
     milliseconds = next((one.milliseconds for name, one in modes.items() if name != "exact"), 100.0)
     steps = sweep.iterations / SweepOptions.iterations if kind == "finetune" else 1.0
-    return each + by_splats * len(setting.source) / 1e6 + by_pictures * steps * 8.0 * milliseconds / 1000.0
+    return each + by_splats * len(setting.source) / 1e6 + by_renders * steps * 8.0 * milliseconds / 1000.0
 
 
 def _measured(measurer: Measurer, candidate: PlannedPoint, progress: Progress) -> SweepPoint | SweepFailure:
@@ -325,7 +325,7 @@ def _made(result: EncodeResult, **settings: Any) -> SweepFile:
 
 def _tune(setting: SweepSetting, sweep: SweepOptions, keep: float | None, progress: Progress) -> SweepFile:
     """Make the file of `csplat finetune` with its default options."""
-    itself = not setting.views.photographs
+    itself = not setting.views.images
     encoding = EncodeOptions(preset=sweep.preset, shape_codebook_size=SHAPE_ENTRIES, threads=sweep.threads)
     options = FinetuneOptions(iterations=sweep.iterations, byte_cost=RATE_WEIGHT[itself])
     tuned = choose_and_finetune(
@@ -345,9 +345,9 @@ def _tune(setting: SweepSetting, sweep: SweepOptions, keep: float | None, progre
 def _tuning_views(setting: SweepSetting) -> ViewSet:
     """Return the views of `csplat finetune`: all photographs that are not test views, or more virtual views."""
     views = setting.views
-    if views.photographs:  # which are in memory already
+    if views.images:  # which are in memory already
         judging = {pose_key(camera) for camera in views.test}
-        training = [one.camera for one in views.photographs if pose_key(one.camera) not in judging]
+        training = [one.camera for one in views.images if pose_key(one.camera) not in judging]
         return replace(views, training=training, validation=())
     return find_view_set(
         setting.source, cameras=setting.cameras, background=setting.background, count=VIEWS, size=VIEW_SIZE,

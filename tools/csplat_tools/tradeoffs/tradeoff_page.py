@@ -27,7 +27,7 @@ def make_tradeoff_page(tradeoff: Tradeoff) -> str:
         _head(tradeoff, title),
         _quality(tradeoff),
         _files(tradeoff),
-        _pictures(tradeoff),
+        _renders(tradeoff),
         _times(tradeoff),
         _bytes(tradeoff),
         _layers(tradeoff),
@@ -97,7 +97,7 @@ def _commands(tradeoff: Tradeoff) -> str:
     return f'<details class="commands"><summary>All commands</summary>\n<p>{text}</p>\n{entries}\n</details>'
 
 
-def _pictures(tradeoff: Tradeoff) -> str:
+def _renders(tradeoff: Tradeoff) -> str:
     blocks = []
     for number, point in enumerate(tradeoff.measured, 1):
         if point.hardest is not None and point in shown_points(tradeoff):
@@ -157,7 +157,7 @@ def _renderer(tradeoff: Tradeoff) -> str:
 
 
 def _measured(tradeoff: Tradeoff) -> str:
-    machine, scores = tradeoff.machine, tradeoff.source_photographs
+    machine, scores = tradeoff.machine, tradeoff.source_image_scores
     facts = {
         "PSNR": "of the squared error pooled over views, pixels and channels, against the source's own renders, 99 dB"
         " at most; other cameras or another background give other numbers",

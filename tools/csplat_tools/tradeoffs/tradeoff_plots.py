@@ -63,13 +63,13 @@ def _quality(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
     return _front_plot(tradeoff, name, inline, lambda one: one.psnr, tradeoff.front, "PSNR against the source, dB")
 
 
-def _photographs(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
-    scores = tradeoff.source_photographs
+def _image_plot(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
+    scores = tradeoff.source_image_scores
     if scores is None:
         return None
-    front, label = tradeoff.photograph_front, "PSNR on held-out photographs, dB"
+    front, label = tradeoff.image_front, "PSNR on held-out photographs, dB"
     level = scores.psnr
-    return _front_plot(tradeoff, name, inline, lambda one: one.photograph_psnr, front, label, level=level)
+    return _front_plot(tradeoff, name, inline, lambda one: one.image_psnr, front, label, level=level)
 
 
 def _front_plot(
@@ -144,7 +144,7 @@ def _layers(tradeoff: Tradeoff, name: str, inline: bool) -> str | None:
 #: Plots by name, which is that of the file, too; drawn in this order.
 PLOTS: dict[str, Callable[[Tradeoff, str, bool], str | None]] = {
     "size-quality": _quality,
-    "size-photographs": _photographs,
+    "size-photographs": _image_plot,
     "size-encode-time": _encode_time,
     "quality-decode-time": _decode_time,
     "attribute-bytes": _attributes,

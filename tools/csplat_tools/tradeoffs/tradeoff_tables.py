@@ -59,10 +59,10 @@ def columns_of(tradeoff: Tradeoff) -> list[Column]:
             Column("LPIPS", "Distance as a trained network sees it (Alex), 0 at best: the mean over the views.",
                    lambda one: one.quality.lpips, 4)
         )  # fmt: skip
-    if tradeoff.setting.views.photographs:
+    if tradeoff.setting.views.images:
         columns.append(
             Column("photo PSNR", "dB against photographs that training has not seen.",
-                   lambda one: one.photograph_psnr, 2)
+                   lambda one: one.image_psnr, 2)
         )  # fmt: skip
     columns += [
         Column("splats", "How many the file holds.", lambda one: one.splats, 0),
@@ -108,8 +108,8 @@ def format_tradeoff(tradeoff: Tradeoff) -> str:
     partial = partial_rows(tradeoff)
     if len(partial) > 1:
         parts.append(format_table(("fewer SH layers", *partial[0]), partial[1:]))
-    if tradeoff.source_photographs is not None:
-        scores = tradeoff.source_photographs
+    if tradeoff.source_image_scores is not None:
+        scores = tradeoff.source_image_scores
         parts.append(f"the source itself scores {scores.psnr:.2f} dB against {len(scores.each)} held-out photographs")
     machine = tradeoff.machine
     parts.append(

@@ -59,15 +59,11 @@ def show_views(
         return []
     places = evenly_spaced(range(len(views.test)), _VIEWS)
     views = replace(views, test=[views.test[place] for place in places])
-    scorer = (
-        views.photograph_test_scorer(threads=threads)
-        if views.photographs
-        else views.test_scorer(source, threads=threads)
-    )
-    reference = "photograph" if views.photographs else "the source"
+    scorer = views.image_test_scorer(threads=threads) if views.images else views.test_scorer(source, threads=threads)
+    reference = "photograph" if views.images else "the source"
     rows: list[dict[str, U8]] = [{} for _ in places]
     for name, model in models.items():
-        if model is source and not views.photographs:
+        if model is source and not views.images:
             continue  # it is the reference itself
 
         def add(at: int, image: NDArray[np.float32], render: NDArray[np.float32], name: str = name) -> None:

@@ -164,15 +164,15 @@ def _trained(
 ) -> TrainResult:
     """Read the data set, train, plot the loss, and print a summary."""
     _check_inputs(options, files)
-    pictures = _loaded(data)
-    for line in () if quiet else pictures.report:
+    data_set = _loaded(data)
+    for line in () if quiet else data_set.report:
         note(line)
-    pictures.read()  # finds a damaged image before kernels are compiled
+    data_set.read()  # finds a damaged image before kernels are compiled
     with thread_count(threads):
         if options.device == "cpu":
             prepare_renderer(quiet=quiet, gradients=True)
         with step_progress("training", _state, quiet=quiet) as show:
-            result = csplat_trainer.train(pictures, options, outputs=files, on_step=show)
+            result = csplat_trainer.train(data_set, options, outputs=files, on_step=show)
     if plot is not None:
         plot_loss(plot, result.log["losses"], Path(data.path).name)
     if not quiet:

@@ -50,8 +50,8 @@ def training_views(source: SplatModel, views: ViewSet, threads: int | None) -> T
     background = np.array(views.background, np.float32)
 
     def as_views(cameras: Sequence[Camera]) -> list[TuningView]:
-        if views.photographs:
-            return [TuningView(one.camera, one) for one in views.photographs_of(cameras)]
+        if views.images:
+            return [TuningView(one.camera, one) for one in views.images_of(cameras)]
         return renders_of(source, cameras, background, threads)
 
     training = as_views(views.training)
@@ -96,7 +96,7 @@ def choose_splats(
         )
 
     given = _read_importance(importance, source)
-    prune = bool(views.photographs) if prune_unseen is None else prune_unseen
+    prune = bool(views.images) if prune_unseen is None else prune_unseen
     found = measure(source) if given is None and keep is None else None
     if found is not None and not (prune and len(measuring) < len(all_views)):
         seen = found.seen

@@ -11,7 +11,6 @@ from csplat.encoder import EncodeResult
 from csplat.errors import counted
 from csplat.model import SplatModel
 from csplat_render.metrics import Distance
-from csplat_render.scorer import Scorer
 from csplat_tools.console import format_bytes, format_table
 from csplat_tools.inspect.file_description import bytes_by_attribute
 from csplat_tools.scene_files import ply_splat_bytes
@@ -45,7 +44,7 @@ def score_models(
     *,
     known: Mapping[str, Mapping[str, float | None]] | None = None,
 ) -> ModelScores | None:
-    """Score models on test views: against photographs, else against renders of the source.
+    """Score models on test views: against images, else against renders of the source.
 
     Args:
         source: the scene.
@@ -53,33 +52,24 @@ def score_models(
         views: the views, of which test views are used.
         lpips: computes LPIPS; `None`: it is not computed.
         threads: number of threads; `None` for all.
-        known: scores by name of models that were scored against the same photographs before.
+        known: scores by name of models that were scored against the same images before.
 
     Returns:
         The scores; `None` without test views.
     """
     if not views.test:
         return None
-    has_photographs = bool(views.photographs)
-    scorer = (
-        views.photograph_test_scorer(threads=threads) if has_photographs else views.test_scorer(source, threads=threads)
-    )
+    has_images = bool(views.images)
+    scorer = views.image_test_scorer(threads=threads) if has_images else views.test_scorer(source, threads=threads)
     scores: dict[str, dict[str, float | None]] = {}
     for name, model in models.items():
         if known is not None and name in known:
             scores[name] = {score: known[name][score] for score in SCORES}
-        elif has_photographs or model is not source:
+        elif has_images or model is not source:
             found = scorer.scores(model, lpips=lpips)
             scores[name] = {score: getattr(found, score) for score in SCORES}
-    reference = "held-out photographs" if has_photographs else "renders of the source"
+    reference = "held-out photographs" if has_images else "renders of the source"
     return ModelScores(reference, len(views.test), scores)
-
-
-def reference_scorer(source: SplatModel, views: ViewSet, threads: int | None) -> Scorer:
-    """Return the scorer by test views: against photographs, else against renders of the source."""
-    if views.photographs:
-        return views.photograph_test_scorer(threads=threads)
-    return views.test_scorer(source, threads=threads)
 
 
 def make_tuning_report(

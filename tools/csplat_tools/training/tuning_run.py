@@ -144,8 +144,8 @@ def run_finetuning(
             models = {"source": source, "before tuning": decode(made.plain.data), "file": made.decoded}
             scores = score_models(source, models, views, lpips, threads, known=known)
         shown = [] if page is None else show_views(source, models, views, threads)
-    facts = make_tuning_report(source, made.plain, made.result, scores, made.log, timer.seconds, tuned.subset.pruning)
-    report = {**facts, "log": made.log}
+    report = make_tuning_report(source, made.plain, made.result, scores, made.log, timer.seconds, tuned.subset.pruning)
+    report["log"] = made.log
     if page is not None:
         write_training_page(page, output, training, report, shown)
     return report

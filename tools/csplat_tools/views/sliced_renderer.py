@@ -61,7 +61,7 @@ class SlicedScene:
     @property
     def origin(self) -> tuple[float, float, float]:
         """The scene's origin, to which cameras are relative."""
-        return self.scene.facts.origin
+        return self.scene.metadata_model.origin
 
     @property
     def disk_bytes(self) -> int:
@@ -71,7 +71,7 @@ class SlicedScene:
     @property
     def layout(self) -> RecordLayout:
         """Layout of splats on the disk."""
-        return RecordLayout.of(_source(self.scene.facts), ())
+        return RecordLayout.of(_source(self.scene.metadata_model), ())
 
     @property
     def splat_bytes(self) -> float:
@@ -123,7 +123,7 @@ class _SlicedRender:
     def drawn(self) -> RenderResult:
         """Draw all slices, and return the render."""
         limits = self._limits(map(_source, source_from_model(self._scene.sample).blocks()), 1, self._scene.every)
-        self._draw(_source(self._scene.scene.facts))  # so that there is a render even if no splat is visible
+        self._draw(_source(self._scene.scene.metadata_model))  # so that there is a render even if no splat is visible
         self._sort_and_draw(self._blocks, self._scene.scene.count, limits, first=True)
         self._tell(1.0)
         assert self._last is not None, "something was drawn"
@@ -139,7 +139,9 @@ class _SlicedRender:
 
     def _looked(self, splats: HasSplats) -> tuple[F32, F64, int]:
         """Return depths and bytes of memory for drawing, both 0 for invisible splats; and the number of ignored."""
-        seen = self._rasteriser.find_visible(splats, self._camera, antialiased=self._scene.scene.facts.antialiased)
+        seen = self._rasteriser.find_visible(
+            splats, self._camera, antialiased=self._scene.scene.metadata_model.antialiased
+        )
         return seen.near, np.where(seen.near > 0, self._splat_bytes + _PAIR_BYTES * seen.tiles, 0.0), seen.ignored
 
     def _blocks(self) -> Iterator[Source]:
@@ -200,7 +202,7 @@ class _SlicedRender:
     def _draw(self, splats: HasSplats) -> None:
         found = self._rasteriser.forward(
             splats, self._camera, background=self._background, state=self._state,
-            antialiased=self._scene.scene.facts.antialiased,
+            antialiased=self._scene.scene.metadata_model.antialiased,
         )  # fmt: skip
         self._last = replace(found, radii=np.empty(0, np.float32))
         self._done, self._pairs = self._done + found.drawn, self._pairs + found.intersections

@@ -36,13 +36,13 @@ class SufficientViews:
     Attributes:
         used: the training views.
         check: the held-out views.
-        removal: pruning errors of the source, measured from `used`.
+        pruning_error: pruning errors of the source, measured from `used`.
         gap: dB by which the error predicted for the splats to be pruned is larger in `check` than in `used`.
     """
 
     used: list[Camera]
     check: list[Camera]
-    removal: PruningError
+    pruning_error: PruningError
     gap: float
 
 
@@ -85,29 +85,29 @@ def find_sufficient_views(
         every, check = _hold_out(every)
     check_errors = measure(check)
     count = min(_BATCH, len(every)) if views.virtual else len(every)
-    removal = measure(every[:count])
+    pruning_error = measure(every[:count])
     while count < len(every):
-        missed = int(np.count_nonzero(check_errors.seen & ~removal.seen))
-        if missed <= _MISSED_MAX * len(model) and _gap(model, removal, check_errors, pruned) < _GAP_MAX:
+        missed = int(np.count_nonzero(check_errors.seen & ~pruning_error.seen))
+        if missed <= _MISSED_MAX * len(model) and _gap(model, pruning_error, check_errors, pruned) < _GAP_MAX:
             break
-        removal += measure(every[count : count + _BATCH])
+        pruning_error += measure(every[count : count + _BATCH])
         count = min(count + _BATCH, len(every))
-    return SufficientViews(every[:count], check, removal, _gap(model, removal, check_errors, pruned))
+    return SufficientViews(every[:count], check, pruning_error, _gap(model, pruning_error, check_errors, pruned))
 
 
-def pruning_keys(opacities: NDArray[np.float32], removal: PruningError, *, keep_unseen: bool = True) -> F64:
+def pruning_keys(opacities: NDArray[np.float32], pruning_error: PruningError, *, keep_unseen: bool = True) -> F64:
     """Return the keys by which splats are pruned, the smallest first.
 
     Args:
         opacities: [N], opacities of a scene.
-        removal: its pruning errors.
+        pruning_error: its pruning errors.
         keep_unseen: prune splats that no view saw last, instead of first.
 
     Returns:
         [N] float64: −1 for a splat whose alpha is too small to be drawn; infinity, or −0.5 without `keep_unseen`, for
         one that no view saw; else the error of pruning it.
     """
-    keys = np.where(removal.seen, removal.error, np.inf if keep_unseen else -0.5)
+    keys = np.where(pruning_error.seen, pruning_error.error, np.inf if keep_unseen else -0.5)
     keys[opacities < ALPHA_MIN] = -1.0
     return keys
 

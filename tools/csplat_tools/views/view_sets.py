@@ -8,7 +8,7 @@ search ends; scores in reports are those of test views. No view has two roles.
 | virtual | `count` small ones and 16 more, all around | twelve like those of `psnr` | the eight of `psnr` |
 | camera file, 40 or more | the others | every 8th of the others | every 4th, 24 at most |
 | camera file, fewer | virtual ones | virtual ones | all |
-| data set | training photographs | 16 for validation at most, else every 8th training one | held-out ones |
+| data set | training images | 16 for validation at most, else every 8th training one | held-out ones |
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from csplat_render.scene_frame import detail, sample_cloud, scene_frame
 from csplat_render.scorer import Renderable, Scorer, renderer
 from csplat_render.up_estimate import with_estimated_up
 from csplat_render.virtual_cameras import HIDING, farthest_points, virtual_cameras
-from csplat_tools.optional_packages import require_photographs
+from csplat_tools.optional_packages import require_data_sets
 from csplat_tools.views import virtual_views
 from csplat_tools.views.virtual_views import HELD_OUT_COUNT, camera_sequence, default_views, evenly_spaced
 
@@ -47,16 +47,16 @@ WHITE: Colour = (1.0, 1.0, 1.0)
 #: Name of a set whose test views are virtual: those of `psnr`.
 VIRTUAL = "virtual"
 
-#: Parts of a data set: the photographs that were held out of training, and the others.
+#: Parts of a data set: the images that were held out of training, and the others.
 Split = Literal["test", "train"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 
 _SPLIT_FROM = 40  # cameras in a file from which they are split into all three roles
 _TEST_EVERY, _TEST_MAX = 4, 24  # every Nth camera of a file is a test view, up to this number
 _VALIDATION_EVERY = 8  # every Nth view that is not a test view is a validation view
-_VALIDATION_MAX = 16  # validation photographs of a data set that are used, at most
+_VALIDATION_MAX = 16  # validation images of a data set that are used, at most
 _VALIDATION_SEED = 1000  # seed of virtual validation views, added to the user's
-_HOLD_OUT_EVERY = 8  # every Nth photograph is held out if nothing else is specified
+_HOLD_OUT_EVERY = 8  # every Nth image is held out if nothing else is specified
 
 _TIMED_MAX = 2  # renders that are timed, at most
 _TIMED_DIVISOR = 8  # of width and height in mode `exact`, whose renders take a minute: time grows with pixels
@@ -77,11 +77,11 @@ class ViewSet:
         training: training views, to which values are fitted, and from which importance is measured.
         validation: validation views, by which the number of splats, the best step and the end of a search are chosen.
         test: test views, to which the scores in reports refer.
-        photographs: photographs of a data set, in its order; each has its camera, one of those above.
+        images: images of a data set, in its order; each has its camera, one of those above.
         virtual: training and validation views were placed around the scene by csplat.
         origin: the scene's origin, to which all cameras are relative.
         notes: remarks for the user on the choice of views, a line each.
-        split: the photographs of a data set that are test views: the held-out ones, or those of the training.
+        split: the images of a data set that are test views: the held-out ones, or those of the training.
 
     Raises:
         InputError: a view has two roles.
@@ -92,7 +92,7 @@ class ViewSet:
     training: Sequence[Camera]
     validation: Sequence[Camera]
     test: Sequence[Camera]
-    photographs: Sequence[PosedImage] = ()
+    images: Sequence[PosedImage] = ()
     virtual: bool = False
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     notes: tuple[str, ...] = ()
@@ -142,43 +142,43 @@ class ViewSet:
         """
         return Scorer.of_source(source, self.validation, self.background, threads=threads)
 
-    def photograph_test_scorer(self, *, mode: Mode = "standard", threads: int | None = None) -> Scorer:
-        """Return the scorer by the photographs of the test views.
+    def image_test_scorer(self, *, mode: Mode = "standard", threads: int | None = None) -> Scorer:
+        """Return the scorer by the images of the test views.
 
         Raises:
-            InputError: there are no photographs, or no test views.
+            InputError: there are no images, or no test views.
         """
-        return self._by_photographs(self.test, mode, threads)
+        return self._image_scorer(self.test, mode, threads)
 
-    def photograph_validation_scorer(self, *, threads: int | None = None) -> Scorer:
-        """Return the scorer by the photographs of the validation views.
+    def image_validation_scorer(self, *, threads: int | None = None) -> Scorer:
+        """Return the scorer by the images of the validation views.
 
         Raises:
-            InputError: there are no photographs, or no validation views.
+            InputError: there are no images, or no validation views.
         """
-        return self._by_photographs(self.validation, "standard", threads)
+        return self._image_scorer(self.validation, "standard", threads)
 
-    def photographs_of(self, cameras: Sequence[Camera]) -> list[PosedImage]:
-        """Return the photographs of the given cameras, in their order."""
-        taken = {id(one.camera): one for one in self.photographs}
+    def images_of(self, cameras: Sequence[Camera]) -> list[PosedImage]:
+        """Return the images of the given cameras, in their order."""
+        taken = {id(one.camera): one for one in self.images}
         return [taken[id(camera)] for camera in cameras]
 
-    def read_photographs(self) -> None:
-        """Read all photographs, so that a damaged one is found before minutes are spent on the others.
+    def read_images(self) -> None:
+        """Read all images, so that a damaged one is found before minutes are spent on the others.
 
         Raises:
             InputError: a file is not an image, or is truncated.
         """
-        for photograph in self.photographs:
-            _ = photograph.pixels, photograph.mask
+        for image in self.images:
+            _ = image.pixels, image.mask
 
-    def _by_photographs(self, cameras: Sequence[Camera], mode: Mode, threads: int | None) -> Scorer:
-        from csplat_trainer.posed_images import photograph_scorer
+    def _image_scorer(self, cameras: Sequence[Camera], mode: Mode, threads: int | None) -> Scorer:
+        from csplat_trainer.posed_images import image_scorer
 
-        if not self.photographs:
+        if not self.images:
             raise InputError("there are no photographs: name a data set")
-        shown = self.photographs_of(cameras)
-        return photograph_scorer(shown, self.background, mode=mode, threads=threads, origin=self.origin)
+        shown = self.images_of(cameras)
+        return image_scorer(shown, self.background, mode=mode, threads=threads, origin=self.origin)
 
 
 def describe_views(count: int, name: str) -> str:
@@ -199,13 +199,13 @@ def pose_key(camera: Camera) -> bytes:
 
 @dataclass(frozen=True)
 class DataOptions:
-    """A data set of photographs. For `None` the scene's own metadata is used, else the default.
+    """A data set of images. For `None` the scene's own metadata is used, else the default.
 
     Attributes:
         path: the set's folder, or its transforms.json.
-        size: width and height to which photographs are scaled; default: no scaling.
+        size: width and height to which images are scaled; default: no scaling.
         images: folder of images of a COLMAP set; default: chosen by the reader.
-        test_every: every Nth photograph is held out if the set does not specify test images; default: 8.
+        test_every: every Nth image is held out if the set does not specify test images; default: 8.
         near: near plane of the cameras, scene units; default: one that suits the set.
     """
 
@@ -246,7 +246,7 @@ def find_view_set(
         size: width and height of virtual training views, pixels; `None`: by the number of splats.
         seed: seed of virtual training and validation views.
         validation_count: number of validation views; `None`: as in the table; 0: none that could be training views.
-        split: the photographs of a data set that are test views. With `train`, no view has another role.
+        split: the images of a data set that are test views. With `train`, no view has another role.
         every: the source is every Nth splat of the scene, by which virtual test views are placed; 1: all splats.
 
     Raises:
@@ -374,7 +374,7 @@ def _views_of_file(
 def _views_of_data(
     source: SplatModel, data: DataOptions, background: Colour | None, validation_count: int | None, split: Split
 ) -> ViewSet:
-    require_photographs()
+    require_data_sets()
     from csplat_trainer.data import load
 
     record = TrainingRecord.of(source.metadata)
@@ -384,7 +384,7 @@ def _views_of_data(
     shift = np.subtract(source.origin, found.origin)
     parts = (found.train, found.test, evenly_spaced(found.val, _VALIDATION_MAX))
     train, test, val = (_shifted(part, shift) for part in parts)
-    colour, more = _choose_background(background, record, photographs=True)
+    colour, more = _choose_background(background, record, images=True)
     if split == "train":
         train, test, val = [], train, []
     test_poses = {pose_key(one.camera) for one in test}
@@ -414,9 +414,9 @@ def _complete_options(data: DataOptions, record: TrainingRecord | None) -> tuple
 
 
 def _choose_background(
-    background: Colour | None, record: TrainingRecord | None, *, photographs: bool = False
+    background: Colour | None, record: TrainingRecord | None, *, images: bool = False
 ) -> tuple[Colour, list[str]]:
-    """Return the background colour, with remarks on it, which matter most if photographs are compared."""
+    """Return the background colour, with remarks on it, which matter most if images are compared."""
     if background is not None:
         if record is None or record.background == background:
             return background, []
@@ -425,7 +425,7 @@ def _choose_background(
     if record is not None:
         return record.background, []
     note = "the background of the training is not known: black is used, --background changes that"
-    return BLACK, [note] if photographs else []
+    return BLACK, [note] if images else []
 
 
 def _set_name(path: str) -> str:

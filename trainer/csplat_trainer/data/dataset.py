@@ -26,7 +26,7 @@ from csplat_trainer.data.lens import Lens, distorted, undistorted_lens
 from csplat_trainer.posed_images import PosedImage, UnreadMask, UnreadPixels
 
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-_NEAR_SHARE = 0.03  # fraction of the cameras' distance from what they look at
+_NEAR_FRACTION = 0.03  # fraction of the cameras' distance from what they look at
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +162,7 @@ def near_plane(shots: Sequence[Shot], points: F64 | None = None) -> float:
     positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     focus = nearest_point(positions, viewmats[:, 2, :3])
     distance = float(np.median(np.linalg.norm(positions - focus, axis=1)))
-    return min(DEFAULT_NEAR, _NEAR_SHARE * distance) if distance > 0.0 else DEFAULT_NEAR
+    return min(DEFAULT_NEAR, _NEAR_FRACTION * distance) if distance > 0.0 else DEFAULT_NEAR
 
 
 _SCANNET = "train_test_lists.json"  # of ScanNet++

@@ -335,8 +335,8 @@ def cost_slopes(parts: Iterable[NDArray[Any]]) -> tuple[F32, float]:
     blurred = 0.25 * padded[:, :-2] + 0.5 * padded[:, 1:-1] + 0.25 * padded[:, 2:]
     bits = -np.log2(blurred / (count + size))
     slopes = np.gradient(bits, axis=1)
-    shares = counts / max(1, count)
-    entropy = -(counts * np.log2(np.maximum(shares, 1e-12))).sum()
+    fractions = counts / max(1, count)
+    entropy = -(counts * np.log2(np.maximum(fractions, 1e-12))).sum()
     return np.clip(slopes, -_MAX_SLOPE, _MAX_SLOPE).astype(np.float32), float(entropy)
 
 

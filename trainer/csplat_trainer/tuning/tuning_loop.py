@@ -366,13 +366,13 @@ class _TuningRun:
         }
 
 
-_TARGET_SHARE = 0.6  # fraction of the steps after which the size should be reached; later ones hardly move a value
+_TARGET_FRACTION = 0.6  # fraction of the steps after which the size should be reached; later ones hardly move a value
 _SIZE_MARGIN = 0.002  # fraction of the size that is left free: files grow between counts
 _GAIN, _MAX_CHANGE = 40.0, 0.5  # change of log(rate weight) per relative excess of bits, and its limit at each count
 _WEIGHT_RANGE = (1e-7, 1e-2)  # range of the rate weight
 # Smallest rate weight, as a fraction of the first: files grow while values move far, and a weight that had fallen to
 # almost 0 before would rise too late.
-_MIN_WEIGHT_SHARE = 0.25
+_MIN_WEIGHT_FRACTION = 0.25
 
 
 @dataclass
@@ -429,9 +429,9 @@ class RateController:
             done: fraction of the steps done.
             first_cost: rate weight at the start of the run.
         """
-        planned_bits = self.goal_bits + (self.first_bits - self.goal_bits) * max(0.0, 1.0 - done / _TARGET_SHARE)
+        planned_bits = self.goal_bits + (self.first_bits - self.goal_bits) * max(0.0, 1.0 - done / _TARGET_FRACTION)
         by = min(max(_GAIN * (bits / max(planned_bits, 1.0) - 1.0), -_MAX_CHANGE), _MAX_CHANGE)
-        least = max(_MIN_WEIGHT_SHARE * min(first_cost, _WEIGHT_RANGE[1]), _WEIGHT_RANGE[0])
+        least = max(_MIN_WEIGHT_FRACTION * min(first_cost, _WEIGHT_RANGE[1]), _WEIGHT_RANGE[0])
         self.byte_cost = min(max(self.byte_cost * math.exp(by), least), _WEIGHT_RANGE[1])
 
 

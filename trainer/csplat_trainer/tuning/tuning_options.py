@@ -17,7 +17,7 @@ class FinetuneOptions:
         iterations: steps at most, one image each.
         seed: seed of the order of the images.
         loss: `inria`, `study` or `l1`, as in `TrainOptions`.
-        lr_means: learning rate of the means, as a share of the median of the splats' middle standard deviation.
+        lr_means: learning rate of the means, as a fraction of the median of the splats' middle standard deviation.
         lr_quats: learning rate of the rotations.
         lr_scales: learning rate of the log scales.
         lr_opacities: learning rate of the logits of opacity.

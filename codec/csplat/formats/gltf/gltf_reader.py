@@ -306,7 +306,7 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]
         fields = {**metadata.fields(), "coordinate_system": AXES}
         if reading.antialiased and all(reading.antialiased):
             fields["antialiased"] = True
-        facts = replace(empty, origin=(x, y, z), **fields)
+        metadata_model = replace(empty, origin=(x, y, z), **fields)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
 
@@ -317,11 +317,11 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]
                 try:
                     block = one.decode(rows)
                     if len(block):
-                        yield _place_block(_pad_bands(block, degree), one, facts)
+                        yield _place_block(_pad_bands(block, degree), one, metadata_model)
                 except InputError as error:
                     raise InputError(f"{path.name}, splats {rows.start} to {rows.stop - 1}: {error}") from None
 
-    yield SceneSource(reading.count - reading.statistics.nonfinite, facts, blocks, reading.findings)
+    yield SceneSource(reading.count - reading.statistics.nonfinite, metadata_model, blocks, reading.findings)
 
 
 def _conclude(reading: _GltfReading) -> None:
@@ -424,16 +424,16 @@ def _pad_bands(block: SplatModel, degree: int) -> SplatModel:
     return replace(block, shN=np.pad(block.shN, ((0, 0), (0, missing), (0, 0)))) if missing else block
 
 
-def _place_block(block: SplatModel, instance: _Instance, facts: SplatModel) -> SplatModel:
+def _place_block(block: SplatModel, instance: _Instance, metadata_model: SplatModel) -> SplatModel:
     """Transform some splats to their place in the scene."""
     if not np.array_equal(instance.linear, np.eye(3)):
         block = stretch_scene(block, instance.linear)
-    offset = instance.translation - np.array(facts.origin)
+    offset = instance.translation - np.array(metadata_model.origin)
     if offset.any():
         with np.errstate(over="ignore"):
             block = replace(block, means=(block.means.astype(np.float64) + offset).astype(np.float32))
     fields = ("origin", "coordinate_system", "unit_metres", "antialiased", "flat", "metadata")
-    return replace(block, **{name: getattr(facts, name) for name in fields})
+    return replace(block, **{name: getattr(metadata_model, name) for name in fields})
 
 
 def _read_metadata(file: GltfDocument) -> CommentMetadata:

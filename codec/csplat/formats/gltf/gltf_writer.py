@@ -32,14 +32,16 @@ def write_gltf(path: Path, scene: SceneSource) -> None:
         raise InputError(f"{path.name}: glTF is written as one file, name it {path.with_suffix('.glb').name}")
     if not scene.count:
         raise InputError(f"{path.name}: the scene has no splats, and glTF has no empty meshes")
-    unit = scene.facts.unit_metres
+    unit = scene.metadata_model.unit_metres
     if unit not in (None, 1.0):
         before, metres = scene, float(unit)
         scene = SceneSource(
-            scene.count, scale_scene(scene.facts, metres), lambda: (scale_scene(one, metres) for one in before.blocks())
+            scene.count,
+            scale_scene(scene.metadata_model, metres),
+            lambda: (scale_scene(one, metres) for one in before.blocks()),
         )
     scene = convert_axes(scene, AXES)
-    attributes = _list_attributes(scene.facts.sh_degree)
+    attributes = _list_attributes(scene.metadata_model.sh_degree)
     lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
     for block in scene.blocks():
         lowest = np.minimum(lowest, block.means.min(axis=0, initial=np.inf))
@@ -110,10 +112,10 @@ def _point_colours(model: SplatModel) -> NDArray[np.uint8]:
 def _build_json(
     scene: SceneSource, attributes: list[_Attribute], offsets: list[int], bounds: tuple[F64, F64]
 ) -> dict[str, Any]:
-    facts = scene.facts
+    metadata_model = scene.metadata_model
     asset: dict[str, Any] = {"version": "2.0", "generator": "csplat"}
-    lines = format_comments(facts, absolute=False)
-    licence = facts.metadata.get("licence")
+    lines = format_comments(metadata_model, absolute=False)
+    licence = metadata_model.metadata.get("licence")
     if isinstance(licence, str):
         asset["copyright"] = licence
     kinds = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
@@ -143,7 +145,7 @@ def _build_json(
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, **({"translation": list(facts.origin)} if any(facts.origin) else {})}],
+        "nodes": [{"mesh": 0, **({"translation": list(metadata_model.origin)} if any(metadata_model.origin) else {})}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": [

@@ -53,13 +53,13 @@ def _open_scene(path: Path, parts: SogParts, name: str, level: int) -> SceneSour
     sog = read_meta(parts, name)
     images = SogImages.of(sog)
     degree = COEFFICIENTS.index(images.palette.shape[1])
-    facts = _empty_model(degree, antialiased=sog.antialiased, flat=sog.flat)
+    metadata_model = _empty_model(degree, antialiased=sog.antialiased, flat=sog.flat)
 
     def blocks() -> Iterator[SplatModel]:
         for arrays in images.blocks(degree):
-            yield replace(facts, **arrays)
+            yield replace(metadata_model, **arrays)
 
-    return SceneSource(sog.count, facts, blocks, [*parts.findings, *_list_findings(images)])
+    return SceneSource(sog.count, metadata_model, blocks, [*parts.findings, *_list_findings(images)])
 
 
 def _empty_model(degree: int, *, antialiased: bool, flat: bool) -> SplatModel:
@@ -104,7 +104,7 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int) -> SceneSource:
             parts.refuse(f"splats up to {taken[-1][1]:,} of {name} are wanted, it has {sog.count:,}")
         metas.append((sog, taken))
     degree = max([read_degree(sog) for sog, _ in metas], default=0)
-    facts = _empty_model(
+    metadata_model = _empty_model(
         degree,
         antialiased=bool(metas) and all(sog.antialiased for sog, _ in metas),
         flat=bool(metas) and all(sog.flat for sog, _ in metas),
@@ -122,7 +122,7 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int) -> SceneSource:
                 keep[start:stop] = True
             at = 0
             for arrays in images.blocks(degree):
-                model = replace(facts, **arrays)
+                model = replace(metadata_model, **arrays)
                 chosen = keep[at : at + len(model)]
                 at += len(model)
                 if chosen.any():
@@ -133,7 +133,7 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int) -> SceneSource:
         sum(stop - start for _, start, stop in (_range_at(leaf, one) for leaf in leaves)) for one in range(last + 1)
     ]
     around = count - inside[level]
-    return SceneSource(count, facts, blocks, findings, levels=tuple(one + around for one in inside))
+    return SceneSource(count, metadata_model, blocks, findings, levels=tuple(one + around for one in inside))
 
 
 def _read_leaves(parts: SogParts, meta: JsonValue) -> tuple[list[str], list[dict[int, _Range]]]:

@@ -74,8 +74,8 @@ def _encode_files(scene: SceneSource) -> Iterator[tuple[str, bytes]]:
     roots = np.sqrt(weights_of(sample))
     scales, colours = _build_codebook(sample.scales, roots), _build_codebook(sample.sh0, roots)
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "csplat"}, "count": count}
-    if scene.facts.antialiased or scene.facts.flat:
-        meta["model"] = "antialiased" if scene.facts.antialiased else "2dgs"
+    if scene.metadata_model.antialiased or scene.metadata_model.flat:
+        meta["model"] = "antialiased" if scene.metadata_model.antialiased else "2dgs"
     meta |= {
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": _shortest_decimals(scales), "files": ["scales.webp"]},
@@ -99,12 +99,12 @@ def _encode_files(scene: SceneSource) -> Iterator[tuple[str, bytes]]:
         codes["scales.webp"][rows] = _nearest_codes(scales, model.scales)
         codes["sh0.webp"][rows, :3] = _nearest_codes(colours, model.sh0)
         codes["sh0.webp"][rows, 3] = np.rint(model.opacities * np.float32(255))
-    if scene.facts.sh_degree and count:
+    if scene.metadata_model.sh_degree and count:
         values, entries, labels = _build_palette(scene, sample, weights_of)
         codes["shN_labels.webp"] = labels[:, None].astype("<u2").view(np.uint8)
         meta["shN"] = {
             "count": len(entries) * ENTRIES,
-            "bands": scene.facts.sh_degree,
+            "bands": scene.metadata_model.sh_degree,
             "codebook": _shortest_decimals(values),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
@@ -124,8 +124,8 @@ def _sample(scene: SceneSource) -> tuple[F64, F64, SplatModel]:
         low, high = np.minimum(low, logs.min(0)), np.maximum(high, logs.max(0))
         taken.append(model.select(np.arange(-rows.start % step, len(model), step)))
     if not taken:
-        return np.zeros(3), np.zeros(3), scene.facts
-    return low, high, join_blocks(scene.facts, taken)
+        return np.zeros(3), np.zeros(3), scene.metadata_model
+    return low, high, join_blocks(scene.metadata_model, taken)
 
 
 def _signed_logs(means: F32) -> F64:
@@ -203,7 +203,7 @@ def _build_palette(scene: SceneSource, sample: SplatModel, weights_of: _SplatWei
     Returns:
         The codebook of coefficients, the image of the palette, and the label of each splat.
     """
-    coefficients = scene.facts.shN.shape[1]
+    coefficients = scene.metadata_model.shN.shape[1]
     lengths = np.sqrt(np.einsum("nkc,nkc->n", sample.shN, sample.shN))
     step = np.float32(max(float(np.quantile(lengths, 0.999)) / _NORM, 1e-6))
     limit = 2 * _NORM / (3 * coefficients) ** 0.5

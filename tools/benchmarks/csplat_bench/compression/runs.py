@@ -87,7 +87,7 @@ class Bench:
         self.source = read_ply(ply)
         data = DataOptions(str(scene.data), scene.size)
         self.looks = find_view_set(self.source, data=data, background=scene.background, validation_count=0)
-        if not (self.looks.photographs and self.looks.test):
+        if not (self.looks.images and self.looks.test):
             raise InputError(f"{scene.data} holds out no photographs to judge by")
         self._picks: dict[tuple[float | None, bool], Pick] = {}
 
@@ -120,10 +120,10 @@ class Bench:
             return chosen, timer.seconds
         timer = StageTimer()  # it would not have measured what it is not told
         with timer.stage("choosing"):
-            removal = measure_pruning_error(
+            pruning_error = measure_pruning_error(
                 chosen.model, self.looks.training, background=self.looks.background, threads=self.threads
             )
-        return replace(chosen, importance=removal.squared_weight), timer.seconds
+        return replace(chosen, importance=pruning_error.squared_weight), timer.seconds
 
     def fix_scene(
         self, model: SplatModel, rows: NDArray[np.int64], encoding: EncodeOptions,

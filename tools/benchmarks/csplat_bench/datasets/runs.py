@@ -22,7 +22,7 @@ from csplat_bench.datasets.records import File, Record
 from csplat_render.lpips import Lpips
 from csplat_tools.console import note
 from csplat_trainer.data import DataSet, load
-from csplat_trainer.posed_images import photograph_scorer
+from csplat_trainer.posed_images import image_scorer
 from csplat_trainer.training_options import TrainOptions
 
 #: Name of the trained scene among its compressed files.
@@ -145,7 +145,7 @@ def _file(
     name: str, model: SplatModel, size_bytes: int, seconds: float | None, data: DataSet, lpips: Lpips | None
 ) -> File:
     """Score a model on the held-out pictures; papers print the mean over them."""
-    found = photograph_scorer(data.test, data.background, origin=(0.0, 0.0, 0.0)).scores(model, lpips=lpips)
+    found = image_scorer(data.test, data.background, origin=(0.0, 0.0, 0.0)).scores(model, lpips=lpips)
     return {
         "file": name,
         "size_bytes": size_bytes,

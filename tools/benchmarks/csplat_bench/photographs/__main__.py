@@ -39,7 +39,7 @@ from csplat_bench.photographs.tables import plot, tables
 from csplat_render.lpips import Lpips, load_lpips
 from csplat_tools.cli.shared_options import parse_size
 from csplat_trainer.data import DataSet, load
-from csplat_trainer.posed_images import photograph_scorer
+from csplat_trainer.posed_images import image_scorer
 from csplat_trainer.training_checkpoint import load_checkpoint
 
 
@@ -146,7 +146,7 @@ def _said(words: Sequence[str], folder: Path) -> str:
 
 def _scores(model: SplatModel, data: DataSet, lpips: Lpips | None) -> dict[str, float | None]:
     """Return the scores of a model on the held-out photographs."""
-    found = photograph_scorer(data.test, data.background, origin=(0.0, 0.0, 0.0)).scores(model, lpips=lpips)
+    found = image_scorer(data.test, data.background, origin=(0.0, 0.0, 0.0)).scores(model, lpips=lpips)
     return {score: getattr(found, score) for score in ("psnr_mean", "psnr", "ssim", "lpips")}
 
 

@@ -121,7 +121,7 @@ class _Bench:
         if method in _BY_OPACITY:
             (model, _), timing = timed(prune_share, source, count / len(source), by_area=method == "opacity-area")
         else:
-            rounds, side = 1 if method == "exact" else options.rounds, MeasuredViews(views.used, views.removal)
+            rounds, side = 1 if method == "exact" else options.rounds, MeasuredViews(views.used, views.pruning_error)
             order, timing = timed(find_pruning_order, source, [side], replace(options, rounds=rounds), count)
             model = source.select(order.kept(len(source), min(len(source) - count, len(order.rows))))
         result: Left = {"psnr": self._judge.psnr(model), "seconds": timing.wall, "views": len(views.used)}

@@ -122,7 +122,7 @@ def rows_of_scene(subject: Subject) -> list[Row]:
         Row("file, small", preset="small", decoded=True),
         Row("SH 0, τ 0.02, file, small", Reduction(0.02, sh_degree=0), "small", decoded=True),
     ]
-    if subject.photographs is not None and len(subject.source) <= _SMALL:
+    if subject.images is not None and len(subject.source) <= _SMALL:
         rows.append(Row("rate in the loss", preset="small", decoded=True, tuned=True))
     return rows
 
@@ -170,9 +170,9 @@ def measure_row(subject: Subject, row: Row) -> Measured:
 
 def _tuned(subject: Subject, model: SplatModel, options: EncodeOptions) -> bytes:
     """A file that was tuned by the photographs, as `csplat finetune --data … --keep-unseen` does."""
-    if subject.photographs is None:
+    if subject.images is None:
         raise InputError(f"{subject.name} has no photographs that a file could be tuned by")
-    views = training_views(model, subject.photographs, None)
+    views = training_views(model, subject.images, None)
     options = replace(options, shape_codebook_size=SHAPE_ENTRIES)
     return csplat_trainer.finetune(model, views, options, FinetuneOptions(byte_cost=RATE_WEIGHT[False])).data
 

@@ -53,7 +53,7 @@ class Subject:
         views: views by which it is judged.
         teachers: cameras that a lower SH degree is distilled by; None for virtual ones.
         judged_by: in words.
-        photographs: by which files are tuned; None if there are none.
+        images: a data set by which files are tuned; None if there are none.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Subject:
     views: Views
     teachers: Sequence[Camera] | None
     judged_by: str
-    photographs: ViewSet | None = None
+    images: ViewSet | None = None
 
 
 def baselines(iterations: int, count: int) -> dict[str, Capture]:
@@ -112,7 +112,7 @@ def open_subject(name: str, known: Mapping[str, Capture], out: Path, lpips: Dist
     found = find_view_set(
         source, data=DataOptions(str(scene.data), scene.size), background=scene.background, validation_count=0
     )
-    judge, teachers = found.photograph_test_scorer(), list(found.training)
+    judge, teachers = found.image_test_scorer(), list(found.training)
     if views and views < len(judge.cameras):
         judge = judge.subset([number * len(judge.cameras) // views for number in range(views)])
     cameras = list(judge.cameras)

@@ -118,7 +118,7 @@ def looked_at(scene: Scene) -> tuple[SplatModel, Camera]:
 
 def placed_in(form: Format, model: SplatModel) -> tuple[SplatModel, Camera]:
     """Return a scene along a format's axes, and its camera."""
-    placed = convert_axes(source_from_model(model), form.axes).facts if form.axes else model
+    placed = convert_axes(source_from_model(model), form.axes).metadata_model if form.axes else model
     return placed, Camera.from_json((placed.cameras or [])[0])
 
 

@@ -1,4 +1,4 @@
-"""Findings of the validator, records that it reads from bytes, and the error code of each clause (spec 2 to 8)."""
+"""The log of violations, records that it reads from bytes, and the error code of each clause (spec 2 to 8)."""
 
 from __future__ import annotations
 
@@ -109,8 +109,8 @@ class PlacedRecord(Generic[T]):
 
 
 @dataclass
-class Findings:
-    """A collection of what was found so far, in any order."""
+class ViolationLog:
+    """The violations, remarks and unread parts that were found so far, in any order."""
 
     violations: list[Violation] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
@@ -174,16 +174,16 @@ class Payload:
         end: offset of its end.
         name: name of the chunk, `TILE.0.0`.
         clause: the clause that requires the payload to end with its last structure.
-        findings: receives the violations.
+        log: receives the violations.
     """
 
-    def __init__(self, view: memoryview, at: int, end: int, name: str, clause: str, findings: Findings) -> None:
+    def __init__(self, view: memoryview, at: int, end: int, name: str, clause: str, log: ViolationLog) -> None:
         self.view = view
         self.at = at
         self.end = end
         self.name = name
         self.clause = clause
-        self.findings = findings
+        self.log = log
 
     @property
     def left(self) -> int:
@@ -198,7 +198,7 @@ class Payload:
         """
         at = self.at
         if size > self.left:
-            self.findings.add(
+            self.log.add(
                 self.clause, at, f"{self.name}/{what}", f"the payload ends here, {self.left} of {size} bytes are left"
             )
             raise UnreadableError
@@ -209,13 +209,13 @@ class Payload:
         """Read the next structure, named after the chunk and `what`, and check its reserved fields."""
         at = self.take(size, what)
         placed = read_record(self.view, unpack, places, at, f"{self.name}/{what}")
-        self.findings.check_reserved(placed)
+        self.log.check_reserved(placed)
         return placed
 
     def finish(self) -> None:
         """Check that nothing follows the last structure."""
         if self.left:
-            self.findings.add(self.clause, self.at, f"{self.name}/tail", f"{self.left} bytes follow the last structure")
+            self.log.add(self.clause, self.at, f"{self.name}/tail", f"{self.left} bytes follow the last structure")
 
 
 #: The error code of each requirement on a stream, the usual one if the text names two. Clauses about decoders, partial
