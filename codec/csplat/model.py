@@ -122,10 +122,7 @@ class SplatModel:
         """Return a scene that can be turned, for a notebook; `None`, for its `repr`, if empty or without the tools."""
         if not len(self):
             return None
-        try:
-            html = load_plugins("csplat.display").get("html")
-        except ModuleNotFoundError:
-            return None
+        html = load_plugins("csplat.display").get("html")
         shown: str | None = html and html(self)
         return shown
 

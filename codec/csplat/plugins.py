@@ -17,11 +17,16 @@ if TYPE_CHECKING:
 
 
 def load_plugins(group: str) -> dict[str, Any]:
-    """Load all entry points of a group, by name; warn of those that cannot be loaded, and leave them out."""
+    """Load the entry points of a group, by name, without those whose dependencies are absent.
+
+    One that cannot be loaded for another reason is left out with a `RuntimeWarning`.
+    """
     found = {}
     for point in _entry_points(group):
         try:
             found[point.name] = point.load()
+        except ModuleNotFoundError:
+            continue  # of an extra that is not installed
         except Exception as error:  # noqa: BLE001  # a broken package of others must not stop the reading of a PLY
             text = f"{point.value}, installed as {point.name!r} of {group}, cannot be loaded: {error}"
             warnings.warn(text, RuntimeWarning, stacklevel=2)
