@@ -1,4 +1,4 @@
-"""What an import brings in, and the classes of errors."""
+"""Imports: how much each brings in, and the classes of errors."""
 
 from __future__ import annotations
 

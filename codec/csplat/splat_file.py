@@ -26,6 +26,7 @@ from csplat.decoder.codebooks import wanted_codebooks
 from csplat.decoder.container import SceneHeader, Tile, check_length, read_file_header
 from csplat.decoder.decode_api import DecodeRequest, prepare_decode
 from csplat.decoder.limits import check_budget, float_bytes
+from csplat.decoder.reconstruct import tile_boxes
 from csplat.decoder.tiles import wanted_layers
 from csplat.disk_files import BinaryWriter
 from csplat.errors import InputError
@@ -313,19 +314,6 @@ def _batches(tiles: Sequence[Tile], degree: int, size_bytes: int) -> Iterator[li
         batch.append(tile)
         size += added
     yield batch
-
-
-def tile_boxes(header: SceneHeader) -> F64:
-    """Return the boxes around the centres of each tile's splats (spec 4.3.5).
-
-    Returns:
-        [T, 2, 3] float64: smallest and largest corner; scene units, relative to the origin, as the means.
-    """
-    step = header.attribute(_spec.ATTRIBUTE_MEANS).step
-    boxes = np.empty((len(header.tiles), 2, 3), np.float64)
-    for tile in header.tiles:
-        boxes[tile.index] = tile.corners(step)
-    return boxes
 
 
 def tiles_touching(header: SceneHeader, box: Sequence[float]) -> list[Tile]:

@@ -20,7 +20,7 @@ from csplat.decoder.blocks import Block, CodebookBlock, ColumnBlock, SparseBlock
 from csplat.decoder.container import SceneHeader
 from csplat.decoder.entropy import Ints
 from csplat.errors import FormatError
-from csplat.types import F32
+from csplat.types import F32, F64
 
 _SQRT_2 = float.fromhex("0x1.6A09E667F3BCDp+0")  # 7.5
 _INT32 = np.dtype(np.int32)
@@ -178,6 +178,19 @@ def check_max_scale(source: TileBlocks, record: _spec.AttributeRecord, largest: 
 
 
 # Lattices: means, scales, colours (7.1, 7.2, 7.4) --------------------------------------------------
+
+
+def tile_boxes(header: SceneHeader) -> F64:
+    """Return the boxes around the centres of each tile's splats (spec 4.3.5).
+
+    Returns:
+        [T, 2, 3] float64: smallest and largest corner; scene units, relative to the origin, as the means.
+    """
+    step = header.attribute(_spec.ATTRIBUTE_MEANS).step
+    boxes = np.empty((len(header.tiles), 2, 3), np.float64)
+    for tile in header.tiles:
+        boxes[tile.index] = tile.corners(step)
+    return boxes
 
 
 def lattice_rows(

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.decoder import SceneHeader, TileReader
+from csplat.decoder.reconstruct import tile_boxes
 from csplat.file_source import PageReleaser
 from csplat.model import SplatModel
 from csplat.scene_source import SceneSource, join_blocks
-from csplat.splat_file import tile_boxes
 from csplat.system import CAN_FORK, default_memory_bytes, map_in_processes
 from csplat.types import F64, I8, I64, Progress
 from csplat_conformance.declared_bounds.bounds_verification import (
