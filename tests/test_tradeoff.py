@@ -245,7 +245,7 @@ def test_what_is_fetched_suffices():
             if layer > 1:
                 data[record.offset : record.offset + record.size] = bytes(record.size)
                 kept -= record.size
-    for chunk in header.directory:  # in a file without codebooks: the chunks about the whole file
+    for chunk in header.directory:  # the file has no codebooks, so these chunks describe the whole file
         data[chunk.offset + 8 : chunk.offset + chunk.size] = bytes(chunk.size - 8)
         kept -= chunk.size
     assert fetched_bytes(header, 1) == kept

@@ -40,7 +40,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _reading = threading.Lock()  # seek and read are two calls
-_task: list[Any] = []  # in a worker process: the function, and the value that all calls share
+_task: list[Any] = []  # set in worker processes only: [function, value shared by all calls]
 
 
 def core_count() -> int:

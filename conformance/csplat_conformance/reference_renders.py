@@ -55,7 +55,7 @@ def quantise_render(rgb: NDArray[Any]) -> U8:
 
 def reference_render(floats: Mapping[str, NDArray[Any]], camera: Mapping[str, Any], antialiased: bool) -> U8:
     """Render the expected arrays of a scene from the equations, in binary64. Needs the extra `render`."""
-    from csplat_render.camera import Camera  # in the extra `render`, which the suite can do without
+    from csplat_render.camera import Camera  # needs the extra `render`, which the rest of the suite does not
     from csplat_render.reference_rasteriser import render_exact
 
     splats: Any = SimpleNamespace(**floats)

@@ -12,7 +12,7 @@ CLASSES: Final = (EXACT := "exact", RENDERER := "renderer")
 
 _EXCESS, _EXCESS_FLOOR = 1e-4, 1e-12  # relative and absolute; by how much a bound may exceed the true error (SER-5)
 _ROUNDING = 1e-9  # relative; sums in binary64 in another order (SER-7)
-_COORDINATE_ROUNDING = 2.0**-50  # of the largest coordinate, which is added and subtracted in binary64 (SER-7)
+_COORDINATE_ROUNDING = 2.0**-50  # relative to the largest coordinate, added and subtracted in binary64 (SER-7)
 #: Absolute, by measure. SER-7 leaves open whether alpha and unit quaternions are rounded to binary32 first.
 _ROUNDING_OF_MEASURE = {"opacities": 2e-7, "covariance": 2e-6}
 

@@ -12,7 +12,7 @@ from csplat_authoring.recipe import Recipe, invalid_recipe
 from csplat_authoring.samples import OPACITIES, SCALES, SH0, levels, rows_of, scene, signed, tile
 from csplat_authoring.scene import Block, Chunk, Codebook, Stream
 
-_SPLAT_BYTES = 4 * (3 + 4 + 3 + 1 + 48)  # in the arrays of section 3, at SH degree 3
+_SPLAT_BYTES = 4 * (3 + 4 + 3 + 1 + 48)  # bytes per splat of SH degree 3, as float32 (spec section 3)
 _RUNS = (_spec.TRANSFORM_RUN_LENGTH,)
 
 

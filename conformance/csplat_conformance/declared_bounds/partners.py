@@ -101,7 +101,7 @@ class _Grid:
     """The source splats sorted by the hash of their cells."""
 
     def __init__(self, source: Source, radius: float, bounds: Mapping[str, float]) -> None:
-        margin = 1.0 + 1e-6  # for the rounding of cells
+        margin = 1.0 + 1e-6  # relative; covers the rounding of coordinates to cells
         self.widths = [2.0 * radius * margin] * 3
         self.widths += [2.0 * bounds[name] * margin for name in ("opacities", "sh0")]
         keys = np.empty(len(source), np.uint64)

@@ -151,8 +151,6 @@ def batch(
                 work = partial(run_job, gate=budget.gate)
                 ended = run_jobs(jobs, [first, *(Worker() for _ in range(count - 1))], work, budget.stop)
             else:
-                # dropped import
-
                 ended = run_on_cluster(jobs, dask)
             before = _record_all(ended, jobs, journal, progress)
             journal.end()

@@ -382,7 +382,7 @@ _ReadAs = Annotated[
     ),
 ]
 _READ_AS = "read_as"
-_MORE = re.compile(r"\n *---\n")  # in a docstring: the text below this line is shown by --help-all only
+_MORE = re.compile(r"\n *---\n")  # separates the part of a docstring that only --help-all shows
 _HELP_ALL = "help_all"
 _ALIAS = "output_option"  # parameter of `-o`, the other way to give the argument `output`
 _EXCLUDED_MAX = 6  # an option that excludes more is not named in the help of each of them

@@ -43,7 +43,7 @@ class SearchReport:
         views_of: source of the views: `virtual`, or a name.
         renders: number of renders that were scored.
         removal_views, sensitivity_views: number of small renders to measure pruning errors, and sensitivities.
-        chosen, tried: the chosen file and all files, see `Trial.as_json`.
+        chosen, tried: the chosen file and all files, see `Candidate.as_json`.
         why, sure: explanations of the choice, and of the reliability of the PSNR.
     """
 

@@ -1,7 +1,8 @@
 """Simple strategies, each a step on a scene: prune by opacity, take fewer SH bands, cluster attribute by attribute.
 
-They serve comparisons with published studies. From the encoder they use `cluster` and `fix_gauge`, so that k-means and
-the canonical form of shapes are those of the codec, and `Draft`, whose colours they replace.
+They serve comparisons with published studies. From the encoder they use `cluster` and
+`canonicalise_shape`, so that k-means and the canonical axis order are those of the codec, and `EncodePlan`, whose
+colours they replace.
 """
 
 from __future__ import annotations
