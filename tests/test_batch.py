@@ -376,7 +376,7 @@ def test_a_cluster_gives_what_a_lost_machine_had_to_another(scenes, tmp_path, ma
     stuck, whole = scenes / "stuck.ply", tmp_path / "whole.ply"
     os.mkfifo(stuck)
     csplat.write_ply(whole, make_model(7, 0))
-    how = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "host": "127.0.0.1"}
+    how = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0", "host": "127.0.0.1"}
     with distributed.LocalCluster(**how) as cluster, distributed.Client(cluster) as client:
         numbers = client.run(os.getpid)
 

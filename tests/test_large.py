@@ -284,7 +284,7 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_is_killed(model, whole, 
     distributed = pytest.importorskip("distributed", reason="a cluster wants the extra [scale]")
     target = tmp_path / "out.csplat"
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+        n_workers=2, threads_per_worker=1, dashboard_address=":0", silence_logs=50
     ) as cluster:
         victims = [one.pid for one in cluster.workers.values()]
 

@@ -35,6 +35,6 @@ def load_plugins(group: str) -> dict[str, Any]:
 
 @cache
 def _entry_points(group: str) -> EntryPoints:
-    from importlib.metadata import entry_points  # takes 20 ms, and the look-up 5 ms for a hundred packages
+    from importlib.metadata import entry_points  # about 20 ms, and the look-up 10 ms with 120 packages
 
     return entry_points(group=group)
