@@ -8,8 +8,8 @@
 
 Peers are written in the same run, by splat-transform: SPZ, and SOG if that takes minutes at most (one iteration of
 its k-means). PSNR is against the source from the cameras of the data folder (psnr_cameras/NAME.json). What was measured
-is kept scene by scene in tools/benchmarks/distortion/NAME.json: an interrupted run continues where it stopped; --again
-forgets.
+is kept scene by scene in tools/benchmarks/results/distortion/NAME.json: an interrupted run continues where it stopped;
+--again forgets.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ from csplat_tools.optimise.target_encoding import encode_to
 from csplat_tools.views import BLACK, find_view_set
 
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg,angel,st-peter,fox120k,statue"  # the quick ones first
-_KEPT = ROOT / "tools" / "benchmarks" / "distortion"
+_KEPT = ROOT / "tools" / "benchmarks" / "results" / "distortion"
 _CHOICES = (("balanced", "scalar"), ("balanced", "codebook"), ("small", "codebook"), ("small", "scalar"))
 _SH_CODINGS: dict[str, ShCoding] = {"scalar": "scalar", "codebook": "codebook"}
 _QUALITIES = (20.0, 110.0)  # dB, between which the encoder's is looked for

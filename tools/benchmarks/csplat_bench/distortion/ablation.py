@@ -5,7 +5,7 @@
     python -m csplat_bench.distortion.ablation --tables --markdown # print what was measured
 
 Files are those of `csplat encode --target-psnr`. What was measured is kept scene by scene in
-tools/benchmarks/ablation/NAME.json: an interrupted run continues where it stopped; --again forgets.
+tools/benchmarks/results/ablation/NAME.json: an interrupted run continues where it stopped; --again forgets.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.optimise.target_encoding import encode_to
 
 _SCENES = "plane3,donut,lego60k,fox120k"
-_KEPT = ROOT / "tools" / "benchmarks" / "ablation"
+_KEPT = ROOT / "tools" / "benchmarks" / "results" / "ablation"
 
 
 @dataclass(frozen=True)

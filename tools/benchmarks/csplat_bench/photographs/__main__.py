@@ -1,7 +1,7 @@
 """Train a scene, make files of several sizes of it, judge them, and plot them with published ones.
 
-    python -m csplat_bench.photographs tools/benchmarks/photographs/lego800.toml FOLDER --lpips alex.npz
-    python -m csplat_bench.photographs tools/benchmarks/photographs/lego800.toml --tables --markdown
+    python -m csplat_bench.photographs tools/benchmarks/results/photographs/lego800.toml FOLDER --lpips alex.npz
+    python -m csplat_bench.photographs tools/benchmarks/results/photographs/lego800.toml --tables --markdown
 
 FOLDER is the data set. A configuration file has the arguments of `csplat train`: `trainings`, by name,
 each from nothing or `after` another one, from whose end it goes on; `files`, by name, each `of` a training; `size`, if

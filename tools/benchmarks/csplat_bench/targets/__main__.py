@@ -6,7 +6,7 @@
     python -m csplat_bench.targets --tables --markdown              # print what was measured
 
 Every file is written by the command line in a process of its own, and judged from sixteen virtual cameras that no
-search consults: those of `psnr`, but for the seed. What was measured is kept in tools/benchmarks/targets/NAME.json,
+search consults: those of `psnr`, but for the seed. What was measured is kept in .../results/targets/NAME.json,
 file by file: an interrupted run continues where it stopped. A row is *beaten* if another file of the same scene is
 smaller by more than 1 % and better by more than 0.1 dB; files that hold every splat are compared among themselves.
 """
@@ -43,7 +43,7 @@ from csplat_tools.views import BLACK
 _SCENES = "plane3,horse,donut,jacket,lego60k,fox60k_noreg,angel,fox120k,st-peter,statue"  # the quick ones first
 _KEEPS = (0.7, 0.5)
 _SEEDS = (1, 2)  # seeds of the judging cameras; targets themselves use seed 0
-_KEPT = ROOT / "tools" / "benchmarks" / "targets"
+_KEPT = ROOT / "tools" / "benchmarks" / "results" / "targets"
 _CSPLAT = str(Path(sys.executable).with_name("csplat"))
 
 
