@@ -86,18 +86,10 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BIN)/csplat encode $(SAMPLE) out/parts.csplat --force --quiet --set tile-splats=1024
 	$(BENCH).codec.parts out/parts.csplat --share 0.2
 	$(BENCH).rendering
-	$(BENCH).rendering.removal pass
-	$(BENCH).rendering.removal removal --gone 20,40,60,80
 	$(BIN)/pytest -rP tests/test_render_forward.py tests/test_render_gradients.py tests/test_removal.py
 	$(BENCH).training
 	$(BENCH).viewer
-	$(BENCH).compression
 	$(BENCH).targets --sizes 4,8
-	$(BENCH).distortion plain
-	$(BENCH).distortion.grades
-	$(BENCH).distortion.operating
-	$(BENCH).distortion.ablation
-	$(BENCH).study
 
 wasm: ## compile the decoder in C for the JavaScript one; needs Debian 12's clang-14 lld-14 wasi-libc libclang-rt-14-dev-wasm32
 	codec/js/wasm/build.sh codec/js/wasm_binary.mjs

@@ -1,1 +1,1 @@
-"""Benchmarks of rendering, gradients, and the removal of splats."""
+"""Benchmarks of rendering and gradients."""

@@ -1,1 +1,0 @@
-"""A whole compression of trained scenes, step by step, on photographs that were held out."""

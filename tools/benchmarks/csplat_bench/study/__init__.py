@@ -1,1 +1,0 @@
-"""A published study of simple strategies, done again."""
