@@ -8,25 +8,25 @@ from typing import Final
 
 from csplat_conformance.manifest import Vector
 
-#: Clauses that no vector covers: the reason, or the test that covers them.
+#: Clauses that no vector covers, with the reason or the tests that cover them instead.
 UNCOVERED: Final = {
-    "CHK-5": "about editors, which change files rather than read them",
-    "CHK-6": "a permission; vectors whose only defect lies in such a payload are marked optional",
+    "CHK-5": "applies to editors",
+    "CHK-6": "a permission; vectors whose only defect is in such a payload are marked optional",
     "CHK-7": "the vectors that are marked optional, for decoders that read the payload",
-    "SER-5": "about what an encoder states, which needs the source: `tests/test_proof.py`, `tests/test_validator.py`",
-    "SER-6": "likewise: `tests/test_proof.py`",
-    "SER-7": "about who checks what is stated: `tests/test_spec_pseudocode.py`, `tests/test_stated.py`",
-    "SRC-1": "about encoders: `tests/test_stated.py`",
-    "SRC-2": "about encoders: `tests/test_stated.py`",
-    "SRC-3": "about encoders: `tests/test_conformance_encoder.py`",
-    "SRC-4": "about encoders: `tests/test_encode.py`",
-    "CNF-2": "the sum of all vectors",
-    "CNF-3": "no file shows the absence of crashes: `tests/fuzz.py`, `tests/test_damage.py`",
-    "CNF-4": "about a decoder's interface: `tests/test_decoder_scene.py`",
-    "CNF-5": "about encoders: `tests/test_encode.py`, `tests/test_conformance_encoder.py`",
-    "CNF-6": "about encoders: `tests/test_encode.py`, `tests/test_conformance_encoder.py`",
-    "CNF-10": "about encoders: `tests/test_encode.py`",
-    "CNF-9": "about what a decoder says of itself",
+    "SER-5": "checking stated errors requires the source: `tests/test_proof.py`, `tests/test_validator.py`",
+    "SER-6": "applies to encoders: `tests/test_proof.py`",
+    "SER-7": "applies to checkers of stated errors: `tests/test_spec_pseudocode.py`, `tests/test_stated.py`",
+    "SRC-1": "applies to encoders: `tests/test_stated.py`",
+    "SRC-2": "applies to encoders: `tests/test_stated.py`",
+    "SRC-3": "applies to encoders: `tests/test_conformance_encoder.py`",
+    "SRC-4": "applies to encoders: `tests/test_encode.py`",
+    "CNF-2": "all vectors together",
+    "CNF-3": "no file can prove the absence of crashes: `tests/fuzz.py`, `tests/test_damage.py`",
+    "CNF-4": "applies to a decoder's interface: `tests/test_decoder_scene.py`",
+    "CNF-5": "applies to encoders: `tests/test_encode.py`, `tests/test_conformance_encoder.py`",
+    "CNF-6": "applies to encoders: `tests/test_encode.py`, `tests/test_conformance_encoder.py`",
+    "CNF-10": "applies to encoders: `tests/test_encode.py`",
+    "CNF-9": "applies to a decoder's documentation",
 }
 
 _NAMES_MAX = 4
@@ -43,9 +43,9 @@ def clause_map(text: str, vectors: Sequence[Vector]) -> str:
     for vector in vectors:
         for clause in vector.clauses:
             covering.setdefault(clause, []).append(vector.name)
-    lines = ["| clause | vectors, or why there are none |", "|---|---|"]
+    lines = ["| clause | vectors, or the reason for having none |", "|---|---|"]
     for clause in clause_ids(text):
-        # Invalid vectors come first, since they show most about a clause.
+        # Invalid vectors come first: they are the most specific to a clause.
         names = sorted(covering.get(clause, []), key=lambda name: not name.startswith("invalid/"))
         cell = ", ".join(f"`{name}`" for name in names[:_NAMES_MAX])
         if len(names) > _NAMES_MAX:

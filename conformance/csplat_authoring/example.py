@@ -13,7 +13,7 @@ from csplat_conformance.fields import Field
 
 
 def example_scene() -> Scene:
-    """Return two splats of SH degree 1: one round and opaque, one turned, long and faint."""
+    """Return a scene of two splats of SH degree 1: one round and opaque, the other rotated, long and faint."""
     runs = Stream(1, (_spec.TRANSFORM_RUN_LENGTH,))
     bands = [[4, 0, 0, 0, 0, 0, 0, 0, 0], [4, 0, 0, 0, 0, 0, 0, 0, -1]]
     tile = Tile(
@@ -46,9 +46,9 @@ def example_scene() -> Scene:
     )
 
 
-_INTRO = """The file is `conformance/csplat_conformance/vectors/valid/worked_example.csplat`, {size} bytes: two splats
-of SH degree 1 in one tile, and a title. Each row of a table is one field; offsets are decimal, bytes hexadecimal in
-the order of the file.
+_INTRO = """The file is `conformance/csplat_conformance/vectors/valid/worked_example.csplat`. It has {size} bytes and
+contains two splats of SH degree 1 in one tile, and a title. Each row of a table is one field. Offsets are decimal,
+bytes hexadecimal in the order of the file.
 """
 
 #: Names of the spec's structures, and the sections that define them.
@@ -101,26 +101,26 @@ _NOTES: Final = {
     "TILE.0.1/sh1.stream.coded": "values 04 00 FF; lengths 2, 15, 1",
 }
 
-_OUTRO = """What a decoder returns, splat by splat:
+_OUTRO = """A decoder returns the following values:
 
-*opacities*. M = 4, mapping LINEAR: 4 / 4 = 1 and 1 / 4 = 0.25.
+*opacities*. M = 4 and the mapping is LINEAR: 4 / 4 = 1 and 1 / 4 = 0.25.
 
-*scales*. The offsets −12, −12, −16 plus the elements give the integers (−12, −12, −12) and (−8, −12, −16); times 0.25:
-(−3, −3, −3) and (−2, −3, −4). The largest is `max_scale`.
+*scales*. The offsets −12, −12, −16 plus the elements give the integers (−12, −12, −12) and (−8, −12, −16). Times 0.25,
+these are (−3, −3, −3) and (−2, −3, −4). The largest value is `max_scale`.
 
 *quats*. M = 3, so c = 1 / (3·√2) = 0.23570226…. The first splat has q = (0, 0, 0), R = 2·9 = 18 and w = √18 · c = 1:
 no rotation. The second has q = (0, 0, 3), R = 18 − 9 = 9, w = 3 · c and z = 3 · c, both 0.70710677 in binary32: a
 quarter turn about z.
 
-*means*. Corner (−2, 0, 16) plus q: (−2, 2, 16) and (3, 0, 17); times 0.25: (−0.5, 0.5, 4) and (0.75, 0, 4.25). The
-smallest q is 0 on each axis and the largest the extent (5, 2, 1), as TIL-10 demands.
+*means*. The corner (−2, 0, 16) plus q gives (−2, 2, 16) and (3, 0, 17). Times 0.25, these are (−0.5, 0.5, 4) and
+(0.75, 0, 4.25). On each axis the smallest q is 0 and the largest q is the extent (5, 2, 1), as TIL-10 requires.
 
 *sh0*. The first splat has Y = 2, Co = 1, Cg = −1: t = 2 − (−1 >> 1) = 2 − (−1) = 3, G = −1 + 3 = 2, B = 3 − (1 >> 1)
-= 3, R = 3 + 1 = 4; times 0.5: (2, 1, 1.5). The second has Y = −1 and no chroma: (−0.5, −0.5, −0.5).
+= 3, R = 3 + 1 = 4. Times 0.5, this is (2, 1, 1.5). The second has Y = −1 and no chroma: (−0.5, −0.5, −0.5).
 
-*shN*. The runs unfold to 04 04, fifteen times 00, FF: eighteen elements, nine columns of two. Column 0 (red, first
-coefficient) is 4 for both splats; column 8 (blue, third coefficient) is 0 and −1; the others are 0. Times 0.25: red is
-1 in the first coefficient of both splats, blue is −0.25 in the third of the second.
+*shN*. The runs expand to 04 04, fifteen times 00, FF: eighteen elements in nine columns of two. Column 0 (red, first
+coefficient) is 4 for both splats. Column 8 (blue, third coefficient) is 0 and −1. The other columns are 0. Times 0.25,
+red is 1 in the first coefficient of both splats, and blue is −0.25 in the third coefficient of the second splat.
 """
 
 
@@ -147,7 +147,7 @@ def annex() -> str:
 
 
 def _covered(built: Built, name: str) -> tuple[int, int]:
-    """Return the bytes that a CRC covers: the index's those before it, a record's the chunk that it names."""
+    """Return the byte range that a CRC covers: the index before its CRC, or the chunk that a record refers to."""
     if name == "index.crc":
         return _spec.HEADER_SIZE, built.fields[name].offset
     fields = [built.fields[name.removesuffix("crc") + key] for key in ("offset", "size")]
