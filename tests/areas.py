@@ -77,13 +77,7 @@ def load(file: Path = FILE) -> list[Area]:
     """Read the areas."""
     tables = tomllib.loads(file.read_text(encoding="utf-8"))
     return [
-        Area(
-            name,
-            table["guards"],
-            tuple(table["sources"]),
-            tuple(table.get("extras", ())),
-            table.get("hash", ""),
-        )
+        Area(name, table["guards"], tuple(table["sources"]), tuple(table.get("extras", ())), table.get("hash", ""))
         for name, table in tables.items()
     ]
 

@@ -245,10 +245,7 @@ WRONG = {
     "INRIA, no focal length": ([standing(), standing(fx=None)], "camera 1: fx is None, expected a number"),
     "INRIA, no position": ([standing(position=None)], "camera 0: rotation and position have other shapes"),
     "INRIA, another entry": ([standing(), {"K": 1}], "camera 1: width is None"),
-    "INRIA, no rotation": (
-        [standing(rotation=[[1, 1, 1]] * 3)],
-        "camera 0: the camera's viewmat does not begin",
-    ),
+    "INRIA, no rotation": ([standing(rotation=[[1, 1, 1]] * 3)], "camera 0: the camera's viewmat does not begin"),
     "INRIA, no object": ([standing(), 3], "camera 1 is int, expected an object"),
     "nerfstudio, panorama": ({**NERFSTUDIO, "camera_type": "equirectangular"}, "camera_type is equirectangular"),
     "nerfstudio, no size": ({**NERFSTUDIO, "render_width": None}, "camera_path 0: render_width is None"),

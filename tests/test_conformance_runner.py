@@ -91,13 +91,7 @@ RECORDED = (
     "valid/quats",
     *(
         f"invalid/{name}"
-        for name in (
-            "quat_radicand",
-            "json_open",
-            "json_surrogate",
-            "json_beyond_budget",
-            "error_counts",
-        )
+        for name in ("quat_radicand", "json_open", "json_surrogate", "json_beyond_budget", "error_counts")
     ),
 )
 

@@ -80,10 +80,7 @@ MISTAKES = {
     "no harmonics": ("render/harmonics", lambda floats: floats | {"shN": floats["shN"][:, :0]}),
     "x, y, z, w": ("render/ellipsoids", lambda floats: floats | {"quats": np.roll(floats["quats"], 1, axis=1)}),
     "w negative": ("render/ellipsoids", lambda floats: floats | {"quats": floats["quats"] * np.float32([-1, 1, 1, 1])}),
-    "scales too large": (
-        "render/ellipsoids",
-        lambda floats: floats | {"scales": floats["scales"] + 0.05},
-    ),
+    "scales too large": ("render/ellipsoids", lambda floats: floats | {"scales": floats["scales"] + 0.05}),
     "no low-pass filter": ("render/antialiased", None),
 }
 

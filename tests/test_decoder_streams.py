@@ -87,12 +87,7 @@ def test_heads_that_contradict_their_place(fields, clause, place):
 
 
 @pytest.mark.parametrize(
-    ("fields", "clause"),
-    [
-        ({"coder": 2}, "RES-2"),
-        ({"coder": 255}, "RES-2"),
-        ({"transforms": b"\5\0\0\0"}, "RES-2"),
-    ],
+    ("fields", "clause"), [({"coder": 2}, "RES-2"), ({"coder": 255}, "RES-2"), ({"transforms": b"\5\0\0\0"}, "RES-2")]
 )
 def test_what_this_version_lacks(fields, clause):
     with pytest.raises(UnsupportedError, match=clause):

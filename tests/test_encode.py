@@ -397,9 +397,7 @@ def test_options_stand_in_the_file(make_model):
 def test_progress_names_its_stages_and_ends_at_one(make_model):
     seen: dict[str, float] = {}
     encode_with_report(
-        make_model(500, 2),
-        EncodeOptions(sh_coding="codebook", tile_splats=100),
-        progress=seen.__setitem__,
+        make_model(500, 2), EncodeOptions(sh_coding="codebook", tile_splats=100), progress=seen.__setitem__
     )
     assert {"codebook": 1.0, "tiles": 1.0} == seen
 

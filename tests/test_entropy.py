@@ -15,10 +15,7 @@ def read(stream: bytes) -> tuple[_spec.StreamHead, list[int]]:
     head = _spec.unpack_stream_head(stream)
     coded = stream[_spec.STREAM_HEAD_SIZE :]
     assert head.coded_size == len(coded)
-    packed = {
-        _spec.CODER_STORED: lambda: coded,
-        _spec.CODER_DEFLATE: lambda: zlib.decompress(coded, -15),
-    }[head.coder]()
+    packed = {_spec.CODER_STORED: lambda: coded, _spec.CODER_DEFLATE: lambda: zlib.decompress(coded, -15)}[head.coder]()
     assert head.packed_size == len(packed)
     transforms = [step for step in head.transforms if step]
     assert transforms == sorted(set(transforms))

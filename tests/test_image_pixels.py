@@ -118,12 +118,7 @@ READ = {
         GREY,
         0,
     ),
-    "16-bit RGB": (
-        "a.tif",
-        lambda p: tiff(p, RGB.astype(np.uint16) * 257, 16, 1, channels=3, photometric=2),
-        RGB,
-        0,
-    ),
+    "16-bit RGB": ("a.tif", lambda p: tiff(p, RGB.astype(np.uint16) * 257, 16, 1, channels=3, photometric=2), RGB, 0),
     "16-bit RGB PNG": ("a.png", lambda p: png_16(p, np.ascontiguousarray(RGB.astype(">u2") * 257, ">u2")), RGB, 0),
     "float TIFF": ("a.tif", lambda p: Image.fromarray(RAMP.astype(np.float32)).save(p), GREY, 0),
 }

@@ -702,10 +702,7 @@ def test_extra_columns_are_named_and_dropped(path):
     with pytest.raises(InputError, match="columns object_id, conf are no property of splats"):
         read_ply(path, strict=True)
     report = []
-    assert [
-        "object_id",
-        "conf",
-    ] == list(read_ply(path, strict=True, keep_extra=True, report=report).extra)
+    assert ["object_id", "conf"] == list(read_ply(path, strict=True, keep_extra=True, report=report).extra)
     assert [] == report
 
 

@@ -11,11 +11,7 @@ from csplat.model import SplatModel, normalise_quats
 def test_defaults_fill_what_is_not_given(make_model):
     model = make_model(4, 0)
     bare = SplatModel(
-        means=model.means,
-        quats=model.quats,
-        scales=model.scales,
-        opacities=model.opacities,
-        sh0=model.sh0,
+        means=model.means, quats=model.quats, scales=model.scales, opacities=model.opacities, sh0=model.sh0
     )
     assert (4, 0, 3) == bare.shN.shape
     assert (0.0, 0.0, 0.0) == bare.origin

@@ -28,13 +28,7 @@ from csplat_render.metrics import psnr_of_mse
 from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
 from csplat_tools.optimise.candidates import CodingChoice, WholeScene
-from csplat_tools.optimise.precision_search import (
-    REFIT_GAIN,
-    PrecisionSearch,
-    SearchGoal,
-    SearchWindow,
-    find_in_window,
-)
+from csplat_tools.optimise.precision_search import REFIT_GAIN, PrecisionSearch, SearchGoal, SearchWindow, find_in_window
 from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.optimise.rate_distortion import error_of_psnr
 from csplat_tools.optimise.scene_sensitivity import complete_importance, measure_importance

@@ -243,8 +243,7 @@ def test_what_is_written_they_read(tmp_path, peer, format, scene):
 
 
 @pytest.mark.parametrize(
-    ("name", "forward"),
-    [("v2.spz", 1), ("raw.spz", 1), ("v3.spz", -1), ("v4.spz", -1), (".splat", 1), (".ksplat", 1)],
+    ("name", "forward"), [("v2.spz", 1), ("raw.spz", 1), ("v3.spz", -1), ("v4.spz", -1), (".splat", 1), (".ksplat", 1)]
 )
 def test_files_of_splat_transform_hold_the_grid_that_they_were_made_of(name, forward):
     """The newer SPZ of its repository were turned when they were made."""

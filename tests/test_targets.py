@@ -103,8 +103,7 @@ def test_a_target_is_one_thing_within_its_range(asked, message):
 
 
 @pytest.mark.parametrize(
-    "bounds",
-    [{"means": 1e-4}, {"opacities": 0.004, "covariance": 0.02}, {"sh0": 0.01}, {"sh1": 0.02, "sh2": 0.05}],
+    "bounds", [{"means": 1e-4}, {"opacities": 0.004, "covariance": 0.02}, {"sh0": 0.01}, {"sh1": 0.02, "sh2": 0.05}]
 )
 def test_no_splat_errs_by_more_than_is_allowed(scene, bounds):
     found = encode_to(scene, errors=bounds)

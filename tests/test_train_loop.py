@@ -413,8 +413,7 @@ def test_a_damaged_validation_picture_is_refused_before_training_begins(make_dat
 
 
 @pytest.mark.parametrize(
-    "words",
-    [("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB"), ("--target-psnr", 30), ("--lambda", 0)],
+    "words", [("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB"), ("--target-psnr", 30), ("--lambda", 0)]
 )
 def test_what_a_file_is_to_be_is_refused_of_a_ply(tmp_path, words):
     result = CliRunner().invoke(app, ["train", str(tmp_path), "-o", str(tmp_path / "a.ply"), *map(str, words)])

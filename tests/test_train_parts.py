@@ -200,8 +200,7 @@ def test_the_moving_average_is_of_the_last_values():
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"max_splats": 0}, {"sh_degree": 4}, {"loss": "l2"}, {"lr_means": float("nan")}, {"lr_means_final": 1.0}],
+    "wrong", [{"max_splats": 0}, {"sh_degree": 4}, {"loss": "l2"}, {"lr_means": float("nan")}, {"lr_means_final": 1.0}]
 )
 def test_options_out_of_range_are_refused(wrong):
     with pytest.raises(InputError, match="wanted"):

@@ -168,12 +168,7 @@ CODINGS = {
     "degree 1": {"sh_degree": 1},
     "degree 0": {"sh_degree": 0},
     "tiles": {"tile_splats": 300},
-    "records of several texels": {
-        "means_coding": "axis",
-        "position_step": 1e-6,
-        "scale_step": 1e-5,
-        "sh0_step": 1e-6,
-    },
+    "records of several texels": {"means_coding": "axis", "position_step": 1e-6, "scale_step": 1e-5, "sh0_step": 1e-6},
     "widest levels": {"opacity_levels": 65535, "quat_levels": 32767},
 }
 

@@ -12,14 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from csplat_render import Camera
-from csplat_render.conventions import (
-    ALPHA_CAP,
-    ALPHA_MIN,
-    COMPENSATION_MIN,
-    DILATION,
-    FOV_MARGIN,
-    TRANSMITTANCE_MIN,
-)
+from csplat_render.conventions import ALPHA_CAP, ALPHA_MIN, COMPENSATION_MIN, DILATION, FOV_MARGIN, TRANSMITTANCE_MIN
 from csplat_render.kernels import python_function
 from csplat_render.projection import sh_basis
 
