@@ -86,7 +86,7 @@ bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
 	$(BIN)/csplat encode $(SAMPLE) out/parts.csplat --force --quiet --set tile-splats=1024
 	$(BENCH).codec.parts out/parts.csplat --share 0.2
 	$(BENCH).rendering
-	$(BIN)/pytest -rP tests/test_render_forward.py tests/test_render_gradients.py tests/test_removal.py
+	$(BIN)/pytest -rP tests/test_rasteriser.py tests/test_removal.py
 	$(BENCH).training
 	$(BENCH).viewer
 	$(BENCH).targets --sizes 4,8

@@ -1,15 +1,35 @@
-"""The search for a target on an analytic scene: the one place where the model meets the search as it is today."""
+"""A scene and an encoder as formulas, for tests of the search for a target: no file is encoded, nothing is rendered.
+
+The law, for a file of n splats whose attributes keep q dB each, with x = E(p) the mean squared error of p dB:
+
+    size  = frame + n · (geometry · grading + sh(coding)) · exp(rate · (q - 42)) + book(entries)
+    error = E(q - lost) + removal(n) + missing(degree) + book(entries) + E(ceiling)
+
+- `sh` is in proportion to the coefficients that are kept; a codebook costs its indices and its entries instead, and
+  errs by what too few of these leave.
+- `removal` is a power of the number of pruned splats, not counting those that no view needs; a refit divides it.
+- `missing` is what the scene shows without its upper bands.
+- `ceiling` bounds what any precision reaches: the search has to notice that finer steps gain nothing.
+
+A plateau of q and jumps (every other step of q loses some dB) break the monotony that a search likes to rely on. Each
+view sees the same error; test views may see more of all of it, or of removal.
+`AnalyticScene.smallest` and `best` find the best file by trying everything, as a reference for the search.
+"""
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
-from analytic_model import AnalyticFile, AnalyticScene, Contents, Views, psnr_of
 
-from csplat import EncodeOptions
+from csplat import EncodeOptions, SplatModel
+from csplat.encoder import PRESETS
 from csplat_tools.optimise.candidates import CandidatePool
 from csplat_tools.optimise.precision_search import PrecisionSearch
 from csplat_tools.optimise.pruning_order import PruningOrder, SimplifyOptions
@@ -18,6 +38,236 @@ from csplat_tools.optimise.sh_codings import CodingSearch
 from csplat_tools.optimise.subsets import Pruner
 from csplat_tools.optimise.target_search import TargetSearch, find_goal
 from csplat_tools.optimise.targets import Target
+
+USUAL_QUALITY = 42.0  # dB that each attribute keeps when bytes per splat are those of the scene
+QUALITIES = np.arange(24.0, 110.0, 0.2)  # dB, the qualities that a search may request
+PSNR_CAP = 99.0  # dB
+BOOKS = tuple(2**power for power in range(5, 13))
+
+
+def error_of(psnr):
+    """Return the mean squared error of a PSNR in dB."""
+    return 10.0 ** (-np.asarray(psnr, np.float64) / 10.0)
+
+
+def psnr_of(error):
+    """Return the PSNR in dB of a mean squared error."""
+    return np.minimum(-10.0 * np.log10(np.maximum(error, 1e-30)), PSNR_CAP)
+
+
+@dataclass(frozen=True)
+class Views:
+    """Views, and what they see.
+
+    Attributes:
+        offset: dB by which they see errors larger than the validation views.
+        removal_offset: dB by which they see errors of removal larger still.
+        photo_psnr: dB by which the source misses their photographs; `None`: they compare with the source.
+    """
+
+    offset: float = 0.0
+    removal_offset: float = 0.0
+    photo_psnr: float | None = None
+
+
+DECIDING = Views()
+
+
+@dataclass(frozen=True)
+class Contents:
+    """A request for a file.
+
+    Attributes:
+        options: options of the encoder, without any that is still to be chosen.
+        splats: number of splats.
+        refitted: whether the kept splats were fitted to renders of the source.
+        graded: whether splats are sorted by importance.
+        draft: whether a refit through its quantisers was left out.
+    """
+
+    options: EncodeOptions
+    splats: int
+    refitted: bool = False
+    graded: bool = False
+    draft: bool = False
+
+
+@dataclass(frozen=True)
+class AnalyticScene:
+    """A scene, and the cost of files of it.
+
+    Attributes:
+        splats, sh_degree: number of splats and SH degree of the scene.
+        unneeded: splats that no view needs.
+        removal_psnr: PSNR once half of the others are gone, dB, before a refit.
+        removal_power: exponent with which the error grows with the number of pruned splats.
+        mended: dB by which a refit reduces that error. tuned: dB that a refit through a file's quantisers gains.
+        shown: PSNR of the scene with bands up to degree 0, 1 and 2 alone, dB.
+        frame_bytes: bytes of a file without splats. splat_bytes, sh_bytes: bytes per splat at the usual quality.
+        rate: share by which bytes grow with each dB.
+        lost: dB between the quality of the attributes and that of renders.
+        grading: factor of the bytes if splats are sorted by importance.
+        index_bytes, entry_bytes: bytes of a codebook of SH, per splat and per entry.
+        book_psnr: PSNR that a codebook of one entry for 64 splats leaves, dB. book_octave: dB with twice the entries.
+        ceiling: dB that no precision exceeds.
+        plateau: from and to which quality more of it gains nothing; what is above gains as much less.
+        jump: dB that every other step of 0.6 dB of quality loses.
+        packing: factor of the bytes of a file that is not packed as tightly as possible.
+        preset_saving: a preset, and the share by which its own file is smaller than others of its quality.
+    """
+
+    splats: int = 8000
+    sh_degree: int = 3
+    unneeded: int = 0
+    removal_psnr: float = 22.0
+    removal_power: float = 3.0
+    mended: float = 8.0
+    tuned: float = 1.1
+    shown: tuple[float, ...] = (26.0, 32.0, 38.0)
+    frame_bytes: int = 900
+    splat_bytes: float = 7.0
+    sh_bytes: float = 3.5
+    rate: float = 0.045
+    lost: float = 10.0
+    grading: float = 1.0
+    index_bytes: float = 1.6
+    entry_bytes: float = 8.0
+    book_psnr: float = 42.0
+    book_octave: float = 2.5
+    ceiling: float = 97.0
+    plateau: tuple[float, float] = (0.0, 0.0)
+    jump: float = 0.0
+    packing: float = 1.008
+    preset_saving: tuple[str, float] = ("", 0.0)
+
+    def model(self) -> SplatModel:
+        """Return a model with this number of splats; their values do not matter."""
+        n, bands = self.splats, (self.sh_degree + 1) ** 2 - 1
+        return SplatModel(
+            means=np.zeros((n, 3), np.float32),
+            quats=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
+            scales=np.zeros((n, 3), np.float32),
+            opacities=np.ones(n, np.float32),
+            sh0=np.zeros((n, 3), np.float32),
+            shN=np.zeros((n, bands, 3), np.float32),
+        )
+
+    def options_of(self, contents: Contents) -> dict[str, Any]:
+        """Return what the encoder chooses if the options leave it open, under the names of a file's options."""
+        asked = contents.options
+        degree = self.sh_degree if asked.sh_degree is None else min(asked.sh_degree, self.sh_degree)
+        coding = "scalar" if asked.sh_coding == "auto" else asked.sh_coding
+        coding, degree = ("none", 0) if coding == "none" or not degree else (coding, degree)
+        entries = (asked.codebook_size or max(16, self.splats // 32)) if coding == "codebook" else 0
+        quality = asked.attribute_psnr or PRESETS[asked.preset].quality[coding == "none"]
+        return {
+            "sh_coding": coding,
+            "sh_degree": degree,
+            "codebook_size": min(entries, contents.splats),
+            "quality": quality,
+            "adaptive": asked.adaptive or 0.0,
+            "deflate_level": asked.deflate_level or 12,
+            "opacity_levels": 255,
+        } | ({"classes": {"splats": [contents.splats // 2] * 2}} if contents.graded else {})
+
+    def size_of(self, contents: Contents, quality: Any = None) -> Any:
+        """Return the size of a file in bytes, or of one file for each of some qualities."""
+        chosen = self.options_of(contents)
+        finer = np.exp(self.rate * ((chosen["quality"] if quality is None else quality) - USUAL_QUALITY))
+        kept = ((chosen["sh_degree"] + 1) ** 2 - 1) / 15.0
+        splat, book = self.splat_bytes * finer, 0.0
+        if contents.graded:
+            splat = splat * self.grading
+        if chosen["sh_coding"] == "scalar":
+            splat = splat + self.sh_bytes * kept * finer
+        elif chosen["sh_coding"] == "codebook":
+            splat, book = splat + self.index_bytes, self.entry_bytes * kept * chosen["codebook_size"]
+        packed = 1.0 if chosen["deflate_level"] == 12 else self.packing
+        saved = 1.0
+        if contents.options.attribute_psnr is None and quality is None:
+            saved -= self.preset_saving[1] * (contents.options.preset == self.preset_saving[0])
+        return np.rint((self.frame_bytes + contents.splats * splat * saved) * packed + book)
+
+    def error_of(self, contents: Contents, views: Views = DECIDING, quality: Any = None) -> Any:
+        """Return what a file errs by in some views, or one file for each of some qualities."""
+        chosen = self.options_of(contents)
+        q = np.asarray(chosen["quality"] if quality is None else quality, np.float64)
+        q = q - np.clip(q - self.plateau[0], 0.0, self.plateau[1] - self.plateau[0])
+        q = q - self.jump * (np.floor(q / 0.6) % 2)
+        gained = (self.tuned * (not contents.draft)) if contents.refitted else 0.0
+        error = error_of(q - self.lost + gained) + error_of(self.ceiling)
+        if chosen["sh_coding"] == "codebook":
+            octaves = math.log2(64.0 * chosen["codebook_size"] / contents.splats)
+            error = error + error_of(self.book_psnr + self.book_octave * octaves)
+        removed = self.removed(contents.splats, refitted=contents.refitted) / error_of(gained) ** -1.0
+        return self._seen(error + self.missing(chosen["sh_degree"]), removed, views)
+
+    def source_error(self, splats: int, sh_degree: int, views: Views, *, refitted: bool = False) -> float:
+        """Return what some splats, before any quantisation, and some bands err by."""
+        return float(self._seen(self.missing(sh_degree), self.removed(splats, refitted=refitted), views))
+
+    def removed(self, splats: Any, *, refitted: bool) -> Any:
+        """Return the error of removal if this number of splats is kept."""
+        needed = self.splats - self.unneeded
+        gone = np.maximum(0, needed - splats) / (0.5 * needed)
+        return error_of(self.removal_psnr + self.mended * refitted) * gone**self.removal_power
+
+    def missing(self, sh_degree: int) -> float:
+        """Return the error of the bands that are left out."""
+        return float(error_of(self.shown[sh_degree])) if sh_degree < self.sh_degree else 0.0
+
+    def _seen(self, error: Any, removed: Any, views: Views) -> Any:
+        seen = (error + removed / error_of(views.removal_offset)) / error_of(views.offset)
+        return seen if views.photo_psnr is None else seen + error_of(views.photo_psnr)
+
+    # by trying everything
+
+    def smallest(self, psnr: float, views: Views = DECIDING, *, no_prune: bool = False) -> float:
+        """Return the size of the smallest file of a PSNR; infinite if there is none."""
+        sizes = [np.where(psnr_of(e) >= psnr, s, np.inf).min() for s, e in self._files(views, no_prune=no_prune)]
+        return float(min(sizes))
+
+    def best(self, size_bytes: int, views: Views = DECIDING, *, no_prune: bool = False) -> float:
+        """Return the PSNR of the best file of a size; negative infinity if there is none."""
+        found = [np.where(s <= size_bytes, psnr_of(e), -np.inf).max() for s, e in self._files(views, no_prune=no_prune)]
+        return float(max(found))
+
+    def _files(self, views: Views, *, no_prune: bool) -> Iterator[tuple[Any, Any]]:
+        """Yield sizes and errors of all qualities, for every number of splats, coding and degree."""
+        shares = [1.0] if no_prune else np.arange(0.1, 1.001, 0.1)
+        for share, coding in itertools.product(shares, ("scalar", "codebook", "none")):
+            splats = round(share * self.splats)
+            degrees = (0,) if coding == "none" else range(1, self.sh_degree + 1)
+            for degree, entries in itertools.product(degrees, BOOKS if coding == "codebook" else (None,)):
+                options = EncodeOptions(sh_coding=coding, sh_degree=degree, codebook_size=entries)
+                for graded in {False, self.grading < 1.0}:
+                    one = Contents(options, splats, refitted=splats < self.splats, graded=graded)
+                    yield self.size_of(one, QUALITIES), self.error_of(one, views, QUALITIES)
+
+
+@dataclass(frozen=True, eq=False)
+class AnalyticFile:
+    """A file, as long as its size says; it cannot be read.
+
+    Attributes:
+        scene, contents: the scene and the request that it was made from.
+    """
+
+    scene: AnalyticScene
+    contents: Contents
+
+    def __len__(self) -> int:
+        return int(self.scene.size_of(self.contents))
+
+    def psnr(self, views: Views = DECIDING) -> float:
+        """Return its PSNR in some views, dB."""
+        return float(psnr_of(self.scene.error_of(self.contents, views)))
+
+    @property
+    def errors(self) -> dict[str, tuple[float, float]]:
+        """Return the largest and the mean error of its means: a power of the quality."""
+        largest = 10.0 ** (-self.scene.options_of(self.contents)["quality"] / 20.0)
+        return {"means": (largest, 0.5 * largest)}
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,51 @@
-"""The command line, run in the process of the tests."""
+"""The command line in the process of the tests, a batch worker without a process, and processes that tests start."""
 
 from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
 
 from typer.testing import CliRunner
 
 from csplat_tools.cli.app import app
+from csplat_tools.cli.batch_protocol import answer
+
+BENCHMARKS = Path(__file__).resolve().parent.parent / "tools" / "benchmarks"
 
 
 def invoke(*words):
-    """Run `csplat WORDS` and return the result, with what it printed and its exit code."""
+    """Run `csplat WORDS` and return the result, with its output and exit code."""
     return CliRunner().invoke(app, [str(word) for word in words])
+
+
+class InThisProcess:
+    """A worker of `csplat batch` without a process, which counts its runs."""
+
+    ran = 0
+    pid = None
+    lock = threading.Lock()  # commands replace standard output while they run
+
+    def ask(self, what, **values):
+        with InThisProcess.lock:
+            InThisProcess.ran += what == "run"
+            return answer({"ask": what, **json.loads(json.dumps(values))})
+
+    def close(self):
+        pass
+
+
+def bench(topic, *words, check=True):
+    """Run `python -m csplat_bench.TOPIC WORDS` in a process of its own."""
+    path = os.pathsep.join(filter(None, (str(BENCHMARKS), os.environ.get("PYTHONPATH"))))
+    command = [sys.executable, "-m", f"csplat_bench.{topic}", *map(str, words)]
+    return subprocess.run(command, check=check, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path})
+
+
+def heed_interrupts():
+    """Restore SIGINT in a child process: a shell that runs the tests in the background makes it ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -204,9 +204,9 @@ def _searched(once, name: str, **goal: float):
 
 @pytest.fixture(scope="session")
 def file_runs(once, tmp_path_factory):
-    """Runs of `csplat train` to files, see file_runs.py."""
+    """Runs of `csplat train` to files, see trained.py."""
     pytest.importorskip("numba", reason="training wants the extra [render]")
     pytest.importorskip("scipy", reason="data sets want the extra [render]")
-    from file_runs import FileRuns
+    from trained import FileRuns
 
     return once("file runs", lambda: FileRuns(tmp_path_factory.mktemp("runs")))

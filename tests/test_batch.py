@@ -10,8 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from batch_worker import InThisProcess
-from child_processes import heed_interrupts
+from command_line import InThisProcess, heed_interrupts
 from typer.testing import CliRunner
 
 import csplat

@@ -19,8 +19,8 @@ pytest.importorskip("scipy", reason="data sets want the extra [render]")
 pytest.importorskip("matplotlib", reason="plots want the extra [render]")
 pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
 
-from child_processes import bench
 from chromium import absent
+from command_line import bench
 from oracle import cropped, difference
 from posed_sets import write_blender
 from typer.testing import CliRunner

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from child_processes import heed_interrupts
+from command_line import heed_interrupts
 from typer.main import get_command
 from typer.testing import CliRunner
 

@@ -1,20 +1,29 @@
-"""The manifest by its schema; which features and clauses the vectors reach."""
+"""The manifest, documents for implementers, and the features and clauses that vectors reach."""
+
+from __future__ import annotations
 
 import fnmatch
 import hashlib
 import json
+import math
 import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jsonschema
+import numpy as np
 import pytest
 
 from csplat import _spec
-from csplat_authoring.clauses import clause_ids
+from csplat_authoring.clauses import UNCOVERED, clause_ids, clause_map, replace_generated
+from csplat_authoring.example import annex, example_scene
 from csplat_authoring.recipes import sound_recipes
-from csplat_conformance.manifest import VECTORS
+from csplat_authoring.reference import expected
+from csplat_conformance.declared_bounds import Source
+from csplat_conformance.encoders.reference_ply import PlyRows, source_of_rows
+from csplat_conformance.manifest import VECTORS, load
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
@@ -73,8 +82,6 @@ def test_files_and_pictures_are_those_of_the_manifest():
 
 
 # Clauses -------------------------------------------------------------------------------------------
-
-
 def clauses_with_codes():
     """Yield clause and error code of each requirement that names one: the last code before the id."""
     body = TEXT.split("## 3 Terms")[1].split("## A Worked example")[0]
@@ -98,20 +105,18 @@ def test_every_clause_that_can_be_broken_is_broken_by_a_vector():
 
 
 # The guide -----------------------------------------------------------------------------------------
-
-
-GUIDE = (ROOT / "conformance" / "IMPLEMENTERS.md").read_text(encoding="utf-8")
+GUIDE_AS_WRITTEN = (ROOT / "conformance" / "IMPLEMENTERS.md").read_text(encoding="utf-8")
 
 
 def test_the_guide_names_vectors_that_exist():
-    names = {*re.findall(r"`((?:valid|extreme|invalid)/[a-z0-9_]+)`", GUIDE)}
+    names = {*re.findall(r"`((?:valid|extreme|invalid)/[a-z0-9_]+)`", GUIDE_AS_WRITTEN)}
 
     assert names
     assert set() == names - {entry["name"] for entry in MANIFEST["vectors"]}
 
 
 def test_patterns_of_the_guide_find_vectors():
-    patterns = {*re.findall(r"'?((?:valid|extreme)/[a-z0-9_]*\*)'?", GUIDE)}
+    patterns = {*re.findall(r"'?((?:valid|extreme)/[a-z0-9_]*\*)'?", GUIDE_AS_WRITTEN)}
     names = [entry["name"] for entry in MANIFEST["vectors"]]
 
     assert patterns
@@ -139,20 +144,18 @@ def test_the_guide_walks_through_every_chapter_of_clauses():
         "QUA",
     }
 
-    assert [] == [chapter for chapter in chapters - elsewhere if chapter not in GUIDE]
+    assert [] == [chapter for chapter in chapters - elsewhere if chapter not in GUIDE_AS_WRITTEN]
 
 
 def test_every_level_and_status_is_explained():
     from csplat_conformance.conformance_report import Status
 
     words = {str(status) for status in Status} - {"skipped"}
-    assert [] == [word for word in words if word not in GUIDE]
-    assert all(f"L{level}" in GUIDE for level in (1, 2, 3, 4))
+    assert [] == [word for word in words if word not in GUIDE_AS_WRITTEN]
+    assert all(f"L{level}" in GUIDE_AS_WRITTEN for level in (1, 2, 3, 4))
 
 
 # Features ------------------------------------------------------------------------------------------
-
-
 def blocks(scene):
     """Yield attribute and block of everything in a scene, escapes too."""
     for tile in scene.tiles:
@@ -224,3 +227,173 @@ def test_vectors_and_annexes_are_those_of_the_recipes():
     words = [sys.executable, "-m", "csplat_authoring", "--check"]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (0, "") == (done.returncode, done.stdout + done.stderr)
+
+
+GUIDE = (ROOT / "conformance" / "IMPLEMENTERS.md").read_text(encoding="utf-8").replace("−", "-")
+SPEC = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
+LEVELS, ALPHAS, MEAN_STEP, SCALE_STEP, SH0_STEP = 127, 63, 0.01, 1 / 16, 1 / 64
+
+
+@pytest.fixture(scope="module")
+def spec():
+    """The spec's pseudo-code."""
+    names = {"float64": np.float64, "float32": np.float32, "sqrt": np.sqrt, "ldexp": math.ldexp, "floor": math.floor}
+    for block in re.findall(r"```python spec-test\n(.*?)```", SPEC, re.DOTALL):
+        exec(block, names)  # noqa: S102 - the text is the project's own
+    return SimpleNamespace(**names)
+
+
+@pytest.fixture(scope="module")
+def row():
+    """A function: the numbers of the row of the example that begins so, a list for each splat."""
+    part = GUIDE.split("### Stating errors")[1].split("So SERR states")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in part.splitlines() if line[:1] == "|"]
+    table = {cells[0]: [re.findall(r"-?\d+(?:\.\d+)?", cell) for cell in cells[1:]] for cells in rows}
+
+    def numbers(name):
+        return [[float(number) for number in cell] for cell in table[name]]
+
+    return numbers
+
+
+@pytest.fixture(scope="module")
+def source(row) -> Source:
+    columns = {
+        "means": row("x, y, z"),
+        "quats": row("rot_0 … rot_3"),
+        "scales": row("scale_0 … scale_2"),
+        "logits": [value for (value,) in row("opacity")],
+        "sh0": row("f_dc_0 … f_dc_2"),
+    }
+    arrays = {name: np.array(values, np.float32) for name, values in columns.items()}
+    return source_of_rows(PlyRows(**arrays, shN=np.zeros((2, 0, 3), np.float32)))
+
+
+@pytest.fixture(scope="module")
+def file(spec, row):
+    """Decode the integers of the guide's example with the functions of the guide."""
+    colours = [spec.rgb_from_ycocg(*map(int, one), 0) for one in row("sh0, integers Y, Co, Cg")]
+    lattice = lambda rows, step: np.array(  # noqa: E731
+        [[spec.lattice_value(int(n), step, 0) for n in one] for one in rows], np.float32
+    )
+    return SimpleNamespace(
+        origin=np.zeros(3),
+        means=lattice(row("means, integers"), MEAN_STEP),
+        scales=lattice(row("scales, integers"), SCALE_STEP),
+        quats=np.array([spec.quat(*map(int, one), LEVELS) for one in row("quats, integers")]),
+        opacities=[spec.opacity_square(int(q), ALPHAS) for (q,) in row("opacities, integer")],
+        sh0=lattice(colours, SH0_STEP),
+    )
+
+
+def near(expected, found):
+    np.testing.assert_allclose(np.array(found, np.float64), np.array(expected), rtol=0, atol=6e-8)
+
+
+def test_the_source_is_what_the_rows_say(row, source):
+    near(row("quaternion of the source"), source.quats)
+    near(row("alpha of the source"), source.opacities[:, None])
+
+
+def test_the_integers_are_those_of_annex_e(spec, row, source):
+    for j in range(2):
+        turned = spec.with_w_largest(*map(float, source.quats[j]))
+        near(row("with w largest")[j] or row("quaternion of the source")[j], turned)
+        assert row("quats, integers")[j] == spec.quat_integers(turned, LEVELS)
+        steps = [float(value) / SH0_STEP for value in source.sh0[j]]
+        assert row("sh0, integers Y, Co, Cg")[j] == list(spec.ycocg_from_rgb(*steps, 0))
+        assert row("means, integers")[j] == [math.floor(float(v) / MEAN_STEP + 0.5) for v in source.means[j]]
+        assert row("scales, integers")[j] == [math.floor(float(v) / SCALE_STEP + 0.5) for v in source.scales[j]]
+        assert row("opacities, integer")[j] == [math.floor(math.sqrt(float(source.opacities[j])) * ALPHAS + 0.5)]
+
+
+def test_the_values_are_what_a_decoder_gives(row, file):
+    near(row("decoded quaternion"), file.quats)
+    near(row("decoded alpha"), [[alpha] for alpha in file.opacities])
+    near(row("decoded sh0"), file.sh0)
+
+
+def test_the_code_of_the_guide_states_what_the_guide_says(row, source, file):
+    code = re.search(r"### Stating errors.*?```python\n(.*?)```", GUIDE, re.DOTALL)[1]
+    names = {"source": source, "file": file}
+    exec(code, names)  # noqa: S102 - the text is the project's own
+    for j in range(2):
+        for name, values in names["errors"](j, j):
+            near(row(f"error of {name}")[j], values)
+    part = GUIDE.split("So SERR states")[1].split("## ")[0]
+    table = dict(re.findall(r"^\| (\w+) \| ([\d.]+ \| [\d.]+) \|", part, re.MULTILINE))
+    for name, pair in names["stated"]([0, 1]).items():
+        near([float(number) for number in table[name].split(" | ")], pair)
+
+
+CLAUSES = clause_ids(TEXT)
+COVERED = {clause for vector in load() for clause in vector.clauses}
+
+
+def worked_example_rows():
+    part = TEXT.split("<!-- begin generated: worked example -->")[1].split("<!-- end generated -->")[0]
+    return re.findall(r"^\| (\d+) \| ((?:[0-9A-F]{2} ?)+) \|", part, re.MULTILINE)
+
+
+def test_clause_ids_are_unique():
+    assert len(set(CLAUSES)) == len(CLAUSES)
+
+
+def test_every_must_ends_in_a_clause_id():
+    # A paragraph that demands something without an id could not be cited by an error.
+    body = TEXT.split("## 3 Terms")[1].split("## 10 Versioning")[0]
+    body = re.sub(r"```.*?```", "", body, flags=re.DOTALL)
+    sentences = re.findall(r"[^.\n|][^|]*?MUST(?: NOT)?\b[^|]*?(?:\[[A-Z]{3}-\d+\]|\n\n)", body)
+
+    assert [] == [sentence for sentence in sentences if not sentence.endswith("]")]
+
+
+def test_every_clause_is_covered_or_excused():
+    assert [] == [clause for clause in CLAUSES if clause not in COVERED and clause not in UNCOVERED]
+
+
+def test_vectors_name_clauses_that_exist():
+    assert set() == COVERED - set(CLAUSES)
+
+
+def test_excuses_are_needed_and_name_clauses_that_exist():
+    assert [] == [clause for clause in UNCOVERED if clause in COVERED or clause not in CLAUSES]
+
+
+@pytest.mark.parametrize("clause", UNCOVERED)
+def test_an_excuse_that_points_at_a_test_finds_the_clause_there(clause):
+    for path in re.findall(r"`(tests/\w+\.py)`", UNCOVERED[clause]):
+        assert clause in (ROOT / path).read_text(encoding="utf-8")
+
+
+def test_the_worked_example_is_its_file_byte_for_byte():
+    rows = worked_example_rows()
+    data = b"".join(bytes.fromhex(digits) for _, digits in rows)
+
+    assert (VECTORS / "valid" / "worked_example.csplat").read_bytes() == data
+
+
+def test_the_worked_example_states_the_right_offsets():
+    at = 0
+    for offset, digits in worked_example_rows():
+        assert at == int(offset)
+        at += len(bytes.fromhex(digits))
+
+
+def test_the_worked_example_explains_the_right_values():
+    floats = {name: array.tolist() for name, array in expected(example_scene()).floats.items()}
+    half = 0.7071067690849304  # the binary32 that the text writes as 0.70710677
+
+    assert [1.0, 0.25] == floats["opacities"]
+    assert [[-3.0, -3.0, -3.0], [-2.0, -3.0, -4.0]] == floats["scales"]
+    assert [[1.0, 0.0, 0.0, 0.0], [half, 0.0, 0.0, half]] == floats["quats"]
+    assert [[-0.5, 0.5, 4.0], [0.75, 0.0, 4.25]] == floats["means"]
+    assert [[2.0, 1.0, 1.5], [-0.5, -0.5, -0.5]] == floats["sh0"]
+    zero, red, blue = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -0.25]
+    assert [[red, zero, zero], [red, zero, blue]] == floats["shN"]
+
+
+def test_annexes_are_what_the_recipes_make():
+    assert TEXT == replace_generated(
+        replace_generated(TEXT, "worked example", annex()), "clause map", clause_map(TEXT, load())
+    )

@@ -1,12 +1,35 @@
-"""Damage that no checksum was repaired for: every prefix and every flipped bit of small files is refused."""
+"""Damaged files, fields, streams and JSON texts: each is refused by a typed error with code, offset and clause."""
+
+from __future__ import annotations
+
+import os
+import random
+import struct
+import tracemalloc
+import zlib
 
 import pytest
 
 import csplat
 from csplat import _spec
-from csplat.decoder import read_header
+from csplat.decoder import (
+    Limits,
+    decode,
+    decode_integers,
+    decode_scene,
+    read_cameras,
+    read_declared_bounds,
+    read_header,
+    read_metadata,
+    read_options,
+)
+from csplat.decoder.container import Cursor
+from csplat.decoder.entropy import read_stream
+from csplat.decoder.metadata import parse_json
+from csplat.errors import CsplatError, FormatError, LimitError, UnsupportedError
 from csplat_authoring.builder import build, chunk_records, repair
-from csplat_authoring.samples import rich_scene
+from csplat_authoring.samples import rich_scene, scene
+from csplat_authoring.scene import Chunk
 from csplat_conformance.manifest import VECTORS
 
 SMALL = (VECTORS / "valid" / "worked_example.csplat").read_bytes()
@@ -84,3 +107,349 @@ def test_trailing_bytes_are_refused(extra):
 @pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
 def test_any_buffer_is_decoded(kind):
     assert 2 == len(csplat.decode(kind(SMALL)))
+
+
+BUILT = build(rich_scene())
+RICH_DATA = BUILT.data
+SMALL_LIMITS = Limits(bytes=50_000_000, json_bytes=100_000)
+
+
+def refusal(data, **arguments) -> CsplatError:
+    with pytest.raises((FormatError, UnsupportedError, LimitError)) as caught:
+        decode(data, **arguments)
+    error = caught.value
+    assert error.clause
+    assert 0 <= error.offset <= len(data)
+    return error
+
+
+def test_short_data_that_is_no_beginning_of_a_file():
+    assert "E_MAGIC" == refusal(b"ply\n").code
+    assert "E_TRUNCATED" == refusal(b"").code
+
+
+def test_the_version_error_names_both_versions():
+    data = bytearray(RICH_DATA)
+    data[8:12] = struct.pack("<HH", 3, 7)
+    error = refusal(data)
+    assert "E_VERSION" == error.code
+    assert "3.7" in str(error)
+    assert "0.2" in str(error)
+
+
+def test_a_crc_error_says_what_was_found_and_computed():
+    data = bytearray(RICH_DATA)
+    data[16] ^= 1
+    computed = zlib.crc32(data[:28])
+    stored = int.from_bytes(data[28:32], "little")
+    assert f"E_CRC at byte 28 (HDR-3): found {stored:#010x}, computed {computed:#010x}" == str(refusal(data))
+
+
+def test_huge_counts_in_a_small_index_cost_nothing():
+    for name in ("tile_count", "directory_count", "codebook_count", "extra_count", "attribute_count"):
+        wide = {"tile_count": 2**32 - 1, "attribute_count": 255}.get(name, 65535)
+        error = refusal(BUILT.patched({f"index.{name}": wide}))
+        assert ("E_INDEX", "IDX-2") == (error.code, error.clause)
+
+
+def test_a_splat_count_that_the_tiles_do_not_hold():
+    assert "IDX-7" == refusal(BUILT.patched({"index.splat_count": 2**63})).clause
+
+
+_EXTREMES = {
+    "B": (0, 1, 2, 127, 128, 255),
+    "H": (0, 1, 255, 32768, 65535),
+    "I": (0, 1, 2**24, 2**31, 2**32 - 1),
+    "Q": (0, 1, 2**53, 2**63, 2**64 - 1),
+    "h": (-32768, -1100, -1, 1, 1100, 32767),
+    "i": (-(2**31), -(2**22) - 1, -1, 1, 2**22, 2**31 - 1),
+    "q": (-(2**63), -(2**53) - 1, -(2**50), -1, 1, 2**50, 2**53, 2**63 - 1),
+    "f": (0.0, -0.0, -1.0, 1e-45, 3e38, float("inf"), float("nan")),
+    "d": (0.0, -0.0, -1.0, 5e-324, 2.0**-1022, 1e308, float("inf"), float("nan")),
+}
+
+
+def extremes(field):
+    """Yield what a field's bytes may become, its first component or its last at its extremes."""
+    now = RICH_DATA[field.offset : field.offset + field.size]
+    if field.format.endswith("s"):
+        yield from (bytes(field.size), b"\xff" * field.size)
+        return
+    values = struct.unpack(field.format, now)
+    for i in sorted({0, len(values) - 1}):
+        code = field.format[-1]
+        for value in _EXTREMES[code]:
+            yield struct.pack(field.format, *values[:i], value, *values[i + 1 :])
+
+
+@pytest.mark.slow
+def test_every_field_at_its_extremes_is_refused_or_decoded_within_limits():
+    # The first and the last place of each field of a structure.
+    places = {}
+    for name, field in BUILT.fields.items():
+        if not name.endswith("crc"):
+            places.setdefault((field.structure, name.rpartition(".")[2]), []).append(name)
+    tried = 0
+    first = {names[0] for names in places.values()}
+    for name in first | {names[-1] for names in places.values()}:
+        # Every other value at the last place of a field.
+        for value in [*extremes(BUILT.fields[name])][:: 1 if name in first else 2]:
+            check_one(BUILT.patched({name: value}))
+            tried += 1
+    assert tried > 600
+
+
+def check_one(data: bytes) -> None:
+    """Decode both ways: no error but ours, and both ways agree."""
+    errors = [error_of(function, data) for function in (decode, decode_integers)]
+    assert (errors[0] is None) == (errors[1] is None)
+    for error in filter(None, errors):
+        assert error.clause
+        assert 0 <= error.offset <= len(data)
+
+
+def error_of(function, data: bytes) -> FormatError | UnsupportedError | LimitError | None:
+    try:
+        function(data, limits=SMALL_LIMITS, threads=1)
+    except (FormatError, UnsupportedError, LimitError) as error:
+        return error
+    return None
+
+
+@pytest.mark.slow
+def test_mutations_with_all_checksums_repaired():
+    rng = random.Random(0)  # noqa: S311 - no secrets here
+    for _ in range(int(os.environ.get("CSPLAT_MUTATIONS", "250"))):
+        data = bytearray(RICH_DATA)
+        for _ in range(rng.choice((1, 1, 2, 4))):
+            at = rng.randrange(_spec.HEADER_SIZE, len(data) - 8)
+            if rng.random() < 0.5:
+                data[at] ^= 1 << rng.randrange(8)
+            elif rng.random() < 0.6:
+                data[at] = rng.choice((0, 1, 2, 3, 4, 5, 127, 128, 255))
+            else:
+                data[at : at + 4] = rng.choice((b"\xff" * 4, bytes(4), rng.randbytes(4)))
+        check_one(repair(bytes(data), BUILT.records))
+
+
+def test_the_header_reader_refuses_no_less_of_the_index():
+    for name in ("index.sh_degree", "index.scene_flags", "index.axes"):
+        with pytest.raises((FormatError, UnsupportedError)):
+            read_header(BUILT.patched({name: b"\7\7\7" if name.endswith("axes") else 255}))
+
+
+STORED, DEFLATE = _spec.CODER_STORED, _spec.CODER_DEFLATE
+RUNS = bytes([_spec.TRANSFORM_RUN_LENGTH, 0, 0, 0])
+NONE = bytes(4)
+
+
+def deflate(data: bytes) -> bytes:
+    packer = zlib.compressobj(9, zlib.DEFLATED, -15)
+    return packer.compress(data) + packer.flush()
+
+
+def read(
+    coded=b"abcd",
+    *,
+    width=1,
+    coder=STORED,
+    transforms=NONE,
+    reserved=0,
+    count=4,
+    packed=4,
+    coded_size=None,
+    wanted=4,
+    width_max=4,
+    **arguments,
+):
+    head = _spec.StreamHead(
+        width, coder, transforms, reserved, count, packed, len(coded) if coded_size is None else coded_size
+    )
+    data = memoryview(b"...." + _spec.pack_stream_head(head) + coded)
+    cursor = Cursor(data, 4, len(data), "TLE-3")
+    return read_stream(cursor, wanted, width_max, **arguments)
+
+
+def test_a_stored_stream():
+    assert list(b"abcd") == read().tolist()
+
+
+def test_a_deflated_stream_of_three_byte_elements_is_signed():
+    data = b"\xff\xff\xff\x00\x00\x80"
+    expected = [-1, -(2**23)]
+    assert expected == read(deflate(data), width=3, coder=DEFLATE, count=2, packed=6, wanted=2, signed=True).tolist()
+
+
+@pytest.mark.parametrize(
+    ("fields", "clause", "place"),
+    [
+        ({"count": 3}, "STR-1", "count"),
+        ({"count": 0, "packed": 0}, "STR-1", "count"),
+        ({"count": 2**32 - 1, "packed": 2**32 - 1}, "STR-1", "count"),
+        ({"width": 0}, "STR-2", "width"),
+        ({"width": 5, "packed": 20}, "STR-2", "width"),
+        ({"transforms": b"\2\1\0\0"}, "STR-3", "transforms"),
+        ({"transforms": b"\1\1\0\0"}, "STR-3", "transforms"),
+        ({"transforms": b"\1\0\2\0"}, "STR-3", "transforms"),
+        ({"packed": 5}, "STR-4", "packed_size"),
+        ({"packed": 2**32 - 1}, "STR-4", "packed_size"),
+        ({"transforms": RUNS, "packed": 4}, "STR-5", "packed_size"),
+        ({"transforms": RUNS, "packed": 0}, "STR-5", "packed_size"),
+        ({"transforms": RUNS, "packed": 15}, "STR-5", "packed_size"),
+        ({"coded_size": 5}, "STR-6", "coded_size"),
+        ({"coded_size": 2**32 - 1}, "STR-6", "coded_size"),
+        ({"reserved": 1}, "RES-1", "reserved_0"),
+    ],
+)
+def test_heads_that_contradict_their_place(fields, clause, place):
+    with pytest.raises(FormatError) as caught:
+        read(**fields)
+    assert (clause, 4 + _spec.STREAM_HEAD_OFFSETS[place]) == (caught.value.clause, caught.value.offset)
+
+
+@pytest.mark.parametrize(
+    ("fields", "clause"), [({"coder": 2}, "RES-2"), ({"coder": 255}, "RES-2"), ({"transforms": b"\5\0\0\0"}, "RES-2")]
+)
+def test_what_this_version_lacks(fields, clause):
+    with pytest.raises(UnsupportedError, match=clause):
+        read(**fields)
+
+
+def test_a_head_that_is_cut():
+    with pytest.raises(FormatError, match="TLE-3"):
+        read_stream(Cursor(memoryview(bytes(19)), 0, 19, "TLE-3"), 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("fields", "clause"),
+    [
+        ({"coded": b"abc"}, "COD-1"),
+        ({"coded": b"abcde"}, "COD-1"),
+        ({"coder": DEFLATE, "coded": b""}, "COD-2"),
+        ({"coder": DEFLATE, "coded": b"\xff\xff"}, "COD-2"),
+        ({"coder": DEFLATE, "coded": deflate(b"abc")}, "COD-2"),
+        ({"coder": DEFLATE, "coded": deflate(b"abcde")}, "COD-2"),
+        ({"coder": DEFLATE, "coded": deflate(b"abcd")[:-1]}, "COD-2"),
+        ({"coder": DEFLATE, "coded": deflate(b"abcd") + b"\0"}, "COD-2"),
+        ({"coder": DEFLATE, "coded": deflate(b"abcd") * 2}, "COD-2"),
+        ({"coder": DEFLATE, "coded": zlib.compress(b"abcd")}, "COD-2"),
+        ({"coded": b"a\1\1", "transforms": RUNS, "packed": 3}, "TRF-1"),
+        ({"coded": b"a\2\0", "transforms": RUNS, "packed": 3}, "TRF-1"),
+    ],
+)
+def test_coded_bytes_that_do_not_give_what_they_should(fields, clause):
+    with pytest.raises(FormatError, match=rf"E_CODER at byte \d+ \({clause}\)"):
+        read(**fields)
+
+
+def test_inflating_stops_at_the_announced_size():
+    bomb = deflate(bytes(20_000_000))
+    tracemalloc.start()
+    with pytest.raises(FormatError, match="more than 4 bytes"):
+        read(bomb, coder=DEFLATE)
+    assert tracemalloc.get_traced_memory()[1] < 5_000_000
+    tracemalloc.stop()
+
+
+def test_a_text_that_exceeds_the_budget():
+    with pytest.raises(LimitError, match=r"E_LIMIT at byte 12 \(STR-8\)"):
+        read(count=2**32 - 1, packed=2**32 - 1, wanted=None, count_max=10)
+
+
+def test_the_longest_runs():
+    assert 0 == read(b"\0\xff\xff", transforms=RUNS, count=65536, packed=3, wanted=65536).max()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"1",
+        b"{} x",
+        b"\xef\xbb\xbf{}",
+        b'{"a": NaN}',
+        b'{"a": Infinity}',
+        b'{"a": -Infinity}',
+        b'{"a": 1e999}',
+        b'{"a": ' + b"9" * 5000 + b"}",
+        b'{"a": 1, "a": 2}',
+        b'{"b": {"a": 1, "a": 2}}',
+        b'{"a": "\xff"}',
+        b'{"a": "\\ud800"}',
+        b'{"\\udfff": 1}',
+        b'{"a": "\x01"}',
+        b'{"a": 01}',
+        b"{'a': 1}",
+        b'{"a": ' + b"[" * 64 + b"]" * 64 + b"}",
+        b'{"a": ' + b"[" * 100_000 + b"]" * 100_000 + b"}",
+        b'{"a":' * 5000 + b"1" + b"}" * 5000,
+    ],
+    ids=lambda text: repr(text[:16]),
+)
+def test_what_is_not_strict_json_is_refused(text):
+    with pytest.raises(FormatError, match=r"E_JSON at byte 99 \(JSN-1\)"):
+        parse_json(text, dict, 99)
+
+
+def test_what_is_strict_json_is_read():
+    deep = b'{"a": ' + b"[" * 63 + b"]" * 63 + b"}"
+    assert "a" in parse_json(deep, dict, 0)
+    assert {"a": "😀", "b": 10**200} == parse_json(b'{"a": "\\ud83d\\ude00", "b": 1' + b"0" * 200 + b"}", dict, 0)
+    with pytest.raises(FormatError, match="an array of objects"):
+        parse_json(b"[1]", list, 0)
+
+
+def test_the_three_texts_reach_their_places():
+    data = build(
+        scene(
+            chunks=(
+                Chunk(_spec.CHUNK_METADATA, b'{"licence": "CC0"}'),
+                Chunk(_spec.CHUNK_CAMERAS, b'[{"W": 2}]'),
+                Chunk(_spec.CHUNK_OPTIONS, b'{"preset": "small"}'),
+            )
+        )
+    ).data
+    model = decode(data)
+    assert ({"licence": "CC0"}, [{"W": 2}]) == (model.metadata, model.cameras)
+    assert ({"licence": "CC0"}, [{"W": 2}]) == (read_metadata(data), read_cameras(data))
+    assert {"preset": "small"} == read_options(data) == decode_scene(data).options
+    assert read_declared_bounds(data) is None
+
+
+def stated(source_count=2, pruned_count=0, flags=0, records=()):
+    head = _spec.pack_stated_errors_head(_spec.StatedErrorsHead(source_count, pruned_count, 0, flags, len(records)))
+    body = [
+        _spec.pack_stated_error_record(_spec.StatedErrorRecord(measure, 0, 0, 0, largest, rms))
+        for measure, largest, rms in records
+    ]
+    return build(scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, payload=head + b"".join(body)),))).data
+
+
+def test_stated_errors():
+    data = stated(source_count=5, pruned_count=3, flags=1, records=((1, 0.5, 0.25), (4, 1.0, 1.7)))
+    errors = read_declared_bounds(data)
+    assert errors == decode_scene(data).declared_bounds
+    assert (5, 3, True) == (errors.source_count, errors.pruned_count, errors.refitted)
+    assert [("means", 0.5, 0.25), ("sh0", 1.0, 1.7)] == [(e.measure, e.max, e.rms) for e in errors.records]
+
+
+@pytest.mark.parametrize(
+    ("fields", "clause"),
+    [
+        ({"records": ((0, 1.0, 1.0),)}, "SER-1"),
+        ({"records": ((8, 1.0, 1.0),)}, "SER-1"),
+        ({"records": ((2, 1.0, 1.0), (2, 1.0, 1.0))}, "SER-1"),
+        ({"records": ((1, 1.0, 1.1),)}, "SER-2"),
+        ({"records": ((4, 1.0, 1.8),)}, "SER-2"),
+        ({"records": ((1, float("nan"), 0.0),)}, "SER-2"),
+        ({"records": ((1, float("inf"), 0.0),)}, "SER-2"),
+        ({"records": ((1, 1.0, -1.0),)}, "SER-2"),
+        ({"pruned_count": 1}, "SER-4"),
+        ({"flags": 2}, "RES-1"),
+    ],
+)
+def test_stated_errors_that_cannot_be(fields, clause):
+    with pytest.raises(FormatError, match=clause):
+        decode(stated(**fields))

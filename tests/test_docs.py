@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from batch_worker import InThisProcess
+from command_line import InThisProcess
 from typer.testing import CliRunner
 
 import csplat

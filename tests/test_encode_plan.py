@@ -1,8 +1,9 @@
-"""Plans of files and the tiles of a scene."""
+"""Plans of files, tiles of a scene, and streams read back by the definition of the transforms in the spec."""
 
 from __future__ import annotations
 
 import re
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +11,11 @@ import numpy as np
 import pytest
 from checked import measure_errors
 
-from csplat import EncodeOptions, decode, encode
+from csplat import EncodeOptions, _spec, decode, encode
 from csplat.decoder import decode_scene, read_declared_bounds, read_options
 from csplat.encoder import EncodePlan, Origin, encode_tiles, encode_with_report, fix_quantisation
 from csplat.encoder.coding_parameters import Lattice
+from csplat.encoder.entropy import DeflateSettings, signed_stream, unsigned_stream
 from csplat.encoder.quantisation import lattice_step, quantise_means
 from csplat.encoder.tiling import cut_tiles
 from csplat.errors import InputError
@@ -23,6 +25,7 @@ from csplat_tools.inspect.file_description import describe_file
 ROOT = Path(__file__).resolve().parent.parent
 GEOMETRY = ("means", "quats", "scales", "opacities")
 COLOURS = ("sh0", "shN")
+
 OPTIONS = {
     "plain": {},
     "tiles": {"tile_splats": 50},
@@ -163,8 +166,6 @@ def test_values_that_were_not_touched_freeze_to_the_same_splats(make_model):
 
 
 # absent bands
-
-
 def sparse_model(source, share):
     """Bands 2 and 3 of some splats are zero."""
     shN = 0.1 * source.shN
@@ -259,3 +260,97 @@ def test_magnitudes_from_denormal_to_huge_are_cut_apart():
     for tile in tiles:
         step = lattice_step(1e-3, tile.exponent)
         assert np.isfinite(quantise_means(means[tile.rows].T.copy(), step)).all()
+
+
+def read(stream: bytes) -> tuple[_spec.StreamHead, list[int]]:
+    """Undo a stream as specified in section 6, one integer at a time."""
+    head = _spec.unpack_stream_head(stream)
+    coded = stream[_spec.STREAM_HEAD_SIZE :]
+    assert head.coded_size == len(coded)
+    packed = {_spec.CODER_STORED: lambda: coded, _spec.CODER_DEFLATE: lambda: zlib.decompress(coded, -15)}[head.coder]()
+    assert head.packed_size == len(packed)
+    transforms = [step for step in head.transforms if step]
+    assert transforms == sorted(set(transforms))
+    if _spec.TRANSFORM_RUN_LENGTH in transforms:
+        runs = len(packed) // 3
+        lengths = [1 + packed[runs + i] + 256 * packed[2 * runs + i] for i in range(runs)]
+        packed = b"".join(bytes([packed[i]]) * lengths[i] for i in range(runs))
+    n, w = head.count, head.width
+    assert n * w == len(packed)
+    if _spec.TRANSFORM_BYTE_PLANES in transforms:
+        values = [sum(packed[plane * n + i] << (8 * plane) for plane in range(w)) for i in range(n)]
+    else:
+        values = [int.from_bytes(packed[i * w : i * w + w], "little") for i in range(n)]
+    if _spec.TRANSFORM_ZIGZAG in transforms:
+        values = [v >> 1 if v % 2 == 0 else 2 ** (8 * w) - 1 - (v >> 1) for v in values]
+    if _spec.TRANSFORM_DELTA in transforms:
+        for i in range(1, n):
+            values[i] = (values[i] + values[i - 1]) % 2 ** (8 * w)
+    return head, values
+
+
+RNG = np.random.default_rng(0)
+
+UNSIGNED = {
+    "one": np.array([7]),
+    "zeros": np.zeros(3000, np.int64),
+    "long runs": np.repeat(RNG.integers(0, 255, 2), 70_000),
+    "bytes": RNG.integers(0, 255, 500),
+    "two bytes": RNG.integers(0, 65535, 500),
+    "three bytes": RNG.integers(0, 2**24, 500),
+    "seven bytes": RNG.integers(0, 2**51, 500),
+    "ascending": np.sort(RNG.integers(0, 2**48, 500)),
+}
+
+
+@pytest.mark.parametrize("library", ["libdeflate", "zlib"])
+@pytest.mark.parametrize("mode", ["plain", "delta", "signed_delta"])
+@pytest.mark.parametrize("name", UNSIGNED)
+def test_unsigned_streams_read_back(name, mode, library):
+    values = UNSIGNED[name].astype(np.int64)
+    stream = unsigned_stream(
+        values, DeflateSettings(6, library), delta=mode == "delta", signed_delta=mode == "signed_delta"
+    )
+    assert values.tolist() == read(stream)[1]
+
+
+@pytest.mark.parametrize("level", [1, 6, 12])
+@pytest.mark.parametrize("dtype", [np.int8, np.int16, np.int32])
+def test_signed_streams_read_back_at_every_width(dtype, level):
+    limits = np.iinfo(dtype)
+    values = np.array([0, 1, -1, limits.min, limits.max, 5, -5] * 50, dtype)
+    head, read_back = read(signed_stream(values, DeflateSettings(level)))
+    assert np.dtype(dtype).itemsize == head.width
+    assert [int(v) % 2 ** (8 * head.width) for v in values] == read_back
+
+
+def test_elements_are_no_wider_than_the_largest_needs():
+    assert 1 == read(signed_stream(np.array([-128, 127], np.int32), DeflateSettings()))[0].width
+    assert 2 == read(signed_stream(np.array([-129], np.int32), DeflateSettings()))[0].width
+    assert 3 == read(unsigned_stream(np.array([1 << 16]), DeflateSettings()))[0].width
+
+
+def test_a_constant_plane_costs_a_few_bytes():
+    assert len(unsigned_stream(np.full(65536, 200), DeflateSettings(1))) <= _spec.STREAM_HEAD_SIZE + 3
+
+
+#: As the SH of splats of which some have none: noise, cut by runs of zeros.
+NOISE = RNG.integers(-20, 20, 60_000).astype(np.int8)
+CUT = np.where(np.repeat(RNG.random(20_000) < 0.6, 3), np.int8(0), NOISE)
+
+
+def test_short_runs_are_written_as_runs_where_that_is_smaller():
+    pairs = np.repeat(RNG.integers(-100, 100, 30_000).astype(np.int8), RNG.integers(1, 4, 30_000))
+    assert _spec.TRANSFORM_RUN_LENGTH in read(signed_stream(pairs, DeflateSettings(12)))[0].transforms
+    assert _spec.TRANSFORM_RUN_LENGTH not in read(signed_stream(NOISE, DeflateSettings(12)))[0].transforms
+
+
+def test_the_lowest_level_finds_runs_and_no_matches_in_noise():
+    assert len(signed_stream(CUT, DeflateSettings(1))) < 1.15 * len(signed_stream(CUT, DeflateSettings(12)))
+    assert len(signed_stream(NOISE, DeflateSettings(1))) < 1.05 * len(signed_stream(NOISE, DeflateSettings(12)))
+
+
+@pytest.mark.parametrize("arguments", [(0,), (13,), (6, "gzip")])
+def test_refuses_a_level_or_library_that_does_not_exist(arguments):
+    with pytest.raises(InputError):
+        DeflateSettings(*arguments)

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("numba", reason="our own pictures want the extra [render]")
 pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
 
-from chromium import IN_CHROMIUM, absent
+from chromium import absent
 
 from csplat import EncodeOptions, decode, encode, read_ply
 from csplat.editing.transform import convert_axes
@@ -24,7 +24,7 @@ from csplat_bench.viewer.stage import pinhole, served
 from csplat_render.camera_paths import orbit_cameras
 from csplat_render.metrics import psnr
 
-pytestmark = [*IN_CHROMIUM, pytest.mark.area(name="engines")]
+pytestmark = [pytest.mark.slow, pytest.mark.area(name="engines")]
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "tools" / "examples"
 FAST = EncodeOptions(preset="fast")

@@ -1,5 +1,6 @@
-"""Measured errors agree with the definition in the spec, computed here splat by splat."""
+"""Measured and declared errors agree with the definitions of the spec, computed splat by splat in Python floats."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,10 @@ from checked import measure_errors
 
 from csplat.encoder.error_bounds import ErrorSums
 from csplat.errors import InputError
-from csplat.model import normalise_quats
+from csplat.model import SplatModel, normalise_quats
+from csplat_conformance.declared_bounds import Source, measure_pairs
+from csplat_conformance.encoders.reference_ply import PlyRows, is_splat, source_of_rows
+from csplat_conformance.tolerance import bound_tolerance, is_valid_bound
 
 
 def covariance(quat: np.ndarray, scales: np.ndarray) -> np.ndarray:
@@ -97,3 +101,197 @@ def test_refuses_an_index_that_does_not_fit(make_model, index):
     model = make_model(10, 0)
     with pytest.raises(InputError, match="source index"):
         measure_errors(model, model, index)
+
+
+ORIGIN = (481_250.0, 5_467_100.0, 310.0)
+
+
+# The slow twin -------------------------------------------------------------------------------------
+def twin_covariance(quat, scales, top):
+    length = math.sqrt(math.fsum(c * c for c in quat))
+    w, x, y, z = (c / length for c in quat)
+    rotation = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    variances = [math.exp(2 * (min(88.0, max(-88.0, s)) - top)) for s in scales]
+    return [
+        [math.fsum(a * v * b for a, v, b in zip(rotation[i], variances, rotation[j], strict=True)) for j in range(3)]
+        for i in range(3)
+    ]
+
+
+def twin_norm(matrix):
+    return math.sqrt(math.fsum(v * v for row in matrix for v in row))
+
+
+def twin_errors(source, decoded, i, j):
+    """Components of the difference of decoded splat i and source splat j, by measure (spec 5.5)."""
+    centre = [float(a) + b for a, b in zip(decoded.means[i], decoded.origin, strict=True)]
+    wanted = [float(a) + b for a, b in zip(source.means[j], source.origin, strict=True)]
+    theirs, ours = (list(map(float, one)) for one in (source.scales[j], decoded.scales[i]))
+    top = min(88.0, max(-88.0, *theirs))
+    reference = twin_covariance(list(map(float, source.quats[j])), theirs, top)
+    found = twin_covariance(list(map(float, decoded.quats[i])), ours, top)
+    difference = [[a - b for a, b in zip(*rows, strict=True)] for rows in zip(found, reference, strict=True)]
+    errors = {
+        "means": [math.dist(centre, wanted)],
+        "covariance": [twin_norm(difference) / twin_norm(reference)],
+        "opacities": [float(decoded.opacities[i]) - float(source.opacities[j])],
+        "sh0": [float(a) - float(b) for a, b in zip(decoded.sh0[i], source.sh0[j], strict=True)],
+    }
+    for band in range(1, min(3, max(decoded.sh_degree, source.sh_degree)) + 1):
+        rows = range(band * band - 1, (band + 1) ** 2 - 1)
+        value = lambda model, k, row, c: float(model.shN[k, row, c]) if row < model.shN.shape[1] else 0.0  # noqa: E731
+        errors[f"sh{band}"] = [value(decoded, i, row, c) - value(source, j, row, c) for row in rows for c in range(3)]
+    return errors
+
+
+def twin(source, decoded, index):
+    """(max, rms) by measure."""
+    pairs = [twin_errors(source, decoded, i, int(j)) for i, j in enumerate(index)]
+    return {
+        name: (
+            max(abs(v) for pair in pairs for v in pair[name]),
+            math.sqrt(math.fsum(v * v for pair in pairs for v in pair[name]) / len(pairs)),
+        )
+        for name in pairs[0]
+    }
+
+
+def scene(count, degree, seed, *, doubles=False):
+    """A source and what a coarse encoder might make of it, in another order and a little fewer."""
+    rng = np.random.default_rng(seed)
+    coefficients = (degree + 1) ** 2 - 1
+    means = rng.normal(0, 3, (count, 3))
+    source = Source(
+        means=means + np.array(ORIGIN) if doubles else means.astype(np.float32),
+        quats=normalise_quats(rng.normal(0, 1, (count, 4)).astype(np.float32)),
+        scales=rng.uniform(-7, 2, (count, 3)).astype(np.float32),
+        opacities=rng.random(count).astype(np.float32),
+        sh0=rng.normal(0, 1, (count, 3)).astype(np.float32),
+        shN=rng.normal(0, 0.2, (count, coefficients, 3)).astype(np.float32),
+    )
+    index = rng.permutation(count)[: count - 2]
+    kept = min(coefficients, 8)
+    decoded = SplatModel(
+        means=np.round(means[index] / 0.01).astype(np.float32) * np.float32(0.01),
+        quats=normalise_quats(source.quats[index] + rng.normal(0, 0.01, (count - 2, 4)).astype(np.float32)),
+        scales=source.scales[index] + rng.uniform(-0.02, 0.02, (count - 2, 3)).astype(np.float32),
+        opacities=np.round(source.opacities[index] * 64) / np.float32(64),
+        sh0=np.round(source.sh0[index] * 32) / np.float32(32),
+        shN=np.round(source.shN[index, :kept] * 16) / np.float32(16),
+        origin=ORIGIN if doubles else (0.0, 0.0, 0.0),
+    )
+    return source, decoded, index
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3, 4])
+@pytest.mark.parametrize("doubles", [False, True])
+def test_errors_are_those_of_the_slow_twin(degree, doubles):
+    # SRC-2, SER-5: bands that the file has not count against 0, degree 4 has no measure
+    source, decoded, index = scene(60, degree, 5 + degree, doubles=doubles)
+    expected, found = twin(source, decoded, index), measure_pairs(source, decoded, index)
+    reach = source.reach(decoded.origin)
+
+    assert list(expected) == list(found)
+    for name, pair in expected.items():
+        for true, measured in zip(pair, found[name][:2], strict=True):
+            assert abs(true - measured) <= bound_tolerance(name, true, reach) / 4, name
+
+
+def test_the_worst_splat_is_the_one_with_the_largest_error():
+    source, decoded, index = scene(60, 2, 1)
+    for name, found in measure_pairs(source, decoded, index).items():
+        errors = twin_errors(source, decoded, found.worst, int(index[found.worst]))[name]
+        assert found.max == pytest.approx(max(map(abs, errors)), rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spread", [0.5, 3.0, 7.0])
+def test_a_checker_lets_pass_whoever_works_in_binary32(spread):
+    # SER-7: the rooms are wide enough for statements that were computed in single precision throughout
+    rng, count = np.random.default_rng(3), 20_000
+    raw = rng.normal(0, 1, (count, 4)).astype(np.float32)
+    scales = rng.uniform(-spread, spread, (count, 3)).astype(np.float32)
+    logits = rng.normal(0, 5, count).astype(np.float32)
+
+    def single(quats, scales, top):
+        w, x, y, z = (quats / np.sqrt(np.square(quats).sum(axis=1, keepdims=True))).T
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        rotation = np.array(rows, np.float32).transpose(2, 0, 1)
+        return np.einsum("nij,nkj->nik", rotation * np.exp(2 * (scales - top))[:, None], rotation)
+
+    quats = (raw + rng.normal(0, 1e-3, raw.shape)).astype(np.float32)
+    top = scales.max(axis=1, keepdims=True)
+    ours, theirs = single(quats, scales, top), single(raw, scales, top)
+    assert ours.dtype == np.float32
+    stated = np.linalg.norm(ours - theirs, axis=(1, 2)) / np.linalg.norm(theirs, axis=(1, 2))
+    nothing = np.zeros((count, 3), np.float32)
+    source = Source(nothing, normalise_quats(raw), scales, nothing[:, 0], nothing, nothing[:, None, :][:, :0])
+    for row in range(0, count, 97):
+        decoded = SplatModel(
+            nothing[:1], normalise_quats(quats[row : row + 1]), scales[row : row + 1], nothing[0, :1], nothing[:1]
+        )
+        true = measure_pairs(source, decoded, np.array([row]))["covariance"].max
+        assert is_valid_bound("covariance", float(stated[row]), true, 0.0)
+
+    alpha = np.float32(1) / (np.float32(1) + np.exp(-logits))
+    rows = PlyRows(nothing, raw, scales, logits, nothing, nothing[:, None, :][:, :0])
+    assert float(np.abs(alpha.astype(np.float64) - source_of_rows(rows).opacities).max()) < 2e-7 / 2
+
+
+# What the source is --------------------------------------------------------------------------------
+def rows_of(count=8):
+    rng = np.random.default_rng(0)
+    return PlyRows(
+        means=rng.normal(0, 1, (count, 3)),
+        quats=rng.normal(0, 1, (count, 4)).astype(np.float32),
+        scales=rng.normal(-3, 1, (count, 3)).astype(np.float32),
+        logits=rng.normal(0, 3, count).astype(np.float32),
+        sh0=rng.normal(0, 1, (count, 3)).astype(np.float32),
+        shN=rng.normal(0, 1, (count, 3, 3)).astype(np.float32),
+    )
+
+
+def test_rows_that_are_no_numbers_are_no_splats():
+    # SRC-1
+    rows = rows_of()
+    rows.means[0, 1] = 1e39  # finite in binary64 alone
+    rows.quats[1, 2] = np.nan
+    rows.scales[2, 0] = -np.inf
+    rows.logits[3], rows.logits[4], rows.logits[5] = np.nan, np.inf, -np.inf
+    rows.shN[6, 2, 1] = np.inf
+
+    assert [False, False, False, False, True, True, False, True] == is_splat(rows).tolist()
+    assert [1.0, 0.0] == source_of_rows(rows).opacities[:2].tolist()
+
+
+def test_a_source_is_alpha_and_unit_quaternions_in_binary32_and_centres_as_they_stand():
+    # SRC-2
+    rows = rows_of()
+    rows.quats[3] = 0
+    source = source_of_rows(rows)
+
+    np.testing.assert_array_equal(rows.means, source.means)
+    assert source.means.dtype == np.float64
+    for j in range(8):
+        assert np.float32(1 / (1 + math.exp(-float(rows.logits[j])))) == source.opacities[j]
+        length = math.sqrt(math.fsum(float(c) ** 2 for c in rows.quats[j]))
+        unit = [np.float32(float(c) / length) for c in rows.quats[j]] if length else [1, 0, 0, 0]
+        np.testing.assert_allclose(source.quats[j], unit, rtol=1.2e-7)
+
+
+def test_a_source_about_another_origin_is_the_same():
+    source, decoded, index = scene(40, 0, 3, doubles=True)
+    near = source.about(ORIGIN)
+    ours, theirs = (measure_pairs(one, decoded, index)["means"].max for one in (source, near))
+
+    assert abs(ours - theirs) <= bound_tolerance("means", ours, source.reach(ORIGIN))
+    assert source.reach(ORIGIN) == pytest.approx(float(np.abs(source.means).max()), rel=1e-12)
+    assert float(np.abs(near.to_model(ORIGIN).means).max()) < 20.0

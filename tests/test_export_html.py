@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from chromium import ViewerPage
 from typer.testing import CliRunner
-from viewer_pages import ViewerPage
 
 from csplat import decode, encode, read_ply, write_ply
 from csplat.errors import CsplatError

@@ -1,17 +1,28 @@
-"""Any format in, any format out: detection, reading in blocks, writing, refusals."""
+"""Formats: detection, reading in blocks, writing, refusals; archives; plug-ins of other packages; notebooks."""
 
+from __future__ import annotations
+
+import base64
+import html
 import io
+import os
+import re
+import subprocess
+import sys
 import zipfile
 
 import numpy as np
 import pytest
 
 import csplat
+import csplat_tools
+from csplat.archives import read_archive
 from csplat.errors import InputError
 from csplat.formats import assume_format, formats, open_scene, write_scene
 from csplat.formats import lint_file as formats_lint
 from csplat.ply import read_ply, write_ply
 from csplat.scene_source import BLOCK_SPLATS, SceneSource, source_from_model
+from csplat_tools.present.notebook import most_visible, scene_html
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
@@ -227,3 +238,194 @@ def test_fewer_bands_are_read_of_any_format(tmp_path, make_model):
         assert (2, 1) == (whole.sh_degree, part.sh_degree)
         assert np.array_equal(whole.shN[:, :3], part.shN)
         assert 1 == csplat.read(tmp_path / name, sh_degree=1).sh_degree
+
+
+PLUGIN = """
+from csplat.formats import Format, format_by_name
+
+FORMAT = Format("lcc", open=format_by_name("splat").open)
+
+
+def html(model):
+    return f"<p>{len(model)}</p>"
+"""
+
+
+@pytest.fixture
+def installed(tmp_path):
+    """Return a function that runs a statement where a distribution has these entry points; it returns the output."""
+
+    def run(statement, name="other", **groups):
+        metadata = tmp_path / f"{name}-1.dist-info"
+        metadata.mkdir()
+        (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n", "utf-8")
+        lines = [f"[csplat.{group}]\n{line}\n" for group, line in groups.items()]
+        (metadata / "entry_points.txt").write_text("".join(lines), "utf-8")
+        (tmp_path / "other_plugin.py").write_text(PLUGIN, "utf-8")
+        paths = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+        code = f"import csplat, csplat.formats, sys, numpy as np\n{statement}"
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "PYTHONPATH": paths},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return done.stdout.strip()
+
+    return run
+
+
+def test_a_format_of_another_package_is_listed_and_read(installed, tmp_path):
+    (tmp_path / "a.lcc").write_bytes(bytes(32))
+    statement = "print('lcc' in [one.name for one in csplat.formats.formats()]); "
+    statement += f"print(len(csplat.read({str(tmp_path / 'a.lcc')!r})))"
+    assert "True\n1" == installed(statement, formats="lcc = other_plugin:FORMAT")
+
+
+def test_entry_points_are_read_only_for_formats_that_this_package_lacks(installed, tmp_path, make_model):
+    csplat.write(tmp_path / "a.ply", make_model(3, 0))
+    statement = f"csplat.read({str(tmp_path / 'a.ply')!r})\nprint('other_plugin' in sys.modules)"
+    assert "False" == installed(statement, formats="lcc = other_plugin:FORMAT")
+
+
+def test_a_plug_in_that_cannot_be_loaded_is_left_out_with_a_warning(installed):
+    statement = "import warnings\nwith warnings.catch_warnings(record=True) as seen:\n"
+    statement += "    names = [one.name for one in csplat.formats.formats()]\nprint(names[0], seen[-1].message)"
+    found = installed(statement, formats="lcc = other_plugin:NOTHING")
+    assert found.startswith(
+        "compressed-ply other_plugin:NOTHING, installed as 'lcc' of csplat.formats, cannot be loaded: module"
+    )
+
+
+def test_notebooks_use_the_display_that_is_installed(installed):
+    model = "csplat.SplatModel(np.zeros((2, 3), np.float32), np.array([[1, 0, 0, 0]] * 2, np.float32), "
+    model += "np.zeros((2, 3), np.float32), np.ones(2, np.float32), np.zeros((2, 3), np.float32))"
+    # A distribution of this name hides the metadata of the installed one, which has a display, too.
+    assert "<p>2</p>" == installed(f"print({model}._repr_html_())", "csplat", display="html = other_plugin:html")
+
+
+def test_without_entry_points_the_formats_are_those_of_the_codec(installed):
+    statement = "print([one.name for one in csplat.formats.formats()][-1])"
+    assert "gltf" == installed(statement, "csplat")
+
+
+def scene_in(shown):
+    """The model inside of a frame."""
+    page = html.unescape(re.search(r'srcdoc="([^"]*)"', shown)[1])
+    coded = re.search(r'<script type="application/octet-stream" id="csplat-scene">([^<]*)</script>', page)[1]
+    return csplat.decode(base64.b64decode(coded))
+
+
+def test_a_model_and_an_opened_file_show_themselves(make_model, tmp_path):
+    model = make_model(40, 1)
+    shown = model._repr_html_()
+    assert (40, 1) == (len(scene_in(shown)), scene_in(shown).sh_degree)
+    assert "<small>" not in shown
+    assert ' src="' not in shown
+    csplat.write_ply(tmp_path / "scene.ply", model)
+    assert 40 == len(scene_in(csplat_tools.load_model(tmp_path / "scene.ply")._repr_html_()))
+
+
+def test_of_a_large_scene_what_covers_most_is_shown_and_that_is_said(make_model):
+    model = make_model(3000, 0)
+    model.opacities[::3] = 0.0
+    shown = scene_html(model, most_splats=1000)
+    assert 1000 == len(scene_in(shown))
+    assert "1,000 of 3,000 splats, those that cover most" in shown
+    kept = most_visible(model, 1000)
+    assert kept.opacities.min() > 0.0
+    areas = np.exp(np.sort(kept.scales, axis=1)[:, 1:].sum(axis=1))
+    assert np.median(areas) > np.median(np.exp(np.sort(model.scales, axis=1)[:, 1:].sum(axis=1)))
+
+
+def test_without_splats_or_without_the_tools_a_notebook_shows_text(make_model, monkeypatch):
+    assert make_model(0)._repr_html_() is None
+    monkeypatch.setitem(sys.modules, "csplat_tools.present.notebook", None)
+    assert make_model(5)._repr_html_() is None
+
+
+@pytest.mark.slow
+def test_the_frame_draws_and_is_kept_from_the_notebook(tab, site, make_model):
+    shown = make_model(200, 0)._repr_html_()
+    head = '<!doctype html><link rel="icon" href="data:,"><title>kept</title>'
+    tab.page.set_viewport_size({"width": 200, "height": 500})
+    tab.page.goto(site.add("/notebook.html", f"{head}{shown}".encode()))
+    frame = next(one for one in tab.page.frames if one is not tab.page.main_frame)
+    frame.wait_for_load_state()
+    frame.evaluate("csplatViewer.ready")
+    brightest = "(all) => all.filter((_, at) => at % 4 < 3).reduce((a, b) => Math.max(a, b), 0)"
+    assert frame.evaluate(f"csplatViewer.engine.readPixels().then({brightest})") > 100
+    with pytest.raises(Exception, match="cross-origin"):
+        frame.evaluate("parent.document.title")
+
+
+KIND = "a file of tests"
+BROKEN = b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', 'fortran_order': False, 'shape': ("
+
+
+def archive(path, data, compression=zipfile.ZIP_STORED):
+    with zipfile.ZipFile(path, "w", compression) as file:
+        file.writestr("facts.npy", data)
+    return path
+
+
+def test_arrays_come_back(tmp_path):
+    np.savez(tmp_path / "a.npz", one=np.arange(3), facts=np.frombuffer(b'{"n": 1}', np.uint8))
+    found = read_archive(tmp_path / "a.npz", KIND)
+    assert np.array_equal(np.arange(3), found["one"])
+    assert found.facts() == {"n": 1}
+    found.check({"n": 1}, {"n": int})
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (b"hello", "facts is no array"),
+        (BROKEN.ljust(128, b" "), "not a file of tests"),
+        (b"\x93NUMPY\x09\x09", "not a file of tests"),
+        (b"", "not a file of tests"),
+    ],
+    ids=["bytes", "open bracket", "version", "empty"],
+)
+def test_members_that_are_no_arrays_are_refused(tmp_path, data, why):
+    with pytest.raises(InputError, match=why):
+        read_archive(archive(tmp_path / "a.npz", data), KIND)
+
+
+def test_objects_are_not_run(tmp_path):
+    np.savez(tmp_path / "a.npz", one=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(InputError, match="not a file of tests"):
+        read_archive(tmp_path / "a.npz", KIND)
+
+
+@pytest.mark.parametrize("way", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_damage_is_named_however_the_file_is_packed(tmp_path, way):
+    np.save(tmp_path / "a.npy", np.random.default_rng(1).normal(size=400))
+    path = archive(tmp_path / "a.npz", (tmp_path / "a.npy").read_bytes(), way)
+    data = path.read_bytes()
+    for place in range(60, 1000, 37):
+        path.write_bytes(data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
+        with pytest.raises(InputError, match=r"a\.npz is not a file of tests"):
+            read_archive(path, KIND)
+
+
+@pytest.mark.parametrize("text", [b"[1]", b"{", b"[" * 100_000, b"\xff"], ids=["list", "open", "deep", "no text"])
+def test_facts_that_are_none_are_refused(tmp_path, text):
+    np.savez(tmp_path / "a.npz", facts=np.frombuffer(text, np.uint8))
+    with pytest.raises(InputError, match="not a file of tests"):
+        read_archive(tmp_path / "a.npz", KIND).facts()
+
+
+def test_what_is_missing_or_of_another_kind_is_named(tmp_path):
+    np.savez(tmp_path / "a.npz", one=np.zeros(1))
+    found = read_archive(tmp_path / "a.npz", KIND)
+    with pytest.raises(InputError, match="holds no two"):
+        found["two"]
+    with pytest.raises(InputError, match="its n is no int"):
+        found.check({"n": "1"}, {"n": int})
+
+
+def test_a_file_that_is_not_there_is_missed(tmp_path):
+    with pytest.raises(FileNotFoundError, match="absent"):
+        read_archive(tmp_path / "absent.npz", KIND)

@@ -1,16 +1,16 @@
-"""Names of images as data sets list them, and the files that they are found to be."""
+"""Images of data sets: names and the files they are found to be; values of every kind of pixel, and masks."""
 
+import json
 import re
+import struct
 import unicodedata
+import zlib
 
+import numpy as np
 import pytest
-
-from csplat.errors import InputError
-
-pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
-pytest.importorskip("PIL", reason="data sets need pillow: pip install 'csplat[render]'")
-
+from PIL import ExifTags, Image  # it needs what is looked for above
 from posed_sets import (  # it needs what is looked for above
+    H,
     W,
     assert_dots_are_where_points_fall,
     cameras,
@@ -25,8 +25,15 @@ from posed_sets import (  # it needs what is looked for above
 )
 from tables import failures
 
+from csplat.errors import InputError
+
+pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
+pytest.importorskip("PIL", reason="data sets need pillow: pip install 'csplat[render]'")
+
+
 from csplat_trainer.data import load
 from csplat_trainer.data.image_files import match_names
+from csplat_trainer.data.image_pixels import mask_values, open_image, read_image_header, rgb_pixels
 
 POSES = [to_opengl(camera) for camera in cameras(10)]  # poses of the frames of `write_transforms`
 
@@ -282,3 +289,278 @@ def move(source, target):
         path.rename(target / path.name)
     if source != target and not any(source.iterdir()):
         source.rmdir()
+
+
+RAMP = np.linspace(0.0, 1.0, W * H).reshape(H, W)  # 0 to 1 in every kind
+GREY = np.rint(255.0 * RAMP).astype(np.uint8)
+RGB = np.stack([GREY, GREY[::-1], GREY[:, ::-1]], axis=2)
+HALF_SEEN = np.where(RAMP < 0.5, 0, 200).astype(np.uint8)
+RGBA = np.dstack([RGB, HALF_SEEN])
+UINT16 = np.rint(65535.0 * RAMP).astype(np.uint16)
+
+
+def tiff(path, values, bits, kind, *, channels=1, photometric=1, planes=1):
+    """Write a TIFF of one strip a plane, in kinds that pillow does not write: 1 unsigned, 2 signed, 3 float."""
+    data = np.ascontiguousarray(values).tobytes()
+    size = len(data) // (channels if planes == 2 else 1)
+    strips = channels if planes == 2 else 1
+    lists = [[bits] * channels, [8 + size * i for i in range(strips)], [size] * strips, [kind] * channels]
+    bits_at, offsets_at, sizes_at, kinds_at = (8 + len(data) + 64 * i for i in range(4))
+    tail = b"".join(
+        struct.pack(f"<{len(row)}{'I' if i in (1, 2) else 'H'}", *row).ljust(64, b"\0") for i, row in enumerate(lists)
+    )
+
+    def entry(tag, form, row, at):
+        packed = struct.pack(f"<{len(row)}{'H' if form == 3 else 'I'}", *row)
+        return struct.pack("<HHI", tag, form, len(row)) + (
+            packed.ljust(4, b"\0") if len(packed) <= 4 else struct.pack("<I", at)
+        )
+
+    height, width = RAMP.shape
+    entries = [
+        entry(256, 4, [width], 0), entry(257, 4, [height], 0), entry(258, 3, lists[0], bits_at),
+        entry(259, 3, [1], 0), entry(262, 3, [photometric], 0), entry(273, 4, lists[1], offsets_at),
+        entry(277, 3, [channels], 0), entry(278, 4, [height], 0), entry(279, 4, lists[2], sizes_at),
+        entry(284, 3, [planes], 0), entry(339, 3, lists[3], kinds_at),
+    ]  # fmt: skip
+    directory = struct.pack("<H", len(entries)) + b"".join(entries) + b"\0\0\0\0"
+    path.write_bytes(b"II*\0" + struct.pack("<I", 8 + len(data) + len(tail)) + data + tail + directory)
+
+
+def png_16(path, colours):
+    """Write a PNG of 16 bits RGB, which pillow does not: [H, W, 3], big-endian."""
+    rows = b"".join(b"\0" + row.tobytes() for row in colours)
+    head = struct.pack(">IIBBBBB", colours.shape[1], colours.shape[0], 16, 2, 0, 0, 0)
+    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
+    whole = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    ]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(whole))
+
+
+def palette(path):
+    image = Image.fromarray((GREY > 127).astype(np.uint8), "P")
+    image.putpalette([200, 10, 30, 40, 50, 60])
+    image.save(path, transparency=0)
+
+
+def transparent_grey(path):
+    Image.fromarray(UINT16).save(path, transparency=int(UINT16[0, 0]))
+
+
+#: File, how it is written, and its pixels to within the number that follows.
+READ = {
+    "RGB": ("a.png", lambda p: Image.fromarray(RGB).save(p), RGB, 0),
+    "RGBA": ("a.png", lambda p: Image.fromarray(RGBA).save(p), RGBA, 0),
+    "grey": ("a.png", lambda p: Image.fromarray(GREY).save(p), GREY, 0),
+    "grey and alpha": (
+        "a.png",
+        lambda p: Image.fromarray(np.dstack([GREY, HALF_SEEN])).save(p),
+        np.dstack([GREY, GREY, GREY, HALF_SEEN]),
+        0,
+    ),
+    "1 bit": ("a.png", lambda p: Image.fromarray(RAMP > 0.5).save(p), 255 * (RAMP > 0.5), 0),
+    "palette with transparency": (
+        "a.png",
+        palette,
+        np.where((GREY > 127)[..., None], (40, 50, 60, 255), (200, 10, 30, 0)),
+        0,
+    ),
+    "CMYK": ("a.tif", lambda p: Image.fromarray(RGB).convert("CMYK").save(p), RGB, 1),
+    "YCbCr": ("a.tif", lambda p: Image.fromarray(RGB).convert("YCbCr").save(p), RGB, 3),
+    "LAB": ("a.tif", lambda p: Image.fromarray(RGB).convert("RGB").convert("LAB").save(p), (H, W, 3), 0),
+    "16-bit grey PNG": ("a.png", lambda p: Image.fromarray(UINT16).save(p), GREY, 0),
+    "16-bit grey with a transparent value": (
+        "a.png",
+        transparent_grey,
+        np.dstack([GREY, GREY, GREY, 255 * (UINT16 != UINT16[0, 0])]),
+        0,
+    ),
+    "16-bit grey TIFF": ("a.tif", lambda p: Image.fromarray(UINT16).save(p), GREY, 0),
+    "16-bit grey, bytes swapped": (
+        "a.tif",
+        lambda p: Image.frombytes("I;16B", (W, H), UINT16.astype(">u2").tobytes()).save(p),
+        GREY,
+        0,
+    ),
+    "16-bit grey, white is 0": ("a.tif", lambda p: tiff(p, 65535 - UINT16, 16, 1, photometric=0), GREY, 0),
+    "16-bit grey PGM": (
+        "a.pgm",
+        lambda p: p.write_bytes(f"P5 {W} {H} 65535 ".encode() + UINT16.astype(">u2").tobytes()),
+        GREY,
+        0,
+    ),
+    "16-bit RGB": ("a.tif", lambda p: tiff(p, RGB.astype(np.uint16) * 257, 16, 1, channels=3, photometric=2), RGB, 0),
+    "16-bit RGB PNG": ("a.png", lambda p: png_16(p, np.ascontiguousarray(RGB.astype(">u2") * 257, ">u2")), RGB, 0),
+    "float TIFF": ("a.tif", lambda p: Image.fromarray(RAMP.astype(np.float32)).save(p), GREY, 0),
+}
+
+#: File, how it is written, and the text of the error.
+REFUSED = {
+    "float beyond 1": (
+        "a.tif",
+        lambda p: Image.fromarray((255 * RAMP).astype(np.float32)).save(p),
+        "holds floats from 0 to 255, expected 0 to 1",
+    ),
+    "float that is none": (
+        "a.tif",
+        lambda p: Image.fromarray(np.full((H, W), np.nan, np.float32)).save(p),
+        "holds floats from nan to nan",
+    ),
+    "32-bit grey": ("a.tif", lambda p: Image.fromarray(UINT16.astype(np.int32)).save(p), "grey of 32 bits"),
+    "signed 16 bits": ("a.tif", lambda p: tiff(p, (UINT16 // 2).astype(np.int16), 16, 2), "or with a sign"),
+    "16-bit RGB in planes": (
+        "a.tif",
+        lambda p: tiff(p, np.moveaxis(RGB.astype(np.uint16) * 257, 2, 0), 16, 1, channels=3, photometric=2, planes=2),
+        "holds 16 bits in planes",
+    ),
+    "float RGB": (
+        "a.tif",
+        lambda p: tiff(p, RGB.astype(np.float32), 32, 3, channels=3, photometric=2),
+        "not of 8 or 16 bits or of floats in one channel: convert it to PNG or JPEG",
+    ),
+    "OpenEXR": ("a.exr", lambda p: p.write_bytes(b"\x76\x2f\x31\x01" + bytes(60)), "is an OpenEXR file"),
+    "Radiance": ("a.hdr", lambda p: p.write_bytes(b"#?RADIANCE\n" + bytes(60)), "is a Radiance HDR file"),
+    "HEIC": ("a.heic", lambda p: p.write_bytes(b"\0\0\0\x18ftypheic" + bytes(60)), "is a HEIC file"),
+    "raw": ("a.dng", lambda p: Image.fromarray(RGB).save(p, "TIFF"), "a camera's raw file"),
+    "a web page": ("a.jpg", lambda p: p.write_text("<html>"), "is a web page"),
+}
+
+
+def pixels_of(path):
+    with open_image(path) as image:
+        return rgb_pixels(image, path)
+
+
+def test_every_kind_of_pixel_is_read_for_what_it_means(tmp_path):
+    def check(case):
+        name, write, wanted, tolerance = case
+        path = tmp_path / name
+        write(path)
+        found = pixels_of(path)
+        assert np.uint8 == found.dtype
+        assert read_image_header(path).has_alpha == (found.shape[2] == 4)
+        assert (W, H) == read_image_header(path).size
+        if isinstance(wanted, tuple):
+            assert wanted == found.shape
+            return
+        wanted = np.repeat(wanted[..., None], 3, axis=2) if wanted.ndim == 2 else wanted
+        assert wanted.shape == found.shape
+        assert np.abs(found.astype(int) - wanted).max() <= tolerance
+
+    assert [] == failures(READ, check)
+
+
+def test_other_kinds_are_refused_by_name(tmp_path):
+    def check(case):
+        name, write, says = case
+        path = tmp_path / name
+        write(path)
+        with pytest.raises(InputError, match=says):
+            pixels_of(path)
+
+    assert [] == failures(REFUSED, check)
+
+
+def test_a_set_reports_how_its_pixels_are_read(tmp_path):
+    write_transforms(tmp_path)
+    files = sorted((tmp_path / "images").glob("*.png"))
+    for path in files:
+        with Image.open(path) as image:
+            grey = np.asarray(image.convert("L"))
+        Image.fromarray(grey.astype(np.uint16) * 16).save(path)
+    (line,) = (line for line in load(tmp_path).report if "16-bit" in line)
+    assert line.startswith(
+        "10 images of 16-bit grey: 0 to 65535 is read as black to white; the first, 0001.png, holds 0"
+    )
+    assert line.endswith("scale them if that is too dark")
+    for path in files:
+        colours = np.ascontiguousarray((RGB.astype(">u2") << 4).astype(">u2"))
+        png_16(path, colours)
+    (line,) = (line for line in load(tmp_path).report if "16-bit" in line)
+    assert line.startswith(
+        "10 images of 16-bit colours: 0 to 255 is read as black to white; the first, 0001.png, holds"
+    )
+    assert line.endswith("0 to 15: scale them if that is too dark")
+    frames = [Image.new("RGB", (W, H), colour) for colour in ("red", "blue")]
+    for path in files:
+        frames[0].save(path, save_all=True, append_images=frames[1:])
+    data = load(tmp_path)
+    assert "10 files with several images: the first of each is read (0001.png has 2)" in data.report
+    assert (data.train[0].pixels == (255, 0, 0)).all()
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_a_turn_that_nothing_decides_is_reported(tmp_path, orientation):
+    write_transforms(tmp_path)
+    for path in sorted((tmp_path / "images").glob("*.png")):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        with Image.open(path) as image:
+            image.save(path, exif=exif)
+    data = load(tmp_path)
+    assert_dots_are_where_points_fall([*data.train, *data.test])
+    told = [line for line in data.report if "EXIF" in line]
+    assert (orientation == 3) == bool(told)  # 6 would swap the sides, which the cameras' sizes contradict
+    assert all("orientation 3): read as stored" in line for line in told)
+
+
+def test_a_square_image_on_its_side_is_undecided(tmp_path):
+    write_transforms(tmp_path)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    for path in sorted((tmp_path / "images").glob("*.png")):
+        Image.new("RGB", (W, W)).save(path, exif=exif)
+    change_transforms(tmp_path, h=W, cy=W / 2)
+    assert any("EXIF turns 10 images (0001.png: orientation 6): read as stored" in one for one in load(tmp_path).report)
+
+
+SHAPE = RAMP > 0.4
+LABELS = SHAPE.astype(np.uint8)
+VOC = Image.fromarray(LABELS, "P")
+VOC.putpalette([0, 0, 0, 128, 0, 0])
+
+#: Files of a mask, and whether how it was understood is reported.
+MASKS = {
+    "0 and 255": (Image.fromarray(255 * LABELS), False),
+    "1 bit": (Image.fromarray(SHAPE), False),
+    "0 and 1": (Image.fromarray(LABELS), True),
+    "0 and 1 in 16 bits": (Image.fromarray(LABELS.astype(np.uint16)), True),
+    "0 and 1 in 32 bits": (Image.fromarray(LABELS.astype(np.int32)), True),
+    "0 and 255 in 16 bits": (Image.fromarray(LABELS.astype(np.uint16) * 255), False),
+    "0 and 65535": (Image.fromarray(LABELS.astype(np.uint16) * 65535), False),
+    "floats": (Image.fromarray(LABELS.astype(np.float32)), False),
+    "floats to 255": (Image.fromarray(LABELS.astype(np.float32) * 255), False),
+    "a palette of labels": (VOC, True),
+    "RGB": (Image.fromarray(np.dstack([255 * LABELS] * 3)), False),
+    "alpha": (Image.fromarray(np.dstack([np.zeros((H, W, 3), np.uint8), 255 * LABELS])), True),
+    "alpha of white": (Image.fromarray(np.dstack([np.full((H, W, 3), 255, np.uint8), 255 * LABELS])), True),
+}
+
+
+def test_masks_of_every_kind_count_the_same(tmp_path):
+    def check(case):
+        image, told = case
+        path = tmp_path / "mask.tif"
+        image.save(path)
+        with open_image(path) as opened:
+            found = mask_values(opened, path)
+        assert ((found.values >= 128) == SHAPE).all()
+        assert told == bool(found.taken_as)
+
+    assert [] == failures(MASKS, check)
+
+
+def test_masks_of_0_and_1_are_reported_and_grey_ones_refused(tmp_path):
+    write_transforms(tmp_path)
+    Image.fromarray(LABELS).save(tmp_path / "mask.png")
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    change_transforms(tmp_path, frames=[{**frame, "mask_path": "mask.png"} for frame in frames])
+    data = load(tmp_path)
+    assert "masks as mask.png: values are 0 and 1: 1 counts as white" in data.report
+    assert (data.train[0].mask == SHAPE).all()
+    Image.fromarray(GREY // 4).save(tmp_path / "mask.png")
+    with pytest.raises(InputError, match=r"mask\.png is a mask of values from 0 to 63, expected 128 or more"):
+        load(tmp_path)
+    Image.fromarray(np.ones((H, W), np.uint8)).save(tmp_path / "mask.png")
+    assert load(tmp_path).train[0].mask.all()

@@ -12,8 +12,7 @@ pytest.importorskip("numba", reason="targets want the extra [render]")
 
 # Importing them needs what is looked for above.
 import extremes
-from analytic_model import AnalyticScene
-from analytic_search import analytic_removal
+from analytic_search import AnalyticScene, analytic_removal
 from captures import around, cameras, crowded, found_within, judged_by, photographed, shell, views_of
 from checked import measure_errors
 

@@ -7,8 +7,7 @@ import pytest
 
 pytest.importorskip("numba", reason="targets want the extra [render]")
 
-from analytic_model import AnalyticScene, Views
-from analytic_search import search
+from analytic_search import AnalyticScene, Views, search
 
 from csplat import EncodeOptions
 from csplat.errors import InputError

@@ -1,8 +1,11 @@
-"""Scenes that are decoded tile by tile."""
+"""Scenes decoded tile by tile, and drawn and compared without being in memory: results equal those in memory."""
 
 import io
-from dataclasses import fields
+import json
+import tempfile
+from dataclasses import fields, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,16 +13,30 @@ from tables import failures
 from typer.testing import CliRunner
 
 import csplat
-from csplat import file_source, formats
+from csplat import EncodeOptions, disk_files, file_source, formats
 from csplat.decoder import Limits, decode, decode_api, open_tiles, read_header
-from csplat.errors import CsplatError, LimitError
+from csplat.encoder import encode_with_report
+from csplat.errors import CsplatError, InputError, LimitError
 from csplat.ply import write_ply
+from csplat.scene_source import source_from_model
 from csplat_conformance.manifest import load
+
+pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+
+
+import csplat_tools
+from csplat_render.camera import intrinsics, look_at
+from csplat_render.rasteriser import Rasteriser
+from csplat_render.scorer import renderer
 from csplat_tools import scene_files
 from csplat_tools.cli.app import app
 from csplat_tools.convert_file import decode_file
+from csplat_tools.scene_files import LoadedModel, OpenedScene, open_scenes
+from csplat_tools.views import comparison_cameras
+from csplat_tools.views.sliced_renderer import SlicedScene, slice_limits
 
 VECTORS = load()
+
 #: Vectors of several tiles or with extra columns, and some others; none with many splats.
 VALID = [
     vector
@@ -27,6 +44,7 @@ VALID = [
     if vector.expect["header"]["splat_count"] < 10_000
     and (vector.expect["header"]["tile_count"] != 1 or vector.expect["extra"] or number % 4 == 0)
 ]
+
 #: Two of each clause, and not the one that is too large to lie in memory at once, which tiles need not.
 INVALID = [
     *{
@@ -169,3 +187,232 @@ def test_who_wants_all_splats_at_once_is_refused_before_the_memory_is_full(many_
     monkeypatch.setattr(scene_files, "available_memory_bytes", lambda: 4000)
     with pytest.raises(LimitError, match="allowed 4000"):
         scene_files.load_model(many_tiles.with_suffix(suffix))
+
+
+UP = (0.0, -1.0, 0.0)
+BEHIND = (0.3, 0.6, 0.1)
+LITTLE = 1  # byte of memory
+
+
+@pytest.fixture
+def model(make_model):
+    cloud = make_model(1500, 1)
+    return replace(cloud, scales=cloud.scales * np.float32(0.3) - np.float32(1.5))
+
+
+@pytest.fixture
+def view():
+    return look_at((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), UP, intrinsics(70, 53, 60.0), 70, 53)
+
+
+@pytest.fixture
+def camera_file(view, tmp_path):
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps([view.to_json()]))
+    return str(path)
+
+
+@pytest.fixture
+def files_of_both(model, tmp_path):
+    """A PLY, what became of it, and which splat is which."""
+    result = encode_with_report(model, EncodeOptions(preset="fast"))
+    source, made, index = (tmp_path / name for name in ("scene.ply", "scene.csplat", "index.npy"))
+    write_ply(source, model)
+    made.write_bytes(result.data)
+    np.save(index, result.source_index)
+    return str(source), str(made), str(index)
+
+
+@pytest.fixture
+def no_least(monkeypatch):
+    """Let any bound of memory do: small scenes fit each that is accepted otherwise."""
+    monkeypatch.setattr(SlicedScene, "least_bytes", -(10**12))
+
+
+def by_disk(model, every=1, progress=None):
+    """A scene in blocks of 300 splats, drawn in slices of about 100."""
+
+    def blocks():
+        return (model.select(slice(start, start + 300)) for start in range(0, len(model), 300))
+
+    scene = replace(source_from_model(model), blocks=blocks)
+    sample = model.select(slice(None, None, every))
+    return SlicedScene(scene, sample, every, LITTLE, progress, slice_bytes=60_000)
+
+
+@pytest.fixture
+def counts(monkeypatch):
+    """The number of splats in each slice that is drawn."""
+    found, forward = [], Rasteriser.forward
+
+    def noted(rasteriser, splats, *words, state=None, **named):
+        if state is not None:
+            found.append(len(splats.means))
+        return forward(rasteriser, splats, *words, state=state, **named)
+
+    monkeypatch.setattr(Rasteriser, "forward", noted)
+    return found
+
+
+def assert_same_picture(model, view, every=1, mode="standard"):
+    wanted = renderer(model, BEHIND, mode=mode)(view)
+    found = renderer(by_disk(model, every), BEHIND, mode=mode)(view)
+    for name in ("rgb", "alpha", "depth"):
+        np.testing.assert_array_equal(getattr(wanted, name), getattr(found, name))
+    assert wanted.ignored == found.ignored
+
+
+# pictures
+@pytest.mark.parametrize("mode", ["standard", "fast"])
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_pictures_are_those_of_memory_to_the_bit(model, view, counts, mode, antialiased):
+    assert_same_picture(replace(model, antialiased=antialiased), view, mode=mode)
+    assert len(counts) > 5
+    assert max(counts) < 300
+
+
+def test_a_sample_that_knows_little_changes_no_bit(model, view, counts):
+    assert_same_picture(model, view, every=700)
+    assert max(counts) < 300
+
+
+@pytest.mark.parametrize("crowd", [1500, 900])
+def test_splats_of_one_depth_are_drawn_in_their_order(model, view, crowd, counts):
+    means = model.means.copy()
+    means[:crowd, 2] = 0.25
+    assert_same_picture(replace(model, means=means), view)
+    assert max(counts) < 300
+
+
+def test_what_lies_behind_finished_pixels_is_not_drawn(model, view, counts):
+    wall = np.arange(len(model)) < 20
+    means, scales, opacities = model.means.copy(), model.scales.copy(), model.opacities.copy()
+    means[wall], scales[wall], opacities[wall] = (0.0, 0.0, -2.5), 3.0, 0.99
+    assert_same_picture(replace(model, means=means, scales=scales, opacities=opacities), view)
+    assert sum(counts) < 600
+
+
+def test_a_scene_that_shows_nothing_is_the_background(model, view):
+    assert_same_picture(replace(model, means=model.means + np.float32([0, 0, -90])), view)
+    assert_same_picture(model.select(slice(0, 0)), view)
+
+
+def test_mode_exact_is_refused(model, view):
+    with pytest.raises(InputError, match="exact"):
+        renderer(by_disk(model), BEHIND, mode="exact")(view)
+
+
+def test_limits_cut_alike_and_keep_what_is_of_one_depth_together():
+    near = np.array([0, 5, 1, 2, 4, 3], np.float32)
+    taken = np.where(near > 0, 10.0, 0.0)
+    assert [] == slice_limits(near, taken, 1).tolist()
+    assert [] == slice_limits(0 * near, 0 * taken, 9).tolist()
+    assert [2.0, 4.0] == slice_limits(near, taken, 3).tolist()
+    same = np.float32(2.0)
+    assert [same, np.nextafter(same, np.float32(3.0))] == slice_limits(np.full(9, same), np.ones(9), 4).tolist()
+
+
+# scenes
+def test_what_fits_is_read_and_what_does_not_is_opened(files_of_both):
+    with open_scenes(files_of_both[:2]) as loaded, open_scenes(files_of_both[:2], LITTLE) as opened:
+        assert {LoadedModel} == {type(one) for one in loaded}
+        assert {OpenedScene} == {type(one) for one in opened}
+        assert [one.as_json() for one in loaded] == [one.as_json() for one in opened]
+        with open_scenes(opened) as again:
+            assert opened == again
+        with open_scenes((loaded[0], files_of_both[1]), LITTLE) as both:
+            assert {LoadedModel} == {type(one) for one in both}
+
+
+def test_a_sample_has_every_so_manieth_splat(files_of_both, model):
+    with open_scenes(files_of_both[:2], LITTLE) as (source, _):
+        found, every = replace(source, sample_splats=220).sample()
+    assert 7 == every
+    np.testing.assert_array_equal(model.means[::7], found.means)
+    assert 0 == found.sh_degree
+
+
+def test_views_placed_by_a_sample_stand_about_where_the_scene_puts_them(sample_path):
+    whole = csplat_tools.load_model(sample_path).model
+    part = comparison_cameras(whole.select(slice(None, None, 2)), every=2)
+    for wanted, found in zip(comparison_cameras(whole), part, strict=True):
+        distance = np.linalg.norm(wanted.position)
+        assert np.linalg.norm(found.position) == pytest.approx(distance, rel=0.15)
+
+
+# comparisons
+@pytest.mark.usefixtures("no_least")
+def test_comparing_finds_what_memory_finds(files_of_both, camera_file, tmp_path):
+    source, made, index = files_of_both
+    words = ["compare", source, made, "--cameras", camera_file, "--source-index", index, "--json"]
+    found = []
+    for more in ([], ["--memory", "1kB"]):
+        result = CliRunner().invoke(app, [*words, "--pictures", str(tmp_path / f"shown{len(more)}"), *more])
+        assert 0 == result.exit_code, result.stderr
+        found.append(json.loads(result.stdout))
+        assert ("by way of the disk" in result.stderr) == bool(more)
+        del found[-1]["seconds"]
+    errors, others = (one["attributes"].pop("errors") for one in found)
+    assert found[0] == found[1]
+    assert errors.keys() == others.keys()
+    for name, one in errors.items():
+        assert one == pytest.approx(others[name], rel=1e-12)
+    shown, also = (sorted((tmp_path / f"shown{n}").iterdir()) for n in (0, 2))
+    assert [one.read_bytes() for one in shown] == [one.read_bytes() for one in also]
+
+
+@pytest.mark.usefixtures("no_least")
+def test_splats_of_one_order_are_measured_without_an_index(model, camera_file, tmp_path):
+    source, moved = str(tmp_path / "a.ply"), str(tmp_path / "b.ply")
+    write_ply(source, model)
+    write_ply(moved, replace(model, means=model.means + np.float32(0.001)))
+    views = csplat_tools.find_view_set(model, cameras=camera_file, count=0)
+    wanted, found = (csplat_tools.compare(source, moved, views=views, memory_bytes=most) for most in (None, LITTLE))
+    assert wanted.quality == found.quality
+    assert "order" == found.attributes.pairing
+    assert wanted.attributes.errors == {
+        name: pytest.approx(one, rel=1e-12) for name, one in found.attributes.errors.items()
+    }
+
+
+@pytest.mark.usefixtures("no_least")
+def test_without_an_index_the_errors_are_said_to_be_unknown(files_of_both, camera_file):
+    source, made, _ = files_of_both
+    result = CliRunner().invoke(app, ["compare", source, made, "--cameras", camera_file, "--memory", "1kB"])
+    assert 0 == result.exit_code
+    assert "errors of the splats are not known" in result.stdout
+
+
+@pytest.mark.usefixtures("no_least")
+def test_exact_pictures_of_what_does_not_fit_are_refused_in_a_line(files_of_both):
+    result = CliRunner().invoke(app, ["compare", *files_of_both[:2], "--memory", "1kB", "--mode", "exact"])
+    assert 1 == result.exit_code
+    assert ["error: --mode exact wants both scenes in memory, and they do not fit: take standard (E_INPUT)"] == [
+        line for line in result.stderr.splitlines() if "exact" in line
+    ]
+
+
+@pytest.mark.usefixtures("no_least")
+def test_a_disk_without_room_is_found_before_anything_is_drawn(files_of_both, monkeypatch):
+    usage = type("Usage", (), {"free": 1000})
+    monkeypatch.setattr(disk_files.shutil, "disk_usage", lambda _: usage)
+    with pytest.raises(InputError, match="TMPDIR"):
+        csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
+
+
+def test_a_bound_that_cannot_be_held_is_refused(files_of_both, monkeypatch):
+    monkeypatch.setattr(SlicedScene, "least_bytes", 450_000_000)
+    with pytest.raises(InputError, match=r"^0 MB of memory are too little to draw these scenes, which take 482$"):
+        csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
+
+
+def test_nothing_is_left_where_drawing_ends_early(model, view, monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+    def interrupted(_, share):
+        if share > 0.61:  # the first slice was read from the disk and drawn
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        renderer(by_disk(model, progress=interrupted), BEHIND)(view)
+    assert [] == list(Path(tmp_path).iterdir())

@@ -4,6 +4,7 @@ import random
 import re
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import pytest
@@ -12,12 +13,16 @@ from tables import failures
 import csplat
 from csplat import _spec
 from csplat_authoring.builder import build, repair
+from csplat_authoring.coders import Deflate, deflate_dynamic, deflate_fixed, deflate_stored
 from csplat_authoring.recipes import sound_recipes
+from csplat_authoring.recipes.deflate_streams import broken_streams, sound_streams
 from csplat_authoring.samples import attributes, rich_scene, scene, tile
 from csplat_authoring.scene import Attribute, Chunk, StatedErrors
 from csplat_conformance.manifest import load
 from csplat_conformance.validator import validate
+from csplat_conformance.validator.inflate import CodedError, Inflater
 from csplat_conformance.validator.json_text import JsonError, parse_json
+from csplat_conformance.validator.streams import undo_coder
 from csplat_conformance.validator.violation_log import CODES, VIOLATIONS_MAX
 from csplat_selftest.fuzzing.bit_flips import flip, flips, prefixes
 from csplat_selftest.fuzzing.damage import damaged_file
@@ -51,7 +56,6 @@ NOT_ABOUT_FILES = {
     "CHK-6", "CHK-7", "COD-4", "CBK-6", "CBK-7", "SER-6", "SER-7", "SRC-1", "SRC-2", "SRC-3", "SRC-4",
 }  # fmt: skip
 
-
 #: Vectors whose arrays, at SH degree 3, fill the decoders' default budget.
 SPLATS_MAX = _spec.BUDGET_BYTES // (4 * (11 + 48))
 
@@ -73,8 +77,6 @@ def broken():
 
 
 # Vectors -------------------------------------------------------------------------------------------
-
-
 def test_valid_vectors_break_nothing(sound):
     def check(vector):
         found, header = sound[vector.name], vector.expect["header"]
@@ -122,8 +124,6 @@ def test_sound_files_get_no_remark(sound):
 
 
 # Clauses -------------------------------------------------------------------------------------------
-
-
 def requirements():
     """Clause to sentence, of the sections on streams."""
     body = TEXT.split("## 2 Conventions")[1].split("## 9 Conformance")[0]
@@ -155,8 +155,6 @@ def test_every_clause_is_reached_by_a_vector_or_a_test_of_this_file(broken):
 
 
 # More than one defect ------------------------------------------------------------------------------
-
-
 def test_all_defects_of_a_file_are_named():
     changes = {
         "header.profile": 9,
@@ -241,8 +239,6 @@ def test_a_file_of_nothing_but_violations_ends():
 
 
 # Clauses that no decoder looks at, or no vector shows -----------------------------------------------
-
-
 def stated(*records, pruned=0, degree=0):
     errors = StatedErrors(2 + pruned, pruned, degree, 0, records)
     return build(scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=errors),))).data
@@ -267,8 +263,6 @@ def test_a_text_beyond_the_budget_is_not_read():
 
 
 # JSON ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("text", "value"),
     [
@@ -299,8 +293,6 @@ def test_texts_that_are_no_json_are_refused(text):
 
 
 # Damage --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("built", "count"), [(SMALL, len(SMALL.data)), (RICH, 150)], ids=["small", "rich"])
 def test_prefixes_are_found(built, count):
@@ -414,3 +406,78 @@ def test_the_validator_shares_nothing_with_the_decoder_nor_the_encoder_suite_wit
     }
     unwanted = ("csplat.encoder", "csplat.ply", "csplat_tools", "numba", "torch")
     assert [] == [name for name in by_suite if name.startswith(unwanted)]
+
+
+DEFLATE = 1
+SIZE = 2000
+
+
+def by_zlib(coded, size=SIZE):
+    """Output and bytes read, or what is wrong, or that there is more output than `size`."""
+    inflater = zlib.decompressobj(-15)
+    try:
+        out = inflater.decompress(coded, size + 1)
+    except zlib.error:
+        return "refused"
+    if len(out) > size:
+        return "long"
+    return (out, len(coded) - len(inflater.unused_data)) if inflater.eof else "refused"
+
+
+def by_validator(coded, size=SIZE):
+    inflater = Inflater(coded)
+    try:
+        out = inflater.inflate(size)
+    except CodedError:
+        return "refused"
+    return "long" if len(out) > size else (out, inflater.used)
+
+
+def test_sound_streams_give_their_output():
+    def check(case):
+        size = len(case.output)
+        assert (case.output, len(case.coded)) == by_zlib(case.coded, size)
+        assert (case.output, len(case.coded)) == by_validator(case.coded, size)
+
+    assert [] == failures(sound_streams(), check)
+
+
+def test_broken_streams_are_refused_for_their_clause():
+    def check(case):
+        assert "refused" == by_zlib(case.coded, len(case.output))
+        with pytest.raises(CodedError) as caught:
+            undo_coder(memoryview(case.coded), DEFLATE, len(case.output))
+        assert case.clause == caught.value.clause
+
+    assert [] == failures(broken_streams(), check)
+
+
+def damaged(count):
+    """Yield streams with a few bits flipped, most of them in the header of the first block."""
+    rng = random.Random(1)  # noqa: S311 - damage is no secret
+    cases = [case.coded for case in sound_streams() + broken_streams() if len(case.output) < SIZE]
+    text = bytes(rng.choice(b"aaaabbcdefgh") for _ in range(300))
+    packers = [zlib.compressobj(9, zlib.DEFLATED, -15, 9, way) for way in (0, 2, 3, 4)]
+    texts = [packer.compress(text) + packer.flush() for packer in packers]
+    texts += [deflate_dynamic(text), deflate_fixed(text), deflate_stored(text, 90)]
+    for _ in range(count):
+        coded = bytearray(rng.choice(rng.choice((cases, texts))))
+        for _ in range(rng.choice((1, 1, 2, 3))):
+            bit = rng.randrange(min(8 * len(coded), rng.choice((40, 120, 3000))))
+            coded[bit >> 3] ^= 1 << (bit & 7)
+        yield bytes(coded)
+
+
+@pytest.mark.slow
+def test_the_slow_inflate_reads_what_zlib_reads_and_refuses_the_rest():
+    verdicts = [(by_zlib(coded), by_validator(coded)) for coded in damaged(1500)]
+
+    assert [] == [pair for pair in verdicts if pair[0] != pair[1]]
+    refused = sum(zlib_says == "refused" for zlib_says, _ in verdicts)
+    assert 375 < refused < 1300
+
+
+def test_a_code_of_code_lengths_without_codewords_is_refused():
+    nothing = Deflate().number(1, 1).number(2, 2).number(0, 14 + 4 * 3 + 258 + 3).end()
+
+    assert "refused" == by_zlib(nothing) == by_validator(nothing)

@@ -15,9 +15,9 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 import pytest
 import typer
-from child_processes import heed_interrupts
+from chromium import ViewerPage
+from command_line import heed_interrupts
 from typer.testing import CliRunner
-from viewer_pages import ViewerPage
 
 from csplat import decode, encode, read_ply, write_ply
 from csplat.errors import FormatError, InputError

@@ -7,13 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chromium import IN_CHROMIUM
-from viewer_pages import ViewerPage
+from chromium import ViewerPage
 
 from csplat import EncodeOptions, decode, encode, read_ply
 from csplat_conformance.validator import validate
 
-pytestmark = IN_CHROMIUM
+pytestmark = pytest.mark.slow
 
 FAST = EncodeOptions(preset="fast", tile_splats=500)
 

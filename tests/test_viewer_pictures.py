@@ -3,11 +3,11 @@
 import base64
 import json
 import math
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from chromium import IN_CHROMIUM
 
 from csplat import EncodeOptions, decode, encode, read_ply
 from csplat.decoder import read_header
@@ -15,12 +15,13 @@ from csplat.model import SplatModel, normalise_quats
 
 pytest.importorskip("numba", reason="pictures need the rasteriser: pip install 'csplat[render]'")
 
+
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import load_cameras
 from csplat_render.virtual_cameras import virtual_cameras
 
-pytestmark = [*IN_CHROMIUM, pytest.mark.area(name="chromium")]
+pytestmark = [pytest.mark.slow, pytest.mark.area(name="chromium")]
 
 #: Well above the 38 dB that are asked for: leaving out all SH costs 33, 8-bit rounding alone leaves 59.
 GOOD = 50.0
@@ -373,3 +374,32 @@ def test_nothing_is_left_after_closing(engine, sample):
     engine.page.evaluate("make()")
     engine.open(encode(sample.select(slice(0, 500)), FAST))
     assert engine.picture(in_front(size=64)).shape == (64, 64, 3)
+
+
+@pytest.mark.parametrize(
+    ("policy", "expected"),
+    [
+        ("", {"compiled": True, "workers": 2}),
+        ("script-src 'self' 'unsafe-inline'; worker-src 'none'", {"compiled": False, "workers": 0}),
+    ],
+    ids=["WebAssembly", "JavaScript"],
+)
+def test_decodes_every_vector(tab, site, policy, expected):
+    results = []
+
+    def take(route):
+        results.append(route.request.post_data_json)
+        route.fulfill(json={"more": False})
+
+    site.policy = policy
+    site.add("/expected", json.dumps(expected).encode())
+    tab.page.route("**/result", take)
+    tab.page.goto(site.url("/codec/js/test/browser.html"))
+    end = time.monotonic() + 120.0
+    while not results:
+        assert time.monotonic() < end, "no result came"
+        tab.page.wait_for_timeout(100)
+    (result,) = results
+    assert [] == result["failures"]
+    assert result["count"] > 700
+    tab.problems.clear()  # the browser reports what the policy forbids

@@ -173,7 +173,7 @@ def test_degenerate_scenes_have_cameras():
     for model in (point, clear, huge, tiny, far):
         (camera,) = virtual_cameras(model, 1)
         assert np.isfinite(camera.viewmat).all()
-    for model in (clear, tiny, far):  # test_paths.py asks for paths of the others
+    for model in (clear, tiny, far):  # test_cameras.py asks for paths of the others
         assert all(np.isfinite(camera.viewmat).all() for camera in orbit_cameras(model, 3))
 
 

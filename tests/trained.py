@@ -9,22 +9,24 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
+
+from csplat_tools.training import training_run
+from csplat_tools.training.training_run import tuning_after
 
 W, H = 48, 40
 FOCAL = 42.0  # pixels
 VIEWS = 16  # views, of which every eighth is held out
 DISTANCE = 3.2  # distance of the cameras from the centre of a ball of radius 1
 _SAMPLES = 3  # rays along each side of a pixel
-
 SETTINGS = "refine_start=50,refine_every=25,lr_means=1e-3"
 TRAIN = ("--max-splats", 300, "--sh-degree", 1, "--iterations", 300, "--seed", 1, "--threads", 1, "--set", SETTINGS)
 TUNE = ("--attribute-psnr", 28, "--iterations", 100, "--seed", 1, "--threads", 1)
-
 Run = Callable[..., str]
 
 
@@ -128,3 +130,31 @@ def make_tuned(folder: Path, source: TrainedScene, run: Run = run_alone) -> Tune
     path, report = folder / "a.csplat", folder / "finetune.json"
     messages = run("finetune", source.ply, "-o", path, "--data", source.data, *TUNE, "--report", report)
     return TunedFile(source, path, report, messages)
+
+
+class FileRuns:
+    """Runs of `csplat train` on the photographs, each to a file, with little training and tuning.
+
+    The first, of all splats, leaves checkpoints of training and tuning, a report and a page.
+    """
+
+    WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 30, "--set", "log_every=10")
+    TUNED = 30  # steps, usually 1,000
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.data = folder, folder / "photographs"
+        self.checkpoint, self.page = folder / "run.npz", folder / "page.html"
+        write_photographs(self.data)
+        self.report, self.messages = self.made(
+            "a.csplat", "--keep", 1, "--checkpoint", self.checkpoint, "--page", self.page
+        )
+
+    def made(self, name: str, *more: object) -> tuple[dict, str]:
+        """Make a file or a PLY; return the report and the messages."""
+        report = self.folder / f"{name}.json"
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(
+                training_run, "tuning_after", lambda **given: replace(tuning_after(**given), iterations=self.TUNED)
+            )
+            messages = run_here("train", self.data, "-o", self.folder / name, *self.WORDS, "--report", report, *more)
+        return json.loads(report.read_text()), messages

@@ -8,7 +8,7 @@ over rounds. `ms` is wall-clock time; `CPU ms` is the time of all threads togeth
 machine disturbs less. `dB` is the PSNR against the standard mode, pooled over the views. Scenes called NAME@COUNT are
 split as training splits them, and pruned until the given number of splats is in view (median of the cameras).
 
-What pictures and gradients are off the exact twin: `pytest -rP tests/test_render_forward.py` and `…_gradients.py`.
+What pictures and gradients are off the exact twin: `pytest -rP tests/test_rasteriser.py`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`csplat info --page`: one page about one file, compared with its source; hardest places, and views worth showing."""
+"""HTML reports: `csplat info --page` on one file, and the page about a training; both fetch nothing."""
 
 import html
 import json
@@ -8,16 +8,20 @@ import sys
 
 import numpy as np
 import pytest
+
+# Importing them needs what is looked for above.
+from captures import cameras, shell
+from posed_sets import write_blender
 from typer.testing import CliRunner
+
+from csplat import EncodeOptions, encode, read_ply, write_ply
 
 pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
 pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
 pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
+pytest.importorskip("matplotlib", reason="plots want the extra [render]")
 
-# Importing them needs what is looked for above.
-from captures import cameras, shell
 
-from csplat import EncodeOptions, encode, read_ply, write_ply
 from csplat_render.scene_frame import detail, sample_cloud, scene_frame
 from csplat_tools.cli.app import app
 from csplat_tools.hardest_place import HardestPlaceSearch
@@ -25,8 +29,6 @@ from csplat_tools.html_report import Bar, draw_bars
 from csplat_tools.inspect.file_description import describe_file
 from csplat_tools.views import comparison_cameras, display_cameras, find_view_set
 from csplat_tools.views.view_sets import ViewSet
-
-pytestmark = pytest.mark.usefixtures("small_views")
 
 
 def invoke(*words):
@@ -52,6 +54,7 @@ def page(files):
     return path
 
 
+@pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
 def test_the_page_says_what_the_text_says(files, page):
     text = html.unescape(page.read_text())
@@ -68,6 +71,7 @@ def test_the_page_says_what_the_text_says(files, page):
         assert re.search(rf"<td[^>]*>{name}</td><td[^>]*>[^<]+</td>", text)
 
 
+@pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
 def test_the_page_shows_the_source_beside_the_file(files, page):
     text = page.read_text()
@@ -77,6 +81,7 @@ def test_the_page_shows_the_source_beside_the_file(files, page):
     assert re.search(r"^psnr +(\S+) dB", compared, re.MULTILINE)[1] == re.search(r"([\d.]+) dB: likeness", text)[1]
 
 
+@pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
 def test_the_page_opens_in_a_browser_without_a_complaint(tab, page):
     tab.page.set_viewport_size({"width": 400, "height": 700})
@@ -92,6 +97,7 @@ def test_the_page_opens_in_a_browser_without_a_complaint(tab, page):
     assert grounds[0] != grounds[1]
 
 
+@pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
 def test_the_page_refers_to_nothing_outside(page):
     text = page.read_text()
@@ -100,6 +106,7 @@ def test_the_page_refers_to_nothing_outside(page):
     assert "default-src 'none'" in text
 
 
+@pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
 def test_the_page_replaces_nothing_unless_forced(files, tmp_path):
     target = tmp_path / "page.html"
@@ -112,6 +119,7 @@ def test_the_page_replaces_nothing_unless_forced(files, tmp_path):
     assert target.read_text().startswith("<!doctype html>")
 
 
+@pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
 def test_a_file_without_splats_has_a_page(tmp_path, make_model):
     (tmp_path / "empty.csplat").write_bytes(encode(make_model(0)))
@@ -121,11 +129,13 @@ def test_a_file_without_splats_has_a_page(tmp_path, make_model):
     assert "0 splats" in (tmp_path / "a.html").read_text()
 
 
+@pytest.mark.usefixtures("small_views")
 def test_a_source_without_a_page_is_a_wrong_command_line(files):
     assert 2 == invoke(files[0], "--source", files[1]).exit_code
     assert 2 == invoke(files[0], "--page", "-").exit_code
 
 
+@pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
 def test_without_the_renderer_there_is_a_page_but_no_comparison(files, tmp_path):
     code = """import json, sys
@@ -145,6 +155,7 @@ for words in ((f"{folder}/a.html",), (f"{folder}/b.html", "--source", source)):
     assert not (tmp_path / "b.html").exists()
 
 
+@pytest.mark.usefixtures("small_views")
 def test_bars_are_as_long_as_their_bytes():
     text = draw_bars([Bar("a", {"means": 100, "sh0": 300}, "400"), Bar("b", {"means": 50}, "50")], key=True)
     widths = [float(one) for one in re.findall(r'width="([\d.]+)" height="17"', text)]
@@ -152,6 +163,7 @@ def test_bars_are_as_long_as_their_bytes():
     np.testing.assert_allclose(np.array(widths) / widths[0], [1.0, 3.0, 0.5], atol=1e-3)
 
 
+@pytest.mark.usefixtures("small_views")
 def test_the_hardest_place_is_where_the_error_is():
     source = np.full((80, 120, 3), 0.5, np.float32)
     slightly, badly = source.copy(), source.copy()
@@ -174,6 +186,7 @@ def test_the_hardest_place_is_where_the_error_is():
     assert HardestPlaceSearch().found() is None
 
 
+@pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
 def test_views_that_are_shown_show_detail(sample_path):
     source = read_ply(sample_path)
@@ -185,12 +198,68 @@ def test_views_that_are_shown_show_detail(sample_path):
     assert all(detail(cloud, camera, nearest) > 0.6 * best for camera in shown)
 
 
+@pytest.mark.usefixtures("small_views")
 def test_views_of_a_user_are_shown_as_they_are():
     own = cameras(3)
     assert display_cameras(shell(8), ViewSet("cameras.json", (0.0, 0.0, 0.0), (), (), own)) is own
 
 
+@pytest.mark.usefixtures("small_views")
 def test_equal_pictures_have_a_place_too():
     place = HardestPlaceSearch()
     place.examine(0, np.zeros((8, 8, 3), np.float32), np.zeros((8, 8, 3), np.float32))
     assert 99.0 == place.found().psnr
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("set")
+    write_blender(path)
+    return path
+
+
+def call(*words):
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, (result.stderr, result.exception)
+
+
+def headings(page):
+    return re.findall("<h2>(.*?)</h2>", page)
+
+
+@pytest.mark.slow
+def test_a_page_about_a_training_and_its_file(file_runs):
+    page = file_runs.page.read_text()
+    assert [
+        "How near it comes", "What it looks like", "The training", "The tuning", "Where the bytes are",
+        "How it was made",
+    ] == headings(page)  # fmt: skip
+    for scores in file_runs.report["file"]["scores"].values():
+        assert f"<td>{scores['psnr_mean']:.2f}</td>" in page
+    assert ["photograph", "source", "before tuning", "file"] * 2 == re.findall("<figcaption>(.*?)</figcaption>", page)
+    assert 8 == page.count('src="data:image/')
+    assert not re.search("(src|href)=.http", page)
+
+
+@pytest.mark.slow
+def test_a_training_alone_has_a_page_and_the_scores_of_its_scene_are_those_of_compare(file_runs, tmp_path):
+    compared, path = tmp_path / "compared.json", tmp_path / "page.html"
+    file_runs.made("a.ply", "--resume", file_runs.checkpoint, "--page", path)
+    page = path.read_text()
+    assert ["How near it comes", "What it looks like", "The training", "How it was made"] == headings(page)
+    assert ["photograph", "trained scene"] * 2 == re.findall("<figcaption>(.*?)</figcaption>", page)
+    both = (file_runs.folder / name for name in ("a.ply", "a.csplat"))
+    call("compare", *both, "--data", file_runs.data, "--report", compared)
+    judged = json.loads(compared.read_text())["photographs"]
+    for name, one in (("source", "a"), ("file", "b")):
+        scores = file_runs.report["file"]["scores"][name]
+        for score in ("psnr", "psnr_mean", "ssim"):
+            assert scores[score] == pytest.approx(judged[one][score], abs=1e-3)
+
+
+def test_a_page_is_not_replaced_without_being_told(folder, tmp_path):
+    (tmp_path / "page.html").write_text("mine")
+    words = ["train", str(folder), "-o", str(tmp_path / "a.ply"), "--page", str(tmp_path / "page.html")]
+    result = CliRunner().invoke(app, words)
+    assert (1, "mine") == (result.exit_code, (tmp_path / "page.html").read_text())
+    assert "page.html exists" in result.stderr

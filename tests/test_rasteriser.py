@@ -1,0 +1,558 @@
+"""The rasteriser: renders and gradients against the exact twin, numbers worked out by hand, and adversarial inputs.
+
+`pytest -rP` prints the errors of gradients: relative L2, the largest of any group of parameters.
+"""
+
+import itertools
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from csplat.errors import InputError, LimitError
+from csplat.model import SH_C0, SplatModel
+from csplat.ply import read_ply
+
+pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+
+
+from oracle import (
+    GROUPS,
+    VIEW,
+    adversarial,
+    cropped,
+    difference,
+    extreme_splats,
+    facing,
+    finite_differences,
+    float32_errors,
+    gradients_of,
+    random_gradients,
+    random_splats,
+    relative_error,
+)
+
+from csplat_render import Camera, rasteriser, render
+from csplat_render.conventions import ALPHA_CAP, DILATION, UncheckedSplats
+from csplat_render.rasteriser import Rasteriser
+from csplat_render.reference_rasteriser import render_exact
+from csplat_render.virtual_cameras import virtual_cameras
+from csplat_render.warmup import warm_up
+
+
+def camera(width=64, height=48, focal=60.0, distance=4.0, **fields):
+    viewmat = np.eye(4)
+    viewmat[2, 3] = distance
+    K = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
+    return Camera(K, viewmat, width, height, **fields)
+
+
+def one_splat(alpha=0.5, scale=-2.0, colour=(1.0, 0.5, 0.25), mean=(0.0, 0.0, 0.0), quat=(1.0, 0.0, 0.0, 0.0)):
+    scales = np.broadcast_to(np.asarray(scale, np.float32), (3,))
+    return SplatModel(
+        means=np.array([mean], np.float32),
+        quats=np.array([quat], np.float32),
+        scales=scales[None].copy(),
+        opacities=np.array([alpha], np.float32),
+        sh0=((np.array([colour], np.float32) - 0.5) / SH_C0).astype(np.float32),
+    )
+
+
+def scene(count=400, degree=3, seed=0):
+    """A random scene of splats of all shapes, none of them degenerate."""
+    rng = np.random.default_rng(seed)
+    quats = rng.standard_normal((count, 4))
+    return SplatModel(
+        means=rng.uniform(-1.2, 1.2, (count, 3)).astype(np.float32),
+        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        scales=rng.uniform(-5.0, -0.8, (count, 3)).astype(np.float32),
+        opacities=rng.random(count).astype(np.float32),
+        sh0=rng.standard_normal((count, 3)).astype(np.float32),
+        shN=(0.3 * rng.standard_normal((count, (degree + 1) ** 2 - 1, 3))).astype(np.float32),
+    )
+
+
+def assert_same_picture(model, view, **options):
+    fast, exact = render(model, view, **options), render(model, view, mode="exact", **options)
+    for found, wanted in ((fast.rgb, exact.rgb), (fast.alpha[..., None], exact.alpha[..., None])):
+        off = difference(found, wanted)
+        print(f"differs from the twin by {off.most:.1e} at most")
+        assert off.share <= 1e-3
+        assert off.mean <= 1e-5
+    assert np.abs(fast.depth - exact.depth).mean() <= 1e-5 * max(1.0, exact.depth.max())
+    assert fast.ignored == exact.ignored
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_random_scenes_look_like_the_twins(degree):
+    assert_same_picture(scene(degree=degree, seed=degree), camera(70, 53), background=(0.3, 0.6, 0.1))
+
+
+def test_antialiased_pictures_look_like_the_twins():
+    model = scene(count=300)
+    model = replace(model, scales=model.scales - 2, antialiased=True)
+    view = camera(64, 48, 40.0)
+    assert_same_picture(model, view)
+    assert not np.allclose(render(model, view).rgb, render(model, view, antialiased=False).rgb, atol=0.01)
+
+
+@pytest.mark.slow
+def test_the_sample_looks_like_the_twins(sample_path):
+    model = read_ply(sample_path)
+    centre = np.median(model.means, axis=0)
+    spread = float(np.quantile(np.abs(model.means - centre), 0.9))
+    viewmat = np.eye(4)
+    viewmat[:3, 3] = -centre + [0.0, 0.0, 3.0 * spread]
+    view = Camera([[90.0, 0.0, 48.0], [0.0, 90.0, 36.0], [0.0, 0.0, 1.0]], viewmat, 96, 72, near=0.05 * spread)
+    result = render(model, view)
+    assert result.alpha.mean() > 0.1
+    assert_same_picture(model.select(slice(0, None, 8)), view)
+
+
+@pytest.mark.parametrize("name", ["donut", "lego60k", "fox60k_noreg"])
+def test_shared_scenes_look_like_the_twins(data_dir, name):
+    path, cameras = data_dir / "ply" / f"{name}.ply", data_dir / "psnr_cameras" / f"{name}.json"
+    if not (path.exists() and cameras.exists()):
+        pytest.skip(f"{name} is absent")
+    model = read_ply(path)
+    views = [Camera.from_json(entry) for entry in json.loads(cameras.read_text())]
+    assert_same_picture(model.select(slice(0, None, 4)), cropped(views[1], 64, 48))
+
+
+def test_one_splat_has_the_values_worked_out_by_hand():
+    # σ = 0.5 at distance 4 with a focal length of 80 pixels: 10 pixels, and 0.3 of dilation.
+    view = camera(65, 49, 80.0)
+    result = render(one_splat(alpha=0.5, scale=math.log(0.5)), view)
+    variance = 100.0 + DILATION
+    for dx, dy in [(0, 0), (5, 0), (0, 7), (-12, 9)]:
+        alpha = 0.5 * math.exp(-0.5 * (dx * dx + dy * dy) / variance)
+        x, y = 32 + dx, 24 + dy  # the centre of the picture is the centre of a pixel
+        np.testing.assert_allclose(result.rgb[y, x], np.array([1.0, 0.5, 0.25]) * alpha, atol=1e-6)
+        assert result.alpha[y, x] == pytest.approx(alpha, abs=1e-6)
+        assert result.depth[y, x] == pytest.approx(4.0 * alpha, abs=1e-5)
+    assert result.radii[0] == pytest.approx(3.0 * math.sqrt(variance), rel=1e-6)
+    # 0.5 · exp(−½ r²/100.3) falls below 1/255 at r = 31.17 pixels.
+    reach = math.sqrt(2.0 * variance * math.log(0.5 * 255.0))
+    assert result.alpha[24, 32 + math.floor(reach)] > 0.0
+    assert result.alpha[24, 32 - math.floor(reach) - 1] == 0.0
+
+
+def test_a_needle_lies_where_its_rotation_says():
+    half = math.sqrt(0.5)
+    turned = (half, 0.0, 0.0, half)  # 90° about z: x becomes y, which points down
+    picture = render(one_splat(scale=(-1.0, -6.0, -6.0), quat=turned), camera()).alpha
+    assert picture[34, 32] > 0.04
+    assert picture[24, 42] == 0.0
+
+
+def test_alpha_is_capped_and_colours_are_clamped_at_zero():
+    model = replace(one_splat(alpha=1.0, scale=0.0), sh0=np.array([[-10.0, 0.0, 10.0]], np.float32))
+    result = render(model, camera())
+    assert result.alpha[24, 32] == pytest.approx(ALPHA_CAP, abs=1e-6)
+    assert result.rgb[24, 32] == pytest.approx([0.0, 0.5 * ALPHA_CAP, (0.5 + 10 * SH_C0) * ALPHA_CAP], abs=1e-5)
+
+
+def test_the_background_shines_through():
+    result = render(one_splat(), camera(), background=(0.1, 0.2, 0.3))
+    assert result.rgb[0, 0] == pytest.approx([0.1, 0.2, 0.3])
+    left = 1.0 - result.alpha[24, 32]
+    assert result.rgb[24, 32, 2] == pytest.approx(0.25 * (1 - left) + 0.3 * left, abs=1e-6)
+
+
+def test_the_nearer_splat_covers_the_farther_and_equal_depths_go_by_index():
+    red, blue = one_splat(0.9, -1.0, (1, 0, 0), (0, 0, 0.5)), one_splat(0.9, -1.0, (0, 0, 1), (0, 0, -0.5))
+    names = ("means", "quats", "scales", "opacities", "sh0", "shN")
+    both = SplatModel(**{name: np.concatenate([getattr(red, name), getattr(blue, name)]) for name in names})
+    pixel = render(both, camera()).rgb[24, 32]
+    assert pixel[2] > 5 * pixel[0]
+    level = replace(both, means=np.zeros((2, 3), np.float32))
+    pixel = render(level, camera()).rgb[24, 32]
+    assert pixel[0] > 5 * pixel[2]
+
+
+def test_a_pixel_is_finished_before_transmittance_falls_below_the_limit():
+    count = 5
+    one = one_splat(alpha=0.95, scale=0.0, colour=(1, 1, 1))
+    names = ("means", "quats", "scales", "opacities", "sh0", "shN")
+    stack = SplatModel(**{name: np.repeat(getattr(one, name), count, axis=0) for name in names})
+    alpha = render(stack, camera(65, 49)).alpha[24, 32]
+    # 0.05⁴ is below 1e-4: three are drawn.
+    assert alpha == pytest.approx(1 - 0.05**3, abs=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["standard", "fast", "exact"])
+def test_spherical_harmonics_can_be_cut_off(mode):
+    model = scene(count=50)
+    flat = replace(model, shN=np.zeros((50, 0, 3), np.float32))
+    np.testing.assert_array_equal(
+        render(model, camera(), sh_degree=0, mode=mode).rgb, render(flat, camera(), mode=mode).rgb
+    )
+
+
+def test_the_fast_mode_stays_near_the_standard_one():
+    model = scene(count=2000)
+    standard, fast = render(model, camera()).rgb, render(model, camera(), mode="fast").rgb
+    error = math.sqrt(np.mean((standard - fast) ** 2))
+    assert 0.0 < error < 0.02
+
+
+def test_any_number_of_threads_gives_the_same_bits():
+    model = scene(count=3000)
+    view = camera(100, 75)
+    rng = np.random.default_rng(0)
+    gradient = rng.standard_normal((75, 100, 3)).astype(np.float32)
+    outcomes = []
+    for threads in (1, 2, None):
+        rasteriser = Rasteriser(threads=threads)
+        picture = rasteriser.forward(model, view)
+        g = rasteriser.backward(gradient)
+        outcomes.append([picture.rgb, picture.alpha, picture.depth, g.means, g.quats, g.scales, g.opacities, g.shN])
+    for other in outcomes[1:]:
+        for a, b in zip(outcomes[0], other, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_buffers_of_earlier_pictures_do_not_show():
+    rasteriser = Rasteriser()
+    large, small = scene(count=3000), scene(count=20, degree=1, seed=5)
+    rasteriser.forward(large, camera(200, 150))
+    again = rasteriser.forward(small, camera(33, 17)).rgb
+    np.testing.assert_array_equal(again, Rasteriser().forward(small, camera(33, 17)).rgb)
+
+
+@pytest.mark.parametrize("mode", ["standard", "fast"])
+def test_slices_of_depth_one_after_the_other_give_the_same_bits(mode):
+    model, view, behind = scene(), camera(70, 53), (0.3, 0.6, 0.1)
+    rasteriser = Rasteriser(mode, gradients=False)
+    wanted = rasteriser.forward(model, view, background=behind)
+    near = rasteriser.find_visible(model, view).near
+    assert wanted.drawn == np.count_nonzero(near)
+    limits = np.quantile(near[near > 0], [0.0, 0.1, 0.4, 0.4, 0.9, 1.0])  # one slice is empty
+    state, found = rasteriser.initial_state(view), wanted
+    for first, last in itertools.pairwise([*limits[:-1], np.inf]):
+        part = model.select((near >= first) & (near < last))
+        found = rasteriser.forward(part, view, background=behind, state=state)
+    for name in ("rgb", "alpha", "depth"):
+        np.testing.assert_array_equal(getattr(wanted, name), getattr(found, name))
+
+
+def test_tiles_that_a_splat_may_touch_are_no_fewer_than_it_touches():
+    rasteriser = Rasteriser(gradients=False)
+    model, view = scene(), camera(70, 53)
+    seen, drawn = rasteriser.find_visible(model, view), rasteriser.forward(model, view)
+    assert drawn.intersections <= seen.tiles.sum() <= 2 * drawn.intersections
+
+
+def test_gradients_of_a_slice_are_refused():
+    rasteriser = Rasteriser()
+    with pytest.raises(InputError, match="slice"):
+        rasteriser.forward(scene(), camera(), state=rasteriser.initial_state(camera()))
+    rasteriser = Rasteriser(gradients=False)
+    with pytest.raises(InputError, match="state"):
+        rasteriser.forward(scene(), camera(), state=rasteriser.initial_state(camera(width=65)))
+
+
+def test_results_belong_to_the_caller():
+    rasteriser = Rasteriser()
+    model = scene(count=100)
+    first = rasteriser.forward(model, camera()).rgb
+    before = first.copy()
+    rasteriser.forward(model, camera(distance=5.0))
+    np.testing.assert_array_equal(before, first)
+
+
+def test_rejects_arrays_that_do_not_fit():
+    model = scene(count=5)
+    bad = UncheckedSplats(model.means, model.quats[:4], model.scales, model.opacities, model.sh0, model.shN)
+    with pytest.raises(InputError, match="quats has shape"):
+        Rasteriser().forward(bad, camera())
+    with pytest.raises(InputError, match="coefficients"):
+        Rasteriser().forward(UncheckedSplats(**{**vars(bad), "quats": model.quats, "shN": model.shN[:, :4]}), camera())
+    with pytest.raises(InputError, match="mode"):
+        render(model, camera(), mode="slow")
+    with pytest.raises(InputError, match="dtype"):
+        Rasteriser(dtype=np.float16)
+    with pytest.raises(InputError, match="forward"):
+        Rasteriser().backward(np.zeros((2, 2, 3)))
+    with pytest.raises(InputError, match="background"):
+        render(model, camera(), background=(0.0, float("nan"), 0.0))
+    with pytest.raises(InputError, match="threads"):
+        render(model, camera(), threads=0)
+
+
+def test_the_twin_takes_what_the_rasteriser_takes():
+    model = scene(count=30)
+    assert render_exact(model, camera()).rgb.dtype == np.float64
+    assert render(model, camera(), mode="exact").drawn == 30
+
+
+W, H = 50, 37
+
+
+def assert_survives(arrays, view, *, antialiased=False):
+    """Render forward and backward in both dtypes: finite, alike, and like the twin."""
+    found = []
+    rng = np.random.default_rng(1)
+    weights = rng.standard_normal((view.H, view.W, 3)), *rng.standard_normal((2, view.H, view.W))
+    for dtype in (np.float32, np.float64):
+        rasteriser = Rasteriser(dtype=dtype)
+        picture = rasteriser.forward(UncheckedSplats(**arrays), view, antialiased=antialiased)
+        g = rasteriser.backward(*weights)
+        for name in ("rgb", "alpha", "depth"):
+            assert np.isfinite(getattr(picture, name)).all(), name
+        for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "means2d"):
+            assert np.isfinite(getattr(g, name)).all(), name
+        found.append((picture, {name: np.array(value, np.float64) for name, value in vars(g).items()}))
+    exact = render(UncheckedSplats(**arrays), view, mode="exact", antialiased=antialiased)
+    assert np.isfinite(exact.rgb).all()
+    for picture, _ in found:
+        off = np.abs(picture.rgb - exact.rgb).max(2) > 1 / 255 * max(1.0, np.abs(exact.rgb).max())
+        assert off.mean() <= 2e-3
+    return found
+
+
+def assert_gradients_agree(found):
+    for name, wanted in found[1][1].items():
+        size = np.linalg.norm(wanted)
+        assert np.linalg.norm(found[0][1][name] - wanted) <= 1e-2 * size + 1e-30, name
+
+
+@pytest.mark.area(name="rasteriser")
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize(
+    "scales",
+    [(0.0, -13.8, -13.8), (0.0, 0.0, -13.8), (4.0, -9.8, -9.8), (4.0, 4.0, -9.8), (9.0, -4.8, -4.8)],
+    ids=["needle", "disc", "large needle", "large disc", "huge needle"],
+)
+def test_an_anisotropy_of_a_million(scales, antialiased):
+    arrays = extreme_splats(scales=scales)
+    assert_gradients_agree(assert_survives(arrays, facing(), antialiased=antialiased))
+
+
+@pytest.mark.area(name="rasteriser")
+def test_the_camera_inside_splats():
+    arrays = extreme_splats(scales=(1.0, 0.5, 0.2))
+    assert_gradients_agree(assert_survives(arrays, facing(distance=0.0)))
+
+
+@pytest.mark.area(name="rasteriser")
+@pytest.mark.parametrize("near", [1e-30, 1e-6, 0.2, 3.0])
+def test_splats_at_the_near_plane_and_behind_it(near):
+    arrays = extreme_splats(count=80)
+    arrays["means"][:, 2] = np.concatenate([np.float32(near) * np.linspace(0.5, 2.0, 40), np.linspace(-4.0, 4.0, 40)])
+    found = assert_survives(arrays, facing(near=near, distance=0.0))
+    assert 0 < found[0][0].drawn < 80
+
+
+@pytest.mark.area(name="rasteriser")
+@pytest.mark.parametrize("log_scale", [-60.0, 60.0, 88.0, -88.0, 3e38, -3e38])
+def test_extreme_log_scales(log_scale):
+    for axes in ((1, 1, 1), (1, 0, 0), (1, 1, 0)):
+        arrays = extreme_splats()
+        arrays["scales"][:] = np.where(axes, np.float32(log_scale), arrays["scales"])
+        assert_survives(arrays, facing())
+    mixed = extreme_splats()
+    mixed["scales"][:, 0], mixed["scales"][:, 1] = 60.0, -60.0
+    assert_survives(mixed, facing(), antialiased=True)
+
+
+@pytest.mark.area(name="rasteriser")
+@pytest.mark.parametrize("alpha", [0.0, 1.0])
+def test_alpha_zero_and_one(alpha):
+    found = assert_survives(extreme_splats(opacities=alpha), facing())
+    assert (found[0][0].alpha.max() > 0.0) == (alpha > 0.0)
+    assert_gradients_agree(found)
+
+
+@pytest.mark.area(name="rasteriser")
+@pytest.mark.parametrize("focal", [1e-6, 1e-2, 1e4, 1e9])
+def test_tiny_and_huge_focal_lengths(focal):
+    assert_survives(extreme_splats(), facing(focal=focal))
+
+
+@pytest.mark.area(name="rasteriser")
+@pytest.mark.parametrize("distance", [1e-20, 1e20, 1e37])
+def test_far_and_large_scenes(distance):
+    arrays = extreme_splats()
+    arrays["means"] *= np.float32(distance)
+    arrays["scales"] += np.float32(math.log(distance))
+    assert_survives(arrays, facing(near=distance * 1e-3, distance=3 * distance))
+
+
+@pytest.mark.area(name="rasteriser")
+def test_zero_and_huge_quaternions():
+    arrays = extreme_splats()
+    arrays["quats"][::3] = 0.0
+    arrays["quats"][1::3] *= np.float32(1e30)
+    arrays["quats"][2::3] *= np.float32(1e-30)
+    found = assert_survives(arrays, facing())
+    plain = dict(arrays)
+    plain["quats"] = arrays["quats"].copy()
+    plain["quats"][::3] = [1.0, 0.0, 0.0, 0.0]
+    np.testing.assert_array_equal(found[0][0].rgb, render(UncheckedSplats(**plain), facing()).rgb)
+
+
+@pytest.mark.area(name="rasteriser")
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh0", "shN"])
+def test_rows_that_hold_nan_are_left_out_and_counted(name, bad):
+    arrays = extreme_splats(count=30)
+    clean = {key: value[3:].copy() for key, value in arrays.items()}
+    arrays[name].reshape(30, -1)[:3, -1] = bad
+    found = assert_survives(arrays, facing())
+    assert [result.ignored for result, _ in found] == [3, 3]
+    assert render(UncheckedSplats(**arrays), facing(), mode="exact").ignored == 3
+    np.testing.assert_array_equal(found[0][0].rgb, render(UncheckedSplats(**clean), facing()).rgb)
+
+
+@pytest.mark.area(name="rasteriser")
+def test_an_empty_scene_shows_the_background():
+    for degree in (0, 3):
+        arrays = extreme_splats(count=0, degree=degree)
+        assert_survives(arrays, facing())
+        picture = render(UncheckedSplats(**arrays), facing(), background=(0.1, 0.2, 0.3))
+        np.testing.assert_array_equal(picture.rgb, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (H, W, 3)))
+
+
+@pytest.mark.area(name="rasteriser")
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 15), (1, 100), (333, 1)])
+def test_pictures_of_any_size(width, height):
+    assert_survives(extreme_splats(), facing(width=width, height=height))
+
+
+@pytest.mark.area(name="rasteriser")
+def test_gradients_beyond_float32_are_clamped():
+    rasteriser = Rasteriser()
+    picture = rasteriser.forward(UncheckedSplats(**extreme_splats(scales=2.0)), facing(focal=1e6))
+    g = rasteriser.backward(np.full_like(picture.rgb, 1e30))
+    assert all(np.isfinite(value).all() for value in vars(g).values())
+
+
+@pytest.mark.area(name="rasteriser")
+def test_too_many_intersections_are_refused(monkeypatch):
+    monkeypatch.setattr(rasteriser, "MAX_INTERSECTIONS", 100)
+    with pytest.raises(LimitError, match="MAX_INTERSECTIONS"):
+        render(UncheckedSplats(**extreme_splats(scales=2.0)), facing())
+
+
+@pytest.mark.area(name="rasteriser")
+def test_warming_up_says_nothing_once_all_is_compiled():
+    warm_up()
+    said = []
+    assert warm_up(said.append) < 5.0
+    assert len(said) in (0, 2)
+
+
+def most(errors):
+    """The largest error; printed."""
+    error = max(errors.values())
+    print(f"relative error {error:.1e}")
+    return error
+
+
+@pytest.mark.area(name="rasteriser")
+@pytest.mark.parametrize(("degree", "antialiased"), [(0, False), (1, True), (2, False), (3, False), (3, True)])
+def test_gradients_are_the_finite_differences_of_the_twin(degree, antialiased):
+    arrays, weights = random_splats(3, degree, seed=degree), random_gradients(VIEW, seed=1)
+    options = {"background": (0.2, 0.5, 0.7), "antialiased": antialiased}
+    picture, gradients = gradients_of(UncheckedSplats(**arrays), VIEW, weights, **options)
+    exact, differences = finite_differences(arrays, VIEW, weights, **options)
+    np.testing.assert_allclose(picture.rgb, exact.rgb, atol=1e-12)
+    errors = {group: relative_error(getattr(gradients, group), differences[group]) for group in GROUPS}
+    assert most(errors) <= 1e-6, errors
+
+
+@pytest.mark.area(name="rasteriser")
+@pytest.mark.area(name="torch")
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_gradients_are_those_of_autograd(degree, antialiased):
+    pytest.importorskip("torch", reason="autograd is that of torch: pip install 'csplat[train]'")
+    from torch_twin import autograd_gradients
+
+    arrays, weights = random_splats(20, degree, seed=degree + 10), random_gradients(VIEW, seed=1)
+    options = {"background": (0.2, 0.5, 0.7), "antialiased": antialiased}
+    picture, gradients = gradients_of(UncheckedSplats(**arrays), VIEW, weights, **options)
+    other, wanted = autograd_gradients(arrays, VIEW, weights, **options)
+    np.testing.assert_allclose(picture.rgb, other, atol=1e-12)
+    errors = {group: relative_error(getattr(gradients, group), wanted[group]) for group in GROUPS}
+    assert most(errors) <= 1e-6, errors
+
+
+@pytest.mark.area(name="rasteriser")
+def test_float32_gradients_are_those_of_float64_on_the_sample(sample_path):
+    model = read_ply(sample_path)
+    (view,) = virtual_cameras(model, 1, 160, 120)
+    flipped, errors = float32_errors(model, view, random_gradients(view, seed=2))
+    assert flipped <= 10
+    assert most(errors) <= 1e-4, errors
+
+
+@pytest.mark.area(name="rasteriser")
+@pytest.mark.parametrize("name", ["donut", "lego60k", "fox120k"])
+def test_float32_gradients_are_those_of_float64_on_shared_scenes(data_dir, name):
+    path, cameras = data_dir / "ply" / f"{name}.ply", data_dir / "psnr_cameras" / f"{name}.json"
+    if not (path.exists() and cameras.exists()):
+        pytest.skip(f"{name} is absent")
+    model, view = read_ply(path), Camera.from_json(json.loads(cameras.read_text())[0])
+    flipped, errors = float32_errors(model, view, random_gradients(view, seed=2))
+    assert flipped <= 10
+    assert most(errors) <= 1e-4, errors
+
+
+@pytest.mark.area(name="rasteriser")
+@pytest.mark.parametrize(("name", "case"), [pytest.param(*pair, id=pair[0]) for pair in adversarial()])
+def test_float32_gradients_survive_adversarial_splats(name, case):
+    splats, weights = UncheckedSplats(**case.arrays), random_gradients(case.view, seed=1)
+    _, found = gradients_of(splats, case.view, weights, np.float32, antialiased=case.antialiased)
+    for group in GROUPS:
+        assert np.isfinite(getattr(found, group)).all(), (name, group)
+    if case.beyond:
+        return
+    flipped, errors = float32_errors(splats, case.view, weights, antialiased=case.antialiased)
+    assert flipped <= 1
+    assert most(errors) <= 1e-2, (name, errors)
+
+
+@pytest.mark.area(name="rasteriser")
+def test_no_gradient_reaches_what_is_clamped_capped_or_out_of_view():
+    arrays = random_splats(4, 0, seed=3)
+    arrays["means"][:] = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.5], [0.0, 0.0, -50.0], [90.0, 0.0, 0.0]]
+    arrays["scales"][:] = -0.5
+    arrays["opacities"][:] = [1.0, 0.5, 0.5, 0.5]
+    arrays["sh0"][0] = [-9.0, 1.0, 1.0]
+    rasteriser = Rasteriser(dtype=np.float64)
+    rasteriser.forward(UncheckedSplats(**arrays), VIEW)
+    g = rasteriser.backward(np.ones((VIEW.H, VIEW.W, 3)))
+    assert g.sh0[0, 0] == 0.0
+    assert g.sh0[0, 1] > 0.0
+    assert (g.means[2:] == 0.0).all()
+    assert (g.opacities[2:] == 0.0).all()
+    assert (g.radii[2:] == 0.0).all()
+    assert g.means2d[2:].max() == 0.0
+
+
+@pytest.mark.area(name="rasteriser")
+def test_the_gradient_ignores_the_length_of_a_quaternion():
+    arrays = random_splats(6, 0, seed=4)
+    weights = random_gradients(VIEW, seed=4)
+    found = []
+    for factor in (1.0, 10.0):
+        rasteriser = Rasteriser(dtype=np.float64)
+        rasteriser.forward(UncheckedSplats(**{**arrays, "quats": arrays["quats"] * factor}), VIEW)
+        found.append(rasteriser.backward(*weights).quats * factor)
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-9, atol=1e-12)
+    radial = np.sum(found[0] * arrays["quats"], axis=1)
+    np.testing.assert_allclose(radial, 0.0, atol=1e-9)
+
+
+@pytest.mark.area(name="rasteriser")
+def test_bands_that_were_not_rendered_have_no_gradient():
+    arrays = random_splats(6, 3, seed=5)
+    rasteriser = Rasteriser(dtype=np.float64)
+    rasteriser.forward(UncheckedSplats(**arrays), VIEW, sh_degree=1)
+    g = rasteriser.backward(np.ones((VIEW.H, VIEW.W, 3)))
+    assert np.abs(g.shN[:, :3]).max() > 0.0
+    assert (g.shN[:, 3:] == 0.0).all()
