@@ -119,7 +119,7 @@ def test_a_manifest_names_scenes_outputs_and_options(scenes, name, text, encodin
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("{", "line 1: wanted an object"),
         ('{"output": "a"}', "line 1: wanted a path"),
@@ -129,9 +129,9 @@ def test_a_manifest_names_scenes_outputs_and_options(scenes, name, text, encodin
         ("", "no scene"),
     ],
 )
-def test_a_manifest_that_says_nothing_is_refused(tmp_path, text, says):
+def test_a_manifest_that_says_nothing_is_refused(tmp_path, text, message):
     (tmp_path / "list.jsonl").write_text(text)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         find_tasks(str(tmp_path / "list.jsonl"), "encode", ".csplat")
 
 

@@ -54,7 +54,7 @@ def test_near_and_image_may_be_left_out(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("{", "not a JSON file"),
         ("[]", "not a camera file"),
@@ -64,10 +64,10 @@ def test_near_and_image_may_be_left_out(tmp_path):
         (b"\xff\xfe", "not a JSON file"),
     ],
 )
-def test_refuses_what_is_no_camera_file(tmp_path, text, says):
+def test_refuses_what_is_no_camera_file(tmp_path, text, message):
     path = tmp_path / "c.json"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         load_cameras(path)
 
 
@@ -275,9 +275,9 @@ WRONG = {
 
 def test_faults_of_camera_files_name_the_camera_and_the_field(tmp_path):
     def check(case):
-        document, says = case
+        document, message = case
         (tmp_path / "c.json").write_text(json.dumps(document))
-        with pytest.raises(InputError, match=says):
+        with pytest.raises(InputError, match=message):
             load_cameras(tmp_path / "c.json")
 
     assert [] == failures(WRONG, check)

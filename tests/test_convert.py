@@ -79,7 +79,7 @@ def test_degree_4_is_converted_encoded_and_fixed_where_fewer_bands_are_asked_for
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         (("a.xyz",), "no format has that ending"),
         (("-",), "standard output"),
@@ -91,12 +91,12 @@ def test_degree_4_is_converted_encoded_and_fixed_where_fewer_bands_are_asked_for
         (("in.ply", "--force"), "is the input"),
     ],
 )
-def test_what_cannot_be_meant_is_refused(tmp_path, ply, monkeypatch, words, says):
+def test_what_cannot_be_meant_is_refused(tmp_path, ply, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     before = ply.read_bytes()
     result = CliRunner().invoke(app, ["convert", "in.ply", *words])
     assert result.exit_code in (1, 2)
-    assert says in result.stderr
+    assert message in result.stderr
     assert before == ply.read_bytes()
     assert ["in.ply"] == [one.name for one in tmp_path.iterdir()]
 

@@ -166,7 +166,7 @@ def test_images_of_one_name_in_two_folders_are_told_apart(colmap_set):
 
 
 @pytest.mark.parametrize(
-    ("lists", "split", "says"),
+    ("lists", "split", "message"),
     [
         ({"train": range(6), "val": (6, 7)}, (5, 2, 0), "transforms.json: 2 images on no list, left out"),
         ({"val": (6, 7)}, (7, 2, 0), "transforms.json names 2 validation images"),
@@ -175,13 +175,13 @@ def test_images_of_one_name_in_two_folders_are_told_apart(colmap_set):
         ({"train": range(6), "test": (4,)}, (5, 0, 0), "names 1 test image, none of them is there"),
     ],
 )
-def test_transforms_json_may_list_its_split(ngp, lists, split, says):
+def test_transforms_json_may_list_its_split(ngp, lists, split, message):
     change_transforms(
         ngp, **{f"{role}_filenames": [f"images/{i:04}.png" for i in part] for role, part in lists.items()}
     )
     data = load(ngp)
     assert split == (len(data.train), len(data.val), len(data.test))
-    assert any(says in line for line in data.report)
+    assert any(message in line for line in data.report)
     assert data.test_every is None
 
 
@@ -343,10 +343,10 @@ def test_lists_of_images_may_lie_next_to_transforms_json(ngp, name, text, split)
 
 
 def test_cameras_that_contradict_their_text_are_reported(colmap_set):
-    for text, says in (("PINHOLE 48 32 51.47 51.47 24 16", False), ("PINHOLE 48 32 99 99 24 16", True)):
+    for text, message in (("PINHOLE 48 32 51.47 51.47 24 16", False), ("PINHOLE 48 32 99 99 24 16", True)):
         (colmap_set / "sparse" / "0" / "cameras.txt").write_text(f"  # comment\n7 {text}\n")
         report = load(colmap_set).report
-        assert says == ("cameras.txt holds other cameras than cameras.bin, which is read" in report), report
+        assert message == ("cameras.txt holds other cameras than cameras.bin, which is read" in report), report
 
 
 def test_images_that_contradict_their_text_are_reported(colmap_set):
@@ -451,13 +451,13 @@ def test_text_files_may_begin_with_a_byte_order_mark(tmp_path, encoding):
 
 
 def test_text_in_another_encoding_is_refused_in_a_line(colmap_set):
-    for name, data, says in (
+    for name, data, message in (
         ("cp1252", "im 002.png\nK\xf6ln.png".encode("cp1252"), r"byte 12 is 0xf6"),
         ("UTF-16 without a mark", "im 002.png".encode("utf-16-le"), "byte 1 is 0"),
         ("binary", bytes(range(256)), "is not a text file in UTF-8"),
     ):
         (colmap_set / "test.txt").write_bytes(data)
-        with pytest.raises(InputError, match=says):
+        with pytest.raises(InputError, match=message):
             load(colmap_set)
         assert name
 
@@ -607,7 +607,7 @@ def test_models_lie_in_several_folders(colmap_set, model):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"frames": []}, "lists no frames"),
         ({"frames": [{"transform_matrix": []}]}, "frame 0 has no file_path"),
@@ -618,10 +618,10 @@ def test_models_lie_in_several_folders(colmap_set, model):
         ({"k1": -30.0}, "cannot be undone"),
     ],
 )
-def test_refuses_broken_transforms(ngp, change, says):
+def test_refuses_broken_transforms(ngp, change, message):
     document = json.loads((ngp / "transforms.json").read_text())
     (ngp / "transforms.json").write_text(json.dumps({**document, **change}))
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         load(ngp)
 
 

@@ -18,18 +18,22 @@ from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 
 VECTORS = Path(csplat_conformance.__file__).parent / "vectors" / "valid"
-
-
+ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 ALL = (-1e6, -1e6, -1e6, 1e6, 1e6, 1e6)
 
 
 @pytest.fixture(scope="module")
-def data(sample_path):
-    return encode(read_ply(sample_path).select(slice(0, None, 3)), EncodeOptions(tile_splats=350))
+def sample(sample_path):
+    return read_ply(sample_path).select(slice(0, None, 3))
+
+
+@pytest.fixture(scope="module")
+def data(sample):
+    return encode(sample, EncodeOptions(tile_splats=350))
 
 
 def extract(data, box):
-    """The part, and its bytes."""
+    """Return the part and its bytes."""
     stream = io.BytesIO()
     part = csplat.extract(data, box, stream)
     assert part.size == len(stream.getvalue())
@@ -50,8 +54,7 @@ def test_a_part_has_the_tiles_that_touch_the_box_bit_for_bit(data):
     assert 1 <= len(part.tiles) < len(header.tiles)
     whole, found = decode(data, tiles=part.tiles), decode(cut)
     assert part.splat_count == len(found) == len(whole)
-    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
-        np.testing.assert_array_equal(getattr(whole, name), getattr(found, name))
+    assert_joined([whole], found)
     for index, tile in enumerate(header.tiles):
         least, most = box_of(tile, header)
         touches = all(least[k] <= high[k] and most[k] >= low[k] for k in range(3))
@@ -60,7 +63,7 @@ def test_a_part_has_the_tiles_that_touch_the_box_bit_for_bit(data):
     assert len(cut) < 0.9 * len(data)
 
 
-def test_a_part_says_of_the_scene_what_the_file_says_and_nothing_of_its_errors(data):
+def test_a_part_keeps_the_metadata_but_no_declared_errors(data):
     part = extract(data, ALL)[1]
     assert read_metadata(data) == read_metadata(part)
     assert decode(data).cameras == decode(part).cameras
@@ -80,17 +83,16 @@ def test_extra_columns_come_along(sample_path):
     np.testing.assert_array_equal(decode(data).extra["id"], decode(extract(data, ALL)[1]).extra["id"])
 
 
-@pytest.mark.parametrize(
-    "name", ["rich", "combined_codebooks", "combined_tiles", "ancillary_extras", "chunks_reversed"]
-)
-def test_everything_of_a_vector_decodes_to_the_same(name):
+COPIED = ["rich", "combined_codebooks", "combined_tiles", "ancillary_extras", "chunks_reversed"]
+
+
+@pytest.mark.parametrize("name", COPIED)
+def test_a_part_of_all_tiles_of_a_vector_decodes_to_the_same(name):
     data = (VECTORS / f"{name}.csplat").read_bytes()
     _, part = extract(data, (-1e300, -1e300, -1e300, 1e300, 1e300, 1e300))
     assert () == validate(part).violations
-    whole, found = decode(data), decode(part)
-    for array in ("means", "quats", "scales", "opacities", "sh0", "shN"):
-        np.testing.assert_array_equal(getattr(whole, array), getattr(found, array))
-    assert whole.extra.keys() == found.extra.keys()
+    assert_joined([decode(data)], decode(part))
+    assert decode(data).extra.keys() == decode(part).extra.keys()
 
 
 def test_a_box_that_nothing_touches_is_refused(data):
@@ -109,7 +111,7 @@ def test_extracting_checks_the_bytes_that_it_copies(data):
         extract(bytes(damaged), ALL)
 
 
-def test_the_command_says_what_it_cut(data, tmp_path):
+def test_the_command_extracts_and_reports(data, tmp_path):
     (tmp_path / "in.csplat").write_bytes(data)
     header = read_header(data)
     low, high = box_of(header.tiles[2], header)
@@ -123,9 +125,6 @@ def test_the_command_says_what_it_cut(data, tmp_path):
     refused = CliRunner().invoke(app, [*words, "--force", "--box=1,2,3"])
     assert 2 == refused.exit_code
     assert "wanted 6 numbers" in refused.stderr
-
-
-ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
 STEPS = {
@@ -143,7 +142,7 @@ def merge(*files, **named):
 
 
 def assert_joined(parts, whole):
-    """The splats of some files, one after the other, bit for bit."""
+    """Assert that `whole` is the splats of `parts` one after the other, bit for bit."""
     for name in ARRAYS:
         expected = np.concatenate([getattr(part, name) for part in parts])
         np.testing.assert_array_equal(expected.view(np.uint32), getattr(whole, name).view(np.uint32))
@@ -152,13 +151,8 @@ def assert_joined(parts, whole):
 
 
 @pytest.fixture(scope="module")
-def sample(sample_path):
-    return read_ply(sample_path).select(slice(0, None, 3))
-
-
-@pytest.fixture(scope="module")
 def halves(sample):
-    """Two files with the same steps, and codebooks of their own: of SH, and of shapes."""
+    """Encode two files with the same steps and separate codebooks of SH and of shapes."""
     order = np.argsort(sample.means[:, 0])
     options = EncodeOptions(
         preset="fast", sh_coding="codebook", codebook_size=64, escape_fraction=0.05, shape_codebook_size=64,
@@ -169,7 +163,7 @@ def halves(sample):
     return [encode(model.select(half), options) for half in np.array_split(order, 2)]
 
 
-# tiles that are copied
+# Copied tiles.
 def test_files_of_the_same_steps_are_copied_with_the_codebooks_of_each(halves):
     done, data = merge(*halves)
     assert ("", 2977) == (done.why, done.splat_count)
@@ -183,7 +177,7 @@ def test_files_of_the_same_steps_are_copied_with_the_codebooks_of_each(halves):
     assert data == merge(*halves)[1]
 
 
-def test_what_nobody_has_proved_of_the_whole_is_left_out(halves):
+def test_a_merged_file_declares_no_errors_and_records_no_options(halves):
     _, data = merge(*halves)
     assert read_declared_bounds(halves[0]) is not None
     assert read_declared_bounds(data) is None
@@ -207,10 +201,8 @@ def test_parts_of_a_file_share_their_codebooks_again(sample):
     assert_joined([decode(part) for part in parts], decode(data))
 
 
-@pytest.mark.parametrize(
-    "name", ["rich", "combined_codebooks", "combined_tiles", "ancillary_extras", "chunks_reversed", "empty"]
-)
-def test_a_vector_beside_itself_is_there_twice(name):
+@pytest.mark.parametrize("name", [*COPIED, "empty"])
+def test_a_vector_merged_with_itself_is_there_twice(name):
     path = VECTORS / f"{name}.csplat"
     done, data = merge(path, path.read_bytes())
     assert not done.why
@@ -241,12 +233,12 @@ def check_references(path):
                     here.add(id)
         assert here <= set(tile.codebook_ids)
         found |= here
-    # A stream that is stepped over wrongly does not end where its chunk does: E_STREAM.
+    # If a stream is skipped wrongly, its end is not the end of the chunk: E_STREAM.
     if "codebook" in path.stem and header.codebooks:
         assert found
 
 
-def test_what_one_file_leaves_open_another_one_may_say(make_model):
+def test_merging_fills_in_metadata_and_drops_contradictions(make_model):
     options = EncodeOptions(preset="fast", **STEPS)
     models = [make_model(40, 1), make_model(50, 1, coordinate_system="RDF", unit_metres=2.0)]
     models[0] = replace(models[0], metadata={"licence": "CC0-1.0", "only": 1, "up": [0, -1, 0]})
@@ -266,9 +258,9 @@ def test_merging_checks_the_bytes_that_it_copies(halves):
         merge(halves[0], bytes(damaged))
 
 
-# scenes that are coded again
+# Re-encoded scenes.
 @pytest.mark.parametrize(
-    ("degree", "fields", "options", "says"),
+    ("degree", "fields", "options", "reason"),
     [
         (1, {}, {"scale_step": 0.1}, "different steps of scales"),
         (3, {}, {}, "file 2 has SH of degree 3, file 1 of 1"),
@@ -276,14 +268,14 @@ def test_merging_checks_the_bytes_that_it_copies(halves):
         (1, {"extra": {"id": np.arange(50, dtype=np.int32)}}, {}, "different extra columns"),
     ],
 )
-def test_files_that_cannot_be_copied_are_coded_again_and_it_is_said_why(make_model, degree, fields, options, says):
+def test_files_that_cannot_be_copied_are_re_encoded_with_a_reason(make_model, degree, fields, options, reason):
     first, second = make_model(40, 1), make_model(50, degree, **fields)
     files = [
         encode(first, EncodeOptions(preset="fast", keep_extra=True, **STEPS)),
         encode(second, EncodeOptions(preset="fast", keep_extra=True, **{**STEPS, **options})),
     ]
     done, data = merge(*files, options=EncodeOptions(preset="small", position_step=1e-4))
-    assert says in done.why
+    assert reason in done.why
     assert () == validate(data).violations
     model = decode(data)
     assert 90 == len(model) == done.splat_count
@@ -297,7 +289,7 @@ def test_files_that_cannot_be_copied_are_coded_again_and_it_is_said_why(make_mod
 
 
 @pytest.mark.parametrize(
-    ("fields", "says"),
+    ("fields", "message"),
     [
         (({"coordinate_system": "RDF"}, {"coordinate_system": "RUB"}), "axes cannot be one: RDF in .*a, RUB in .*b"),
         (({"unit_metres": 1.0}, {"unit_metres": 0.01}), "a unit in metres cannot be one: 1.0 in .*a, 0.01 in .*b"),
@@ -305,10 +297,10 @@ def test_files_that_cannot_be_copied_are_coded_again_and_it_is_said_why(make_mod
         (({}, {"flat": True}), "flatness cannot be one: no in .*a, yes in .*b"),
     ],
 )
-def test_scenes_that_contradict_each_other_are_refused(make_model, tmp_path, fields, says):
+def test_scenes_that_contradict_each_other_are_refused(make_model, tmp_path, fields, message):
     for name, its in zip("ab", fields, strict=True):
         (tmp_path / name).write_bytes(encode(make_model(20, 0, **its), EncodeOptions(preset="fast", **STEPS)))
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         csplat.merge([tmp_path / "a", tmp_path / "b"], tmp_path / "out.csplat")
     assert not (tmp_path / "out.csplat").exists()
 
@@ -319,14 +311,14 @@ def test_fewer_than_two_files_are_refused(files, tmp_path):
         csplat.merge(files, tmp_path / "out.csplat")
 
 
-def test_more_codebooks_than_a_file_can_have_are_coded_again(halves):
+def test_too_many_codebooks_cause_re_encoding(halves):
     done, data = merge(*halves, options=EncodeOptions(preset="fast"), codebooks_max=3)
     assert "they have 4 codebooks together, and a file at most 3" == done.why
     assert 2977 == len(decode(data))
 
 
-# the command
-def test_the_command_says_what_it_did(halves, make_model, tmp_path):
+# The command.
+def test_the_command_merges_and_reports(halves, make_model, tmp_path):
     for name, data in zip("abc", [*halves, encode(make_model(40, 3))], strict=True):
         (tmp_path / f"{name}.csplat").write_bytes(data)
     a, b, c, out = (str(tmp_path / f"{name}.csplat") for name in ("a", "b", "c", "out"))

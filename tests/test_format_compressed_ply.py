@@ -98,7 +98,7 @@ def test_it_is_told_from_a_plain_ply_by_its_words(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("data", "says"),
+    ("data", "message"),
     [
         (SMALL[:-1], "copy or download it again"),
         (SMALL.replace(b"vertex 2", b"vertex 2000000000"), "copy or download it again"),
@@ -118,9 +118,9 @@ def test_it_is_told_from_a_plain_ply_by_its_words(tmp_path):
         (built([[ROW[3] + 1, *ROW[1:]]], [WORD]), "chunk 0 has min_x .* above max_x"),
     ],
 )
-def test_what_does_not_fit_is_refused(tmp_path, data, says):
+def test_what_does_not_fit_is_refused(tmp_path, data, message):
     (tmp_path / "a.ply").write_bytes(data)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         csplat.read(tmp_path / "a.ply", "compressed-ply")
 
 
@@ -131,7 +131,7 @@ def test_bounds_that_were_rounded_apart_are_read(tmp_path):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_bands_above_those_asked_for_are_left_out(tmp_path, degree):
+def test_sh_bands_above_the_requested_degree_are_left_out(tmp_path, degree):
     (tmp_path / "a.ply").write_bytes(built([ROW], [WORD], [range(100, 172)], rest=72))
     report = []
     model = csplat.read(tmp_path / "a.ply", sh_degree=degree, report=report)

@@ -197,7 +197,7 @@ def test_buffers_may_be_text_or_files_beside_it(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "says"),
+    ("place", "value", "message"),
     [
         ("asset/version", "1.0", "wanted 2.0"),
         ("asset", 3, "no asset"),
@@ -240,7 +240,7 @@ def test_buffers_may_be_text_or_files_beside_it(tmp_path):
         ("meshes/0/primitives", [0] * 5, "found 0"),
     ],
 )  # fmt: skip
-def test_what_breaks_a_rule_is_refused_by_its_place(place, value, says):
+def test_what_breaks_a_rule_is_refused_by_its_place(place, value, message):
     said, data = document(TWO)
     said["nodes"].append({"mesh": 0, "translation": [1, 2, 1e39]})
     said["extensionsRequired"] = ["KHR_draco_mesh_compression"]
@@ -252,7 +252,7 @@ def test_what_breaks_a_rule_is_refused_by_its_place(place, value, says):
         holder[int(key)] = value
     else:
         holder[key] = value
-    with pytest.raises(InputError, match=rf"^data.*{says}") as caught:
+    with pytest.raises(InputError, match=rf"^data.*{message}") as caught:
         read(said, data)
     assert "\n" not in str(caught.value)
 

@@ -205,13 +205,13 @@ def test_a_zip_of_several_scenes_is_refused_with_their_names(tmp_path):
     }
     more = {f"b/{name}": data for name, data in other.items()}
     bundle = {"lod-meta.json": (folder / "lod-meta.json").read_bytes().replace(b"0_0/meta.json", b"0_0.sog")}
-    for path, says in (
+    for path, message in (
         (zipped(tmp_path / "b.zip", two), r"2 scenes, expected one \(one/meta.json, two/meta.json\): unpack it"),
         (zipped_folder(tmp_path / "c.zip", folder, more=more), r"2 scenes, .*b/meta.json, lod-meta.json"),
         (zipped_folder(tmp_path / "d.zip", folder, more=bundle), r"0_0/meta.json, lod-meta.json"),
         (zipped(tmp_path / "e.sog", {"lod-meta.json": b'{"filenames": 3}', "x/meta.json": b"{}"}), "2 scenes"),
     ):
-        with pytest.raises(InputError, match=says):
+        with pytest.raises(InputError, match=message):
             csplat.read(path)
     foldered(folder, other)
     with pytest.raises(InputError, match=r"lod-meta.json, meta.json\): name one of these files"):
@@ -251,7 +251,7 @@ def test_names_in_a_zip_may_have_backslashes_and_capitals(tmp_path):
     files = files_of(*splats())
     expected = csplat.read(zipped(tmp_path / "a.sog", files))
     loud = {name.upper() if name == "meta.json" else name: data for name, data in files.items()}
-    for name, found, folder, says in (
+    for name, found, folder, message in (
         ("b.zip", files, "scene\\", "backslashes in the names of the zip, read as slashes"),
         ("c.sog", loud, "", "META.JSON is read as meta.json"),
         ("d.zip", loud, "scene/", "META.JSON is read as meta.json"),
@@ -259,7 +259,7 @@ def test_names_in_a_zip_may_have_backslashes_and_capitals(tmp_path):
         report = []
         model = csplat.read(zipped(tmp_path / name, found, folder), report=report)
         assert np.array_equal(expected.means, model.means)
-        assert [("zip-names", "note", says)] == [(one.id, one.kind, one.text) for one in report]
+        assert [("zip-names", "note", message)] == [(one.id, one.kind, one.text) for one in report]
     with pytest.raises(InputError, match="2 scenes"):
         csplat.read(zipped(tmp_path / "e.sog", {**files, "META.JSON": files["meta.json"]}))
     two = {**{name: data for name, data in files.items() if name != "sh0.webp"}, "SH0.webp": b"", "Sh0.webp": b""}
@@ -269,10 +269,10 @@ def test_names_in_a_zip_may_have_backslashes_and_capitals(tmp_path):
 
 def test_a_meta_json_of_another_program_is_no_sog(tmp_path):
     files = {"meta.json": b'{"app": "a scanner"}', "room.ply": b"ply"}
-    says = "meta.json is not that of SOG, which has means, quats, scales, sh0; .*"
-    with pytest.raises(InputError, match=says + r"a zip that holds room\.ply: unzip it"):
+    message = "meta.json is not that of SOG, which has means, quats, scales, sh0; .*"
+    with pytest.raises(InputError, match=message + r"a zip that holds room\.ply: unzip it"):
         csplat.read(zipped(tmp_path / "a.zip", files))
-    with pytest.raises(InputError, match=says + r"a folder, and no scene: name room\.ply"):
+    with pytest.raises(InputError, match=message + r"a folder, and no scene: name room\.ply"):
         csplat.read(foldered(tmp_path / "a", files))
 
 
@@ -284,7 +284,7 @@ def test_a_zip_within_a_zip_is_refused_by_name(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "message"),
     [
         ({"version": 2}, "version 2 of streamed"),
         ({"tree": {"lods": 3}}, "no object"),
@@ -296,8 +296,8 @@ def test_a_zip_within_a_zip_is_refused_by_name(tmp_path):
         ({"tree": {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 2}}}] * 2}}, "wanted twice"),
     ],
 )
-def test_levels_that_do_not_fit_are_refused(tmp_path, changes, says):
-    with pytest.raises(InputError, match=says):
+def test_levels_that_do_not_fit_are_refused(tmp_path, changes, message):
+    with pytest.raises(InputError, match=message):
         csplat.read(levels(tmp_path, **changes))
 
 
@@ -360,8 +360,8 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_what_does_not_fit_is_refused(tmp_path, name):
-    files, says = BAD[name]
-    with pytest.raises(InputError, match=rf"^a\.sog: .*{says}"):
+    files, message = BAD[name]
+    with pytest.raises(InputError, match=rf"^a\.sog: .*{message}"):
         csplat.read(zipped(tmp_path / "a.sog", files))
 
 

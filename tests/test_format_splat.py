@@ -81,7 +81,7 @@ def plausible(rows):
 
 
 @pytest.mark.parametrize(
-    ("data", "says"),
+    ("data", "message"),
     [
         (b"<!DOCTYPE html><html>" + b"a" * 3083, "is a web page"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "git lfs pull"),
@@ -97,11 +97,11 @@ def plausible(rows):
         (bytes(64), "a rotation of the bytes 0, 0, 0, 0"),
     ],
 )
-def test_what_is_hardly_a_splat_file_is_refused_unless_insisted(tmp_path, data, says):
+def test_what_is_hardly_a_splat_file_is_refused_unless_insisted(tmp_path, data, message):
     (tmp_path / "a.splat").write_bytes(data)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         csplat.read(tmp_path / "a.splat")
-    if len(data) % 32 == 0 and "web page" not in says:  # which is nothing but that
+    if len(data) % 32 == 0 and "web page" not in message:  # which is nothing but that
         with assume_format("splat"), open_scene(tmp_path / "a.splat") as scene:
             assert "splat" == scene.format
 
@@ -241,7 +241,7 @@ def test_ksplat_splats_that_are_not_finite_are_dropped_and_counted():
 
 
 @pytest.mark.parametrize(
-    ("data", "says"),
+    ("data", "message"),
     [
         (simple(0)[:4095], "ends inside of its header"),
         (ksplat(0, [], version=(0, 2)), r"version 0\.2, wanted 0\.1"),
@@ -262,9 +262,9 @@ def test_ksplat_splats_that_are_not_finite_are_dropped_and_counted():
         (simple(1, centres=CENTRES * np.float32(1.1e36)), "finite places"),
     ],
 )
-def test_what_is_no_ksplat_or_too_much_is_refused(tmp_path, data, says):
+def test_what_is_no_ksplat_or_too_much_is_refused(tmp_path, data, message):
     (tmp_path / "a.ksplat").write_bytes(data)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         csplat.read(tmp_path / "a.ksplat")
 
 
@@ -285,8 +285,8 @@ def test_a_damaged_file_is_refused_or_read(tmp_path, level):
     told = [*range(44), *range(4096, 4138), *range(5120, 5200)]  # headers, buckets, first row
     assert all(read(whole[:size]) for size in (*told[::9], len(whole) - 1))
     for at in told:
-        says = read(whole[:at] + bytes([whole[at] ^ (255 >> at % 8)]) + whole[at + 1 :])
-        assert not says or ("a.ksplat" in says and "\n" not in says)
+        message = read(whole[:at] + bytes([whole[at] ^ (255 >> at % 8)]) + whole[at + 1 :])
+        assert not message or ("a.ksplat" in message and "\n" not in message)
 
 
 @pytest.mark.parametrize(("scale", "found"), [(-4.0, "log-scales"), ([0.5, -0.5, 0.5], "negative-scales")])

@@ -107,7 +107,7 @@ def test_a_file_without_splats_is_read():
     assert 0 == len(checked(spz(3, [b""] * 6, degree=3)))
 
 
-def test_bands_above_those_asked_for_are_left_out(tmp_path):
+def test_sh_bands_above_the_requested_degree_are_left_out(tmp_path):
     parts = splats(4, degree=4)
     (tmp_path / "a.spz").write_bytes(spz(4, parts, degree=4))
     for degree in (3, 1):
@@ -136,7 +136,7 @@ MANY = spz(4, [bytes(n * (1 << 22)) for n in (9, 1, 3, 3, 4)])
 
 
 @pytest.mark.parametrize(
-    ("data", "says"),
+    ("data", "message"),
     [
         (spz(4, splats(4, degree=3), degree=4), "SH degree 4, expected at most 3: --sh-degree 3"),
         (struct.pack("<4sI40x", b"NGSP", 5), "version 5"),
@@ -152,9 +152,9 @@ MANY = spz(4, [bytes(n * (1 << 22)) for n in (9, 1, 3, 3, 4)])
         (spz(1, [b"\xff\xff" * 3, b"\1", bytes(3), bytes(3), bytes(3)]), "NaN or infinite"),
     ],
 )
-def test_what_is_no_spz_or_too_much_is_refused(tmp_path, data, says):
+def test_what_is_no_spz_or_too_much_is_refused(tmp_path, data, message):
     (tmp_path / "a.spz").write_bytes(data)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         checked(tmp_path / "a.spz")
 
 
@@ -175,8 +175,8 @@ def test_a_damaged_file_is_refused_or_read(tmp_path, version):
     assert all(read(whole[:size]) for size in range(0, len(whole), 3))
     assert read(whole[:-1])
     for at in range(len(whole)):
-        says = read(whole[:at] + bytes([whole[at] ^ (255 >> at % 8)]) + whole[at + 1 :])
-        assert not says or ("a.spz" in says and "\n" not in says)
+        message = read(whole[:at] + bytes([whole[at] ^ (255 >> at % 8)]) + whole[at + 1 :])
+        assert not message or ("a.spz" in message and "\n" not in message)
 
 
 def fields(path):

@@ -101,7 +101,7 @@ def test_each_format_has_a_name_of_its_own():
 
 
 @pytest.mark.parametrize(
-    ("name", "data", "says"),
+    ("name", "data", "message"),
     [
         ("a.ply", b"", "empty"),
         ("a.txt", b"hello, this is no scene", "no format that csplat knows"),
@@ -127,9 +127,9 @@ def test_each_format_has_a_name_of_its_own():
         ("a.csplat", b"\x1f\x8b\x08\0hello", "is gzip, unpack it first, with gunzip"),
     ],
 )
-def test_other_files_are_refused_by_what_they_are(tmp_path, name, data, says):
+def test_other_files_are_refused_by_what_they_are(tmp_path, name, data, message):
     (tmp_path / name).write_bytes(data)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         csplat.read(tmp_path / name)
 
 
@@ -137,14 +137,14 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 63327587
 
 
 def test_pointers_of_git_lfs_are_named_whatever_reads_them(tmp_path):
-    says = "is a pointer of Git LFS, not the file itself: run `git lfs pull`"
+    message = "is a pointer of Git LFS, not the file itself: run `git lfs pull`"
     ends = [end for one in formats() for end in one.suffixes]
     for path in [tmp_path / ("a" + end if end.startswith(".") else end) for end in [*ends, ".txt"]]:
         path.write_bytes(LFS)
         for read in (csplat.read, read_ply, formats_lint):
-            with pytest.raises(InputError, match=says):
+            with pytest.raises(InputError, match=message):
                 read(path)
-        with assume_format("splat"), pytest.raises(InputError, match=says):
+        with assume_format("splat"), pytest.raises(InputError, match=message):
             csplat.read(path)
     (tmp_path / "meta.json").write_text('{"version": 2, "count": 1}')
     for decode in (csplat.decode, csplat.open):
@@ -161,7 +161,7 @@ def test_pointers_of_git_lfs_are_named_within_scenes_of_several_files(tmp_path, 
 
 
 def test_a_zip_is_told_by_what_is_in_it(tmp_path):
-    for name, says in (
+    for name, message in (
         ("x.npy", "NumPy"),
         ("scene.ply", r"a zip that holds scene\.ply: unzip it"),
         ("a.usdc", "USD"),
@@ -169,7 +169,7 @@ def test_a_zip_is_told_by_what_is_in_it(tmp_path):
     ):
         with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
             archive.writestr(name, "")
-        with pytest.raises(InputError, match=says):
+        with pytest.raises(InputError, match=message):
             csplat.read(tmp_path / "a.sog")
 
 
@@ -221,8 +221,10 @@ def test_of_a_folder_that_a_trainer_wrote_the_newest_scene_is_named(tmp_path):
     for name in ("input.ply", *(f"point_cloud/iteration_{count}/point_cloud.ply" for count in (7000, 30000))):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"")
-    says = r"is a folder, and no scene: name point_cloud/iteration_30000/point_cloud\.ply, the last of 2 scenes in it"
-    with pytest.raises(InputError, match=says):
+    message = (
+        r"is a folder, and no scene: name point_cloud/iteration_30000/point_cloud\.ply, the last of 2 scenes in it"
+    )
+    with pytest.raises(InputError, match=message):
         csplat.read(tmp_path)
     (tmp_path / "splat").mkdir()
     (tmp_path / "splat" / "a.spz").write_bytes(b"")

@@ -219,7 +219,7 @@ def test_a_target_takes_a_model_or_a_file_and_gives_the_same_bytes(files):
 
 
 @pytest.mark.parametrize(
-    ("asked", "says"),
+    ("asked", "message"),
     [
         ({}, "no target"),
         ({"psnr": 40.0, "size": 1000}, "one of them"),
@@ -229,8 +229,8 @@ def test_a_target_takes_a_model_or_a_file_and_gives_the_same_bytes(files):
         ({"psnr": "40"}, "psnr is '40', wanted a number"),
     ],
 )
-def test_a_target_that_is_none_is_refused_before_the_scene_is_read(asked, says):
-    with pytest.raises(InputError, match=says):
+def test_a_target_that_is_none_is_refused_before_the_scene_is_read(asked, message):
+    with pytest.raises(InputError, match=message):
         csplat_tools.encode_to("absent.ply", **asked)
 
 

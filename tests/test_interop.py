@@ -22,7 +22,7 @@ STORED = {name: Path(__file__).parent / "checkpoints" / name for name in ("gspla
 
 
 class PlainTensor(np.ndarray):
-    """An array with the one method of a tensor that the reader calls."""
+    """An array with the one tensor method that the reader calls."""
 
     def numel(self):
         return self.size
@@ -33,20 +33,18 @@ def tensor(values):
 
 
 def load_plainly(path, **_):
-    """Read the tensors of a checkpoint as `torch.load` does, float32 and contiguous ones alone."""
+    """Read the contiguous float32 tensors of a checkpoint as `torch.load` does."""
 
     class Reader(pickle.Unpickler):  # noqa: S301  # a file of the project
         def find_class(self, module, name):
             if name == "_rebuild_tensor_v2":
-                return lambda values, first, shape, *_: tensor(values[first:][: np.prod(shape, dtype=int)]).reshape(
-                    shape
-                )
+                return lambda values, at, shape, *_: tensor(values[at:][: np.prod(shape, dtype=int)]).reshape(shape)
             if name == "_rebuild_parameter":
                 return lambda values, *_: values
             return name if module.startswith("torch") else super().find_class(module, name)
 
-        def persistent_load(self, said):
-            return np.frombuffer(archive.read(f"{folder}/data/{said[2]}"), "<f4")
+        def persistent_load(self, entry):
+            return np.frombuffer(archive.read(f"{folder}/data/{entry[2]}"), "<f4")
 
     with zipfile.ZipFile(path) as archive:
         folder = archive.namelist()[0].partition("/")[0]
@@ -60,7 +58,7 @@ def torch():
 
 @pytest.fixture
 def no_torch(monkeypatch):
-    """A function that has torch replaced by what loads checkpoints plainly, or as it is given."""
+    """Return a function that replaces torch by a module whose `load` reads checkpoints without it."""
 
     def replace_by(load=load_plainly):
         monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(__version__="2.5.0", load=load))
@@ -73,9 +71,9 @@ def made_splats(make_model, degree):
     return {name: tensor(values) for name, values in to_gsplat(make_model(5, degree)).items()}
 
 
-def saved(torch, said):
+def saved(torch, checkpoint):
     stream = io.BytesIO()
-    torch.save(said, stream)
+    torch.save(checkpoint, stream)
     return stream.getvalue()
 
 
@@ -88,14 +86,10 @@ def of_splatfacto(splats, **changed):
 
 
 def of_checkpoint(path):
-    """The five splats that were stored: normals of NumPy's generator of seed 0."""
+    """Check the five stored splats: normals of NumPy's generator of seed 0."""
     rng = np.random.default_rng(0)
-    means, _, scales, opacities = (
-        rng.standard_normal((5, 3)),
-        rng.standard_normal((5, 4)),
-        rng.standard_normal((5, 3)),
-        rng.random(5),
-    )
+    means, _, scales = (rng.standard_normal((5, width)) for width in (3, 4, 3))
+    opacities = rng.random(5)
     model = csplat.read(path)
     np.testing.assert_allclose(means, model.means, atol=1e-6)
     np.testing.assert_allclose(scales - 4.0, model.scales, atol=1e-6)
@@ -107,7 +101,7 @@ def of_checkpoint(path):
 
 # without torch
 @pytest.mark.parametrize("name", STORED)
-def test_a_stored_checkpoint_is_the_scene_that_was_stored(no_torch, name):
+def test_a_stored_checkpoint_is_read(no_torch, name):
     no_torch()
     of_checkpoint(STORED[name])
 
@@ -123,7 +117,7 @@ def test_colours_that_splatfacto_trained_without_sh_are_logits(no_torch, make_mo
     assert (found[0].means == found[1].means).all()
 
 
-def test_bands_above_those_asked_for_are_left_out(no_torch, make_model):
+def test_sh_bands_above_the_requested_degree_are_left_out(no_torch, make_model):
     splats = made_splats(make_model, 3)
     many = tensor(np.concatenate([splats["shN"], np.ones((5, 9, 3), np.float32)], axis=1))
     for said in ({"splats": {**splats, "shN": many}}, of_splatfacto({**splats, "shN": many})):
@@ -135,7 +129,7 @@ def test_bands_above_those_asked_for_are_left_out(no_torch, make_model):
             assert np.array_equal(splats["shN"][:, : (degree + 1) ** 2 - 1], read.shN)
 
 
-def test_a_checkpoint_of_something_else_is_refused_by_name(no_torch, make_model):
+def test_a_checkpoint_without_splats_is_refused(no_torch, make_model):
     splats = made_splats(make_model, 1)
     many = np.broadcast_to(np.float32(0.0), (10**9, 3)).view(PlainTensor)
     for said, says in (
@@ -154,19 +148,19 @@ def test_a_checkpoint_of_something_else_is_refused_by_name(no_torch, make_model)
 
 
 def renamed(splats, prefix):
-    """The tensors of splatfacto under other names."""
+    """Return the tensors of splatfacto under other names."""
     return {
         name.replace("_model.gauss_params.", prefix): one for name, one in of_splatfacto(splats)["pipeline"].items()
     }
 
 
 def of_inria(splats):
-    """Return the result of `GaussianModel.capture` of INRIA's trainer, and the iteration."""
+    """Return the pair that INRIA's trainer saves: the result of `GaussianModel.capture`, and the iteration."""
     arrays = (splats[name] for name in ("means", "sh0", "shN", "scales", "quats"))
     return ((3, *arrays, splats["opacities"][:, None], 0, 0, 0, {"state": {}}, 5.0), 30000)
 
 
-def test_checkpoints_of_other_programs_and_versions_are_the_same_scene(no_torch, make_model):
+def test_checkpoints_of_other_programs_and_versions_give_the_same_scene(no_torch, make_model):
     splats = made_splats(make_model, 3)
     no_torch(lambda *_, **__: {"splats": splats})
     expected = csplat.read(STORED["gsplat.pt"])
@@ -183,17 +177,17 @@ def test_checkpoints_of_other_programs_and_versions_are_the_same_scene(no_torch,
         assert all(np.array_equal(getattr(expected, name), getattr(read, name)) for name in ARRAYS)
 
 
-def test_several_models_in_one_checkpoint_are_refused_by_name(no_torch, make_model):
+def test_several_models_in_one_checkpoint_are_refused(no_torch, make_model):
     splats = made_splats(make_model, 1)
     few = {name: values[:2] for name, values in splats.items()}
     pipeline = {**renamed(splats, "_model.gauss_params."), **renamed(few, "_model.background.gauss_params.")}
     no_torch(lambda *_, **__: {"pipeline": pipeline})
-    says = r"2 models of splats, .*: _model\.gauss_params\.\* \(5 splats\), _model\.background\.gauss_params\.\* \(2 s"
-    with pytest.raises(InputError, match=says):
+    words = r"2 models of splats, .*: _model\.gauss_params\.\* \(5 splats\), _model\.background\.gauss_params\.\* \(2 s"
+    with pytest.raises(InputError, match=words):
         csplat.read(STORED["gsplat.pt"])
 
 
-def test_the_files_of_all_gpus_are_one_scene(no_torch, make_model, tmp_path):
+def test_checkpoints_of_several_gpus_are_one_scene(no_torch, make_model, tmp_path):
     splats = made_splats(make_model, 1)
     paths = [tmp_path / f"ckpt_29_rank{rank}.pt" for rank in range(3)]
     for path in [*paths, tmp_path / "ckpt_6_rank7.pt"]:
@@ -206,9 +200,8 @@ def test_the_files_of_all_gpus_are_one_scene(no_torch, make_model, tmp_path):
         one.text for one in report
     ]
     paths[1].unlink()
-    with pytest.raises(
-        InputError, match=r"ckpt_29_rank2\.pt has the splats of one GPU of several, .*: no ckpt_29_rank1"
-    ):
+    words = r"ckpt_29_rank2\.pt has the splats of one GPU of several, .*: no ckpt_29_rank1"
+    with pytest.raises(InputError, match=words):
         csplat.read(paths[2])
     paths[2].unlink()
     assert 2 == len(csplat.read(paths[0], report=report))
@@ -221,7 +214,7 @@ def read_splats(no_torch, splats):
     return csplat.read(STORED["gsplat.pt"], report=report), {one.id: one for one in report}
 
 
-def test_values_are_looked_at_as_those_of_a_ply(no_torch):
+def test_values_are_checked_like_those_of_a_ply(no_torch):
     rng = np.random.default_rng(0)
     numbers = {"means": 3, "quats": 4, "scales": 3, "sh0": 3}
     splats = {name: rng.standard_normal((20, width)).astype(np.float32) for name, width in numbers.items()}
@@ -253,7 +246,7 @@ def test_positions_in_doubles_get_an_origin(no_torch, make_model):
     np.testing.assert_allclose(model.means + np.array(model.origin), far, rtol=0, atol=1e-6)
 
 
-def test_what_is_no_checkpoint_is_refused_before_torch_loads_it(no_torch, tmp_path):
+def test_other_files_are_refused_before_torch_loads_them(no_torch, tmp_path):
     no_torch(lambda *_, **__: pytest.fail("it was loaded"))
     for data, says in (
         (b"404: Not Found", "no checkpoint of torch: it begins with b'404: Not'"),
@@ -269,7 +262,7 @@ def test_what_is_no_checkpoint_is_refused_before_torch_loads_it(no_torch, tmp_pa
             csplat.read(tmp_path / "b_rank0.pt")
 
 
-def test_what_torch_cannot_load_is_refused_in_one_line(no_torch):
+def test_files_that_torch_cannot_load_are_refused(no_torch):
     for error, says in (
         (pickle.UnpicklingError("Weights only load failed"), "holds objects of a program"),
         (RuntimeError("PytorchStreamReader failed"), "is no whole checkpoint of torch"),
@@ -300,10 +293,10 @@ def test_torch_reads_a_stored_checkpoint_as_the_plain_reader_does(name):
 
 @pytest.mark.area(name="torch")
 @pytest.mark.parametrize("degree", [0, 3])
-def test_a_scene_comes_out_of_either(torch, make_model, degree):
+def test_checkpoints_of_all_programs_are_read(torch, make_model, degree):
     model = make_model(20, degree)
     splats = {name: torch.nn.Parameter(torch.from_numpy(array)) for name, array in to_gsplat(model).items()}
-    loose = {**splats, "quats": splats["quats"] * 3.0}  # they are normalised where they are used
+    loose = {**splats, "quats": splats["quats"] * 3.0}  # trainers normalise them on use
     own = csplat.read(saved(torch, {"step": 7, "splats": loose}))
     inria = csplat.read(saved(torch, of_inria(loose)))
     assert all(np.array_equal(getattr(own, name), getattr(inria, name)) for name in ARRAYS)
@@ -317,7 +310,7 @@ def test_a_scene_comes_out_of_either(torch, make_model, degree):
 
 
 @pytest.mark.area(name="torch")
-def test_learning_rates_may_be_numbers_of_either_numpy(torch, make_model):
+def test_learning_rates_may_be_scalars_of_numpy_1_or_2(torch, make_model):
     splats = to_gsplat(make_model(5, 0), device="cpu")
     whole = saved(torch, {"schedulers": {"last": [np.float64(0.1), np.float32(0.2)]}, "splats": splats})
     old = io.BytesIO()
@@ -328,30 +321,21 @@ def test_learning_rates_may_be_numbers_of_either_numpy(torch, make_model):
 
 
 @pytest.mark.area(name="torch")
-def test_what_is_no_scene_is_refused(torch, make_model, tmp_path):
+def test_invalid_tensors_are_refused(torch, make_model, tmp_path):
     splats = to_gsplat(make_model(5, 0), device="cpu")
-    many = torch.zeros(1).expand(10**9, 3)
-    endless = {**splats, "means": torch.full((5, 3), torch.inf)}
-    for said, says in (
-        ([1], "it holds a list"),
-        ({"model": 3}, "it holds model: neither"),
-        ({"splats": {**splats, "means": many}}, "means is no tensor that the file can hold"),
-        ({"splats": {**splats, "means": "many"}}, "means is no tensor"),
-        ({"splats": endless}, "NaN or infinite"),
-        ({"splats": {"means": splats["means"]}}, "no quats"),
-        ({"splats": {**splats, "sh0": torch.zeros(5, 2)}}, "sh0 has shape"),
-        ({"splats": print}, r"a\.pt holds objects of a program"),
-        (of_splatfacto(splats, **{"_model.gauss_params.scales": torch.zeros(3, 3)}), "scales"),
+    for values, message in (
+        ({**splats, "means": torch.zeros(1).expand(10**9, 3)}, "means is no tensor that the file can hold"),
+        ({**splats, "means": torch.full((5, 3), torch.inf)}, "NaN or infinite"),
+        ({**splats, "sh0": torch.zeros(5, 2)}, "sh0 has shape"),
+        (print, "holds objects of a program"),
     ):
-        (tmp_path / "a.pt").write_bytes(saved(torch, said))
-        with pytest.raises(InputError, match=rf"a\.pt.*{says}|{says}") as caught:
+        (tmp_path / "a.pt").write_bytes(saved(torch, {"splats": values}))
+        with pytest.raises(InputError, match=rf"^a\.pt[^\n]*{message}[^\n]*$"):
             csplat.read(tmp_path / "a.pt")
-        assert "a.pt" in str(caught.value)
-        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.area(name="torch")
-def test_damage_is_refused_or_read(torch, make_model, tmp_path):
+def test_a_damaged_checkpoint_is_refused_or_read(torch, make_model, tmp_path):
     whole, path = saved(torch, {"splats": to_gsplat(make_model(3, 0), device="cpu")}), tmp_path / "a.ckpt"
 
     def read(data):
@@ -392,18 +376,18 @@ def test_parameters_are_logarithms_and_logits(model):
     assert np.isfinite(splats["opacities"]).all()
 
 
-def test_the_activated_form_is_what_rasterization_takes(model):
+def test_the_activated_form_has_scales_and_alphas(model):
     splats = csplat.to_gsplat(model, form="activated")
     assert np.allclose(np.exp(model.scales), splats["scales"], rtol=1e-6)
     assert np.array_equal(model.opacities, splats["opacities"])
 
 
 @pytest.mark.parametrize("form", ["parameters", "activated"])
-def test_a_model_comes_back(model, form):
+def test_to_gsplat_and_back_keeps_the_model(model, form):
     assert_near(model, csplat.from_gsplat(csplat.to_gsplat(model, form=form), form=form))
 
 
-def test_nothing_is_shared_with_the_model(model):
+def test_no_memory_is_shared_with_the_model(model):
     for array in csplat.to_gsplat(model).values():
         array[:] = 9.0
     again = csplat.to_gsplat(model)
@@ -414,9 +398,9 @@ def test_nothing_is_shared_with_the_model(model):
     assert model.opacities.max() <= 1.0
 
 
-def test_a_checkpoint_of_the_trainer_is_understood(model):
+def test_from_gsplat_accepts_a_checkpoint(model):
     splats = csplat.to_gsplat(model)
-    splats["quats"] *= 3.0  # they are normalised where they are used
+    splats["quats"] *= 3.0  # trainers normalise them on use
     splats["opacities"] = splats["opacities"][:, None]
     assert_near(model, csplat.from_gsplat({"step": 30_000, "splats": splats}))
 
@@ -440,14 +424,14 @@ def test_shn_may_be_left_out(model):
         ({"shN": "text"}, "shN is a str"),
     ],
 )
-def test_what_is_no_dict_of_splats_is_refused_by_name(model, change, says):
+def test_from_gsplat_refuses_invalid_arrays(model, change, says):
     splats = {**csplat.to_gsplat(model), **change}
     splats = {name: value for name, value in splats.items() if value is not None}
     with pytest.raises(InputError, match=says):
         csplat.from_gsplat(splats)
 
 
-def test_the_wrong_form_is_noticed_where_it_can_be(model):
+def test_a_wrong_form_is_refused(model):
     with pytest.raises(InputError, match="logarithms"):
         csplat.from_gsplat(csplat.to_gsplat(model), form="activated")
     for call, given in ((csplat.from_gsplat, {}), (csplat.to_gsplat, model)):
@@ -457,13 +441,13 @@ def test_the_wrong_form_is_noticed_where_it_can_be(model):
         csplat.to_gsplat({})
 
 
-def test_tensors_without_torch_are_an_error_that_says_what_helps(model, monkeypatch):
+def test_tensors_without_torch_are_an_error_with_a_remedy(model, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(InputError, match="device=None gives NumPy arrays"):
         csplat.to_gsplat(model, device="cpu")
 
 
-def test_tensors_go_both_ways_with_gradients_and_in_half_precision(model):
+def test_tensors_may_require_gradients_or_have_half_precision(model):
     torch = pytest.importorskip("torch", reason="tensors want torch (the train extra)")
     tensors = csplat.to_gsplat(model, device="cpu")
     assert all(isinstance(one, torch.Tensor) and one.dtype == torch.float32 for one in tensors.values())

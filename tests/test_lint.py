@@ -320,17 +320,17 @@ def test_red_green_and_blue_stand_for_f_dc(path, kind, largest, names):
 
 
 @pytest.mark.parametrize(
-    ("kind", "values", "says"),
+    ("kind", "values", "message"),
     [
         ("<f4", (0, 17, 255), "floats up to 255, expected 0 to 1"),
         ("<i4", (0, 17, 255), "of type int32, int32, int32, expected uint8, uint16 or float"),
     ],
 )
-def test_colours_of_another_range_are_refused(path, kind, values, says):
+def test_colours_of_another_range_are_refused(path, kind, values, message):
     rows = coloured(kind, values)
     path.write_bytes(header(rows) + rows.tobytes())
     assert ["colour-columns"] == [one.id for one in found(path).values() if one.kind == "error"]
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         read_ply(path)
 
 
@@ -432,7 +432,7 @@ def test_values_after_their_activation_are_noted(path, changes, noted):
 
 
 @pytest.mark.parametrize(
-    ("names", "after", "says"),
+    ("names", "after", "message"),
     [
         (["x", "y", "z", *COLOURS], [], r"but a point cloud \(it has x, y, z, red, green, blue\): csplat train"),
         (["x", "y", "z"], ["element face 0", "property list uchar int vertex_indices"], "but a mesh"),
@@ -440,10 +440,10 @@ def test_values_after_their_activation_are_noted(path, changes, noted):
         ([*without("scale_0", "scale_1", "scale_2"), "scale_x"], [], "no column scale_0, scale_1, scale_2.* it has x"),
     ],
 )
-def test_what_is_no_splats_is_named(path, names, after, says):
+def test_what_is_no_splats_is_named(path, names, after, message):
     rows = good_rows(names=names)
     path.write_bytes(header(rows, after=after) + rows.tobytes())
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         read_ply(path)
 
 
@@ -451,10 +451,10 @@ def test_columns_of_moving_splats_are_named(path):
     for names in (["motion_0", "trbf_center"], ["t", "scale_t"]):
         rows = good_rows(names=[*NAMES, *names])
         path.write_bytes(header(rows) + rows.tobytes())
-        says = (
+        message = (
             f"{', '.join(names)} are no property of splats: dropped; the file holds dynamic (4D) splats: their time is"
         )
-        assert says in found(path)["extra-columns"].text
+        assert message in found(path)["extra-columns"].text
 
 
 def test_elements_that_move_splats_are_named(path):
@@ -472,7 +472,7 @@ ROWS = good_rows(4)  # an x of 3.0 in the last row
 
 
 @pytest.mark.parametrize(
-    ("written", "says"),
+    ("written", "message"),
     [
         (lambda lines: "\n".join(lines).replace(".", ","), "decimal commas"),
         (lambda lines: "\n".join(lines).replace(".", ",").replace(" ", ";"), "decimal commas"),
@@ -484,9 +484,9 @@ ROWS = good_rows(4)  # an x of 3.0 in the last row
         (lambda lines: "\r".join([" ".join(lines[:2]), " ".join(lines[2:])]), "4 of vertex in 2 lines"),
     ],
 )
-def test_rows_of_text_are_read_where_they_can_be_meant_in_one_way(path, written, says):
+def test_rows_of_text_are_read_where_they_can_be_meant_in_one_way(path, written, message):
     path.write_bytes(header(ROWS, kind="ascii") + written(lines_of(ROWS)).encode())
-    assert says in found(path)["unusual-rows"].text
+    assert message in found(path)["unusual-rows"].text
     model = read_ply(path)
     assert np.array_equal(model.means[:, 0], ROWS["x"])
     assert np.array_equal(model.quats[:, 3], ROWS["rot_3"])
@@ -502,7 +502,7 @@ def test_numbers_that_are_none_are_known_as_other_languages_write_them(path, wor
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "says"),
+    ("old", "new", "message"),
     [
         ("\n3.0 ", "\n3,0 ", "row 3 of vertex: x is '3,0', expected a number"),
         ("\n3.0 ", "\n3.0.0 ", r"row 3 of vertex: x is '3\.0\.0', expected a number"),
@@ -510,9 +510,9 @@ def test_numbers_that_are_none_are_known_as_other_languages_write_them(path, wor
         ("\n2.0 ", " 9.0\n", "row 1 of vertex has 27 values, expected 26"),
     ],
 )
-def test_a_row_that_can_be_meant_in_several_ways_is_quoted(path, old, new, says):
+def test_a_row_that_can_be_meant_in_several_ways_is_quoted(path, old, new, message):
     path.write_bytes(header(ROWS, kind="ascii") + "\n".join(lines_of(ROWS)).replace(old, new, 1).encode())
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         read_ply(path)
 
 
@@ -534,7 +534,7 @@ def test_rows_of_text_end_where_their_number_is_reached(path):
 
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
 @pytest.mark.parametrize(
-    ("written", "says"),
+    ("written", "message"),
     [
         (lambda head: b"\xef\xbb\xbf" + head, "a byte order mark"),
         (lambda head: head.replace(b"element", b"\nelement"), "a blank line"),
@@ -545,10 +545,10 @@ def test_rows_of_text_end_where_their_number_is_reached(path):
         (lambda head: head.replace(b"\n", b"\r\n", 4), "line ends of two kinds"),
     ],
 )
-def test_headers_are_read_as_other_programs_spell_them(path, kind, written, says):
+def test_headers_are_read_as_other_programs_spell_them(path, kind, written, message):
     body = ROWS.tobytes() if kind != "ascii" else ("\n".join(lines_of(ROWS)) + "\n").encode()
     path.write_bytes(written(header(ROWS, kind=kind, before=["comment Made by É"])) + body)
-    assert says in found(path)["unusual-header"].text
+    assert message in found(path)["unusual-header"].text
     model = csplat.read(path)
     assert np.array_equal(model.means[:, 0], ROWS["x"])
     assert "by ??" in model.metadata["comments"][0].lower()
@@ -625,7 +625,7 @@ def test_quantised_values_are_no_half_floats(path):
 
 
 @pytest.mark.parametrize(
-    ("changed", "kind", "says"),
+    ("changed", "kind", "message"),
     [
         (["opacity"], "u1", "opacity is of type uint8, expected float: export"),
         (["f_dc_0", "f_dc_1", "f_dc_2"], "u1", "are of type uint8, expected float: call colours of 0 to 255 red"),
@@ -633,12 +633,12 @@ def test_quantised_values_are_no_half_floats(path):
         (without(*"xyz", "nx", "ny", "nz"), "u2", "are of type uint16, expected float"),  # NaN as halves
     ],
 )
-def test_integers_in_place_of_floats_are_refused(path, changed, kind, says):
+def test_integers_in_place_of_floats_are_refused(path, changed, kind, message):
     rows = np.zeros(5, [(name, kind if name in changed else "<f4") for name in NAMES])
     for name in changed:
         rows[name] = 65535 if kind == "u2" else 200
     path.write_bytes(header(rows) + rows.tobytes())
-    with pytest.raises(InputError, match=f"integer-columns: .*{says}"):
+    with pytest.raises(InputError, match=f"integer-columns: .*{message}"):
         read_ply(path)
 
 

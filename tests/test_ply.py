@@ -224,14 +224,14 @@ def test_the_facts_of_a_scene_survive_a_ply(tmp_path, make_model):
 
 def test_what_others_say_of_antialiasing_is_understood(tmp_path, make_model):
     write_ply(tmp_path / "a.ply", make_model(2, 0, antialiased=True))
-    for says, antialiased, flat in [
+    for message, antialiased, flat in [
         ("antialiased 1", True, False),
         ("antialiased 0", False, False),
         ("SplatRenderMode: default", False, False),
         ("splatrendermode: 2DGS", False, True),
         ("csplat antialiased", True, False),
     ]:
-        data = (tmp_path / "a.ply").read_bytes().replace(b"SplatRenderMode: mip", says.encode())
+        data = (tmp_path / "a.ply").read_bytes().replace(b"SplatRenderMode: mip", message.encode())
         found = read_ply(data)
         assert (antialiased, flat, {}) == (found.antialiased, found.flat, found.metadata)
 

@@ -1,4 +1,4 @@
-"""The parts of `verify` and `info`: errors of pairs, partners without an index, the walk through the blocks."""
+"""Verification of declared errors, in memory and out of core, and descriptions of files."""
 
 import json
 import multiprocessing
@@ -45,12 +45,12 @@ def match(source, *rest, **options):
 
 
 def measure_pairs(source, *rest, **options):
-    """(max, rms) by measure."""
+    """Return (max, rms) by measure."""
     return {name: found[:2] for name, found in measured(Source.of(source), *rest, **options).items()}
 
 
 def moved(model, rng, sigma=1e-3):
-    """The same scene, each number a little different."""
+    """Return the scene with every value changed a little."""
     return replace(
         model,
         means=model.means + rng.normal(0, sigma, model.means.shape).astype(np.float32),
@@ -63,7 +63,7 @@ def moved(model, rng, sigma=1e-3):
 
 
 def covariance(quat, scales):
-    """A slow twin, from the definition."""
+    """Compute a covariance from its definition, as a slow twin."""
     w, x, y, z = quat / np.linalg.norm(quat)
     rotation = np.array(
         [
@@ -76,7 +76,7 @@ def covariance(quat, scales):
 
 
 # Errors of pairs ----------------------------------------------------------------------------------
-def test_covariance_errors_are_those_of_the_definition(make_model):
+def test_covariance_errors_agree_with_the_definition(make_model):
     source = make_model(60, 0)
     decoded = moved(source, np.random.default_rng(1), 0.1)
     rows = np.arange(60)
@@ -87,7 +87,7 @@ def test_covariance_errors_are_those_of_the_definition(make_model):
         assert found[row] == pytest.approx(np.linalg.norm(ours - theirs) / np.linalg.norm(theirs), rel=1e-9)
 
 
-def test_no_log_scale_is_too_large(make_model):
+def test_log_scales_of_any_size_have_covariance_errors(make_model):
     source = make_model(3, 0, scales=np.array([[60, 60, 60], [-60, -60, -60], [60, -60, 0]], np.float32))
     decoded = replace(source, scales=source.scales + np.float32(0.0078125))
     found = differences(source, decoded, np.arange(3), np.arange(3))["covariance"]
@@ -95,16 +95,14 @@ def test_no_log_scale_is_too_large(make_model):
 
 
 @pytest.mark.parametrize(
-    ("source", "decoded", "same"), [(-1e6, 1e6, (-88, 88)), (90, 3e38, (1, 1)), (-1, 99, (-1, 88))]
+    ("source", "decoded", "clipped"), [(-1e6, 1e6, (-88, 88)), (90, 3e38, (1, 1)), (-1, 99, (-1, 88))]
 )
-def test_scales_beyond_binary32_count_as_its_ends(make_model, source, decoded, same):
-    def error(wanted, found):
-        pair = [make_model(1, 0, scales=np.full((1, 3), scale, np.float32)) for scale in (wanted, found)]
-        return measure_pairs(*pair, np.zeros(1, int))["covariance"], measure_errors(*pair, np.zeros(1, int))[
-            "covariance"
-        ]
+def test_scales_beyond_float32_are_clipped_to_its_range(make_model, source, decoded, clipped):
+    def error(*scales):
+        pair = [make_model(1, 0, scales=np.full((1, 3), scale, np.float32)) for scale in scales]
+        return [measure(*pair, np.zeros(1, int))["covariance"] for measure in (measure_pairs, measure_errors)]
 
-    found, expected = error(source, decoded), error(*same)
+    found, expected = error(source, decoded), error(*clipped)
     assert np.isfinite(found).all()
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)
 
@@ -115,7 +113,7 @@ def test_equal_descriptions_of_one_rotation_have_no_error(make_model):
     assert measure_pairs(source, decoded, np.arange(50))["covariance"][0] < 1e-15
 
 
-def test_agrees_with_what_the_encoder_measures(make_model):
+def test_agrees_with_the_encoder(make_model):
     source = make_model(9000, 3)
     rng = np.random.default_rng(2)
     index = rng.permutation(9000)[:8500]
@@ -141,7 +139,7 @@ def test_bands_that_one_model_lacks_are_zero_there(make_model):
     assert errors["sh2"][0] == np.abs(source.shN[:, 3:]).max()
 
 
-def test_refuses_an_index_that_leaves_the_source(make_model):
+def test_an_index_beyond_the_source_is_refused(make_model):
     model = make_model(5, 0)
     for index in (np.array([0, 1, 2, 3, 5]), np.array([-1, 0, 1, 2, 3]), np.arange(4), np.arange(5.0)):
         with pytest.raises(InputError, match="source index"):
@@ -166,7 +164,7 @@ def test_finds_partners(make_model, sigma):
     assert all(np.abs(errors[name]).max() <= bounds[name] * (1 + 1e-9) + 1e-12 for name in bounds)
 
 
-def test_a_radius_that_is_too_small_costs_time_only(make_model):
+def test_a_radius_that_is_too_small_only_costs_time(make_model):
     source = make_model(500, 0)
     decoded = moved(source, np.random.default_rng(5), 0.05)
     bounds = bounds_of(source, decoded, np.arange(500))
@@ -175,7 +173,7 @@ def test_a_radius_that_is_too_small_costs_time_only(make_model):
 
 
 @pytest.mark.parametrize("attribute", ["means", "scales", "opacities", "sh0", "shN"])
-def test_misses_a_splat_that_has_no_partner(make_model, attribute):
+def test_a_splat_without_a_partner_is_reported(make_model, attribute):
     source = make_model(300, 1)
     decoded = moved(source, np.random.default_rng(6))
     bounds = bounds_of(source, decoded, np.arange(300))
@@ -193,7 +191,7 @@ def test_coordinates_of_all_magnitudes_find_partners(make_model):
     assert list(match(source, source, {**bounds, "means": 1e-3}, np.full(5, 1e-30))) == [0, 1, 2, 3, 4]
 
 
-def test_gives_up_on_scenes_of_equals(make_model):
+def test_the_search_gives_up_on_equal_splats(make_model):
     count = 300
     ones = {
         "means": np.zeros((count, 3), np.float32),
@@ -216,10 +214,10 @@ def test_an_empty_source_has_no_partners(make_model):
     assert list(match(make_model(0, 0), model, bounds, np.zeros(3))) == [UNMATCHED] * 3
 
 
-# Proofs -------------------------------------------------------------------------------------------
+# Verification -------------------------------------------------------------------------------------------
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["fast", "balanced", "small"])
-def test_what_the_encoder_states_is_proved(make_model, preset):
+def test_errors_declared_by_the_encoder_are_verified(make_model, preset):
     source = make_model(3000, 3)
     result = encode_with_report(source, EncodeOptions(preset=preset, tile_splats=700))
     scene = decode_scene(result.data)
@@ -231,7 +229,7 @@ def test_what_the_encoder_states_is_proved(make_model, preset):
     assert not proof.rms_verified
 
 
-def test_a_statement_that_says_too_little_or_too_much_is_not_proved(make_model):
+def test_declared_errors_that_are_too_small_or_inexact_are_not_verified(make_model):
     # SER-5
     source = make_model(500, 1)
     result = encode_with_report(source)
@@ -253,7 +251,7 @@ def test_a_statement_that_says_too_little_or_too_much_is_not_proved(make_model):
             assert not verify_bounds(Source.of(source), scene.model, scene.header, stated, result.source_index).holds
 
 
-def test_what_is_fitted_anew_or_not_stated_is_not_proved(make_model):
+def test_refitted_or_undeclared_attributes_are_not_verified(make_model):
     # SER-6
     source = make_model(50, 0)
     scene = decode_scene(encode(source))
@@ -269,7 +267,7 @@ def test_what_is_fitted_anew_or_not_stated_is_not_proved(make_model):
     assert nothing.failures == ("the file states no errors",)
 
 
-def test_what_a_refitted_file_states_has_to_hold(make_model):
+def test_errors_declared_by_a_refitted_file_have_to_hold(make_model):
     # SER-5
     source = make_model(50, 0)
     result = encode_with_report(source)
@@ -281,7 +279,7 @@ def test_what_a_refitted_file_states_has_to_hold(make_model):
 
 
 @pytest.mark.parametrize("indexed", [True, False])
-def test_a_failure_names_splat_tile_source_and_amount(make_model, indexed):
+def test_a_failure_names_splat_tile_source_and_error(make_model, indexed):
     source = make_model(1500, 1)
     result = encode_with_report(source, EncodeOptions(tile_splats=400))
     scene = decode_scene(result.data)
@@ -304,14 +302,12 @@ def test_a_failure_names_splat_tile_source_and_amount(make_model, indexed):
     assert f"above the stated {wrong[0].declared_max:.9g}" in line
 
 
-def test_a_statement_of_any_size_is_judged(make_model):
+def test_declared_errors_of_any_size_are_verified(make_model):
     source = make_model(50, 0)
     scene = decode_scene(encode(source))
     vast = tuple(replace(one, max=1e200, rms=1e200) for one in scene.declared_bounds.records)
     stated = replace(scene.declared_bounds, records=vast)
-    assert verify_bounds(
-        Source.of(source), scene.model, scene.header, stated
-    ).holds  # nobody knows which splat is which
+    assert verify_bounds(Source.of(source), scene.model, scene.header, stated).holds  # RMS needs an index
     assert not verify_bounds(Source.of(source), scene.model, scene.header, stated, np.arange(50)).holds
 
 
@@ -320,7 +316,7 @@ def test_errors_beyond_float64_are_infinite(make_model):
     assert measure_pairs(low, high, np.arange(9000))["covariance"][1] == np.inf
 
 
-def test_normals_are_nobodys_business(make_model):
+def test_normals_are_not_verified(make_model):
     source = make_model(50, 0)
     kept = replace(source, extra={"nx": np.zeros(50, np.float32)})
     result = encode_with_report(kept, EncodeOptions(keep_extra=True))
@@ -328,7 +324,7 @@ def test_normals_are_nobodys_business(make_model):
     assert verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index).holds
 
 
-def test_extra_columns_are_part_of_the_proof(make_model):
+def test_extra_columns_are_verified(make_model):
     source = make_model(50, 0, extra={"label": np.arange(50, dtype=np.int16)})
     result = encode_with_report(source, EncodeOptions(keep_extra=True))
     scene = decode_scene(result.data)
@@ -339,7 +335,7 @@ def test_extra_columns_are_part_of_the_proof(make_model):
     assert proof.clauses == ("SRC-3",)
 
 
-# The walk through the blocks ----------------------------------------------------------------------
+# Descriptions ----------------------------------------------------------------------
 @pytest.mark.parametrize(
     "options",
     [
@@ -365,7 +361,7 @@ def test_a_description_accounts_for_every_byte(make_model, options):
 
 
 @pytest.mark.slow
-def test_damage_is_described_or_refused_but_never_a_crash(make_model):
+def test_damaged_files_are_described_or_refused(make_model):
     data = encode(make_model(4, 1), EncodeOptions(sh_coding="codebook", codebook_size=2))
     for place, change in zip(range(0, len(data), 2), cycle((0x01, 0xFF, 0x80)), strict=False):
         damaged = bytearray(data)
@@ -382,7 +378,7 @@ PARTS = PartSizes(least=200, most=200)  # small scenes have several
 
 
 def both(source, data, stated=None, index=None):
-    """Return the proofs made in memory and by way of the disk as JSON, with numbers rounded to nine digits."""
+    """Verify in memory and out of core; return both results as JSON, with numbers rounded to nine digits."""
     opened = open_tiles(data)
     opened = replace(opened, declared_bounds=stated or opened.declared_bounds)
     at_once = verify_bounds(Source.of(source), decode(data), opened.header, opened.declared_bounds, index)
@@ -405,7 +401,7 @@ def states(stated, **changes):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("indexed", [True, False])
-def test_what_is_true_is_proved(make_model, indexed):
+def test_both_paths_verify_correct_files(make_model, indexed):
     source = make_model(450, 1, origin=(1e6, -2.0, 3.5), extra={"label": np.arange(450, dtype=np.int32)})
     result = encode_with_report(source, OPTIONS)
     at_once, in_parts = both(source, result.data, index=result.source_index if indexed else None)
@@ -416,7 +412,7 @@ def test_what_is_true_is_proved(make_model, indexed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("indexed", [True, False])
-def test_centres_in_doubles_are_those_of_the_source(make_model, indexed):
+def test_both_paths_use_means_in_doubles(make_model, indexed):
     model = make_model(500, 0)
     doubles = model.means.astype(np.float64) + np.array([5e5, 4e6, 30.0])
     source = replace(model, means_double=doubles, means=(doubles - [5e5, 4e6, 30.0]).astype(np.float32),
@@ -430,7 +426,7 @@ def test_centres_in_doubles_are_those_of_the_source(make_model, indexed):
 @pytest.mark.slow
 @pytest.mark.parametrize("indexed", [True, False])
 @pytest.mark.parametrize("attribute", ["means", "sh0", "extra"])
-def test_what_is_false_is_told_in_the_same_words(make_model, indexed, attribute):
+def test_both_paths_report_the_same_failures(make_model, indexed, attribute):
     source = make_model(450, 1, extra={"label": np.arange(450, dtype=np.int32)})
     result = encode_with_report(source, OPTIONS)
     if attribute == "extra":
@@ -445,7 +441,7 @@ def test_what_is_false_is_told_in_the_same_words(make_model, indexed, attribute)
 
 
 @pytest.mark.slow
-def test_a_partner_beyond_the_lattice_is_looked_for_as_far_as_is_stated(make_model):
+def test_partners_are_searched_within_the_declared_error(make_model):
     source = make_model(500, 0)
     result = encode_with_report(source, OPTIONS)
     moved = replace(source, means=source.means + np.float32(0.04))
@@ -458,7 +454,7 @@ def test_a_partner_beyond_the_lattice_is_looked_for_as_far_as_is_stated(make_mod
 
 @pytest.mark.slow
 @pytest.mark.skipif(not CAN_FORK, reason="processes are no copies of each other here")
-def test_processes_find_what_one_finds(make_model, monkeypatch):
+def test_several_processes_find_the_same(make_model, monkeypatch):
     source = make_model(600, 1)
     opened = open_tiles(encode_with_report(source, OPTIONS).data)
     far = np.where(np.arange(600) % 50, np.float32(0.04), np.float32(0.5))
@@ -485,7 +481,7 @@ def test_processes_find_what_one_finds(make_model, monkeypatch):
 
 
 @pytest.mark.slow
-def test_another_scene_is_told_before_any_splat(make_model):
+def test_another_scene_is_reported_without_any_splat(make_model):
     result = encode_with_report(make_model(400, 1), OPTIONS)
     at_once, in_parts = both(make_model(401, 0), result.data)
     assert at_once == in_parts
@@ -494,7 +490,7 @@ def test_another_scene_is_told_before_any_splat(make_model):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("indexed", [True, False])
-def test_a_scene_of_no_splats_is_proved(make_model, indexed):
+def test_an_empty_scene_is_verified(make_model, indexed):
     source = make_model(0, 1)
     result = encode_with_report(source, OPTIONS)
     at_once, in_parts = both(source, result.data, index=result.source_index if indexed else None)
@@ -502,7 +498,7 @@ def test_a_scene_of_no_splats_is_proved(make_model, indexed):
 
 
 @pytest.mark.slow
-def test_splats_of_one_place_are_no_part_that_is_too_large(make_model):
+def test_a_part_of_splats_at_one_place_may_be_large(make_model):
     source = make_model(900, 0, means=np.full((900, 3), 0.5, np.float32))
     result = encode_with_report(source, OPTIONS)
     at_once, in_parts = both(source, result.data)
@@ -511,7 +507,7 @@ def test_splats_of_one_place_are_no_part_that_is_too_large(make_model):
 
 
 @pytest.mark.slow
-def test_cells_have_about_as_many_splats(make_model):
+def test_cells_have_similar_numbers_of_splats(make_model):
     source = make_model(4000, 0)
     opened = open_tiles(encode_with_report(source, OPTIONS).data)
     places = CellTree.of(opened.header, 4000, 500).place(source.means)
@@ -523,21 +519,21 @@ def test_cells_have_about_as_many_splats(make_model):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("index", "words"),
+    ("index", "message"),
     [
         (np.array([0, 1, 1]), "splats 1 and 2 both splat 1"),
         (np.array([2, 0, 2]), "splats 0 and 2 both splat 2"),
         (np.array([0, 1, 5]), "splat 2 splat 5"),
     ],
 )
-def test_a_source_index_is_looked_at_in_parts(index, words):
+def test_invalid_source_indices_are_found_in_blocks(index, message):
     for block in (1, 2, 3):
-        with pytest.raises(InputError, match=words):
+        with pytest.raises(InputError, match=message):
             check_source_index(index, 5, 3, block=block)
 
 
 @pytest.mark.slow
-def test_the_disk_is_asked_before_and_nothing_stays_there(make_model, tmp_path, monkeypatch):
+def test_too_little_disk_space_is_an_error_and_no_files_are_left(make_model, tmp_path, monkeypatch):
     source = make_model(450, 1)
     result = encode_with_report(source, OPTIONS)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -549,7 +545,7 @@ def test_the_disk_is_asked_before_and_nothing_stays_there(make_model, tmp_path, 
 
 
 @pytest.mark.slow
-def test_a_source_index_may_be_mapped(make_model, tmp_path):
+def test_a_source_index_may_be_memory_mapped(make_model, tmp_path):
     source = make_model(500, 1)
     result = encode_with_report(source, OPTIONS)
     np.save(tmp_path / "index.npy", result.source_index)
@@ -559,7 +555,7 @@ def test_a_source_index_may_be_mapped(make_model, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_finds_by_way_of_the_disk_what_it_finds_in_memory(make_model, tmp_path):
+def test_the_command_reports_the_same_with_a_memory_limit(make_model, tmp_path):
     ply, file, index = tmp_path / "scene.ply", tmp_path / "scene.csplat", tmp_path / "index.npy"
     source = make_model(700, 1)
     result = encode_with_report(source, OPTIONS)
@@ -569,9 +565,8 @@ def test_the_command_finds_by_way_of_the_disk_what_it_finds_in_memory(make_model
     for words in ([], ["--source-index", str(index)]):
         found = []
         for memory in ([], ["--memory", "100kB"]):
-            said = CliRunner().invoke(
-                app, ["verify", str(file), "--source", str(ply), "--json", "--quiet", *words, *memory]
-            )
-            assert said.exit_code == 0, said.output
-            found.append(rounded(json.loads(said.stdout)))
+            command = ["verify", str(file), "--source", str(ply), "--json", "--quiet", *words, *memory]
+            result = CliRunner().invoke(app, command)
+            assert result.exit_code == 0, result.output
+            found.append(rounded(json.loads(result.stdout)))
         assert found[0] == found[1]

@@ -74,7 +74,7 @@ def scene(count=400, degree=3, seed=0):
     )
 
 
-def assert_same_picture(model, view, **options):
+def assert_same_render(model, view, **options):
     fast, exact = render(model, view, **options), render(model, view, mode="exact", **options)
     for found, wanted in ((fast.rgb, exact.rgb), (fast.alpha[..., None], exact.alpha[..., None])):
         off = difference(found, wanted)
@@ -87,14 +87,14 @@ def assert_same_picture(model, view, **options):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_random_scenes_look_like_the_twins(degree):
-    assert_same_picture(scene(degree=degree, seed=degree), camera(70, 53), background=(0.3, 0.6, 0.1))
+    assert_same_render(scene(degree=degree, seed=degree), camera(70, 53), background=(0.3, 0.6, 0.1))
 
 
 def test_antialiased_pictures_look_like_the_twins():
     model = scene(count=300)
     model = replace(model, scales=model.scales - 2, antialiased=True)
     view = camera(64, 48, 40.0)
-    assert_same_picture(model, view)
+    assert_same_render(model, view)
     assert not np.allclose(render(model, view).rgb, render(model, view, antialiased=False).rgb, atol=0.01)
 
 
@@ -108,7 +108,7 @@ def test_the_sample_looks_like_the_twins(sample_path):
     view = Camera([[90.0, 0.0, 48.0], [0.0, 90.0, 36.0], [0.0, 0.0, 1.0]], viewmat, 96, 72, near=0.05 * spread)
     result = render(model, view)
     assert result.alpha.mean() > 0.1
-    assert_same_picture(model.select(slice(0, None, 8)), view)
+    assert_same_render(model.select(slice(0, None, 8)), view)
 
 
 @pytest.mark.parametrize("name", ["donut", "lego60k", "fox60k_noreg"])
@@ -118,7 +118,7 @@ def test_shared_scenes_look_like_the_twins(data_dir, name):
         pytest.skip(f"{name} is absent")
     model = read_ply(path)
     views = [Camera.from_json(entry) for entry in json.loads(cameras.read_text())]
-    assert_same_picture(model.select(slice(0, None, 4)), cropped(views[1], 64, 48))
+    assert_same_render(model.select(slice(0, None, 4)), cropped(views[1], 64, 48))
 
 
 def test_one_splat_has_the_values_worked_out_by_hand():

@@ -167,7 +167,7 @@ def test_parts_that_lie_together_are_read_in_one_request(data):
 def test_arguments_that_make_no_sense_are_typed_errors_before_anything_is_read(data):
     with csplat.open(data, limits=Limits(splats=1000)) as file:
         before = file.bytes_read
-        for call, error, says in (
+        for call, error, message in (
             (lambda: file.read((0, 0, 0, 1, 1, math.nan)), InputError, "six finite numbers"),
             (lambda: file.read((1e6,) * 6), InputError, "no tile touches the box 1e.06"),
             (lambda: file.read(tiles=[99]), InputError, "tile 99"),
@@ -176,7 +176,7 @@ def test_arguments_that_make_no_sense_are_typed_errors_before_anything_is_read(d
             (lambda: file.read((0, 0, 0, 1, 1, 1), tiles=[1]), InputError, "wanted one of them"),
             (file.read, LimitError, "splats"),
         ):
-            with pytest.raises(error, match=says):
+            with pytest.raises(error, match=message):
                 call()
         assert before == file.bytes_read
     with pytest.raises(InputError, match="is closed"):
@@ -271,13 +271,13 @@ def test_a_damaged_file_of_a_store_is_named(store, data):
 
 
 @pytest.mark.parametrize(
-    ("status", "error", "says"),
+    ("status", "error", "message"),
     [(404, FileNotFoundError, "No such file"), (403, PermissionError, "Permission"), (500, StoreError, "status 500")],
 )
-def test_what_a_store_refuses_is_said_without_secrets(store, status, error, says):
+def test_what_a_store_refuses_is_said_without_secrets(store, status, error, message):
     store.answer = Refused("store://scene.csplat?key=secret")
     store.answer.status = status
-    with pytest.raises(error, match=says) as raised:
+    with pytest.raises(error, match=message) as raised:
         csplat.open("store://somebody:password@scenes/scene.csplat?key=secret")
     assert "scene.csplat" in str(raised.value)
     assert "secret" not in str(raised.value)

@@ -80,13 +80,13 @@ def test_a_file_of_the_web_that_is_damaged_is_named(web, data):
 
 
 @pytest.mark.parametrize(
-    ("answer", "error", "says"),
+    ("answer", "error", "message"),
     [(404, FileNotFoundError, "No such file"), (403, PermissionError, "Permission"), (500, StoreError, "status 500")],
 )
-def test_what_a_server_refuses_is_said_without_secrets(web, answer, error, says):
+def test_what_a_server_refuses_is_said_without_secrets(web, answer, error, message):
     web.files["/other.csplat?key=secret"] = answer
     address = web.url.replace("://", "://somebody:password@").replace("scene", "other")
-    with pytest.raises(error, match=says) as raised:
+    with pytest.raises(error, match=message) as raised:
         csplat.open(address + "?key=secret")
     assert "other.csplat" in str(raised.value)
     assert "secret" not in str(raised.value)

@@ -381,7 +381,7 @@ def test_a_film_of_one_picture_is_a_picture(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "status", "says"),
+    ("words", "status", "message"),
     [
         (("--depth",), 2, "want a folder"),
         (("--fps", "0"), 2, "fps"),
@@ -389,10 +389,10 @@ def test_a_film_of_one_picture_is_a_picture(tmp_path):
         (("--size", "20000x10"), 1, "at most 16383 pixels a side"),
     ],
 )
-def test_what_a_film_cannot_be_is_refused(film_scene, tmp_path, words, status, says):
+def test_what_a_film_cannot_be_is_refused(film_scene, tmp_path, words, status, message):
     refused = invoke("render", film_scene, "--orbit", 2, "-o", tmp_path / "turn.webp", *words)
     assert status == refused.exit_code
-    assert says in " ".join(refused.stderr.split())
+    assert message in " ".join(refused.stderr.split())
 
 
 def test_pictures_of_two_sizes_make_no_film():

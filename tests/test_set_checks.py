@@ -219,9 +219,9 @@ def test_factors_that_a_model_does_not_have_are_refused(tmp_path):
     (tmp_path / "a.png").rename(tmp_path / "images" / "a.png")
 
     def check(case):
-        values, says = case
+        values, message = case
         write_lens_transforms(tmp_path, **values)
-        with pytest.raises(InputError, match=says):
+        with pytest.raises(InputError, match=message):
             load(tmp_path)
 
     cases = {
@@ -312,9 +312,9 @@ def refusals(folder, cases, change):
     whole = json.loads(file.read_text())
 
     def check(case):
-        value, says = case
+        value, message = case
         file.write_text(json.dumps({**whole, **change(whole, value)}))
-        with pytest.raises(InputError, match=says):
+        with pytest.raises(InputError, match=message):
             load(folder)
 
     return failures(cases, check)
@@ -328,7 +328,7 @@ def test_matrices_that_are_no_poses_are_refused(tmp_path):
     def change(whole, matrix):
         return {"frames": [{**whole["frames"][0], "transform_matrix": matrix.tolist()}, *whole["frames"][1:]]}
 
-    cases = {name: (matrix, says.replace("0 0 0 1 ", "0 0 0 1$")) for name, (matrix, says) in MATRICES.items()}
+    cases = {name: (matrix, message.replace("0 0 0 1 ", "0 0 0 1$")) for name, (matrix, message) in MATRICES.items()}
     assert [] == refusals(tmp_path, cases, change)
 
 
@@ -456,21 +456,21 @@ def test_doubtful_lenses_and_poses_are_reported(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (lambda pose: pose, None),
         (np.linalg.inv, "all 10 cameras stand at one place"),
         (lambda pose: pose @ np.diag([1, -1, -1, 1]), "all cameras look away from what they stand around"),
     ],
 )
-def test_poses_of_other_conventions_are_reported(tmp_path, change, says):
+def test_poses_of_other_conventions_are_reported(tmp_path, change, message):
     write_transforms(tmp_path)
     frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
     for frame in frames:
         frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
     change_transforms(tmp_path, frames=frames)
     found = [line for line in load(tmp_path).report if "cameras look" in line or "one place" in line]
-    assert [] == found if says is None else says in found[0]
+    assert [] == found if message is None else message in found[0]
 
 
 def test_one_camera_far_away_does_not_make_the_others_look_inverted(tmp_path):

@@ -306,8 +306,8 @@ def test_bands_without_worth_are_zero_and_others_are_not(source, given):
 
 
 def test_several_targets_and_options_out_of_range_are_refused(source):
-    for given, says in (({}, "no target"), ({"psnr": 40.0, "keep": 0.5}, "one of them")):
-        with pytest.raises(InputError, match=says):
+    for given, message in (({}, "no target"), ({"psnr": 40.0, "keep": 0.5}, "one of them")):
+        with pytest.raises(InputError, match=message):
             simplify(source, options=SMALL, **given)
     for wrong in ({"rounds": 0}, {"effort": 0}, {"effort": 10}, {"views": 0}, {"view_size": (0, 1)}):
         with pytest.raises(InputError, match="wanted"):

@@ -45,7 +45,7 @@ VALID = [
     and (vector.expect["header"]["tile_count"] != 1 or vector.expect["extra"] or number % 4 == 0)
 ]
 
-#: Two of each clause, and not the one that is too large to lie in memory at once, which tiles need not.
+#: Two of each clause, without the one that is too large for memory at once: decoding it by tiles succeeds.
 INVALID = [
     *{
         (vector.error["clause"], turn): vector
@@ -63,7 +63,7 @@ def ply_of(model):
 
 
 def answer(make):
-    """Return the result, or the error's text if the input is refused: a PLY cannot hold some names of columns."""
+    """Return the result, or the error's text if the input is refused: some column names are impossible in a PLY."""
     try:
         return make()
     except csplat.InputError as error:
@@ -85,7 +85,7 @@ def assert_same(expected, found):
 
 @pytest.fixture
 def many_tiles(make_model, tmp_path):
-    """A file of eleven tiles, and where it lies."""
+    """Return the path of a file of eleven tiles."""
     data = csplat.encode(make_model(2000, 2), csplat.EncodeOptions(tile_splats=200))
     path = tmp_path / "scene.csplat"
     path.write_bytes(data)
@@ -94,7 +94,7 @@ def many_tiles(make_model, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_scene_and_its_ply_are_those_of_a_decode_at_once(tmp_path):
+def test_tile_wise_scenes_and_plys_equal_those_of_one_decode(tmp_path):
     path, ply = tmp_path / "scene.csplat", tmp_path / "scene.ply"
 
     def check(vector):
@@ -111,7 +111,7 @@ def test_a_scene_and_its_ply_are_those_of_a_decode_at_once(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_a_decode_refuses_is_refused_in_the_same_words_and_leaves_no_ply(tmp_path):
+def test_invalid_files_give_the_same_error_and_leave_no_ply(tmp_path):
     path = tmp_path / "scene.csplat"
 
     def check(vector):
@@ -127,7 +127,7 @@ def test_what_a_decode_refuses_is_refused_in_the_same_words_and_leaves_no_ply(tm
 
 
 @pytest.mark.parametrize("threads", [1, 2, 7])
-def test_threads_and_letting_go_of_the_file_change_nothing(many_tiles, threads, monkeypatch):
+def test_threads_and_released_pages_do_not_change_the_result(many_tiles, threads, monkeypatch):
     monkeypatch.setattr(decode_api, "PageReleaser", partial(file_source.PageReleaser, step_bytes=1))
     expected = decode(many_tiles)
     opened = open_tiles(many_tiles, threads=threads)
@@ -140,7 +140,7 @@ def test_threads_and_letting_go_of_the_file_change_nothing(many_tiles, threads, 
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_the_first_damaged_tile_is_told_and_those_before_it_come(many_tiles, threads):
+def test_tiles_before_a_damaged_one_are_decoded(many_tiles, threads):
     data = bytearray(many_tiles.read_bytes())
     tiles = read_header(data).tiles
     for place in (4, 6):
@@ -153,7 +153,7 @@ def test_the_first_damaged_tile_is_told_and_those_before_it_come(many_tiles, thr
 
 
 @pytest.mark.slow
-def test_nothing_of_a_damaged_file_goes_to_standard_output(many_tiles):
+def test_no_part_of_a_damaged_file_goes_to_standard_output(many_tiles):
     data = bytearray(many_tiles.read_bytes())
     whole = CliRunner().invoke(app, ["decode", str(many_tiles), "-", "--quiet"])
     assert ply_of(decode(bytes(data))) == whole.stdout_bytes
@@ -163,7 +163,7 @@ def test_nothing_of_a_damaged_file_goes_to_standard_output(many_tiles):
     assert (1, b"") == (found.exit_code, found.stdout_bytes)
 
 
-def test_a_caller_bounds_the_splats_and_a_tile_the_bytes(many_tiles):
+def test_the_limit_of_splats_is_per_file_and_that_of_bytes_per_tile(many_tiles):
     with pytest.raises(LimitError, match="splats"):
         open_tiles(many_tiles, limits=Limits(splats=1999))
     tile = max(one.splat_count for one in read_header(many_tiles.read_bytes()).tiles)
@@ -173,16 +173,16 @@ def test_a_caller_bounds_the_splats_and_a_tile_the_bytes(many_tiles):
         decode(many_tiles, limits=limits)
 
 
-def test_progress_goes_from_nothing_to_all(many_tiles, tmp_path):
-    told = []
-    decode_file(str(many_tiles), str(tmp_path / "scene.ply"), progress=lambda stage, done: told.append((stage, done)))
-    shares = [done for stage, done in told if stage == "decoding"]
+def test_progress_goes_from_0_to_1(many_tiles, tmp_path):
+    seen = []
+    decode_file(str(many_tiles), str(tmp_path / "scene.ply"), progress=lambda stage, done: seen.append((stage, done)))
+    shares = [done for stage, done in seen if stage == "decoding"]
     assert shares == sorted(shares)
     assert (0.0, 1.0) == (shares[0], shares[-1])
 
 
 @pytest.mark.parametrize("suffix", [".csplat", ".ply"])
-def test_who_wants_all_splats_at_once_is_refused_before_the_memory_is_full(many_tiles, tmp_path, monkeypatch, suffix):
+def test_loading_a_scene_that_exceeds_the_memory_is_refused(many_tiles, tmp_path, monkeypatch, suffix):
     decode_file(str(many_tiles), str(tmp_path / "scene.ply"))
     monkeypatch.setattr(scene_files, "available_memory_bytes", lambda: 4000)
     with pytest.raises(LimitError, match="allowed 4000"):
@@ -214,7 +214,7 @@ def camera_file(view, tmp_path):
 
 @pytest.fixture
 def files_of_both(model, tmp_path):
-    """A PLY, what became of it, and which splat is which."""
+    """Return the paths of a PLY, its encoded file and the source index."""
     result = encode_with_report(model, EncodeOptions(preset="fast"))
     source, made, index = (tmp_path / name for name in ("scene.ply", "scene.csplat", "index.npy"))
     write_ply(source, model)
@@ -225,12 +225,12 @@ def files_of_both(model, tmp_path):
 
 @pytest.fixture
 def no_least(monkeypatch):
-    """Let any bound of memory do: small scenes fit each that is accepted otherwise."""
+    """Accept any memory limit: small scenes fit into all that are accepted otherwise."""
     monkeypatch.setattr(SlicedScene, "least_bytes", -(10**12))
 
 
 def by_disk(model, every=1, progress=None):
-    """A scene in blocks of 300 splats, drawn in slices of about 100."""
+    """Return a scene in blocks of 300 splats that is drawn in slices of about 100."""
 
     def blocks():
         return (model.select(slice(start, start + 300)) for start in range(0, len(model), 300))
@@ -242,7 +242,7 @@ def by_disk(model, every=1, progress=None):
 
 @pytest.fixture
 def counts(monkeypatch):
-    """The number of splats in each slice that is drawn."""
+    """Record the number of splats in each slice that is drawn."""
     found, forward = [], Rasteriser.forward
 
     def noted(rasteriser, splats, *words, state=None, **named):
@@ -254,7 +254,7 @@ def counts(monkeypatch):
     return found
 
 
-def assert_same_picture(model, view, every=1, mode="standard"):
+def assert_same_render(model, view, every=1, mode="standard"):
     wanted = renderer(model, BEHIND, mode=mode)(view)
     found = renderer(by_disk(model, every), BEHIND, mode=mode)(view)
     for name in ("rgb", "alpha", "depth"):
@@ -265,14 +265,14 @@ def assert_same_picture(model, view, every=1, mode="standard"):
 # pictures
 @pytest.mark.parametrize("mode", ["standard", "fast"])
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_pictures_are_those_of_memory_to_the_bit(model, view, counts, mode, antialiased):
-    assert_same_picture(replace(model, antialiased=antialiased), view, mode=mode)
+def test_sliced_renders_equal_those_in_memory(model, view, counts, mode, antialiased):
+    assert_same_render(replace(model, antialiased=antialiased), view, mode=mode)
     assert len(counts) > 5
     assert max(counts) < 300
 
 
-def test_a_sample_that_knows_little_changes_no_bit(model, view, counts):
-    assert_same_picture(model, view, every=700)
+def test_a_sparse_sample_does_not_change_the_render(model, view, counts):
+    assert_same_render(model, view, every=700)
     assert max(counts) < 300
 
 
@@ -280,21 +280,21 @@ def test_a_sample_that_knows_little_changes_no_bit(model, view, counts):
 def test_splats_of_one_depth_are_drawn_in_their_order(model, view, crowd, counts):
     means = model.means.copy()
     means[:crowd, 2] = 0.25
-    assert_same_picture(replace(model, means=means), view)
+    assert_same_render(replace(model, means=means), view)
     assert max(counts) < 300
 
 
-def test_what_lies_behind_finished_pixels_is_not_drawn(model, view, counts):
+def test_splats_behind_opaque_pixels_are_not_drawn(model, view, counts):
     wall = np.arange(len(model)) < 20
     means, scales, opacities = model.means.copy(), model.scales.copy(), model.opacities.copy()
     means[wall], scales[wall], opacities[wall] = (0.0, 0.0, -2.5), 3.0, 0.99
-    assert_same_picture(replace(model, means=means, scales=scales, opacities=opacities), view)
+    assert_same_render(replace(model, means=means, scales=scales, opacities=opacities), view)
     assert sum(counts) < 600
 
 
-def test_a_scene_that_shows_nothing_is_the_background(model, view):
-    assert_same_picture(replace(model, means=model.means + np.float32([0, 0, -90])), view)
-    assert_same_picture(model.select(slice(0, 0)), view)
+def test_a_scene_out_of_view_renders_as_the_background(model, view):
+    assert_same_render(replace(model, means=model.means + np.float32([0, 0, -90])), view)
+    assert_same_render(model.select(slice(0, 0)), view)
 
 
 def test_mode_exact_is_refused(model, view):
@@ -302,7 +302,7 @@ def test_mode_exact_is_refused(model, view):
         renderer(by_disk(model), BEHIND, mode="exact")(view)
 
 
-def test_limits_cut_alike_and_keep_what_is_of_one_depth_together():
+def test_slices_have_equal_costs_and_do_not_split_a_depth():
     near = np.array([0, 5, 1, 2, 4, 3], np.float32)
     taken = np.where(near > 0, 10.0, 0.0)
     assert [] == slice_limits(near, taken, 1).tolist()
@@ -313,7 +313,7 @@ def test_limits_cut_alike_and_keep_what_is_of_one_depth_together():
 
 
 # scenes
-def test_what_fits_is_read_and_what_does_not_is_opened(files_of_both):
+def test_scenes_that_fit_are_loaded_and_others_opened(files_of_both):
     with open_scenes(files_of_both[:2]) as loaded, open_scenes(files_of_both[:2], LITTLE) as opened:
         assert {LoadedModel} == {type(one) for one in loaded}
         assert {OpenedScene} == {type(one) for one in opened}
@@ -324,7 +324,7 @@ def test_what_fits_is_read_and_what_does_not_is_opened(files_of_both):
             assert {LoadedModel} == {type(one) for one in both}
 
 
-def test_a_sample_has_every_so_manieth_splat(files_of_both, model):
+def test_a_sample_has_every_nth_splat(files_of_both, model):
     with open_scenes(files_of_both[:2], LITTLE) as (source, _):
         found, every = replace(source, sample_splats=220).sample()
     assert 7 == every
@@ -332,7 +332,7 @@ def test_a_sample_has_every_so_manieth_splat(files_of_both, model):
     assert 0 == found.sh_degree
 
 
-def test_views_placed_by_a_sample_stand_about_where_the_scene_puts_them(sample_path):
+def test_a_sample_gives_about_the_same_views(sample_path):
     whole = csplat_tools.load_model(sample_path).model
     part = comparison_cameras(whole.select(slice(None, None, 2)), every=2)
     for wanted, found in zip(comparison_cameras(whole), part, strict=True):
@@ -342,7 +342,7 @@ def test_views_placed_by_a_sample_stand_about_where_the_scene_puts_them(sample_p
 
 # comparisons
 @pytest.mark.usefixtures("no_least")
-def test_comparing_finds_what_memory_finds(files_of_both, camera_file, tmp_path):
+def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, camera_file, tmp_path):
     source, made, index = files_of_both
     words = ["compare", source, made, "--cameras", camera_file, "--source-index", index, "--json"]
     found = []
@@ -376,7 +376,7 @@ def test_splats_of_one_order_are_measured_without_an_index(model, camera_file, t
 
 
 @pytest.mark.usefixtures("no_least")
-def test_without_an_index_the_errors_are_said_to_be_unknown(files_of_both, camera_file):
+def test_without_an_index_the_errors_are_reported_as_unknown(files_of_both, camera_file):
     source, made, _ = files_of_both
     result = CliRunner().invoke(app, ["compare", source, made, "--cameras", camera_file, "--memory", "1kB"])
     assert 0 == result.exit_code
@@ -384,7 +384,7 @@ def test_without_an_index_the_errors_are_said_to_be_unknown(files_of_both, camer
 
 
 @pytest.mark.usefixtures("no_least")
-def test_exact_pictures_of_what_does_not_fit_are_refused_in_a_line(files_of_both):
+def test_mode_exact_of_scenes_beyond_the_memory_is_refused(files_of_both):
     result = CliRunner().invoke(app, ["compare", *files_of_both[:2], "--memory", "1kB", "--mode", "exact"])
     assert 1 == result.exit_code
     assert ["error: --mode exact wants both scenes in memory, and they do not fit: take standard (E_INPUT)"] == [
@@ -393,20 +393,20 @@ def test_exact_pictures_of_what_does_not_fit_are_refused_in_a_line(files_of_both
 
 
 @pytest.mark.usefixtures("no_least")
-def test_a_disk_without_room_is_found_before_anything_is_drawn(files_of_both, monkeypatch):
+def test_too_little_disk_space_is_an_error_before_drawing(files_of_both, monkeypatch):
     usage = type("Usage", (), {"free": 1000})
     monkeypatch.setattr(disk_files.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(InputError, match="TMPDIR"):
         csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
 
 
-def test_a_bound_that_cannot_be_held_is_refused(files_of_both, monkeypatch):
+def test_a_memory_limit_below_the_minimum_is_refused(files_of_both, monkeypatch):
     monkeypatch.setattr(SlicedScene, "least_bytes", 450_000_000)
     with pytest.raises(InputError, match=r"^0 MB of memory are too little to draw these scenes, which take 482$"):
         csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
 
 
-def test_nothing_is_left_where_drawing_ends_early(model, view, monkeypatch, tmp_path):
+def test_an_interrupted_render_leaves_no_files(model, view, monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
 
     def interrupted(_, share):
