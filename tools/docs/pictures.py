@@ -1,10 +1,9 @@
-"""Make the pictures of README and documentation from the sample scene: two renders, a plot, views of the tutorial.
+"""Make the images of README and documentation from the sample scene.
 
-What the plot shows stands in `measured.json`: bytes, PSNR over the eight views of `csplat compare`, seconds, and the
-versions of all programs. `--measure` takes those figures anew, on an idle machine; it needs npm, for splat-transform,
-and some minutes. `--tutorial` takes a scene and a page that the commands of `guide/tutorial.md` left behind, and needs
-Chromium. `--engines` takes what `python -m csplat_bench.viewer.owners --scenes sample --formats csplat --out FOLDER`
-left behind.
+`measured.json` holds the figures of the README's table and plot: bytes, PSNR over the eight views of `csplat compare`,
+seconds, and versions. `--measure` updates them; run it on an idle machine with npm, for splat-transform, and then
+`python -m csplat_bench pages`. `--tutorial` takes the output of the commands in `guide/tutorial.md` and needs Chromium.
+`--engines` takes a folder of screenshots `sample-ENGINE-csplat.png`.
 
 Usage:
     python tools/docs/pictures.py [--measure] [--peers FOLDER] [--tutorial FOLDER] [--engines FOLDER]
@@ -14,12 +13,11 @@ from __future__ import annotations
 
 import argparse
 import io
-import json
 import math
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +29,6 @@ from csplat.encoder import PresetName
 from csplat.types import U8
 from csplat_bench.common.measuring import timed
 from csplat_bench.common.peers import find_splat_transform
-from csplat_bench.common.plots import new_figure, save_svg
 from csplat_bench.common.report import describe
 from csplat_render import Camera, render
 from csplat_render.camera import intrinsics, look_at
@@ -46,28 +43,25 @@ MEASURED = FOLDER / "measured.json"
 SHOWN: PresetName = "balanced"  # preset of the file shown next to the source
 
 _PRESETS: tuple[PresetName, ...] = ("fast", "balanced", "small")
-_WHOLE = (30, 34, 38, 42, 46, 50)  # dB wanted, every splat kept
-_FEWER = (30, 34, 38)  # dB wanted, splats removed and the others fitted
+_TARGETS = (30, 34, 38, 42, 46, 50)  # dB, every splat kept
+_PRUNED_TARGETS = (30, 34, 38)  # dB, splats pruned and the rest refitted
 _RUNS = 5
 _WIDTH, _HEIGHT = 640, 480
 _QUALITY = 86
 _ENGINES = ("three", "spark", "playcanvas", "babylon")
-# Okabe and Ito's colours, told apart by all eyes.
-_OURS, _FITTED, _SPZ, _SOG = "#0072B2", "#009E73", "#D55E00", "#CC79A7"
 
 
 def main() -> None:
-    """Read the command line, make the pictures."""
+    """Parse the command line and make the images."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--measure", action="store_true", help="take all figures anew")
-    parser.add_argument("--peers", type=Path, default=Path("out/npm"), metavar="FOLDER", help="for npm packages")
-    parser.add_argument("--tutorial", type=Path, metavar="FOLDER", help="where its commands were run")
-    parser.add_argument("--engines", type=Path, metavar="FOLDER", help="pictures of the sample in engines")
+    parser.add_argument("--measure", action="store_true", help="measure all figures again")
+    parser.add_argument("--peers", type=Path, default=Path("out/npm"), metavar="FOLDER", help="folder of npm packages")
+    parser.add_argument("--tutorial", type=Path, metavar="FOLDER", help="folder in which its commands were run")
+    parser.add_argument("--engines", type=Path, metavar="FOLDER", help="screenshots of the sample scene in engines")
     arguments = parser.parse_args()
     if arguments.measure:
         write_json(str(MEASURED), measure(arguments.peers))
     draw_scene()
-    draw_curves(json.loads(MEASURED.read_text("utf-8")))
     if arguments.tutorial is not None:
         draw_tutorial(arguments.tutorial)
     if arguments.engines is not None:
@@ -77,42 +71,43 @@ def main() -> None:
 
 
 def measure(peers: Path) -> dict[str, Any]:
-    """Encode the sample in all ways that the plot shows.
+    """Encode the sample scene with every setting that the README shows.
 
     Args:
-        peers: folder for npm packages.
+        peers: folder of npm packages.
 
     Returns:
-        What `measured.json` holds: bytes, dB and least seconds by name, and what took them.
+        The content of `measured.json`.
     """
     source = csplat.read_ply(SAMPLE)
-    judge = Scorer.of_source(source, comparison_cameras(source))
-    presets = {}
+    scorer = Scorer.of_source(source, comparison_cameras(source))
+    rows: list[dict[str, Any]] = []
     for name in _PRESETS:
         options = csplat.EncodeOptions(preset=name)
         runs = [timed(csplat.encode, source, options) for _ in range(_RUNS)]
-        presets[name] = {**_scored(judge, runs[0][0]), "seconds": round(min(one.wall for _, one in runs), 2)}
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        whole = [_target(judge, folder, psnr, "--no-prune") for psnr in _WHOLE]
-        fewer = [_target(judge, folder, psnr) for psnr in _FEWER]
-        command, version = find_splat_transform(peers)
-        if command is None:
-            raise SystemExit(f"no splat-transform: {version}")
-        others = {ending: _peer(judge, command, folder / f"sample.{ending}") for ending in ("spz", "sog")}
+        seconds = round(min(one.wall for _, one in runs), 2)
+        rows.append(
+            {"name": name, "preset": name, "series": "preset", **_scored(scorer, runs[0][0]), "seconds": seconds}
+        )
+    command, version = find_splat_transform(peers)
+    if command is None:
+        raise SystemExit(f"no splat-transform: {version}")
+    with tempfile.TemporaryDirectory() as folder:
+        rows += [_target(scorer, Path(folder), psnr, "--no-prune") for psnr in _TARGETS]
+        rows += [_target(scorer, Path(folder), psnr) for psnr in _PRUNED_TARGETS]
+        rows += [_peer(scorer, command, Path(folder) / f"sample.{ending}") for ending in ("spz", "sog")]
+    machine = describe()
     return {
-        "machine": describe(),
-        "splat_transform": version,
-        "source": {"bytes": SAMPLE.stat().st_size, "splats": len(source), "sh_degree": source.sh_degree},
-        "presets": presets,
-        "keep_all": whole,
-        "fitted": fewer,
-        **others,
+        "command": "python tools/docs/pictures.py --measure",
+        "machine": machine.pop("machine"),
+        "versions": {**machine, "splat_transform": version},
+        "source": {"size_bytes": SAMPLE.stat().st_size, "splats": len(source), "sh_degree": source.sh_degree},
+        "rows": rows,
     }
 
 
 def draw_scene() -> None:
-    """Render source and file from one place, with nothing behind them."""
+    """Render the source and a file of it from one camera, on a transparent background."""
     source = csplat.read_ply(SAMPLE)
     decoded = csplat.decode(csplat.encode(source, csplat.EncodeOptions(preset=SHOWN)))
     for name, model in (("source", source), (SHOWN, decoded)):
@@ -120,49 +115,11 @@ def draw_scene() -> None:
         _save(picture, f"sample-{name}.webp")
 
 
-def draw_curves(measured: Mapping[str, Any]) -> None:
-    """Plot PSNR over bytes. The same figures give the same bytes."""
-    from matplotlib import rc_context
-
-    splats = measured["source"]["splats"]
-    version = measured["splat_transform"]
-    with rc_context({"svg.fonttype": "none", "font.size": 10, "font.family": "sans-serif"}):
-        figure = new_figure(7.2, 3.6)
-        axis = figure.subplots()
-        axis.set_xscale("log")
-        for name, colour, label in (
-            ("keep_all", _OURS, "csplat --target-psnr --no-prune"),
-            ("fitted", _FITTED, "csplat --target-psnr: fewer splats, fitted anew"),
-        ):
-            rows = sorted(measured[name], key=lambda row: row["bytes"])
-            style = "o-" if name == "keep_all" else "^-"
-            axis.plot(*_xy(rows), style, color=colour, markersize=4.5, linewidth=1.6, label=label)
-        axis.plot(*_xy(measured["presets"].values()), "s", color="0.15", markersize=5, label="csplat --preset")
-        for name, one in measured["presets"].items():
-            place, away = (one["bytes"] / 1000, one["psnr"]), (5, -11 if name == "fast" else -3)
-            axis.annotate(name, place, away, textcoords="offset points", fontsize=9)
-        for name, colour, marker in (("spz", _SPZ, "D"), ("sog", _SOG, "D")):
-            one = measured[name]
-            axis.plot(*_xy([one]), marker, color=colour, markersize=7, label=f"{name.upper()}, {version}")
-        left, right = 35, 600
-        axis.set_xlim(left, right)
-        ticks = (50, 100, 200, 400)
-        axis.set_xticks(ticks, [str(one) for one in ticks])
-        axis.set_xticks([], minor=True)
-        axis.set_xlabel(f"kB, of {measured['source']['bytes'] / 1000:,.0f} kB of PLY ({splats:,} splats, SH 3)")
-        axis.set_ylabel("PSNR, dB")
-        axis.grid(color="0.9", linewidth=0.6)
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.tick_params(length=0)
-        axis.legend(frameon=False, fontsize=8.5, loc="lower right")
-        save_svg(figure, PICTURES / "bytes-psnr.svg")
-
-
 def draw_tutorial(folder: Path) -> None:
-    """Show what the commands of the tutorial left: photographs, one next to its render, the page in Chromium.
+    """Show the results of the tutorial: photographs in a row, and the exported page in Chromium.
 
     Args:
-        folder: with `photographs`, `garden.csplat` and `garden.html`.
+        folder: contains `photographs` and `garden.html`.
     """
     names = [folder / "photographs" / "train" / f"{number:03d}.png" for number in (4, 9, 13, 18, 22, 27)]
     _save(_row(names), "tutorial-photographs.webp")
@@ -183,7 +140,7 @@ def draw_tutorial(folder: Path) -> None:
 
 
 def _row(names: Sequence[Path]) -> Image.Image:
-    """Pictures of one size next to each other."""
+    """Put images of one size next to each other."""
     pictures = [Image.open(name).convert("RGBA") for name in names]
     width, height = pictures[0].size
     row = Image.new("RGBA", (width * len(pictures), height))
@@ -192,28 +149,30 @@ def _row(names: Sequence[Path]) -> Image.Image:
     return row
 
 
-def _target(judge: Scorer, folder: Path, psnr: int, *more: str) -> dict[str, Any]:
-    """A file that reaches a PSNR, by the command itself."""
+def _target(scorer: Scorer, folder: Path, psnr: int, *options: str) -> dict[str, Any]:
     path = folder / "target.csplat"
-    words = ["encode", str(SAMPLE), str(path), "--target-psnr", str(psnr), "--force", "--quiet", *more]
+    words = ["encode", str(SAMPLE), str(path), "--target-psnr", str(psnr), "--force", "--quiet", *options]
     _, timing = timed(subprocess.run, [sys.executable, "-m", "csplat_tools", *words], check=True)
-    return {**_scored(judge, path.read_bytes()), "wanted": psnr, "seconds": round(timing.wall, 1)}
+    name = " ".join(["--target-psnr", str(psnr), *options])
+    series = "no-prune" if options else "pruned"
+    return {"name": name, "series": series, **_scored(scorer, path.read_bytes()), "seconds": round(timing.wall, 1)}
 
 
-def _peer(judge: Scorer, command: list[str], path: Path) -> dict[str, Any]:
-    """A file of another format, with that program's defaults, and what the program reads from it."""
+def _peer(scorer: Scorer, command: list[str], path: Path) -> dict[str, Any]:
+    """Encode with another program's defaults, and score the scene that it decodes."""
     back = path.with_name(path.name + ".ply")
     for given, made in ((SAMPLE, path), (path, back)):
         subprocess.run([*command, "-q", "-w", "-g", "cpu", str(given), str(made)], check=True, capture_output=True)
-    return {"bytes": path.stat().st_size, "psnr": round(judge.psnr(csplat.read_ply(back)), 2)}
+    name, psnr = path.suffix[1:].upper(), round(scorer.psnr(csplat.read_ply(back)), 2)
+    return {"name": name, "series": name, "size_bytes": path.stat().st_size, "psnr": psnr}
 
 
-def _scored(judge: Scorer, data: bytes) -> dict[str, Any]:
-    return {"bytes": len(data), "psnr": round(judge.psnr(csplat.decode(data)), 2)}
+def _scored(scorer: Scorer, data: bytes) -> dict[str, Any]:
+    return {"size_bytes": len(data), "psnr": round(scorer.psnr(csplat.decode(data)), 2)}
 
 
 def _camera() -> Camera:
-    """From a little above, near enough to fill the picture."""
+    """Return a camera slightly above the scene, close enough to fill the image."""
     turn, height, distance = math.radians(215.0), math.radians(24.0), 3.2
     middle = np.array([0.0, -0.22, 0.0])  # y points down
     away = np.array([math.cos(height) * math.cos(turn), -math.sin(height), math.cos(height) * math.sin(turn)])
@@ -222,7 +181,7 @@ def _camera() -> Camera:
 
 
 def _cut_out(model: csplat.SplatModel, camera: Camera) -> U8:
-    """[H, W, 4], a render with nothing behind it."""
+    """Render on a transparent background: [H, W, 4]."""
     seen = render(model, camera)
     alpha = np.clip(seen.alpha, 0.0, 1.0)[..., None]
     colour = np.clip(seen.rgb / np.maximum(alpha, 1e-3), 0.0, 1.0)
@@ -233,10 +192,6 @@ def _save(picture: Image.Image, name: str) -> None:
     buffer = io.BytesIO()
     picture.save(buffer, "WEBP", quality=_QUALITY, method=6)
     write_bytes(str(PICTURES / name), buffer.getvalue())
-
-
-def _xy(rows: Any) -> tuple[list[float], list[float]]:
-    return [row["bytes"] / 1000 for row in rows], [row["psnr"] for row in rows]
 
 
 if __name__ == "__main__":
