@@ -273,7 +273,7 @@ def test_scenes_wait_for_memory_and_one_that_wants_all_of_it_is_refused():
             order.append("first")
     thread.join()
     assert ["first", "in"] == order
-    with pytest.raises(LimitError, match="wanted 101, allowed 100"), budget.gate(101):
+    with pytest.raises(LimitError, match="needs 101, allowed 100"), budget.gate(101):
         pass
     with MemoryBudget(10**9, has_option=True).gate(10**9 + 1) as options:
         assert ("--memory", str(10**9 - RENDERER_BYTES)) == options

@@ -477,7 +477,7 @@ def test_files_have_the_usual_permissions(csplat_file):
         (("info", "absent.csplat"), "No such file"),
         (("verify", "absent.csplat"), "No such file"),
         (("lint", "absent.ply"), "No such file"),
-        (("info", "."), "is a folder, and no scene"),
+        (("info", "."), "is a folder, not a scene"),
         (("encode", "scene.ply", "."), "is a folder"),
         (("encode", "scene.ply", "no/such/folder/out.csplat"), "No such file"),
     ],
@@ -602,7 +602,7 @@ def test_formats_that_are_not_read_are_named_with_a_converter(tmp_path):
         assert line.endswith("(E_INPUT)\n")
     (tmp_path / "a.spz").write_bytes(gzip.compress(b"NGSP" + bytes(60)))
     for words in [("decode", tmp_path / "a.spz", tmp_path / "out.ply"), ("verify", tmp_path / "a.spz")]:
-        assert "`csplat encode` makes a .csplat file" in refused(*words)
+        assert "convert it with `csplat encode`" in refused(*words)
 
 
 @pytest.mark.parametrize(

@@ -270,9 +270,9 @@ def test_names_in_a_zip_may_have_backslashes_and_capitals(tmp_path):
 def test_a_meta_json_of_another_program_is_no_sog(tmp_path):
     files = {"meta.json": b'{"app": "a scanner"}', "room.ply": b"ply"}
     message = "meta.json is not that of SOG, which has means, quats, scales, sh0; .*"
-    with pytest.raises(InputError, match=message + r"a zip that holds room\.ply: unzip it"):
+    with pytest.raises(InputError, match=message + r"a zip that contains room\.ply: unzip it"):
         csplat.read(zipped(tmp_path / "a.zip", files))
-    with pytest.raises(InputError, match=message + r"a folder, and no scene: name room\.ply"):
+    with pytest.raises(InputError, match=message + r"a folder, not a scene: name room\.ply"):
         csplat.read(foldered(tmp_path / "a", files))
 
 

@@ -111,7 +111,7 @@ def test_each_format_has_a_name_of_its_own():
         ("a.glb", b"b3dm\1\0\0\0", "3D Tiles"),
         ("a.ply", b"\x89PNG\r\n\x1a\n", "is a PNG, an image"),
         ("a.json", b'{"cameras": []}', "is JSON"),
-        ("a.csplat", b"<?xml version='1.0'?><Error/>", "XML, as servers"),
+        ("a.csplat", b"<?xml version='1.0'?><Error/>", "XML, probably"),
         ("a.ply", b"\xef\xbb\xbf<html>", "a web page"),
         ("a.ply", b"<!-- saved from url=(0030)https://example.org/ -->\n<html>", "a web page"),
         ("a.spz", " <!DOCTYPE html><html>".encode("utf-16"), "a web page"),
@@ -120,7 +120,7 @@ def test_each_format_has_a_name_of_its_own():
         ("a.spz", b"\xef\xbb\xbfversion https://git-lfs.github.com/spec/v1\noid", "Git LFS"),
         ("a.ply", b"/annex/objects/SHA256E-s1234--abc.ply\n", "a pointer of git-annex, .* run `git annex get`"),
         ("a.splat", b"{\\rtf1\\ansi hello}".ljust(64), "is RTF, a text"),
-        ("a.splat", b"\x93NUMPY\1\0v\0{'descr': '<f4'", "is an array of NumPy, no scene"),
+        ("a.splat", b"\x93NUMPY\1\0v\0{'descr': '<f4'", "is a NumPy array, not a scene"),
         ("a.ckpt", b'\x3c\0\0\0\0\0\0\0{"means":{', "is safetensors, which csplat does not read"),
         ("a.xz", b"\xfd7zXZ\0\0", "is xz, unpack it first, with unxz"),
         ("a.ply", b"BZh91AY&SY", "is bzip2, unpack it first"),
@@ -163,7 +163,7 @@ def test_pointers_of_git_lfs_are_named_within_scenes_of_several_files(tmp_path, 
 def test_a_zip_is_told_by_what_is_in_it(tmp_path):
     for name, message in (
         ("x.npy", "NumPy"),
-        ("scene.ply", r"a zip that holds scene\.ply: unzip it"),
+        ("scene.ply", r"a zip that contains scene\.ply: unzip it"),
         ("a.usdc", "USD"),
         ("a/data.pkl", "checkpoint"),
     ):
@@ -192,7 +192,7 @@ def test_names_that_no_format_has_are_refused(tmp_path, make_model):
         csplat.write(tmp_path / "a.xyz", make_model(3, 0))
     with pytest.raises(InputError, match=r"wanted one of .*\bply\b"):
         csplat.read(tmp_path, format="xyz")
-    with pytest.raises(InputError, match="no scene"):
+    with pytest.raises(InputError, match="not a scene"):
         csplat.read(tmp_path)
 
 
@@ -207,13 +207,13 @@ def test_scenes_in_a_zip_are_named(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         for name in ("a/scene.ply", "__MACOSX/a/._scene.ply", "b.spz", "readme.txt"):
             archive.writestr(name, "x")
-    with pytest.raises(InputError, match=r"a.zip is a zip that holds a/scene.ply, b.spz: unzip it"):
+    with pytest.raises(InputError, match=r"a.zip is a zip that contains a/scene.ply, b.spz: unzip it"):
         csplat.read(tmp_path / "a.zip")
     (tmp_path / "b.zip").write_bytes((tmp_path / "a.zip").read_bytes()[:-30])
-    with pytest.raises(InputError, match=r"b\.zip is a zip, and damaged"):
+    with pytest.raises(InputError, match=r"b\.zip is a damaged zip"):
         csplat.read(tmp_path / "b.zip")
     np.savez(tmp_path / "c.npz", means=np.zeros((2, 3)), quats=np.zeros((2, 4)))
-    with pytest.raises(InputError, match=r"c\.npz is an archive of NumPy arrays \(means, quats\), no scene"):
+    with pytest.raises(InputError, match=r"c\.npz is an archive of NumPy arrays \(means, quats\), not a scene"):
         csplat.read(tmp_path / "c.npz")
 
 
@@ -221,14 +221,12 @@ def test_of_a_folder_that_a_trainer_wrote_the_newest_scene_is_named(tmp_path):
     for name in ("input.ply", *(f"point_cloud/iteration_{count}/point_cloud.ply" for count in (7000, 30000))):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"")
-    message = (
-        r"is a folder, and no scene: name point_cloud/iteration_30000/point_cloud\.ply, the last of 2 scenes in it"
-    )
+    message = r"is a folder, not a scene: name point_cloud/iteration_30000/point_cloud\.ply, the last of 2 scenes in it"
     with pytest.raises(InputError, match=message):
         csplat.read(tmp_path)
     (tmp_path / "splat").mkdir()
     (tmp_path / "splat" / "a.spz").write_bytes(b"")
-    with pytest.raises(InputError, match=r"splat is a folder, and no scene: name a\.spz$"):
+    with pytest.raises(InputError, match=r"splat is a folder, not a scene: name a\.spz$"):
         csplat.read(tmp_path / "splat")
 
 
@@ -383,7 +381,7 @@ def test_arrays_come_back(tmp_path):
 @pytest.mark.parametrize(
     ("data", "why"),
     [
-        (b"hello", "facts is no array"),
+        (b"hello", "facts is not an array"),
         (BROKEN.ljust(128, b" "), "not a file of tests"),
         (b"\x93NUMPY\x09\x09", "not a file of tests"),
         (b"", "not a file of tests"),
@@ -422,9 +420,9 @@ def test_facts_that_are_none_are_refused(tmp_path, text):
 def test_what_is_missing_or_of_another_kind_is_named(tmp_path):
     np.savez(tmp_path / "a.npz", one=np.zeros(1))
     found = read_archive(tmp_path / "a.npz", KIND)
-    with pytest.raises(InputError, match="holds no two"):
+    with pytest.raises(InputError, match="has no two"):
         found["two"]
-    with pytest.raises(InputError, match="its n is no int"):
+    with pytest.raises(InputError, match="its n is not of type int"):
         found.check({"n": "1"}, {"n": int})
 
 

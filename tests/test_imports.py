@@ -67,9 +67,9 @@ def test_a_format_error_names_code_place_clause_and_both_values():
     assert ("E_CRC", 12, "CRC-1") == (error.code, error.offset, error.clause)
 
 
-def test_found_and_wanted_make_the_message():
+def test_the_message_contains_the_values_found_and_expected():
     error = errors.FormatError("E_COUNT", 40, "IDX-3", found=7, wanted="at most 5")
-    assert "E_COUNT at byte 40 (IDX-3): found 7, wanted at most 5" == str(error)
+    assert "E_COUNT at byte 40 (IDX-3): found 7, expected at most 5" == str(error)
 
 
 def test_a_format_error_without_a_place_leaves_it_out():
@@ -84,7 +84,7 @@ def test_an_unsupported_error_names_the_feature():
 
 def test_a_limit_error_names_both_sides():
     error = errors.LimitError("max_splats", 10, 5)
-    assert "E_LIMIT: max_splats: wanted 10, allowed 5" == str(error)
+    assert "E_LIMIT: max_splats: needs 10, allowed 5" == str(error)
     assert ("max_splats", 10, 5) == (error.limit, error.wanted, error.allowed)
 
 

@@ -128,7 +128,7 @@ def test_messages_name_an_open_file(tmp_path):
 @pytest.mark.parametrize("wrong", [5, None, 1.5, ["scene.ply"], io.StringIO("ply\n")])
 @pytest.mark.parametrize("function", ["read_ply", "decode", "read_header", "lint_ply"])
 def test_what_is_no_file_is_a_typed_error(function, wrong):
-    with pytest.raises(InputError, match="wanted"):
+    with pytest.raises(InputError, match="expected"):
         getattr(csplat, function)(wrong)
 
 
@@ -142,7 +142,7 @@ def test_a_file_that_is_not_there_is_named(function, tmp_path):
 def test_what_is_no_model_is_refused_with_the_name_of_what_makes_one(wrong, tmp_path):
     calls = [csplat.encode, csplat.encode_with_report, lambda model: csplat.write_ply(tmp_path / "out.ply", model)]
     for call in calls:
-        with pytest.raises(InputError, match=r"takes a SplatModel.*csplat\.read_ply"):
+        with pytest.raises(InputError, match=r"expects a SplatModel.*csplat\.read_ply"):
             call(wrong)
     assert not list(tmp_path.iterdir())
 

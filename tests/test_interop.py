@@ -415,11 +415,11 @@ def test_shn_may_be_left_out(model):
     ("change", "says"),
     [
         ({"sh0": None}, "have no sh0"),
-        ({"sh0": None, "features": 1}, "features of appearance"),
+        ({"sh0": None, "features": 1}, "appearance features"),
         ({"means": np.zeros((20, 2))}, r"means has shape \[20, 2\]"),
-        ({"sh0": np.zeros((20, 2, 3))}, r"sh0 has shape \[20, 2, 3\], wanted \[20, 1, 3\]"),
+        ({"sh0": np.zeros((20, 2, 3))}, r"sh0 has shape \[20, 2, 3\], expected \[20, 1, 3\]"),
         ({"opacities": np.full(20, np.nan)}, "NaN"),
-        ({"quats": np.full((20, 4), np.inf)}, "quats holds values that are NaN"),
+        ({"quats": np.full((20, 4), np.inf)}, "quats contains NaN"),
         ({"quats": np.zeros((20, 3))}, r"quats has shape \[20, 3\]"),
         ({"shN": "text"}, "shN is a str"),
     ],
@@ -435,15 +435,15 @@ def test_a_wrong_form_is_refused(model):
     with pytest.raises(InputError, match="logarithms"):
         csplat.from_gsplat(csplat.to_gsplat(model), form="activated")
     for call, given in ((csplat.from_gsplat, {}), (csplat.to_gsplat, model)):
-        with pytest.raises(InputError, match="wanted one of parameters, activated"):
+        with pytest.raises(InputError, match="expected one of parameters, activated"):
             call(given, form="logits")
-    with pytest.raises(InputError, match="takes a SplatModel"):
+    with pytest.raises(InputError, match="expects a SplatModel"):
         csplat.to_gsplat({})
 
 
 def test_tensors_without_torch_are_an_error_with_a_remedy(model, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(InputError, match="device=None gives NumPy arrays"):
+    with pytest.raises(InputError, match="use device=None for NumPy arrays"):
         csplat.to_gsplat(model, device="cpu")
 
 

@@ -174,7 +174,7 @@ def test_a_full_disk_is_said_before_and_survived_within(model, whole, tmp_path, 
     target = tmp_path / "out.csplat"
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=1000))
-        with pytest.raises(InputError, match="0 MB free, and 1 are wanted"):
+        with pytest.raises(InputError, match="0 MB free, 1 MB are needed"):
             encode_large(source_from_model(model), target, FAST)
     assert not list(tmp_path.iterdir())
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -239,7 +239,7 @@ def test_a_scene_that_gets_shorter_while_it_is_read_is_refused(model, tmp_path):
         times.append(1)
         yield model.select(slice(0, COUNT if len(times) == 1 else 3000))
 
-    with pytest.raises(InputError, match="3,000 splats came where 3,600 were announced"):
+    with pytest.raises(InputError, match="the scene has 3,000 splats, expected 3,600"):
         encode_large(replace(source_from_model(model), blocks=blocks), tmp_path / "out.csplat", FAST)
     assert not (tmp_path / "out.csplat").exists()
 

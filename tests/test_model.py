@@ -39,21 +39,21 @@ def test_repr_is_short(make_model):
     ("field", "value", "message"),
     [
         ("means", np.zeros((10, 2), np.float32), r"means has shape \[10, 2\]"),
-        ("means", np.float32(1), "means is a float32, wanted a float32 array"),
-        ("quats", np.zeros((10, 3), np.float32), r"quats has shape \[10, 3\], wanted \[10, 4\]"),
-        ("scales", np.zeros((9, 3), np.float32), r"scales has shape \[9, 3\], wanted \[10, 3\]"),
+        ("means", np.float32(1), "means is a float32, expected a float32 array"),
+        ("quats", np.zeros((10, 3), np.float32), r"quats has shape \[10, 3\], expected \[10, 4\]"),
+        ("scales", np.zeros((9, 3), np.float32), r"scales has shape \[9, 3\], expected \[10, 3\]"),
         ("opacities", np.zeros((10, 1), np.float32), "opacities has shape"),
-        ("sh0", np.zeros((10, 3)), "sh0 is float64, wanted float32"),
-        ("sh0", np.zeros((10, 3), ">f4"), "sh0 is >f4, wanted float32"),
-        ("shN", np.zeros((10, 4, 3), np.float32), "4 coefficients per channel, wanted 0, 3, 8"),
+        ("sh0", np.zeros((10, 3)), "sh0 is float64, expected float32"),
+        ("sh0", np.zeros((10, 3), ">f4"), "sh0 is >f4, expected float32"),
+        ("shN", np.zeros((10, 4, 3), np.float32), "4 coefficients per channel, expected 0, 3, 8"),
         ("shN", np.zeros((10, 24, 3), np.float32), "24 coefficients"),
         ("shN", np.zeros((10, 45), np.float32), "shN has shape"),
         ("opacities", np.full(10, 1.5, np.float32), "alpha in .0, 1."),
         ("opacities", np.full(10, -0.1, np.float32), "not logits"),
-        ("quats", np.zeros((10, 4), np.float32), "10 rows that are not unit length"),
-        ("quats", np.full((10, 4), 1e30, np.float32), "10 rows that are not unit length"),
-        ("origin", (1.0, 2.0), "wanted three numbers"),
-        ("origin", (1.0, 2.0, float("nan")), "wanted finite numbers"),
+        ("quats", np.zeros((10, 4), np.float32), "10 rows that are not of unit length"),
+        ("quats", np.full((10, 4), 1e30, np.float32), "10 rows that are not of unit length"),
+        ("origin", (1.0, 2.0), "expected three numbers"),
+        ("origin", (1.0, 2.0, float("nan")), "expected finite numbers"),
         ("coordinate_system", "XYZ", "the axes are 'XYZ'"),
         ("coordinate_system", "RLU", "the axes are 'RLU'"),
         ("coordinate_system", "RDFF", "the axes are 'RDFF'"),
@@ -73,7 +73,7 @@ def test_refuses_what_is_no_model(make_model, field, value, message):
 def test_refuses_values_that_are_not_finite(make_model, field, value):
     array = getattr(make_model(), field).copy()
     array.flat[-1] = value
-    with pytest.raises(InputError, match=f"{field} holds 1 values that are NaN or infinite"):
+    with pytest.raises(InputError, match=f"{field} contains 1 values that are NaN or infinite"):
         make_model(**{field: array})
 
 

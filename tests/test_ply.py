@@ -352,8 +352,8 @@ def test_what_is_not_said_in_our_words_is_not_written(tmp_path, make_model):
         ("", "not JSON"),
         ("white", "not JSON"),
         ("[" * 100_000, "too many brackets"),
-        ("[]", r"training is \[\], wanted an object"),
-        ("{}", "training names no background"),
+        ("[]", r"training is \[\], expected an object"),
+        ("{}", "training has no background"),
         ('{"background": [0, 0]}', "background of training is"),
         ('{"background": [0, 0, 1.5]}', "background of training is"),
         ('{"background": [0, 0, NaN]}', "background of training is"),
@@ -504,7 +504,7 @@ def test_names_sog_in_a_zip_and_in_a_folder(tmp_path):
 def test_refuses_a_zip_that_is_no_scene(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         archive.writestr("readme.txt", "")
-    with pytest.raises(InputError, match=r"is a zip that holds no scene: readme\.txt"):
+    with pytest.raises(InputError, match=r"is a zip without a scene: readme\.txt"):
         read_ply(tmp_path / "a.zip")
 
 

@@ -540,7 +540,7 @@ def test_too_little_disk_space_is_an_error_and_no_files_are_left(make_model, tmp
     both(source, result.data)
     assert [] == list(tmp_path.iterdir())
     monkeypatch.setattr(shutil, "disk_usage", lambda _: namedtuple("usage", "free")(1000))  # noqa: PYI024  # a stand-in
-    with pytest.raises(InputError, match=r"0 MB free, and 0 are wanted .*TMPDIR"):
+    with pytest.raises(InputError, match=r"0 MB free, 0 MB are needed .*TMPDIR"):
         both(source, result.data)
 
 

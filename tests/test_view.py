@@ -217,7 +217,7 @@ def test_cameras_are_served_beside_the_scene(tmp_path, scene_path):
 
 @pytest.mark.parametrize("axes", ["RL", "RDX", "RUD", "rdf", "RDFF"])
 def test_axes_that_are_none_are_refused(axes):
-    with pytest.raises(typer.BadParameter, match="wanted three letters"):
+    with pytest.raises(typer.BadParameter, match="expected three letters"):
         OrientationOptions(axes=axes).parse()
 
 

@@ -4,16 +4,17 @@
     >>> model = csplat.read_ply("scene.ply")
     >>> data = csplat.encode(model, csplat.EncodeOptions(preset="small"))
     >>> model = csplat.decode(data)
-    >>> with csplat.open("scene.csplat") as file:  # or https://…, s3://…: only what is wanted is read
+    >>> with csplat.open("scene.csplat") as file:  # or https://…, s3://…: reads only the parts it needs
     ...     model = file.read(box=(-1, -1, -1, 1, 1, 1))
 
-One rule for what goes in: where a *file* is read (`read_ply`, `decode`, `read_header`), a path, an open binary file and
-bytes are taken alike; where a *scene* is wanted (`encode`, `write_ply`, `to_gsplat`), it is a `SplatModel`.
-Errors are `CsplatError`s: `FormatError`, `UnsupportedError` and `LimitError` are the file's, `InputError` is the
-caller's, `StoreError` a server's; what the system says of a path stays an `OSError`.
+Functions that read a *file* (`read_ply`, `decode`, `read_header`) accept a path, an open binary file or bytes.
+Functions that take a *scene* (`encode`, `write_ply`, `to_gsplat`) accept a `SplatModel`.
 
-The names below load their modules when first used (PEP 562): `import csplat.decoder` brings in
-neither the encoder nor the PLY reader, so that a decoder can be embedded alone.
+All errors are `CsplatError`s: `FormatError`, `UnsupportedError` and `LimitError` concern the file, `InputError` the
+caller's data, `StoreError` a server. Errors of the operating system stay `OSError`s.
+
+Names are imported on first use (PEP 562): `import csplat.decoder` loads neither the encoder nor the PLY reader, so a
+decoder can be embedded alone.
 """
 
 from __future__ import annotations
@@ -28,14 +29,7 @@ if TYPE_CHECKING:
     from csplat.editing.merge import merge
     from csplat.editing.up_axis import with_up
     from csplat.encoder import EncodeOptions, EncodeResult, encode, encode_with_report
-    from csplat.errors import (
-        CsplatError,
-        FormatError,
-        InputError,
-        LimitError,
-        StoreError,
-        UnsupportedError,
-    )
+    from csplat.errors import CsplatError, FormatError, InputError, LimitError, StoreError, UnsupportedError
     from csplat.formats import read, write
     from csplat.interop import from_gsplat, to_gsplat
     from csplat.model import SplatModel
@@ -77,12 +71,13 @@ __all__ = [
 
 
 def lazy_exports(package: str, module_of: Mapping[str, str]) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
-    """Make `__getattr__` and `__dir__` of a package whose names load their modules when first used (PEP 562).
+    """Return `__getattr__` and `__dir__` for a package that imports its public names on first use (PEP 562).
+
+    A name whose module needs an optional package that is not installed raises an `InputError` with the install command.
 
     Args:
-        package: its name.
-        module_of: by name, the module that has it. One that wants a package of an extra, which is not installed, is an
-            `InputError` that says how to get it.
+        package: name of the package.
+        module_of: module of each public name.
     """
 
     def get(name: str) -> object:
@@ -97,7 +92,7 @@ def lazy_exports(package: str, module_of: Mapping[str, str]) -> tuple[Callable[[
             from csplat.errors import missing_package
 
             raise missing_package(error) from None
-        setattr(sys.modules[package], name, value)  # the next access does not come here again
+        setattr(sys.modules[package], name, value)  # later accesses bypass __getattr__
         return value
 
     return get, lambda: sorted(sys.modules[package].__all__)

@@ -1,4 +1,4 @@
-"""`python -m csplat`: the console script of that name, which belongs to another package."""
+"""Run `python -m csplat`: the console script `csplat`, which another package provides."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Read parts of files in memory or on disk; the base of the store for URLs."""
+"""Read byte ranges of files in memory and on disk; base class of the store for URLs."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from csplat.system import Pages, read_at
 
 @dataclass(frozen=True)
 class RequestSizes:
-    """Sizes and number of requests for a file.
+    """Sizes and concurrency of the requests for a file.
 
     Attributes:
-        first: bytes of the first request: the index of a scene of some twenty million splats.
-        batch: bytes of tiles that are fetched together if tiles are read one after the other.
-        gap: bytes between two parts that are read along with them: they take less time than a separate request.
-        request: maximum size of one request in bytes.
+        first: size of the first request, bytes: holds the index of a scene of about twenty million splats.
+        batch: total size of the tiles fetched together during a sequential read, bytes.
+        gap: largest gap between two ranges that one request reads through, bytes; a second request takes longer.
+        request: maximum size of one request, bytes.
         at_once: maximum number of concurrent requests.
     """
 
@@ -36,14 +36,14 @@ class RequestSizes:
 
 
 class Store:
-    """A file that is read in parts.
+    """A file that is read by byte ranges.
 
     Attributes:
-        name: name in messages; for a URL, without passwords and signatures; empty if it has none.
-        size: size of the file in bytes.
-        requests: number of requests to the store, including those for its size.
-        bytes_read: number of bytes read.
-        sizes: sizes of requests; may be replaced before the first one.
+        name: name for messages, without the passwords and signatures of a URL; "" if the file has no name.
+        size: size of the file, bytes.
+        requests: number of requests so far, including those for the size.
+        bytes_read: number of bytes read so far.
+        sizes: sizes of requests; may be replaced before the first request.
     """
 
     sizes = RequestSizes()
@@ -55,14 +55,14 @@ class Store:
         self.bytes_read = 0
 
     def read(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-        """Read parts of the file.
+        """Read byte ranges of the file.
 
         Args:
-            ranges: first byte of each part, and the byte behind its last.
+            ranges: (start, stop) of each range.
 
         Raises:
             StoreError: the store returned something else, or the connection broke.
-            OSError: the file no longer exists, or may not be read.
+            OSError: the file no longer exists or may not be read.
         """
         self.requests += len(ranges)
         try:
@@ -72,17 +72,15 @@ class Store:
         for (start, stop), part in zip(ranges, parts, strict=True):
             self.bytes_read += len(part)
             if len(part) != stop - start:
-                raise self._fault(
-                    f"{self.name} gave {len(part)} bytes where {stop - start} from byte {start} were asked for"
-                )
+                raise self._fault(f"{self.name} returned {len(part)} bytes from byte {start}, expected {stop - start}")
         return parts
 
     def changed(self) -> str:
-        """Return a message if the file is not the one that was opened; otherwise ""."""
+        """Return an error message if the file has changed since it was opened, otherwise ""."""
         return f"{self.name} has changed while it was read: open it again" if self._is_other() else ""
 
     def _fault(self, message: str) -> StoreError:
-        """Return the error for unexpected data, which a changed file would explain."""
+        """Return the error for unexpected data: that the file has changed, if it has."""
         try:
             return StoreError(self.changed() or message)
         except (StoreError, OSError):
@@ -90,7 +88,7 @@ class Store:
 
     @contextmanager
     def named_errors(self) -> Iterator[None]:
-        """Name the file in errors, and report it as changed if it is not the file that was opened."""
+        """Add the file's name to errors, and report a changed file as such."""
         try:
             yield
         except CsplatError as error:
@@ -122,35 +120,35 @@ class MemoryStore(Store):
 
 
 class DiskStore(Store):
-    """A file on this machine. It is not mapped: a process that truncates it during a read must not end the program."""
+    """A file on disk. It is not mapped: truncating a mapped file would kill the process that reads it."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("rb")
-        self._metadata_model = os.fstat(self._file.fileno())
-        super().__init__(str(path), self._metadata_model.st_size)
+        self._stat = os.fstat(self._file.fileno())
+        super().__init__(str(path), self._stat.st_size)
 
     def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
         return [read_at(self._file.fileno(), stop - start, start) for start, stop in ranges]
 
     def _is_other(self) -> bool:
         now = os.fstat(self._file.fileno())
-        return (now.st_size, now.st_mtime_ns) != (self._metadata_model.st_size, self._metadata_model.st_mtime_ns)
+        return (now.st_size, now.st_mtime_ns) != (self._stat.st_size, self._stat.st_mtime_ns)
 
     def close(self) -> None:
-        """Close it."""
+        """Close the file."""
         self._file.close()
 
 
 class FileWindow:
-    """A view of a file in which only the fetched parts are present; all other bytes are 0 and take no memory.
+    """A sparse view of a file: bytes that were not fetched are 0 and take no memory.
 
     Attributes:
-        view: as long as the file.
+        view: the file's bytes, at their offsets in the file.
         store: the file.
 
     Args:
         store: the file.
-        head: its beginning, if it was read already.
+        head: beginning of the file, if it was read before.
     """
 
     def __init__(self, store: Store, head: bytes = b"") -> None:
@@ -161,15 +159,15 @@ class FileWindow:
             self._pages = Pages(store.size) if store.size else None
         except (OSError, OverflowError):
             raise LimitError("address space of this machine", store.size) from None
-        # An array's memory is not taken for a mapped file, whose pages can be released and read again.
+        # Wrapped in an array, so that `PageReleaser` does not mistake it for a mapped file and drop its pages.
         self.view = np.frombuffer(self._pages.buffer if self._pages else bytearray(), np.uint8).data
         self.view[: len(head)] = head
 
     def fetch(self, parts: Iterable[tuple[int, int]]) -> None:
-        """Read parts of the file that are not present yet; adjacent ones in one request.
+        """Read the parts that are not present yet, adjacent parts in one request.
 
         Args:
-            parts: offset and size of each.
+            parts: (offset, size) of each part.
 
         Raises:
             StoreError, OSError: as in `Store.read`.
@@ -186,7 +184,7 @@ class FileWindow:
         self._take(waiting)
 
     def forget(self) -> None:
-        """Discard all fetched parts; they must no longer be used."""
+        """Discard all fetched parts except the head."""
         if self._pages is not None:
             self._pages.discard()
         self.view[: len(self._head)] = self._head
@@ -201,7 +199,7 @@ class FileWindow:
 
 
 def _joined(ranges: Iterable[tuple[int, int]], gap: int = 0) -> list[tuple[int, int]]:
-    """Sort ranges, and join those that are at most `gap` apart."""
+    """Sort ranges, and join ranges that are at most `gap` bytes apart."""
     runs: list[tuple[int, int]] = []
     for start, stop in sorted(ranges):
         if runs and start - runs[-1][1] <= gap:
@@ -212,7 +210,7 @@ def _joined(ranges: Iterable[tuple[int, int]], gap: int = 0) -> list[tuple[int, 
 
 
 def _missing(ranges: Iterable[tuple[int, int]], held: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-    """Yield the parts of `ranges` that are in none of `held`, which is sorted."""
+    """Yield the parts of `ranges` that no range of `held` covers; `held` is sorted."""
     for start, stop in ranges:
         for first, end in held:
             if start < end and first < stop:

@@ -1,8 +1,8 @@
-"""Identify files: one table of the kinds that csplat reads and of others that users pass to it by mistake.
+"""Identify files: a table of the formats that csplat reads and of other files that users pass by mistake.
 
-The content decides, then the name. `csplat.formats` has the readers, under the names of this table; the table stands
-apart because the PLY reader, which knows no other format, refuses files by it. Only the first bytes and the names in a
-zip are looked at; nothing is parsed.
+Content takes precedence over the file name. Only the first bytes and the names in a zip are examined; nothing is
+parsed. The readers of `csplat.formats` have the names of this table. The table is separate from them because the PLY
+reader uses it to refuse other formats, which it must not import.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from csplat.archives import folder_refusal, zip_refusal
 from csplat.errors import InputError
 from csplat.file_source import describe_substitute
 
-#: Bytes at the beginning of a file that identify it.
+#: Size of the beginning of a file that identifies it, bytes.
 HEAD_SIZE = 512
 
 _SPLAT_TRANSFORM = "splat-transform (npm package @playcanvas/splat-transform)"
 _NOT_READ = "which csplat does not read: convert it to PLY first, with"
-_NO_SPLATS = "no scene of splats"
+_NO_SPLATS = "not a scene of splats"
 _PLY_HEADER_SIZE = 1 << 16  # bytes within which a compressed PLY declares its packed columns
-_KSPLAT_HEAD = 44  # bytes of .ksplat's header that carry information; the others are 0
-_SPLAT_ROW_SIZE = 32
-_SAFETENSORS_HEAD = 100_000_000  # largest header of safetensors, bytes of JSON
-_MANIFESTS = {"meta.json", "lod-meta.json"}  # of SOG
+_KSPLAT_HEAD = 44  # used bytes of .ksplat's header; the rest are 0
+_SPLAT_ROW_SIZE = 32  # bytes of one splat in a .splat file
+_SAFETENSORS_HEAD = 100_000_000  # maximum size of the JSON header of safetensors, bytes
+_MANIFESTS = {"meta.json", "lod-meta.json"}  # manifests in a SOG file
 _PLY, _CSPLAT = "ply", "csplat"
 
 
@@ -38,11 +38,11 @@ class FileKind:
     """A kind of file.
 
     Attributes:
-        name: id of the kind; for formats that csplat reads, the one that `csplat formats` lists.
+        name: id of the kind; for a format that csplat reads, its id in `csplat formats`.
         title: name in prose: `SPZ 4`.
-        suffixes: suffixes of file names, the usual one first; with their dots, in lower case.
-        matches: returns True if path and first bytes (empty for a folder) are those of this kind.
-        remedy: what the user can do, in words that follow the title and a comma; "" if csplat has a reader.
+        suffixes: file name suffixes in lower case with their dots, the usual one first.
+        matches: returns True if the path and the first bytes (empty for a folder) are of this kind.
+        remedy: advice to the user that follows "<file> is <title>, "; "" if csplat has a reader.
     """
 
     name: str
@@ -53,19 +53,19 @@ class FileKind:
 
     @property
     def is_scene(self) -> bool:
-        """True for formats of splats, whether csplat reads them or not."""
+        """True for every splat format, including formats that csplat does not read."""
         return not self.remedy or self.remedy.startswith(_NOT_READ)
 
 
 def detect_content(path: Path, head: bytes) -> FileKind | None:
-    """Identify a file or folder by its content; return `None` if it is of no known kind.
+    """Identify a file or folder by its content; return `None` if its kind is unknown.
 
     Args:
-        path: path of the file; zips, folders and PLYs are looked into.
+        path: path of the file; zips, folders and PLYs are opened.
         head: the first `HEAD_SIZE` bytes, or all of a shorter file; empty for a folder.
 
     Raises:
-        InputError: the content is that of a pointer of Git LFS, or a web page, in place of a file.
+        InputError: the content is a placeholder such as a Git LFS pointer or an HTML page.
     """
     instead = describe_substitute(head)
     if instead:
@@ -74,14 +74,14 @@ def detect_content(path: Path, head: bytes) -> FileKind | None:
 
 
 def detect_name(path: Path) -> FileKind | None:
-    """Identify a file by its name; return `None` if the name is of no known kind."""
+    """Identify a file by its name; return `None` if the suffix is unknown."""
     name = path.name.lower()
     found = [(len(suffix), kind) for kind in KINDS.values() for suffix in kind.suffixes if name.endswith(suffix)]
     return max(found, key=lambda pair: pair[0])[1] if found else None
 
 
 def read_head(path: Path) -> bytes:
-    """Read the first bytes of a file, for `detect_content`.
+    """Return the first bytes of a file for `detect_content`; none for a folder.
 
     Raises:
         OSError: the file cannot be read.
@@ -93,19 +93,19 @@ def read_head(path: Path) -> bytes:
 
 
 def refusal(path: Path, head: bytes, *, wanted: str = "") -> InputError:
-    """Return the error for a file of the wrong kind: what the file is, and a remedy.
+    """Return the error for a file of the wrong kind; it names the kind and a remedy.
 
     Args:
         path: path of the file.
         head: as in `detect_content`.
-        wanted: name of the only kind that the caller reads; "" if it reads all that csplat does.
+        wanted: name of the only kind that the caller reads; "" if it reads all formats of csplat.
     """
     if path.is_dir() and wanted and not detect_content(path, head):
-        return InputError(f"{path.name} is a folder, wanted a {KINDS[wanted].title}")
+        return InputError(f"{path.name} is a folder, expected a {KINDS[wanted].title}")
     if path.is_dir() and not wanted:
         return InputError(folder_refusal(path))
     if not (head or path.is_dir()):
-        return InputError(f"{path.name} is empty" + (f", wanted a {KINDS[wanted].title}" if wanted else ""))
+        return InputError(f"{path.name} is empty" + (f", expected a {KINDS[wanted].title}" if wanted else ""))
     try:
         kind = detect_content(path, head) or detect_name(path)
     except InputError as error:
@@ -118,13 +118,13 @@ def refusal(path: Path, head: bytes, *, wanted: str = "") -> InputError:
     if kind is None or kind.name == wanted:
         if path.stat().st_size % _SPLAT_ROW_SIZE == 0 and not head[:_SPLAT_ROW_SIZE].isascii():
             tool = "convert it to PLY first, with `csplat convert --from splat`" if wanted else "--from splat reads it"
-            begin = f"its size, a multiple of {_SPLAT_ROW_SIZE} bytes, is that of a .splat file: if it is one, {tool}"
+            begin = f"its size, a multiple of {_SPLAT_ROW_SIZE} bytes, fits a .splat file: if it is one, {tool}"
         state = f"not a {KINDS[wanted].title}" if wanted else "in no format that csplat knows"
-        return InputError(f"{path.name} is {state}: {begin}" + ("; wanted one of Gaussian splats" if wanted else ""))
+        return InputError(f"{path.name} is {state}: {begin}" + ("; expected Gaussian splats" if wanted else ""))
     if wanted == _CSPLAT:
         title = f"a {kind.title}" if kind.name == _PLY else kind.title
-        return InputError(f"{path} is {title}, wanted a .csplat file: `csplat encode` makes a .csplat file of it")
-    tool = "`csplat decode`" if kind.name == _CSPLAT else "`csplat convert`, or take csplat.read, which reads it"
+        return InputError(f"{path} is {title}, expected a .csplat file: convert it with `csplat encode`")
+    tool = "`csplat decode`" if kind.name == _CSPLAT else "`csplat convert`, or use csplat.read, which reads it"
     return InputError(f"{path.name} is {kind.title}, not a plain PLY: convert it to PLY first, with {tool}")
 
 
@@ -133,7 +133,7 @@ def _starts_with(*magics: bytes) -> Callable[[Path, bytes], bool]:
 
 
 def is_ply(head: bytes) -> bool:
-    """Return True if a file begins as a PLY; a byte order mark, capitals and spaces are accepted."""
+    """Return True if a file begins like a PLY; a byte order mark, capitals and spaces are accepted."""
     head = head.removeprefix(b"\xef\xbb\xbf")
     return head[:3].lower() == b"ply" and head[3:].lstrip(b" \t")[:1] in (b"\n", b"\r")
 
@@ -141,7 +141,7 @@ def is_ply(head: bytes) -> bool:
 def _is_compressed_ply(path: Path, head: bytes) -> bool:
     if not is_ply(head):
         return False
-    if b"end_header" not in head and path.is_file():  # the packed columns come after bounds and comments
+    if b"end_header" not in head and path.is_file():  # packed columns are declared after bounds and comments
         with path.open("rb") as stream:
             head = stream.read(_PLY_HEADER_SIZE)
     return b"packed_position" in head.partition(b"end_header")[0]
@@ -157,7 +157,7 @@ def _is_spz(_path: Path, head: bytes) -> bool:
 
 
 def _is_gzip(path: Path, head: bytes) -> bool:
-    return head[:3] == b"\x1f\x8b\x08" and path.suffix.lower() != ".spz"  # that reader reports what is wrong
+    return head[:3] == b"\x1f\x8b\x08" and path.suffix.lower() != ".spz"  # the SPZ reader reports the damage
 
 
 def _is_ksplat(_path: Path, head: bytes) -> bool:
@@ -176,7 +176,7 @@ def _is_sog(path: Path, head: bytes) -> bool:
 
 
 def _zip_with(ending: str) -> Callable[[Path, bytes], bool]:
-    """Match zips that hold a name with this ending."""
+    """Return a test for zips with a member whose name has this suffix."""
 
     def matches(path: Path, head: bytes) -> bool:
         return head[:4] == b"PK\x03\x04" and any(name.endswith(ending) for name in _names_in_zip(path) or ())
@@ -201,7 +201,7 @@ def _is_tileset(path: Path, head: bytes) -> bool:
 
 
 def _is_json(_path: Path, head: bytes) -> bool:
-    """Return True if the content is text that begins as JSON; a lone brace may also begin a binary file."""
+    """Return True if the content is text that begins like JSON; a lone brace may also begin a binary file."""
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     begins = text[:1] == b"[" or (text[:1] == b"{" and text[1:].lstrip()[:1] in (b'"', b"}", b""))
     return begins and not any(byte < 32 and byte not in b"\t\n\r" for byte in text)
@@ -215,7 +215,7 @@ def _is_usd(path: Path, head: bytes) -> bool:
     return head.startswith((b"PXR-USDC", b"#usda")) or _zip_with(".usdc")(path, head) or _zip_with(".usda")(path, head)
 
 
-#: All kinds by name. If several match a content, the first one counts.
+#: All kinds by name. If several match, the first one counts.
 KINDS: dict[str, FileKind] = {
     kind.name: kind
     for kind in (
@@ -239,7 +239,7 @@ KINDS: dict[str, FileKind] = {
             "RAD of Spark",
             (".rad",),
             _starts_with(b"RAD0"),
-            f"{_NOT_READ} Spark, or take the file it was made of",
+            f"{_NOT_READ} Spark, or use the file it was made from",
         ),
         FileKind("usd", "USD", (".usdz", ".usdc", ".usda", ".usd"), _is_usd, f"{_NOT_READ} the program that wrote it"),
         FileKind(
@@ -275,16 +275,16 @@ KINDS: dict[str, FileKind] = {
             "safetensors",
             (".safetensors",),
             _is_safetensors,
-            "which csplat does not read: csplat.from_gsplat makes a scene of tensors under gsplat's names",
+            "which csplat does not read: csplat.from_gsplat converts tensors under gsplat's names",
         ),
         FileKind(
             "npy",
-            "an array of NumPy",
+            "a NumPy array",
             (".npy",),
             _starts_with(b"\x93NUMPY"),
-            "no scene: csplat.from_gsplat makes one of arrays under gsplat's names",
+            "not a scene: csplat.from_gsplat converts arrays under gsplat's names",
         ),
-        FileKind("rtf", "RTF", (".rtf",), _starts_with(b"{\\rtf"), f"a text, {_NO_SPLATS}"),
+        FileKind("rtf", "RTF", (".rtf",), _starts_with(b"{\\rtf"), f"a text document, {_NO_SPLATS}"),
         FileKind("json", "JSON", (), _is_json, _NO_SPLATS),
     )
 }

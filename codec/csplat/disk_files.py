@@ -1,4 +1,4 @@
-"""Read text, JSON and arrays; copy inputs to disk; write files that appear only when complete."""
+"""Read text, JSON and arrays; copy inputs to disk; write files atomically."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.file_source import File, describe_substitute
 
-_PART_SIZE = 1 << 20
-_MB = 1e6
+_PART_SIZE = 1 << 20  # bytes copied at a time
+_MB = 1e6  # bytes
 
 
 class BinaryWriter(Protocol):
     """A binary file open for writing, such as `open(path, "wb")` or `io.BytesIO`."""
 
     def write(self, data: bytes | memoryview, /) -> object:
-        """Write some bytes."""
+        """Write bytes."""
         ...
 
 
-#: Byte order marks, and the encoding of each; UTF-32's begin with UTF-16's.
+#: Byte order marks and their encodings. UTF-32 comes first, because its little-endian mark begins with UTF-16's.
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF32_LE, "utf-32"),
@@ -45,16 +45,16 @@ _MARKS = (
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """Read a text file in UTF-8, or in the encoding that its byte order mark states.
+    """Read a text file in UTF-8, or in the encoding of its byte order mark.
 
     Args:
-        path: the file.
+        path: path of the file.
 
     Returns:
-        Its text without the mark, with line feeds as line ends.
+        The text without the mark, with line feeds as line ends.
 
     Raises:
-        InputError: the file cannot be read, or is text in another encoding, or no text.
+        InputError: the file cannot be read, has another encoding, or is not text.
     """
     try:
         data = Path(path).read_bytes()
@@ -79,11 +79,8 @@ def read_text(path: str | os.PathLike[str]) -> str:
 def read_json(path: str | os.PathLike[str]) -> Any:
     """Read a JSON file, in the encodings of `read_text`.
 
-    Args:
-        path: the file.
-
     Raises:
-        InputError: the file cannot be read, or is not JSON.
+        InputError: the file cannot be read or is not JSON.
     """
     try:
         return json.loads(read_text(path))
@@ -92,40 +89,40 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 
 def finite_or_none(value: float | None) -> float | None:
-    """Return the value; `None` for NaN and infinities, which JSON does not have."""
+    """Return the value, or `None` for NaN and infinities, which JSON cannot represent."""
     return value if value is not None and math.isfinite(value) else None
 
 
 def check_free_space(folder: str | os.PathLike[str], wanted_bytes: int, what: str) -> None:
-    """Refuse work that needs more space than a disk has free.
+    """Check that a disk has enough free space.
 
     Args:
         folder: a folder on the disk.
-        wanted_bytes: bytes that the work will write.
-        what: the work, in words.
+        wanted_bytes: bytes that will be written.
+        what: the work, for the message: "the scene is sorted".
 
     Raises:
-        InputError: the disk has fewer free.
-        OSError: there is no such folder.
+        InputError: less space is free.
+        OSError: the folder does not exist.
     """
     free = shutil.disk_usage(folder).free
     if free < wanted_bytes:
         raise InputError(
-            f"{os.fspath(folder)} has {free / _MB:,.0f} MB free, and {wanted_bytes / _MB:,.0f} are wanted while {what}"
+            f"{os.fspath(folder)} has {free / _MB:,.0f} MB free, {wanted_bytes / _MB:,.0f} MB are needed while {what}"
         )
 
 
 @contextmanager
 def local_file(file: File, name: str = "") -> Iterator[Path]:
-    """Yield the path of a file that can be read twice; anything but a path is copied into a temporary file.
+    """Yield the path of a file that can be read twice; other inputs than paths are copied to a temporary file.
 
     Args:
-        file: a path; a binary file, read from its current position; or bytes. Named pipes are copied as well.
-        name: name of the copy, for messages; by default that of the binary file, or "data".
+        file: a path; a binary file, read from its current position; or bytes. Named pipes are copied, too.
+        name: name of the copy, for messages; by default the name of the binary file, or "data".
 
     Raises:
-        InputError: it is none of these, or a file of text.
-        OSError: it cannot be read.
+        InputError: `file` has another type, or is open in text mode.
+        OSError: the file cannot be read.
     """
     if isinstance(file, (str, os.PathLike)):
         path = Path(file)
@@ -135,7 +132,9 @@ def local_file(file: File, name: str = "") -> Iterator[Path]:
         with path.open("rb") as pipe, local_file(pipe) as copied:
             yield copied
             return
-    with TemporaryDirectory(prefix="csplat-", ignore_cleanup_errors=True) as folder:  # Windows: it may be mapped yet
+    with TemporaryDirectory(
+        prefix="csplat-", ignore_cleanup_errors=True
+    ) as folder:  # Windows: the copy may still be mapped
         own = getattr(file, "name", None)
         spool = Path(folder) / (name or (Path(own).name if isinstance(own, str) else "") or "data")
         with _named(spool), spool.open("wb") as stream:
@@ -145,22 +144,21 @@ def local_file(file: File, name: str = "") -> Iterator[Path]:
 
 
 def _parts(file: Any) -> Iterator[memoryview]:
-    """Yield the bytes of anything but a path, piece by piece."""
+    """Yield the bytes of a binary file or buffer in pieces."""
     try:
         if isinstance(file, mmap) or not hasattr(file, "read"):
             yield memoryview(file).cast("B")
             return
         while data := file.read(_PART_SIZE):
             yield memoryview(data)
-    except (TypeError, ValueError) as error:  # the latter of text that does not decode
-        raise InputError(
-            f"a {type(file).__name__} is no file, wanted a path, a binary file or bytes: {error}"
-        ) from None
+    except (TypeError, ValueError) as error:  # ValueError: text that does not decode
+        name = type(file).__name__
+        raise InputError(f"file is a {name}, expected a path, a binary file or bytes: {error}") from None
 
 
 @contextmanager
 def _named(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Add the name of the file to errors of writing."""
+    """Add the name of the file to errors that lack one."""
     try:
         yield
     except OSError as error:
@@ -171,10 +169,10 @@ def _named(path: str | os.PathLike[str]) -> Iterator[None]:
 
 @contextmanager
 def open_writer(file: str | os.PathLike[str] | BinaryWriter) -> Iterator[BinaryWriter]:
-    """Yield a writer for a file: `atomic_writer` for a path; an open binary file itself, which stays open.
+    """Yield a writer: `atomic_writer` for a path, or the given binary file, which stays open.
 
     Raises:
-        InputError: it is neither.
+        InputError: `file` is neither.
         OSError: as in `atomic_writer`.
     """
     if isinstance(file, (str, os.PathLike)):
@@ -183,29 +181,29 @@ def open_writer(file: str | os.PathLike[str] | BinaryWriter) -> Iterator[BinaryW
     elif hasattr(file, "write"):
         yield file
     else:
-        raise InputError(f"a {type(file).__name__} is no file to write, wanted a path or a binary file")
+        raise InputError(f"file is a {type(file).__name__}, expected a path or a binary file")
 
 
 @contextmanager
 def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iterator[BinaryIO]:
-    """Open a file for writing that takes its name only when all of it is written.
+    """Write a file that appears under its name only when complete.
 
-    The bytes go to a temporary neighbour, renamed over `path` on success and removed on any
-    error; a symbolic link keeps pointing where it points. Devices and pipes are written directly.
+    Bytes go to a temporary file in the same folder, which is renamed on success and removed on any error. The target
+    of a symbolic link is replaced, not the link. Devices and pipes are written directly.
 
     Args:
         path: path of the file to write.
-        replace: replace an existing file; if False, a file that was created meanwhile is kept as well.
+        replace: replace an existing file; False also keeps a file that another process creates in the meantime.
 
     Yields:
-        A binary file object, positioned at 0.
+        An empty binary file.
 
     Raises:
         FileExistsError: the file exists and `replace` is False.
         OSError: the folder does not exist, is full or is not writable.
     """
     if Path(path).exists() and not Path(path).is_file():
-        with _named(path), Path(path).open("wb") as stream:  # not resolved: /dev/stdout leads to no name
+        with _named(path), Path(path).open("wb") as stream:  # not resolved: /dev/stdout may point to an unnamed pipe
             yield stream
         return
     target = Path(path).resolve()
@@ -214,7 +212,7 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
         with temporary.open("xb") as stream:
             yield stream
             stream.flush()
-            os.fsync(stream.fileno())  # the name must not reach the disk before the bytes
+            os.fsync(stream.fileno())  # the bytes must reach the disk before the name
         if replace:
             temporary.replace(target)
         else:
@@ -223,21 +221,21 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
         with suppress(FileNotFoundError):
             temporary.unlink()
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):
-            error.filename = os.fspath(path)  # the file that failed, under the name that the caller used
+            error.filename = os.fspath(path)  # report the caller's name
         raise
 
 
 def _take_name(temporary: Path, target: Path) -> None:
-    """Give a complete file its name, unless another writer was faster.
+    """Move a complete file to its name.
 
     Raises:
-        FileExistsError: another writer was faster.
+        FileExistsError: another process created the file first.
     """
     try:
         os.link(temporary, target)
     except FileExistsError:
         raise
-    except (OSError, AttributeError):  # no hard links here: an empty file takes the name, the complete one replaces it
+    except (OSError, AttributeError):  # no hard links: reserve the name with an empty file, then replace that
         os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
         temporary.replace(target)
     else:
@@ -245,15 +243,15 @@ def _take_name(temporary: Path, target: Path) -> None:
 
 
 def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -> NDArray[Any]:
-    """Read one array from a .npy file.
+    """Read an array from a .npy file.
 
     Args:
         path: path of the file.
-        most_bytes: larger files are mapped into memory; `None`: no file is.
+        most_bytes: size from which a file is mapped instead of read; `None`: always read.
 
     Raises:
-        InputError: it is not one.
-        OSError: it cannot be read.
+        InputError: the file is not a .npy file.
+        OSError: the file cannot be read.
     """
     if Path(path).exists() and not Path(path).is_file():
         raise InputError(f"{path} is not a file")
@@ -265,14 +263,7 @@ def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -
                 raise InputError(f"{path} is {instead}")
             stream.seek(0)
             array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
-    except (
-        ValueError,
-        EOFError,
-        SyntaxError,
-        TokenError,
-        TypeError,
-        MemoryError,
-    ) as error:
+    except (ValueError, EOFError, SyntaxError, TokenError, TypeError, MemoryError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path} is not a NumPy array file (.npy): {reason}") from None
     return array

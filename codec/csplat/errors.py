@@ -1,12 +1,12 @@
-"""Define the exceptions, one class for each party at fault.
+"""Define the exceptions, one class per party at fault.
 
-| class | at fault | what helps |
+| class | fault | remedy |
 |---|---|---|
-| `FormatError` | the file: it breaks a clause of the format | another copy of the file |
-| `UnsupportedError` | nobody: the file needs a feature that this decoder does not have | a newer decoder |
-| `LimitError` | nobody: the file needs more than the caller allows | larger limits |
-| `InputError` | the caller's data: a PLY, an array, an option | see the message |
-| `StoreError` | a server, or the connection to it | trying again |
+| `FormatError` | the file breaks a clause of the format | another copy of the file |
+| `UnsupportedError` | the file needs a feature that this decoder does not have | a newer decoder |
+| `LimitError` | the file needs more than the caller allows | larger limits |
+| `InputError` | the caller's data is invalid: a PLY, an array, an option | see the message |
+| `StoreError` | a server or the connection failed | try again |
 
 Every error has a `code`, a short constant string that programs may compare.
 """
@@ -19,7 +19,7 @@ class CsplatError(Exception):
 
     Attributes:
         code: short constant string for the kind of error, the same in all versions and languages (`E_CRC`).
-        path: path of the file that was being read, as the caller named it; `None` if it is not known.
+        path: path of the file that was being read, as the caller named it; `None` if unknown.
     """
 
     code: str = "E_CSPLAT"
@@ -29,14 +29,14 @@ class CsplatError(Exception):
 class FormatError(CsplatError):
     """A file breaks a clause of the format.
 
-    `str()` gives the code, the offset, the clause, the value found and the value expected:
-    `E_CRC at byte 12 (CRC-1): found 0x1a2b3c4d, computed 0x5e6f7081`.
+    `str()` contains the code, the offset, the clause, the value found and the value expected:
+    `E_VALUE at byte 72 (TIL-1): splat_count, found 0, expected 1 to 65536`.
 
     Args:
         code: error code of the registry, `E_...`.
-        offset: offset in the file of the invalid field; `None` if it is not a single field.
-        clause: id of the clause that is broken, `CRC-1`.
-        detail: text after the colon, if `found` and `wanted` are not enough.
+        offset: offset of the invalid field in the file; `None` if no single field is at fault.
+        clause: id of the broken clause, `TIL-1`.
+        detail: name of the field, or a description of the fault.
         found: value in the file.
         wanted: value that the clause requires.
     """
@@ -67,17 +67,11 @@ class UnsupportedError(CsplatError):
     Args:
         feature: name of the feature that the file requires, `version 0.7`.
         code: error code of the registry.
-        offset: offset in the file of the bytes that need it, if known.
-        clause: id of the clause that specifies this, if there is one.
+        offset: offset of the field in the file, if known.
+        clause: id of the clause, if there is one.
     """
 
-    def __init__(
-        self,
-        feature: str,
-        code: str = "E_UNSUPPORTED",
-        offset: int | None = None,
-        clause: str = "",
-    ) -> None:
+    def __init__(self, feature: str, code: str = "E_UNSUPPORTED", offset: int | None = None, clause: str = "") -> None:
         super().__init__(feature, code, offset, clause)
         self.code = code
         self.feature = feature
@@ -96,8 +90,8 @@ class LimitError(CsplatError):
         wanted: amount that the file needs.
         allowed: amount that the caller allows.
         code: error code of the registry.
-        offset: offset in the file of the bytes that need it, if known.
-        clause: id of the clause that specifies this, if there is one.
+        offset: offset of the field in the file, if known.
+        clause: id of the clause, if there is one.
     """
 
     def __init__(
@@ -119,14 +113,14 @@ class LimitError(CsplatError):
 
     def __str__(self) -> str:
         allowed = "" if self.allowed is None else f", allowed {self.allowed}"
-        return _sentence(self.code, self.offset, self.clause, f"{self.limit}: wanted {self.wanted}{allowed}")
+        return _sentence(self.code, self.offset, self.clause, f"{self.limit}: needs {self.wanted}{allowed}")
 
 
 class InputError(CsplatError):
-    """The caller's data cannot be used: a PLY, an array, an option.
+    """The caller's data is invalid: a PLY, an array, an option.
 
     Args:
-        message: one line that states what is wrong and, if there is one, the remedy.
+        message: one line with the problem and, if there is one, the remedy.
     """
 
     code = "E_INPUT"
@@ -136,10 +130,10 @@ class InputError(CsplatError):
 
 
 class StoreError(CsplatError):
-    """The store of a file did not return its bytes: no support of ranges, a lost connection, a changed file.
+    """The store of a file did not return its bytes: no support for ranges, a lost connection, a changed file.
 
     Args:
-        message: one line that names the file and states what arrived instead.
+        message: one line with the name of the file and the problem.
     """
 
     code = "E_STORE"
@@ -149,23 +143,23 @@ class StoreError(CsplatError):
 
 
 def counted(count: int, one: str, many: str | None = None) -> str:
-    """Format a number with the noun it counts: `1 tile`, `59,325 tiles`.
+    """Format a count with its noun: `1 tile`, `59,325 tiles`.
 
     Args:
         count: the number.
-        one: the noun in the singular.
-        many: the noun in the plural; `None`: the singular with an s.
+        one: singular of the noun.
+        many: plural of the noun; `None`: the singular with an s.
     """
     return f"{count:,} {one if count == 1 else many or one + 's'}"
 
 
 def missing_package(error: ModuleNotFoundError, package: str | None = None, *, extra: str = "render") -> InputError:
-    """Return the error for a package that a plain install leaves out.
+    """Return the error for a missing optional package.
 
     Args:
-        error: error raised by its import.
-        package: name of the package, if it is not the module's.
-        extra: extra of csplat that installs it.
+        error: error raised by the import.
+        package: name of the package, if it differs from the module's.
+        extra: extra of csplat that installs the package.
     """
     return InputError(f"this needs {package or error.name}: pip install 'csplat[{extra}]'")
 
@@ -175,7 +169,7 @@ def _join(detail: str, found: object, wanted: object) -> str:
     if found is not None:
         parts.append(f"found {found}")
     if wanted is not None:
-        parts.append(f"wanted {wanted}")
+        parts.append(f"expected {wanted}")
     return ", ".join(parts)
 
 

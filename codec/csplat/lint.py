@@ -1,46 +1,46 @@
-"""Findings about files of splats: what is unusual or wrong, and what is repaired.
+"""Describe findings about splat files: unusual or invalid content and its repair.
 
-A *note* is ordinary variation: nothing is lost, nothing looks different. A *repair* changes or drops something safely;
-`strict` refuses it. An *error* cannot be repaired without guessing.
+A *note* is ordinary variation; nothing is lost or looks different. A *repair* changes or drops data safely; `strict`
+refuses it. An *error* cannot be repaired without guessing.
 
 | id | meaning | kind |
 |---|---|---|
 | `missing-columns` | a required column is absent | error |
-| `sh-columns` | f_rest columns that are no SH degree, or of a higher one than 3, or not numbered from 0 | error |
-| `ambiguous-columns` | two columns have the same meaning under the names of other programs | error |
-| `colour-columns` | red, green and blue that are neither bytes nor 0 to 1 | error |
-| `integer-columns` | integers in place of the floats of a splat | error |
-| `colour-space` | colours of ml-sharp that are not sRGB | error |
+| `sh-columns` | f_rest columns that match no SH degree up to 3, or are not numbered from 0 | error |
+| `ambiguous-columns` | two columns with the same meaning under other programs' names | error |
+| `colour-columns` | red, green and blue that are neither bytes nor in 0 to 1 | error |
+| `integer-columns` | integers instead of floats | error |
+| `colour-space` | ml-sharp colours that are not sRGB | error |
 | `truncated` | fewer splats than the header declares | error |
 | `malformed` | a row that cannot be parsed, or binary rows changed by a text-mode transfer | error |
 | `trailing-bytes` | bytes after the last declared splat: ignored | repair |
-| `extra-columns` | columns that splats do not have: dropped, unless asked to keep them | repair |
+| `extra-columns` | columns that splats do not have: dropped unless extra columns are kept | repair |
 | `list-columns` | list properties of splats: dropped | repair |
-| `other-elements` | elements besides the splats: dropped | repair |
-| `nonfinite-rows` | splats with NaN or infinity: dropped; an error if no other is left | repair |
-| `zero-quats` | rotations of length 0: the identity | repair |
-| `unnormalised-quats` | rotations that are not unit: scaled, as every renderer does | note |
+| `other-elements` | elements other than the splats: dropped | repair |
+| `nonfinite-rows` | splats with NaN or infinity: dropped; an error if no splats remain | repair |
+| `zero-quats` | rotations of length 0: replaced by the identity | repair |
+| `unnormalised-quats` | rotations that are not of unit length: normalised, as in every renderer | note |
 | `infinite-logits` | opacities of exactly 0 or 1 | note |
 | `flat-scales` | two scales instead of three: discs (2DGS) | note |
 | `nonzero-normals` | normals, which splats do not use: dropped | note |
 | `huge-values` | log scales beyond ± 88, colours beyond ± 1e6 | note |
-| `shuffled-columns` | columns in another order than usual | note |
-| `alias-columns` | columns that another program named in its own way: `scalar_opacity` of CloudCompare | note |
-| `second-columns` | columns that also exist under the usual name, which is read | note |
-| `rgb-colours` | red, green and blue in place of f_dc, read as colours of SH degree 0 | note |
+| `shuffled-columns` | columns in an unusual order | note |
+| `alias-columns` | columns under another program's names: CloudCompare's `scalar_opacity` | note |
+| `second-columns` | duplicates of columns that exist under the usual name, which is read | note |
+| `rgb-colours` | red, green and blue instead of f_dc: read as colours of SH degree 0 | note |
 | `filter-3d` | the 3D filter of Mip-Splatting: fused into scales and opacities, or left out | note, repair |
 | `sh-bands` | SH bands above the requested degree: dropped | note |
 | `vertical-axis` | a comment names the up axis | note |
-| `opacities-are-alphas` | opacities that all lie in 0 to 1 or 255, as after the sigmoid; read as logits | note |
+| `opacities-are-alphas` | opacities all in 0 to 1 or 255, probably alpha; read as logits | note |
 | `scales-are-linear` | scales that fit the scene as lengths, not as logarithms; read as logarithms | note |
-| `colours-are-rgb` | f_dc that are all in 0 to 1 or in 0 to 255, as colours are; read as SH coefficients | note |
-| `half-floats` | columns of 16-bit integers whose bits are those of half floats: read as these | note |
+| `colours-are-rgb` | f_dc all in 0 to 1 or 0 to 255, probably colours; read as SH coefficients | note |
+| `half-floats` | columns of 16-bit integers whose bits are half floats: read as half floats | note |
 | `sharp-elements` | elements of ml-sharp other than the splats: dropped | note |
 | `unusual-header` | a byte order mark, blank lines or capitals in the header | note |
-| `unusual-rows` | rows of text with blank lines, decimal commas, NaN of other languages, or in other lines | note |
-| `ranks` | checkpoints of gsplat: the splats of one GPU or of several are read | note |
-| `zip-names` | backslashes or capitals in the names of a SOG's zip or in its list of files | note |
-| `other-scenes` | more scenes than the one that is read: in a SOG's zip, or in glTF without a default scene | note |
+| `unusual-rows` | text rows with blank lines, decimal commas, other spellings of NaN, or unusual line breaks | note |
+| `ranks` | gsplat checkpoints: the splats of one GPU or of several are read | note |
+| `zip-names` | backslashes or capitals in the names in a SOG's zip or manifest | note |
+| `other-scenes` | more scenes than the one that is read, in a SOG's zip or in glTF without a default scene | note |
 | `double-means` | positions in doubles or integers: an origin keeps their precision | note |
 | `non-ascii-header` | characters outside ASCII in the header: read as question marks | note |
 | `zero-rows` | splats of .splat and .ksplat whose bytes are all 0: kept | note |
@@ -72,11 +72,11 @@ class Finding:
     """A finding about a file.
 
     Attributes:
-        id: id in the table above, constant across versions.
-        count: number of splats, columns, elements or bytes concerned.
-        text: one line: what was found and what is done about it.
+        id: id in the table above, stable across versions.
+        count: number of splats, columns, elements or bytes affected.
+        text: one line that describes the finding and its treatment.
         kind: `note`, `repair` or `error`.
-        usual: most trained scenes have it: shown only if all findings are requested.
+        usual: True if most trained scenes have the finding; it is shown only if all findings are requested.
     """
 
     id: str
@@ -87,7 +87,7 @@ class Finding:
 
     @property
     def repairable(self) -> bool:
-        """True if reading can go on."""
+        """True if the file can be read."""
         return self.kind != "error"
 
     def __str__(self) -> str:
@@ -95,13 +95,13 @@ class Finding:
 
 
 def trailing_bytes(count: int) -> list[Finding]:
-    """Report bytes after the last splat, if there are any."""
+    """Return the finding for bytes after the last splat, if there are any."""
     text = f"{counted(count, 'byte')} after the last splat: ignored"
     return [Finding("trailing-bytes", count, text, "repair")] if count > 0 else []
 
 
 def too_many_bands(degree: int) -> str:
-    """Describe a file that has more SH bands than a model, and how to read it without them."""
+    """Return the error message for a file with more SH bands than a model, with the options that drop them."""
     bands = f"band {degree}" if degree == MAX_SH_DEGREE + 1 else f"bands {MAX_SH_DEGREE + 1} to {degree}"
     return (
         f"SH degree {degree}, expected at most {MAX_SH_DEGREE}: --sh-degree {MAX_SH_DEGREE} of csplat encode, convert,"
@@ -110,10 +110,10 @@ def too_many_bands(degree: int) -> str:
 
 
 def refuse(findings: Sequence[Finding], *, strict: bool) -> None:
-    """Raise if there are errors or, under `strict`, repairs.
+    """Refuse a file with errors or, if `strict`, with repairs.
 
     Raises:
-        InputError: there are; the message lists them all.
+        InputError: the message lists all errors and refused repairs.
     """
     refused = [one for one in findings if one.kind == "error" or (strict and one.kind == "repair")]
     if refused:

@@ -1,7 +1,6 @@
-"""Hold a scene of 3D Gaussian splats in memory: `SplatModel`.
+"""Represent a scene of 3D Gaussian splats in memory: `SplatModel`.
 
-All readers, writers, renderers and the codec use it. The constructor checks and never repairs: readers convert their
-data first.
+All readers, writers, renderers and the codec use it. The constructor checks its data and never repairs them.
 """
 
 from __future__ import annotations
@@ -21,54 +20,52 @@ from csplat.types import F32, F64
 #: Highest spherical-harmonics degree of a model.
 MAX_SH_DEGREE = 3
 
-#: The basis function of SH degree 0: colour of a channel per coefficient.
+#: Basis function of SH degree 0: colour per coefficient.
 SH_C0 = 0.28209479177387814
 
-#: A quaternion counts as unit when its length lies within this of 1.
+#: Maximum deviation of the length of a unit quaternion from 1.
 QUAT_LENGTH_TOLERANCE = 1e-3
 
-#: The coordinate system of a scene whose source did not name one.
+#: Coordinate system of a scene whose source did not specify one.
 UNSPECIFIED = "unspecified"
 
 _AXIS_OF_LETTER = {"R": "x", "L": "x", "U": "y", "D": "y", "F": "z", "B": "z"}
-_BLOCK = 1 << 18  # values that are checked at a time if a sum was not finite
+_BLOCK = 1 << 18  # values checked at a time
 _NO_SH: F32 = np.zeros((0, 0, 3), np.float32)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SplatModel:
-    """N splats and the metadata that a viewer needs.
+    """N splats, and the metadata that a viewer needs.
 
-    The arrays are not copied and not made read-only; treat them as constant.
+    The arrays are neither copied nor made read-only; treat them as constant.
 
     Attributes:
         means: [N, 3] float32, centres in scene units, relative to `origin`.
-        quats: [N, 4] float32, rotations w x y z. Their lengths lie within
-            `QUAT_LENGTH_TOLERANCE` of 1; `normalise_quats` makes them so.
-        scales: [N, 3] float32, natural logarithms of the standard deviations (scene units).
-        opacities: [N] float32, alpha in [0, 1] (no logits).
+        quats: [N, 4] float32, rotations w x y z; lengths within `QUAT_LENGTH_TOLERANCE` of 1, see `normalise_quats`.
+        scales: [N, 3] float32, natural logarithms of the standard deviations in scene units.
+        opacities: [N] float32, alpha in [0, 1] (not logits).
         sh0: [N, 3] float32, spherical-harmonics coefficient of degree 0, red green blue.
-        shN: [N, K, 3] float32, the higher coefficients, K = (d + 1)**2 - 1 for d = 0, 1, 2, 3.
-            By default none, K = 0.
-        origin: what to add to `means`, three float64, scene units. A scene at geographic
-            coordinates keeps its float32 precision this way.
-        means_double: [N, 3] float64, the centres as the source has them, origin included, where
-            `means` are these less the origin, rounded; `None` if `origin` and `means` are exact.
-        coordinate_system: `"unspecified"`, or the directions of +x, +y and +z for a person who
-            looks at the scene, as three letters of R/L, U/D and F/B: `"RDF"`.
-        unit_metres: length of one scene unit in metres; `None` if it is not known.
+        shN: [N, K, 3] float32, higher coefficients, K = (d + 1)**2 - 1 for degree d = 0, 1, 2, 3. Default: K = 0.
+        origin: offset of `means` in the source's coordinates, three float64, scene units. Scenes at geographic
+            coordinates keep the precision of float32 this way.
+        means_double: [N, 3] float64, centres in the source's coordinates; `means` are these minus `origin`, rounded.
+            `None` if `origin` and `means` are exact.
+        coordinate_system: directions of +x, +y and +z from the viewer's perspective, one letter each of R/L, U/D and
+            F/B: `"RDF"`; or `"unspecified"`.
+        unit_metres: length of one scene unit in metres; `None` if unknown.
         antialiased: trained with the mip-splatting low-pass filter; renders must apply it.
-        flat: splats are discs (2DGS): the third, smallest scale means nothing.
-        cameras: training cameras, each {K, viewmat, W, H, near, image}, viewmat world to camera
-            with OpenCV axes, pixel centres at +0.5; `None` if there are none.
-        metadata: free, JSON-compatible. Keys in use: `licence` (str), `comments` (list of str),
-            `training` (see `csplat.training_record`), `up` (see `csplat.editing.up_axis`), `view`
-            (a camera as those of `cameras`, from which the scene is shown first).
-        extra: further columns by name, each [N], integer or floating.
+        flat: splats are discs (2DGS); the smallest scale has no meaning.
+        cameras: training cameras, each {K, viewmat, W, H, near, image}; viewmat maps world to camera with OpenCV axes,
+            pixel centres are at +0.5. `None` if there are none.
+        metadata: JSON-compatible. Keys in use: `licence` (str), `comments` (list of str), `training` (see
+            `csplat.training_record`), `up` (see `csplat.editing.up_axis`), `view` (initial camera of a viewer, in the
+            form of `cameras`).
+        extra: additional columns by name, each [N], integer or floating.
 
     Raises:
-        InputError: an array has another shape or dtype, holds NaN or infinity, or is out of
-            range; or another field is invalid.
+        InputError: an array has the wrong shape or dtype, contains NaN or infinity, or is out of range; or another
+            field is invalid.
     """
 
     means: F32
@@ -110,7 +107,7 @@ class SplatModel:
             check_axes(self.coordinate_system)
         unit = self.unit_metres
         if unit is not None and not (math.isfinite(unit) and unit > 0):
-            raise InputError(f"unit_metres is {unit}, wanted a length above 0 or None")
+            raise InputError(f"unit_metres is {unit}, expected a length above 0 or None")
 
     def __len__(self) -> int:
         return len(self.means)
@@ -119,7 +116,7 @@ class SplatModel:
         return f"SplatModel({len(self)} splats, sh_degree={self.sh_degree})"
 
     def _repr_html_(self) -> str | None:
-        """Return a scene that can be turned, for a notebook; `None`, for its `repr`, if empty or without the tools."""
+        """Return an interactive view for notebooks; `None`, so that they show `repr`, if empty or without the tools."""
         if not len(self):
             return None
         html = load_plugins("csplat.display").get("html")
@@ -132,13 +129,10 @@ class SplatModel:
         return sh_degree_of(self.shN.shape[1])
 
     def select(self, index: NDArray[Any] | slice) -> SplatModel:
-        """Keep some splats, in the order of `index`; everything else stays.
+        """Return the model of some splats, with the same metadata.
 
         Args:
-            index: an index of the first axis of a NumPy array: positions, a mask, a slice.
-
-        Returns:
-            A model of the chosen splats (views of this one's arrays for a slice).
+            index: index of the first axis of a NumPy array: integers, a mask, or a slice, which returns views.
         """
         return replace(
             self,
@@ -154,12 +148,12 @@ class SplatModel:
 
 
 def trusted_model(**values: Any) -> SplatModel:
-    """Make a model without the constructor's checks, for a caller that has just checked more than they do.
+    """Make a model without the constructor's checks, which take an eighth of the time of a decode.
 
-    The constructor passes over every value, an eighth of the time of a decode; the decoder's clauses are stricter.
+    For the decoder, whose clauses are stricter.
 
     Args:
-        values: fields by name; those with a default may be left out.
+        values: fields by name; fields with a default may be omitted.
     """
     required = {one.name for one in fields(SplatModel) if one.default is MISSING}
     assert required <= values.keys() <= {one.name for one in fields(SplatModel)}
@@ -170,51 +164,36 @@ def trusted_model(**values: Any) -> SplatModel:
 
 
 def check_model(caller: str, model: object) -> None:
-    """Refuse anything but a model, with a hint how to make one.
-
-    Raises:
-        InputError: it is not a model.
-    """
+    """Raise an `InputError` unless `model` is a `SplatModel`; it explains how to make one."""
     if not isinstance(model, SplatModel):
         raise InputError(
-            f"{caller} takes a SplatModel, not a {type(model).__name__}: csplat.read_ply(file) makes one of a PLY,"
-            " csplat.decode(file) of a .csplat file"
+            f"{caller} expects a SplatModel, not a {type(model).__name__}: read a PLY with csplat.read_ply(file),"
+            " a .csplat file with csplat.decode(file)"
         )
 
 
 def check_sh_degree(sh_degree: int | None) -> None:
-    """Refuse a highest SH band out of range.
-
-    Raises:
-        InputError: it is neither `None` nor 0 to `MAX_SH_DEGREE`.
-    """
+    """Raise an `InputError` unless `sh_degree` is `None` or 0 to `MAX_SH_DEGREE`."""
     if sh_degree is not None and not 0 <= sh_degree <= MAX_SH_DEGREE:
         raise InputError(f"sh_degree is {sh_degree}, expected 0 to {MAX_SH_DEGREE}")
 
 
 def sh_degree_of(coefficient_count: int) -> int:
-    """Return the spherical-harmonics degree of K higher coefficients.
-
-    Args:
-        coefficient_count: K, the length of the middle axis of `shN`.
-
-    Returns:
-        d with K = (d + 1)**2 - 1.
+    """Return the SH degree d of K = (d + 1)**2 - 1 higher coefficients, K being the length of `shN`'s middle axis.
 
     Raises:
-        InputError: K belongs to no degree up to `MAX_SH_DEGREE`.
+        InputError: K matches no degree up to `MAX_SH_DEGREE`.
     """
     for degree in range(MAX_SH_DEGREE + 1):
         if (degree + 1) ** 2 - 1 == coefficient_count:
             return degree
-    raise InputError(f"shN has {coefficient_count} coefficients per channel, wanted 0, 3, 8 or 15")
+    raise InputError(f"shN has {coefficient_count} coefficients per channel, expected 0, 3, 8 or 15")
 
 
 def normalise_quats(quats: NDArray[Any]) -> F32:
-    """Bring quaternions to unit length; a zero quaternion becomes the identity.
+    """Normalise quaternions; a zero quaternion becomes the identity.
 
-    Quaternions that are unit already, as nearly as float32 can represent, stay as they are, bit for
-    bit: so doing it twice changes nothing. Huge and denormal ones are no special case in float64.
+    Idempotent: quaternions of unit length, up to float32 rounding, are returned bit for bit.
 
     Args:
         quats: [N, 4] float32, w x y z, finite, of any length.
@@ -222,6 +201,7 @@ def normalise_quats(quats: NDArray[Any]) -> F32:
     Returns:
         [N, 4] float32, a new array.
     """
+    # In float64, huge and denormal values need no special case.
     wide = quats.astype(np.float64)
     squared = np.einsum("ij,ij->i", wide, wide)
     zero = squared == 0.0
@@ -235,27 +215,27 @@ def normalise_quats(quats: NDArray[Any]) -> F32:
 
 
 def _check_array(name: str, array: F32, shape: tuple[int | str, ...]) -> None:
-    wanted = "[" + ", ".join(str(size) for size in shape) + "]"
+    expected = "[" + ", ".join(str(size) for size in shape) + "]"
     if not isinstance(array, np.ndarray):
-        raise InputError(f"{name} is a {type(array).__name__}, wanted a float32 array {wanted}")
+        raise InputError(f"{name} is a {type(array).__name__}, expected a float32 array {expected}")
     fits = len(array.shape) == len(shape) and all(
         isinstance(want, str) or have == want for have, want in zip(array.shape, shape, strict=True)
     )
     if not fits:
-        raise InputError(f"{name} has shape {list(array.shape)}, wanted {wanted}")
+        raise InputError(f"{name} has shape {list(array.shape)}, expected {expected}")
     if array.dtype != np.float32:
-        raise InputError(f"{name} is {array.dtype}, wanted float32")
+        raise InputError(f"{name} is {array.dtype}, expected float32")
     bad = _non_finite_count(array)
     if bad:
-        raise InputError(f"{name} holds {bad} values that are NaN or infinite")
+        raise InputError(f"{name} contains {bad} values that are NaN or infinite")
 
 
 def _non_finite_count(array: F32) -> int:
     """Count NaN and infinities; one pass over memory if there are none."""
     with np.errstate(over="ignore", invalid="ignore"):
         if np.isfinite(array.sum(dtype=np.float32)):
-            return 0  # a NaN or an infinity would have shown in the sum
-    # Large finite values can overflow the sum too: look at each, without a mask of the whole.
+            return 0
+    # The sum of large finite values may overflow, too. Count in blocks: a mask of the whole array takes memory.
     rows = max(1, _BLOCK // max(1, math.prod(array.shape[1:])))
     return sum(int(np.count_nonzero(~np.isfinite(array[start : start + rows]))) for start in range(0, len(array), rows))
 
@@ -265,7 +245,7 @@ def _check_opacities(opacities: F32) -> None:
         return
     low, high = float(opacities.min()), float(opacities.max())
     if low < 0.0 or high > 1.0:
-        raise InputError(f"opacities reach from {low:g} to {high:g}, wanted alpha in [0, 1] (not logits)")
+        raise InputError(f"opacities range from {low:g} to {high:g}, expected alpha in [0, 1] (not logits)")
 
 
 def _check_quats(quats: F32) -> None:
@@ -274,7 +254,7 @@ def _check_quats(quats: F32) -> None:
     low, high = (1.0 - QUAT_LENGTH_TOLERANCE) ** 2, (1.0 + QUAT_LENGTH_TOLERANCE) ** 2
     bad = int(np.count_nonzero((squared < low) | (squared > high)))
     if bad:
-        raise InputError(f"quats holds {bad} rows that are not unit length: see normalise_quats")
+        raise InputError(f"quats contains {bad} rows that are not of unit length: see normalise_quats")
 
 
 def _check_extra(extra: Mapping[str, NDArray[Any]], n: int) -> None:
@@ -282,32 +262,28 @@ def _check_extra(extra: Mapping[str, NDArray[Any]], n: int) -> None:
         if not isinstance(column, np.ndarray) or column.shape != (n,):
             raise InputError(f"extra column {name!r} is not an array of {n} values")
         if column.dtype.kind not in "iuf":
-            raise InputError(f"extra column {name!r} is {column.dtype}, wanted integers or floats")
+            raise InputError(f"extra column {name!r} is {column.dtype}, expected integers or floats")
 
 
 def _checked_origin(origin: Sequence[float]) -> tuple[float, float, float]:
     try:
         x, y, z = (float(value) for value in origin)
     except (TypeError, ValueError):
-        raise InputError(f"origin is {origin!r}, wanted three numbers") from None
+        raise InputError(f"origin is {origin!r}, expected three numbers") from None
     if not all(math.isfinite(value) for value in (x, y, z)):
-        raise InputError(f"origin is {origin!r}, wanted finite numbers")
+        raise InputError(f"origin is {origin!r}, expected finite numbers")
     return x, y, z
 
 
 def _check_doubles(means: F32, doubles: F64, origin: tuple[float, float, float]) -> None:
-    """Refuse doubles of which the means are not the rounding: changed means need other doubles or none."""
+    """Raise an `InputError` unless `means` are `doubles` minus `origin`, rounded."""
     fits = isinstance(doubles, np.ndarray) and doubles.dtype == np.float64 and doubles.shape == means.shape
     if not fits or not np.array_equal((doubles - np.array(origin)).astype(np.float32), means):
-        raise InputError("means_double is not the centres of which means are the float32 less the origin")
+        raise InputError("means_double and means disagree: means are float32(means_double - origin)")
 
 
 def check_axes(letters: str) -> None:
-    """Refuse letters that are not directions of +x, +y and +z.
-
-    Raises:
-        InputError: they are not three letters, one each of R/L, U/D and F/B.
-    """
+    """Raise an `InputError` unless these are three letters, one each of R/L, U/D and F/B."""
     axes = {_AXIS_OF_LETTER.get(letter) for letter in letters}
     if len(letters) != 3 or axes != {"x", "y", "z"}:
-        raise InputError(f"the axes are {letters!r}, wanted three letters, one each of R/L, U/D and F/B, as RDF")
+        raise InputError(f"the axes are {letters!r}, expected three letters, one each of R/L, U/D and F/B, such as RDF")

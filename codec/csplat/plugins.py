@@ -1,9 +1,9 @@
-"""Entry points of installed packages, which extend the codec without it knowing them.
+"""Load extensions of the codec from the entry points of installed packages.
 
 | group | entry points |
 |---|---|
-| `csplat.formats` | a `csplat.formats.format.Format` each, under its name |
-| `csplat.display` | `html`: a function from a `SplatModel` to HTML, for notebooks |
+| `csplat.formats` | a `csplat.formats.format.Format` under the name of each format |
+| `csplat.display` | `html`: a function that converts a `SplatModel` to HTML for notebooks |
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 
 
 def load_plugins(group: str) -> dict[str, Any]:
-    """Load the entry points of a group, by name, without those whose dependencies are absent.
+    """Load the entry points of a group by name.
 
-    One that cannot be loaded for another reason is left out with a `RuntimeWarning`.
+    Entry points with missing dependencies are omitted; those that fail otherwise are omitted with a `RuntimeWarning`.
     """
     found = {}
     for point in _entry_points(group):
         try:
             found[point.name] = point.load()
         except ModuleNotFoundError:
-            continue  # of an extra that is not installed
-        except Exception as error:  # noqa: BLE001  # a broken package of others must not stop the reading of a PLY
+            continue  # its extra is not installed
+        except Exception as error:  # noqa: BLE001  # someone else's broken package must not keep us from reading a PLY
             text = f"{point.value}, installed as {point.name!r} of {group}, cannot be loaded: {error}"
             warnings.warn(text, RuntimeWarning, stacklevel=2)
     return found
@@ -35,6 +35,6 @@ def load_plugins(group: str) -> dict[str, Any]:
 
 @cache
 def _entry_points(group: str) -> EntryPoints:
-    from importlib.metadata import entry_points  # about 20 ms, and the look-up 10 ms with 120 packages
+    from importlib.metadata import entry_points  # takes 20 ms, the look-up another 10 ms with 120 packages
 
     return entry_points(group=group)

@@ -1,4 +1,4 @@
-"""Read parts of files at URLs, with fsspec, and choose the store of a file."""
+"""Read byte ranges of files at URLs with fsspec, and choose the store of a file."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from csplat.errors import InputError, StoreError, missing_package
 from csplat.file_source import File
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(://|::)")
-#: File systems of servers that may send all of a file when a part is requested.
+#: Protocols of servers that may ignore a range request and send the whole file.
 _WEB = {"http", "https"}
-#: Fields that identify a version of a file, under the names that fsspec's file systems use.
+#: Fields that identify a version of a file, under the names of fsspec's file systems.
 _VERSION = (
     "size", "ETag", "etag", "Last-Modified", "LastModified", "last_modified", "mtime", "created", "VersionId",
     "generation",
 )  # fmt: skip
+#: Errors of the operating system that HTTP status codes are reported as.
 _STATUS = {401: errno.EACCES, 403: errno.EACCES, 404: errno.ENOENT, 410: errno.ENOENT}
 
 
 def is_url(file: object) -> bool:
-    """Return True if a file is named by a URL, `s3://bucket/scene.csplat`, and not by a path."""
+    """Return True if `file` is a URL such as `s3://bucket/scene.csplat`."""
     return isinstance(file, str) and _URL.match(file) is not None
 
 
@@ -39,46 +40,46 @@ def open_store(file: File, storage: Mapping[str, Any] | None = None) -> Store:
         storage: options of fsspec's file system, for a URL.
 
     Raises:
-        InputError: it is none of these, or a URL of an unknown kind.
+        InputError: `file` has another type, or is a URL of an unknown protocol.
         StoreError: the store does not answer.
-        OSError: the file does not exist, or cannot be read.
+        OSError: the file does not exist or cannot be read.
     """
     if isinstance(file, str) and is_url(file):
         return RemoteStore(file, storage or {})
     if storage:
-        raise InputError("storage options are for a URL, and the file is none")
+        raise InputError("storage options require a URL, and the file is not one")
     if isinstance(file, (str, os.PathLike)) and stat.S_ISREG(Path(file).stat().st_mode):
         return DiskStore(Path(file))
     return MemoryStore(file)
 
 
 class RemoteStore(Store):
-    """A file at a URL; fsspec manages connections, which it keeps for the next file, and retries."""
+    """A file at a URL. fsspec manages retries and connections, which it keeps for the next file."""
 
     def __init__(self, url: str, options: Mapping[str, Any]) -> None:
         self._fs, self._path = _file_system(url, options)
         self._shown = _shown(url)
         names = self._fs.protocol
         self._web = not _WEB.isdisjoint((names,) if isinstance(names, str) else names)
-        self._proved = not self._web
-        self._info = self._asked()
+        self._supports_ranges = not self._web
+        self._info = self._read_info()
         size = self._info.get("size")
         if self._info.get("type") == "directory":
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), self._shown)
         if size is None:
-            raise StoreError(f"{self._shown}: the server does not say how long the file is, so no parts can be read")
+            raise StoreError(f"{self._shown}: the server does not report the size of the file, so no parts can be read")
         super().__init__(self._shown, size, requests=1)
 
     def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
         parts: list[bytes] = []
-        while not self._proved and len(parts) < len(ranges):
-            parts.append(self._careful(*ranges[len(parts)]))
+        while not self._supports_ranges and len(parts) < len(ranges):
+            parts.append(self._read_checked(*ranges[len(parts)]))
         rest = ranges[len(parts) :]
-        # File systems without coroutines open files, which would read more than is requested.
-        how = {} if self._fs.async_impl else {"cache_type": "none"}
+        # File systems without coroutines open files, which would read ahead.
+        cache = {} if self._fs.async_impl else {"cache_type": "none"}
         starts, stops = [start for start, _ in rest], [stop for _, stop in rest]
         try:
-            found: list[Any] = self._fs.cat_ranges([self._path] * len(rest), starts, stops, on_error="return", **how)
+            found: list[Any] = self._fs.cat_ranges([self._path] * len(rest), starts, stops, on_error="return", **cache)
         except Exception as error:  # noqa: BLE001  # stores raise the exceptions of their libraries
             raise self._failure(error) from None
         for one in found:
@@ -86,20 +87,20 @@ class RemoteStore(Store):
                 raise self._failure(one) from None
         return parts + found
 
-    def _careful(self, start: int, stop: int) -> bytes:
-        """Read a part from a server that may not support ranges, which fsspec's file notices early."""
+    def _read_checked(self, start: int, stop: int) -> bytes:
+        """Read a range from a server that may not support ranges, which fsspec's file object detects early."""
         try:
             with self._fs.open(self._path, "rb", cache_type="none", size=self.size) as stream:
                 stream.seek(start)
                 part: bytes = stream.read(stop - start)
         except ValueError:  # raised by fsspec
-            raise StoreError(f"{self.name}: the server sends whole files alone, no parts (HTTP Range)") from None
+            raise StoreError(f"{self.name}: the server sends only whole files, no parts (HTTP Range)") from None
         except Exception as error:  # noqa: BLE001  # as above
             raise self._failure(error) from None
-        self._proved = start > 0  # any server returns the beginning
+        self._supports_ranges = start > 0  # a server without ranges also returns the beginning
         return part
 
-    def _asked(self) -> dict[str, Any]:
+    def _read_info(self) -> dict[str, Any]:
         try:
             info: dict[str, Any] = self._fs.info(self._path)
         except Exception as error:  # noqa: BLE001  # as above
@@ -109,15 +110,15 @@ class RemoteStore(Store):
     def _is_other(self) -> bool:
         self._fs.invalidate_cache(self._path)
         self.requests += 1
-        now = self._asked()
+        now = self._read_info()
         return any(self._info.get(name) != now.get(name) for name in _VERSION)
 
     def _failure(self, error: BaseException) -> Exception:
-        """Return the exception to raise for one that fsspec raised."""
+        """Translate an exception of fsspec."""
         if isinstance(error, ModuleNotFoundError):
             return missing_package(error, extra="remote")
         if self._web and isinstance(error, FileNotFoundError) and error.__cause__ is not None:
-            error = error.__cause__  # fsspec raises "not found" for any failure; this is its cause
+            error = error.__cause__  # fsspec raises FileNotFoundError for any failure
         status = getattr(error, "status", 0)
         number = _STATUS.get(status, 0)
         if isinstance(error, FileNotFoundError):
@@ -125,8 +126,8 @@ class RemoteStore(Store):
         elif isinstance(error, PermissionError):
             number = errno.EACCES
         if number:
-            return OSError(number, os.strerror(number), self._shown)  # gives the subclass that belongs to the number
-        text = f"HTTP status {status}" if status else str(error)  # aiohttp would add the address, with secrets
+            return OSError(number, os.strerror(number), self._shown)  # creates the subclass for the number
+        text = f"HTTP status {status}" if status else str(error)  # aiohttp's text contains the URL with its secrets
         return StoreError(f"{self._shown}: {' '.join(text.split()) or type(error).__name__}")
 
 
@@ -136,12 +137,12 @@ def _file_system(url: str, options: Mapping[str, Any]) -> tuple[Any, str]:
         from fsspec.core import url_to_fs
     except ModuleNotFoundError as error:
         raise missing_package(error, extra="remote") from None
-    if url.startswith(("http://", "https://")):  # ranges refer to the file, not to its compressed transfer
+    if url.startswith(("http://", "https://")):  # ranges must refer to the file, not to compressed data
         options = {**options, "headers": {"Accept-Encoding": "identity", **options.get("headers", {})}}
     try:
         fs, path = url_to_fs(url, **options)
-    except ImportError as error:  # fsspec names the package in its own words
-        raise InputError(f"{_shown(url)}: {error}: pip install 'csplat[remote]' brings those of HTTP and S3") from None
+    except ImportError as error:  # fsspec's message names the package
+        raise InputError(f"{_shown(url)}: {error}; for HTTP and S3: pip install 'csplat[remote]'") from None
     except (ValueError, TypeError) as error:
         raise InputError(f"{_shown(url)}: {' '.join(str(error).split())}") from None
     return fs, path

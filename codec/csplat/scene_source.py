@@ -1,7 +1,7 @@
-"""Read a scene in blocks of a bounded number of splats.
+"""Read a scene in blocks of bounded size.
 
-A block is a `SplatModel` with the metadata of the whole scene. Blocks may be read several times, in memory for one of
-them.
+A block is a `SplatModel` with the metadata of the whole scene. Blocks may be read several times, one in memory at a
+time.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class SceneSource:
         count: N.
         metadata_model: the scene without its splats: SH degree, axes, origin, antialiasing, metadata, names and types
             of extra columns.
-        blocks: yields all splats in order, from the first one at every call, in models of at most `BLOCK_SPLATS` splats
-            that agree with `metadata_model` in everything else.
-        findings: findings so far; grows while the first blocks are read.
-        format: name of the format that it is read from; "" if the scene is in memory.
-        levels: splats of each level of detail, the finest first, if the file has several; this scene is one of them.
+        blocks: returns an iterator over all splats in order, in models of at most `BLOCK_SPLATS` splats that equal
+            `metadata_model` in everything else.
+        findings: findings so far; the first iteration over the blocks may add some.
+        format: name of the format that the scene is read from; "" if it is in memory.
+        levels: number of splats of each level of detail, finest first, if the file has several; this scene is one.
     """
 
     count: int
@@ -83,14 +83,14 @@ def join_blocks(metadata_model: SplatModel, blocks: Sequence[SplatModel]) -> Spl
 
 
 def drop_bands(model: SplatModel, sh_degree: int) -> SplatModel:
-    """Leave out the SH bands above a degree."""
+    """Drop the SH bands above a degree."""
     if sh_degree >= model.sh_degree:
         return model
     return replace(model, shN=np.ascontiguousarray(model.shN[:, : (sh_degree + 1) ** 2 - 1]))
 
 
 def with_progress(scene: SceneSource, stage: str, progress: Progress) -> SceneSource:
-    """Return the scene with blocks that report progress, and raise `InputError` if the number of splats changed."""
+    """Return a source whose blocks report progress, and raise an `InputError` if their number of splats is not N."""
 
     def blocks() -> Iterator[SplatModel]:
         done = 0
@@ -99,7 +99,7 @@ def with_progress(scene: SceneSource, stage: str, progress: Progress) -> SceneSo
             yield model
             done += len(model)
         if done != scene.count:
-            raise InputError(f"{done:,} splats came where {scene.count:,} were announced: did the file change?")
+            raise InputError(f"the scene has {done:,} splats, expected {scene.count:,}: did the file change?")
         progress(stage, 1.0)
 
     return replace(scene, blocks=blocks)

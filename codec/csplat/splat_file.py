@@ -1,4 +1,4 @@
-"""Read parts of a file on disk, in memory or at a URL: first header and index, then what is requested."""
+"""Read parts of a file on disk, in memory or at a URL: header and index first, then requested parts."""
 
 from __future__ import annotations
 
@@ -9,19 +9,10 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.byte_store import FileWindow, Store
-from csplat.decoder import (
-    DecodedTile,
-    Limits,
-    decode,
-    iter_tiles,
-    read_cameras,
-    read_header,
-    read_metadata,
-)
+from csplat.decoder import DecodedTile, Limits, decode, iter_tiles, read_cameras, read_header, read_metadata
 from csplat.decoder.codebooks import wanted_codebooks
 from csplat.decoder.container import SceneHeader, Tile, check_length, read_file_header
 from csplat.decoder.decode_api import DecodeRequest, prepare_decode
@@ -38,17 +29,12 @@ from csplat.types import F64
 
 
 class SplatFile:
-    """A `.csplat` file that is read in parts, a context manager; `csplat.open` makes it.
+    """A `.csplat` file opened by `csplat.open` to read parts of it; a context manager.
 
-    Parts are checked as in a decode of the same part.
+    The parts read are checked as in a decode.
 
     Attributes:
         header: header and index.
-        splat_count: its splats; also its length.
-        name: the path or URL, for messages.
-        size: bytes of the file.
-        requests: number of requests to the store so far.
-        bytes_read: number of bytes read so far.
     """
 
     header: SceneHeader
@@ -76,31 +62,31 @@ class SplatFile:
 
     @property
     def splat_count(self) -> int:
-        """N."""
+        """Number of splats in the file."""
         return self.header.splat_count
 
     @property
     def name(self) -> str:
-        """Path or URL, without secrets."""
+        """Path or URL, without secrets, for messages."""
         return self._store.name
 
     @property
     def size(self) -> int:
-        """Bytes of the file."""
+        """Size of the file, bytes."""
         return self._store.size
 
     @property
     def requests(self) -> int:
-        """Number of requests to the store, including one for the size of a file at a URL."""
+        """Number of requests to the store so far, including one for the size of a file at a URL."""
         return self._store.requests
 
     @property
     def bytes_read(self) -> int:
-        """Number of bytes that the store returned."""
+        """Number of bytes read so far."""
         return self._store.bytes_read
 
     @cached_property
-    def boxes(self) -> NDArray[np.float64]:
+    def boxes(self) -> F64:
         """Boxes around the centres of each tile: [T, 2, 3] float64, scene units, relative to the origin."""
         return tile_boxes(self.header)
 
@@ -126,12 +112,12 @@ class SplatFile:
         self._store.close()
 
     def tiles(self, box: Sequence[float] | None = None, *, sh_degree: int | None = None) -> Iterator[DecodedTile]:
-        """Decode tile by tile, in memory for the codebooks, a tile and some megabytes of the file.
+        """Decode tile by tile; memory holds the codebooks, one tile and a few megabytes of the file.
 
         Args:
-            box: read the tiles that touch it, whole; by default all. Two corners, x, y, z each, in any order;
-                scene units, relative to the origin.
-            sh_degree: highest SH band to read; by default all.
+            box: region whose tiles are read; tiles that touch it are returned whole. Two corners, x, y, z each, in any
+                order, in scene units relative to the origin. Default: all tiles.
+            sh_degree: highest SH band to read; default: all.
 
         Raises:
             InputError: an argument is invalid, or no tile touches the box.
@@ -146,17 +132,13 @@ class SplatFile:
         return self._iterate(window, job, decoded)
 
     def read(
-        self,
-        box: Sequence[float] | None = None,
-        *,
-        tiles: Sequence[int] | None = None,
-        sh_degree: int | None = None,
+        self, box: Sequence[float] | None = None, *, tiles: Sequence[int] | None = None, sh_degree: int | None = None
     ) -> SplatModel:
-        """Decode a part, or all.
+        """Decode the file or a part of it.
 
         Args:
             box: as in `tiles`.
-            tiles: places of the tiles to decode, in the order requested; not with a box.
+            tiles: indices of the tiles to decode, in the order requested; excludes `box`.
             sh_degree: as in `tiles`.
 
         Examples:
@@ -173,7 +155,7 @@ class SplatFile:
         """
         if box is not None:
             if tiles is not None:
-                raise InputError("a box and tiles are given: wanted one of them")
+                raise InputError("box and tiles exclude each other")
             tiles = [tile.index for tile in tiles_touching(self.header, box)]
         with self._store.named_errors():
             window = self.window()
@@ -185,12 +167,12 @@ class SplatFile:
             return decode(window.view, limits=self._limits, tiles=tiles, sh_degree=sh_degree)
 
     def extract(self, box: Sequence[float], output: str | os.PathLike[str] | BinaryWriter) -> ExtractResult:
-        """Cut the tiles that touch a box out of the file, as `csplat.extract` does."""
+        """Extract the tiles that touch a box; see `csplat.extract`."""
         with self._store.named_errors():
             return write_extract(self.window(), self.header, tiles_touching(self.header, box), output)
 
     def window(self) -> FileWindow:
-        """Return a view into which parts of the file can be fetched, to copy them."""
+        """Return a view into which parts of the file can be fetched."""
         if not self._open:
             raise InputError(f"{self.name} is closed")
         return FileWindow(self._store, self._head)
@@ -209,20 +191,20 @@ class SplatFile:
                 yield tile
             side = []
         with self._store.named_errors():
-            next(decoded, None)  # a scene without tiles still has chunks to check
+            next(decoded, None)  # checks the chunks of a scene without tiles
 
     def _chunks(self, *kinds: bytes) -> list[tuple[int, int]]:
         return [(one.offset, one.size) for one in self.header.directory if one.type in kinds]
 
 
 def open(file: File, *, limits: Limits | None = None, storage: Mapping[str, Any] | None = None) -> SplatFile:
-    """Open a file to read parts of it: header and index are read, nothing else.
+    """Open a file to read parts of it; only header and index are read at once.
 
     Args:
-        file: a path; a URL that fsspec knows (`https://…`, `s3://…`; requires the extra `remote`); an open binary file,
-            which is read to its end; or bytes.
+        file: a path; a URL that fsspec supports (`https://…`, `s3://…`; requires the extra `remote`); an open binary
+            file, which is read to its end; or bytes.
         limits: as in `decode`, for each part.
-        storage: options of fsspec's file system of the URL: `{"endpoint_url": …, "anon": True}`.
+        storage: options of fsspec's file system for the URL: `{"endpoint_url": …, "anon": True}`.
 
     Examples:
         >>> import csplat
@@ -232,11 +214,11 @@ def open(file: File, *, limits: Limits | None = None, storage: Mapping[str, Any]
         1000 (1000, 0, 3)
 
     Raises:
-        FormatError, UnsupportedError: as in `read_header`, or the file is shorter or longer than its header states.
-        InputError: the file is none of these; storage options without a URL; the extra is not installed.
-        StoreError: a server does not answer, does not support ranges (HTTP Range), or breaks off; or the file
-            has changed since it was opened. Nothing is returned in this case.
-        OSError: the file does not exist, or cannot be read.
+        FormatError, UnsupportedError: as in `read_header`, or the file is shorter or longer than its header specifies.
+        InputError: `file` has another type; storage options without a URL; the extra is not installed.
+        StoreError: the server does not answer, does not support ranges (HTTP Range), or closes the connection; or the
+            file has changed since it was opened.
+        OSError: the file does not exist or cannot be read.
     """
     store = open_store(file, storage)
     try:
@@ -253,16 +235,16 @@ def extract(
     *,
     storage: Mapping[str, Any] | None = None,
 ) -> ExtractResult:
-    """Cut the tiles whose boxes touch a box out of a file, into a file of their own.
+    """Write the tiles of a file that touch a box as a file of their own.
 
-    Tiles stay whole, so that splats around the box come along; values are those of the file, bit for bit. Declared
-    errors and the encoder's record of its options are left out: they are about the whole. So are chunks of unknown
-    types. Only header, index and the copied data are read; some megabytes at a time are held in memory.
+    Tiles are copied whole, including splats outside the box; values are preserved bit for bit. Declared error bounds
+    and the encoder's options, which refer to the whole file, are omitted, as are chunks of unknown types. Only header,
+    index and the copied data are read, a few megabytes at a time.
 
     Args:
         file: as in `open`.
-        box: two corners, x, y, z each, in any order; scene units, as the means: relative to the origin.
-        output: a path, which the part takes when it is complete, replacing an older file; or an open binary file.
+        box: two corners, x, y, z each, in any order, in scene units relative to the origin.
+        output: a path, written atomically and replaced if it exists; or an open binary file.
         storage: as in `open`.
 
     Examples:
@@ -272,16 +254,16 @@ def extract(
         True
 
     Raises:
-        InputError: the box is not six finite numbers; or no tile touches the box.
-        FormatError: a clause on header, index, or the chunks that are copied is broken.
-        UnsupportedError, StoreError, OSError: as in `open`; or the output cannot be written.
+        InputError: the box is not six finite numbers, or no tile touches the box.
+        FormatError: the header, the index or a copied chunk breaks a clause.
+        UnsupportedError, StoreError, OSError: as in `open`, or the output cannot be written.
     """
     with open(file, storage=storage) as opened:
         return opened.extract(box, output)
 
 
 def _read_head(store: Store, window: FileWindow) -> bytes:
-    """Read header and index, and any data after them that came in the same request."""
+    """Return header and index, with any data after them from the same request."""
     first = min(store.size, store.sizes.first)
     window.fetch([(0, first)])
     head = read_file_header(window.view)
@@ -293,7 +275,7 @@ def _read_head(store: Store, window: FileWindow) -> bytes:
 
 
 def _side(job: DecodeRequest) -> list[tuple[int, int]]:
-    """Return the ranges to read in addition to tiles: their codebooks, or for a whole file all chunks."""
+    """Return the ranges to read in addition to tiles: their codebooks, or all other chunks for a whole file."""
     records = job.header.directory if job.whole else wanted_codebooks(job.header, job.tiles, job.degree)
     return [(record.offset, record.size) for record in records]
 
@@ -303,7 +285,7 @@ def _layers(tiles: Sequence[Tile], degree: int) -> list[tuple[int, int]]:
 
 
 def _batches(tiles: Sequence[Tile], degree: int, size_bytes: int) -> Iterator[list[Tile]]:
-    """Yield tiles to fetch together; at least one batch, which may be empty."""
+    """Yield batches of tiles to fetch together, at least one, which may be empty."""
     batch: list[Tile] = []
     size = 0
     for tile in tiles:
@@ -321,14 +303,14 @@ def tiles_touching(header: SceneHeader, box: Sequence[float]) -> list[Tile]:
 
     Args:
         header: the scene.
-        box: two corners, x, y, z each, in any order; scene units, relative to the origin.
+        box: as in `extract`.
 
     Raises:
         InputError: the box is not six finite numbers, or no tile touches it.
     """
     numbers = [float(value) for value in box]
     if len(numbers) != 6 or not all(map(math.isfinite, numbers)):
-        raise InputError(f"a box is {tuple(box)!r}, wanted six finite numbers: two corners, x, y, z each")
+        raise InputError(f"box is {tuple(box)!r}, expected six finite numbers: two corners, x, y, z each")
     low, high = np.sort(np.reshape(numbers, (2, 3)), axis=0)
     boxes = tile_boxes(header)
     found = ((boxes[:, 0] <= high) & (boxes[:, 1] >= low)).all(axis=1)

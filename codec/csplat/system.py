@@ -1,6 +1,6 @@
-"""Use the operating system: files, memory, locks, signals and processes, with replacements where a system lacks a call.
+"""Provide operating-system services on every platform: files, memory, locks, signals and processes.
 
-`sys.platform` is for type checkers: whether a system has a call is asked of its modules.
+Checks of `sys.platform` are for type checkers; `hasattr` decides whether a system has a call.
 """
 
 from __future__ import annotations
@@ -21,26 +21,27 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-#: True if a process can be copied with all of its memory. macOS can, but its system libraries do not survive it.
+#: True if a process may be forked. On macOS, system libraries are unsafe after a fork.
 CAN_FORK = sys.platform == "linux" and hasattr(os, "fork")
 
-#: `creationflags` of a process that an interrupt at the terminal does not reach; on POSIX `start_new_session` does it.
+#: `creationflags` that shield a process from interrupts at the terminal; POSIX has `start_new_session` instead.
 NEW_GROUP_FLAGS: int = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
 
-_SHARE = 0.5  # fraction of the free memory that a command uses; other programs need some
-_UNKNOWN = 4 << 30  # bytes, if the system does not report its memory
+_SHARE = 0.5  # fraction of the free memory that a command uses; the rest is for other programs
+_UNKNOWN = 4 << 30  # bytes assumed if the system does not report its memory
+#: Files with limit and usage of the control group, versions 2 and 1.
 _LIMITS = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
     ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
 )
-_SPAWNED_MAX = 61  # processes of one pool that Windows can wait for
+_SPAWNED_MAX = 61  # maximum number of processes that Windows can wait for
 
 Shared = TypeVar("Shared")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_reading = threading.Lock()  # seek and read are two calls
-_task: list[Any] = []  # set in worker processes only: [function, value shared by all calls]
+_reading = threading.Lock()  # without pread, seek and read are two calls
+_task: list[Any] = []  # set in worker processes only: [function, shared value]
 
 
 def core_count() -> int:
@@ -49,7 +50,7 @@ def core_count() -> int:
 
 
 def read_at(descriptor: int, size: int, offset: int) -> bytes:
-    """Read from an offset of a file; threads may do so at the same time. Fewer bytes come at the end of the file.
+    """Read from an offset of a file, fewer bytes at its end. Thread-safe.
 
     Raises:
         OSError: the file cannot be read.
@@ -75,13 +76,13 @@ def read_into(descriptor: int, buffer: memoryview, offset: int) -> int:
 
 
 class Pages:
-    """Zeroed memory of which only written pages take space, if the system can do so.
+    """Zeroed memory whose pages take space only once written, if the system supports it.
 
     Attributes:
         buffer: the memory.
 
     Args:
-        size_bytes: length, at least 1.
+        size_bytes: size, at least 1.
 
     Raises:
         OSError, OverflowError: the address space is too small.
@@ -91,27 +92,27 @@ class Pages:
         if sys.platform != "win32" and hasattr(mmap, "MAP_ANONYMOUS"):
             flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | getattr(mmap, "MAP_NORESERVE", 0)
             self.buffer = mmap.mmap(-1, size_bytes, flags=flags)
-        else:  # Windows: the page file must have space for all of it
+        else:  # Windows reserves all of it in the page file
             self.buffer = mmap.mmap(-1, size_bytes)
 
     def discard(self) -> None:
-        """Give the memory back to the system if it takes it; the content is undefined afterwards."""
+        """Return the memory to the system if possible; the content is undefined afterwards."""
         if hasattr(self.buffer, "madvise") and hasattr(mmap, "MADV_DONTNEED"):
             self.buffer.madvise(mmap.MADV_DONTNEED)
 
 
 @contextmanager
 def locked_folder(folder: Path, name: str) -> Iterator[bool]:
-    """Lock a folder against other programs that do the same; yield whether this program has the lock.
+    """Lock a folder against other processes that use this function; yield True if the lock was acquired.
 
-    File systems without locks count as locked. The system releases the lock when the program ends in any way.
+    File systems without locks yield True. The system releases the lock when the process ends, even if it is killed.
 
     Args:
         folder: an existing folder.
-        name: name of a lock file, which systems that cannot lock a folder (Windows) create in it.
+        name: name of the lock file that is created in it on systems that cannot lock a folder (Windows).
 
     Raises:
-        OSError: the folder cannot be read, or the lock file cannot be made.
+        OSError: the folder cannot be read, or the lock file cannot be created.
     """
     try:
         import fcntl
@@ -135,7 +136,7 @@ def locked_folder(folder: Path, name: str) -> Iterator[bool]:
 
 @contextmanager
 def _lock_file(path: Path) -> Iterator[bool]:
-    """Lock by a file that exists as long as the lock; Windows deletes it when the program that opened it ends."""
+    """Lock by creating a file, which Windows deletes when the process ends."""
     try:
         held = os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR | getattr(os, "O_TEMPORARY", 0))
     except FileExistsError:
@@ -149,10 +150,10 @@ def _lock_file(path: Path) -> Iterator[bool]:
 
 
 def split_words(command: str, *, is_posix: bool = os.sep == "/") -> list[str]:
-    """Split a command line into words as a shell does. On Windows a backslash separates folders and escapes nothing.
+    """Split a command line into words as a shell does. On Windows the backslash is not an escape character.
 
     Raises:
-        ValueError: a quote has no end.
+        ValueError: a quote is not closed.
     """
     lexer = shlex.shlex(command, posix=True, punctuation_chars=False)
     lexer.whitespace_split, lexer.commenters = True, ""
@@ -162,7 +163,7 @@ def split_words(command: str, *, is_posix: bool = os.sep == "/") -> list[str]:
 
 
 def kill_group(process: subprocess.Popen[Any]) -> None:
-    """Kill a process and, on POSIX, its children: it must lead a session (`start_new_session`)."""
+    """Kill a process and, on POSIX, its children; it must have been started with `start_new_session`."""
     if sys.platform != "win32" and hasattr(os, "killpg"):
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -172,16 +173,16 @@ def kill_group(process: subprocess.Popen[Any]) -> None:
 
 
 def interrupt_process(process: subprocess.Popen[Any]) -> None:
-    """Ask a process to end: by SIGINT, or by closing its standard input if signals do not reach processes (Windows)."""
+    """Ask a process to end: by SIGINT, or on Windows, which has no such signals, by closing its standard input."""
     if sys.platform != "win32" and hasattr(signal, "pthread_kill"):
         process.send_signal(signal.SIGINT)
     elif process.stdin is not None:
-        with suppress(OSError):  # bytes that could not be delivered
+        with suppress(OSError):  # buffered bytes that can no longer be written
             process.stdin.close()
 
 
 def interrupt_main_thread() -> None:
-    """Raise KeyboardInterrupt in the main thread, from another thread; on POSIX in the middle of a system call, too."""
+    """Raise KeyboardInterrupt in the main thread from another thread; on POSIX this also interrupts system calls."""
     if sys.platform != "win32" and hasattr(signal, "pthread_kill"):
         main = threading.main_thread().ident
         assert main is not None
@@ -191,7 +192,7 @@ def interrupt_main_thread() -> None:
 
 
 def available_memory_bytes() -> int:
-    """Return the free memory of the machine, or of the control group of this process if that is less."""
+    """Return the free memory of the machine or of the process's control group, whichever is less."""
     found = [_free_machine_bytes()]
     for limit, current in _LIMITS:
         with suppress(OSError, ValueError):
@@ -200,7 +201,7 @@ def available_memory_bytes() -> int:
 
 
 def default_memory_bytes() -> int:
-    """Return the memory that a command uses by default: half of what is free."""
+    """Return the memory that a command uses by default: half of the free memory."""
     return int(_SHARE * available_memory_bytes())
 
 
@@ -218,18 +219,18 @@ def _free_machine_bytes() -> int:
 def map_in_processes(
     work: Callable[[Shared, Item], Result], shared: Shared, items: Sequence[Item], workers: int, *, copied: bool = False
 ) -> Iterator[tuple[Item, Result]]:
-    """Call a function for each item in worker processes; yield every item with its result when it is done.
+    """Call a function for each item in worker processes; yield (item, result) in order of completion.
 
     Args:
         work: a top-level function, called with `shared` and an item.
-        shared: a value for all calls; changes that a call makes to it are not seen by others.
-        items: arguments, which can be pickled, as the results can.
-        workers: number of processes; 1: only this one.
-        copied: fork this process, if `CAN_FORK`: `shared` is not pickled and takes no memory of its own. The function
-            must not use a lock that another thread of this process may hold, such as that of a stream.
+        shared: a value for all calls, not to be modified.
+        items: arguments; items and results must be picklable.
+        workers: number of processes; 1 runs everything in this process.
+        copied: fork this process if `CAN_FORK`, so that `shared` is neither pickled nor copied. `work` must not use
+            a lock that another thread of this process may hold, such as a stream's.
 
     Raises:
-        OSError: a process was killed.
+        OSError: a worker process was killed.
     """
     if workers == 1 or len(items) < 2:
         for item in items:
@@ -243,13 +244,13 @@ def map_in_processes(
         for future in as_completed(futures):
             yield futures.pop(future), future.result()
     except BrokenProcessPool:
-        raise OSError(errno.ENOMEM, "a worker process was killed, perhaps for want of memory") from None
+        raise OSError(errno.ENOMEM, "a worker process was killed, perhaps for lack of memory") from None
     finally:
         pool.shutdown(cancel_futures=True)
 
 
 def _begin(work: Callable[..., Any], shared: Any) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it and ends its workers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent receives it and ends its workers
     _task[:] = [work, shared]
 
 

@@ -1,4 +1,4 @@
-"""Copy tiles of a file into another one without decoding a stream."""
+"""Copy tiles from one file to another without decoding their streams."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from csplat.encoder.container import (
     file_pieces,
 )
 
-#: Chunks that are copied with a part of a file; declared bounds and options are about the whole.
+#: Chunks that are copied to an extract; declared bounds and options refer to the whole file.
 _KEPT = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
-_ALL = 1 << 26  # maximum size of the data fetched together from all files, bytes
+_ALL = 1 << 26  # maximum size of the data fetched at once from all files, bytes
 
 
 @dataclass(frozen=True)
 class ExtractResult:
-    """The result of cutting a part out of a file.
+    """The result of `csplat.extract`.
 
     Attributes:
-        tiles: indices of its tiles in the file.
-        splat_count: its splats.
-        size: its bytes.
+        tiles: indices of the extracted tiles in the source file.
+        splat_count: number of splats extracted.
+        size: size of the new file, bytes.
     """
 
     tiles: tuple[int, ...]
@@ -45,12 +45,12 @@ class ExtractResult:
 def write_extract(
     window: FileWindow, header: SceneHeader, tiles: Sequence[Tile], output: str | os.PathLike[str] | BinaryWriter
 ) -> ExtractResult:
-    """Write some tiles of a file as a file of their own, for `csplat.extract`.
+    """Write some tiles of a file as a file of their own.
 
     Args:
         window: the file.
-        header: its header.
-        tiles: in the order of the file.
+        header: header of the file.
+        tiles: tiles to write, in file order.
         output: a path or an open binary file.
     """
     codebook_ids = {identity for tile in tiles for identity in tile.codebook_ids}
@@ -73,12 +73,12 @@ def write_extract(
 
 
 class ChunkPrefetcher:
-    """Fetches chunks of a file in their order, several in a request.
+    """Fetches chunks of a file in order, several per request.
 
     Args:
-        window: the file; fetched data is discarded when the next chunks are fetched.
-        records: records of the chunks, in the order of `take`.
-        files: number of files that are read in turn.
+        window: the file; each fetch discards the previous data.
+        records: records of the chunks in the order in which they are taken.
+        files: number of files that are read concurrently and share the memory.
     """
 
     def __init__(self, window: FileWindow, records: Sequence[_spec.LayerRecord], files: int = 1) -> None:
@@ -88,7 +88,7 @@ class ChunkPrefetcher:
         self._here = range(0)
 
     def take(self, place: int, extra: Sequence[_spec.DirectoryRecord] = ()) -> _spec.LayerRecord:
-        """Fetch a chunk, the next ones that fit a batch, and `extra`, unless the window has it; return its record."""
+        """Return the record of a chunk; if it is not in the window, fetch it with the next batch and `extra`."""
         if place not in self._here:
             stop, size = place + 1, self._records[place].size
             while stop < len(self._records) and size + self._records[stop].size <= self._batch:
@@ -103,7 +103,7 @@ class ChunkPrefetcher:
 
 
 class TileCopier:
-    """Makes tiles of another file from those of a file, unchanged; their chunks are read when they are written.
+    """Copies tiles of a file; their chunks are read when the new file is written.
 
     Args:
         window, files: as in `ChunkPrefetcher`.
@@ -115,11 +115,11 @@ class TileCopier:
         self._records: dict[int, list[_spec.LayerRecord]] = {layer: [] for layer in _spec.LAYER_NAMES}
 
     def of(self, tile: Tile, changed: Mapping[int, LazyPayload] | None = None) -> FileTile:
-        """Return the tile for the other file, without layers of unknown ids.
+        """Return a tile for the new file, without layers of unknown ids.
 
         Args:
-            tile: its record.
-            changed: by layer, payloads that replace the file's.
+            tile: the tile's record.
+            changed: replaced payloads by layer.
         """
         layers: dict[int, Payload] = dict(changed or {})
         for layer in _spec.LAYER_NAMES.keys() & tile.layers.keys() - layers.keys():
@@ -132,23 +132,23 @@ class TileCopier:
         )  # fmt: skip
 
     def begin(self, extra: Sequence[_spec.DirectoryRecord]) -> None:
-        """Once all tiles are known, fetch the first chunks, and `extra`, which is needed before any tile."""
-        self._turn[0].take(0, extra)
+        """Fetch the first chunks, and `extra`, which is needed before any tile; call after all tiles are added."""
+        self._chunks[0].take(0, extra)
 
     @cached_property
-    def _turn(self) -> tuple[ChunkPrefetcher, dict[int, int]]:
-        """Return all chunks, in the order of the file, and the index of the first chunk of each layer."""
+    def _chunks(self) -> tuple[ChunkPrefetcher, dict[int, int]]:
+        """Return all chunks in file order, and the index of the first chunk of each layer."""
         starts = dict(zip(self._records, accumulate(map(len, self._records.values()), initial=0), strict=False))
         records = [one for records in self._records.values() for one in records]
         return ChunkPrefetcher(self._window, records, self._files), starts
 
     def _read(self, layer: int, place: int) -> bytes:
-        turn, starts = self._turn
-        return chunk_payload(self._window, turn.take(starts[layer] + place))
+        chunks, starts = self._chunks
+        return chunk_payload(self._window, chunks.take(starts[layer] + place))
 
 
 def chunk_payload(window: FileWindow, record: _spec.DirectoryRecord | _spec.LayerRecord) -> bytes:
-    """Return the payload of a fetched chunk, its CRC and header checked."""
+    """Return the payload of a fetched chunk after checking its CRC and header."""
     with window.store.named_errors():
         if isinstance(record, _spec.LayerRecord):
             cursor = open_chunk(window.view, record, _spec.CHUNK_TILE, TILE_FLAGS, "TLE-1")
@@ -160,13 +160,13 @@ def chunk_payload(window: FileWindow, record: _spec.DirectoryRecord | _spec.Laye
 def scene_fields(
     window: FileWindow, header: SceneHeader, codebook_ids: Container[int], chunks: Sequence[FileChunk]
 ) -> SceneFields:
-    """Return the scene fields of a file, with other chunks.
+    """Return the scene fields of a file with other chunks.
 
     Args:
-        window: the file's header and index.
-        header: the same, read.
-        codebook_ids: ids of the codebooks that are used.
-        chunks: chunks in addition to the tiles.
+        window: the file.
+        header: header and index of the file.
+        codebook_ids: ids of the codebooks to keep.
+        chunks: all chunks except tiles.
     """
     head = _spec.unpack_index_head(window.view, _spec.HEADER_SIZE)
     at = _spec.HEADER_SIZE + head.head_size + head.attribute_count * head.attribute_size

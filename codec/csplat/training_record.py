@@ -1,6 +1,6 @@
-"""The record of a scene's training, as far as later comparisons with its images depend on it (spec 5.4).
+"""Record the training settings that comparisons of a scene with its images depend on (spec 5.4).
 
-The metadata may also hold one of the training cameras under `VIEW`: a viewer shows the scene from there first.
+The metadata may also contain a training camera under `VIEW`, the initial camera of a viewer.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 from csplat.errors import InputError
 
-#: Keys of the metadata for the training and the first view.
+#: Metadata keys of the training record and of the initial camera.
 TRAINING = "training"
 VIEW = "view"
 
@@ -22,14 +22,14 @@ _COLOURS = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
 
 @dataclass(frozen=True)
 class TrainingRecord:
-    """Settings of a training that a comparison of the scene with its images has to repeat.
+    """Training settings that a comparison of the scene with its images must repeat.
 
     Attributes:
-        background: red, green, blue behind the splats, 0..1.
-        test_every: every Nth image was held out, 0 for none; `None`: the data set names the test images itself.
-        size: width and height that the images were scaled to, pixels; `None`: they were not scaled.
+        background: red, green and blue of the background, 0..1.
+        test_every: N if every Nth image was held out, 0 if none; `None`: the data set specifies the test images.
+        size: width and height that the images were scaled to, pixels; `None`: not scaled.
         near: near plane of the cameras, scene units; `None`: unknown.
-        images: for COLMAP data sets, the folder of images; `None`: the reader's choice.
+        images: folder of images in a COLMAP data set; `None`: the reader's choice.
     """
 
     background: tuple[float, float, float]
@@ -40,7 +40,7 @@ class TrainingRecord:
 
     @classmethod
     def of(cls, metadata: Mapping[str, Any]) -> TrainingRecord | None:
-        """Return the record in a scene's metadata; `None` if there is none that can be understood."""
+        """Return the record in a scene's metadata, `None` if there is none or it is invalid."""
         try:
             return cls.from_json(metadata[TRAINING]) if TRAINING in metadata else None
         except InputError:
@@ -51,10 +51,10 @@ class TrainingRecord:
         """Parse the result of `as_json`, ignoring unknown members.
 
         Raises:
-            InputError: there is no background, or a member has another type or range.
+            InputError: the background is missing, or a member has the wrong type or range.
         """
         if not isinstance(record, Mapping):
-            raise InputError(f"{TRAINING} is {record!r}, wanted an object")
+            raise InputError(f"{TRAINING} is {record!r}, expected an object")
         background = _member(
             record, "background", lambda value: _are(value, 3, _is_fraction), "three numbers of 0 to 1"
         )
@@ -63,12 +63,12 @@ class TrainingRecord:
         every = _member(record, "test_every", _is_interval, "0, or a whole number above 1")
         images = _member(record, "images", _is_name, "a name")
         if background is None:
-            raise InputError(f"{TRAINING} names no background")
+            raise InputError(f"{TRAINING} has no background")
         red, green, blue = (float(value) for value in background)
         return cls((red, green, blue), every, None if size is None else (size[0], size[1]), near, images)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the JSON for the metadata, without members that are unknown."""
+        """Return the record as JSON, without unknown values."""
         record: dict[str, Any] = {"background": list(self.background)}
         for name in ("test_every", "near", "images"):
             if getattr(self, name) is not None:
@@ -76,7 +76,7 @@ class TrainingRecord:
         return record if self.size is None else {**record, "size": list(self.size)}
 
     def __str__(self) -> str:
-        """Describe the settings in words."""
+        """Return a description in words."""
         colour = _COLOURS.get(self.background) or " ".join(f"{value:g}" for value in self.background)
         words = [f"{colour} background"]
         if self.test_every is not None:
@@ -90,10 +90,10 @@ class TrainingRecord:
         return ", ".join(words)
 
 
-def _member(record: Mapping[str, Any], name: str, is_valid: Callable[[Any], bool], wanted: str) -> Any:
+def _member(record: Mapping[str, Any], name: str, is_valid: Callable[[Any], bool], expected: str) -> Any:
     value = record.get(name)
     if value is not None and not is_valid(value):
-        raise InputError(f"{name} of {TRAINING} is {value!r}, wanted {wanted}")
+        raise InputError(f"{name} of {TRAINING} is {value!r}, expected {expected}")
     return value
 
 
@@ -114,7 +114,7 @@ def _is_interval(value: Any) -> bool:
 
 
 def _is_name(value: Any) -> bool:
-    return isinstance(value, str) and value.isprintable() and value != ""  # no surrogates, no ends of lines
+    return isinstance(value, str) and value.isprintable() and value != ""  # excludes surrogates and line breaks
 
 
 def _is_count(value: Any) -> bool:

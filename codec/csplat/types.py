@@ -1,4 +1,4 @@
-"""Types that every layer shares: arrays by their dtype, and the callback of long work."""
+"""Define types that all layers share: arrays by dtype, and the progress callback."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ U64 = NDArray[np.uint64]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-"""One truth value per row."""
+"""One bool per row."""
 
 Progress = Callable[[str, float], None]
-"""Called with the name of a stage and the fraction of it that is done, 0 to 1."""
+"""Progress callback: (name of the stage, fraction done from 0 to 1)."""
 
 
 def null_progress(stage: str, done: float) -> None:
-    """Ignore progress: the default of functions that take a `Progress`."""
+    """Ignore progress."""

@@ -227,12 +227,7 @@ def read_block_head(cursor: Cursor, attribute: int, legal: tuple[int, ...] | Non
     place = at + _spec.BLOCK_HEAD_OFFSETS["coding"]
     if head.attribute != attribute:
         raise FormatError(
-            _spec.ERROR_STREAM,
-            at,
-            "CBK-5" if legal else "TLE-2",
-            "attribute",
-            found=head.attribute,
-            wanted=attribute,
+            _spec.ERROR_STREAM, at, "CBK-5" if legal else "TLE-2", "attribute", found=head.attribute, wanted=attribute
         )
     if head.coding not in _spec.CODING_NAMES:
         raise UnsupportedError(f"attribute coding {head.coding}", offset=place, clause="BLK-1")

@@ -103,12 +103,7 @@ def _read_chunk(
     ):
         if found != wanted:
             raise FormatError(
-                _spec.ERROR_INDEX,
-                at + _spec.CODEBOOK_HEAD_OFFSETS[name],
-                "CDB-1",
-                name,
-                found=found,
-                wanted=wanted,
+                _spec.ERROR_INDEX, at + _spec.CODEBOOK_HEAD_OFFSETS[name], "CDB-1", name, found=found, wanted=wanted
             )
     columns, stream_at = layer_columns(book, record.layer), cursor.at
     elements = read_stream(cursor, book.size * columns, _ENTRY_WIDTH_MAX, signed=True).reshape(columns, book.size)

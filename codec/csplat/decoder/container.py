@@ -190,7 +190,7 @@ def view_of(data: File) -> memoryview:
         return memoryview(data if read is None else read()).cast("B")  # type: ignore[arg-type]  # the except says so
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"data is a {type(data).__name__}, wanted a path, a binary file or contiguous bytes: {error}"
+            f"data is a {type(data).__name__}, expected a path, a binary file or contiguous bytes: {error}"
         ) from None
 
 

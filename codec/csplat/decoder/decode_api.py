@@ -295,7 +295,7 @@ def prepare_decode(
     degree = header.sh_degree
     if sh_degree is not None:
         if not 0 <= sh_degree <= _spec.SH_DEGREE_MAX:
-            raise InputError(f"sh_degree is {sh_degree}, wanted 0 to {_spec.SH_DEGREE_MAX}")
+            raise InputError(f"sh_degree is {sh_degree}, expected 0 to {_spec.SH_DEGREE_MAX}")
         degree = min(degree, sh_degree)
     chosen: Sequence[Tile] = header.tiles
     if tiles is not None:
@@ -428,7 +428,7 @@ def _thread_count(threads: int | None, task_count: int) -> int:
     if threads is None:
         threads = min(os.cpu_count() or 1, _THREADS_MAX)
     if threads < 1:
-        raise InputError(f"threads is {threads}, wanted 1 or more")
+        raise InputError(f"threads is {threads}, expected 1 or more")
     return max(1, min(threads, task_count))
 
 

@@ -29,12 +29,7 @@ _ZLIB_CLAUSES = {
 
 
 def read_stream(
-    cursor: Cursor,
-    count: int | None,
-    width_max: int,
-    *,
-    signed: bool = False,
-    count_max: int | None = None,
+    cursor: Cursor, count: int | None, width_max: int, *, signed: bool = False, count_max: int | None = None
 ) -> Ints:
     """Read one stream and step over it.
 

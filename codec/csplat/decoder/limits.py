@@ -32,7 +32,7 @@ class Limits:
         for name in ("splats", "bytes", "json_bytes"):
             value = getattr(self, name)
             if not isinstance(value, int) or value < 0:
-                raise InputError(f"limit {name} is {value!r}, wanted a whole number, 0 or more")
+                raise InputError(f"limit {name} is {value!r}, expected a whole number, 0 or more")
 
 
 def float_bytes(header: SceneHeader, degree: int) -> int:

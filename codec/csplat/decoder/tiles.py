@@ -280,12 +280,7 @@ def holds_indices(book: _spec.CodebookRecord, attribute: int) -> bool:
 
 
 def _indices(
-    cursor: Cursor,
-    context: TileContext,
-    attribute: int,
-    book: Codebook,
-    params: _spec.CodebookParams,
-    at: int,
+    cursor: Cursor, context: TileContext, attribute: int, book: Codebook, params: _spec.CodebookParams, at: int
 ) -> Indices:
     """Read the indices, or find those of the tile's first block of the codebook (CBK-4)."""
     name = _spec.ATTRIBUTE_NAMES[attribute]

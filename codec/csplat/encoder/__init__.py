@@ -10,14 +10,7 @@ from csplat.encoder.encode_options import PRESETS, Deflate, EncodeOptions, Means
 from csplat.encoder.encode_plan import EncodePlan, Origin
 from csplat.encoder.fixed_quantisation import DecodedValues, FixedQuantisation, FreeValues, fix_quantisation
 from csplat.encoder.kmeans import cluster
-from csplat.encoder.pipeline import (
-    EncodedTiles,
-    EncodeReport,
-    EncodeResult,
-    encode,
-    encode_tiles,
-    encode_with_report,
-)
+from csplat.encoder.pipeline import EncodedTiles, EncodeReport, EncodeResult, encode, encode_tiles, encode_with_report
 from csplat.encoder.quantisation import canonicalise_shape
 from csplat.encoder.quantisation_classes import max_class_count
 from csplat.encoder.splat_importance import GaussNewtonBlocks, Importance, apply_weight_floor

@@ -185,8 +185,7 @@ def choose_parameters(
         adaptive=_default_to(options.adaptive, preset.adaptive if importance_given else 0.0),
         tile_splats=options.tile_splats,
         deflate=DeflateSettings(
-            level=_default_to(options.deflate_level, preset.deflate_level),
-            library=deflate_library(options.deflate),
+            level=_default_to(options.deflate_level, preset.deflate_level), library=deflate_library(options.deflate)
         ),
     )
 

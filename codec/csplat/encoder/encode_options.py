@@ -63,7 +63,7 @@ class EncodeOptions:
         'small'
         >>> csplat.EncodeOptions(preset="tiny")
         Traceback (most recent call last):
-        csplat.errors.InputError: preset is 'tiny', wanted one of fast, balanced, small
+        csplat.errors.InputError: preset is 'tiny', expected one of fast, balanced, small
 
     Raises:
         InputError: a word is not one of those listed, or a number is out of range.
@@ -99,7 +99,7 @@ class EncodeOptions:
     def __post_init__(self) -> None:
         for name, words in _WORDS.items():
             if getattr(self, name) not in words:
-                raise InputError(f"{name} is {getattr(self, name)!r}, wanted one of {', '.join(words)}")
+                raise InputError(f"{name} is {getattr(self, name)!r}, expected one of {', '.join(words)}")
         for name, (kind, low, high) in _RANGES.items():
             value = getattr(self, name)
             if value is None and name not in _NEVER_NONE:
@@ -107,7 +107,7 @@ class EncodeOptions:
             number = _number(value, kind)
             if number is None or not low <= number <= high:
                 what = "an integer, " if kind is int else ""
-                raise InputError(f"{name} is {value!r}, wanted {what}{low:g} to {high:g}")
+                raise InputError(f"{name} is {value!r}, expected {what}{low:g} to {high:g}")
             object.__setattr__(self, name, number)  # JSON does not know NumPy's numbers
 
     @property

@@ -137,10 +137,10 @@ class EncodePlan:
         check_model("the encoder", model)
         options = EncodeOptions() if options is None else options
         if not isinstance(options, EncodeOptions):
-            raise InputError(f"options is {options!r}, wanted csplat.EncodeOptions(preset=...)")
+            raise InputError(f"options is {options!r}, expected csplat.EncodeOptions(preset=...)")
         origin = origin or Origin(len(model), np.arange(len(model)))
         if len(origin.source_index) != len(model):
-            raise InputError(f"an origin of {len(origin.source_index)} splats, wanted {len(model)}")
+            raise InputError(f"an origin of {len(origin.source_index)} splats, expected {len(model)}")
         model = clip_scales(model)
         if len(model) > BUCKET_SPLATS and importance is None and not options.shape_codebook_size:
             return cls._of_many(model, options, origin, progress)
@@ -263,7 +263,7 @@ def extra_records(model: SplatModel, options: EncodeOptions) -> list[_spec.Extra
         text = name.encode()
         kind = f"{column.dtype.kind}{8 * column.dtype.itemsize}"
         if kind not in ids:
-            raise InputError(f"extra column {name!r} has dtype {column.dtype}, wanted one of {', '.join(ids)}")
+            raise InputError(f"extra column {name!r} has dtype {column.dtype}, expected one of {', '.join(ids)}")
         if not 1 <= len(text) <= _spec.EXTRA_NAME_MAX or any(ord(c) < 32 or ord(c) == 127 for c in name):
             raise InputError(f"extra column {name!r}: a name has 1 to {_spec.EXTRA_NAME_MAX} bytes, no control codes")
         records.append(_spec.ExtraRecord(ids[kind], len(text), text.ljust(_spec.EXTRA_NAME_MAX, b"\0")))

@@ -47,9 +47,9 @@ class DeflateSettings:
 
     def __post_init__(self) -> None:
         if self.library not in ("libdeflate", "zlib"):
-            raise InputError(f"deflate library is {self.library!r}, wanted libdeflate or zlib")
+            raise InputError(f"deflate library is {self.library!r}, expected libdeflate or zlib")
         if not 1 <= self.level <= 12:
-            raise InputError(f"the level of DEFLATE is {self.level}, wanted 1 to 12")
+            raise InputError(f"the level of DEFLATE is {self.level}, expected 1 to 12")
 
 
 def deflate_library(wanted: str) -> str:

@@ -145,7 +145,7 @@ def measured_sums(source: SplatModel, decoded: SplatModel, source_index: NDArray
     """
     index = np.asarray(source_index)
     if index.shape != (len(decoded),):
-        raise InputError(f"source index has shape {index.shape}, wanted ({len(decoded)},)")
+        raise InputError(f"source index has shape {index.shape}, expected ({len(decoded)},)")
     if len(index) and not (int(index.min()) >= 0 and int(index.max()) < len(source)):
         raise InputError(f"source index leaves the source's {len(source)} splats")
     parts = []
@@ -171,9 +171,7 @@ def _errors_of_rows(source: SplatModel, decoded: SplatModel, rows: NDArray[Any],
         after = decoded.shN[part, span] if band <= decoded.sh_degree else zeros
         pairs[f"sh{band}"] = value_errors(np.ascontiguousarray(before), np.ascontiguousarray(after))
     return ErrorSums(
-        len(rows),
-        {name: pair[0] for name, pair in pairs.items()},
-        {name: pair[1] for name, pair in pairs.items()},
+        len(rows), {name: pair[0] for name, pair in pairs.items()}, {name: pair[1] for name, pair in pairs.items()}
     )
 
 

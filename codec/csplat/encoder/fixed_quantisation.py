@@ -273,7 +273,7 @@ def fix_quantisation(
     source = plan.model if source is None else source
     wanted = plan.origin.source_count
     if len(source) != wanted:
-        raise InputError(f"a source of {len(source)} splats, wanted {wanted}: that of the origin")
+        raise InputError(f"a source of {len(source)} splats, expected {wanted}: that of the origin")
     parameters, codebooks = plan.choose_sh_coding(progress)
     parameters = replace(parameters, canonical=True)
     rows = [quantise_and_sort(plan.model, tile, parameters).rows for tile in plan.tiles]

@@ -147,12 +147,7 @@ def rank_by_frequency(index: U32, entries: I32) -> tuple[U32, I32]:
 
 
 def search_nearest(
-    points: I16 | I32,
-    entries: I32,
-    near_groups: int = 0,
-    threads: int | None = None,
-    *,
-    other: bool = False,
+    points: I16 | I32, entries: I32, near_groups: int = 0, threads: int | None = None, *, other: bool = False
 ) -> tuple[U32, F64]:
     """Find the entry nearest to each point, and its squared distance.
 

@@ -106,7 +106,7 @@ class GaussNewtonBlocks:
             wanted = (count, _TRIANGLE) if one.name == "shapes" else (count,)
             if array.shape != wanted or array.dtype.kind != "f":
                 found = f"{array.dtype} {list(array.shape)}"
-                raise InputError(f"curvatures of {one.name} are {found}, wanted floats {list(wanted)}")
+                raise InputError(f"curvatures of {one.name} are {found}, expected floats {list(wanted)}")
             if not np.isfinite(array).all() or (one.name != "shapes" and (array < 0.0).any()):
                 raise InputError(f"curvatures of {one.name} are negative or not finite")
 
@@ -182,9 +182,9 @@ def splat_weights(model: SplatModel, importance: Floats | Importance | None) -> 
         return weights
     given = np.asarray(importance)
     if given.shape != (len(model),):
-        raise InputError(f"importance has shape {given.shape}, wanted ({len(model)},)")
+        raise InputError(f"importance has shape {given.shape}, expected ({len(model)},)")
     if given.dtype.kind not in "biuf":
-        raise InputError(f"importance has dtype {given.dtype}, wanted real numbers")
+        raise InputError(f"importance has dtype {given.dtype}, expected real numbers")
     values = given.astype(np.float64)
     if not (np.isfinite(values).all() and (values >= 0).all()):
         raise InputError("importance has negative or non-finite values")
@@ -315,7 +315,7 @@ def doubled_triangles(triangles: Floats) -> F64:
 def _checked_metric(name: str, weights: F32, found: Floats, size: int) -> ErrorMetric:
     wanted = (len(weights), size * (size + 1) // 2)
     if found.shape != wanted or found.dtype.kind != "f":
-        raise InputError(f"importance has {name} {found.dtype} {list(found.shape)}, wanted floats {list(wanted)}")
+        raise InputError(f"importance has {name} {found.dtype} {list(found.shape)}, expected floats {list(wanted)}")
     if not np.isfinite(found).all():
         raise InputError(f"importance has {name} that are not finite")
     return ErrorMetric(weights, found)
