@@ -1,10 +1,10 @@
-"""Build the documentation site: collect its pages from all over the repository, then have them laid out.
+"""Build the documentation site: collect its pages from the repository, then run MkDocs.
 
-Nothing is written twice: a page is a file of the repository, which stays where it lies, or made by a program. What is
-collected is plain Markdown, whose links lead from page to page; any generator that knows mkdocstrings can take it.
+A page is a Markdown file of the repository or generated. Links between files become links between pages, so any site
+generator that supports mkdocstrings can build the result.
 
 Usage:
-    python tools/docs/make_site.py            # into out/site; the pages as collected: out/docs
+    python tools/docs/make_site.py            # writes out/site; the collected pages are in out/docs
 """
 
 from __future__ import annotations
@@ -21,14 +21,13 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-GUIDE = "tools/docs/guide"
+FOLDERS = ("tools/docs/guide", "tools/docs/results")  # every file in them is a page
 CONFIGURATION = ROOT / "tools" / "docs" / "mkdocs.yml"
 COLLECTED, SITE = ROOT / "out" / "docs", ROOT / "out" / "site"  # as in mkdocs.yml
 
-#: Pages that are files of the repository.
+#: Pages elsewhere in the repository.
 SOURCES = {
     "index.md": "README.md",
-    "study.md": "tools/STUDY.md",
     "embedding.md": "codec/EMBEDDING.md",
     "implementers.md": "conformance/IMPLEMENTERS.md",
     "javascript.md": "codec/js/README.md",
@@ -37,7 +36,6 @@ SOURCES = {
     "conformance.md": "conformance/README.md",
     "codec-figures.md": "codec/FIGURES.md",
     "trainer-figures.md": "trainer/FIGURES.md",
-    "compression.md": "tools/COMPRESSION.md",
     "extremes.md": "codec/EXTREMES.md",
     "architecture.md": "ARCHITECTURE.md",
     "contributing.md": "CONTRIBUTING.md",
@@ -56,13 +54,13 @@ _COLUMNS = "80"
 
 
 def pages() -> dict[str, str]:
-    """All pages that are files, with the path of each in the repository."""
-    own = {path.name: f"{GUIDE}/{path.name}" for path in sorted((ROOT / GUIDE).glob("*.md"))}
+    """Return the path in the repository of each page that is a file."""
+    own = {path.name: f"{folder}/{path.name}" for folder in FOLDERS for path in sorted((ROOT / folder).glob("*.md"))}
     return own | SOURCES
 
 
 def links(text: str) -> Iterator[re.Match[str]]:
-    """The links and pictures of a Markdown text, but for those inside code."""
+    """Yield the links and images of a Markdown text, except those inside code."""
     code = [match.span() for match in re.finditer(r"(?ms)^(`{3,}).*?^\1|`[^`\n]+`", text)]
     for match in _LINK.finditer(text):
         target = match.start(3)
@@ -74,7 +72,7 @@ def target_of(source: str, link: str) -> tuple[str, str]:
     """Resolve a link in a file of the repository to a path in the repository and an anchor.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        FileNotFoundError: the file does not exist.
     """
     path, _, place = link.partition("#")
     found = posixpath.normpath(posixpath.join(posixpath.dirname(source), path)) if path else source
@@ -84,14 +82,14 @@ def target_of(source: str, link: str) -> tuple[str, str]:
 
 
 def rewritten(text: str, source: str, on_picture: Callable[[str], object] | None = None) -> str:
-    """A text with its links as the site has them.
+    """Return a text with its links replaced by those of the site.
 
-    Links to files that are no pages become plain text: the site has no address of the repository to offer.
+    Links to files that are not pages become plain text, because the site does not know the repository's address.
 
     Args:
         text: Markdown.
         source: its path in the repository.
-        on_picture: called with the path of each picture in the repository.
+        on_picture: called with the path of each image in the repository.
     """
     page_of = {path: page for page, path in pages().items()}
 
@@ -116,7 +114,7 @@ def rewritten(text: str, source: str, on_picture: Callable[[str], object] | None
 
 
 def collect(folder: Path) -> None:
-    """Write all pages, their pictures and styles into a folder, which is emptied before."""
+    """Empty a folder and write all pages, their images and the style sheet into it."""
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "pictures").mkdir(parents=True)
     pictures: set[str] = set()
@@ -131,19 +129,19 @@ def collect(folder: Path) -> None:
 
 
 def commands() -> str:
-    """The reference of the command line, as the commands print it themselves."""
+    """Return the reference of the command line, made of the commands' own help."""
     from typer.main import get_command
 
-    from csplat_tools.cli.app import app  # the commands, in their order
+    from csplat_tools.cli.app import app
 
     group: Any = get_command(app)
-    parts = ["# Commands\n\nEach as `--help-all` prints it: every option, setting and example.\n"]
+    parts = ["# Commands\n\nThe output of `--help-all` of each command.\n"]
     parts += [f"## csplat {name}\n\n```text\n{_help(name)}\n```\n" for name in group.list_commands(None)]
     return "\n".join(parts)
 
 
 def python() -> str:
-    """The reference of the Python interface: directives for mkdocstrings, which reads the docstrings."""
+    """Return the reference of the Python interface: directives for mkdocstrings, which reads the docstrings."""
     parts = ["# Python\n"]
     for package in PACKAGES:
         module = import_module(package)
@@ -159,7 +157,7 @@ def python() -> str:
 def _help(name: str) -> str:
     words = [sys.executable, "-m", "csplat_tools", name, "--help-all"]
     found = subprocess.run(words, capture_output=True, text=True, env=_environment(), check=False)
-    if found.returncode:  # a group of commands has none
+    if found.returncode:  # groups of commands lack --help-all
         words[-1] = "--help"
         found = subprocess.run(words, capture_output=True, text=True, env=_environment(), check=True)
     lines = [line.rstrip() for line in found.stdout.splitlines()]
@@ -171,10 +169,10 @@ def _environment() -> dict[str, str]:
 
 
 def for_python_markdown(text: str) -> str:
-    """Mend what GitHub takes and Python-Markdown does not.
+    """Convert GitHub's Markdown to Python-Markdown's.
 
-    A comment would have what follows it taken for HTML, a block of code may name its language alone, a list needs an
-    empty line before it.
+    Comments go, because Python-Markdown reads the lines after one as HTML. A code block keeps only the language of its
+    info string. A list gets an empty line before it.
     """
     text = _WORDS.sub(r"\1", _COMMENT.sub("", text))
     lines: list[str] = []
@@ -191,18 +189,18 @@ def for_python_markdown(text: str) -> str:
 
 
 def main() -> int:
-    """Collect the pages, run the generator; a warning of its is an error."""
+    """Collect the pages and run MkDocs; its warnings are errors."""
     collect(COLLECTED)
     words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-f", str(CONFIGURATION)]
     status = subprocess.run(words, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}, check=False).returncode
     lost = [page for page in pages() if not status and _is_cut(page)]
     for page in lost:
-        print(f"{page}: headings, tables or blocks of code are missing")
+        print(f"{page}: headings, tables or code blocks are missing on the site")
     return status or bool(lost)
 
 
 def _is_cut(page: str) -> bool:
-    """Return True if the site generator lost part of a page: Python-Markdown does not parse all that GitHub does."""
+    """Return True if headings, tables or code blocks were lost: Python-Markdown parses less than GitHub."""
     text = (COLLECTED / page).read_text("utf-8")
     html = (SITE / page).with_suffix(".html").read_text("utf-8").partition("md-content__inner")[2]
     blocks = len(re.findall(r"(?ms)^(`{3,}).*?^\1$", text))

@@ -149,7 +149,7 @@ def draw_plot(rows: Sequence[Row], spec: Mapping[str, Any], path: Path) -> None:
         spec: `x`, `y` and `series`, fields or arithmetic over them. Optional keys: `per`, a field with a panel for each
             value, `columns` panels in a row; `note`, a field whose text is shown next to a point; `styles`, colour and
             matplotlib's format by series; `labels` of series; `x_title`, `y_title`, `x_scale` (log or linear), `ticks`,
-            `size` in inches.
+            `x_limits`, `y_limits`, `size` in inches.
         path: the file, which is replaced.
     """
     from matplotlib import rc_context
@@ -199,6 +199,7 @@ def _draw_panel(axis: Any, spec: Mapping[str, Any], rows: Sequence[Row]) -> None
     if "ticks" in spec:
         axis.set_xticks(spec["ticks"], [f"{tick:g}" for tick in spec["ticks"]])
         axis.set_xticks([], minor=True)
+    axis.set(xlim=spec.get("x_limits"), ylim=spec.get("y_limits"))
     axis.grid(color="0.9", linewidth=0.6)
     axis.spines[["top", "right"]].set_visible(False)
 
