@@ -20,9 +20,16 @@ from csplat_tools.batches import batch_run
 from csplat_tools.batches.batch_page import make_batch_page
 from csplat_tools.batches.batch_run import MemoryBudget
 from csplat_tools.batches.batch_scenes import find_tasks, starting_points
-from csplat_tools.batches.batch_worker import Worker, WorkerLostError
 from csplat_tools.batches.journal import JOURNAL, Record, open_journal, read_journal
-from csplat_tools.batches.scene_job import RENDERER_BYTES, SceneFile, content_hash, estimate_job, inspect_scene
+from csplat_tools.batches.scene_job import (
+    RENDERER_BYTES,
+    SceneFile,
+    Worker,
+    WorkerLostError,
+    content_hash,
+    estimate_job,
+    inspect_scene,
+)
 from csplat_tools.cli.app import app
 
 FAST = ("encode", "--preset", "fast")

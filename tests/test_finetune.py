@@ -552,14 +552,14 @@ def capture(source, tmp_path_factory):
 def brief_fits(monkeypatch):
     """Fit the splats that are left in a quarter of the usual steps, once."""
     brief = partial(SimplifyOptions, effort=1, bands=False)
-    monkeypatch.setattr("csplat_tools.training.tuning_inputs.SimplifyOptions", brief)
+    monkeypatch.setattr("csplat_tools.training.tuning_run.SimplifyOptions", brief)
 
 
 @pytest.fixture
 def no_fits(monkeypatch):
     """Leave the splats that are left as they were: where their number is the point."""
     bare = partial(SimplifyOptions, refit=False, bands=False)
-    monkeypatch.setattr("csplat_tools.training.tuning_inputs.SimplifyOptions", bare)
+    monkeypatch.setattr("csplat_tools.training.tuning_run.SimplifyOptions", bare)
 
 
 @pytest.mark.slow
@@ -733,7 +733,7 @@ def test_a_file_is_made_larger_until_it_looks_well_enough(capture, whole, tmp_pa
     words = ("finetune", capture / "scene.ply", "--data", capture, *BRIEF)
     result = invoke(*words, "-o", tmp_path / "x.csplat", "--target-psnr", 90)
     assert (1, False) == (result.exit_code, (tmp_path / "x.csplat").exists())
-    assert "90 dB are not reached" in result.stderr
+    assert "90 dB cannot be reached" in result.stderr
 
 
 @pytest.mark.parametrize(("wanted", "size"), [(30.0, 100_000), (33.0, 400_000), (24.0, 6_250)])
@@ -748,7 +748,7 @@ def test_sizes_are_tried_until_one_is_near_enough(wanted, size):
     assert wanted <= found.psnr <= wanted + 0.1
     assert size <= found.size_bytes <= 1.05 * size
     assert len(tried) <= 4
-    with pytest.raises(InputError, match=r"31 dB are not reached: 90,000 bytes have 29\.77 dB"):
+    with pytest.raises(InputError, match=r"31 dB cannot be reached: 90,000 bytes have 29\.77 dB"):
         smallest_reaching(31.0, partial(make, most=90_000))
 
 

@@ -31,8 +31,8 @@ from csplat_conformance.protocol import run_program
 from csplat_selftest.decoder_processes import DecoderProcess
 from csplat_selftest.mutation import __main__ as mutation
 from csplat_tools.batches.batch_scenes import leads_out
-from csplat_tools.batches.batch_worker import Worker, WorkerLostError
 from csplat_tools.batches.journal import JOURNAL, Record, open_journal, read_journal
+from csplat_tools.batches.scene_job import Worker, WorkerLostError
 from csplat_trainer.training_report import peak_memory
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -24,8 +24,7 @@ pytest.importorskip("matplotlib", reason="plots want the extra [render]")
 
 from csplat_render.scene_frame import detail, sample_cloud, scene_frame
 from csplat_tools.cli.app import app
-from csplat_tools.hardest_place import HardestPlaceSearch
-from csplat_tools.html_report import Bar, draw_bars
+from csplat_tools.html_report import Bar, HardestPlaceSearch, draw_bars
 from csplat_tools.inspect.file_description import describe_file
 from csplat_tools.views import comparison_cameras, display_cameras, find_view_set
 from csplat_tools.views.view_sets import ViewSet
@@ -59,7 +58,7 @@ def page(files):
 def test_the_page_says_what_the_text_says(files, page):
     text = html.unescape(page.read_text())
     facts = describe_file(files[0].read_bytes())
-    assert "<h1>a & b.csplat</h1>" in text
+    assert "<h1>a & b.csplat: content</h1>" in text
     assert "a & b" not in page.read_text()  # names are no markup
     for name, one in facts.attributes.items():
         assert re.search(rf"<td[^>]*>{name}</td><td[^>]*>[^<]+</td><td[^>]*>{one.size_bytes:,}</td>", text)
@@ -78,7 +77,7 @@ def test_the_page_shows_the_source_beside_the_file(files, page):
     assert 4 == len(re.findall(r'<img src="data:image/webp;base64,', text))
     words = ["compare", str(files[1]), str(files[0])]
     compared = CliRunner().invoke(app, words).stdout
-    assert re.search(r"^psnr +(\S+) dB", compared, re.MULTILINE)[1] == re.search(r"([\d.]+) dB: likeness", text)[1]
+    assert re.search(r"^psnr +(\S+) dB", compared, re.MULTILINE)[1] == re.search(r"([\d.]+) dB: similarity", text)[1]
 
 
 @pytest.mark.usefixtures("small_views")
@@ -231,8 +230,7 @@ def headings(page):
 def test_a_page_about_a_training_and_its_file(file_runs):
     page = file_runs.page.read_text()
     assert [
-        "How near it comes", "What it looks like", "The training", "The tuning", "Where the bytes are",
-        "How it was made",
+        "Scores", "Renders", "Training", "Tuning", "Bytes by attribute", "Options",
     ] == headings(page)  # fmt: skip
     for scores in file_runs.report["file"]["scores"].values():
         assert f"<td>{scores['psnr_mean']:.2f}</td>" in page
@@ -246,7 +244,7 @@ def test_a_training_alone_has_a_page_and_the_scores_of_its_scene_are_those_of_co
     compared, path = tmp_path / "compared.json", tmp_path / "page.html"
     file_runs.made("a.ply", "--resume", file_runs.checkpoint, "--page", path)
     page = path.read_text()
-    assert ["How near it comes", "What it looks like", "The training", "How it was made"] == headings(page)
+    assert ["Scores", "Renders", "Training", "Options"] == headings(page)
     assert ["photograph", "trained scene"] * 2 == re.findall("<figcaption>(.*?)</figcaption>", page)
     both = (file_runs.folder / name for name in ("a.ply", "a.csplat"))
     call("compare", *both, "--data", file_runs.data, "--report", compared)

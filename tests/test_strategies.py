@@ -214,10 +214,10 @@ def test_words_for_kmeans_are_understood():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "'' is no number"),
-        ("means=many", "'many' is no number"),
-        ("xyz=3", "k-means of 'xyz': wanted some of means, quats"),
-        ("means=0", "means is 0, wanted 1 to 65536 entries"),
+        ("", "'' is not a number"),
+        ("means=many", "'many' is not a number"),
+        ("xyz=3", "k-means of 'xyz', expected some of means, quats"),
+        ("means=0", "means is 0, expected 1 to 65536 entries"),
         ("means=2.5", "means is 2.5"),
         ("70000", "means is 70000"),
         ("nan", "means is nan"),
@@ -328,14 +328,14 @@ def test_given_cameras_decide_and_one_is_not_enough(shell):
 def test_impossible_reductions_are_refused(make_model):
     model = make_model(20, 1)
     for call, message in (
-        (lambda: encode_reduced(model, Reduction(distil=True)), "nothing to distil: the scene has SH of degree 1"),
+        (lambda: encode_reduced(model, Reduction(distil=True)), "SH of degree 1: distilling requires a lower"),
         (lambda: encode_reduced(model, Reduction(prune_opacity=0.9999)), "no splat has an opacity above"),
         (lambda: Reduction(prune_opacity=1.5), "the opacity to prune by is 1.5"),
         (lambda: Reduction(sh_degree=4), "sh_degree is 4"),
         (lambda: Reduction(views=1), "1 views"),
         (lambda: Reduction(seed=-1), "seed of views is -1"),
         (lambda: KMeans({}), "of no attribute"),
-        (lambda: KMeans({"means": 4}, stages=5), "in 5 stages, wanted 1 to 4"),
+        (lambda: KMeans({"means": 4}, stages=5), "in 5 stages, expected 1 to 4"),
         (lambda: KMeans({"means": 4}, seed=-1), "seed of k-means is -1"),
     ):
         with pytest.raises(InputError, match=message):
@@ -345,7 +345,7 @@ def test_impossible_reductions_are_refused(make_model):
 @pytest.mark.slow
 def test_pruning_and_clustering_want_no_renderer():
     code = (
-        "import sys, json; import csplat_tools.study; from csplat_tools.study.attribute_codebooks import parse_kmeans;"
+        "import sys, json; from csplat_tools.study import parse_kmeans;"
         "print(json.dumps([name for name in ('numba', 'torch', 'matplotlib') if name in sys.modules]))"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)

@@ -31,13 +31,17 @@ from csplat.scene_source import drop_bands
 from csplat_render.camera_files import save_cameras
 from csplat_tools.cli.app import app
 from csplat_tools.study import Reduction
-from csplat_tools.tradeoffs.sweep_commands import reduction_command, target_command
 from csplat_tools.tradeoffs.sweep_options import USUAL, SweepOptions, parse_sweep, read_setting
 from csplat_tools.tradeoffs.sweep_points import StageClock, SweepFailure, fetched_bytes, pareto_front
-from csplat_tools.tradeoffs.sweep_run import plan_points, tradeoff
-from csplat_tools.tradeoffs.tradeoff_page import make_tradeoff_page, shown_points
-from csplat_tools.tradeoffs.tradeoff_plots import PLOTS, draw_plot, label_marks
-from csplat_tools.tradeoffs.tradeoff_tables import format_tradeoff
+from csplat_tools.tradeoffs.sweep_run import plan_points, reduction_command, target_command, tradeoff
+from csplat_tools.tradeoffs.tradeoff_report import (
+    PLOTS,
+    draw_plot,
+    format_tradeoff,
+    label_marks,
+    make_tradeoff_page,
+    shown_points,
+)
 from csplat_tools.views import DataOptions, ViewSet
 from csplat_tools.views.view_sets import pose_key
 
@@ -483,7 +487,9 @@ def test_a_scene_without_splats_is_swept(setting, make_model, monkeypatch):
     assert {99.0} == {one.psnr for one in found.measured}
     assert "0 splats" in format_tradeoff(found)
     assert "<svg" in draw_plot("size-quality", replace(found, points=found.points[:1]), inline=False)
-    monkeypatch.setattr("csplat_tools.tradeoffs.tradeoff_page.draw_plot", lambda *_, **_options: None)  # takes a second
+    monkeypatch.setattr(
+        "csplat_tools.tradeoffs.tradeoff_report.draw_plot", lambda *_, **_options: None
+    )  # takes a second
     assert make_tradeoff_page(found).startswith("<!doctype html>")
 
 
@@ -514,7 +520,7 @@ def test_memory_that_runs_out_costs_one_point(setting, monkeypatch):
 @pytest.mark.slow
 def test_nothing_is_overwritten_unless_forced(capture, tmp_path, monkeypatch):
     plots = {name: PLOTS[name] for name in ("size-quality", "attribute-bytes", "sh-layers")}  # one of each kind
-    monkeypatch.setattr("csplat_tools.tradeoffs.tradeoff_page.PLOTS", plots)
+    monkeypatch.setattr("csplat_tools.tradeoffs.tradeoff_report.PLOTS", plots)
     (tmp_path / "plots").mkdir()
     plot = tmp_path / "plots" / "size-quality.svg"
     mine = {"-o": tmp_path / "page", "--report": tmp_path / "report", "--plots": plot}
@@ -542,7 +548,7 @@ def test_nothing_is_overwritten_unless_forced(capture, tmp_path, monkeypatch):
 def test_json_alone_is_on_standard_output_and_what_it_does_on_standard_error(capture):
     result = invoke(capture / "scene.ply", *QUICK, "--cameras", capture / "cameras.json", "--json")
     assert ["attributes 36 dB", "attributes 40 dB"] == [one["name"] for one in json.loads(result.stdout)["points"]]
-    assert "2 files to make and to measure: about" in result.stderr
+    assert "2 files to make and measure: about" in result.stderr
     assert re.search(r"1/2 attributes 36 dB: [\d.]+ kB, [\d.]+ dB, [\d.]+ s\n", result.stderr)
 
 
@@ -558,7 +564,7 @@ def test_a_scene_without_splats_is_one_line(tmp_path, make_model):
     write_ply(tmp_path / "empty.ply", make_model(0))
     result = invoke(tmp_path / "empty.ply", "-o", tmp_path / "report.html")
     assert 1 == result.exit_code
-    assert "error: a scene without splats has nothing to trade (E_INPUT)\n" == result.stderr
+    assert "error: the scene has no splats (E_INPUT)\n" == result.stderr
     assert not (tmp_path / "report.html").exists()
 
 

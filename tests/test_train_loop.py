@@ -23,7 +23,7 @@ from csplat_render.rasteriser import Rasteriser
 from csplat_tools.cli.app import app
 from csplat_tools.training import tuning_run
 from csplat_tools.training.training_run import tuning_after
-from csplat_tools.training.tuning_inputs import TuningSubset
+from csplat_tools.training.tuning_run import TuningSubset
 from csplat_trainer.data import DataSet
 from csplat_trainer.engine import CpuEngine
 from csplat_trainer.initial_splats import measure_extent, place_splats

@@ -1,4 +1,7 @@
-"""Parts of the HTML reports of commands: style, script, tables, bars and plots, in one page that loads nothing else."""
+"""Parts of the HTML reports of commands: style, script, tables, bars, plots and images.
+
+A report is one page that loads nothing else; a policy in it forbids the network.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,15 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 from xml.etree import ElementTree as ET
 
+import numpy as np
+
+from csplat.types import F32, F64, U8
+from csplat_render.metrics import psnr, squared_error
 from csplat_tools.console import format_bytes
+from csplat_tools.render_files import side_by_side, to_uint8
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -123,9 +131,16 @@ for (const button of document.querySelectorAll('button.copy')) {
 """
 
 
-def document(title: str, parts: Sequence[str]) -> str:
-    """Return a whole page from the parts of its body; empty ones are left out."""
-    body = "\n".join(part for part in parts if part)
+def document(title: str, parts: Sequence[str], summary: str = "") -> str:
+    """Return a whole page.
+
+    Args:
+        title: title and heading of the page.
+        parts: HTML of its body; empty parts are left out.
+        summary: a line below the heading.
+    """
+    head = f"<h1>{escape(title)}</h1>" + (f'\n<p class="quiet">{escape(summary)}</p>' if summary else "")
+    body = "\n".join(part for part in (head, *parts) if part)
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{_policy()}">\n'
@@ -136,8 +151,30 @@ def document(title: str, parts: Sequence[str]) -> str:
     )
 
 
+def section(title: str, *parts: str) -> str:
+    """Return a heading and the parts below it; an empty string if all parts are empty."""
+    body = "\n".join(part for part in parts if part)
+    return f"<h2>{escape(title)}</h2>\n{body}" if body else ""
+
+
+def paragraph(text: str) -> str:
+    """Return a paragraph of plain text."""
+    return f"<p>{escape(text)}</p>"
+
+
+def details(summary: str, *parts: str) -> str:
+    """Return parts that a click on a summary shows."""
+    return f"<details><summary>{escape(summary)}</summary>\n{''.join(parts)}\n</details>"
+
+
+def figure(svg: str, caption: str = "") -> str:
+    """Return an inline SVG as a figure that scrolls sideways on narrow screens."""
+    text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+    return f'<figure class="plot"><div class="scroll">{svg}</div>{text}</figure>\n'
+
+
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], words: Collection[int] = ()) -> str:
-    """Return a table: names to the left, numbers to the right.
+    """Return a table: names on the left, numbers on the right.
 
     Args:
         header: titles of the columns.
@@ -147,11 +184,68 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], words: Collectio
     kinds = ["words" if place in words else "" if place else "name" for place in range(len(header))]
     marks = [f' class="{kind}"' if kind else "" for kind in kinds]
     heads = "".join(f'<th scope="col"{mark}>{escape(one)}</th>' for mark, one in zip(marks, header, strict=True))
-    cells = "\n".join(
+    cells = [
         "<tr>" + "".join(f"<td{mark}>{escape(cell)}</td>" for mark, cell in zip(marks, row, strict=True)) + "</tr>"
         for row in rows
-    )
-    return f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>\n{cells}\n</tbody></table></div>'
+    ]
+    return _table(heads, cells)
+
+
+@dataclass(frozen=True)
+class Head:
+    """The heading of a column of a `sortable_table`.
+
+    Attributes:
+        title: title of the column.
+        hint: text that appears when the mouse rests on it.
+        kind: `number` or `name`, which a click on the heading sorts; or `html`, which is not sorted.
+    """
+
+    title: str
+    hint: str = ""
+    kind: Literal["number", "name", "html"] = "number"
+
+    def html(self) -> str:
+        """Return the cell of the heading."""
+        kind = ' class="name" data-kind="text"' if self.kind == "name" else ""
+        hint = f' title="{escape(self.hint)}"' if self.hint else ""
+        title = escape(self.title)
+        return f'<th scope="col"{kind}{hint}>' + (
+            f"{title}</th>" if self.kind == "html" else f'<button type="button">{title}</button></th>'
+        )
+
+    def cell(self, content: Any) -> str:
+        """Return a cell of the column, see `sortable_table`."""
+        if self.kind == "html":
+            return f"<td>{content}</td>"
+        text, more = content
+        if self.kind == "number":
+            return f'<td data-value="{"" if more is None else f"{more:.6g}"}">{escape(text)}</td>'
+        hint = f' title="{escape(more)}"' if more else ""
+        return f'<td class="name" data-value="{escape(text)}"{hint}>{escape(text)}</td>'
+
+
+def sortable_table(heads: Sequence[Head], rows: Sequence[Sequence[Any]], marked: Collection[int] = ()) -> str:
+    """Return a table that a click on a heading sorts.
+
+    Args:
+        heads: headings of the columns.
+        rows: cells by the kind of their column. `number`: (text, value), a value of `None` comes last. `name`: (text,
+            text that appears when the mouse rests on it). `html`: HTML.
+        marked: indices of rows with another background.
+    """
+    lines = [
+        ('<tr class="front">' if place in marked else "<tr>")
+        + "".join(head.cell(content) for head, content in zip(heads, row, strict=True))
+        + "</tr>"
+        for place, row in enumerate(rows)
+    ]
+    return _table("".join(one.html() for one in heads), lines, ' class="sortable"')
+
+
+def _table(heads: str, rows: Sequence[str], kind: str = "") -> str:
+    body = "\n".join(rows)
+    return f'<div class="scroll"><table{kind}><thead><tr>{heads}</tr></thead><tbody>\n{body}\n</tbody></table></div>'
 
 
 def definitions(entries: Mapping[str, str], kind: str = "") -> str:
@@ -183,7 +277,7 @@ def _hash(text: str) -> str:
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
 
 
-# Colours that people tell apart whatever colours they see, on white and on black.
+# Colours that colour-blind readers can tell apart, on white and on black.
 _COLOURS = {
     "opacities": "#88ccee",
     "scales": "#5588bb",
@@ -201,7 +295,7 @@ _WIDTH, _ROW, _BAR = 820, 24, 17  # width of the figure, height of a row and of 
 _LETTER, _SIZE = 7.2, 13  # approximate width of a letter, and the font size, pixels
 _GAP = 10  # pixels between text and bar
 
-#: Style of an SVG that stands alone: colours of text and background by the reader's light or dark setting.
+#: Style and background of an SVG that is a file: light or dark, by the reader's setting.
 STANDALONE = (
     "<style>svg{color:#1d2126}.ground{fill:#ffffff}"
     "@media (prefers-color-scheme:dark){svg{color:#e4e8ed}.ground{fill:#14171b}}</style>"
@@ -229,8 +323,8 @@ def draw_bars(bars: Sequence[Bar], *, key: bool, inline: bool = True) -> str:
 
     Args:
         bars: the rows, at least one.
-        key: name the colours above the bars, if the labels do not.
-        inline: for a page, whose text colour is used; else with a background of its own.
+        key: write a key of the colours above the bars.
+        inline: for a page, in its text colour; else with a background of its own.
     """
     names = [name for name in _COLOURS if any(bar.parts.get(name) for bar in bars)]
     names += sorted({name for bar in bars for name in bar.parts if bar.parts[name]} - set(names))
@@ -250,12 +344,12 @@ def draw_bars(bars: Sequence[Bar], *, key: bool, inline: bool = True) -> str:
 
 
 def attribute_figure(sizes: Mapping[str, int]) -> str:
-    """Return a figure for a page with the bytes of each attribute, whose sum is the size of the file."""
+    """Return a figure with the bytes of each attribute, whose sum is the size of the file."""
     whole = sum(sizes.values())
     bars = [
         Bar(name, {name: size}, f"{format_bytes(size)}, {100.0 * size / whole:.1f} %") for name, size in sizes.items()
     ]
-    return f'<figure class="plot"><div class="scroll">{draw_bars(bars, key=False)}</div></figure>'
+    return figure(draw_bars(bars, key=False))
 
 
 def _row(bar: Bar, left: float, scale: float, top: float) -> list[str]:
@@ -274,7 +368,7 @@ def _row(bar: Bar, left: float, scale: float, top: float) -> list[str]:
 
 
 def _key(names: Sequence[str]) -> tuple[list[str], int]:
-    """Return coloured squares with their names, in as many lines as they take, and the height of these in pixels."""
+    """Return the key, coloured squares with their names, and its height in pixels."""
     parts, across, top = list[str](), 0.0, 0
     for name in names:
         width = _ROW + _LETTER * len(name) + _GAP
@@ -292,9 +386,9 @@ INK = "#123457"
 _SVG = "{http://www.w3.org/2000/svg}"
 _XLINK = "{http://www.w3.org/1999/xlink}"
 _BLACK = "#1d2126"  # colour of text for readers that do not support styles
-# `font` is no attribute of SVG; older versions of matplotlib write sizes so.
+# Older versions of matplotlib write font sizes in `font`, which is not an attribute of SVG.
 _FONT = re.compile(r"^(?:\S+\s+)*?(?P<size>[0-9.]+px)\s")
-_SETTINGS: dict[Any, Any] = {  # matplotlib's types name every key there is
+_SETTINGS: dict[Any, Any] = {  # matplotlib's types list every key
     "svg.fonttype": "none",
     "text.color": INK,
     "axes.labelcolor": INK,
@@ -334,8 +428,8 @@ def draw_svg(
         draw: called with an empty figure.
         size: width and height, inches.
         name: name of the plot: ids inside begin with it, so that several plots can share a page.
-        inline: for a page, whose text colour lines and letters take; else with an XML prologue and a background, light
-            or dark by the reader's setting.
+        inline: for a page, in its text colour; else with an XML prologue and a background, light or dark by the
+            reader's setting.
         titles: texts that appear when the mouse rests on a mark, by its id.
 
     Returns:
@@ -346,12 +440,12 @@ def draw_svg(
     from matplotlib.figure import Figure
 
     with mpl.rc_context({**_SETTINGS, "svg.hashsalt": name}):
-        figure = Figure(figsize=size, layout="constrained")
-        FigureCanvasSVG(figure)
-        draw(figure)
+        canvas = Figure(figsize=size, layout="constrained")
+        FigureCanvasSVG(canvas)
+        draw(canvas)
         buffer = io.StringIO()
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        figure.savefig(buffer, format="svg", metadata=nothing, transparent=True)
+        canvas.savefig(buffer, format="svg", metadata=nothing, transparent=True)
     root = ET.fromstring(buffer.getvalue())  # noqa: S314 -- matplotlib has just written it
     _clean(root, name, titles or {})
     if inline:
@@ -402,7 +496,7 @@ def _own_id(key: str, value: str, name: str, titles: Mapping[str, str]) -> str:
 
 
 def _as_attributes(style: str) -> dict[str, str]:
-    """Parse `fill: none; stroke: red` into attributes; the font is left to the page."""
+    """Parse `fill: none; stroke: red` into attributes, without the font family, which the page sets."""
     found: dict[str, str] = {}
     for part in style.split(";"):
         key, _, value = (piece.strip() for piece in part.partition(":"))
@@ -413,3 +507,133 @@ def _as_attributes(style: str) -> dict[str, str]:
         elif key and key != "font-family":
             found[key] = value
     return found
+
+
+_AMPLIFICATION = 10.0  # factor of the differences that are shown
+
+#: Description of the images of `piece_images`, for the page.
+IMAGES_NOTE = (
+    "The piece of a view with the largest error: its place, the source, the file, and their difference times"
+    f" {_AMPLIFICATION:g}. Images are compressed for this page; scores are not measured on them."
+)
+
+_SHARE = 4  # width and height of a view divided by those of the piece
+_SIDE = 480  # largest side of an image, pixels; larger ones would make pages of tens of megabytes
+_WEBP = {"quality": 94, "method": 4}
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePiece:
+    """A piece of a view.
+
+    Attributes:
+        view: number of the view.
+        psnr: PSNR of the piece, dB.
+        where: [h, w, 3] uint8, the whole view of the source, with a frame around the piece.
+        source, decoded, difference: [h, w, 3] uint8, the piece; the difference is amplified.
+    """
+
+    view: int
+    psnr: float
+    where: U8
+    source: U8
+    decoded: U8
+    difference: U8
+
+
+class HardestPlaceSearch:
+    """A search through views for the place where a file differs most from its source."""
+
+    def __init__(self) -> None:
+        self._error = -1.0
+        self._place: tuple[int, slice, slice, F32, F32] | None = None
+
+    def examine(self, number: int, source: F32, decoded: F32) -> None:
+        """Examine the view of this number; both renders are [H, W, 3] in 0..1."""
+        errors: F64 = np.asarray(squared_error(source, decoded).sum(axis=2), np.float64)
+        height, width = (max(1, side // _SHARE) for side in errors.shape)
+        sums = _window_sums(errors, height, width) / (height * width)
+        top, left = np.unravel_index(int(np.argmax(sums)), sums.shape)
+        if sums[top, left] > self._error:
+            self._error = float(sums[top, left])
+            rows, columns = slice(int(top), int(top) + height), slice(int(left), int(left) + width)
+            self._place = (number, rows, columns, source, decoded)
+
+    def found(self) -> ImagePiece | None:
+        """Return the piece, with images reduced to a size for a page; `None` if no view was examined."""
+        if self._place is None:
+            return None
+        number, rows, columns, source, decoded = self._place
+        a, b = source[rows, columns], decoded[rows, columns]
+        pieces = [_reduced(one) for one in np.split(side_by_side(a, b, _AMPLIFICATION), 3, axis=1)]
+        return ImagePiece(number, float(psnr(a, b)), _framed(source, rows, columns), *pieces)
+
+
+def piece_images(place: ImagePiece, name: str) -> str:
+    """Return HTML that shows a piece side by side in the source and in the file of this name."""
+    words = {
+        f"view {place.view}": place.where,
+        "source": place.source,
+        f"file, here {place.psnr:.1f} dB": place.decoded,
+        f"difference × {_AMPLIFICATION:g}": place.difference,
+    }
+    return image_row(words, name)
+
+
+def image_row(images: Mapping[str, U8], name: str) -> str:
+    """Return HTML that shows images side by side, reduced to a size for a page.
+
+    Args:
+        images: [h, w, 3] uint8, by caption.
+        name: name of the subject, for the alternative text.
+    """
+    figures = ""
+    for word, pixels in images.items():
+        small = _reduced(pixels)
+        figures += (
+            f'<figure><img src="{_data_uri(small)}" width="{small.shape[1]}" height="{small.shape[0]}"'
+            f' alt="{escape(f"{name}: {word}")}"><figcaption>{escape(word)}</figcaption></figure>'
+        )
+    return f'<div class="pictures">{figures}</div>'
+
+
+def _window_sums(values: F64, height: int, width: int) -> F64:
+    """Return the sums over all windows of this size, [H − height + 1, W − width + 1]."""
+    total = np.zeros((values.shape[0] + 1, values.shape[1] + 1))
+    np.cumsum(np.cumsum(values, axis=0), axis=1, out=total[1:, 1:])
+    sums: F64 = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
+    return sums
+
+
+def _framed(image: F32, rows: slice, columns: slice) -> U8:
+    """Return the whole view, reduced, with a frame that is visible on any background."""
+    shown = _reduced(to_uint8(image)).copy()
+    factor = shown.shape[0] / image.shape[0]
+    top, bottom, left, right = (round(factor * at) for at in (rows.start, rows.stop, columns.start, columns.stop))
+    for inset, value in ((0, 0), (1, 255), (2, 0)):
+        edge = np.zeros(shown.shape[:2], bool)
+        edge[top + inset : bottom - inset, left + inset : right - inset] = True
+        edge[top + inset + 1 : bottom - inset - 1, left + inset + 1 : right - inset - 1] = False
+        shown[edge] = value
+    return shown
+
+
+def _data_uri(pixels: U8) -> str:
+    """Return an image as a data URI for an `img` element: WebP, or PNG if pillow was built without it."""
+    from PIL import Image, features
+
+    kind, options = ("WEBP", _WEBP) if features.check("webp") else ("PNG", {})
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, kind, **options)
+    return f"data:image/{kind.lower()};base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
+def _reduced(pixels: U8) -> U8:
+    from PIL import Image
+
+    height, width = pixels.shape[:2]
+    factor = _SIDE / max(width, height)
+    if factor >= 1.0:
+        return np.ascontiguousarray(pixels)
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    return np.asarray(Image.fromarray(np.ascontiguousarray(pixels)).resize(size, Image.Resampling.LANCZOS))

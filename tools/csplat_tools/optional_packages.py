@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import os
+import platform
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
 
+import csplat
+from csplat._spec import VERSION_MAJOR, VERSION_MINOR
 from csplat.errors import missing_package
+from csplat.system import core_count
 from csplat_tools.console import note, progress_bar
 
 _SPIN_COUNT = "1000"  # see `_limit_spinning`
@@ -131,3 +138,43 @@ def _limit_spinning() -> None:
     loaded, so it is set before; a value that the user has set is kept.
     """
     os.environ.setdefault("GOMP_SPINCOUNT", _SPIN_COUNT)
+
+
+_PACKAGES = ("numpy", "numba", "scipy", "deflate", "zstandard", "matplotlib", "pillow")
+
+
+def describe_machine(threads: int | None) -> dict[str, Any]:
+    """Describe processor, cores, threads in use, system, and versions, JSON-compatible.
+
+    Args:
+        threads: number of threads in use; `None` for all.
+    """
+    cores = core_count()
+    return {
+        "processor": processor_name(),
+        "cores": cores,
+        "threads": threads or cores,
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "csplat": csplat.__version__,
+        "format": f"{VERSION_MAJOR}.{VERSION_MINOR}",
+        "packages": {name: package_version(name) for name in _PACKAGES},
+    }
+
+
+def processor_name() -> str:
+    """Return the processor's model, as far as the system reports it."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text("utf-8", "replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def package_version(name: str) -> str:
+    """Return the version of an installed package, or `absent`."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "absent"

@@ -20,9 +20,16 @@ from csplat.remote_store import is_url
 from csplat.system import available_memory_bytes, core_count
 from csplat_tools.batches.batch_page import PAGE, write_batch_page
 from csplat_tools.batches.batch_scenes import Task, find_tasks
-from csplat_tools.batches.batch_worker import Worker, WorkerLostError
 from csplat_tools.batches.journal import JOURNAL, Journal, Record, open_journal, read_journal
-from csplat_tools.batches.scene_job import RENDERER_BYTES, PlannedJob, SceneJob, plan_job, run_job
+from csplat_tools.batches.scene_job import (
+    RENDERER_BYTES,
+    PlannedJob,
+    SceneJob,
+    Worker,
+    WorkerLostError,
+    plan_job,
+    run_job,
+)
 from csplat_tools.scene_files import size_on_disk
 
 _SET_BY_BATCH = ("threads", "memory", "resume")  # options that the batch passes to a command that has them

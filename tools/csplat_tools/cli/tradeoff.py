@@ -77,8 +77,7 @@ def tradeoff(
     require_images()
     import csplat_tools
     from csplat_tools.tradeoffs.sweep_options import read_setting
-    from csplat_tools.tradeoffs.tradeoff_page import check_plots, write_plots, write_tradeoff_page
-    from csplat_tools.tradeoffs.tradeoff_tables import format_tradeoff
+    from csplat_tools.tradeoffs.tradeoff_report import check_plots, format_tradeoff, write_plots, write_tradeoff_page
 
     check_plots(plots, force=out.force)
     setting = read_setting(

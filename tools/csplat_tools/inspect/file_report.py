@@ -1,4 +1,4 @@
-"""Write the HTML report on a file: `csplat info --page`."""
+"""The HTML report on a file: `csplat info --page`."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import PurePath
 
 from csplat.decoder import DeclaredBounds, decode
 from csplat.types import Progress
+from csplat_tools import html_report as html
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import STANDARD_STREAM, write_bytes
-from csplat_tools.html_report import attribute_figure, definitions, document, table
 from csplat_tools.inspect.file_description import (
     FileDescription,
     describe_coding,
@@ -20,35 +20,35 @@ from csplat_tools.inspect.file_description import (
     format_headline,
     other_metadata,
 )
-from csplat_tools.scene_files import LoadedModel, load_model
+from csplat_tools.scene_files import load_model
 
 _ATTRIBUTES = {
     "opacities": "opacity of each splat",
     "scales": "size along its three axes",
     "quats": "rotation",
     "means": "position of its centre",
-    "sh0": "its colour, independent of the view direction",
+    "sh0": "colour, independent of the view direction",
     "sh1": "change of colour with the view direction, coarse",
     "sh2": "the same, finer",
     "sh3": "the same, finest",
-    "overhead": "header, index, frames, and metadata of the file",
+    "overhead": "header, index, frames and metadata",
 }
 _LAYERS = {
-    "geometry": "everything but view-dependent colour: a viewer shows the scene when it has arrived",
+    "geometry": "everything but view-dependent colour: a viewer shows the scene when it has this layer",
     "sh1": "first band of view-dependent colour, fetched afterwards",
     "sh2": "second band",
     "sh3": "third band",
 }
 _MEASURES = {
-    "means": "distance by which a centre has moved, in scene units",
-    "covariance": "relative change of a splat's shape: 0.01 is one per cent",
-    "opacities": "change of its alpha, 0 to 1",
-    "sh0": "its base colour; times 0.28 it is brightness, 0 to 1: 0.014 is one step of an 8-bit image",
+    "means": "distance between the centres, in scene units",
+    "covariance": "relative change of the shape: 0.01 is one per cent",
+    "opacities": "change of alpha, 0 to 1",
+    "sh0": "base colour; times 0.28 it is brightness, 0 to 1: 0.014 is one step of an 8-bit image",
     "sh1": "first band of the change of colour with the view direction",
     "sh2": "second band",
     "sh3": "third band",
 }
-_CHECK = "<code>csplat verify FILE --source SCENE</code> checks that."
+_CHECK = "<code>csplat verify FILE --source SCENE</code> checks them."
 _SCENE = {
     "axes": "directions of +x, +y and +z: Right, Left, Up, Down, Forward, Back",
     "up": "the up direction",
@@ -80,9 +80,9 @@ def write_page(
 
     Args:
         path: path of the report.
-        name: name of the file that it describes, or `-`.
-        data: the file.
-        description: the file's description of itself.
+        name: name of the described file, or `-`.
+        data: its bytes.
+        description: its description.
         source: a scene to compare it with, which requires the renderer.
         progress: progress callback of the comparison.
 
@@ -97,55 +97,38 @@ def write_page(
 
 def make_page(title: str, description: FileDescription, comparison: _SourceComparison | None = None) -> str:
     """Return the report as HTML: the same for the same file and source."""
+    parts = [_bytes(description), _layers(description), _bounds(description.declared_bounds), _scene(description)]
+    if comparison is not None:
+        measured, images = html.definitions(comparison.measurements), comparison.images
+        parts.insert(0, html.section("Comparison with the source", measured, "<h3>The hardest place</h3>", images))
     summary = f"{description.header.splat_count:,} splats; {format_headline(description)}"
-    return document(
-        f"{title}: content",
-        [
-            f'<h1>{escape(title)}</h1>\n<p class="quiet">{escape(summary)}</p>',
-            _source(comparison),
-            _bytes(description),
-            _layers(description),
-            "" if description.declared_bounds is None else _bounds(description.declared_bounds),
-            _scene(description),
-        ],
-    )
+    return html.document(f"{title}: content", parts, summary)
 
 
 def _compare(data: bytes | mmap, source: str, progress: Progress | None) -> _SourceComparison:
-    """Render file and source: from the views of `psnr` for scores, and from others to find the hardest place."""
+    """Score renders of the file on the views of `psnr`, and find the hardest place in views that show the scene."""
     from csplat_render.scorer import Scorer
-    from csplat_tools.hardest_place import IMAGES_NOTE, HardestPlaceSearch, piece_images
     from csplat_tools.views import display_cameras, find_view_set
 
     loaded, model = load_model(source), decode(data)
     views = find_view_set(loaded.model, count=0)
-    hardest, shown = HardestPlaceSearch(), display_cameras(loaded.model, views)
+    hardest, shown = html.HardestPlaceSearch(), display_cameras(loaded.model, views)
     scores = views.test_scorer(loaded.model).scores(model, progress=progress)
     showing = Scorer.of_source(loaded.model, shown, views.test_background)
     showing.scores(model, ssim=False, on_view=hardest.examine)
     place = hardest.found()
     assert place is not None
+    name = "standard input" if source == STANDARD_STREAM else PurePath(source).name
     measurements = {
-        "source": _source_text(source, loaded, len(data)),
-        "PSNR": f"{scores.psnr:.2f} dB: likeness of renders of the file and of the source, from"
-        f" {len(scores.each)} views all around; at 30 a difference is visible, at 40 hardly",
+        "source": f"{name}: {len(loaded.model):,} splats, {format_bytes(loaded.size_bytes)},"
+        f" {loaded.size_bytes / len(data):.1f} times the bytes of the file",
+        "PSNR": f"{scores.psnr:.2f} dB: similarity of renders of the file and of the source, from"
+        f" {len(scores.each)} views all around; at 30 dB a difference is visible, at 40 dB hardly",
         "worst view": f"{scores.psnr_worst:.2f} dB",
-        "SSIM": f"{scores.ssim:.4f}: likeness of structure, 1 at best",
+        "SSIM": f"{scores.ssim:.4f}: structural similarity, 1 at best",
     }
-    return _SourceComparison(measurements, f"<p>{escape(IMAGES_NOTE)}</p>\n{piece_images(place, 'the file')}")
-
-
-def _source_text(path: str, source: LoadedModel, size_bytes: int) -> str:
-    name = "standard input" if path == STANDARD_STREAM else PurePath(path).name
-    times = f"{source.size_bytes / size_bytes:.1f} times as many bytes"
-    return f"{name}: {len(source.model):,} splats, {format_bytes(source.size_bytes)}, {times}"
-
-
-def _source(comparison: _SourceComparison | None) -> str:
-    if comparison is None:
-        return ""
-    measurements = definitions(comparison.measurements)
-    return f"<h2>Compared with its source</h2>\n{measurements}\n<h3>The hardest place</h3>\n{comparison.images}"
+    images = f"{html.paragraph(html.IMAGES_NOTE)}\n{html.piece_images(place, 'the file')}"
+    return _SourceComparison(measurements, images)
 
 
 def _bytes(description: FileDescription) -> str:
@@ -158,36 +141,32 @@ def _bytes(description: FileDescription) -> str:
     overhead = ", ".join(f"{name} {number}" for name, number in description.overhead.items())
     rows.append(("overhead", _ATTRIBUTES["overhead"], f"{sizes['overhead']:,}", "", overhead))
     head = ("attribute", "meaning", "bytes", "bits per splat", "coding")
-    return f"<h2>Bytes by attribute</h2>\n{attribute_figure(sizes)}\n{table(head, rows, words=(1, 4))}"
+    return html.section("Bytes by attribute", html.attribute_figure(sizes), html.table(head, rows, words=(1, 4)))
 
 
 def _layers(description: FileDescription) -> str:
+    size = description.header.file_size
     rows = [
-        (
-            name,
-            _LAYERS.get(name, ""),
-            f"{one.size_bytes:,}",
-            f"{100.0 * one.size_bytes / description.header.file_size:.1f} %",
-        )
+        (name, _LAYERS.get(name, ""), f"{one.size_bytes:,}", f"{100.0 * one.size_bytes / size:.1f} %")
         for name, one in description.layers.items()
     ]
     head = ("layer", "content", "bytes", "share of the file")
-    return f"<h2>Layers, in order of arrival</h2>\n{table(head, rows, words=(1,))}" if rows else ""
+    return html.section("Layers, in order of arrival", html.table(head, rows, words=(1,)) if rows else "")
 
 
-def _bounds(bounds: DeclaredBounds) -> str:
+def _bounds(bounds: DeclaredBounds | None) -> str:
+    if bounds is None:
+        return ""
     text = (
         f"The file was made from a source of {bounds.source_count:,} splats of SH degree {bounds.source_sh_degree};"
-        f" {bounds.pruned_count:,} of them were pruned. For the others it declares error bounds:"
-        " no splat has more than the largest error; rms is the root of the mean square."
+        f" {bounds.pruned_count:,} of them were pruned. For the others it declares error bounds: the largest error of"
+        " any splat, and the root mean square (rms)."
     )
     if bounds.refitted:
-        text += (
-            " Some attributes were refitted to renders of the source: they have no bounds, and are checked by renders."
-        )
+        text += " Some attributes were refitted to renders of the source: they have no bounds."
     rows = [(one.measure, _MEASURES.get(one.measure, ""), f"{one.max:.4g}", f"{one.rms:.4g}") for one in bounds.records]
-    errors = table(("error of", "meaning", "largest", "rms"), rows, words=(1,)) if rows else ""
-    return f"<h2>Declared error bounds</h2>\n<p>{escape(text)} {_CHECK}</p>\n{errors}"
+    errors = html.table(("error of", "meaning", "largest", "rms"), rows, words=(1,)) if rows else ""
+    return html.section("Declared error bounds", f"<p>{escape(text)} {_CHECK}</p>", errors)
 
 
 def _scene(description: FileDescription) -> str:
@@ -198,7 +177,7 @@ def _scene(description: FileDescription) -> str:
     for title, value in (("options of the encoder", description.options), ("metadata", other_metadata(description))):
         if value:
             words[title] = json.dumps(value, sort_keys=True, ensure_ascii=False)
-    return f"<h2>The scene</h2>\n{definitions(words)}"
+    return html.section("The scene", html.definitions(words))
 
 
 def _bits(value: float | None) -> str:

@@ -1,4 +1,4 @@
-"""The points of a sweep that are requested, and the scene and views of the sweep."""
+"""Options of a sweep, and its scene and views."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from csplat_tools.console import parse_size_bytes
 from csplat_tools.scene_files import LoadedModel, load_model, read_source
 from csplat_tools.views import Colour, DataOptions, ViewSet, find_view_set
 
-#: Groups of points, in the order in which they are measured: quick ones come first.
+#: Groups of points, in the order in which they are measured: quick ones first.
 FAMILIES = ("presets", "precision", "strategies", "targets", "simplify", "finetune")
-#: Groups that are measured by default: without fine-tuning, which takes minutes for each point.
+#: Groups that are measured by default: all but fine-tuning, which takes minutes per point.
 USUAL = FAMILIES[:-1]
 
 _VALUES = {"precision": "attribute_psnr", "strategies": "opacities", "targets": "psnr", "simplify": "keep"}
@@ -67,11 +67,11 @@ class SweepOptions:
     def __post_init__(self) -> None:
         for one in self.what:
             if one not in FAMILIES:
-                raise InputError(f"{one!r} cannot be swept, wanted some of {', '.join(FAMILIES)}")
+                raise InputError(f"{one!r} cannot be swept, expected some of {', '.join(FAMILIES)}")
         if not self.what:
-            raise InputError(f"nothing is to be swept, wanted some of {', '.join(FAMILIES)}")
+            raise InputError(f"no group to sweep, expected some of {', '.join(FAMILIES)}")
         if self.preset not in PRESETS:
-            raise InputError(f"the preset is {self.preset!r}, wanted one of {', '.join(PRESETS)}")
+            raise InputError(f"the preset is {self.preset!r}, expected one of {', '.join(PRESETS)}")
         _check("the PSNR of an attribute", self.attribute_psnr, 10.0, 120.0, "dB")
         _check("a target PSNR", self.psnr, 1.0, 99.0, "dB")
         _check("a target size", self.sizes, 1, math.inf, "bytes")
@@ -79,25 +79,25 @@ class SweepOptions:
         _check("the number of entries", self.kmeans, 1, 65536, "")
         for share in self.keep:
             if not 0.0 < share <= 1.0:
-                raise InputError(f"a share of the splats is {share:g}, wanted above 0, at most 1")
+                raise InputError(f"a fraction of the splats is {share:g}, expected above 0 and at most 1")
         if not self.modes or not {*self.modes} <= {*MODES}:
-            raise InputError(f"the modes are {', '.join(map(repr, self.modes))}, wanted some of {', '.join(MODES)}")
+            raise InputError(f"the modes are {', '.join(map(repr, self.modes))}, expected some of {', '.join(MODES)}")
 
 
 def parse_sweep(text: str, **how: Any) -> SweepOptions:
     """Parse the points of a sweep from `presets,precision=36:44,targets=40:2MB`.
 
     Args:
-        text: groups, and values of some; `usual` stands for all of `USUAL`. A group without `=` has default values.
+        text: groups, and values of some; `usual` means all of `USUAL`. A group without `=` has default values.
         how: other fields of `SweepOptions`.
 
     Raises:
-        InputError: there is no such group, or a value is invalid.
+        InputError: a group is unknown, or a value is invalid.
     """
     parts = [word.strip().split("=", 1) for word in text.split(",") if word.strip()]
     words = {name: values for name, *values in parts}
     if len([name for name, *values in parts if values]) > len([name for name, values in words.items() if values]):
-        raise InputError("values of a group are given twice: put colons between them")
+        raise InputError("a group has values twice: separate them by colons")
     what = [one for name in words for one in (USUAL if name == "usual" else (name,))]
     values: dict[str, Any] = {}
     for name, listed in words.items():
@@ -105,7 +105,7 @@ def parse_sweep(text: str, **how: Any) -> SweepOptions:
             continue
         found = tuple(dict.fromkeys(one.strip() for one in listed[0].split(":") if one.strip()))
         if name not in _VALUES:
-            raise InputError(f"{name} takes no values, wanted them for {', '.join(_VALUES)}")
+            raise InputError(f"{name} takes no values; only {', '.join(_VALUES)} do")
         if name == "targets":
             values["sizes"] = tuple(parse_size_bytes(one) for one in found if not _NUMBER.fullmatch(one))
             found = tuple(one for one in found if _NUMBER.fullmatch(one))
@@ -119,7 +119,7 @@ def parse_sweep(text: str, **how: Any) -> SweepOptions:
 
 def _number(word: str) -> float:
     if not _NUMBER.fullmatch(word):
-        raise InputError(f"{word!r} is no number, wanted some with colons between them")
+        raise InputError(f"{word!r} is not a number, expected numbers separated by colons")
     return float(word)
 
 
@@ -127,20 +127,20 @@ def _check(what: str, values: tuple[float, ...], low: float, high: float, unit: 
     for value in values:
         if not low <= value <= high:
             most = f"to {high:g}" if math.isfinite(high) else "or more"
-            raise InputError(f"{what} is {value:g}, wanted {low:g} {most} {unit}".rstrip())
+            raise InputError(f"{what} is {value:g}, expected {low:g} {most} {unit}".rstrip())
 
 
 @dataclass(frozen=True, eq=False)
 class SweepSetting:
-    """A scene, and the views by which its files are chosen and scored.
+    """A scene and its views.
 
     Attributes:
-        path: path of the PLY, as it was given; `scene.ply` if none was.
+        path: path of the PLY as given by the caller; `scene.ply` for a model in memory.
         name: name of the file.
         source: its splats.
         source_bytes: its size.
-        findings: findings of lint in it.
-        views: the views; all files are scored on the same test views, by which none was chosen.
+        findings: lint findings in it.
+        views: the views; all files are scored on the same test views.
         cameras, data, background: arguments of `find_view_set` that gave the views.
         distance: computes LPIPS; `None`: LPIPS is not computed.
     """
@@ -165,12 +165,12 @@ def read_setting(
     background: Colour | None = None,
     lpips: str | None = None,
 ) -> SweepSetting:
-    """Read scene and views.
+    """Read the scene, and find its views.
 
     Args:
         scene: a model, or a file; the path `-` is standard input.
         cameras, data, background: as for `find_view_set`.
-        lpips: a file of LPIPS weights, or `auto`; LPIPS is not computed if left out.
+        lpips: a file of LPIPS weights, or `auto`; `None`: LPIPS is not computed.
 
     Raises:
         CsplatError: a file is not valid, the scene has no splats, or there are no test views.
@@ -180,10 +180,10 @@ def read_setting(
     source = load_model(scene) if isinstance(scene, (SplatModel, LoadedModel)) else read_source(scene)
     path = os.fspath(scene) if isinstance(scene, (str, os.PathLike)) else "scene.ply"
     if not len(source.model):
-        raise InputError("a scene without splats has nothing to trade")
+        raise InputError("the scene has no splats")
     views = find_view_set(source.model, cameras=cameras, data=data, background=background)
     if not views.test:
-        raise InputError(f"{views.name} has no photographs that were held out")
+        raise InputError(f"{views.name} has no test images")
     return SweepSetting(
         path, source.name, source.model, source.size_bytes, source.findings, views, cameras, data, background, distance
     )

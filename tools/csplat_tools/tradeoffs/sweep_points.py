@@ -1,4 +1,4 @@
-"""Measure the files of a sweep: bytes, quality of renders, and seconds; and find the Pareto front."""
+"""Measure the files of a sweep: bytes, quality and seconds; and find the Pareto front."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from csplat_render import Mode
 from csplat_render.camera import relative_to
 from csplat_render.metrics import Scores, ViewScore, psnr_of_mse, squared_error
 from csplat_render.scorer import Scorer, renderer
-from csplat_tools.hardest_place import HardestPlaceSearch, ImagePiece
+from csplat_tools.html_report import HardestPlaceSearch, ImagePiece
 from csplat_tools.inspect.file_description import bytes_by_attribute
 from csplat_tools.tradeoffs.sweep_options import SweepSetting
 from csplat_tools.views import display_cameras, evenly_spaced
@@ -35,7 +35,7 @@ class SweepFile:
     Attributes:
         data: the bytes of the file.
         settings: settings with which it was made, JSON-compatible.
-        stages: seconds by stage; empty if they are not known.
+        stages: seconds by stage; empty if unknown.
     """
 
     data: bytes
@@ -49,7 +49,7 @@ class ModeTime:
 
     Attributes:
         milliseconds: time of a render, median over views.
-        psnr: PSNR against the source's renders of mode `standard`, pooled over the views that were timed, dB.
+        psnr: PSNR against the source's renders in mode `standard`, pooled over the timed views, dB.
     """
 
     milliseconds: float
@@ -62,13 +62,13 @@ class ModeTime:
 
 @dataclass(frozen=True)
 class PartialFetch:
-    """A file whose SH layers above a degree are not fetched.
+    """Results for a file whose SH layers above a degree are not fetched.
 
     Attributes:
         sh_degree: the highest band that is fetched.
         size_bytes: bytes of header, index, and the layers up to this band with their codebooks.
         quality: scores against the source's renders.
-        decode_seconds: time of decoding, median of some runs.
+        decode_seconds: time of decoding, median of `DECODE_RUNS`.
         render_milliseconds: time of a render in mode `standard`, median over views.
     """
 
@@ -109,11 +109,11 @@ class SweepFailure:
 
 @dataclass(frozen=True, eq=False)
 class SweepPoint:
-    """One way of storing the scene, measured.
+    """A measured file.
 
     Attributes:
         name: unique among the points.
-        family: the group that it belongs to.
+        family: its group, one of `FAMILIES`.
         command: the command that makes the same file.
         settings: settings with which the file was made, JSON-compatible.
         size_bytes: size of the file.
@@ -121,11 +121,11 @@ class SweepPoint:
         splats, sh_degree: number of splats and SH degree of the file.
         source_splats, source_bytes: number of splats of the scene, and size of its PLY.
         quality: scores against the source's renders.
-        image_scores: scores against held-out photographs, if there are any.
+        image_scores: scores against test images; `None` without images.
         encode_seconds: time from the splats to the bytes.
-        stages: seconds of its stages, as far as known.
-        decode_seconds: time from the bytes to the splats, median of some runs.
-        modes: times of the renderer's modes, by name.
+        stages: seconds by stage, as far as known.
+        decode_seconds: time from the bytes to the splats, median of `DECODE_RUNS`.
+        modes: render times by mode.
         attribute_bytes: bytes by attribute, and everything else as `overhead`.
         first_picture_bytes: bytes of header, index, and everything but the SH bands.
         partial: results with fewer SH layers, if they were measured.
@@ -160,7 +160,7 @@ class SweepPoint:
 
     @property
     def bytes_per_source_splat(self) -> float | None:
-        """Bytes of the file divided by the number of splats of the source; `None` if it has none."""
+        """Bytes of the file per splat of the source; `None` if the source has no splats."""
         return self.size_bytes / self.source_splats if self.source_splats else None
 
     @property
@@ -170,7 +170,7 @@ class SweepPoint:
 
     @property
     def image_psnr(self) -> float | None:
-        """PSNR pooled over held-out photographs, dB; `None` without photographs."""
+        """PSNR pooled over test images, dB; `None` without images."""
         return None if self.image_scores is None else self.image_scores.psnr
 
     def as_json(self) -> dict[str, Any]:
@@ -202,11 +202,11 @@ class SweepPoint:
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Return the indices of the points that no other one beats.
+    """Return the indices of the points that no other point dominates.
 
     Args:
-        points: (size, quality) each: a point beats another one if it is neither larger nor worse, and better in one of
-            the two. Of equal points only the first is returned.
+        points: (size, quality) each. A point dominates another one if it is neither larger nor worse, and better in
+            one of the two. Of equal points only the first is returned.
 
     Returns:
         Indices, the smallest size first.
@@ -220,7 +220,7 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
-#: Number of runs of decoding, which takes milliseconds: the median is reported.
+#: Number of timed runs of decoding, which takes milliseconds: the median is reported.
 DECODE_RUNS = 3
 #: Largest number of views from which rendering is timed.
 TIMED_VIEWS = 8
@@ -228,11 +228,11 @@ TIMED_VIEWS = 8
 
 @dataclass
 class StageClock:
-    """Seconds between the calls of a progress callback, by the name of the stage; calls come from any thread.
+    """Seconds by stage, measured between the calls of a progress callback, which come from any thread.
 
     Attributes:
-        clock: returns the seconds that have passed.
-        seconds: by stage.
+        clock: returns seconds.
+        seconds: seconds by stage.
     """
 
     clock: Callable[[], float] = time.perf_counter
@@ -243,7 +243,7 @@ class StageClock:
         self._last = self.clock()
 
     def listening(self, report: Progress) -> Progress:
-        """Return a callback that passes calls on, and records their times. Time before a stage's 0 is not counted."""
+        """Return a callback that records times and forwards calls. Time before a stage's 0 is not counted."""
 
         def relay(stage: str, done: float) -> None:
             with self._lock:
@@ -258,15 +258,13 @@ class StageClock:
 
 @dataclass(frozen=True, eq=False)
 class PlannedPoint:
-    """A way of storing the scene.
+    """A point that has not been measured yet.
 
     Attributes:
-        name: unique name.
-        family: one of `FAMILIES`.
-        command: command line that makes the same file.
+        name, family, command: as in `SweepPoint`.
         make: makes the file; called with a progress callback.
         is_partial: measure it with fewer SH layers, too.
-        cost: kind of point in the estimates of time; `None`: that of the family.
+        cost: kind of point in the estimates of time; `None`: the family.
     """
 
     name: str
@@ -278,7 +276,7 @@ class PlannedPoint:
 
 
 class Measurer:
-    """Measures files of one scene, all on the same test views. Owns the renders of the source.
+    """Measures files of one scene on its test views. Owns the renders of the source.
 
     Args:
         setting: the scene and its views.
@@ -286,8 +284,8 @@ class Measurer:
         threads: number of threads; `None` for all.
 
     Attributes:
-        source_modes: times of rendering the source, by mode.
-        source_image_scores: the source's scores against photographs, if there are any.
+        source_modes: render times of the source, by mode.
+        source_image_scores: the source's scores against images; `None` without images.
     """
 
     def __init__(self, setting: SweepSetting, modes: Sequence[Mode], threads: int | None) -> None:
@@ -360,7 +358,7 @@ class Measurer:
         )
 
     def _decoded(self, data: bytes, sh_degree: int | None) -> tuple[SplatModel, float]:
-        """Decode the file, and return the scene and the median of the seconds; the first run is included."""
+        """Decode the file, and return the scene and the median time in seconds; the first run is included."""
         seconds, models = [], list[SplatModel]()
         for _ in range(DECODE_RUNS):
             start = time.perf_counter()
@@ -369,7 +367,7 @@ class Measurer:
         return models[0], statistics.median(seconds)
 
     def _compared(self, decoded: SplatModel, hardest: HardestPlaceSearch | None) -> tuple[Scores, Scores | None]:
-        """Score against the source's renders; LPIPS and photographs are used only with a `HardestPlaceSearch`."""
+        """Score against the source's renders; with a `HardestPlaceSearch`, also by LPIPS and against images."""
         distance = None if hardest is None else self._setting.distance
         each = list[ViewScore]()
 
@@ -394,12 +392,12 @@ class Measurer:
         return Scores.of(each)
 
     def _mode_time(self, model: SplatModel, mode: Mode) -> ModeTime:
-        """Time the renders of a model, after one that is not timed because it allocates."""
+        """Measure the renders of a model from the timed views."""
         shift = np.subtract(model.origin, self._setting.source.origin)
         views = [(relative_to(shift, camera), reference) for camera, reference in self._timed]
         draw = renderer(model, self._scorer.background, mode=mode, threads=self._threads)
-        if mode != "exact":  # a render takes seconds, and buffers are not kept from one to the next
-            draw(views[0][0])
+        if mode != "exact":  # `exact` takes seconds per render, and keeps no buffers
+            draw(views[0][0])  # not timed: allocates buffers
         seconds, error, count = [], 0.0, 0
         for camera, reference in views:
             start = time.perf_counter()
@@ -411,17 +409,17 @@ class Measurer:
 
 
 def fetched_bytes(header: SceneHeader, sh_degree: int) -> int:
-    """Return the bytes that a decoder needs for a scene with the SH bands up to a degree.
+    """Return the bytes that a viewer fetches for the SH bands up to a degree.
 
     Args:
         header: header and index of the file.
-        sh_degree: the highest band; 0 for the first picture of a viewer.
+        sh_degree: the highest band; 0 for the first render.
 
     Returns:
-        Bytes of header, index, the layers of all tiles up to this band and the codebooks that they need. Chunks of the
-        whole file, such as declared errors and options, are not fetched, nor are extra columns.
+        Bytes of header, index, the layers of all tiles up to this band and their codebooks. Chunks of the whole file,
+        such as declared error bounds and options, are not fetched, nor are extra columns.
     """
-    layers = {id_ for id_ in _spec.LAYER_NAMES if id_ <= sh_degree}  # layer d holds band d, layer 0 everything before
+    layers = {id_ for id_ in _spec.LAYER_NAMES if id_ <= sh_degree}  # layer d holds band d, layer 0 everything else
     tiles = sum(layer.size for tile in header.tiles for id_, layer in tile.layers.items() if id_ in layers)
     codebooks = sum(
         chunk.size for chunk in header.directory if chunk.type == _spec.CHUNK_CODEBOOK and chunk.layer in layers

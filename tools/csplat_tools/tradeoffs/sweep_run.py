@@ -1,10 +1,17 @@
-"""Run a sweep point by point; a point that fails does not stop the others."""
+"""Plan and run a sweep, point by point; a point that fails does not stop the others.
+
+Each point has the command that makes its file again, for readers to paste into a shell.
+"""
 
 from __future__ import annotations
 
+import json
+import re
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import PurePath
 from typing import Any
 
 from csplat.encoder import PRESETS, EncodeOptions, EncodeResult, encode_with_report
@@ -15,11 +22,10 @@ from csplat.types import Progress, null_progress
 from csplat_render.kernels import thread_count
 from csplat_render.metrics import Scores
 from csplat_tools.console import format_bytes, format_estimate
+from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.optimise.target_encoding import encode_to
-from csplat_tools.optional_packages import require_renderer
+from csplat_tools.optional_packages import describe_machine, require_renderer
 from csplat_tools.study import Reduction, encode_reduced, parse_kmeans
-from csplat_tools.tradeoffs.machine import describe_machine
-from csplat_tools.tradeoffs.sweep_commands import encode_command, finetune_command, reduction_command, target_command
 from csplat_tools.tradeoffs.sweep_options import SweepOptions, SweepSetting, read_setting
 from csplat_tools.tradeoffs.sweep_points import (
     DECODE_RUNS,
@@ -44,8 +50,8 @@ from csplat_tools.views import Colour, DataOptions, ViewSet, find_view_set
 from csplat_tools.views.view_sets import pose_key
 from csplat_trainer.tuning import FinetuneOptions
 
-# Seconds by kind of point, on two cores: a fixed part (scores, and for presets those with fewer bands); per million
-# splats; and per second that eight renders of the source take. Only for the estimate that is shown to the user.
+# Seconds by kind of point, measured on two cores: a fixed part (scores, and for presets those with fewer bands); per
+# million splats; and per second that eight renders of the source take. Used only for the estimate shown to the user.
 _COSTS = {
     "presets": (3.6, 12.0, 10.0),
     "precision": (1.2, 12.0, 4.0),
@@ -66,8 +72,8 @@ class Tradeoff:
         setting: the scene and its views.
         sweep: the options of the sweep.
         points: all points, measured or failed, in the order of the sweep.
-        source_modes: times of rendering the source, by mode of the renderer.
-        source_image_scores: the source's scores against photographs, if there are any.
+        source_modes: render times of the source, by mode of the renderer.
+        source_image_scores: the source's scores against images; `None` without images.
         machine: processor, system, versions.
     """
 
@@ -90,13 +96,13 @@ class Tradeoff:
 
     @property
     def front(self) -> list[SweepPoint]:
-        """The points that no other one beats in size and `psnr`, the smallest file first."""
+        """The points on the Pareto front of size and `psnr`, the smallest file first."""
         measured = self.measured
         return [measured[place] for place in pareto_front([(one.size_bytes, one.psnr) for one in measured])]
 
     @property
     def image_front(self) -> list[SweepPoint]:
-        """The points that no other one beats in size and PSNR against photographs; empty without photographs."""
+        """The points on the Pareto front of size and PSNR against images; empty without images."""
         known = [one for one in self.measured if one.image_psnr is not None]
         return [known[at] for at in pareto_front([(one.size_bytes, one.image_psnr or 0.0) for one in known])]
 
@@ -143,16 +149,13 @@ def tradeoff(
     """Make and measure all files of a sweep, as `csplat tradeoff` does. Takes minutes, and requires the render extra.
 
     Args:
-        scene: a model, or a file; or the `SweepSetting` of an earlier sweep, instead of this and all other inputs.
+        scene: a model, or a file; or the `SweepSetting` of an earlier sweep, which replaces all inputs but `sweep`.
         sweep: the points to measure; `None`: presets, precision, strategies, targets and simplification.
-        cameras, data, background: views by which files are chosen and scored, as for `find_view_set`; given by name,
-            so that the report can contain the command for each file.
-        lpips: a file of LPIPS weights, or `auto`; LPIPS is not computed if left out.
-        say: called with a line on the expected time, and with one for each file when it is measured.
-        progress: called with the stage and the fraction of it that is done, 0 to 1.
-
-    Returns:
-        All points, measured or failed; those on the Pareto front; and everything as JSON (`as_json`).
+        cameras, data, background: the views, as for `find_view_set`; paths, so that the report can contain the command
+            for each file.
+        lpips: a file of LPIPS weights, or `auto`; `None`: LPIPS is not computed.
+        say: called with a line on the expected time, and with one for each file that was measured.
+        progress: progress callback.
 
     Examples:
         >>> import csplat_tools
@@ -160,7 +163,7 @@ def tradeoff(
         >>> [(point.name, point.size_bytes, point.psnr) for point in found.front]  # doctest: +SKIP
 
     Raises:
-        InputError: there is nothing to sweep, or not one point could be measured.
+        InputError: the sweep has no points, or none of them could be measured.
         CsplatError: a file is not valid.
         OSError: a file cannot be read.
     """
@@ -176,9 +179,9 @@ def tradeoff(
         measurer = Measurer(setting, sweep.modes, sweep.threads)
         tried = plan_points(setting, sweep)
         if not tried:
-            raise InputError("nothing to sweep: what is asked for has no values")
+            raise InputError("nothing to sweep: the groups have no values")
         costs = [estimated_seconds(one.cost or one.family, setting, sweep, measurer.source_modes) for one in tried]
-        show(f"{counted(len(tried), 'file')} to make and to measure: about {format_estimate(sum(costs))} here")
+        show(f"{counted(len(tried), 'file')} to make and measure: about {format_estimate(sum(costs))} here")
         points = list[SweepPoint | SweepFailure]()
         for number, candidate in enumerate(tried):
             report("the sweep", sum(costs[:number]) / sum(costs))
@@ -192,7 +195,7 @@ def tradeoff(
 
 
 def estimated_seconds(kind: str, setting: SweepSetting, sweep: SweepOptions, modes: dict[str, ModeTime]) -> float:
-    """Estimate the seconds that a point of a kind takes, by the number of splats and the time of a render."""
+    """Estimate the seconds for a point of a kind from the number of splats and the time of a render."""
     each, by_splats, by_renders = _COSTS[kind]
     milliseconds = next((one.milliseconds for name, one in modes.items() if name != "exact"), 100.0)
     steps = sweep.iterations / SweepOptions.iterations if kind == "finetune" else 1.0
@@ -209,18 +212,17 @@ def _measured(measurer: Measurer, candidate: PlannedPoint, progress: Progress) -
 
 
 def _line(point: SweepPoint | SweepFailure, number: int, count: int) -> str:
-    """Return a line on a point that has just been measured."""
     if isinstance(point, SweepFailure):
         return f"{number}/{count} {point.name}: {point.error}"
     size, seconds = format_bytes(point.size_bytes), f"{point.encode_seconds:.1f} s"
     return f"{number}/{count} {point.name}: {size}, {point.psnr:.2f} dB, {seconds}"
 
 
-_MOST_DISTILLED = 2  # number of SH degrees that are distilled, 0 and 1: each takes as long as a simplification
+_MOST_DISTILLED = 2  # SH degrees that are distilled, 0 and 1: each takes as long as a simplification
 
 
 def plan_points(setting: SweepSetting, sweep: SweepOptions) -> list[PlannedPoint]:
-    """List the candidates, quick ones first."""
+    """Return the points of a sweep, quick ones first."""
     makers = {
         "presets": _presets,
         "precision": _precisions,
@@ -249,7 +251,7 @@ def _precisions(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedP
 
 
 def _strategies(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
-    """Yield candidates that reduce bands, splats and values by simple rules; those that need renders come last."""
+    """Yield the points of `csplat_tools.study`, and plain SH degrees; those that need renders come last."""
 
     def strategy(name: str, reduction: Reduction, cost: str = "strategies") -> PlannedPoint:
         how = replace(reduction, threads=sweep.threads)
@@ -293,7 +295,7 @@ def _simplified(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedP
 
 
 def _tuned(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
-    one_keep = sweep.keep[len(sweep.keep) // 2 :][:1]  # the middle one alone: each takes minutes
+    one_keep = sweep.keep[len(sweep.keep) // 2 :][:1]  # only the middle one: each takes minutes
     for keep in (None, *one_keep):
         name = "tuned" if keep is None else f"tuned, keep {keep:g}"
         command = finetune_command(setting, name, sweep, keep)
@@ -343,13 +345,113 @@ def _tune(setting: SweepSetting, sweep: SweepOptions, keep: float | None, progre
 
 
 def _tuning_views(setting: SweepSetting) -> ViewSet:
-    """Return the views of `csplat finetune`: all photographs that are not test views, or more virtual views."""
+    """Return the views of `csplat finetune`: all images that are not test views, or more virtual views."""
     views = setting.views
-    if views.images:  # which are in memory already
-        judging = {pose_key(camera) for camera in views.test}
-        training = [one.camera for one in views.images if pose_key(one.camera) not in judging]
+    if views.images:
+        test = {pose_key(camera) for camera in views.test}
+        training = [one.camera for one in views.images if pose_key(one.camera) not in test]
         return replace(views, training=training, validation=())
     return find_view_set(
         setting.source, cameras=setting.cameras, background=setting.background, count=VIEWS, size=VIEW_SIZE,
         validation_count=default_validation_count(VIEWS, cameras=setting.cameras, data=None),
     )  # fmt: skip
+
+
+_IMPORTS = "from pathlib import Path; from csplat import EncodeOptions, read_ply; from csplat_tools.study import"
+
+
+def file_name(setting: SweepSetting, name: str) -> str:
+    """Return the file name of a point: `scene-target-40-dB.csplat`."""
+    stem = "scene" if setting.path == STANDARD_STREAM else PurePath(setting.path).stem
+    return f"{stem}-{re.sub(r'[^A-Za-z0-9.]+', '-', name)}.csplat"
+
+
+def encode_command(setting: SweepSetting, name: str, preset: str, **options: Any) -> str:
+    """Return the `csplat encode` command for a file that does not depend on views."""
+    return _csplat_command("encode", setting, name, "--preset", preset, *_option_words(options))
+
+
+def target_command(setting: SweepSetting, name: str, preset: str, **options: Any) -> str:
+    """Return the `csplat encode` command for a file that depends on views."""
+    return _csplat_command("encode", setting, name, *_option_words(options), "--preset", preset, *_view_words(setting))
+
+
+def finetune_command(setting: SweepSetting, name: str, sweep: SweepOptions, keep: float | None) -> str:
+    """Return the `csplat finetune` command for a file."""
+    options = {"keep": keep, "iterations": None if sweep.iterations == SweepOptions.iterations else sweep.iterations}
+    words = [*([] if setting.views.images else ["--self"]), *_option_words(options), "--preset", sweep.preset]
+    return _csplat_command("finetune", setting, name, *words, *_view_words(setting))
+
+
+def reduction_command(setting: SweepSetting, name: str, preset: str, reduction: Reduction) -> str:
+    """Return a Python command for a file of `csplat_tools.study`, which has no csplat command."""
+    names, before, others, views = ["Reduction", "encode_reduced"], "", [], ""
+    if reduction.prune_opacity is not None:
+        others.append(f"prune_opacity={reduction.prune_opacity!r}")
+    if reduction.sh_degree is not None:
+        others.append(f"sh_degree={reduction.sh_degree}")
+    if reduction.kmeans is not None:
+        names.append("parse_kmeans")
+        sizes = ",".join(f"{attribute}={size:g}" for attribute, size in reduction.kmeans.sizes.items())
+        one = set(reduction.kmeans.sizes.values())
+        others.append(f"kmeans=parse_kmeans({_literal(f'{one.pop():g}' if len(one) == 1 else sizes)})")
+    if reduction.distil:
+        others.append("distil=True")
+        before = "from csplat_tools.views import DataOptions, find_view_set; "
+        views = f", views=find_view_set(scene{_view_arguments(setting)})"
+    source = "/dev/stdin" if setting.path == STANDARD_STREAM else setting.path
+    arguments = f"scene, Reduction({', '.join(others)}), EncodeOptions(preset={_literal(preset)}){views}"
+    program = (
+        f"{_IMPORTS} {', '.join(names)}; {before}scene = read_ply({_literal(source)}); "
+        f"made = encode_reduced({arguments}); "
+        f"Path({_literal(file_name(setting, name))}).write_bytes(made.data)"
+    )
+    return f"python -c {shlex.quote(program)}"
+
+
+def _csplat_command(command: str, setting: SweepSetting, name: str, *words: str) -> str:
+    return shlex.join(["csplat", command, setting.path, file_name(setting, name), *words])
+
+
+def _option_words(values: dict[str, Any]) -> list[str]:
+    given = {name: value for name, value in values.items() if value is not None}
+    return [word for name, value in given.items() for word in (f"--{name.replace('_', '-')}", _number_text(value))]
+
+
+def _number_text(value: Any) -> str:
+    """Return a number in its short form if that is exact, else in full."""
+    short = str(value) if isinstance(value, int) else f"{value:g}"
+    return short if float(short) == value else repr(value)
+
+
+def _view_words(setting: SweepSetting) -> list[str]:
+    """Return the options that select the views of the sweep."""
+    words, data = list[str](), setting.data
+    if setting.cameras is not None:
+        words += ["--cameras", setting.cameras]
+    if data is not None:
+        words += ["--data", data.path]
+        words += ["--size", f"{data.size[0]}x{data.size[1]}"] if data.size else []
+        words += ["--images", data.images] if data.images else []
+        words += ["--test-every", str(data.test_every)] if data.test_every else []
+    if setting.background is not None:
+        words += ["--background", ",".join(repr(one) for one in setting.background)]
+    return words
+
+
+def _view_arguments(setting: SweepSetting) -> str:
+    """Return the views of the sweep as arguments of `find_view_set`."""
+    words, data = list[str](), setting.data
+    if setting.cameras is not None:
+        words.append(f"cameras={_literal(setting.cameras)}")
+    if data is not None:
+        images = None if data.images is None else _literal(data.images)
+        words.append(f"data=DataOptions({_literal(data.path)}, {data.size}, {images}, {data.test_every})")
+    if setting.background is not None:
+        words.append(f"background={setting.background}")
+    return "".join(f", {word}" for word in words)
+
+
+def _literal(value: str) -> str:
+    """Return a string literal of Python, in double quotation marks."""
+    return json.dumps(value, ensure_ascii=False)

@@ -1,4 +1,4 @@
-"""Train a scene from a data set, and write a PLY, or a file tuned to the same photographs: `csplat train`."""
+"""Train a scene from a data set, and write a PLY, or a file tuned to the same images: `csplat train`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from csplat_tools.console import note, step_progress
 from csplat_tools.file_streams import write_model
 from csplat_tools.optional_packages import prepare_renderer
 from csplat_tools.scene_files import MetadataOverrides
-from csplat_tools.training.training_page import show_views, write_training_page
+from csplat_tools.training.tuning_report import show_views, write_training_page
 from csplat_tools.training.tuning_run import RATE_WEIGHT, default_validation_count, run_finetuning
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.data import DataSet, load
@@ -27,7 +27,7 @@ from csplat_trainer.training_report import TrainingStep, plot_loss
 from csplat_trainer.tuning import FinetuneOptions
 
 _TUNING = 1 / 6  # steps of the tuning that follows a training, as a fraction of the training's steps
-_BRIEF = 4_000  # training steps up to which a tuning uses full learning rates: after longer training they gain nothing
+_BRIEF = 4_000  # training steps up to which the tuning uses full learning rates; later they gain nothing
 
 
 def run_training(
@@ -42,24 +42,24 @@ def run_training(
     threads: int | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Read a data set, train, write the scene.
+    """Read a data set, train, and write the scene.
 
     Args:
-        data: the data set; every eighth image is held out if it does not specify test images.
+        data: the data set; every eighth image is a test image if it does not specify any.
         output: the PLY to write, or `-`.
         options: options of the training.
         files: files that are written and read during training.
-        overrides: overrides of the metadata that the set provides.
+        overrides: overrides of the data set's metadata.
         plot: a PNG to write with the loss over the steps.
         page: an HTML report to write.
         threads: number of threads; `None` for all.
         quiet: print nothing.
 
     Returns:
-        Options, losses and figures, JSON-compatible.
+        The log: options, losses and scores, JSON-compatible.
 
     Raises:
-        InputError: a package or the data set is missing, or does not suit the options.
+        InputError: a package is missing, or the data set is invalid or does not fit the options.
         OSError: a file cannot be read or written.
     """
     result = _trained(data, options, files, plot=plot, threads=threads, quiet=quiet)
@@ -69,7 +69,8 @@ def run_training(
         views = find_view_set(model, data=data, validation_count=0)
         write_training_page(page, output, result.log, None, show_views(model, {"trained scene": model}, views, threads))
     if not quiet:
-        note(f"{output} says how to compare it with its photographs: {TrainingRecord.of(result.model.metadata)}")
+        record = TrainingRecord.of(result.model.metadata)
+        note(f"the metadata of {output} contain the options for comparing it with its images: {record}")
     return result.log
 
 
@@ -88,27 +89,27 @@ def run_training_to_file(
     page: str | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Read a data set, train, and tune a file to the same photographs; the trained scene itself is not written.
+    """Read a data set, train, and tune a file to the same images; the trained scene itself is not written.
 
     Args:
         data, options, overrides, plot, page, quiet: as for `run_training`.
         output: the `.csplat` file to write, or `-`.
-        files: as for `run_training`; checkpoints of the tuning are next to those of the training
-            (`tuning_checkpoint`), and a run goes on from them if the training had ended.
+        files: as for `run_training`. Checkpoints of the tuning are next to those of the training
+            (`tuning_checkpoint`); a run resumes from them if the training had ended.
         encoding: options of the encoder; its number of threads applies to everything.
         tuning: options of the tuning.
         size_bytes: largest size of the file.
         psnr: as for `run_finetuning`.
 
     Returns:
-        `training`, as `run_training` returns it, and `file`, as `run_finetuning` does.
+        `training`, the log of `run_training`, and `file`, the report of `run_finetuning`.
 
     Raises:
         InputError: as for both.
         OSError: a file cannot be read or written.
     """
-    further = _tuning_outputs(files, options)
-    for one in _loaded(data).val:  # finds a damaged image before training; they are not kept
+    tuning_files = _tuning_outputs(files, options)
+    for one in _loaded(data).val:  # training does not read these; finds damaged ones before it
         _ = one.pixels, one.mask
     result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (overrides or MetadataOverrides()).apply(result.model)
@@ -117,21 +118,21 @@ def run_training_to_file(
     if result.metrics is not None and options.eval_views == 0 and options.device == "cpu":
         known = {"source": {**result.metrics, "lpips": None}}
     report = run_finetuning(
-        model, views, output, encoding, tuning, further, size_bytes=size_bytes, psnr=psnr, known=known, page=page,
+        model, views, output, encoding, tuning, tuning_files, size_bytes=size_bytes, psnr=psnr, known=known, page=page,
         training=result.log, quiet=quiet,
     )  # fmt: skip
     return {"training": result.log, "file": report}
 
 
 def tuning_after(training: TrainOptions, byte_cost: float | None = None) -> FinetuneOptions:
-    """Return the options of the tuning after a training: the longer it was, the more and the smaller steps.
+    """Return the options of the tuning after a training: the longer the training, the more and smaller steps.
 
     Args:
         training: options of the training.
-        byte_cost: lambda, the rate weight: loss per bit and splat; `None`: the default.
+        byte_cost: lambda, loss per bit and splat; `None`: the default.
 
     Raises:
-        InputError: the weight is out of its range.
+        InputError: lambda is out of range.
     """
     usual = FinetuneOptions(seed=training.seed, byte_cost=RATE_WEIGHT[False] if byte_cost is None else byte_cost)
     tuning = usual.scaled(min(1.0, _BRIEF / training.iterations))
@@ -140,23 +141,23 @@ def tuning_after(training: TrainOptions, byte_cost: float | None = None) -> Fine
 
 
 def tuning_checkpoint(path: str | Path) -> Path:
-    """Return the path of the tuning's checkpoint from that of the training's: run.tuning.npz for run.npz."""
+    """Return the path of the tuning's checkpoint: run.tuning.npz for a training with run.npz."""
     return Path(f"{str(path).removesuffix('.npz')}.tuning.npz")
 
 
 def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
     """Return the checkpoints of the tuning.
 
-    The tuning resumes from its own checkpoint if the run resumes from the one that it writes, and the training had
-    ended. A run that writes no checkpoint, or to another path, makes another file of the same training.
+    The tuning resumes from its own checkpoint if the training had ended, and the run writes the checkpoint that it
+    resumes from. Otherwise the run makes another file from the same training.
     """
     checkpoint = None if files.checkpoint is None else tuning_checkpoint(files.checkpoint)
-    tuned = Outputs(checkpoint, files.checkpoint_every)
+    outputs = Outputs(checkpoint, files.checkpoint_every)
     if files.resume is None or checkpoint is None or not checkpoint.exists():
-        return tuned
-    same = Path(str(files.checkpoint)).resolve() == Path(files.resume).resolve()
-    ended = load_checkpoint(files.resume).iteration >= options.iterations
-    return replace(tuned, resume=checkpoint) if same and ended else tuned
+        return outputs
+    is_same = Path(str(files.checkpoint)).resolve() == Path(files.resume).resolve()
+    has_ended = load_checkpoint(files.resume).iteration >= options.iterations
+    return replace(outputs, resume=checkpoint) if is_same and has_ended else outputs
 
 
 def _trained(
@@ -167,7 +168,7 @@ def _trained(
     data_set = _loaded(data)
     for line in () if quiet else data_set.report:
         note(line)
-    data_set.read()  # finds a damaged image before kernels are compiled
+    data_set.read()  # before kernels are compiled, to find damaged images early
     with thread_count(threads):
         if options.device == "cpu":
             prepare_renderer(quiet=quiet, gradients=True)
@@ -181,16 +182,15 @@ def _trained(
 
 
 def _loaded(data: DataOptions) -> DataSet:
-    """Load the data set; every eighth image is held out if neither the user nor the set specifies test images."""
     every = 8 if data.test_every is None else data.test_every
     return load(data.path, data.size, images=data.images, test_every=every, near=data.near)
 
 
 def _check_inputs(options: TrainOptions, files: Outputs) -> None:
-    """Check the small inputs, before the data set is read and kernels are compiled, which takes long.
+    """Check small inputs before the data set is read and kernels are compiled, which takes long.
 
     Raises:
-        InputError: weights, checkpoint or torch are absent or damaged, or the path of early renders is not a folder.
+        InputError: weights, checkpoint or torch are missing or damaged, or the path of previews is not a folder.
     """
     if options.lpips_weight > 0.0:
         PerceptualLoss(load_lpips(files.lpips_weights))
@@ -212,8 +212,7 @@ def _state(now: TrainingStep) -> str:
 def _summary(log: dict[str, Any], metrics: dict[str, Any] | None) -> str:
     text = f"{counted(log['splat_count'], 'splat')} after {counted(len(log['losses']), 'step')}, {log['seconds']:.1f} s"
     if metrics is None:
-        return text + "; no test pictures"
-    text += f"; {counted(metrics['views'], 'test picture')}: PSNR {metrics['psnr']:.2f} dB pooled,"
-    text += f" {metrics['psnr_mean']:.2f} mean"
-    text += f", SSIM {metrics['ssim']:.4f}"
+        return text + "; no test images"
+    text += f"; {counted(metrics['views'], 'test image')}: PSNR {metrics['psnr']:.2f} dB pooled,"
+    text += f" {metrics['psnr_mean']:.2f} mean, SSIM {metrics['ssim']:.4f}"
     return text + (f", LPIPS {metrics['lpips']:.4f}" if metrics["lpips"] is not None else "")

@@ -1,28 +1,44 @@
-"""Build the report on a tuned file: sizes, scores of source and decoded file on test views, times, bytes."""
+"""Reports on a training and on a tuned file: JSON, text, and the HTML page of `csplat train` and `finetune`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from html import escape
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from csplat.decoder import read_header
 from csplat.encoder import EncodeResult
 from csplat.errors import counted
 from csplat.model import SplatModel
+from csplat.types import U8
 from csplat_render.metrics import Distance
+from csplat_tools import html_report as html
 from csplat_tools.console import format_bytes, format_table
+from csplat_tools.file_streams import write_bytes
+from csplat_tools.html_report import INK, draw_svg
 from csplat_tools.inspect.file_description import bytes_by_attribute
+from csplat_tools.render_files import to_uint8
 from csplat_tools.scene_files import ply_splat_bytes
-from csplat_tools.views import ViewSet
+from csplat_tools.views import ViewSet, evenly_spaced
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 #: Scores that are reported, with their number of digits after the decimal point.
 SCORES = {"psnr": 2, "psnr_mean": 2, "ssim": 4, "lpips": 4}
 
+_TEST_IMAGES = "held-out photographs"
+
 
 @dataclass(frozen=True)
 class ModelScores:
-    """Scores on test views, which were used neither for training nor for validation.
+    """Scores of several models on the test views.
 
     Attributes:
         reference: kind of the reference images, in words.
@@ -49,10 +65,10 @@ def score_models(
     Args:
         source: the scene.
         models: models by name; the source itself is left out if its renders are the reference.
-        views: the views, of which test views are used.
+        views: the views; only test views are used.
         lpips: computes LPIPS; `None`: it is not computed.
         threads: number of threads; `None` for all.
-        known: scores by name of models that were scored against the same images before.
+        known: scores of models that were scored against the same images before, by name.
 
     Returns:
         The scores; `None` without test views.
@@ -68,7 +84,7 @@ def score_models(
         elif has_images or model is not source:
             found = scorer.scores(model, lpips=lpips)
             scores[name] = {score: getattr(found, score) for score in SCORES}
-    reference = "held-out photographs" if has_images else "renders of the source"
+    reference = _TEST_IMAGES if has_images else "renders of the source"
     return ModelScores(reference, len(views.test), scores)
 
 
@@ -109,7 +125,7 @@ def make_tuning_report(
         "test_reference": None if test is None else test.reference,
         "test_view_count": 0 if test is None else test.view_count,
         "scores": {} if test is None else {name: dict(one) for name, one in test.scores.items()},
-        "decoded_is_what_was_tuned": True,  # otherwise the run would have ended with an error
+        "decoded_is_what_was_tuned": True,  # `finetune` raises an error otherwise
         "validation": {
             "views": log["validation_views"],
             "held_out": log["held_out"],
@@ -130,8 +146,8 @@ def format_tuning_report(report: Mapping[str, Any]) -> str:
     """Return the report as text."""
     unseen = report["unseen"]
     others = report["source_splats"] - report["splats"] - unseen
-    words = [f"{unseen} that no view shows"] * bool(unseen) + [f"{others} that pictures need least"] * bool(others)
-    left_out = f" ({' and '.join(words)} are left out)" if words else ""
+    words = [f"{unseen} that no view shows"] * bool(unseen) + [f"{others} of low importance"] * bool(others)
+    left_out = f" ({' and '.join(words)} pruned)" if words else ""
     size = f"{format_bytes(report['size_bytes'])}, {report['bytes_per_source_splat']:.2f} bytes per source splat"
     ratio = f"{report['ratio']:.1f} times smaller than a PLY of {ply_splat_bytes(report['sh_degree'])} bytes per splat"
     lines = [f"{counted(report['source_splats'], 'splat')}{left_out}: {size}, {ratio}"]
@@ -142,18 +158,194 @@ def format_tuning_report(report: Mapping[str, Any]) -> str:
     rows_bytes = [(name, size, f"{size / report['source_splats']:.2f}") for name, size in parts]
     lines += ["", format_table(("bytes", "all", "per source splat"), rows_bytes)]
     times = ", ".join(f"{name} {seconds:.1f}" for name, seconds in report["seconds"].items())
-    stop = ", and nothing was gained any more" if report["converged"] else ""
-    lines += [
-        "",
-        f"{counted(report['steps'], 'step')}{stop}; the best stood at {report['best_step']}; seconds: {times}",
-    ]
+    stop = " until convergence" if report["converged"] else ""
+    lines += ["", f"{counted(report['steps'], 'step')}{stop}; best step {report['best_step']}; seconds: {times}"]
     return "\n".join(lines)
 
 
 def score_rows(scores: Mapping[str, Mapping[str, float | None]]) -> list[tuple[str, ...]]:
-    """Return the rows of a table of scores, one per model, with a dash for scores that were not measured."""
+    """Return a table row per model, with a dash for scores that were not measured."""
 
     def cell(value: float | None, digits: int) -> str:
         return "-" if value is None else f"{value:.{digits}f}"
 
     return [(name, *(cell(one[score], digits) for score, digits in SCORES.items())) for name, one in scores.items()]
+
+
+_SHOWN_VIEWS = 3  # number of test views on the page
+_WIDE, _HIGH = 7.0, 3.4  # width and height of a plot, inches
+_LINE, _OTHER = "#2f83c9", "#d55e00"
+
+
+@dataclass(frozen=True, eq=False)
+class ShownView:
+    """Images of a test view.
+
+    Attributes:
+        name: name of its image, or number of the view.
+        images: [H, W, 3] uint8 each, by caption.
+    """
+
+    name: str
+    images: Mapping[str, U8]
+
+
+def show_views(
+    source: SplatModel, models: Mapping[str, SplatModel], views: ViewSet, threads: int | None
+) -> list[ShownView]:
+    """Render a few test views, evenly spread, and return the renders next to the reference images.
+
+    Args:
+        source: the scene, whose renders are the reference if the views have no images.
+        models: models to render, by caption.
+        views: the views.
+        threads: number of threads; `None` for all.
+    """
+    if not views.test:
+        return []
+    places = evenly_spaced(range(len(views.test)), _SHOWN_VIEWS)
+    views = replace(views, test=[views.test[place] for place in places])
+    scorer = views.image_test_scorer(threads=threads) if views.images else views.test_scorer(source, threads=threads)
+    reference = "photograph" if views.images else "the source"
+    rows: list[dict[str, U8]] = [{} for _ in places]
+    for name, model in models.items():
+        if model is source and not views.images:
+            continue  # it is the reference itself
+
+        def add(at: int, image: NDArray[np.float32], render: NDArray[np.float32], name: str = name) -> None:
+            rows[at].setdefault(reference, to_uint8(image))
+            rows[at][name] = to_uint8(render)
+
+        scorer.scores(model, ssim=False, on_view=add)
+    names = [camera.image or f"view {place}" for place, camera in zip(places, scorer.cameras, strict=True)]
+    return [ShownView(name, row) for name, row in zip(names, rows, strict=True)]
+
+
+def write_training_page(
+    path: str, name: str, training: Mapping[str, Any] | None, file: Mapping[str, Any] | None, shown: Sequence[ShownView]
+) -> None:
+    """Write the page; arguments as for `make_training_page`.
+
+    Raises:
+        OSError: the page cannot be written.
+    """
+    write_bytes(path, make_training_page(PurePath(name).name, training, file, shown).encode())
+
+
+def make_training_page(
+    title: str, training: Mapping[str, Any] | None, file: Mapping[str, Any] | None, shown: Sequence[ShownView]
+) -> str:
+    """Return the page as HTML.
+
+    Args:
+        title: name of the scene or file.
+        training: log of the training; `None` without one.
+        file: report on the tuned file, with its log; `None` without one.
+        shown: images of test views.
+    """
+    sizes = {} if file is None else {**file["bytes_by_attribute"], "overhead": file["overhead_bytes"]}
+    parts = [
+        _scores(training, file),
+        _images(shown),
+        _training_plot(training),
+        _tuning_plot(file),
+        html.section("Bytes by attribute", html.attribute_figure(sizes)) if sizes else "",
+        html.section("Options", html.definitions(_options(training, file))),
+    ]
+    return html.document(title, parts, _summary(training, file))
+
+
+def _summary(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> str:
+    words = []
+    if file is not None:
+        words += [counted(file["splats"], "splat"), format_bytes(file["size_bytes"])]
+        words.append(f"{file['ratio']:.1f} times smaller than the PLY")
+    elif training is not None:
+        words.append(counted(training["splat_count"], "splat"))
+    seconds = training["seconds"] if training else 0.0
+    if file is not None:
+        tuning = file["seconds"]["tuning"]
+        seconds += file["seconds_without_judging"] - tuning + max(tuning, file["log"]["seconds"])  # if it was resumed
+    return "; ".join([*words, f"{seconds / 60:.1f} minutes"])
+
+
+def _scores(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> str:
+    if file is not None and file["scores"]:
+        scores, views, by = file["scores"], file["test_view_count"], file["test_reference"]
+    elif training is not None and training["metrics"]:
+        scores, views, by = {"trained scene": training["metrics"]}, training["metrics"]["views"], _TEST_IMAGES
+    else:
+        return ""
+    text = (
+        f"Measured on {views} {by}, which had no part in the training. psnr is pooled over all pixels, dB; psnr_mean"
+        " is the mean over the views, as in papers; ssim is 1 at best, lpips 0."
+    )
+    return html.section("Scores", html.paragraph(text), html.table(("", *SCORES), score_rows(scores)))
+
+
+def _images(shown: Sequence[ShownView]) -> str:
+    blocks = [f"<h3>{escape(one.name)}</h3>\n{html.image_row(one.images, one.name)}" for one in shown]
+    text = "Test views, evenly spread. Images are compressed for this page."
+    return html.section("Renders", html.paragraph(text), *blocks) if blocks else ""
+
+
+def _training_plot(training: Mapping[str, Any] | None) -> str:
+    if training is None or len(training["entries"]) < 2:
+        return ""
+    entries, tests = training["entries"], training["evaluations"]
+
+    def draw(canvas: Figure) -> None:
+        axes = canvas.add_subplot()
+        steps = [one["iteration"] for one in entries]
+        axes.plot(steps, [one["psnr"] for one in entries], color=_LINE, label="training images")
+        if tests:
+            at, found = [one["iteration"] for one in tests], [one["psnr"] for one in tests]
+            axes.plot(at, found, "o", color=_OTHER, label="test images")
+        axes.set(xlabel="step", ylabel="PSNR, dB")
+        axes.legend(loc="lower right")
+        right = axes.twinx()
+        right.plot(steps, [one["splat_count"] for one in entries], ":", color=INK)
+        right.set_ylabel("splats (dotted)")
+        right.set_ylim(bottom=0)
+        right.grid(visible=False)
+
+    small = training["options"]["half_size"]
+    note = html.paragraph(f"The first {small:.0%} of the steps used images of half the size.") if small else ""
+    return html.section("Training", note, html.figure(draw_svg(draw, (_WIDE, _HIGH), "training", inline=True)))
+
+
+def _tuning_plot(file: Mapping[str, Any] | None) -> str:
+    validations = [] if file is None else file["log"]["validations"]
+    if len(validations) < 2:
+        return ""
+
+    def draw(canvas: Figure) -> None:
+        axes = canvas.add_subplot()
+        steps = [one["iteration"] for one in validations]
+        axes.plot(steps, [one["psnr"] for one in validations], "o-", color=_LINE, markersize=3)
+        axes.set(xlabel="step", ylabel="PSNR on validation views, dB")
+        right = axes.twinx()
+        right.plot(steps, [one["size_bytes"] / 1e6 for one in validations], ":", color=INK)
+        right.set_ylabel("MB of the file (dotted)")
+        right.grid(visible=False)
+
+    text = "Values are optimised through the encoder's quantisers; the step with the best loss was kept."
+    plot = html.figure(draw_svg(draw, (_WIDE, _HIGH), "tuning", inline=True))
+    return html.section("Tuning", html.paragraph(text), plot)
+
+
+def _options(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> dict[str, str]:
+    words = {}
+    if training is not None:
+        words["training"] = _joined(training["options"])
+    if file is not None:
+        words |= {"encoding": _joined(file["encoding"]), "tuning": _joined(file["log"]["options"])}
+        words["seconds"] = _joined(file["seconds"])
+    memory = (file["log"] if file else training or {}).get("peak_memory_bytes")
+    if memory is not None:
+        words["peak memory"] = format_bytes(memory)
+    return words
+
+
+def _joined(options: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in options.items() if isinstance(value, str | int | float))

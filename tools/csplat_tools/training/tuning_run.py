@@ -1,72 +1,87 @@
-"""Encode a scene and tune the file to look like photographs or the scene, as `csplat finetune` does."""
+"""Encode a scene, and tune the file to images or to renders of the scene, as `csplat finetune` does."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 import csplat_trainer
 from csplat.decoder import decode
-from csplat.encoder import PRESETS, EncodeOptions, EncodePlan, Origin, encode_tiles
+from csplat.encoder import PRESETS, EncodeOptions, EncodePlan, Importance, Origin, encode_tiles
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import Progress
+from csplat.types import I64, Progress
+from csplat_render import Camera
 from csplat_render.kernels import thread_count
 from csplat_render.metrics import Distance
+from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.console import format_bytes, note, progress_bar, step_progress
 from csplat_tools.file_streams import write_array, write_bytes
+from csplat_tools.importance_file import read_importance
+from csplat_tools.optimise.pruning import simplify
+from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.optimise.rate_distortion import BYTES_PER_DB
+from csplat_tools.optimise.scene_sensitivity import measure_views
 from csplat_tools.optional_packages import prepare_renderer
-from csplat_tools.training.training_page import show_views, write_training_page
-from csplat_tools.training.tuning_inputs import TuningSubset, choose_splats, training_views
-from csplat_tools.training.tuning_report import make_tuning_report, score_models
-from csplat_tools.views import ViewSet
+from csplat_tools.training.tuning_report import make_tuning_report, score_models, show_views, write_training_page
+from csplat_tools.views import VIEW_COUNT, ViewSet, with_validation_views
+from csplat_trainer.sensitivity import Sensitivity
+from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.training_options import Outputs
-from csplat_trainer.tuning import FinetuneOptions, StageTimer, TunedFile, TuningStep
+from csplat_trainer.tuning import (
+    FinetuneOptions,
+    StageTimer,
+    TunedFile,
+    TuningStep,
+    TuningView,
+    TuningViews,
+    renders_of,
+    split_views,
+)
 
-#: Factor of the learning rates; True: the scene's own renders are the reference instead of photographs. Those can be
-#: matched almost exactly: what long steps lose of that, short ones take long to regain.
+#: Factor of the learning rates, by whether the reference are the scene's own renders. Those can be matched almost
+#: exactly, and large steps lose quality that small ones are slow to regain.
 LEARNING_FACTOR = {False: 1.0, True: 0.03}
-#: Default of lambda, the rate weight: loss per bit and splat. It is smaller for the scene's own renders, whose loss is
+#: Default of lambda, loss per bit and splat, by whether the reference are the scene's own renders. Their loss is
 #: smaller.
 RATE_WEIGHT = {False: 1e-4, True: 2e-5}
-#: Entries of the codebook of shapes, which clustering by sensitivities and tuning make good use of; `encode`, which has
-#: neither, makes no such codebook by default.
+#: Entries of the codebook of shapes. It pays with clustering by sensitivities and tuning; `encode` has neither, and
+#: makes no such codebook by default.
 SHAPE_ENTRIES = 4096
-#: Bytes per splat of a tuned file, measured with all bands and the preset small: more splats of 8 bytes look worse.
+#: Bytes per splat of a tuned file, measured with all bands and preset small. More splats of 8 bytes look worse.
 SPLAT_BYTES = 10
-#: Number of virtual training views without photographs, and their size: more and larger than for other commands.
+#: Number and size of virtual training views, used without images: more and larger than for other commands.
 VIEWS, VIEW_SIZE = 480, (320, 240)
 
-_WITHIN = 1.02  # factor by which a draft may be too large: the rate weight saves that before renders get worse
-_FINE_ENOUGH = 1.03  # factor by which a draft may be too small: finer steps are not worth the time
-_TRIES = 3  # largest number of splat counts, each predicted from the last file; of steps; of tunings
-_FIXED = 1.2  # power of a factor of bytes that gives the factor of splats: some bytes do not depend on splats
+_WITHIN = 1.02  # factor by which a draft may be too large: the tuning saves this much without loss of quality
+_FINE_ENOUGH = 1.03  # factor by which a draft may be too small: finer steps would gain little
+_TRIES = 3  # splat counts to try, each predicted from the last file; also quantisation steps, and tunings
+_FIXED = 1.2  # exponent from a factor of bytes to a factor of splats: some bytes do not depend on splats
 _FEWER = 1.08  # divisor of the number of splats if a tuned file is too large
-_ENTRIES_DOUBLE = 6.0  # dB of all attributes at which twice the entries of an SH codebook pay
-_BYTE_ENTRIES, _MOST_ENTRIES, _SPLATS_PER_ENTRY = (
-    255,
-    1 << 15,
-    3,
-)  # codebooks of more entries grow; up to this; least splats per entry
-_FINEST = 70.0  # dB of an attribute at which renders are as good as the scene's
+_ENTRIES_DOUBLE = 6.0  # dB of attribute PSNR at which twice the entries of an SH codebook pay
+_BYTE_ENTRIES = 255  # SH codebooks of more entries grow with precision
+_MOST_ENTRIES, _SPLATS_PER_ENTRY = 1 << 15, 3  # limits of their growth: entries; least splats per entry
+_FINEST = 70.0  # dB of attribute PSNR at which renders equal the scene's
 
-_PER_DOUBLING = 1.25  # dB that twice the bytes bring, about, if there is only one file
-_SLOPE_RANGE = (0.3, 12.0)  # range of this slope if it is taken from two files, dB per doubling
-_NEAR_ENOUGH = 0.1  # dB above the target that are near enough
+_PER_DOUBLING = 1.25  # assumed gain in dB per doubling of the size, with only one file
+_SLOPE_RANGE = (0.3, 12.0)  # range of the same if measured on two files
+_NEAR_ENOUGH = 0.1  # dB above the target at which the search ends
 _SIZE_TRIES, _FARTHEST = 5, 2.0  # files after the first; largest change of size from the nearest file, in doublings
 
-_VALIDATION_EVERY = 8  # one in this many renders is held out for validation
-_MOST_VALIDATION = 16  # largest number of them
+_VALIDATION_EVERY = 8  # every Nth virtual view is a validation view
+_MOST_VALIDATION = 16  # validation views, at most
 
 
 def default_validation_count(count: int, *, cameras: str | None, data: object | None) -> int | None:
-    """Return the default number of validation views, as `validation_count` for `find_view_set`.
+    """Return the default `validation_count` of `find_view_set` for a tuning.
 
-    With photographs it is 0, as `training_views` takes some training views; of few virtual views it is few.
+    With images it is 0, since `training_views` splits the training views.
 
     Args:
         count: number of virtual training views.
@@ -101,24 +116,24 @@ def run_finetuning(
 
     Args:
         source: the scene.
-        views: views that the file is to match.
+        views: the views; the file is tuned to training views and scored on test views.
         output: the file to write, or `-`.
         encoding: options of the encoder.
         options: options of the tuning.
         files: checkpoints.
         size_bytes: as for `choose_and_finetune`.
-        psnr: a target instead of a size: PSNR on the validation views, pooled, dB. Of several files that are made, the
-            smallest that reaches it is written, and there are no checkpoints.
+        psnr: a target instead of a size: PSNR on the validation views, pooled, dB. Several files are made without
+            checkpoints, and the smallest that reaches the target is written.
         keep, prune_unseen, importance: as for `choose_splats`.
-        source_index: a .npy file to write: for each splat of the file, its index in the scene.
+        source_index: a .npy file to write: the index in the scene of each splat of the file.
         lpips: computes LPIPS; `None`: it is not computed.
         known: as for `score_models`.
         page: an HTML report to write.
-        training: log of the training before, for the report.
+        training: log of the preceding training, for the report.
         quiet: print only errors.
 
     Returns:
-        The report, JSON-compatible; under `log` options, losses and the results of each validation.
+        The report, JSON-compatible; `log` has options, losses and the results of each validation.
 
     Raises:
         CsplatError: an option or a file is not usable.
@@ -194,16 +209,16 @@ def choose_and_finetune(
 
     Args:
         source: the scene.
-        views: views that the file is to match.
+        views: the views; the file is tuned to training views.
         encoding: options of the encoder.
         options: options of the tuning.
-        size_bytes: largest size of the file: splats are kept as far as they fit in, and the tuning meets it.
+        size_bytes: largest size of the file; splats are pruned and lambda is raised until it fits.
         files: checkpoints.
         keep, prune_unseen, importance: as for `choose_splats`; with `size_bytes`, `keep` is an upper bound.
         progress, on_step: as for `csplat_trainer.finetune`.
 
     Raises:
-        InputError: no file of the scene is small enough.
+        InputError: no file is small enough.
         CsplatError: as for `choose_splats` and `csplat_trainer.finetune`.
     """
     timer = StageTimer()
@@ -233,14 +248,14 @@ def choose_and_finetune(
         tries -= 1
         if not tries:
             raise InputError(f"the smallest file has {len(made.data):,} bytes, more than {size_bytes:,}")
-        outputs = replace(outputs, resume=None)  # that checkpoint belongs to a tuning of more splats
+        outputs = replace(outputs, resume=None)  # the checkpoint is of a tuning of more splats
         share = (size_bytes / len(made.data)) ** 2 / _FEWER
         with timer.stage("choosing"):
             chosen = choose(max(1, int(share * len(chosen.model))) / len(source))
 
 
 def _tune_to_psnr(psnr: float, make: Callable[..., TunedSubset], *, quiet: bool) -> TunedSubset:
-    """Make files until one reaches a PSNR; the seconds are those of all of them."""
+    """Make files until one reaches a PSNR, and return it with the seconds of all."""
     timer = StageTimer()
 
     def made(size_bytes: int | None) -> TunedSubset:
@@ -261,10 +276,10 @@ def _fit_to_size(
     choose: Callable[[int], TuningSubset],
     progress: Progress | None,
 ) -> tuple[TuningSubset, EncodeOptions]:
-    """Return splats and options of a file that the tuning can bring to a size: fewer splats, or finer steps."""
+    """Return the splats and options of a draft close to a size: fewer splats, or finer steps."""
 
     def size_factor(encoding: EncodeOptions) -> tuple[float, dict[str, Any]]:
-        """Return the factor from the size of a draft to the size allowed, and the options that the encoder chose."""
+        """Return the allowed size divided by that of a draft, and the options that the encoder chose."""
         plan = EncodePlan.of(
             chosen.model, encoding, importance=chosen.importance, allow_classes=False, progress=progress
         )
@@ -310,7 +325,7 @@ def _state(now: TuningStep) -> str:
 
 
 class SizedFile(Protocol):
-    """A file that was made."""
+    """A file with its size and quality."""
 
     @property
     def size_bytes(self) -> int:
@@ -327,13 +342,13 @@ T = TypeVar("T", bound=SizedFile)
 
 
 def smallest_reaching(psnr: float, make: Callable[[int | None], T]) -> T:
-    """Make files until one is near enough above a PSNR, and return the smallest that reaches it.
+    """Make files until one is just above a PSNR, and return the smallest that reaches it.
 
-    Between two files, PSNR is taken to be linear in the logarithm of the size.
+    Between two files, PSNR is assumed to be linear in the logarithm of the size.
 
     Args:
         psnr: target PSNR, dB.
-        make: makes a file of at most a number of bytes; called first with `None`, for any size.
+        make: makes a file of at most this number of bytes; called first with `None`, for no limit.
 
     Raises:
         InputError: none of the files reaches the PSNR.
@@ -343,7 +358,7 @@ def smallest_reaching(psnr: float, make: Callable[[int | None], T]) -> T:
         if psnr <= tried[-1].psnr <= psnr + _NEAR_ENOUGH:
             break
         size = _next_size(psnr + 0.5 * _NEAR_ENOUGH, tried)
-        if size <= least:  # no file can be that small: halfway to the smallest file
+        if size <= least:  # known to fail: halfway to the smallest file instead
             size = math.sqrt(least * min(one.size_bytes for one in tried))
         try:
             tried.append(make(max(1, round(size))))
@@ -355,12 +370,12 @@ def smallest_reaching(psnr: float, make: Callable[[int | None], T]) -> T:
     enough = [one for one in tried if one.psnr >= psnr]
     if not enough:
         best = max(tried, key=lambda one: one.psnr)
-        raise InputError(f"{psnr:g} dB are not reached: {best.size_bytes:,} bytes have {best.psnr:.2f} dB")
+        raise InputError(f"{psnr:g} dB cannot be reached: {best.size_bytes:,} bytes have {best.psnr:.2f} dB")
     return min(enough, key=lambda one: one.size_bytes)
 
 
 def _next_size(psnr: float, tried: list[T]) -> float:
-    """Return the size at which a PSNR is expected, from the two files nearest to it, on either side if possible."""
+    """Predict the size for a PSNR from the two files nearest to it, one on either side if possible."""
     near = sorted(tried, key=lambda one: abs(one.psnr - psnr))
     near[1:] = sorted(near[1:], key=lambda one: (one.psnr < psnr) == (near[0].psnr < psnr))
     octave = math.log2(near[0].size_bytes)
@@ -369,3 +384,119 @@ def _next_size(psnr: float, tried: list[T]) -> float:
         slope = (near[1].psnr - near[0].psnr) / (math.log2(near[1].size_bytes) - octave)
     by = (psnr - near[0].psnr) / min(max(slope, _SLOPE_RANGE[0]), _SLOPE_RANGE[1])
     return float(2.0 ** (octave + min(max(by, -_FARTHEST), _FARTHEST)))
+
+
+@dataclass(frozen=True, eq=False)
+class TuningSubset:
+    """The splats to encode and tune.
+
+    Attributes:
+        model: the splats; refitted if others were pruned.
+        rows: [N] int64, their indices in the source, ascending.
+        importance: their importance.
+        pruning: report on the pruned splats, JSON-compatible.
+    """
+
+    model: SplatModel
+    rows: I64
+    importance: NDArray[Any] | Importance
+    pruning: Mapping[str, Any] = field(default_factory=dict)
+
+
+def training_views(source: SplatModel, views: ViewSet, threads: int | None) -> TuningViews:
+    """Return training and validation views with their images, or renders of the scene if there are none.
+
+    Without validation views, some training views become validation views.
+    """
+    background = np.array(views.background, np.float32)
+
+    def as_views(cameras: Sequence[Camera]) -> list[TuningView]:
+        if views.images:
+            return [TuningView(one.camera, one) for one in views.images_of(cameras)]
+        return renders_of(source, cameras, background, threads)
+
+    training = as_views(views.training)
+    return (
+        TuningViews(training, as_views(views.validation), background)
+        if views.validation
+        else split_views(training, background)
+    )
+
+
+def choose_splats(
+    source: SplatModel,
+    views: ViewSet,
+    *,
+    keep: float | None = None,
+    prune_unseen: bool | None = None,
+    importance: str | None = None,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> TuningSubset:
+    """Prune splats that no view shows and those of low importance, and measure the importance of the others.
+
+    Args:
+        source: the scene.
+        views: the views; importance is measured in training views.
+        keep: fraction of the splats to keep; `None`: keep all.
+        prune_unseen: prune splats that no training or validation view shows; `None`: only if the views have images.
+        importance: a file with the importance of the source's splats; `None`: measure it in the training views, as
+            `csplat sensitivity` does.
+        threads: number of threads; `None` for all.
+        progress: progress callback.
+
+    Raises:
+        InputError: no view shows any splat; or the file is invalid, or belongs to another scene.
+    """
+    measuring = views.training[:VIEW_COUNT] if views.virtual else views.training
+    all_views = [*views.training, *views.validation]
+
+    def measure(model: SplatModel) -> Sensitivity:
+        return measure_views(
+            model, measuring, views.background, matrices=True, magnitudes=False, threads=threads, progress=progress
+        )
+
+    given = _read_importance(importance, source)
+    prune = bool(views.images) if prune_unseen is None else prune_unseen
+    found = measure(source) if given is None and keep is None else None
+    if found is not None and not (prune and len(measuring) < len(all_views)):
+        seen = found.seen
+    else:
+        seen = measure_pruning_error(
+            source, all_views, background=views.background, bands=False, threads=threads, progress=progress
+        ).seen
+    if not seen.any():
+        raise InputError("no view shows any splat: check that the cameras belong to the scene")
+    rows = np.flatnonzero(seen) if prune else np.arange(len(source))
+    model, pruning = source.select(rows), {"unseen": len(source) - len(rows)}
+    if keep is not None:
+        simplify_views = with_validation_views(replace(views, training=measuring, test=()))
+        model, kept = _pruned(model, simplify_views, keep * len(source) / len(rows), threads, progress)
+        rows, pruning = rows[kept], {**pruning, "simplified_from": len(rows)}
+    if given is not None:
+        return TuningSubset(model, rows, given.select(rows) if isinstance(given, Importance) else given[rows], pruning)
+    if found is not None:
+        return TuningSubset(model, rows, StoredSensitivity.of(source, found).importance().select(rows), pruning)
+    return TuningSubset(model, rows, StoredSensitivity.of(model, measure(model)).importance(), pruning)
+
+
+def _read_importance(importance: str | None, source: SplatModel) -> NDArray[Any] | Importance | None:
+    if importance is None:
+        return None
+    given = read_importance(importance, source)
+    if isinstance(given, StoredSensitivity):
+        return given.importance()
+    if isinstance(given, np.ndarray) and given.shape != (len(source),):
+        raise InputError(f"{importance} has shape {given.shape}, expected ({len(source)},)")
+    return given
+
+
+def _pruned(
+    model: SplatModel, views: ViewSet, keep: float, threads: int | None, progress: Progress | None
+) -> tuple[SplatModel, I64]:
+    """Return a fraction of the splats, refitted, and their indices."""
+    if keep >= 1.0:
+        return model, np.arange(len(model))
+    options = SimplifyOptions(threads=threads)
+    result = simplify(model, keep=keep, views=views, options=options, progress=progress)
+    return result.model, result.source_index

@@ -11,7 +11,7 @@ from typing import Any
 
 from csplat.disk_files import atomic_writer
 from csplat_tools.console import format_table, note
-from csplat_tools.tradeoffs.machine import describe_machine
+from csplat_tools.optional_packages import describe_machine
 
 #: The machine that figures were taken on: descriptions by name.
 Machine = dict[str, str]
