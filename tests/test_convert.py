@@ -60,8 +60,8 @@ def test_columns_that_are_lost_are_named_by_every_command(tmp_path, make_model):
     write_ply(source, replace(make_model(40, 0), extra={"motion_0": np.ones(40, np.float32)}))
     assert "lost on the way: extra columns motion_0" in call("convert", source, tmp_path / "a.spz").stderr
     for words in (("encode", source, tmp_path / "a.csplat"), ("compare", source, source)):
-        assert "columns motion_0 are no property of splats" in call(*words).stderr
-    assert "columns motion_0 are no property of splats" in call("lint", source, status=1).stdout
+        assert "columns motion_0 are not splat attributes" in call(*words).stderr
+    assert "columns motion_0 are not splat attributes" in call("lint", source, status=1).stdout
 
 
 def test_degree_4_is_converted_encoded_and_fixed_where_fewer_bands_are_asked_for(tmp_path, ply):
@@ -83,7 +83,7 @@ def test_degree_4_is_converted_encoded_and_fixed_where_fewer_bands_are_asked_for
     [
         (("a.xyz",), "no format has that ending"),
         (("-",), "standard output"),
-        (("a.ply", "--to", "zzz"), "wanted one of "),
+        (("a.ply", "--to", "zzz"), "expected one of "),
         (("a.ply", "--rotate", "1,2"), "wanted 3 numbers"),
         (("a.ply", "--crop-sphere", "0,0,0,-1"), "radius"),
         (("a.ply", "--scale", "0"), "above 0"),
@@ -255,7 +255,7 @@ def test_every_command_that_reads_scenes_can_be_told_what_a_file_is(tmp_path, pl
     call("convert", bare, tmp_path / "b.ply", "--from", "splat")
     call("encode", bare, tmp_path / "b.csplat", "--from", "splat")
     call("verify", tmp_path / "b.csplat", "--source", bare, "--from", "splat")
-    assert "the format is 'x', wanted one of" in call("encode", bare, "-", "--from", "x", status=1).stderr
+    assert "the format is 'x', expected one of" in call("encode", bare, "-", "--from", "x", status=1).stderr
     for name in ("compare", "export-html", "finetune", "render", "sensitivity", "simplify", "tradeoff", "view"):
         assert "read_as" in inspect.signature(command_function(name)).parameters, name
 

@@ -291,10 +291,10 @@ def test_files_that_cannot_be_copied_are_re_encoded_with_a_reason(make_model, de
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        (({"coordinate_system": "RDF"}, {"coordinate_system": "RUB"}), "axes cannot be one: RDF in .*a, RUB in .*b"),
-        (({"unit_metres": 1.0}, {"unit_metres": 0.01}), "a unit in metres cannot be one: 1.0 in .*a, 0.01 in .*b"),
-        (({"antialiased": True}, {}), "antialiasing cannot be one: yes in .*a, no in .*b"),
-        (({}, {"flat": True}), "flatness cannot be one: no in .*a, yes in .*b"),
+        (({"coordinate_system": "RDF"}, {"coordinate_system": "RUB"}), "axes cannot be merged: RDF in .*a, RUB in .*b"),
+        (({"unit_metres": 1.0}, {"unit_metres": 0.01}), "units cannot be merged: 1.0 in .*a, 0.01 in .*b"),
+        (({"antialiased": True}, {}), "antialiasing cannot be merged: yes in .*a, no in .*b"),
+        (({}, {"flat": True}), "flatness cannot be merged: no in .*a, yes in .*b"),
     ],
 )
 def test_scenes_that_contradict_each_other_are_refused(make_model, tmp_path, fields, message):
@@ -313,7 +313,7 @@ def test_fewer_than_two_files_are_refused(files, tmp_path):
 
 def test_too_many_codebooks_cause_re_encoding(halves):
     done, data = merge(*halves, options=EncodeOptions(preset="fast"), codebooks_max=3)
-    assert "they have 4 codebooks together, and a file at most 3" == done.why
+    assert "they have 4 codebooks together, a file has at most 3" == done.why
     assert 2977 == len(decode(data))
 
 

@@ -110,12 +110,12 @@ def test_it_is_told_from_a_plain_ply_by_its_words(tmp_path):
         (SMALL.replace(b"min_scale_x", b"min_scale_q"), "no float32 min_scale_x"),
         (SMALL.replace(b"uint packed_scale", b"int packed_scale"), "no uint32 packed_scale"),
         (SMALL.replace(b"packed_color", b"packed_scale"), "twice"),
-        (SMALL.replace(b"little", b"big"), "wanted binary_little_endian"),
+        (SMALL.replace(b"little", b"big"), "expected binary_little_endian"),
         (SMALL.replace(b"made by hand", b"csplat origin 1 2"), r"a\.ply: .*3 finite numbers"),
-        (built([[*ROW[:4], float("nan"), *ROW[5:]]], [WORD]), "chunk 0 has no finite max_y"),
-        (SMALL.replace(struct.pack("<f", -8), b"\1\0\xa0\x7f"), "chunk 0 has no finite min_scale_x"),  # signalling
+        (built([[*ROW[:4], float("nan"), *ROW[5:]]], [WORD]), "max_y of chunk 0 is not finite"),
+        (SMALL.replace(struct.pack("<f", -8), b"\1\0\xa0\x7f"), "min_scale_x of chunk 0 is not finite"),  # signalling
         (built([ROW], [WORD], [range(72)], rest=72), "SH degree 4, expected at most 3: --sh-degree 3"),
-        (built([[ROW[3] + 1, *ROW[1:]]], [WORD]), "chunk 0 has min_x .* above max_x"),
+        (built([[ROW[3] + 1, *ROW[1:]]], [WORD]), "chunk 0 has min_x .*, expected at most max_x"),
     ],
 )
 def test_what_does_not_fit_is_refused(tmp_path, data, message):

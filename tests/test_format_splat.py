@@ -65,7 +65,7 @@ def test_splats_that_are_not_finite_are_dropped_and_counted(tmp_path):
 
 def test_a_cut_row_is_refused(tmp_path):
     (tmp_path / "a.splat").write_bytes(ROW[:-1])
-    with pytest.raises(InputError, match=r"a\.splat has 31 bytes, wanted a multiple of 32"):
+    with pytest.raises(InputError, match=r"a\.splat has 31 bytes, expected a multiple of 32"):
         csplat.read(tmp_path / "a.splat")
 
 
@@ -92,8 +92,8 @@ def plausible(rows):
             "hardly .splat: it is text, and begins with 'what",
         ),
         (b"0.1234 0.5678 0.9012 1.0 0.5 0.5\n" * 32, "hardly .splat: it is text"),
-        (np.random.default_rng(0).normal(size=320).astype("<f4").tobytes(), "are no splats; that .* has scales of"),
-        (np.random.default_rng(0).bytes(32 * 40), "hardly .splat: [89].% of 40 rows are no splats"),
+        (np.random.default_rng(0).normal(size=320).astype("<f4").tobytes(), "are not splats; the one .* has scales of"),
+        (np.random.default_rng(0).bytes(32 * 40), "hardly .splat: [89].% of 40 rows are not splats"),
         (bytes(64), "a rotation of the bytes 0, 0, 0, 0"),
     ],
 )
@@ -243,23 +243,23 @@ def test_ksplat_splats_that_are_not_finite_are_dropped_and_counted():
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (simple(0)[:4095], "ends inside of its header"),
-        (ksplat(0, [], version=(0, 2)), r"version 0\.2, wanted 0\.1"),
-        (ksplat(3, []), "compression level 3, wanted at most 2"),
+        (simple(0)[:4095], "ends within its header"),
+        (ksplat(0, [], version=(0, 2)), r"version 0\.2, expected 0\.1"),
+        (ksplat(3, []), "compression level 3, expected at most 2"),
         (ksplat(2, [], sh=(-np.inf, 1)), "SH from -inf"),
-        (ksplat(0, [], most=2**32 - 1), "4,294,967,295 sections, more than"),
-        (ksplat(0, [section(rows(0, 5, 0), 0, 0)], count=6), "5 splats in its sections, and its header says 6"),
+        (ksplat(0, [], most=2**32 - 1), "4,294,967,295 sections, too many"),
+        (ksplat(0, [section(rows(0, 5, 0), 0, 0)], count=6), "5 splats in its sections, its header declares 6"),
         (simple(0, degree=2)[:-1], "section 0 ends at byte"),
         (simple(1, room=2**32 - 1), "section 0 ends at byte"),
         (simple(1, buckets=2**32 - 1), "section 0 ends at byte"),
-        (simple(1, room=4), "5 splats in room for 4"),
-        (ksplat(0, [section(rows(0, 1, 2), 0, 3)]), "SH degree 3, wanted at most 2"),
-        (simple(1, partial=(1, 1)), "hold fewer than its 5 splats"),
-        (simple(1, full=2), "2 full buckets and 2 others, of 3"),
-        (simple(1, block=np.nan), "finite places"),
-        (simple(1, block=-5.0), "its blocks are -5 long"),
-        (ksplat(2, [section(rows(2, 5, 1), 2, 1)], sh=(2.0, -2.0)), "wanted numbers"),
-        (simple(1, centres=CENTRES * np.float32(1.1e36)), "finite places"),
+        (simple(1, room=4), "5 splats, but space for 4"),
+        (ksplat(0, [section(rows(0, 1, 2), 0, 3)]), "SH degree 3, expected at most 2"),
+        (simple(1, partial=(1, 1)), "contain fewer than its 5 splats"),
+        (simple(1, full=2), "2 full and 2 partial buckets, expected 3"),
+        (simple(1, block=np.nan), "not finite"),
+        (simple(1, block=-5.0), "length of its blocks is -5"),
+        (ksplat(2, [section(rows(2, 5, 1), 2, 1)], sh=(2.0, -2.0)), "expected finite numbers"),
+        (simple(1, centres=CENTRES * np.float32(1.1e36)), "not finite"),
     ],
 )
 def test_what_is_no_ksplat_or_too_much_is_refused(tmp_path, data, message):

@@ -140,15 +140,15 @@ MANY = spz(4, [bytes(n * (1 << 22)) for n in (9, 1, 3, 3, 4)])
     [
         (spz(4, splats(4, degree=3), degree=4), "SH degree 4, expected at most 3: --sh-degree 3"),
         (struct.pack("<4sI40x", b"NGSP", 5), "version 5"),
-        (gzip.compress(spz(4, splats(4)), mtime=0), "version 4, wanted 1 to 4"),
+        (gzip.compress(spz(4, splats(4)), mtime=0), "version 4, expected 1 to 4"),
         (gzip.compress(b"NGSX" + bytes(40), mtime=0), "begins with b'NGSX'"),
         (spz(3, splats(3), bits=31), "31 fractional bits"),
         (spz(3, splats(3), flags=0x80), "levels of detail"),
-        (spz(3, splats(3), count=2**32 - 1), "4,294,967,295 splats, more than"),
-        (spz(4, splats(4), count=3), r"streams of \[18, 2, 6, 6, 8\] bytes, wanted \[27, 3, 9, 9, 12\]"),
-        (MANY, "4,194,304 splats, more than"),
-        (spz(4, splats(4)) + b"\0", "its table says"),
-        (spz(3, splats(3), extensions=bytes(1 << 21)), "goes on after its last splat"),
+        (spz(3, splats(3), count=2**32 - 1), "4,294,967,295 splats, too many"),
+        (spz(4, splats(4), count=3), r"streams of \[18, 2, 6, 6, 8\] bytes, expected \[27, 3, 9, 9, 12\]"),
+        (MANY, "4,194,304 splats, too many"),
+        (spz(4, splats(4)) + b"\0", "its table declares"),
+        (spz(3, splats(3), extensions=bytes(1 << 21)), "bytes after its last splat"),
         (spz(1, [b"\xff\xff" * 3, b"\1", bytes(3), bytes(3), bytes(3)]), "NaN or infinite"),
     ],
 )
@@ -231,7 +231,7 @@ def test_positions_have_as_fine_a_step_as_splats_want_and_the_scene_allows(tmp_p
     assert [12, 12, 16, 11, 0, 14] == [
         bits(*one) for one in [(1, 0), (2047, 0), (1, -7.5), (2049, 0), (8e6, 0), (500, -9)]
     ]
-    with pytest.raises(InputError, match="positions reach 9e\\+06, and SPZ holds up to 8,388,607"):
+    with pytest.raises(InputError, match="positions reach 9e\\+06, SPZ stores up to 8,388,607"):
         bits(9e6, 0)
     assert 12 == bits(0, 0)
 

@@ -188,9 +188,9 @@ def test_insisting_counts_where_the_content_is_that_of_no_format(tmp_path, make_
 
 
 def test_names_that_no_format_has_are_refused(tmp_path, make_model):
-    with pytest.raises(InputError, match=r"wanted one of .*\.ply"):
+    with pytest.raises(InputError, match=r"expected one of .*\.ply"):
         csplat.write(tmp_path / "a.xyz", make_model(3, 0))
-    with pytest.raises(InputError, match=r"wanted one of .*\bply\b"):
+    with pytest.raises(InputError, match=r"expected one of .*\bply\b"):
         csplat.read(tmp_path, format="xyz")
     with pytest.raises(InputError, match="not a scene"):
         csplat.read(tmp_path)

@@ -142,9 +142,9 @@ def test_an_interrupted_encoding_goes_on(model, whole, tmp_path, stage, after):
         encode_large(scene, target, FAST, progress=Interrupt(stage, after=after))
     assert not target.exists()
     assert (tmp_path / "out.csplat.work").is_dir()
-    with pytest.raises(InputError, match="left of an interrupted encoding"):
+    with pytest.raises(InputError, match="left from an interrupted encoding"):
         encode_large(scene, target, FAST)
-    with pytest.raises(InputError, match="another options"):
+    with pytest.raises(InputError, match="started with options"):
         encode_large(scene, target, replace(FAST, seed=1), resume=True)
     coded = []
     encode_large(scene, target, FAST, resume=True, progress=lambda stage, _done: coded.append(stage))
@@ -213,7 +213,7 @@ def test_a_folder_of_somebody_else_stays_as_it_is(model, tmp_path):
     folder.mkdir()
     (folder / "one.jpg").write_bytes(b"dear to somebody")
     for resume in (False, True):
-        with pytest.raises(InputError, match="photographs holds something else"):
+        with pytest.raises(InputError, match="photographs is not empty"):
             encode_large(source_from_model(model), tmp_path / "out.csplat", FAST, folder=folder, resume=resume)
     assert b"dear to somebody" == (folder / "one.jpg").read_bytes()
 
@@ -245,9 +245,9 @@ def test_a_scene_that_gets_shorter_while_it_is_read_is_refused(model, tmp_path):
 
 
 def test_too_little_memory_is_refused(model, tmp_path):
-    with pytest.raises(InputError, match="100 MB of memory are too little for this scene, which wants 2"):
+    with pytest.raises(InputError, match="100 MB of memory are too little for this scene, which requires 2"):
         encode_large(source_from_model(model), tmp_path / "out.csplat", FAST, memory_bytes=100_000_000)
-    with pytest.raises(InputError, match="a codebook of shapes wants the scene in memory"):
+    with pytest.raises(InputError, match="a codebook of shapes requires the scene in memory"):
         encode_large(source_from_model(model), tmp_path / "out.csplat", replace(FAST, shape_codebook_size=64))
     assert not list(tmp_path.iterdir())
 

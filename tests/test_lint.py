@@ -200,7 +200,7 @@ def test_sh_columns_of_no_degree_are_refused(path, count):
     rows = good_rows(names=names)
     path.write_bytes(header(rows) + rows.tobytes())
     assert count == found(path)["sh-columns"].count
-    with pytest.raises(InputError, match=f"{count} f_rest columns are no SH degree, expected 0, 9, 24 or 45"):
+    with pytest.raises(InputError, match=f"{count} f_rest columns match no SH degree, expected 0, 9, 24 or 45"):
         read_ply(path)
 
 
@@ -274,7 +274,7 @@ def test_the_usual_name_is_read_and_the_other_is_named(path):
     rows = good_rows(names=[*NAMES, "scalar_opacity"])
     rows["scalar_opacity"] = 9.0
     path.write_bytes(header(rows) + rows.tobytes())
-    assert "scalar_opacity: there once more" in found(path)["second-columns"].text
+    assert "scalar_opacity: duplicated" in found(path)["second-columns"].text
     assert np.array_equal(alpha_of_logits(rows["opacity"]), read_ply(path).opacities)
 
 
@@ -337,7 +337,7 @@ def test_colours_of_another_range_are_refused(path, kind, values, message):
 def test_colours_of_16_bits_that_are_none_above_255_are_bytes(path):
     rows = coloured("<u2", (0, 17, 255))
     path.write_bytes(header(rows) + rows.tobytes())
-    assert "in steps of 1/255: they are of 16 bits, and at most 255" in found(path)["rgb-colours"].text
+    assert "in steps of 1/255: they have 16 bits, but are at most 255" in found(path)["rgb-colours"].text
     expected = (np.array([0, 17 / 255, 1]) - 0.5) / 0.28209479177387814
     np.testing.assert_allclose(read_ply(path, strict=True).sh0, [expected] * 3, rtol=1e-6)
     with open_scene(path) as scene:
@@ -348,7 +348,7 @@ def test_f_dc_comes_before_red_green_and_blue(path):
     rows = good_rows(names=[*NAMES, *COLOURS])
     path.write_bytes(header(rows) + rows.tobytes())
     assert np.array_equal(rows["f_dc_1"], read_ply(path).sh0[:, 1])
-    assert "red, green, blue are no property of splats" in found(path)["extra-columns"].text
+    assert "red, green, blue are not splat attributes" in found(path)["extra-columns"].text
 
 
 def test_the_filter_of_mip_splatting_is_fused(path):
@@ -452,7 +452,7 @@ def test_columns_of_moving_splats_are_named(path):
         rows = good_rows(names=[*NAMES, *names])
         path.write_bytes(header(rows) + rows.tobytes())
         message = (
-            f"{', '.join(names)} are no property of splats: dropped; the file holds dynamic (4D) splats: their time is"
+            f"{', '.join(names)} are not splat attributes: dropped; the file contains dynamic (4D) splats: their time"
         )
         assert message in found(path)["extra-columns"].text
 
@@ -460,7 +460,7 @@ def test_columns_of_moving_splats_are_named(path):
 def test_elements_that_move_splats_are_named(path):
     rows = good_rows()
     path.write_bytes(header(rows, after=["element delta_vertex_0 1", "property float x"]) + rows.tobytes() + bytes(4))
-    assert "of which the first moment is kept" in found(path)["other-elements"].text
+    assert "of which the first frame is kept" in found(path)["other-elements"].text
     assert 5 == len(read_ply(path))
 
 
@@ -611,7 +611,7 @@ def test_positions_alone_may_be_half_floats(path):
     for values in (rng.integers(0, 30_000, 60), rng.integers(0, 1000, 60), rng.integers(64_000, 65_536, 60)):
         halves["x"] = halves["y"] = halves["z"] = values
         path.write_bytes(header(halves) + halves.tobytes())
-        with pytest.raises(InputError, match=r"integer-columns: x, y, z are 16-bit integers, and no half floats"):
+        with pytest.raises(InputError, match=r"integer-columns: x, y, z are 16-bit integers other than half floats"):
             read_ply(path)
 
 
@@ -620,7 +620,7 @@ def test_quantised_values_are_no_half_floats(path):
     for index, name in enumerate(NAMES):
         rows[name] = np.random.default_rng(index).integers(0, 30_000, 60)
     path.write_bytes(header(rows) + rows.tobytes())
-    with pytest.raises(InputError, match="of type uint16, expected float: export the values before they are quantised"):
+    with pytest.raises(InputError, match="of type uint16, expected float: export the values before quantisation"):
         read_ply(path)
 
 
@@ -628,7 +628,7 @@ def test_quantised_values_are_no_half_floats(path):
     ("changed", "kind", "message"),
     [
         (["opacity"], "u1", "opacity is of type uint8, expected float: export"),
-        (["f_dc_0", "f_dc_1", "f_dc_2"], "u1", "are of type uint8, expected float: call colours of 0 to 255 red"),
+        (["f_dc_0", "f_dc_1", "f_dc_2"], "u1", "are of type uint8, expected float: rename colours of 0 to 255 to red"),
         (["scale_0", "rot_2"], "i4", "scale_0, rot_2 are of type int32, expected float"),
         (without(*"xyz", "nx", "ny", "nz"), "u2", "are of type uint16, expected float"),  # NaN as halves
     ],
@@ -667,7 +667,7 @@ def test_a_truncated_file_is_refused_with_the_count(path):
     path.write_bytes(header(rows) + rows.tobytes()[:-1])
     finding = found(path)["truncated"]
     assert (1, "error") == (finding.count, finding.kind)
-    with pytest.raises(InputError, match="5 rows of vertex are declared, 4 are there"):
+    with pytest.raises(InputError, match="5 rows of vertex are declared, 4 are present"):
         read_ply(path)
 
 
@@ -699,7 +699,7 @@ def test_extra_columns_are_named_and_dropped(path):
         rows[name] = good_rows()[name]
     path.write_bytes(header(rows) + rows.tobytes())
     assert 2 == found(path)["extra-columns"].count
-    with pytest.raises(InputError, match="columns object_id, conf are no property of splats"):
+    with pytest.raises(InputError, match="columns object_id, conf are not splat attributes"):
         read_ply(path, strict=True)
     report = []
     assert ["object_id", "conf"] == list(read_ply(path, strict=True, keep_extra=True, report=report).extra)

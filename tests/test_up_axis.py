@@ -67,7 +67,7 @@ def test_a_direction_gets_unit_length_and_keeps_it(values, up):
     [None, "xyz", (0, 0, 0), (1, 2), (1, 2, 3, 4), (math.nan, 0, 1), (math.inf, 0, 1), (True, 0, 0), "z", [[1]]],
 )
 def test_values_other_than_a_direction_are_refused(values):
-    with pytest.raises(InputError, match="wanted three finite numbers"):
+    with pytest.raises(InputError, match="expected three finite numbers"):
         unit_up(values)
 
 
@@ -368,9 +368,9 @@ def test_cameras_follow_a_translation(make_model):
 
 def test_invalid_transforms_are_refused(make_model):
     for matrix in (np.ones((3, 3)), np.eye(4), 2 * np.eye(3), np.full((3, 3), np.nan)):
-        with pytest.raises(InputError, match="wanted an orthogonal matrix"):
+        with pytest.raises(InputError, match="expected an orthogonal matrix"):
             rotate_scene(make_model(2, 0), matrix)
-    with pytest.raises(InputError, match="wanted one above 0"):
+    with pytest.raises(InputError, match="expected a number above 0"):
         scale_scene(make_model(2, 0), -1.0)
     with pytest.raises(InputError, match="one each of"):
         axes_rotation("RDF", "XYZ")

@@ -56,7 +56,7 @@ class Camera:
             object.__setattr__(self, name, _checked_size(name, getattr(self, name)))
         object.__setattr__(self, "near", _checked_near(self.near))
         if self.image is not None and not isinstance(self.image, str):
-            raise InputError(f"the camera's image is {self.image!r}, wanted a name or nothing")
+            raise InputError(f"the camera's image is {self.image!r}, expected a name or nothing")
         _check_intrinsics(self.K)
         _check_pose(self.viewmat)
 
@@ -89,7 +89,7 @@ class Camera:
             InputError: a key is missing or a value is not valid for `Camera`.
         """
         if not isinstance(entry, Mapping):
-            raise InputError(f"a camera is a {type(entry).__name__}, wanted an object with K, viewmat, W and H")
+            raise InputError(f"a camera is a {type(entry).__name__}, expected an object with K, viewmat, W and H")
         missing = [key for key in ("K", "viewmat", "W", "H") if key not in entry]
         if missing:
             raise InputError(f"a camera has no {', '.join(missing)}")
@@ -126,7 +126,7 @@ def _checked_matrix(name: str, value: ArrayLike, size: int) -> F64:
     except (TypeError, ValueError):
         raise InputError(f"the camera's {name} is not a matrix of numbers") from None
     if matrix.shape != (size, size):
-        raise InputError(f"the camera's {name} has shape {list(matrix.shape)}, wanted [{size}, {size}]")
+        raise InputError(f"the camera's {name} has shape {list(matrix.shape)}, expected [{size}, {size}]")
     if not np.isfinite(matrix).all():
         raise InputError(f"the camera's {name} holds values that are NaN or infinite")
     matrix.flags.writeable = False
@@ -135,9 +135,9 @@ def _checked_matrix(name: str, value: ArrayLike, size: int) -> F64:
 
 def _checked_size(name: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        raise InputError(f"the camera's {name} is {value!r}, wanted a number of pixels")
+        raise InputError(f"the camera's {name} is {value!r}, expected a number of pixels")
     if not (math.isfinite(value) and value == int(value) and 1 <= value <= MAX_IMAGE_SIZE):
-        raise InputError(f"the camera's {name} is {value}, wanted 1 to {MAX_IMAGE_SIZE} pixels")
+        raise InputError(f"the camera's {name} is {value}, expected 1 to {MAX_IMAGE_SIZE} pixels")
     return int(value)
 
 
@@ -145,17 +145,17 @@ def _checked_near(value: Any) -> float:
     try:
         near = float(value)
     except (TypeError, ValueError):
-        raise InputError(f"the camera's near plane is {value!r}, wanted a distance above 0") from None
+        raise InputError(f"the camera's near plane is {value!r}, expected a distance above 0") from None
     if not (math.isfinite(near) and near > 0.0):
-        raise InputError(f"the camera's near plane is {near:g}, wanted a distance above 0")
+        raise InputError(f"the camera's near plane is {near:g}, expected a distance above 0")
     return near
 
 
 def _check_intrinsics(K: F64) -> None:
     if not (K[0, 0] > 0.0 and K[1, 1] > 0.0):
-        raise InputError(f"the camera's focal lengths are {K[0, 0]:g} and {K[1, 1]:g} pixels, wanted above 0")
+        raise InputError(f"the camera's focal lengths are {K[0, 0]:g} and {K[1, 1]:g} pixels, expected above 0")
     if K[0, 1] != 0.0 or K[1, 0] != 0.0 or (K[2] != (0.0, 0.0, 1.0)).any():
-        raise InputError("the camera's K has skew or a last row other than 0 0 1, wanted (fx 0 cx; 0 fy cy; 0 0 1)")
+        raise InputError("the camera's K has skew or a last row other than 0 0 1, expected (fx 0 cx; 0 fy cy; 0 0 1)")
 
 
 def _check_pose(viewmat: F64) -> None:
@@ -301,7 +301,7 @@ def intrinsics(width: int, height: int, field_of_view: float) -> F64:
         [3, 3] float64.
     """
     if not 0.0 < field_of_view < 180.0:
-        raise InputError(f"the field of view is {field_of_view:g} degrees, wanted above 0 and below 180")
+        raise InputError(f"the field of view is {field_of_view:g} degrees, expected above 0 and below 180")
     focal = 0.5 * width / math.tan(math.radians(field_of_view) / 2.0)
     return np.array([[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]])
 
@@ -402,7 +402,7 @@ def orbit(
         near: near plane, scene units.
     """
     if count < 1:
-        raise InputError(f"an orbit of {count} cameras, wanted at least 1")
+        raise InputError(f"an orbit of {count} cameras, expected at least 1")
     middle = np.array(centre, np.float64)
     return [
         look_at(middle + distance * direction_at(up, 360.0 * i / count, elevation), middle, up, K, width, height, near)

@@ -74,7 +74,7 @@ def orbit_cameras(
         InputError: `count` is below 1, or a camera of the scene is invalid.
     """
     if count < 1:
-        raise InputError(f"an orbit of {count} cameras, wanted at least 1")
+        raise InputError(f"an orbit of {count} cameras, expected at least 1")
     frame, K = scene_frame(with_estimated_up(model)), intrinsics(width, height, FIELD_OF_VIEW)
     if not along and frame.kind == "surrounding":
         along = [Camera.from_json(one) for one in model.cameras or ()]

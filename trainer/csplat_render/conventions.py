@@ -64,7 +64,7 @@ def thresholds_of(mode: str) -> Thresholds:
         InputError: there is no such mode, or it is that of the exact reference.
     """
     if mode not in _THRESHOLDS:
-        raise InputError(f"the rasteriser's mode is {mode!r}, wanted one of {', '.join(_THRESHOLDS)}")
+        raise InputError(f"the rasteriser's mode is {mode!r}, expected one of {', '.join(_THRESHOLDS)}")
     return _THRESHOLDS[mode]
 
 

@@ -216,7 +216,7 @@ def thread_count(threads: int | None) -> Iterator[int]:
         InputError: `threads` is below 1.
     """
     if threads is not None and threads < 1:
-        raise InputError(f"threads is {threads}, wanted 1 or more")
+        raise InputError(f"threads is {threads}, expected 1 or more")
     with LOCK:
         before = _threads.limit
         if threads is not None:

@@ -74,7 +74,9 @@ class Lpips:
                 ("head", self.heads[i], shape[-1:]),
             ):
                 if array.shape != wanted:
-                    raise InputError(f"{self.source}: {name} {i} has shape {list(array.shape)}, wanted {list(wanted)}")
+                    raise InputError(
+                        f"{self.source}: {name} {i} has shape {list(array.shape)}, expected {list(wanted)}"
+                    )
                 if not np.isfinite(array).all():
                     raise InputError(f"{self.source}: {name} {i} holds values that are not finite")
 
@@ -90,7 +92,7 @@ class Lpips:
                 f"LPIPS of pictures of shapes {list(reference.shape)} and {list(image.shape)}, wanted [H, W, 3] twice"
             )
         if reference.dtype.kind != "f" or image.dtype.kind != "f":
-            raise InputError(f"LPIPS of {reference.dtype} and {image.dtype}, wanted floating values in 0 to 1")
+            raise InputError(f"LPIPS of {reference.dtype} and {image.dtype}, expected floating values in 0 to 1")
         if min(reference.shape[:2]) < MIN_SIZE:
             raise InputError(f"LPIPS wants pictures of at least {MIN_SIZE}×{MIN_SIZE} pixels")
         distance = 0.0

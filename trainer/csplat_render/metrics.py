@@ -153,7 +153,7 @@ def score_view(
     squares = squared_error(reference, render)
     for name, pixels in (("cover", covered), ("mask", mask)):
         if pixels is not None and pixels.shape != squares.shape[:2]:
-            raise InputError(f"the {name} has shape {list(pixels.shape)}, wanted {list(squares.shape[:2])}")
+            raise InputError(f"the {name} has shape {list(pixels.shape)}, expected {list(squares.shape[:2])}")
     if mask is not None:
         reference, squares = np.where(mask[..., None], reference, render), squares[mask]
         covered = None if covered is None else covered[mask]
@@ -217,9 +217,9 @@ def _mean(values: Sequence[float | None]) -> float | None:
 def _clipped(reference: NDArray[Any], image: NDArray[Any]) -> tuple[F64, F64]:
     for name, array in (("reference", reference), ("image", image)):
         if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
-            raise InputError(f"the {name} has shape {list(array.shape)}, wanted [H, W, 3]")
+            raise InputError(f"the {name} has shape {list(array.shape)}, expected [H, W, 3]")
         if array.dtype.kind != "f":
-            raise InputError(f"the {name} is {array.dtype}, wanted floating values in 0 to 1")
+            raise InputError(f"the {name} is {array.dtype}, expected floating values in 0 to 1")
     if reference.shape != image.shape:
         raise InputError(f"pictures of sizes {list(reference.shape)} and {list(image.shape)} cannot be compared")
     a = np.clip(np.ascontiguousarray(reference, np.float64), 0.0, 1.0)

@@ -90,7 +90,7 @@ class Rasteriser:
         self.thresholds: Thresholds = thresholds_of(mode)
         self.dtype = np.dtype(dtype)
         if self.dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
-            raise InputError(f"the rasteriser's dtype is {self.dtype}, wanted float32 or float64")
+            raise InputError(f"the rasteriser's dtype is {self.dtype}, expected float32 or float64")
         self.gradients = gradients
         self.threads = threads
         self._limits = np.array([self.thresholds.alpha_min, ALPHA_CAP, self.thresholds.transmittance_min], self.dtype)
@@ -295,10 +295,10 @@ def _checked(splats: HasSplats, dtype: Any) -> UncheckedSplats:
     arrays = {name: np.ascontiguousarray(getattr(splats, name), dtype) for name in (*wanted, "shN")}
     for name, shape in wanted.items():
         if arrays[name].shape != shape:
-            raise InputError(f"{name} has shape {list(arrays[name].shape)}, wanted {list(shape)}")
+            raise InputError(f"{name} has shape {list(arrays[name].shape)}, expected {list(shape)}")
     shN = arrays["shN"]
     if shN.ndim != 3 or shN.shape[::2] != (n, 3):
-        raise InputError(f"shN has shape {list(shN.shape)}, wanted [{n}, K, 3]")
+        raise InputError(f"shN has shape {list(shN.shape)}, expected [{n}, K, 3]")
     sh_degree_of(shN.shape[1])
     return UncheckedSplats(**arrays)
 
@@ -308,14 +308,14 @@ def _checked_degree(sh_degree: int | None, coefficient_count: int) -> int:
     if sh_degree is None:
         return available
     if sh_degree < 0:
-        raise InputError(f"sh_degree is {sh_degree}, wanted 0 or more")
+        raise InputError(f"sh_degree is {sh_degree}, expected 0 or more")
     return min(sh_degree, available)
 
 
 def _checked_background(background: ArrayLike, dtype: Any) -> Array:
     colour = np.asarray(background, dtype)
     if colour.shape != (3,) or not np.isfinite(colour).all():
-        raise InputError(f"the background is {background!r}, wanted red, green and blue")
+        raise InputError(f"the background is {background!r}, expected red, green and blue")
     return colour
 
 
@@ -323,7 +323,7 @@ def _checked_state(state: Array | None, shape: Sequence[int], dtype: Any) -> Arr
     if state is None:
         return np.empty((0, 0, 5), dtype)
     if state.shape != tuple(shape) or state.dtype != dtype:
-        raise InputError(f"the state has shape {list(state.shape)} of {state.dtype}, wanted {list(shape)} of {dtype}")
+        raise InputError(f"the state has shape {list(state.shape)} of {state.dtype}, expected {list(shape)} of {dtype}")
     return state
 
 
@@ -332,5 +332,5 @@ def _checked_gradient(name: str, gradient: ArrayLike | None, shape: Sequence[int
         return np.zeros(tuple(shape), dtype)
     array = np.ascontiguousarray(gradient, dtype)
     if array.shape != tuple(shape):
-        raise InputError(f"{name} has shape {list(array.shape)}, wanted {list(shape)}")
+        raise InputError(f"{name} has shape {list(array.shape)}, expected {list(shape)}")
     return array

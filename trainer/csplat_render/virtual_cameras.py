@@ -82,7 +82,7 @@ def virtual_cameras(
         InputError: `count` is below 1 or the size is not that of an image.
     """
     if count < 1:
-        raise InputError(f"{count} virtual cameras, wanted at least 1")
+        raise InputError(f"{count} virtual cameras, expected at least 1")
     rng = np.random.default_rng(seed)
     frame = scene_frame(model)
     begin = 360.0 * float(rng.random())

@@ -1,6 +1,6 @@
-"""Merge several files: copy their tiles if that is possible, otherwise encode the scenes again together.
+"""Merge several files: copy their tiles if possible, otherwise decode the scenes and encode them together.
 
-Copied tiles are not decoded; those that name codebooks are rewritten with the ids of the merged file.
+Copied tiles are not decoded; only the codebook ids in them are replaced by those of the merged file.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from csplat.splat_file import SplatFile
 from csplat.splat_file import open as opened
 from csplat.tile_copy import ChunkPrefetcher, TileCopier, chunk_payload, scene_fields
 
-#: Fields that must be equal, because they determine how all splats of a file are rendered: words for messages, name.
-_FACTS = (
+#: Fields that must be equal because they determine how all splats of a file are rendered: words for messages, name.
+_SHARED_FIELDS = (
     ("axes", "coordinate_system"),
-    ("a unit in metres", "unit_metres"),
+    ("units", "unit_metres"),
     ("antialiasing", "antialiased"),
     ("flatness", "flat"),
 )
@@ -59,11 +59,11 @@ class MergeResult:
     """The result of merging several files.
 
     Attributes:
-        splat_count: splats of the file.
-        tile_count: its tiles.
-        size: its bytes.
-        why: the reason why the scenes were decoded and coded again; empty if tiles were copied.
-        dropped: extra columns that not all of them had, if they were coded again.
+        splat_count: number of splats in the merged file.
+        tile_count: number of its tiles.
+        size: size of the file in bytes.
+        why: the reason why the scenes were encoded again; "" if tiles were copied.
+        dropped: extra columns that were dropped because not all files have them; only if scenes were encoded again.
     """
 
     splat_count: int
@@ -81,23 +81,23 @@ def merge(
     storage: Mapping[str, Any] | None = None,
     codebooks_max: int = (1 << 16) - 1,
 ) -> MergeResult:
-    """Join files: the splats of the first, then those of the second, and so on.
+    """Merge files: the splats of the first, then those of the second, and so on.
 
-    Tiles are copied bit for bit, without decoding, if the files agree on steps and levels of all attributes, SH
-    degree, origin and extra columns, as parts of one file do (`extract`, or files that were encoded with the same
-    steps); their codebooks get new ids. This takes memory for the codebooks of one file and some megabytes. Other files
-    are decoded and encoded again together, as `csplat.out_of_core.encode_scene` does it, which costs quality once more;
+    Tiles are copied bit for bit, without decoding, if the files agree on steps and levels of all attributes, SH degree,
+    origin and extra columns. That is true for parts of one file (`extract`) and files encoded with the same steps.
+    Codebooks get new ids. Copying takes memory for the codebooks of one file and a few megabytes. Other files are
+    decoded and encoded together by `csplat.out_of_core.encode_scene`, which loses quality once more;
     `MergeResult.why` gives the reason. Pending data is kept in temporary files.
 
-    Metadata and cameras are kept as far as all files have the same. If one file leaves axes or unit open, another
-    one may specify them. Copied files declare no errors and no options: nobody has measured the whole.
+    Metadata and cameras are kept if they are the same in all files. If one file leaves axes or unit open, another may
+    specify them. Merged files of copied tiles declare no error bounds and no options, because nothing is measured.
 
     Args:
         files: as in `csplat.open`, two or more.
-        output: a path, which the file takes when it is complete, replacing an older one; or an open binary file.
-        options: options of the encoder, if scenes are coded again; by default the preset "balanced" and extra columns.
+        output: path of the file, which appears when complete, replacing an older one; or an open binary file.
+        options: encoder options for encoding again; default: the preset "balanced", keeping extra columns.
         storage: as in `csplat.open`, for all files.
-        codebooks_max: with more codebooks together, scenes are encoded again; a file can have no more than the default.
+        codebooks_max: encode again if the files have more codebooks together; the default is the format's maximum.
 
     Examples:
         >>> import csplat
@@ -107,15 +107,16 @@ def merge(
         ('', True)
 
     Raises:
-        InputError: fewer than two files; their axes, units or ways to be shown contradict each other.
+        InputError: there are fewer than two files, or they contradict each other in axes, unit, antialiasing or
+            flatness.
         FormatError, UnsupportedError, LimitError, StoreError, OSError: as in `csplat.open`, and errors of reading.
     """
     if isinstance(files, (str, bytes, os.PathLike)) or len(files) < 2:
-        raise InputError("merge joins two files or more: wanted a list of them")
+        raise InputError("merge takes a list of two files or more")
     with ExitStack() as stack:
         scenes = [stack.enter_context(opened(file, storage=storage)) for file in files]
         names = [scene.name or f"file {place}" for place, scene in enumerate(scenes, 1)]
-        for words, field in _FACTS:
+        for words, field in _SHARED_FIELDS:
             _refuse_contradiction(words, [getattr(scene.header, field) for scene in scenes], names)
         windows = [scene.window() for scene in scenes]
         fields = [scene_fields(one, scene.header, (), ()) for one, scene in zip(windows, scenes, strict=True)]
@@ -125,7 +126,7 @@ def merge(
         if not why:
             ids = [books.take(one, scene.header) for one, scene in zip(windows, scenes, strict=True)]
             if len(books.records) > codebooks_max:
-                why = f"they have {len(books.records):,} codebooks together, and a file at most {codebooks_max:,}"
+                why = f"they have {len(books.records):,} codebooks together, a file has at most {codebooks_max:,}"
         if why:
             return _encode_again(scenes, output, options or EncodeOptions(keep_extra=True), why)
         tiles = [
@@ -144,16 +145,12 @@ def merge(
 
 
 def _refuse_contradiction(words: str, values: Sequence[Any], names: Sequence[str]) -> None:
-    """Refuse scenes that contradict each other.
-
-    Raises:
-        InputError: two files have different values.
-    """
+    """Raise `InputError` if two files have different values."""
     known = [(value, name) for value, name in zip(values, names, strict=True) if value not in (None, UNSPECIFIED)]
     for value, name in known[1:]:
         if value != known[0][0]:
             raise InputError(
-                f"scenes that differ in {words} cannot be one: {_text(known[0][0])} in {known[0][1]},"
+                f"scenes with different {words} cannot be merged: {_text(known[0][0])} in {known[0][1]},"
                 f" {_text(value)} in {name}"
             )
 
@@ -163,23 +160,23 @@ def _text(value: Any) -> str:
 
 
 def _difference(fields: Sequence[SceneFields], names: Sequence[str]) -> str:
-    """Return why tiles of one file would mean something else in the other; "" if they would not."""
-    first, name = fields[0], names[0]
-    for other, its in zip(fields[1:], names[1:], strict=True):
+    """Return the reason why tiles of one file are not valid in another; "" if they are."""
+    first, first_name = fields[0], names[0]
+    for other, name in zip(fields[1:], names[1:], strict=True):
         if other.sh_degree != first.sh_degree:
-            return f"{its} has SH of degree {other.sh_degree}, {name} of {first.sh_degree}"
+            return f"{name} has SH of degree {other.sh_degree}, {first_name} of {first.sh_degree}"
         if other.origin != first.origin:
-            return f"{its} and {name} have different origins"
+            return f"{name} and {first_name} have different origins"
         for one, two in zip(first.attributes, other.attributes, strict=True):
             if one != two:
-                return f"{its} and {name} have different steps of {_spec.ATTRIBUTE_NAMES[one.attribute]}"
+                return f"{name} and {first_name} have different steps of {_spec.ATTRIBUTE_NAMES[one.attribute]}"
         if other.extras != first.extras:
-            return f"{its} and {name} have different extra columns"
+            return f"{name} and {first_name} have different extra columns"
     return ""
 
 
 def _agreed_chunks(scenes: Sequence[SplatFile]) -> list[FileChunk]:
-    """Metadata and cameras, as far as all files have the same."""
+    """Return chunks of the metadata and cameras that all files have in common."""
     chunks = []
     if metadata := _agreed([scene.metadata or {} for scene in scenes]):
         chunks.append(FileChunk(_spec.CHUNK_METADATA, json_payload(metadata, DeflateSettings())))
@@ -208,7 +205,7 @@ def _write_merged(
 def _encode_again(
     scenes: Sequence[SplatFile], output: str | os.PathLike[str] | BinaryWriter, options: EncodeOptions, why: str
 ) -> MergeResult:
-    """Decode tile by tile and encode anew, in memory if that is enough for it."""
+    """Decode the scenes tile by tile and encode them together, in memory if they fit."""
     metadata_model = _metadata_model(scenes)
     whole = SceneSource(sum(map(len, scenes)), metadata_model, partial(_blocks, scenes, metadata_model))
     dropped = {column.name for scene in scenes for column in scene.header.extras} - metadata_model.extra.keys()
@@ -221,10 +218,10 @@ def _encode_again(
 
 
 def _metadata_model(scenes: Sequence[SplatFile]) -> SplatModel:
-    """Return a model without splats for the scenes together: one origin, and the columns that all have."""
+    """Return the metadata of the merged scene: a common origin, and the extra columns that all files have."""
     headers = [scene.header for scene in scenes]
     origins = np.array([header.origin for header in headers])
-    x, y, z = map(float, (origins.min(axis=0) + origins.max(axis=0)) / 2.0)  # float32 is finest about it
+    x, y, z = map(float, (origins.min(axis=0) + origins.max(axis=0)) / 2.0)  # minimises float32 rounding
     axes = (header.coordinate_system for header in headers if header.coordinate_system != UNSPECIFIED)
     bands = (max(header.sh_degree for header in headers) + 1) ** 2 - 1
     cameras = [scene.cameras for scene in scenes]
@@ -272,35 +269,35 @@ _ID_END = _spec.CODEBOOK_HEAD_OFFSETS["codebook_id"] + _ID_SIZE
 
 
 class PayloadSpool:
-    """Payloads that wait in a temporary file until they are written.
+    """Payloads in a temporary file until they are written to the output.
 
     Args:
-        stream: a temporary file, open to write and read.
+        stream: a temporary file, open for reading and writing.
     """
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream = stream
 
     def put(self, kind: bytes, payload: bytes) -> LazyPayload:
-        """Put the payload of a chunk aside."""
+        """Store the payload of a chunk."""
         start = self._stream.seek(0, os.SEEK_END)
         self._stream.write(payload)
-        return LazyPayload(len(payload), chunk_crc(kind, payload), partial(self._again, start, len(payload)))
+        return LazyPayload(len(payload), chunk_crc(kind, payload), partial(self._read, start, len(payload)))
 
-    def _again(self, start: int, size: int) -> bytes:
+    def _read(self, start: int, size: int) -> bytes:
         self._stream.seek(start)
         return self._stream.read(size)
 
 
 class MergedCodebooks:
-    """The codebooks of all files under new ids from 0 on; equal codebooks are stored once.
+    """The codebooks of all files with new ids from 0 on; equal codebooks are stored once.
 
     Args:
-        spool: keeps their payloads.
+        spool: stores the payloads.
 
     Attributes:
-        records: their index records.
-        chunks: their chunks.
+        records: index records of the codebooks.
+        chunks: chunks of the codebooks.
     """
 
     def __init__(self, spool: PayloadSpool) -> None:
@@ -310,7 +307,7 @@ class MergedCodebooks:
         self._known: dict[tuple[object, ...], int] = {}
 
     def take(self, window: FileWindow, header: SceneHeader) -> dict[int, int]:
-        """Add the codebooks of a file that its tiles name; return the new ids by the old ones."""
+        """Add the codebooks that the tiles of a file reference; return the new ids by old id."""
         used = {identity for tile in header.tiles for identity in tile.codebook_ids}
         chunks = [one for one in header.directory if one.type == _spec.CHUNK_CODEBOOK and one.id in used]
         window.fetch((one.offset, one.size) for one in chunks)
@@ -324,11 +321,11 @@ class MergedCodebooks:
         return ids
 
     def _id(self, book: _spec.CodebookRecord, contents: Mapping[int, bytes]) -> int:
-        """Return the id of a codebook, known or new.
+        """Return the new id of a codebook, adding it if it is unknown.
 
         Args:
-            book: its record in its file.
-            contents: by layer, its payloads behind the id.
+            book: the record in its file.
+            contents: its payloads after the id, by layer.
         """
         bands = (book.band_first, book.band_last)
         digests = (hashlib.sha256(content).digest() for content in contents.values())
@@ -336,7 +333,7 @@ class MergedCodebooks:
         if key not in self._known:
             id = self._known[key] = len(self.records)
             self.records.append(IndexedCodebook(id, book.kind, bands, book.size))
-            if id <= _ID_MAX:  # a file with more cannot be written
+            if id <= _ID_MAX:  # with more, `merge` encodes again
                 for layer, content in contents.items():
                     payload = self._spool.put(_spec.CHUNK_CODEBOOK, _as_bytes(id) + content)
                     self.chunks.append(FileChunk(_spec.CHUNK_CODEBOOK, payload, id, layer))
@@ -346,13 +343,13 @@ class MergedCodebooks:
 def renumber_tiles(
     window: FileWindow, header: SceneHeader, ids: Mapping[int, int], spool: PayloadSpool, files: int
 ) -> list[FileTile]:
-    """Return the tiles of a file with new ids of codebooks.
+    """Return the tiles of a file with new codebook ids.
 
     Args:
         window, files: as in `ChunkPrefetcher`.
-        header: its header.
-        ids: the new ids by the old ones.
-        spool: keeps rewritten chunks; others are read when they are written.
+        header: header of the file.
+        ids: new ids by old id.
+        spool: stores rewritten chunks; other chunks are read when they are written.
     """
     changed: dict[int, dict[int, LazyPayload]] = {}
     naming = [
@@ -375,7 +372,7 @@ def renumber_tiles(
 
 
 def _naming_layers(header: SceneHeader, tile: Tile, ids: Mapping[int, int]) -> set[int]:
-    """Return the layers of a tile that may name a codebook whose id changes."""
+    """Return the layers of a tile that may reference a codebook whose id changes."""
     moved = {identity for identity in tile.codebook_ids if ids[identity] != identity}
     return {
         layer
@@ -388,7 +385,7 @@ def _naming_layers(header: SceneHeader, tile: Tile, ids: Mapping[int, int]) -> s
 def _rewrite_ids(
     window: FileWindow, header: SceneHeader, record: _spec.LayerRecord, ids: Mapping[int, int], spool: PayloadSpool
 ) -> LazyPayload | None:
-    """Rewrite the ids in a chunk, and put it aside; return `None` if it names no codebook."""
+    """Replace the ids in a chunk and store it; return `None` if it references no codebook."""
     with window.store.named_errors():
         places = list(codebook_references(window.view, header, record))
     if not places:

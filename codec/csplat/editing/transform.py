@@ -1,7 +1,7 @@
-"""Transform scenes: rotate, mirror, scale, translate, stretch, and change their axes.
+"""Transform scenes: rotate, mirror, scale, translate, stretch, and convert axes.
 
-A mirror image of a Gaussian is a Gaussian: its covariance M Σ Mᵀ does not tell M from -M, one of which is a rotation.
-Its colours follow by the parity of their SH bands. So axes of either handedness can be reached from any others.
+The mirror image of a Gaussian is a Gaussian: its covariance M Σ Mᵀ is the same for M and -M, one of which is a
+rotation. Colours change by the parity of their SH bands. So axes can be converted to axes of either handedness.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ _OPPOSITE = dict(zip("RLUDFB", "LRDUBF", strict=True))
 #: Axes assumed for a scene that does not specify any: those of COLMAP and OpenCV.
 DEFAULT_AXES = "RDF"
 _ORTHOGONAL = 1e-6  # tolerance for the entries of M Mᵀ - 1
-_WHOLE = 1e-9  # entries of a computed rotation this close to a whole number are rounded to it
-_DIRECTIONS = 40  # directions in which rotated SH bands are fitted
-_EVEN = 1e-6  # relative difference up to which a stretch counts as uniform: files have it in float32
-_ROWS = 1024  # rows converted to float64 at a time: they stay in the cache
+_WHOLE = 1e-9  # entries of a computed rotation within this distance of an integer are rounded
+_DIRECTIONS = 40  # number of directions in which rotated SH bands are fitted
+_EVEN = 1e-6  # relative difference up to which a stretch counts as uniform: files store it in float32
+_ROWS = 1024  # rows converted to float64 at a time, which fit in the cache
 
 
 def axes_rotation(before: str, after: str) -> F64:
     """Return the matrix that converts coordinates from some axes to others.
 
     Args:
-        before: directions of +x, +y and +z, three letters as in `SplatModel`.
-        after: the same of the other axes.
+        before: directions of +x, +y and +z before, three letters as in `SplatModel`.
+        after: directions of +x, +y and +z after.
 
     Returns:
-        [3, 3] float64 of 0, 1 and -1; a reflection if only one of the two is left-handed.
+        [3, 3] float64 of 0, 1 and -1; a reflection if the handedness changes.
 
     Examples:
         >>> import csplat.editing.transform
@@ -49,7 +49,7 @@ def axes_rotation(before: str, after: str) -> F64:
         [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
 
     Raises:
-        InputError: they are no axes.
+        InputError: the letters are not valid axes.
     """
     check_axes(before)
     check_axes(after)
@@ -59,8 +59,8 @@ def axes_rotation(before: str, after: str) -> F64:
 def convert_axes(scene: SceneSource, axes: str) -> SceneSource:
     """Convert a scene to the axes of a format.
 
-    A scene without axes is assumed to have x to the right, y down and z forward; if it specifies its up direction, it
-    is tilted accordingly.
+    A scene without named axes is assumed to have x right, y down and z forward. If it has an up direction, it is also
+    rotated so that this is up.
 
     Args:
         scene: the scene.
@@ -79,24 +79,24 @@ def convert_axes(scene: SceneSource, axes: str) -> SceneSource:
 
 
 def rotate_scene(model: SplatModel, rotation: ArrayLike) -> SplatModel:
-    """Rotate a scene about its zero: means, rotations, colours, origin, up and cameras.
+    """Rotate a scene about its zero: means, rotations, colours, origin, up direction and cameras.
 
-    If the matrix only permutes and flips axes, means, rotations and scales are exact, and SH as well if z stays on its
-    line: rotated back, the arrays are the same, bit for bit.
+    If the matrix only permutes and flips axes, the result is exact for means, rotations and scales, and for SH if z
+    stays on its line: rotating back restores the arrays bit for bit.
 
     Args:
         model: the scene, or some of its splats.
-        rotation: [3, 3] orthogonal, applied to columns; with a reflection, cameras see mirror images.
+        rotation: [3, 3], orthogonal, applied to column vectors; with a reflection, cameras see mirror images.
 
     Returns:
-        The scene. It has no named axes if they no longer lie along coordinate axes; the metadata has their up instead.
+        The scene. If the named axes are no longer coordinate axes, they are replaced by an up direction.
 
     Raises:
         InputError: the matrix is not orthogonal.
     """
     matrix = np.asarray(rotation, np.float64)
     if matrix.shape != (3, 3) or not (np.abs(matrix @ matrix.T - np.eye(3)) < _ORTHOGONAL).all():
-        raise InputError(f"the rotation is {matrix.tolist()}, wanted an orthogonal matrix [3, 3]")
+        raise InputError(f"the rotation is {matrix.tolist()}, expected an orthogonal matrix [3, 3]")
     quats, scales = _turned_shapes(model, matrix)
     x, y, z = (_applied(matrix, np.array(model.origin)) + 0.0).tolist()  # no negative zeros
     doubles = None if model.means_double is None else _applied(matrix, model.means_double)
@@ -108,7 +108,7 @@ def rotate_scene(model: SplatModel, rotation: ArrayLike) -> SplatModel:
         shN=_turned_sh(model.shN, matrix),
         origin=(x, y, z),
         means_double=doubles,
-        **_turned_facts(model, matrix),
+        **_turned_metadata(model, matrix),
     )
 
 
@@ -116,10 +116,10 @@ def scale_scene(model: SplatModel, factor: float) -> SplatModel:
     """Multiply all lengths of a scene by a factor.
 
     Raises:
-        InputError: the factor is not above 0, or a value leaves float32.
+        InputError: the factor is not above 0, or a value exceeds float32.
     """
     if not 0.0 < factor < np.inf:
-        raise InputError(f"the factor is {factor}, wanted one above 0")
+        raise InputError(f"the factor is {factor}, expected a number above 0")
     with np.errstate(over="ignore"):
         origin = np.array(model.origin) * factor
         doubles = None if model.means_double is None else model.means_double * factor
@@ -137,14 +137,16 @@ def scale_scene(model: SplatModel, factor: float) -> SplatModel:
 
 
 def stretch_scene(model: SplatModel, matrix: ArrayLike) -> SplatModel:
-    """Apply any linear map to a scene: a rotation, and scaling by three factors along orthogonal directions.
+    """Apply a linear map to a scene.
+
+    Colours follow the rotation in the polar decomposition of the map. Cameras are dropped unless it scales uniformly.
 
     Args:
-        model: the scene, or some of its splats; colours rotate. Cameras are dropped unless the scaling is uniform.
-        matrix: [3, 3], applied to columns, of full rank.
+        model: the scene, or some of its splats.
+        matrix: [3, 3], of full rank, applied to column vectors.
 
     Raises:
-        InputError: a value leaves float32.
+        InputError: a value exceeds float32.
     """
     left, lengths, right = np.linalg.svd(np.asarray(matrix, np.float64))
     model = rotate_scene(model, _snapped(left @ right))
@@ -171,7 +173,7 @@ def stretch_scene(model: SplatModel, matrix: ArrayLike) -> SplatModel:
 
 
 def translate_scene(model: SplatModel, offset: Direction) -> SplatModel:
-    """Translate a scene by changing its means, not its origin, which few formats can store."""
+    """Translate a scene by changing its means, because few formats store an origin."""
     step = np.array(offset, np.float64)
     doubles = None if model.means_double is None else model.means_double + step
     means = model.means + step if doubles is None else doubles - np.array(model.origin)
@@ -192,17 +194,17 @@ def _rotation_to(metadata_model: SplatModel, axes: str) -> F64:
 def _tilt(start: F64, end: F64) -> F64:
     """Return the smallest rotation that takes one unit vector to another."""
     axis, cosine = np.cross(start, end), float(start @ end)
-    if cosine < -1.0 + 1e-12:  # half a turn, about the axis that is farthest from them
+    if cosine < -1.0 + 1e-12:  # half a turn about any perpendicular axis
         axis = np.eye(3)[int(np.abs(start).argmin())]
         axis -= start * (axis @ start)
         return _snapped(2.0 * np.outer(axis, axis) / (axis @ axis) - np.eye(3))
     cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     left, _, right = np.linalg.svd(np.eye(3) + cross + cross @ cross / (1.0 + cosine))
-    return _snapped(left @ right)  # orthogonal, even if the vectors are unit to six digits only
+    return _snapped(left @ right)  # orthogonal even if the vectors are unit to six digits only
 
 
 def _applied(matrix: F64, rows: _Rows) -> _Rows:
-    """Multiply each row by a square matrix; exact if it only permutes and flips."""
+    """Multiply each row by a square matrix; exact if it only permutes and flips axes."""
     order = np.abs(matrix).argmax(axis=1)
     signs: F64 = matrix[np.arange(len(matrix)), order]
     out = np.empty_like(rows)
@@ -210,7 +212,7 @@ def _applied(matrix: F64, rows: _Rows) -> _Rows:
         picked = rows if (order == np.arange(len(order))).all() else rows[..., order]
         np.multiply(picked, signs.astype(rows.dtype), out=out)
         return out
-    with np.errstate(over="ignore"):  # the model refuses infinite values
+    with np.errstate(over="ignore"):  # `SplatModel` refuses infinite values
         for start in range(0, len(rows), _ROWS):
             part = slice(start, start + _ROWS)
             out[part] = rows[part].astype(np.float64) @ matrix.T
@@ -218,11 +220,11 @@ def _applied(matrix: F64, rows: _Rows) -> _Rows:
 
 
 def _turned_shapes(model: SplatModel, matrix: F64) -> tuple[F32, F32]:
-    """Return rotations and scales; if possible the axes of the splats are permuted with those of the scene."""
+    """Return rotations and scales; a permutation of axes permutes the scales, which is exact."""
     proper = matrix * np.sign(np.linalg.det(matrix))
     order = np.abs(matrix).argmax(axis=1)
     whole = np.count_nonzero(matrix) == 3
-    # M R S Rᵀ Mᵀ = (M R Mᵀ) (M S Mᵀ) (M R Mᵀ)ᵀ, and M S Mᵀ is diagonal. The third scale of discs stays the third.
+    # M R S Rᵀ Mᵀ = (M R Mᵀ) (M S Mᵀ) (M R Mᵀ)ᵀ, and M S Mᵀ is diagonal. The third scale of discs must stay the third.
     if whole and not (model.flat and order[2] != 2):
         turn = np.eye(4)
         turn[1:, 1:] = np.rint(proper)
@@ -231,14 +233,14 @@ def _turned_shapes(model: SplatModel, matrix: F64) -> tuple[F32, F32]:
 
 
 def _quat_of(matrix: F64) -> F64:
-    """Return quaternions of rotations [..., 3, 3], exact at any angle: largest eigenvectors (Bar-Itzhack 2000)."""
+    """Convert rotation matrices [..., 3, 3] to quaternions: eigenvectors, accurate at any angle (Bar-Itzhack 2000)."""
     a, b, c, d, e, f, g, h, i = np.moveaxis(matrix.reshape(*matrix.shape[:-2], 9), -1, 0)
     lower = np.zeros((*matrix.shape[:-2], 4, 4))
     entries = (a + e + i, h - f, a - e - i, c - g, b + d, e - a - i, d - b, c + g, f + h, i - a - e)
     for row, column, entry in zip(*np.tril_indices(4), entries, strict=True):
         lower[..., row, column] = entry
     quats: F64 = np.linalg.eigh(lower)[1][..., 3]
-    return np.where(quats[..., :1] < 0.0, -quats, quats)  # the solver's signs differ from machine to machine
+    return np.where(quats[..., :1] < 0.0, -quats, quats)  # the signs of eigenvectors differ between machines
 
 
 def _matrices(quats: F32) -> F64:
@@ -252,21 +254,21 @@ def _matrices(quats: F32) -> F64:
 
 
 def _product(quat: F64) -> F64:
-    """Return the matrix that multiplies quaternions by one from the left."""
+    """Return the matrix of the left multiplication by a quaternion."""
     w, x, y, z = quat
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
 
 
 def _turned_sh(shN: F32, matrix: F64) -> F32:
-    """Rotate SH band by band: colours at M v become those at v."""
+    """Rotate SH band by band: the colour in direction v becomes the one in direction M v."""
     directions = sphere_lattice(_DIRECTIONS)
-    there, before = sh_bands(directions), sh_bands(directions @ matrix)  # rows: v there is Mᵀ v before
+    after, before = sh_bands(directions), sh_bands(directions @ matrix)  # row v of `after` is Mᵀ v before
     out = np.empty_like(shN)
     for band in range(1, sh_degree_of(shN.shape[1]) + 1):
         part = slice(band**2 - 1, (band + 1) ** 2 - 1)
-        turn = _snapped(np.linalg.lstsq(there[band - 1], before[band - 1], rcond=None)[0])
+        turn = _snapped(np.linalg.lstsq(after[band - 1], before[band - 1], rcond=None)[0])
         shape = len(shN), 2 * band + 1, 3
-        channels = np.kron(turn, np.eye(3)).astype(np.float64)  # all three at once
+        channels = np.kron(turn, np.eye(3)).astype(np.float64)  # rotates all three channels
         out[:, part] = _applied(channels, shN[:, part].reshape(len(shN), channels.shape[0])).reshape(shape)
     return out
 
@@ -278,7 +280,7 @@ def _snapped(matrix: NDArray[Any]) -> F64:
 
 
 def sphere_lattice(count: int) -> F64:
-    """Spread unit vectors [count, 3] evenly over the sphere, on a Fibonacci lattice."""
+    """Return unit vectors [count, 3] spread evenly over the sphere, on a Fibonacci lattice."""
     index = np.arange(count) + 0.5
     height, angle = 1.0 - 2.0 * index / count, index * np.pi * (3.0 - np.sqrt(5.0))
     ring = np.sqrt(1.0 - height * height)
@@ -286,9 +288,9 @@ def sphere_lattice(count: int) -> F64:
 
 
 def sh_bands(directions: F64) -> list[F64]:
-    """Compute the basis of bands 1, 2 and 3 in unit directions, in the order and with the signs of INRIA and gsplat.
+    """Evaluate the SH basis of bands 1, 2 and 3 in unit directions, with the order and signs of INRIA and gsplat.
 
-    A factor that all functions of a band have is left out.
+    A factor common to all functions of a band is omitted.
     """
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
@@ -306,8 +308,8 @@ def sh_bands(directions: F64) -> list[F64]:
     return [np.stack(band, axis=1) for band in (first, second, third)]
 
 
-def _turned_facts(model: SplatModel, matrix: F64) -> dict[str, Any]:
-    """Return the rotated axes, metadata and cameras, as fields of a model."""
+def _turned_metadata(model: SplatModel, matrix: F64) -> dict[str, Any]:
+    """Return the rotated axes, metadata and cameras as fields of a model."""
     letters = model.coordinate_system
     fields = _with_cameras(model, lambda camera: _turned_camera(camera, matrix))
     up = up_of(model.metadata)
@@ -323,7 +325,7 @@ def _turned_facts(model: SplatModel, matrix: F64) -> dict[str, Any]:
 
 
 def _with_cameras(model: SplatModel, change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> dict[str, Any]:
-    """Return the fields of a model whose cameras change; a view that is not a camera stays."""
+    """Return the fields of a model with changed cameras; a view that is not a valid camera stays unchanged."""
     fields: dict[str, Any] = {}
     if model.cameras:
         fields["cameras"] = [change(camera) for camera in model.cameras]
@@ -336,7 +338,7 @@ def _with_cameras(model: SplatModel, change: Callable[[Mapping[str, Any]], dict[
 def _turned_camera(camera: Mapping[str, Any], matrix: F64) -> dict[str, Any]:
     view, K = np.array(camera["viewmat"], np.float64), np.array(camera["K"], np.float64)
     view[:3, :3] = view[:3, :3] @ matrix.T
-    if np.linalg.det(matrix) < 0.0:  # left and right are exchanged, so that it stays a rotation
+    if np.linalg.det(matrix) < 0.0:  # mirror the image horizontally, so that the view stays a rotation
         view[0] *= -1.0
         K[0, 2] = camera["W"] - K[0, 2]
     return {**camera, "viewmat": view.tolist(), "K": K.tolist()}

@@ -1,7 +1,7 @@
 """Read and set the up direction of a scene (spec 5.4).
 
-The axes of a scene specify where +x, +y and +z point; they can name up only along one of these. The member `up` of the
-metadata names any direction, and takes precedence over them.
+The axes of a scene specify the directions of +x, +y and +z, so their up direction is along one of these. The metadata
+entry `up` can be any direction and takes precedence.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ Direction = tuple[float, float, float]
 #: The key of the metadata for the up direction.
 UP = "up"
 
-_DIGITS = 6  # decimals: the same text on machines whose last bits differ
+_DIGITS = 6  # decimals; hides differences in the last bits between machines
 _UNIT = 1e-5  # tolerance for the length of a unit vector of six digits
-_CONTRADICTS = math.cos(math.radians(45.0))  # cosine; beyond that angle another axis is closer to up
+_CONTRADICTS = math.cos(math.radians(45.0))  # cosine; at larger angles another axis is closer to up
 
 
 def up_of(metadata: Mapping[str, Any], coordinate_system: str = UNSPECIFIED) -> Direction | None:
-    """Return the direction that is up according to a scene; `None` if it has no valid one.
+    """Return the up direction of a scene; `None` if it specifies no valid one.
 
     Args:
-        metadata: metadata of the scene; its `up` comes first.
+        metadata: metadata of the scene; a valid `up` in it takes precedence.
         coordinate_system: as in `SplatModel`.
     """
     try:
@@ -38,7 +38,7 @@ def up_of(metadata: Mapping[str, Any], coordinate_system: str = UNSPECIFIED) -> 
 
 
 def up_of_axes(coordinate_system: str) -> Direction | None:
-    """Return the up direction that three letters specify; `None` if there are none."""
+    """Return the up direction of named axes; `None` if they are unspecified."""
     if coordinate_system == UNSPECIFIED:
         return None
     x, y, z = ({"U": 1.0, "D": -1.0}.get(letter, 0.0) for letter in coordinate_system)
@@ -46,34 +46,34 @@ def up_of_axes(coordinate_system: str) -> Direction | None:
 
 
 def unit_up(values: object) -> Direction:
-    """Bring a direction to unit length, rounded to six digits.
+    """Normalise a direction to unit length, rounded to six digits.
 
     Args:
         values: three finite numbers, not all 0.
 
     Raises:
-        InputError: they are not.
+        InputError: the values are invalid.
     """
     numbers = list(values) if isinstance(values, Sequence) and not isinstance(values, str) else []
     if len(numbers) == 3 and all(type(value) in (int, float) and abs(value) < math.inf for value in numbers):
         largest = max(abs(value) for value in numbers)
         if largest > 0.0:
-            parts = [value / largest for value in numbers]  # squares of large ones are infinite
+            parts = [value / largest for value in numbers]  # squares of large numbers overflow
             length = math.hypot(*parts)
-            length = length if abs(length * largest - 1.0) > _UNIT else 1.0 / largest  # the stored value stays as it is
+            length = length if abs(length * largest - 1.0) > _UNIT else 1.0 / largest  # unit vectors stay unchanged
             x, y, z = (round(part / length, _DIGITS) + 0.0 for part in parts)
             return x, y, z
-    raise InputError(f"{UP} is {values!r}, wanted three finite numbers, not all 0")
+    raise InputError(f"{UP} is {values!r}, expected three finite numbers, not all 0")
 
 
 def with_up(model: SplatModel, up: Direction | None = None, coordinate_system: str | None = None) -> SplatModel:
-    """Return the scene with another up direction or other axes; an entry that contradicts them is removed.
+    """Return the scene with another up direction or other axes; contradicting metadata is removed.
 
     Args:
         model: the scene.
-        up: three finite numbers, not all 0; `None`: unchanged. Axes with another up are removed if no axes are
-            given.
-        coordinate_system: as in `SplatModel`; `None`: unchanged. An existing `up` is removed if none is given.
+        up: three finite numbers, not all 0; `None`: unchanged. Without `coordinate_system`, existing axes with a
+            different up are removed.
+        coordinate_system: as in `SplatModel`; `None`: unchanged. Without `up`, an existing up direction is removed.
 
     Examples:
         >>> import csplat
@@ -81,7 +81,7 @@ def with_up(model: SplatModel, up: Direction | None = None, coordinate_system: s
         [0.0, 0.0, 1.0]
 
     Raises:
-        InputError: one of them is not valid.
+        InputError: an argument is invalid.
     """
     if up is None and coordinate_system is None:
         return model

@@ -1,20 +1,21 @@
-"""Files of splats in any format: `read`, `write`, and what each format can store.
+"""Read and write splat files in any format.
 
-A module or package per format has a `FORMAT`; `formats` lists them. The content of a file decides its format, its name
-only if the content does not. Scenes of formats with fixed axes are transformed to x right, y down, z forward, the axes
-that PLY is assumed to have, so that all scenes are oriented alike.
+Each format has a module or package with a `FORMAT`; `formats` lists them. A file is identified by its content, and by
+its name only if the content is ambiguous. Scenes of formats with fixed axes are converted to x right, y down, z
+forward, the axes assumed for PLY, so all scenes have the same orientation.
 """
 
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
 
-from csplat.decoder import decode
+from csplat.decoder import decode, open_tiles
 from csplat.detect import detect_content, detect_name, read_head, refusal
 from csplat.disk_files import local_file
 from csplat.editing.transform import DEFAULT_AXES, convert_axes
@@ -43,21 +44,12 @@ __all__ = [
     "write_scene",
 ]
 
-_PLY, _CSPLAT = "ply", "csplat"  # read at once by readers of their own, which need no second copy of the arrays
-_PLY_FORMAT = Format(
-    name=_PLY,
-    open=open_ply,
-    open_bands=open_ply,
-    write=write_scene_ply,
-    splat_bytes=(68.0, 104.0, 164.0, 248.0),
-    exact=frozenset(ARRAYS),
-    carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "extra", "metadata"}),
-)
-_assumed: ContextVar[str | None] = ContextVar("assumed", default=None)  # --from of a command, for all files it reads
+_PLY, _CSPLAT = "ply", "csplat"  # `read` calls their own readers, which load a file in one pass without extra copies
+_assumed: ContextVar[str | None] = ContextVar("assumed", default=None)  # set by `assume_format`
 
 
 def formats() -> tuple[Format, ...]:
-    """Return all formats: those of this package, then those of other packages (`csplat.plugins`)."""
+    """Return all formats: first the built-in ones, then those of plugins (`csplat.plugins`)."""
     return (*_own_formats().values(), *load_plugins("csplat.formats").values())
 
 
@@ -73,12 +65,12 @@ def read(
     """Read a scene in any format.
 
     Args:
-        file: its path, also that of a folder; an open binary file; or bytes.
+        file: path of a file or folder, an open binary file, or bytes.
         format: name of the format as `csplat formats` lists it, if neither content nor name identify it.
-        strict: refuse what would be repaired.
-        keep_extra: keep columns that splats do not have.
-        sh_degree: drop the SH bands above it, 0 to 3, also from a file of a higher degree than 3; `None`: keep all.
-        report: findings are appended to this list, repairs among them.
+        strict: refuse files that need repairs.
+        keep_extra: keep columns that are not splat attributes.
+        sh_degree: drop the SH bands above this degree, 0 to 3; the file's own degree may exceed 3. `None`: keep all.
+        report: findings, including repairs, are appended to this list.
 
     Examples:
         >>> import csplat
@@ -86,8 +78,8 @@ def read(
         SplatModel(1000 splats, sh_degree=3)
 
     Raises:
-        InputError: csplat reads no such format, or the file is incomplete.
-        FormatError: it is a .csplat file that breaks a clause.
+        InputError: csplat cannot read the format, or the file is incomplete.
+        FormatError: it is a .csplat file that violates the specification.
         OSError: it cannot be read.
     """
     with local_file(file) as path:
@@ -104,7 +96,7 @@ def read(
 def read_all(
     scene: SceneSource, *, strict: bool = False, keep_extra: bool = False, report: list[Finding] | None = None
 ) -> SplatModel:
-    """Read all splats of an open scene; otherwise as `read`."""
+    """Read all splats of an open scene; arguments are those of `read`."""
     model = scene.model()
     if report is not None:
         report += scene.findings
@@ -114,13 +106,13 @@ def read_all(
 
 @contextmanager
 def assume_format(format: str | None) -> Iterator[None]:
-    """Read files as this format, until the context ends, if their content identifies no other format.
+    """Within the context, read files as this format unless their content identifies another one.
 
     Args:
-        format: name of the format; `None`: file names decide, as usual.
+        format: name of the format; `None`: use file names, as usual.
 
     Raises:
-        InputError: csplat reads no format of that name.
+        InputError: csplat cannot read a format of that name.
     """
     if format is not None and format_by_name(format).open is None:
         raise InputError(f"the format is {format}, which csplat does not read")
@@ -135,7 +127,7 @@ def assume_format(format: str | None) -> Iterator[None]:
 def open_scene(
     file: File, format: str | None = None, *, level: int = 0, sh_degree: int | None = None
 ) -> Iterator[SceneSource]:
-    """Open a scene in any format, to be read block by block.
+    """Open a scene in any format to read it block by block.
 
     Args:
         file: as in `read`.
@@ -147,7 +139,7 @@ def open_scene(
         The scene; its blocks can be read until the context ends.
 
     Raises:
-        InputError: csplat reads no such format, or the file is incomplete. Blocks raise it, too.
+        InputError: csplat cannot read the format, or the file is incomplete. Reading a block may raise it, too.
         OSError: the file cannot be read.
     """
     with local_file(file) as path, _open(_readable_format(path, format), path, level, sh_degree) as scene:
@@ -155,7 +147,7 @@ def open_scene(
 
 
 def lint_file(path: Path, *, sh_degree: int | None = None) -> list[Finding]:
-    """List what is wrong with a file of any format, without refusing it.
+    """List the defects of a file in any format without refusing it.
 
     Args:
         path: path of the file.
@@ -165,7 +157,7 @@ def lint_file(path: Path, *, sh_degree: int | None = None) -> list[Finding]:
         Findings in the order of reading; the last one is an error if `read` would refuse the file.
 
     Raises:
-        InputError: csplat reads no such format, or the header cannot be understood.
+        InputError: csplat cannot read the format, or cannot parse the header.
         OSError: the file cannot be read.
     """
     found = _readable_format(path, None)
@@ -185,7 +177,7 @@ def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = 
     """Write a scene in any format.
 
     Args:
-        path: path of the file, which appears when it is complete, replacing an older one.
+        path: path of the file; it appears when complete, replacing an older one.
         model: the scene.
         format: name of the format, if the suffix of the path does not identify it.
 
@@ -194,7 +186,7 @@ def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = 
         >>> csplat.write("copy.ply", csplat.read("scene.ply"))
 
     Raises:
-        InputError: csplat writes no such format, or it cannot store the scene.
+        InputError: csplat cannot write the format, or the format cannot store the scene.
         OSError: the file cannot be written.
     """
     check_model("write", model)
@@ -202,7 +194,7 @@ def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = 
 
 
 def write_scene(path: str | os.PathLike[str], scene: SceneSource, format: str | None = None) -> None:
-    """Write a scene block by block; otherwise as `write`."""
+    """Write a scene block by block; arguments are those of `write`."""
     target = Path(path)
     found = format_by_suffix(target) if format is None else format_by_name(format)
     if found.write is None:
@@ -214,8 +206,8 @@ def detect_format(path: Path) -> Format:
     """Identify the format of a file or folder by its content, otherwise by its name.
 
     Raises:
-        InputError: csplat reads no such format, or the content makes the format of its name unlikely; the message says
-            what the file may be, and what converts it.
+        InputError: csplat cannot read the format, or the content makes the format of its name unlikely. The message
+            names the probable format and a converter.
         OSError: the file cannot be read.
     """
     head, assumed = read_head(path), _assumed.get()
@@ -234,11 +226,11 @@ def detect_format(path: Path) -> Format:
     doubt = found.doubt(path)
     if doubt:
         raise InputError(f"{path.name} is hardly {kind.title}: {doubt}; if it is one, read it with --from {kind.name}")
-    return found  # its reader reports what is wrong
+    return found
 
 
 def format_by_suffix(path: Path) -> Format:
-    """Return the format that a file of that name has.
+    """Return the format for the suffix of a file name.
 
     Raises:
         InputError: no format has its suffix.
@@ -247,33 +239,65 @@ def format_by_suffix(path: Path) -> Format:
     found = None if kind is None else _find(kind.name)
     if found is None:
         endings = ", ".join(one.suffixes[0] for one in formats() if one.write is not None)
-        raise InputError(f"{path.name}: no format has that ending, wanted one of {endings}")
+        raise InputError(f"{path.name}: no format has that ending, expected one of {endings}")
     return found
 
 
 def format_by_name(name: str) -> Format:
-    """Return the format of that name.
+    """Return the format of a name.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such format.
     """
     found = _find(name)
     if found is None:
-        raise InputError(f"the format is {name!r}, wanted one of {', '.join(one.name for one in formats())}")
+        raise InputError(f"the format is {name!r}, expected one of {', '.join(one.name for one in formats())}")
     return found
 
 
-def _own_formats() -> dict[str, Format]:
-    # Imported here: libraries of other formats would delay the start of programs that read none.
-    from csplat.formats import compressed_ply, csplat_format, gltf, ksplat, sog, splat, spz
+@contextmanager
+def _open_csplat(path: Path) -> Iterator[SceneSource]:
+    opened = open_tiles(path)
+    yield SceneSource(opened.header.splat_count, opened.metadata_model, opened.models)
 
-    found = [compressed_ply.FORMAT, _PLY_FORMAT, csplat_format.FORMAT, spz.FORMAT, spz.FORMAT_4]
+
+def _write_csplat(path: Path, scene: SceneSource) -> None:
+    from csplat.encoder import EncodeOptions  # imported lazily: reading does not load the encoder
+    from csplat.out_of_core import encode_scene
+
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        encode_scene(scene, path, EncodeOptions(keep_extra=True), folder=Path(folder) / "work")
+
+
+_PLY_FORMAT = Format(
+    name=_PLY,
+    open=open_ply,
+    open_bands=open_ply,
+    write=write_scene_ply,
+    splat_bytes=(68.0, 104.0, 164.0, 248.0),
+    exact=frozenset(ARRAYS),
+    carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "extra", "metadata"}),
+)
+_CSPLAT_FORMAT = Format(
+    name=_CSPLAT,
+    open=_open_csplat,
+    write=_write_csplat,
+    splat_bytes=(7.0, 8.0, 9.0, 10.0),
+    carries=_PLY_FORMAT.carries | {"cameras"},
+)
+
+
+def _own_formats() -> dict[str, Format]:
+    # Imported lazily: the libraries of these formats delay the start of programs that do not need them.
+    from csplat.formats import compressed_ply, gltf, ksplat, sog, splat, spz
+
+    found = [compressed_ply.FORMAT, _PLY_FORMAT, _CSPLAT_FORMAT, spz.FORMAT, spz.FORMAT_4]
     found += [splat.FORMAT, ksplat.FORMAT, sog.FORMAT, gltf.FORMAT]
     return {one.name: one for one in found}
 
 
 def _find(name: str) -> Format | None:
-    """Return the format of that name, looking for those of other packages only if this one has none."""
+    """Return the format of a name or `None`; plugins are loaded only if no built-in format has it."""
     return _own_formats().get(name) or load_plugins("csplat.formats").get(name)
 
 
@@ -288,11 +312,11 @@ def _readable_format(path: Path, format: str | None) -> Format:
 def _open(
     found: Format, path: Path, level: int = 0, sh_degree: int | None = None, *, lenient: bool = False
 ) -> Iterator[SceneSource]:
-    """Open a scene along the usual axes, even with findings that are errors if `lenient`."""
+    """Open a scene along the default axes; `lenient` accepts findings that are errors."""
     assert found.open is not None
     check_sh_degree(sh_degree)
     if level and found.open_level is None:
-        raise InputError(f"{path.name} is {found.title}, which has no levels, and level {level} is wanted")
+        raise InputError(f"{path.name} is {found.title}, which has no levels: level {level} cannot be read")
     if found.open_level is not None:
         opened = found.open_level(path, level)
     elif found.open_bands is not None and sh_degree is not None:

@@ -1,4 +1,4 @@
-"""Steps that several formats share: rows to a scene, checks of activated values, packing, sorting along a Z curve."""
+"""Shared steps of the formats: rows to scenes, checks of activated values, quaternion packing, sorting on a Z curve."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from csplat.types import F32, F64, I64, U8
 
 Rows = NDArray[Any]
 
-_HUGE = float(np.exp(87.0))  # scene units; only files with larger standard deviations are searched for huge values
+_HUGE = float(np.exp(87.0))  # scene units; huge values are only counted if a standard deviation exceeds this
 _SMALLEST = np.float32(1e-20)  # scene units; replaces a standard deviation of 0
 
 
@@ -34,16 +34,16 @@ def finite_scene(
     *,
     zero_quat: int = 0,
 ) -> SceneSource:
-    """Make a scene of structured rows, dropping and counting those with NaN or infinity.
+    """Build a scene from structured rows, dropping and counting rows with NaN or infinity.
 
     Args:
-        blocks: yields rows, at most `BLOCK_SPLATS` at a time, together with arrays of the same length.
-        decode: makes a model of natural logarithms of scales and such a tuple.
+        blocks: yields tuples of rows, at most `BLOCK_SPLATS`, and further arrays of the same length.
+        decode: called with the natural logarithms of the scales and such a tuple, returns a model.
         metadata_model: as in `SceneSource`.
         zero_quat: value of each component of a rotation of length 0 in the file.
 
     Returns:
-        The scene; its findings hold an error if there are rows but none is finite.
+        The scene; its findings contain an error if there are rows but none is finite.
     """
     total, kept, empty, scale_range, statistics = 0, 0, 0, RangeStatistics(), RowStatistics()
     for rows, *_ in blocks():
@@ -52,7 +52,7 @@ def finite_scene(
         scales = np.ascontiguousarray(found["scales"])
         scale_range.add(scales, total)
         colours = [found["shN"]] if "shN" in (rows.dtype.names or ()) and found["shN"].dtype.kind == "f" else []
-        huge = max(scale_range.most, -scale_range.least) > _HUGE  # so far; most files have none
+        huge = max(scale_range.most, -scale_range.least) > _HUGE
         statistics.huge += count_huge_rows(_log_scales(scales.astype(np.float32)) if huge else scales[:0], *colours)
         empty += _count_empty_rows(rows)
         zero = np.logical_and.reduce([found["quats"][:, part] == zero_quat for part in range(4)])
@@ -63,8 +63,8 @@ def finite_scene(
     are_logs, findings = classify_scales(scale_range, "scale", strict=False)
     findings = list_findings(statistics, total) + findings
     if empty:
-        text = f"{counted(empty, 'splat')} whose bytes are all 0, which nothing is seen of: kept"
-        findings.append(Finding("zero-rows", empty, f"{text}; a download that broke off may leave them", "note"))
+        text = f"{counted(empty, 'splat')} whose bytes are all 0, which are invisible: kept"
+        findings.append(Finding("zero-rows", empty, f"{text}; an interrupted download may leave them", "note"))
 
     def models() -> Iterator[SplatModel]:
         for parts in blocks():
@@ -79,8 +79,8 @@ def finite_scene(
 
 def _count_empty_rows(rows: Rows) -> int:
     """Count rows whose bits are all 0."""
-    unseen = np.flatnonzero(rows["colours"][:, 3] == 0)
-    return int(np.count_nonzero(~rows[unseen].view(np.uint8).reshape(len(unseen), rows.dtype.itemsize).any(axis=1)))
+    transparent = rows[rows["colours"][:, 3] == 0]
+    return int(np.count_nonzero(~transparent.view(np.uint8).reshape(len(transparent), rows.dtype.itemsize).any(axis=1)))
 
 
 def _finite_rows(rows: Rows) -> NDArray[np.bool_]:
@@ -88,47 +88,47 @@ def _finite_rows(rows: Rows) -> NDArray[np.bool_]:
     for name in rows.dtype.names or ():
         if rows.dtype[name].base.kind == "f" and rows[name].size:
             with np.errstate(over="ignore", invalid="ignore"):
-                one_is_not = not np.isfinite(rows[name].sum(dtype=np.float32))  # or the sum is too large
-            if one_is_not:
+                suspicious = not np.isfinite(rows[name].sum(dtype=np.float32))  # a sum of finite values may overflow
+            if suspicious:
                 good &= np.isfinite(rows[name]).all(axis=1)
     return good
 
 
 def _log_scales(scales: F32) -> F32:
-    """Return natural logarithms of standard deviations, with `_SMALLEST` in place of 0."""
+    """Return natural logarithms of standard deviations; `_SMALLEST` replaces 0."""
     logs: F32 = np.log(np.maximum(np.abs(scales), _SMALLEST))
     return logs
 
 
 def round_to_bytes(values: F32) -> U8:
-    """Round to integers within 0 to 255."""
+    """Round to integers, clipped to 0..255."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 def sh0_from_bytes(colours: NDArray[np.uint8]) -> F32:
-    """Return the SH coefficients of degree 0 of colours [N, 3]."""
+    """Convert colours [N, 3] to SH coefficients of degree 0."""
     return (np.divide(colours, 255, dtype=np.float32) - np.float32(0.5)) / np.float32(SH_C0)
 
 
-# glTF, .splat and .ksplat store values after activation: scales of at least 0, opacities from 0 to 1. Some writers omit
-# the activation (splat-transform 2.3.1 in its GLB). One value does not show that; all of them together do.
+# glTF, .splat and .ksplat store activated values: scales >= 0, opacities from 0 to 1. Some writers omit the activation
+# (splat-transform 2.3.1 in its GLB). A single value does not reveal that, the distribution of all values does.
 _LOGS = (-30.0, 10.0)  # plausible natural logarithms of lengths in scene units: 1e-13 to 22,026
-_MOST_ARE_LOGS = 0.5  # smallest share of negative values: most splats of trained scenes are smaller than a unit
-_MANY_LOGITS = 0.25  # smallest share of values outside of 0..1: in trained scenes it is two thirds and more
-_OVERSHOOT = (-1.0, 2.0)  # opacities that are clipped: writers that do not end in a sigmoid overshoot now and then
+_MOST_ARE_LOGS = 0.5  # minimum fraction of negative values: most splats of trained scenes are smaller than one unit
+_MANY_LOGITS = 0.25  # minimum fraction of values outside 0..1; trained scenes have two thirds or more
+_OVERSHOOT = (-1.0, 2.0)  # opacities in this range are clipped: writers without a sigmoid overshoot occasionally
 
 
 @dataclass
 class RangeStatistics:
-    """Statistics of values relative to the range that is allowed, updated by `add`.
+    """Statistics of values relative to an allowed range, updated by `add`.
 
     Attributes:
-        low, high: the range.
+        low, high: the allowed range.
         count: number of values.
         below, above: number of values below and above the range.
-        least, most: smallest and largest of all values.
-        rows: number of splats with a value outside.
-        first: index of the first of these splats and its value; `None`: there is none.
+        least, most: minimum and maximum of all values.
+        rows: number of splats with a value outside the range.
+        first: index of the first such splat and its value; `None` if there is none.
     """
 
     low: float = 0.0
@@ -142,7 +142,7 @@ class RangeStatistics:
     first: tuple[int, float] | None = None
 
     def add(self, values: NDArray[Any], start: int) -> None:
-        """Add values [N] or [N, C] of the splats from number `start` on; NaN statistics as inside the range."""
+        """Add values [N] or [N, C] of the splats from index `start` on; NaN counts as inside the range."""
         if not values.size:
             return
         least, most = float(np.fmin.reduce(values, axis=None)), float(np.fmax.reduce(values, axis=None))
@@ -165,13 +165,13 @@ def classify_scales(found: RangeStatistics, name: str, *, strict: bool, writer: 
     """Decide whether scales are logarithms.
 
     Args:
-        found: the scales of a file, with a range from 0 on.
+        found: statistics of the scales of a file, with an allowed range from 0 on.
         name: name of their column, for messages.
-        strict: the format forbids negative scales; otherwise their sign is ignored: a covariance has their squares.
+        strict: negative scales are an error. Otherwise their sign is ignored, because covariances contain squares.
         writer: the program that wrote the file, if the file names it.
 
     Returns:
-        True if they are logarithms; and findings, with an error if they are neither.
+        True if the scales are logarithms; and findings, which contain an error if they are neither.
     """
     if found.first is None:
         return False, []
@@ -182,25 +182,25 @@ def classify_scales(found: RangeStatistics, name: str, *, strict: bool, writer: 
         return True, [Finding("log-scales", found.rows, text, "repair")]
     text = f"{name} of splat {row} is {value:.6g}, expected a standard deviation of at least 0"
     if not strict:
-        repair = f"{text}; {counted(found.rows, 'splat')} of that kind: the sign is left out"
+        repair = f"{text}; {counted(found.rows, 'splat')} of that kind: the sign is ignored"
         return False, [Finding("negative-scales", found.rows, repair, "repair")]
     text += f"; {share:.1%} of the values are negative, from {found.least:.3g} to {found.most:.3g}: export it again"
     return False, [Finding("negative-scales", found.rows, text, "error")]
 
 
 def classify_opacities(found: RangeStatistics, name: str) -> tuple[bool, list[Finding]]:
-    """Decide whether opacities are logits; as `classify_scales`, with a range from 0 to 1."""
+    """Decide whether opacities are logits; like `classify_scales`, with an allowed range of 0 to 1."""
     if found.first is None:
         return False, []
     share, (row, value) = found.rows / found.count, found.first
     if share >= _MANY_LOGITS and found.below and (found.above or found.least < _OVERSHOOT[0]):
-        text = f"{name}: {share:.0%} of the values lie outside of 0 to 1, from {found.least:.3g} to {found.most:.3g}"
+        text = f"{name}: {share:.0%} of the values are outside 0 to 1, from {found.least:.3g} to {found.most:.3g}"
         return True, [Finding("logit-opacities", found.rows, f"{text}: read as logits", "repair")]
     text = f"{name} of splat {row} is {value:.6g}, expected 0 to 1"
     if _OVERSHOOT[0] <= found.least and found.most <= _OVERSHOOT[1]:
         repair = f"{text}; {counted(found.rows, 'splat')} of that kind: clipped"
         return False, [Finding("out-of-range-opacities", found.rows, repair, "repair")]
-    text += f"; the values go from {found.least:.3g} to {found.most:.3g}: export it again"
+    text += f"; the values range from {found.least:.3g} to {found.most:.3g}: export it again"
     return False, [Finding("out-of-range-opacities", found.rows, text, "error")]
 
 
@@ -208,19 +208,19 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 def crossed_bounds(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return a mask of lower bounds that exceed the upper one by more than a rounding of float32."""
+    """Return a mask of the lower bounds that exceed their upper bound by more than one float32 rounding."""
     above: NDArray[np.bool_] = low > np.nextafter(high.astype(np.float32), np.float32(np.inf))
     return above
 
 
 def encode_smallest_three(quats: F32) -> tuple[NDArray[np.int64], F32]:
-    """Drop the largest component of each rotation after making it positive: the others determine it.
+    """Drop the largest component of each unit quaternion, which the other three determine once it is positive.
 
     Args:
         quats: [N, 4], unit.
 
     Returns:
-        The index of the dropped component [N], 0 to 3, the first of equal ones; and the others [N, 3] in order, within
+        [N] index of the dropped component, 0 to 3, the lowest on ties; and [N, 3] the others in order, within
         ± 1 / sqrt(2).
     """
     largest = np.argmax(np.abs(quats), 1)
@@ -230,7 +230,7 @@ def encode_smallest_three(quats: F32) -> tuple[NDArray[np.int64], F32]:
 
 
 def decode_smallest_three(largest: NDArray[Any], three: F32) -> F32:
-    """Invert `encode_smallest_three`; components whose squares sum to more than 1 are normalised.
+    """Invert `encode_smallest_three`; components whose squares sum to more than 1 are rescaled.
 
     Args:
         largest: [N], 0 to 3.
@@ -249,9 +249,9 @@ def decode_smallest_three(largest: NDArray[Any], three: F32) -> F32:
     return normalise_quats(quats)
 
 
-_STEPS = 1 << 21  # cells along each axis of the Z curve
-_CURVE_SAMPLE = 1 << 16  # splats that determine the ends of the curve and its splits
-_IN_MEMORY = 1 << 24  # bytes that are sorted without a file
+_STEPS = 1 << 21  # cells of the Z curve along each axis
+_CURVE_SAMPLE = 1 << 16  # number of splats that determine the bounds of the curve and its splits
+_IN_MEMORY = 1 << 24  # bytes; smaller scenes are sorted without a file
 
 
 @contextmanager
@@ -260,21 +260,21 @@ def sorted_along_curve(scene: SceneSource, folder: Path) -> Iterator[SceneSource
 
     Args:
         scene: the scene; its blocks are read twice.
-        folder: folder for an unnamed file of 56 bytes per splat, and 12 more per SH coefficient. Memory holds only a
-            few blocks.
+        folder: folder for an unnamed temporary file of 56 bytes per splat and 12 per SH coefficient. Only a few blocks
+            are in memory at a time.
 
     Yields:
-        The sorted scene, without extra columns; all of its blocks but the last are full.
+        The sorted scene without extra columns; all blocks but the last are full.
 
     Raises:
-        InputError: the blocks of the scene raise it.
+        InputError: raised by the blocks of the scene.
         OSError: the folder is full.
     """
     curve = _ZCurve.through(scene)
     metadata_model = replace(scene.metadata_model, extra={}, means_double=None)
     dtype = np.dtype([(name, "<f4", getattr(metadata_model, name).shape[1:]) for name in ARRAYS])
     with tempfile.SpooledTemporaryFile(_IN_MEMORY, dir=str(folder)) as spool:
-        runs = []  # for each block written, the offsets of its parts
+        runs = []  # per block written: the offsets of its parts
         for model in scene.blocks():
             codes = curve.codes(model.means)
             order = np.argsort(codes, kind="stable")
@@ -292,7 +292,7 @@ def sorted_along_curve(scene: SceneSource, folder: Path) -> Iterator[SceneSource
 
 
 def _merge_runs(spool: IO[bytes], runs: Sequence[I64], dtype: np.dtype[Any], curve: _ZCurve) -> Iterator[NDArray[Any]]:
-    """Yield sorted rows, about a block at a time: the parts of all runs between two splits."""
+    """Yield the sorted rows between two splits at a time, about one block, collected from all runs."""
     for part in range(len(curve.splits) + 1):
         pieces = []
         for run in runs:
@@ -323,7 +323,7 @@ class _ZCurve:
     """A Z curve through a scene.
 
     Attributes:
-        low, high: [3], bounds of a sample; positions beyond are moved to the border.
+        low, high: [3], bounds of a sample; positions outside are clipped.
         splits: codes that divide the scene into blocks of about equal size.
     """
 
@@ -340,7 +340,7 @@ class _ZCurve:
             at += len(model)
         sample = np.concatenate(taken)
         if at != scene.count:
-            raise InputError(f"the scene has {at:,} splats, {scene.count:,} were announced")
+            raise InputError(f"the scene has {at:,} splats, expected {scene.count:,}")
         if not len(sample):
             return cls(np.zeros(3), np.ones(3), np.zeros(0, np.int64))
         low, high = sample.min(0).astype(np.float64), sample.max(0).astype(np.float64)

@@ -1,7 +1,7 @@
-"""PlayCanvas' compressed PLY: packed words, scaled to the bounds of chunks of 256 splats.
+"""PlayCanvas' compressed PLY: attributes packed into words, relative to the bounds of chunks of 256 splats.
 
-Follows the sources of splat-transform (MIT), `decompress-ply.ts` and `compressed-chunk.ts`. Metadata is in the comments
-of the header, as in a plain PLY.
+Follows `decompress-ply.ts` and `compressed-chunk.ts` of splat-transform (MIT). Metadata is stored in header comments,
+as in a plain PLY.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, U8, U32
 
 _CHUNK = 256  # splats that share bounds
-_LARGEST_LOG = 20.0  # log scales are clipped to it: larger ones would take all steps of their chunk
+_LARGEST_LOG = 20.0  # log scales are clipped to ± this: a larger one would use up the precision of its chunk
 _LARGEST_BOUND = 9e37  # largest colour bound: a coefficient is 3.5 times that, and float32 ends at 3.4e38
-_BANDS = (9, 24, 45, 72)  # number of SH columns, degrees 1 to 4
+_BANDS = (9, 24, 45, 72)  # number of SH columns by degree, 1 to 4
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
@@ -42,7 +42,7 @@ _PACKED_COLUMNS = ["packed_position", "packed_rotation", "packed_scale", "packed
 
 @dataclass(frozen=True)
 class _Element:
-    """The rows of an element: their offset in the file, number and type."""
+    """The rows of a PLY element: file offset, count and type."""
 
     offset: int
     count: int
@@ -62,7 +62,7 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
     elements, comments, findings = _parse_header(path)
     chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
     if chunk is None or vertex is None:
-        raise InputError(f"{path.name} has no element {'chunk' if chunk is None else 'vertex'}: no compressed PLY")
+        raise InputError(f"{path.name} has no element {'chunk' if chunk is None else 'vertex'}: not a compressed PLY")
     _check_columns(path, "vertex", vertex, _PACKED_COLUMNS, "<u4")
     coloured = "min_r" in (chunk.dtype.names or ())
     names = _BOUNDS + (_COLOUR_BOUNDS if coloured else [])
@@ -70,7 +70,7 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
     if chunk.count != -(-vertex.count // _CHUNK):
         raise InputError(
             f"{path.name}: {counted(chunk.count, 'chunk')} for {counted(vertex.count, 'splat')},"
-            f" wanted one for each {_CHUNK}"
+            f" expected one per {_CHUNK}"
         )
     kept = 0  # coefficients per channel
     if sh is not None:
@@ -78,7 +78,7 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
         if sh.count != vertex.count or rest not in _BANDS:
             raise InputError(
                 f"{path.name}: {counted(sh.count, 'row')} of {rest} SH coefficients for"
-                f" {counted(vertex.count, 'splat')}, wanted as many, of 9, 24 or 45"
+                f" {counted(vertex.count, 'splat')}, expected one row of 9, 24 or 45 per splat"
             )
         _check_columns(path, "sh", sh, [f"f_rest_{index}" for index in range(rest)], "u1")
         degree = _BANDS.index(rest) + 1
@@ -86,21 +86,21 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
             raise InputError(f"{path.name} has {too_many_bands(degree)}")
         kept = rest // 3 if sh_degree is None else min(rest // 3, (sh_degree + 1) ** 2 - 1)
         if degree > MAX_SH_DEGREE:
-            text = f"SH degree {degree}: bands above {sh_degree} are left out, as asked"
+            text = f"SH degree {degree}: bands above {sh_degree} are dropped, as requested"
             findings.append(Finding("sh-bands", rest - 3 * kept, text, "note"))
     table = chunk.read(path, 0, chunk.count)
-    with np.errstate(invalid="ignore"):  # a signalling NaN is refused below
+    with np.errstate(invalid="ignore"):  # signalling NaNs are refused below
         columns = np.stack([table[name] for name in names], 1).astype(np.float64)
     bounds = columns.reshape(chunk.count, len(names) // 6, 2, 3)
     bad = np.argwhere(~(np.abs(bounds) < _LARGEST_BOUND))
     if len(bad):
         row, kind, end, axis = bad[0]
-        raise InputError(f"{path.name}: chunk {row} has no finite {names[kind * 6 + end * 3 + axis]}")
+        raise InputError(f"{path.name}: {names[kind * 6 + end * 3 + axis]} of chunk {row} is not finite")
     bad = np.argwhere(crossed_bounds(bounds[:, :, 0], bounds[:, :, 1]))
     if len(bad):
         row, kind, axis = bad[0]
         low, high = (f"{names[kind * 6 + end * 3 + axis]} {bounds[row, kind, end, axis]:.6g}" for end in (0, 1))
-        raise InputError(f"{path.name}: chunk {row} has {low} above {high}, expected at most that")
+        raise InputError(f"{path.name}: chunk {row} has {low}, expected at most {high}")
     try:
         metadata = parse_comments(comments)
         metadata_model = SplatModel(
@@ -123,10 +123,10 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
 
 
 def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Finding]]:
-    """Return the elements, all of whose rows are present, the comments and findings."""
+    """Return the elements, the comments and findings, after checking that the file has all rows."""
     findings: list[Finding] = []
     header = read_ply_header(path, findings, "compressed-ply")
-    findings = [one for one in findings if one.repairable]  # numbers of rows are checked below
+    findings = [one for one in findings if one.repairable]  # row counts are checked below
     lines = [line.strip() for line in header.text.decode("ascii").splitlines()[:-1]]
     found: list[tuple[str, int, list[tuple[str, str]]]] = []
     comments, form = [], ""
@@ -141,18 +141,18 @@ def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Find
         elif words[:1] == ["property"] and len(words) == 3 and words[1] in _TYPES and found:
             found[-1][2].append((words[2], _TYPES[words[1]]))
         elif words and words[0] != "obj_info":
-            raise InputError(f"{path.name}: the header line {line[:80]!r} is none of a compressed PLY")
+            raise InputError(f"{path.name}: the header line {line[:80]!r} is not valid in a compressed PLY")
     if form != "binary_little_endian 1.0":
-        raise InputError(f"{path.name}: the format is {form[:40]!r}, wanted binary_little_endian 1.0")
+        raise InputError(f"{path.name}: the format is {form[:40]!r}, expected binary_little_endian 1.0")
     elements: dict[str, _Element] = {}
     offset, size = header.end, path.stat().st_size
     for name, count, columns in found:
         if len({column for column, _ in columns}) != len(columns) or name in elements:
-            raise InputError(f"{path.name}: the header says something of {name} twice")
+            raise InputError(f"{path.name}: the header declares {name} or one of its columns twice")
         elements[name] = _Element(offset, count, np.dtype(columns))
         offset += count * elements[name].dtype.itemsize
     if offset > size:
-        raise InputError(f"{path.name}: {size:,} bytes, its header declares {offset:,}: copy or download it again")
+        raise InputError(f"{path.name} has {size:,} bytes, its header declares {offset:,}: copy or download it again")
     return elements, comments, findings + trailing_bytes(size - offset)
 
 
@@ -160,16 +160,16 @@ def _check_columns(path: Path, name: str, element: _Element, wanted: list[str], 
     fields: Any = element.dtype.fields or {}
     for column in wanted:
         if column not in fields or fields[column][0] != np.dtype(kind):
-            raise InputError(f"{path.name}: {name} has no {np.dtype(kind).name} {column}: no compressed PLY")
+            raise InputError(f"{path.name}: {name} has no {np.dtype(kind).name} {column}: not a compressed PLY")
 
 
 def _unpack(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None, kept: int) -> dict[str, Any]:
     """Decode the arrays of a model.
 
     Args:
-        words: packed words of the splats.
-        bounds: [C, 2 or 3, 2, 3], bounds of their chunks: means, scales and perhaps colours; low and high.
-        sh: rows of SH coefficients; `None`: there are none.
+        words: [N] packed words of the splats.
+        bounds: [C, 2 or 3, 2, 3], lower and upper bounds per chunk of means, scales and, if stored, colours.
+        sh: [N] rows of SH coefficients; `None` if the file has none.
         kept: number of coefficients per channel to decode.
     """
     count = len(words)
@@ -187,7 +187,7 @@ def _unpack(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None, 
     shN = np.zeros((count, kept, 3), np.float32)
     if sh is not None and kept:
         names = sh.dtype.names or ()
-        codes = sh.view(np.uint8).reshape(count, len(names))  # bytes only, none between them
+        codes = sh.view(np.uint8).reshape(count, len(names))  # all columns are bytes, without gaps
         each = len(names) // 3
         places = [names.index(f"f_rest_{channel * each + index}") for channel in range(3) for index in range(kept)]
         shN = _sh_values()[codes[:, places].reshape(count, 3, -1).transpose(0, 2, 1)]
@@ -230,7 +230,7 @@ def _write(path: Path, scene: SceneSource) -> None:
 
 
 def _pack_words(model: SplatModel) -> tuple[F32, U32]:
-    """Return the bounds of the chunks of a block [C, 18] and the words of its splats [N, 4]."""
+    """Return the chunk bounds [C, 18] and the words [N, 4] of a block."""
     largest, three = encode_smallest_three(model.quats)
     steps = np.clip(np.rint((three / np.float32(2**0.5) + np.float32(0.5)) * 1023), 0, 1023).astype(np.int64)
     words = np.empty((len(model), 4), "<u4")
@@ -253,7 +253,7 @@ def _sh_codes(model: SplatModel) -> U8:
 
 
 def _pack(values: F32, bits: tuple[int, int, int]) -> tuple[U32, F32, F32]:
-    """Pack three columns into the upper bits of words; return also the bounds of each chunk, [C, 3] each."""
+    """Pack three columns into the upper bits of words; also return the lower and upper chunk bounds, [C, 3] each."""
     count = len(values)
     starts = np.arange(0, count, _CHUNK)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)

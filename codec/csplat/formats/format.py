@@ -1,4 +1,4 @@
-"""A file format: how it is read and written, and which parts of a scene it can store."""
+"""Describe a file format: its reader, its writer, and the parts of a scene that it can store."""
 
 from __future__ import annotations
 
@@ -12,39 +12,38 @@ from csplat.detect import KINDS
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.scene_source import SceneSource
 
-#: Splat attributes of every format.
+#: Splat attributes common to all formats.
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
-# Opening a file raises InputError if it is incomplete or not of the format, OSError if it cannot be read; so do the
-# blocks of the scene, which can be read until the context ends.
+# Opening a file raises InputError if it is incomplete or of another format, OSError if it cannot be read. Reading its
+# blocks raises the same errors; it is possible until the context ends.
 OpenScene = Callable[[Path], AbstractContextManager[SceneSource]]
 OpenLevel = Callable[[Path, int], AbstractContextManager[SceneSource]]  # level of detail, 0 is the finest
-OpenBands = Callable[
-    [Path, int], AbstractContextManager[SceneSource]
-]  # highest SH degree to read; the file may have more
-# Writing raises InputError if the format cannot hold the scene (too many splats, positions out of range), OSError if
-# the file cannot be written. The path appears when the file is complete.
+OpenBands = Callable[[Path, int], AbstractContextManager[SceneSource]]  # highest SH degree to read
+# Writing raises InputError if the format cannot represent the scene (too many splats, positions out of range), OSError
+# if the file cannot be written. The path appears when the file is complete.
 WriteScene = Callable[[Path, SceneSource], None]
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format of files.
+    """A file format.
 
     Attributes:
-        name: the name in `csplat formats` and `--from`, a key of `csplat.detect.KINDS`: `spz`.
+        name: name for `csplat formats` and `--from`, a key of `csplat.detect.KINDS`, for example `spz`.
         open: opens a file; `None`: csplat does not read the format.
         open_level: opens a level of detail; `None`: scenes have one level.
-        open_bands: opens a file without the SH bands above a degree; `None`: `open` reads all bands of a model.
+        open_bands: opens a file without the SH bands above a degree; `None`: `open` reads all bands.
         write: writes a file; `None`: csplat does not write the format.
-        doubt: for formats known by the file name alone, returns why a file is hardly of this format; "" if it may be.
+        doubt: for formats identified by the file name alone: returns the reason why the content is unlikely to be of
+            this format, "" if it may be.
         degree: highest SH degree that the format stores.
-        axes: directions of +x, +y and +z in all files of this format, along which `open` returns scenes; "" if files
-            name their axes or leave them open.
-        exact: names of the arrays that come back bit for bit; opacities stored as logits come back within an ulp.
-        splat_bytes: approximate bytes of a splat at SH degrees 0 to 3; empty if that depends on the scene.
-        carries: which of `antialiased`, `origin`, `extra`, `metadata`, `coordinate_system`, `unit_metres`, `flat` and
-            `cameras` the format stores.
+        axes: directions of +x, +y and +z in every file of this format, and in the scenes that `open` returns; "" if
+            files specify their axes or leave them open.
+        exact: names of the arrays that are stored losslessly; opacities stored as logits come back within an ulp.
+        splat_bytes: approximate bytes per splat at SH degrees 0 to 3; empty if that depends on the scene.
+        carries: the fields among `antialiased`, `origin`, `extra`, `metadata`, `coordinate_system`, `unit_metres`,
+            `flat` and `cameras` that the format stores.
     """
 
     name: str
@@ -61,12 +60,12 @@ class Format:
 
     @property
     def title(self) -> str:
-        """The name in prose: `SPZ 4`."""
+        """Name for messages, for example `SPZ 4`."""
         return KINDS[self.name].title
 
     @property
     def suffixes(self) -> tuple[str, ...]:
-        """Endings of file names, the usual one first; with their dots, in lower case."""
+        """File name suffixes with their dots, in lower case, the usual one first."""
         return KINDS[self.name].suffixes
 
     def expected_bytes(self, model: SplatModel, count: int) -> int | None:
@@ -74,7 +73,7 @@ class Format:
         return round(count * self.splat_bytes[min(model.sh_degree, self.degree)]) if self.splat_bytes else None
 
     def losses(self, model: SplatModel) -> tuple[str, ...]:
-        """List the parts of a scene that this format cannot store, a few words each; precision is not one of them.
+        """Describe the parts of a scene that this format cannot store, in a few words each; precision is not listed.
 
         Args:
             model: `metadata_model` of a `SceneSource`, or a model.

@@ -1,7 +1,7 @@
-""".ksplat 0.1 of mkkellogg/GaussianSplats3D: rows of floats or of smaller types around bucket centres.
+"""Read .ksplat 0.1 of mkkellogg/GaussianSplats3D: rows of floats, or of smaller types relative to bucket centres.
 
-Level 0 is float32 throughout. Levels 1 and 2 have 16-bit positions in a block around the centre of a bucket of splats
-and float16 for the rest, except SH in bytes at level 2. SH go up to degree 2. Files do not specify which way is up.
+Level 0 is float32 throughout. Levels 1 and 2 store 16-bit positions in a block around the centre of a bucket of splats
+and float16 for the rest, except that level 2 stores SH in bytes. The highest SH degree is 2. Files do not specify axes.
 """
 
 from __future__ import annotations
@@ -31,22 +31,23 @@ Rows = NDArray[Any]
 _HEADER = struct.Struct("<BBxxIIIIHxx12xff")
 _SECTION = struct.Struct("<IIIIfHxxIIIIH")
 _HEADER_SIZE, _SECTION_SIZE = 4096, 1024
-_TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))  # per level: positions, others, SH
+_TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))  # by level: positions, others, SH
 _COEFFICIENTS = (0, 9, 24)  # number of SH coefficients, by degree
 _CENTRE_SIZE = 12
-_DEFAULT_SPAN = 32767  # units of a position from the centre of a block to its faces
+_DEFAULT_SPAN = 32767  # position units from the centre of a block to its faces
 _DEFAULT_SH = 1.5  # SH bytes represent -1.5 to 1.5
-_LARGEST = 1e38  # larger values leave float32
+_LARGEST = 1e38  # larger values exceed float32
 
 
 @dataclass(frozen=True, eq=False)
 class _Section:
-    """Splats whose rows have one type.
+    """A section: splats whose rows have one type.
 
     Attributes:
-        ends: [buckets] index of the splat after the last one of each.
-        corners: [buckets, 3] the place of position 0 in each, scene units.
-        step: scene units per unit of a position.
+        rows: [N], structured.
+        ends: [buckets], index after the last splat of each bucket.
+        corners: [buckets, 3], scene coordinates of position 0.
+        step: scene units per position unit.
     """
 
     rows: Rows
@@ -59,11 +60,11 @@ class _SectionHead(NamedTuple):
     """The header of a section.
 
     Attributes:
-        capacity: number of splats that the section has bytes for.
+        capacity: number of splats for which the section has space.
         bucket: number of splats in a full bucket.
-        block: length of the block around a bucket's centre, scene units.
-        span: units of a position from the centre to a face; 0: `_DEFAULT_SPAN`.
-        full, partial: number of full and of other buckets.
+        block: edge length of the block around a bucket's centre, scene units.
+        span: position units from the centre to a face; 0: `_DEFAULT_SPAN`.
+        full, partial: number of full and of partial buckets.
     """
 
     splats: int
@@ -83,19 +84,19 @@ class _SectionHead(NamedTuple):
 def _open(path: Path) -> Iterator[SceneSource]:
     data = map_file(path)
     if len(data) < _HEADER_SIZE:
-        raise InputError(f"{path.name} ends inside of its header")
+        raise InputError(f"{path.name} is truncated: it ends within its header")
     major, minor, most, _, _, count, level, low, high = _HEADER.unpack_from(data)
     if (major, minor) != (0, 1):
-        raise InputError(f"{path.name} is .ksplat of version {major}.{minor}, wanted 0.1")
+        raise InputError(f"{path.name} is .ksplat of version {major}.{minor}, expected 0.1")
     if level >= len(_TYPES):
-        raise InputError(f"{path.name} has compression level {level}, wanted at most {len(_TYPES) - 1}")
+        raise InputError(f"{path.name} has compression level {level}, expected at most {len(_TYPES) - 1}")
     low, high = low or -_DEFAULT_SH, high or _DEFAULT_SH
     if not (abs(low) < _LARGEST and abs(high) < _LARGEST and low <= high):
-        raise InputError(f"{path.name} has SH from {low} to {high}, wanted numbers, the larger one last")
+        raise InputError(f"{path.name} has SH from {low} to {high}, expected finite numbers, the larger one last")
     sections, end = _sections(path.name, data, level, most)
     total = sum(len(section.rows) for section in sections)
     if total != count:
-        raise InputError(f"{path.name} has {total:,} splats in its sections, and its header says {count:,}")
+        raise InputError(f"{path.name} has {total:,} splats in its sections, its header declares {count:,}")
     widest = max((section.rows.dtype["shN"].shape[0] for section in sections if len(section.rows)), default=0)
 
     def blocks() -> Iterator[tuple[Rows, ...]]:
@@ -133,24 +134,24 @@ def _row_type(level: int, degree: int) -> np.dtype[Any]:
 
 
 def _sections(name: str, data: Any, level: int, most: int) -> tuple[list[_Section], int]:
-    """Return the sections and the offset of the end of the last one."""
+    """Return the sections and the offset after the last one."""
     found: list[_Section] = []
     at = _HEADER_SIZE + most * _SECTION_SIZE
     if at > len(data):
-        raise InputError(f"{name} says it has {most:,} sections, more than its {len(data):,} bytes can hold")
+        raise InputError(f"{name} declares {most:,} sections, too many for its {len(data):,} bytes")
     for index in range(most):
         head = _SectionHead(*_SECTION.unpack_from(data, _HEADER_SIZE + index * _SECTION_SIZE))
         where = f"{name}, section {index}"
         if head.degree >= len(_COEFFICIENTS):
-            raise InputError(f"{where}: SH degree {head.degree}, wanted at most {len(_COEFFICIENTS) - 1}")
+            raise InputError(f"{where}: SH degree {head.degree}, expected at most {len(_COEFFICIENTS) - 1}")
         row = _row_type(level, head.degree)
         centres = at + 4 * head.partial
         start = centres + head.centre_size * head.buckets
         at = start + row.itemsize * head.capacity
         if at > len(data):
-            raise InputError(f"{where} ends at byte {at:,}, and the file at {len(data):,}")
+            raise InputError(f"{where} ends at byte {at:,}, the file at byte {len(data):,}")
         if head.splats > head.capacity:
-            raise InputError(f"{where}: {head.splats:,} splats in room for {head.capacity:,}")
+            raise InputError(f"{where}: {head.splats:,} splats, but space for {head.capacity:,}")
         rows = np.frombuffer(data, row, head.splats, start)
         if level and head.splats:
             found.append(_Section(rows, *_buckets(where, data, head, centres)))
@@ -160,20 +161,22 @@ def _sections(name: str, data: Any, level: int, most: int) -> tuple[list[_Sectio
 
 
 def _buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[NDArray[np.int64], F64, float]:
-    """Return the buckets' ends and corners and the step, as in `_Section`; partial buckets list their lengths first."""
+    """Return `ends`, `corners` and `step` of a `_Section`; the lengths of partial buckets precede the centres."""
     if head.centre_size != _CENTRE_SIZE or head.full + head.partial > head.buckets:
-        raise InputError(f"{where}: {head.full:,} full buckets and {head.partial:,} others, of {head.buckets:,}")
+        raise InputError(
+            f"{where}: {head.full:,} full and {head.partial:,} partial buckets, expected {head.buckets:,} together"
+        )
     lengths = np.frombuffer(data, "<u4", head.partial, centres - 4 * head.partial)
     ends = np.cumsum(np.concatenate([np.full(head.full, head.bucket, np.int64), lengths]))
     if not len(ends) or ends[-1] < head.splats:
-        raise InputError(f"{where}: its buckets hold fewer than its {head.splats:,} splats")
+        raise InputError(f"{where}: its buckets contain fewer than its {head.splats:,} splats")
     middles = np.frombuffer(data, "<f4", 3 * head.buckets, centres).reshape(-1, 3).astype(np.float64)
     span = head.span or _DEFAULT_SPAN
     if head.block < 0:
-        raise InputError(f"{where}: its blocks are {head.block:g} long, wanted at least 0")
+        raise InputError(f"{where}: the length of its blocks is {head.block:g}, expected at least 0")
     step = head.block / 2 / span
     if not (np.abs(middles) + 65535 * abs(step) < _LARGEST).all():
-        raise InputError(f"{where}: its buckets do not lie at finite places")
+        raise InputError(f"{where}: its bucket centres are not finite")
     return ends, middles - span * step, step
 
 
@@ -185,7 +188,7 @@ def _section_blocks(section: _Section) -> Iterator[tuple[Rows, ...]]:
 
 
 def _decode_sh(coded: Rows, widest: int, low: float, high: float) -> F32:
-    """Decode SH, which are stored band by band, then channel by channel."""
+    """Decode SH coefficients, which are ordered by band, then by channel."""
     width = coded.shape[1]
     bands = [np.arange(start, end).reshape(3, -1).T for start, end in pairwise(_COEFFICIENTS) if end <= width]
     values = coded[:, np.concatenate([np.zeros(0, np.int64), *(band.ravel() for band in bands)])].astype(np.float32)

@@ -1,4 +1,4 @@
-""".splat of antimatter15/splat: 32 bytes per splat and nothing else: no header, no SH, no axes.
+"""Read and write .splat of antimatter15/splat: 32 bytes per splat, without header, SH or axes.
 
 Positions and standard deviations are floats; colours, opacities and rotations are bytes. Only the file name identifies
 the format.
@@ -24,12 +24,12 @@ from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colours", "u1", 4), ("quats", "u1", 4)])
-_LARGEST_LOG = np.float32(88.0)  # float32 holds its exponential
+_LARGEST_LOG = np.float32(88.0)  # its exponential fits in float32
 _QUAT_ZERO = 128  # byte of a component of 0; 1 would be 256
-_SAMPLE = 4096  # splats that `_doubt` looks at
-_PLACES = (1e-12, 1e12)  # scene units; range of the largest coordinate unless 0; a quarter of random bytes lies there
-_LONGEST_QUAT = 250  # units of 1/128; four bytes of 0 are 256 long
-_MOST_IS_TEXT = 0.95  # smallest share of printable bytes in a text
+_SAMPLE = 4096  # number of splats that `_doubt` checks
+_PLACES = (1e-12, 1e12)  # scene units; plausible largest coordinates other than 0; a quarter of random bytes is inside
+_LONGEST_QUAT = 250  # units of 1/128; four bytes of 0 have length 256
+_MOST_IS_TEXT = 0.95  # minimum fraction of printable bytes in a text
 _PRINTABLE = np.array([32 <= byte < 127 or byte in b"\t\n\r" for byte in range(256)])
 
 
@@ -37,7 +37,7 @@ _PRINTABLE = np.array([32 <= byte < 127 or byte in b"\t\n\r" for byte in range(2
 def _open(path: Path) -> Iterator[SceneSource]:
     data = map_file(path)
     if len(data) % _ROW.itemsize:
-        raise InputError(f"{path.name} has {len(data):,} bytes, wanted a multiple of {_ROW.itemsize} (.splat)")
+        raise InputError(f"{path.name} has {len(data):,} bytes, expected a multiple of {_ROW.itemsize} (.splat)")
     rows = np.frombuffer(data, _ROW)
 
     def blocks() -> Iterator[tuple[NDArray[Any], ...]]:
@@ -48,33 +48,33 @@ def _open(path: Path) -> Iterator[SceneSource]:
 
 
 def _doubt(path: Path) -> str:
-    """Return why a file hardly consists of splats (`Format.doubt`): half of a sample has to look like splats."""
+    """Return the reason why a file is unlikely to contain splats (`Format.doubt`): most of a sample is implausible."""
     data = map_file(path)
     if len(data) % _ROW.itemsize or not len(data):
-        return ""  # the reader reports what is wrong
+        return ""  # the reader reports the error
     rows = np.frombuffer(data, _ROW)
     step = max(1, len(rows) // _SAMPLE)
     sample = rows[::step]
     share = np.mean(_PRINTABLE[np.frombuffer(sample.tobytes(), np.uint8)])
     if share >= _MOST_IS_TEXT:
         return f"it is text, and begins with {bytes(data[:24]).decode('ascii', 'replace')!a}"
-    far = np.abs(sample["means"]).max(axis=1)  # NaN where there is one
+    far = np.abs(sample["means"]).max(axis=1)  # NaN if a coordinate is NaN
     placed = (far == 0) | ((far > _PLACES[0]) & (far < _PLACES[1]))
     lengths = np.linalg.norm(np.subtract(sample["quats"], _QUAT_ZERO, dtype=np.float32), axis=1)
     rotated = lengths < _LONGEST_QUAT
     has_both_signs = (sample["scales"] < 0).any(axis=1) & (sample["scales"] > 0).any(axis=1)  # neither lengths nor logs
-    finite = np.isfinite(far)  # findings report the others
+    finite = np.isfinite(far)  # findings report the other rows
     good = ~finite | (placed & rotated & ~has_both_signs)
     if 2 * np.count_nonzero(~good) <= np.count_nonzero(finite):
         return ""
     worst = int(np.argmin(good))
-    name, verb = ("means", "lies at")
+    name, verb = ("means", "is at")
     if placed[worst]:
         name, verb = ("scales", "has scales of") if rotated[worst] else ("quats", "has a rotation of the bytes")
     values = ", ".join(f"{value:.3g}" for value in sample[name][worst].tolist())
     share = np.count_nonzero(~good) / np.count_nonzero(finite)
     at = worst * step * _ROW.itemsize
-    return f"{share:.0%} of {counted(len(good), 'row')} are no splats; that at byte {at:,} {verb} {values}"
+    return f"{share:.0%} of {counted(len(good), 'row')} are not splats; the one at byte {at:,} {verb} {values}"
 
 
 def _decode_rows(scales: F32, rows: NDArray[Any]) -> SplatModel:
@@ -100,7 +100,7 @@ def _write(path: Path, scene: SceneSource) -> None:
 
 
 def _with_negative_largest(quats: F32) -> F32:
-    """Make the largest component negative: -1 has a byte, 1 has none, and some viewers do not normalise."""
+    """Make the largest component negative: a byte represents -1 but not 1, and some viewers do not normalise."""
     largest = np.take_along_axis(quats, np.abs(quats).argmax(axis=1)[:, None], axis=1)
     return np.where(largest > 0, -quats, quats)
 

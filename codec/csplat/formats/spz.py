@@ -1,13 +1,13 @@
 """SPZ of Niantic and Adobe, versions 1 to 4: fixed-point positions, bytes for the rest, one attribute after the other.
 
-Versions 1 to 3 are one gzip stream, version 4 has a Zstandard stream per attribute. The axes are right, up, back
-(https://github.com/nianticlabs/spz) unless an extension names others; some converters store scenes along other axes
-without saying so.
+Versions 1 to 3 are a single gzip stream, version 4 has a Zstandard stream per attribute. The axes are right, up, back
+(https://github.com/nianticlabs/spz) unless an extension specifies others. Some converters store scenes along other axes
+without this extension.
 
-The writer makes version 3, which more programs read, or version 4. SH coefficients get 6 bits each; the owner's library
-keeps 5 for band 1 and 4 for the others. On three scenes 6 bits cost 36 to 38 % more bytes and gain 9 to 10 dB; a
-seventh would cost 18 % more for 2 to 4 dB, an eighth 16 % for 1 dB. Positions get the usual 12 fractional bits, more
-for fine splats (all that fit would cost up to 9 % more bytes, for 0.3 dB at best), fewer if the scene would not fit.
+The writer produces version 3, which more programs read, or version 4. SH coefficients get 6 bits each; Niantic's
+library keeps 5 for band 1 and 4 for the others. On three scenes, 6 bits cost 36 to 38 % more bytes and gain 9 to 10 dB;
+a seventh bit would cost 18 % more for 2 to 4 dB, an eighth 16 % for 1 dB. Positions get the usual 12 fractional bits,
+more for fine splats (the maximum would cost up to 9 % more bytes for 0.3 dB at best), fewer if the scene would not fit.
 """
 
 from __future__ import annotations
@@ -45,28 +45,28 @@ SPZ_AXES = "RUB"
 #: Bit of `SpzArrays.flags`.
 ANTIALIASED = 0x01
 
-#: Largest number of fractional bits: readers compute 1 << bits in 32 bits.
+#: Maximum number of fractional bits: readers compute 1 << bits in 32 bits.
 MAX_FRACTION_BITS = 30
 
 _MAGIC = b"NGSP"
 _GZIP = b"\x1f\x8b"
 _HEADER = struct.Struct("<4sIIBBBB")
 _HEADER_REST = struct.Struct("<I12x")  # version 4: offset of the table of streams
-_STREAM = struct.Struct("<QQ")  # entry of that table: bytes packed, bytes unpacked
-_RECORD = struct.Struct("<II")  # head of an extension: type, bytes of its value
+_STREAM = struct.Struct("<QQ")  # entry of that table: packed size, unpacked size
+_RECORD = struct.Struct("<II")  # head of an extension: type, size of its value
 _EXTENDED, _LEVELS = 0x02, 0x80
 _COORDINATE_SYSTEM = 0xADBE0003  # the extension SPZ_ADOBE_coordinate_system
 _SYSTEMS = "RUBLDBRDBLUBRUBLDFRDFLUFRUFLFDRFDLFURFULBDRBDLBURBU"  # three letters per number; 0 is unspecified
-_EXTENSION_BYTES = 1 << 20  # largest size of all extensions together
-_RATIO = 1032  # largest expansion by deflate; programs of the format refuse more from Zstandard, too
-_MAX_DEGREE = 4  # largest SH degree since version 4 of the format
+_EXTENSION_BYTES = 1 << 20  # maximum size of all extensions together
+_RATIO = 1032  # maximum expansion by deflate; SPZ programs refuse more from Zstandard, too
+_MAX_DEGREE = 4  # highest SH degree since version 4 of the format
 _GZIP_LEVEL, _ZSTD_LEVEL = 9, 12
-_PIECE = 1 << 18
+_PIECE = 1 << 18  # bytes unpacked at a time
 
 
 @dataclass(eq=False)
 class SpzArrays:
-    """The header and the arrays of bytes of a file.
+    """The header and the byte arrays of a file.
 
     Attributes:
         name: name of the file, for messages.
@@ -77,8 +77,8 @@ class SpzArrays:
         flags: `ANTIALIASED` and others.
         streams: number of streams that a header of version 4 declares.
         axes: three letters, as in `SplatModel`.
-        parts: [N, bytes] each: positions, alphas, colours, scales, rotations, SH.
-        findings: what is unusual about the file.
+        parts: positions, alphas, colours, scales, rotations and SH, each [N, bytes].
+        findings: findings about the file.
     """
 
     name: str
@@ -99,7 +99,7 @@ class SpzArrays:
         return 6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version > 2 else 3, rest
 
     def allocate(self) -> U8:
-        """Allocate the parts after space for the header, as in versions 1 to 3, and return all of it."""
+        """Allocate the parts contiguously after space for the header, as in versions 1 to 3; return the whole array."""
         ends = _HEADER.size + np.cumsum((0, *self.widths)) * self.count
         data = np.empty(ends[-1], np.uint8)
         self.parts = [
@@ -121,7 +121,7 @@ def read_spz_file(file: BinaryIO, name: str, size: int, *, any_degree: bool = Fa
         file: the file, positioned at its beginning.
         name: name of the file, for messages.
         size: bytes of the file.
-        any_degree: accept SH of a higher degree than that of models, up to 4.
+        any_degree: also accept SH of degree 4, which models do not have.
 
     Raises:
         InputError: the file is incomplete, or csplat does not read its version.
@@ -134,7 +134,7 @@ def read_spz_file(file: BinaryIO, name: str, size: int, *, any_degree: bool = Fa
             packed = _parse_header(name, size, stream, any_degree=any_degree)
             (_read_streams if packed.version == 4 else _read_arrays)(packed, size, stream)
     except (EOFError, zlib.error, zstandard.ZstdError, gzip.BadGzipFile) as error:
-        raise InputError(f"{name} is damaged: {str(error) or 'it ends too early'}") from None
+        raise InputError(f"{name} is damaged: {str(error) or 'it is truncated'}") from None
     if packed.version == 1 and not np.isfinite(packed.means_half).all():
         raise InputError(f"{name} has positions that are NaN or infinite")
     return packed
@@ -143,48 +143,50 @@ def read_spz_file(file: BinaryIO, name: str, size: int, *, any_degree: bool = Fa
 def _parse_header(name: str, size: int, stream: BinaryIO, *, any_degree: bool) -> SpzArrays:
     magic, version, count, degree, bits, flags, streams = _HEADER.unpack(_read_exactly(name, stream, _HEADER.size))
     if magic != _MAGIC:
-        raise InputError(f"{name} is no SPZ: it begins with {magic!r}, wanted {_MAGIC!r}")
+        raise InputError(f"{name} is not SPZ: it begins with {magic!r}, expected {_MAGIC!r}")
     if not 1 <= version <= 4 or (version == 4 and isinstance(stream, gzip.GzipFile)):
-        raise InputError(f"{name} is SPZ of version {version}, wanted 1 to 4 (4 not inside of gzip)")
+        raise InputError(f"{name} is SPZ of version {version}, expected 1 to 4 (4 not within gzip)")
     if degree > _MAX_DEGREE:
-        raise InputError(f"{name} has SH degree {degree}, wanted at most {_MAX_DEGREE}")
+        raise InputError(f"{name} has SH degree {degree}, expected at most {_MAX_DEGREE}")
     if degree > MAX_SH_DEGREE and not any_degree:
         raise InputError(f"{name} has {too_many_bands(degree)}")
     if version > 1 and bits > MAX_FRACTION_BITS:
-        raise InputError(f"{name} has {bits} fractional bits, wanted at most {MAX_FRACTION_BITS}")
+        raise InputError(f"{name} has {bits} fractional bits, expected at most {MAX_FRACTION_BITS}")
     if flags & _LEVELS:
-        raise InputError(f"{name} holds levels of detail of Spark in one list, which csplat does not read")
+        raise InputError(f"{name} contains Spark's levels of detail in one list, which csplat does not read")
     packed = SpzArrays(name, version, count, degree, bits, flags, streams)
     unpacked = count * sum(packed.widths)
     if unpacked > _RATIO * size:
-        raise InputError(f"{name} says it has {count:,} splats, more than its {size:,} bytes can hold")
+        raise InputError(f"{name} declares {count:,} splats, too many for its {size:,} bytes")
     return packed
 
 
 def _read_arrays(packed: SpzArrays, _size: int, stream: BinaryIO) -> None:
     """Read versions 1 to 3: one attribute after the other, then extensions."""
     _fill(packed.name, stream, packed.allocate()[_HEADER.size :])
-    tail = stream.read(_EXTENSION_BYTES + 1)  # to the end: gzip checks its checksum there
+    tail = stream.read(_EXTENSION_BYTES + 1)  # up to the end, where gzip verifies its checksum
     if len(tail) > _EXTENSION_BYTES:
-        raise InputError(f"{packed.name} goes on after its last splat")
+        raise InputError(f"{packed.name} has more than {_EXTENSION_BYTES:,} bytes after its last splat")
     packed.findings += trailing_bytes(len(tail) - _read_extensions(packed, tail))
 
 
 def _read_streams(packed: SpzArrays, size: int, stream: BinaryIO) -> None:
-    """Read version 4: extensions, a table, then a stream per attribute that has any bytes."""
+    """Read version 4: extensions, a table, then a stream for each attribute that is not empty."""
     (table,) = _HEADER_REST.unpack(_read_exactly(packed.name, stream, _HEADER_REST.size))
     start = _HEADER.size + _HEADER_REST.size
     if not start <= table <= start + _EXTENSION_BYTES:
-        raise InputError(f"{packed.name} has its table of streams at byte {table}, wanted {start} or a little more")
+        raise InputError(
+            f"{packed.name} has its table of streams at byte {table}, expected {start} to {start + _EXTENSION_BYTES}"
+        )
     _read_extensions(packed, _read_exactly(packed.name, stream, table - start))
     sizes = [packed.count * width for width in packed.widths]
     unpacked = [size for size in sizes if size]
     rows = [_STREAM.unpack(_read_exactly(packed.name, stream, _STREAM.size)) for _ in range(packed.streams)]
     if [row[1] for row in rows] != unpacked:
-        raise InputError(f"{packed.name} has streams of {[row[1] for row in rows]} bytes, wanted {unpacked}")
+        raise InputError(f"{packed.name} has streams of {[row[1] for row in rows]} bytes, expected {unpacked}")
     found = table + _STREAM.size * len(rows) + sum(row[0] for row in rows)
     if found != size:
-        raise InputError(f"{packed.name} has {size:,} bytes, and its table says {found:,}")
+        raise InputError(f"{packed.name} has {size:,} bytes, its table declares {found:,}")
     each = iter(rows)
     for part_size, width in zip(sizes, packed.widths, strict=True):
         data = np.empty(part_size, np.uint8)
@@ -198,7 +200,7 @@ def _read_streams(packed: SpzArrays, size: int, stream: BinaryIO) -> None:
 
 
 def _read_extensions(packed: SpzArrays, data: bytes) -> int:
-    """Read the axes, skipping other extensions; return the number of bytes that extensions take."""
+    """Read the axes, skip other extensions, and return the size of all extensions in bytes."""
     at = 0
     while packed.flags & _EXTENDED and at + _RECORD.size <= len(data):
         kind, size = _RECORD.unpack_from(data, at)
@@ -208,23 +210,23 @@ def _read_extensions(packed: SpzArrays, data: bytes) -> int:
             number = int.from_bytes(value, "little")
             packed.axes = _SYSTEMS[3 * number : 3 * number + 3]
             if not packed.axes:
-                raise InputError(f"{packed.name} has axes number {number}, wanted at most {len(_SYSTEMS) // 3 - 1}")
+                raise InputError(f"{packed.name} has axes number {number}, expected at most {len(_SYSTEMS) // 3 - 1}")
     return at
 
 
 def _read_exactly(name: str, stream: BinaryIO, size: int) -> bytes:
     data = stream.read(size)
     if len(data) < size:
-        raise InputError(f"{name} is no SPZ, or ends too early")
+        raise InputError(f"{name} is not SPZ, or is truncated")
     return data
 
 
 def _fill(name: str, stream: Any, data: U8) -> None:
     at = 0
     while at < len(data):
-        got = stream.readinto(data[at : at + _PIECE])  # in pieces: gzip copies what it reads at once
+        got = stream.readinto(data[at : at + _PIECE])  # in pieces, because gzip copies each read
         if not got:
-            raise InputError(f"{name} ends too early: {at:,} of {len(data):,} bytes are there")
+            raise InputError(f"{name} is truncated: {at:,} of {len(data):,} bytes are present")
         at += got
 
 
@@ -234,7 +236,7 @@ def write_spz_file(path: Path, packed: SpzArrays, data: U8) -> None:
     Args:
         path: path of the file.
         packed: header and filled parts.
-        data: result of `packed.allocate()`, which gets the header, too.
+        data: result of `packed.allocate()`; its space for the header is filled.
 
     Raises:
         OSError: the file cannot be written.
@@ -251,12 +253,12 @@ def write_spz_file(path: Path, packed: SpzArrays, data: U8) -> None:
         stream.writelines([head, _HEADER_REST.pack(_HEADER.size + _HEADER_REST.size), *rows, *streams])
 
 
-_COLOUR = np.float32(0.15)  # factor of coefficients, in units of the 256 levels
-_PART = np.sqrt(np.float32(0.5)) / np.float32(511)  # step of a component of a rotation
+_COLOUR = np.float32(0.15)  # colour per unit of an SH coefficient of degree 0
+_PART = np.sqrt(np.float32(0.5)) / np.float32(511)  # quantisation step of a quaternion component
 _LARGEST_POSITION = (1 << 23) - 1
 _USUAL_BITS = 12
-_STEPS = 32  # steps of positions within the median standard deviation, at least
-_SH_STEP = 4  # step of SH coefficients, in units of the 256 levels
+_STEPS = 32  # minimum number of position steps within the median standard deviation
+_SH_STEP = 4  # quantisation step of SH coefficients, in units of the 256 levels
 
 
 @contextmanager
@@ -273,7 +275,7 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
 
 
 def write_spz(path: Path, scene: SceneSource, *, version: int) -> None:
-    """Write version 3 or 4; otherwise as `Format.write`."""
+    """Write version 3 or 4 (`Format.write`)."""
     scene = convert_axes(scene, SPZ_AXES)
     flags = ANTIALIASED if scene.metadata_model.antialiased else 0
     packed = SpzArrays(
@@ -287,7 +289,7 @@ def write_spz(path: Path, scene: SceneSource, *, version: int) -> None:
 
 
 def decode_block(packed: SpzArrays, rows: slice, degree: int) -> SplatModel:
-    """Decode some splats along the axes of the file, with SH up to a degree."""
+    """Decode some splats along the axes of the file, with SH bands up to a degree."""
     _, alphas, colours, scales, rotations, rest = (part[rows] for part in packed.parts)
     coefficients = (degree + 1) ** 2 - 1
     shN = np.subtract(rest[:, : 3 * coefficients], 128, dtype=np.float32)
@@ -317,7 +319,7 @@ def decode_means(packed: SpzArrays, rows: slice) -> F32:
 
 
 def _decode_first_three(rotations: U8) -> F32:
-    """Decode rotations of versions 1 and 2: x, y and z in bytes; w >= 0 follows from them."""
+    """Decode rotations of versions 1 and 2: x, y and z are bytes, w >= 0 follows from them."""
     quats = np.empty((len(rotations), 4), np.float32)
     quats[:, 1:] = np.divide(rotations, 127.5, dtype=np.float32) - np.float32(1)
     quats[:, 0] = np.sqrt(np.maximum(0, 1 - np.einsum("ij,ij->i", quats[:, 1:], quats[:, 1:])))
@@ -325,7 +327,7 @@ def _decode_first_three(rotations: U8) -> F32:
 
 
 def _decode_rotations(rotations: U8) -> F32:
-    """Decode all but the largest of x y z w: ten bits each, sign and magnitude, the first in the highest bits."""
+    """Decode the three smallest of x y z w: ten bits each, sign and magnitude, the first one in the highest bits."""
     words = rotations.view("<u4")[:, 0]
     fields = (words[:, None] >> np.array([20, 10, 0], np.uint32)).astype(np.int32)
     sizes = fields & 511
@@ -334,13 +336,13 @@ def _decode_rotations(rotations: U8) -> F32:
 
 
 def _choose_fraction_bits(path: Path, scene: SceneSource) -> int:
-    """Choose the fractional bits of positions: enough for the median splat, and no more than fit."""
+    """Choose the number of fractional bits of positions: enough for the median splat, limited by the scene's extent."""
     reach, scales = 0.0, np.zeros(256, np.int64)
     for block in scene.blocks():
         reach = max(reach, float(np.abs(block.means).max(initial=0.0)))
         scales += np.bincount(_scale_codes(block.scales).ravel(), minlength=256)
     if reach > _LARGEST_POSITION:
-        raise InputError(f"{path.name}: positions reach {reach:,g}, and SPZ holds up to {_LARGEST_POSITION:,}")
+        raise InputError(f"{path.name}: positions reach {reach:,g}, SPZ stores up to {_LARGEST_POSITION:,}")
     middle = int(np.searchsorted(np.cumsum(scales), scales.sum() / 2))
     fine = math.ceil(math.log2(_STEPS) - (middle / 16 - 10) / math.log(2))
     fitting = math.floor(math.log2(_LARGEST_POSITION / reach)) if reach > 2**-8 else MAX_FRACTION_BITS

@@ -1,4 +1,4 @@
-"""Encode scenes that do not fit in memory, bucket by bucket on disk, to the same bytes as in memory."""
+"""Encode scenes that do not fit in memory bucket by bucket on disk, with the same bytes as in memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Encode buckets, from splats on disk to chunks on disk, in this process, several processes or on a Dask cluster."""
+"""Encode buckets from splats on disk to chunks on disk: in this process, several processes or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from csplat.system import map_in_processes
 
 @dataclass(frozen=True, eq=False)
 class BucketCoding:
-    """The decisions that all buckets share.
+    """The parameters with which all buckets are coded.
 
     Attributes:
         layout: layout of the splats.
-        plan: parameters of the encoding, complete.
-        books: codebooks chosen on the sample, without the entries of its splats.
+        plan: final parameters of the encoding.
+        books: codebooks chosen on the sample, without the assignment of its splats.
     """
 
     layout: SplatLayout
@@ -43,15 +43,15 @@ class BucketCoding:
 
 
 def code_bucket(folder: Path, bucket: Bucket, coding: BucketCoding) -> None:
-    """Code a bucket, unless that is done.
+    """Code a bucket unless it is already coded.
 
     Args:
         folder: the working folder.
         bucket: the bucket to code.
-        coding: decisions that all buckets share.
+        coding: parameters of all buckets.
 
     Raises:
-        InputError: a value fits no lattice, or a file is damaged.
+        InputError: a value does not fit on the lattice, or a file is damaged.
         OSError: a file cannot be read or written.
     """
     if _record_path(folder, bucket).exists():
@@ -68,7 +68,7 @@ def code_bucket(folder: Path, bucket: Bucket, coding: BucketCoding) -> None:
                 stream.write(payload)
                 size += len(payload)
     text = json.dumps(records).encode()
-    with atomic_writer(_record_path(folder, bucket)) as stream:  # last: if it is there, everything is
+    with atomic_writer(_record_path(folder, bucket)) as stream:  # written last: it marks the bucket as complete
         stream.write(zlib.crc32(text).to_bytes(4, "little") + text)
 
 
@@ -97,7 +97,7 @@ def _record_path(folder: Path, bucket: Bucket) -> Path:
 
 
 def _record(coded: EncodedTile, start: int) -> dict[str, Any]:
-    """Return a coded tile without its payloads, JSON-compatible."""
+    """Return a coded tile as JSON, with offset, size and CRC in place of each payload."""
     layers, at = {}, start
     for layer, payload in coded.tile.layers.items():
         assert isinstance(payload, bytes)
@@ -135,13 +135,13 @@ def code_here(folder: Path, buckets: Sequence[Bucket], coding: BucketCoding, wor
 
     Args:
         folder: the working folder.
-        buckets: the buckets that are not done.
-        coding: decisions that all buckets share.
+        buckets: the buckets to code.
+        coding: parameters of all buckets.
         workers: number of processes; 1: only this one.
 
     Raises:
         CsplatError: as in `code_bucket`.
-        OSError: likewise; or a process was killed.
+        OSError: as in `code_bucket`; or a process was killed.
     """
     for bucket, _ in map_in_processes(_code, (folder, coding), buckets, workers):
         yield bucket
@@ -153,7 +153,7 @@ def _code(shared: tuple[Path, BucketCoding], bucket: Bucket) -> None:
 
 
 def code_on_cluster(folder: Path, buckets: Sequence[Bucket], coding: BucketCoding, address: str) -> Iterator[Bucket]:
-    """Code buckets on a Dask cluster, whose workers see the working folder under the same name.
+    """Code buckets on a Dask cluster, whose workers access the working folder under the same path.
 
     Dask repeats the work of a lost worker.
 
@@ -164,10 +164,10 @@ def code_on_cluster(folder: Path, buckets: Sequence[Bucket], coding: BucketCodin
     Raises:
         InputError: `dask.distributed` is not installed.
         CsplatError: as in `code_bucket`.
-        OSError: likewise; or the scheduler does not answer.
+        OSError: as in `code_bucket`; or the scheduler does not respond.
     """
     try:
-        distributed: Any = import_module("distributed")  # it has no types
+        distributed: Any = import_module("distributed")  # has no type annotations
     except ModuleNotFoundError as error:
         raise missing_package(error, extra="scale") from None
     with distributed.Client(address, set_as_default=False) as client, client.as_current():

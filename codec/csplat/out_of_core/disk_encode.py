@@ -29,19 +29,19 @@ from csplat.types import Progress, null_progress
 
 _MB = 1_000_000
 _PROGRAM = 120 * _MB  # memory of a process that has loaded the encoder
-_PER_ROW = 2.2  # memory for coding a bucket or sample beyond its arrays, as a multiple of their size
-_WHOLE_ROW = 3.0  # the same for a scene that is encoded in memory
-_CODED = 0.3  # maximum size of a file, as a multiple of its arrays' size
-_PENDING = 96 * _MB  # splats that wait to be written to their buckets
+_PER_ROW = 2.2  # memory for coding a bucket or sample, as a multiple of the size of its arrays
+_WHOLE_ROW = 3.0  # memory for encoding a whole scene in memory, likewise
+_CODED = 0.3  # maximum size of a file, as a multiple of the size of its arrays
+_PENDING = 96 * _MB  # buffer of splats before they are written to their buckets
 
 
 @dataclass(frozen=True)
 class ResourceNeeds:
-    """The resources that an encoding takes.
+    """The resources that an encoding needs.
 
     Attributes:
         in_memory: True if the scene stays in memory.
-        workers: processes that code buckets.
+        workers: number of processes that code buckets.
         memory_bytes: approximate memory of all processes together.
         disk_bytes: maximum size of the working folder and the file.
     """
@@ -55,13 +55,13 @@ class ResourceNeeds:
 def estimate_needs(
     scene: SceneSource, options: EncodeOptions, memory_bytes: int | None = None, *, by_disk: bool = False
 ) -> ResourceNeeds:
-    """Estimate the resources that the encoding of a scene will take.
+    """Estimate the resources needed to encode a scene.
 
     Args:
         scene: the scene; its blocks are not read.
         options: options of the encoder.
         memory_bytes: memory limit; `None`: half of the free memory.
-        by_disk: use buckets on disk for a scene of several buckets, even if it would fit in memory.
+        by_disk: use buckets on disk for a scene of several buckets even if it fits in memory.
 
     Raises:
         InputError: the limit is too low.
@@ -75,7 +75,7 @@ def estimate_needs(
             raise _too_low(bound, whole)
         return ResourceNeeds(True, options.thread_count, whole, file_bytes)
     if options.shape_codebook_size:
-        raise InputError(f"a codebook of shapes wants the scene in memory, about {whole / _MB:,.0f} MB")
+        raise InputError(f"a codebook of shapes requires the scene in memory, about {whole / _MB:,.0f} MB")
     worker = _PROGRAM + int(BUCKET_SPLATS * row * _PER_ROW)
     here = worker + _PENDING
     if here > bound:
@@ -86,12 +86,14 @@ def estimate_needs(
 
 
 def _layout(scene: SceneSource, options: EncodeOptions) -> SplatLayout:
-    """Return the layout of the arrays that are carried."""
+    """Return the layout of the arrays that are encoded."""
     return SplatLayout(scene.metadata_model if options.keep_extra else replace(scene.metadata_model, extra={}))
 
 
 def _too_low(bound: int, least: int) -> InputError:
-    return InputError(f"{bound / _MB:,.0f} MB of memory are too little for this scene, which wants {least / _MB:,.0f}")
+    return InputError(
+        f"{bound / _MB:,.0f} MB of memory are too little for this scene, which requires {least / _MB:,.0f} MB"
+    )
 
 
 def encode_scene(
@@ -107,31 +109,31 @@ def encode_scene(
     source: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> EncodeReport:
-    """Compress a scene that is read some splats at a time, to the bytes that `encode` makes of it.
+    """Encode a scene that is read block by block; the bytes are those of `encode`.
 
-    A scene that does not fit in memory is sorted into buckets of neighbours in a working folder on the disk, which
-    are coded one by one, by `options.threads` processes. Finished work stays there if it is interrupted. In a script,
-    the script's own work has to be under `if __name__ == "__main__":`, as for all worker processes.
+    A scene that does not fit in memory is sorted into buckets of neighbours in a working folder on disk. The buckets
+    are coded one by one, by `options.threads` processes. If the encoding is interrupted, finished work stays in the
+    folder. Scripts must guard their own code by `if __name__ == "__main__":`, because worker processes import it.
 
     Args:
-        scene: as `csplat.formats.open_scene` gives it.
-        target: the file, which takes its name when it is complete.
-        options: presets and knobs.
-        memory_bytes: a bound on what all processes take together; `None`: half of what is free. The file does not
+        scene: the scene, for example from `csplat.formats.open_scene`.
+        target: path of the file, which appears when complete.
+        options: options of the encoder.
+        memory_bytes: memory limit for all processes together; `None`: half of the free memory. The file does not
             depend on it.
-        by_disk: use buckets on disk for a scene of several buckets, even if it would fit in memory.
-        folder: the working folder; `None`: next to the target, with its name and `.work`.
-        resume: continue from what an interrupted encoding left in the folder, if there is anything.
-        cluster: address of a Dask scheduler, whose workers see the folder under the same name; they code the buckets.
-        source: identity of this scene, JSON-compatible, for `resume`.
-        progress: called with the stage and the fraction of it that is done, 0 to 1.
+        by_disk: use buckets on disk for a scene of several buckets even if it fits in memory.
+        folder: the working folder; `None`: the target path with the suffix `.work`.
+        resume: continue an interrupted encoding if the folder exists.
+        cluster: address of a Dask scheduler whose workers code the buckets; they access the folder under the same path.
+        source: identity of the scene, JSON-compatible; checked when resuming.
+        progress: called with the stage and the completed fraction of it, 0 to 1.
 
     Returns:
-        What was chosen, and errors, as the file states them.
+        The chosen parameters and the error bounds that the file declares.
 
     Raises:
-        InputError: as `encode`; the bound is too low; the disk is too small; the folder is there, or is about another
-            scene; or it is damaged.
+        InputError: as `encode`; the memory limit is too low; the disk is too small; the folder already exists,
+            belongs to another scene or is damaged.
         CsplatError: the scene cannot be read.
         OSError: a file cannot be read or written; or a worker was killed.
     """
@@ -157,7 +159,7 @@ def encode_scene(
 
 @dataclass(eq=False)
 class _Encoding:
-    """The stages of an encoding on disk; those that the working folder has are skipped."""
+    """The stages of an encoding on disk; stages that the working folder has completed are skipped."""
 
     scene: SceneSource
     target: Path
@@ -192,12 +194,12 @@ class _Encoding:
         try:
             check_free_space(work.folder, self.needs.disk_bytes, "this scene is encoded: --work names another folder")
         except InputError:
-            if "curve" not in work.state:  # nothing is lost
+            if "curve" not in work.state:  # no work would be lost
                 work.remove()
             raise
 
     def _sort(self) -> None:
-        """Pass over the scene twice: to survey it, and to sort its splats into buckets."""
+        """Read the scene twice: survey it, then sort its splats into buckets."""
         work, survey = self.work, self.work.survey
         if survey is None:
             survey = take_survey(with_progress(self.scene, "looking", self.progress), work.layout)
@@ -210,7 +212,7 @@ class _Encoding:
         work.note(counts=writer.counts.tolist())
 
     def _decide(self) -> tuple[EncodePlan, FileCodebooks]:
-        """Choose parameters and codebooks on the sample; return them without its splats."""
+        """Choose parameters and codebooks on the sample; return them without the sample's splats."""
         work, survey = self.work, self.work.survey
         assert survey is not None
         sample = EncodePlan.of(survey.sample, self.options, contrast=work.state["contrast"], progress=self.progress)
@@ -263,11 +265,11 @@ class _Encoding:
 
 
 def take_survey(scene: SceneSource, layout: SplatLayout) -> Survey:
-    """Survey a scene of more than `BUCKET_SPLATS` splats, and take a sample that has the arrays of the layout.
+    """Survey a scene of more than `BUCKET_SPLATS` splats.
 
     Raises:
-        CsplatError: its blocks cannot be read.
-        OSError: as above.
+        CsplatError: the blocks cannot be read.
+        OSError: the blocks cannot be read.
     """
     rows = sample_rows(scene.count)
     arrays, largest = layout.empty(len(rows)), 0.0

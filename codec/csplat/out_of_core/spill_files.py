@@ -1,7 +1,7 @@
-"""Keep an encoding's state in a working folder: splats of each bucket, and progress to resume from.
+"""Keep the state of an encoding in a working folder: the splats of each bucket, and progress for resuming.
 
-A bucket file is a sequence of frames. A frame has the number of its splats, a CRC, and then each array of a model in
-one piece. The files are read by the machine that wrote them, in its own byte order.
+A bucket file is a sequence of frames. A frame consists of the number of its splats, a CRC, and the arrays of a model
+one after the other. Files use the byte order of the machine, which is also the one that reads them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class SplatLayout:
     """Names and dtypes of a model's arrays.
 
     Attributes:
-        metadata_model: a model without splats that holds everything else.
+        metadata_model: a model without splats that has all other fields.
     """
 
     metadata_model: SplatModel
@@ -49,15 +49,15 @@ class SplatLayout:
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of a splat."""
+        """Size of a splat in bytes."""
         return sum(array.dtype.itemsize * int(np.prod(array.shape[1:])) for array in self.arrays(self.metadata_model))
 
     def empty(self, count: int) -> list[NDArray[Any]]:
-        """Allocate arrays for some splats."""
+        """Allocate uninitialised arrays for `count` splats."""
         return [np.empty((count, *array.shape[1:]), array.dtype) for array in self.arrays(self.metadata_model)]
 
     def model(self, arrays: Sequence[NDArray[Any]]) -> SplatModel:
-        """Make a model of these arrays."""
+        """Build a model from arrays in the order of a frame."""
         named: dict[str, Any] = dict(zip(_ARRAYS, arrays, strict=False))
         rest = list(arrays[len(_ARRAYS) :])
         doubles = None if self.metadata_model.means_double is None else rest.pop(0)
@@ -75,8 +75,8 @@ class Bucket:
 
     Attributes:
         number: index among all buckets.
-        place: index of the file that holds its splats.
-        start, stop: its rows in that file.
+        place: index of the file with its splats.
+        start, stop: range of its rows in that file.
     """
 
     number: int
@@ -95,9 +95,9 @@ class Survey:
     """The results of one pass over all splats of a scene.
 
     Attributes:
-        sample: some of its splats, in the scene's order.
-        largest: magnitude of its largest SH coefficient.
-        curve: its buckets.
+        sample: a sample of the splats, in the scene's order.
+        largest: largest magnitude of all SH coefficients.
+        curve: the curve that assigns splats to buckets.
     """
 
     sample: SplatModel
@@ -107,13 +107,14 @@ class Survey:
 
 @dataclass(eq=False)
 class BucketWriter:
-    """Appends splats to the files of their buckets.
+    """A buffered writer that appends splats to the files of their buckets.
 
     Attributes:
-        folder: folder of the files; it exists, and holds none of them.
+        folder: an existing folder without bucket files.
         layout: layout of the splats.
-        curve: the curve that determines a splat's bucket.
-        pending_bytes_max: maximum size of the splats that wait to be written.
+        curve: the curve that assigns splats to buckets.
+        pending_bytes_max: maximum size of the buffer.
+        counts: [buckets], number of splats added so far.
     """
 
     folder: Path
@@ -129,10 +130,10 @@ class BucketWriter:
         self._waiting = [[] for _ in range(self.curve.count)]
 
     def add(self, model: SplatModel) -> None:
-        """Add splats; those of a bucket keep their order.
+        """Add splats; within a bucket they keep their order.
 
         Raises:
-            OSError: they cannot be written.
+            OSError: the splats cannot be written.
         """
         bucket = self.curve.bucket_of(model.means)
         order = np.argsort(bucket, kind="stable")
@@ -152,7 +153,7 @@ class BucketWriter:
         """Write all pending splats.
 
         Raises:
-            OSError: they cannot be written.
+            OSError: the splats cannot be written.
         """
         for place, waiting in enumerate(self._waiting):
             if waiting:
@@ -168,21 +169,21 @@ def bucket_path(folder: Path, place: int) -> Path:
 
 
 def write_splats(path: Path, layout: SplatLayout, model: SplatModel) -> None:
-    """Write splats to a file of their own.
+    """Write splats to a new file.
 
     Raises:
-        OSError: they cannot be written.
+        OSError: the file cannot be written.
     """
     with path.open("wb") as stream:
         _append(stream, layout.arrays(model))
 
 
 def read_splats(path: Path, layout: SplatLayout, part: slice | None = None) -> SplatModel:
-    """Read the splats of a file, or a part of them.
+    """Read the splats of a file, or a range of them.
 
     Raises:
         InputError: the file is damaged.
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     with path.open("rb") as stream:
         sizes = list(_sizes(stream, path, layout))
@@ -227,7 +228,7 @@ def _sizes(stream: Any, path: Path, layout: SplatLayout) -> Iterator[int]:
 
 
 def _read_frame(stream: Any, path: Path, frame: Sequence[NDArray[Any]]) -> None:
-    """Fill arrays with the next frame."""
+    """Read the next frame into arrays."""
     found, crc = _FRAME.unpack(stream.read(_FRAME.size)), 0
     for array in frame:
         view = array.reshape(-1).view(np.uint8)
@@ -239,7 +240,7 @@ def _read_frame(stream: Any, path: Path, frame: Sequence[NDArray[Any]]) -> None:
 
 def damaged_file(path: Path) -> InputError:
     """Return the error for a damaged file of the working folder."""
-    return InputError(f"{path} is damaged: remove {path.parent.name} and begin again")
+    return InputError(f"{path} is damaged: remove {path.parent.name} and start again")
 
 
 _STATE = "state.json"
@@ -253,8 +254,8 @@ class WorkingFolder:
     Attributes:
         folder: path of the folder.
         layout: layout of the splats in it.
-        state: progress so far: `key`, the scene and the options; `curve` and `largest` after the first pass;
-            `counts`, splats of each bucket, after the second one; then `contrast`.
+        state: progress so far: `key` identifies scene and options; `curve` and `largest` follow after the first pass,
+            `counts`, the number of splats of each bucket, after the second pass; then `contrast`.
     """
 
     folder: Path
@@ -263,18 +264,18 @@ class WorkingFolder:
 
     @classmethod
     def begun(cls, folder: Path, layout: SplatLayout, key: dict[str, Any], *, resume: bool) -> WorkingFolder:
-        """Make a folder, or resume in one.
+        """Create a folder, or open an existing one to resume.
 
         Raises:
-            InputError: the folder exists and `resume` is False, or it belongs to another scene or other options, or
+            InputError: the folder exists and `resume` is False, it belongs to another scene or other options, or it
                 has other content.
-            OSError: it cannot be made or read.
+            OSError: the folder cannot be created or read.
         """
         work = cls(folder, layout)
         if (folder / _STATE).exists():
             if not resume:
                 raise InputError(
-                    f"{folder} is left of an interrupted encoding: `--resume` goes on with it; or remove it"
+                    f"{folder} is left from an interrupted encoding: continue with `--resume`, or remove it"
                 )
             try:
                 work.state = json.loads((folder / _STATE).read_text())
@@ -282,10 +283,10 @@ class WorkingFolder:
                 raise damaged_file(folder / _STATE) from None
             for name, value in key.items():
                 if (found := work.state["key"].get(name)) != value:
-                    raise InputError(f"{folder} was begun with another {name} ({found}, now {value}): remove it")
+                    raise InputError(f"{folder} was started with {name} {found}, now {value}: remove it")
             return work
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise InputError(f"{folder} holds something else: splats wait in a folder of their own, which is removed")
+            raise InputError(f"{folder} is not empty: the working folder is removed afterwards, choose a new one")
         folder.mkdir(exist_ok=True)
         work.note(key=key)
         return work
@@ -294,7 +295,7 @@ class WorkingFolder:
         """Record progress.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the state cannot be written.
         """
         self.state.update(done)
         with atomic_writer(self.folder / _STATE) as stream:
@@ -302,11 +303,11 @@ class WorkingFolder:
 
     @property
     def survey(self) -> Survey | None:
-        """Results of the first pass, `None` if it is not done.
+        """Results of the first pass; `None` if it is not complete.
 
         Raises:
-            InputError: its file is damaged.
-            OSError: it cannot be read.
+            InputError: the sample file is damaged.
+            OSError: the sample file cannot be read.
         """
         if "curve" not in self.state:
             return None
@@ -315,10 +316,10 @@ class WorkingFolder:
         return Survey(read_splats(self.folder / _SAMPLE, self.layout), self.state["largest"], curve)
 
     def keep(self, survey: Survey) -> None:
-        """Record the result of the first pass.
+        """Record the results of the first pass.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: they cannot be written.
         """
         write_splats(self.folder / _SAMPLE, self.layout, survey.sample)
         curve = survey.curve
@@ -327,7 +328,7 @@ class WorkingFolder:
 
     @property
     def buckets(self) -> list[Bucket]:
-        """Buckets in the order of the file; known after the second pass."""
+        """All buckets in the order of the output file; known after the second pass."""
         parts = [
             (place, part) for place, count in enumerate(self.state["counts"]) if count for part in bucket_slices(count)
         ]
@@ -339,11 +340,11 @@ class WorkingFolder:
             path.unlink()
 
     def drop(self, bucket: Bucket, left: Sequence[Bucket]) -> None:
-        """Remove the splats of a bucket that is coded, unless others that are not have the same file."""
+        """Remove the file of a coded bucket unless buckets in `left`, which are not coded, share it."""
         if all(other.place != bucket.place for other in left):
             bucket_path(self.folder, bucket.place).unlink(missing_ok=True)
 
     def remove(self) -> None:
-        """Remove the folder: the file is written."""
+        """Remove the folder after the output is complete."""
         with suppress(OSError):
             shutil.rmtree(self.folder)

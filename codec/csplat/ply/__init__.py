@@ -1,14 +1,15 @@
-"""PLY files of 3D Gaussian splats: INRIA's layout and its relatives.
+"""PLY files of 3D Gaussian splats: INRIA's layout and its variants.
 
-| module | does |
+| module | contents |
 |---|---|
 | `ply_reader` | `read_ply`, `lint_ply`; the only module that imports plyfile, which is GPL-3.0-or-later |
-| `ply_header` | headers and text rows that plyfile does not accept as they are |
-| `columns` | rows to the arrays of a model, with repairs |
+| `ply_header` | headers and text rows, rewritten for plyfile if necessary |
+| `column_names` | the columns of a file by their meaning |
+| `columns` | conversion of rows to the arrays of a model, with repairs |
 | `comments` | metadata of a scene in header comments |
 | `ply_writer` | `write_ply` |
 
-The names below load their modules when first used: writing a PLY does not load plyfile.
+Modules are loaded when one of the names below is first used, so writing a PLY does not load plyfile.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Find the columns of a splat PLY by their usual names or by those of other programs."""
+"""Find the columns of a splat PLY by their usual names or those of other programs."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ _FILTER = "filter_3D"
 _REST = re.compile(r"f_rest_(0|[1-9][0-9]*)")
 _ZEROS = re.compile(r"\Af_rest_0+(?=[0-9])")
 
-#: Prefix of CloudCompare's scalar fields (PlyFilter.cpp), and the one that 3dgsconverter, which prepares files for it,
-#: puts before that.
+#: Prefix of CloudCompare's scalar fields (PlyFilter.cpp), and the additional one of 3dgsconverter, which prepares files
+#: for CloudCompare.
 _PREFIXES = re.compile(r"(?:scal(?:ar)?_)+")
 #: Colours in place of f_dc: the names of nerfstudio's ns-export, and those that three.js' PLYLoader and Brush accept.
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 #: The value of white, by type of the column.
 _COLOUR_RANGES = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
-#: Columns of scenes that are more than plain splats, and what is lost without them.
+#: Columns of scenes that are more than plain splats, with a description for messages.
 _MEANINGS = {
     re.compile(r"motion_.*|trbf_.*|omega_.*|scale_t|rot_r_\d"): (
-        "dynamic (4D) splats: their time is lost, and those of all moments are seen at once"
+        "dynamic (4D) splats: their time is lost, so the splats of all frames are visible at once"
     ),
-    re.compile(r"f_anchor_feat.*|f_offset.*"): "anchors of Scaffold-GS, of which a network makes the splats",
+    re.compile(r"f_anchor_feat.*|f_offset.*"): "anchors of Scaffold-GS, from which a network generates the splats",
     re.compile(r"sg_(axis|sharpness|color).*"): "colours by spherical Gaussians, which are lost",
 }
-_NAMED = 6  # columns that a message names
-_ADVICE = "csplat train makes splats of its images"
+_NAMED = 6  # maximum number of columns that a message lists
+_ADVICE = "csplat train creates splats from its images"
 
 
 @dataclass(frozen=True)
@@ -49,13 +49,13 @@ class ColumnMap:
 
     Attributes:
         means, scales, quats, sh0: names of the columns; `scales` has two names for discs.
-        rest: 3 K names, channel by channel: all of red, all of green, all of blue.
+        rest: 3 K names, channel by channel: red, green, blue.
         opacity: name of the column of logits.
         normals: three names, or none.
         extra: names of all other columns.
         double: True if positions have more precision than float32.
         colour_range: the value of white if `sh0` are red, green and blue; 0 if they are coefficients.
-        filter_3d: name of the column with the standard deviations of Mip-Splatting's 3D filter, or "".
+        filter_3d: name of the column with the standard deviations of Mip-Splatting's 3D filter; "" if absent.
     """
 
     means: tuple[str, ...]
@@ -79,11 +79,11 @@ def find_columns(
     Args:
         dtype: structured, one field per scalar property, in the order of the file.
         keep_extra: extra columns are kept, so they are not reported.
-        sh_degree: highest SH band to read; `None`: all, up to degree 3.
+        sh_degree: highest SH degree to read; `None`: all, up to 3.
         elements: names of the other elements of the file, for messages.
 
     Returns:
-        The columns, or `None` if the findings hold an error; and the findings.
+        The columns, or `None` if the findings contain an error; and the findings.
     """
     names = _NameIndex(dtype.names or ())
     findings: list[Finding] = []
@@ -130,7 +130,7 @@ def find_columns(
     in_file = tuple(name for name in names.all if name in known)
     if in_file != usual:
         moved = sum(have != want for have, want in zip(in_file, usual, strict=True))
-        text = f"{counted(moved, 'column')} in another place than usual: read by name"
+        text = f"{counted(moved, 'column')} not in the usual order: read by name"
         findings.append(Finding("shuffled-columns", moved, text, "note"))
     double = any(dtype[name].kind != "f" or dtype[name].itemsize > 4 for name in means)
     columns = ColumnMap(
@@ -140,28 +140,28 @@ def find_columns(
 
 
 def dropped_columns(names: Sequence[str]) -> Finding:
-    """Report columns that splats do not have, which are dropped, and what a scene with them may be."""
+    """Report dropped columns that are not splat attributes, and the kind of scene that they indicate."""
     meaning = _meaning(names)
-    text = f"columns {', '.join(names)} are no property of splats: dropped"
-    text += "" if meaning is None else f"; the file holds {meaning}"
+    text = f"columns {', '.join(names)} are not splat attributes: dropped"
+    text += "" if meaning is None else f"; the file contains {meaning}"
     return Finding("extra-columns", len(names), text, "repair")
 
 
 def colour_finding(colours: Sequence[str], largest: float, why: str = "") -> Finding:
-    """Report that columns are read as colours, with the value of white and the reason for it."""
+    """Report that columns are read as colours, with the value of white and the reason."""
     steps = "" if largest == 1.0 else f", in steps of 1/{largest:.0f}"
     text = f"{_list_colours(colours)} are read as the colours of SH degree 0{steps}{why}"
     return Finding("rgb-colours", len(colours), text, "note")
 
 
 def float_columns(names: Sequence[str]) -> list[str]:
-    """Return the columns of a PLY that hold splat attributes other than positions, under any name."""
-    wanted = {*_SH0, *_SCALES, *_QUATS, _OPACITY}
-    return [name for name in names if plain_name(name) in wanted or _REST.fullmatch(plain_name(name))]
+    """Return the columns of splat attributes other than positions, under any name."""
+    attributes = {*_SH0, *_SCALES, *_QUATS, _OPACITY}
+    return [name for name in names if plain_name(name) in attributes or _REST.fullmatch(plain_name(name))]
 
 
 def plain_name(name: str) -> str:
-    """Return a column's name in lower case, without the prefix of another program and leading zeros of its number."""
+    """Return a column name in lower case without the prefixes of other programs and leading zeros of its number."""
     return _ZEROS.sub("f_rest_", _PREFIXES.sub("", name.lower(), count=1))
 
 
@@ -178,11 +178,11 @@ class _NameIndex:
         self._ambiguous: list[str] = []
 
     def has(self, wanted: Sequence[str]) -> bool:
-        """Return True if each name has a column, under whichever name."""
+        """Return True if each usual name has a column, possibly under another name."""
         return all(name in self.plain for name in wanted)
 
     def find(self, wanted: Sequence[str]) -> tuple[str, ...]:
-        """Return the column of each name, or the only one of that meaning under another name, or ""."""
+        """Return the column for each usual name; "" if there is none, or several under other names."""
         return tuple(self._find(name) for name in wanted)
 
     def _find(self, name: str) -> str:
@@ -207,7 +207,7 @@ class _NameIndex:
             text = f"{counted(len(self._renamed), 'column')} named by another program: {pairs}"
             found.append(Finding("alias-columns", len(self._renamed), text, "note"))
         if self._second:
-            text = f"{_list_some(self._second)}: there once more under the usual name, which is read"
+            text = f"{_list_some(self._second)}: duplicated under the usual name, which is read"
             found.append(Finding("second-columns", len(self._second), text, "note"))
         return found
 
@@ -235,21 +235,19 @@ def _list_colours(colours: Sequence[str]) -> str:
 
 
 def _integers(dtype: np.dtype[Any], groups: Sequence[Sequence[str]]) -> Finding | None:
-    """Report columns of integers, whose meaning is unknown."""
+    """Report columns of integers, whose scale is unknown."""
     found = [name for group in groups for name in group if name and dtype[name].kind != "f"]
     if not found:
         return None
     types = " and ".join(sorted({dtype[name].name for name in found}))
     colours = groups[0] and set(groups[0]) == set(found)
-    remedy = (
-        "call colours of 0 to 255 red, green and blue" if colours else "export the values before they are quantised"
-    )
+    remedy = "rename colours of 0 to 255 to red, green and blue" if colours else "export the values before quantisation"
     text = f"{_list_some(found)} {'is' if len(found) == 1 else 'are'} of type {types}, expected float: {remedy}"
     return Finding("integer-columns", len(found), text, "error")
 
 
 def _describe_absence(names: _NameIndex, missing: Sequence[str], elements: Sequence[str]) -> str:
-    """Describe missing columns and what the file seems to be."""
+    """Describe missing columns and the probable kind of the file."""
     text = f"no column {', '.join(missing)}: not a PLY of Gaussian splats"
     shown = f"it has {_list_some(names.all)}" if names.all else "it has no columns"
     if (meaning := _meaning(names.all)) is not None:
@@ -268,7 +266,7 @@ def _meaning(names: Sequence[str]) -> str | None:
 
 
 def _find_rest(names: _NameIndex, sh_degree: int | None) -> tuple[tuple[str, ...], tuple[str, ...], Finding | None]:
-    """Return the columns of all bands, those of the bands to read, and the finding about them."""
+    """Return the columns of all bands, the columns of the bands to read, and the finding about them."""
     numbers = sorted(int(match[1]) for name in names.plain if (match := _REST.fullmatch(name)))
     count = len(numbers)
     if numbers != list(range(count)):
@@ -277,9 +275,8 @@ def _find_rest(names: _NameIndex, sh_degree: int | None) -> tuple[tuple[str, ...
     bands = count // 3
     degree = math.isqrt(bands + 1) - 1
     if count % 3 or (degree + 1) ** 2 - 1 != bands:
-        wanted = ", ".join(str(3 * (one * one - 1)) for one in range(1, MAX_SH_DEGREE + 1))
-        last = 3 * ((MAX_SH_DEGREE + 1) ** 2 - 1)
-        text = f"{count} f_rest columns are no SH degree, expected {wanted} or {last}"
+        *others, last = (3 * (one * one - 1) for one in range(1, MAX_SH_DEGREE + 2))
+        text = f"{count} f_rest columns match no SH degree, expected {', '.join(map(str, others))} or {last}"
         return (), (), Finding("sh-columns", count, text, "error")
     found = names.find([f"f_rest_{number}" for number in numbers])
     kept = degree if sh_degree is None else min(degree, sh_degree)
@@ -287,9 +284,8 @@ def _find_rest(names: _NameIndex, sh_degree: int | None) -> tuple[tuple[str, ...
         return found, (), Finding("sh-columns", count, f"{count} f_rest columns are {too_many_bands(degree)}", "error")
     if kept == degree:
         return found, found, None
-    wanted_bands = (kept + 1) ** 2 - 1
-    rest = tuple(found[channel * bands + band] for channel in range(3) for band in range(wanted_bands))
+    rest = tuple(found[channel * bands + band] for channel in range(3) for band in range((kept + 1) ** 2 - 1))
     if degree <= MAX_SH_DEGREE:
         return found, rest, None
-    text = f"SH degree {degree}: {'all bands' if kept == 0 else f'bands above {kept}'} are left out, as asked"
+    text = f"SH degree {degree}: {'all bands' if kept == 0 else f'bands above {kept}'} are dropped, as requested"
     return found, rest, Finding("sh-bands", count - len(rest), text, "note")

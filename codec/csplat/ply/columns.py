@@ -1,7 +1,7 @@
-"""Convert the rows of a splat PLY to the arrays of a model, with the repairs that are safe.
+"""Convert the rows of a splat PLY to the arrays of a model, with safe repairs.
 
-Rows come in blocks that stay in the cache while each group of columns is copied, checked and repaired, in one pass over
-memory: 0.1 s for a million splats of SH degree 3, a tenth of what it takes column by column over the whole file.
+Blocks of rows fit in the cache while each group of columns is copied, checked and repaired. This single pass over
+memory takes 0.1 s for a million splats of SH degree 3, a tenth of the time of a pass per column over the whole file.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ Rows = NDArray[Any]  # one block of the file: 1-D, structured, contiguous
 LOGIT_OF_0 = -110.0
 LOGIT_OF_1 = 20.0
 
-#: Natural logarithm of 100: the third scale of a disc is a hundredth of the smallest scale of the file.
+#: Natural logarithm of 100: the third scale of a disc is a hundredth of the smallest scale in the file.
 _FLAT_SCALE_STEP = 4.605170
 
-_HUGE_LOG = 88.0  # standard deviations beyond this exponent overflow float32
+_HUGE_LOG = 88.0  # the exponential of larger values overflows float32
 _HUGE_COLOUR = 1e6
-_USUAL_LENGTHS = (1e-3, 1e3)  # lengths of quaternions: they grow and shrink while a scene is trained
-_LARGEST_COLOUR = 16.0  # float colours have 1 for white: larger values are on a scale of 0 to 255
-_SAMPLE_ROWS = 4096  # rows by which half floats are told from integers
-_BYTE, _WORD = 255.0, 65535.0  # the value of white, for colours of 8 and of 16 bits
+_USUAL_LENGTHS = (1e-3, 1e3)  # lengths of quaternions, which drift during training
+_LARGEST_COLOUR = 16.0  # white is 1 for float colours: larger values are on a scale of 0 to 255
+_SAMPLE_ROWS = 4096  # number of rows that are tested for half floats
+_BYTE, _WORD = 255.0, 65535.0  # the value of white for colours of 8 and 16 bits
 _POSITIONS = ("x", "y", "z")
-_BAD_SHARE = 0.01  # largest share of half floats that are NaN or infinite, as in any scene
-_SANE_LENGTHS = (0.01, 100.0)  # lengths of quaternions; integers read as half floats lie outside
-_MAX_SPREAD = 256.0  # largest ratio of the 90th to the 50th percentile of positions in half floats
-_FEW = 16  # splats; a property that all of fewer share may be chance
+_BAD_SHARE = 0.01  # maximum fraction of NaN and infinity among half floats
+_SANE_LENGTHS = (0.01, 100.0)  # lengths of quaternions in half floats; integers read as half floats are outside
+_MAX_SPREAD = 256.0  # maximum ratio of the 90th to the 50th percentile of positions in half floats
+_FEW = 16  # splats; what fewer have in common may be coincidence
 _TINY = 1e-30  # smallest divisor
-_ROUNDING = 1e-3  # alphas may exceed 0 and 1 by that much
-_SAMPLE_OF_BLOCK = 256  # splats of a block whose scales are compared with the scene's extent
-_LENGTHS_RATIO = 3.0  # smallest ratio of the 95th to the 5th percentile of scales that are lengths
-_BYTE_COLOUR = 4.0  # a larger f_dc is brighter than white, 1.77, and may be a colour of 0 to 255
+_ROUNDING = 1e-3  # tolerance by which alphas may exceed 0 and 1
+_SAMPLE_OF_BLOCK = 256  # splats per block whose scales are compared with the scene's extent
+_LENGTHS_RATIO = 3.0  # minimum ratio of the 95th to the 5th percentile of scales that are lengths
+_BYTE_COLOUR = 4.0  # a larger f_dc is much brighter than white (1.77) and may be a colour of 0 to 255
 
 
 @dataclass(eq=False)
 class AttributeArrays:
-    """The arrays of a `SplatModel` under the same names; `means` is float64 if the file has doubles."""
+    """The arrays of a `SplatModel`; `means` is float64 if the file has doubles."""
 
     means: NDArray[Any]
     quats: F32
@@ -65,12 +65,12 @@ _NO_RANGE = (math.inf, -math.inf)
 
 @dataclass
 class RowStatistics:
-    """Counts and ranges of what findings report about rows, updated block by block."""
+    """Counts and ranges for the findings about rows, updated block by block."""
 
     nonfinite: int = 0
     zero_quats: int = 0
     unnormalised: int = 0
-    quat_lengths: tuple[float, float] = (math.inf, 0.0)  # shortest and longest, without those that are 0
+    quat_lengths: tuple[float, float] = (math.inf, 0.0)  # shortest and longest, except 0
     infinite_logits: int = 0
     normals: int = 0
     huge: int = 0
@@ -79,7 +79,7 @@ class RowStatistics:
     scales: tuple[float, float] = _NO_RANGE
     colours: tuple[float, float] = _NO_RANGE
     colour_range: float = 0.0  # as in `ColumnMap`
-    has_columns: bool = True  # the rows are those of a PLY
+    has_columns: bool = True  # the rows are those of a PLY, whose columns can be renamed
     sample: list[tuple[NDArray[Any], F32]] = field(default_factory=list)  # means and scales of some splats
 
 
@@ -93,25 +93,25 @@ def gather_arrays(
     statistics: RowStatistics | None = None,
     thinnest: float = math.inf,
 ) -> AttributeArrays:
-    """Copy columns into arrays, dropping rows that are not finite and repairing rotations.
+    """Copy columns into arrays, drop rows that are not finite, and repair rotations.
 
     Args:
         blocks: the rows in order, `count` in total.
         count: N.
         dtype: dtype of the blocks.
         columns: meaning of the columns.
-        keep_extra: keep `columns.extra` too.
+        keep_extra: also keep `columns.extra`.
         statistics: updated.
-        thinnest: the smallest scale of all discs of the file, if the blocks are only some of its rows.
+        thinnest: smallest scale of all discs of the file, if the blocks are only some of its rows.
 
     Returns:
-        Arrays of the splats that are kept.
+        Arrays of the remaining splats.
     """
     out = _allocate(count, dtype, columns, keep_extra=keep_extra)
     statistics = RowStatistics() if statistics is None else statistics
     statistics.colour_range = columns.colour_range
     at = 0
-    with np.errstate(over="ignore", invalid="ignore"):  # overflow of float32 is found below
+    with np.errstate(over="ignore", invalid="ignore"):  # `_repair` detects overflow of float32
         for rows in blocks:
             part = _part(out, slice(at, at + len(rows)))
             _copy(rows, columns, part)
@@ -128,14 +128,14 @@ def choose_thickness(scales: F32, thinnest: float = math.inf) -> np.float32:
     """Choose the third scale of discs.
 
     Args:
-        scales: [N, 2] natural logarithms, N >= 1.
-        thinnest: the smallest scale of all discs of the scene, if these are only some of them.
+        scales: [N, 2], natural logarithms, N >= 1.
+        thinnest: smallest scale of all discs of the scene, if these are only some of them.
     """
     return np.float32(min(scales.min(), np.float32(thinnest)) - np.float32(_FLAT_SCALE_STEP))
 
 
 def survey_arrays(arrays: AttributeArrays, scale_count: int, statistics: RowStatistics) -> None:
-    """Update the statistics with splats that are not rows of a PLY, leaving the arrays unchanged.
+    """Update the statistics with splats that are not rows of a PLY; the arrays stay unchanged.
 
     Args:
         arrays: finite; opacities are logits, and rotations may have any length.
@@ -152,15 +152,14 @@ def survey_arrays(arrays: AttributeArrays, scale_count: int, statistics: RowStat
 
 
 def with_half_floats(rows: Rows, findings: list[Finding]) -> Rows:
-    """View columns that are declared as 16-bit integers as half floats, if that is what they are.
+    """View 16-bit integer columns as half floats if they contain plausible half floats.
 
-    PLY has no float type of two bytes. Rows of other types and rows that would hold no sane numbers are returned
-    unchanged: `csplat.lint` refuses integers in place of floats; 16-bit positions that are not half floats are an error
-    here.
+    PLY has no half float type. Other rows are returned unchanged: `find_columns` refuses integers in place of floats.
+    16-bit positions that are not half floats are an error here, because integer positions are otherwise allowed.
 
     Args:
         rows: rows of the file.
-        findings: a finding is appended if columns are half floats, or can be neither.
+        findings: a finding is appended if columns are half floats, or invalid 16-bit positions.
     """
     dtype = rows.dtype
     floats = set(float_columns(dtype.names or ()))
@@ -174,21 +173,21 @@ def with_half_floats(rows: Rows, findings: list[Finding]) -> Rows:
     if not _are_sane(viewed[:_SAMPLE_ROWS], halves, alone=not floats & halves):
         if positions and not floats & halves:
             names = [name for name in dtype.names or () if name in positions]
-            text = f"{', '.join(names)} are 16-bit integers, and no half floats, expected float: store them as float"
+            text = f"{', '.join(names)} are 16-bit integers other than half floats, expected float: store them as float"
             findings.append(Finding("integer-columns", len(names), text, "error"))
         return rows
-    text = f"{counted(len(halves), 'column')} of 16-bit integers hold the bits of half floats: read as these"
+    text = f"{counted(len(halves), 'column')} of 16-bit integers contain half floats: read as such"
     findings.append(Finding("half-floats", len(halves), text, "note"))
     return viewed
 
 
 def _are_sane(rows: Rows, halves: set[str], *, alone: bool) -> bool:
-    """Return True if the columns may be half floats: nearly all values are finite and of the size that splats have.
+    """Return True if the columns may be half floats: nearly all values are finite and plausible for splats.
 
     Args:
         rows: some rows of the file, viewed as half floats.
         halves: names of the columns of half floats.
-        alone: only positions are half floats; the other columns give no hint of integers.
+        alone: only positions are half floats, so other columns give no evidence.
     """
     columns = {name: rows[name].astype(np.float32) for name in halves}
     bad = sum(int((np.isnan(one) if plain_name(name) == "opacity" else ~np.isfinite(one)).sum())
@@ -196,7 +195,7 @@ def _are_sane(rows: Rows, halves: set[str], *, alone: bool) -> bool:
     if bad > _BAD_SHARE * len(rows) * len(columns):
         return False
     named = {plain_name(name): rows[name].astype(np.float64) for name in rows.dtype.names or ()}
-    absent = np.zeros(len(rows))  # for missing columns, which are refused later
+    absent = np.zeros(len(rows))  # missing columns are refused later
     scales = np.stack([named.get(f"scale_{axis}", absent) for axis in range(2)])
     if not alone:
         quats = np.stack([named.get(f"rot_{axis}", absent) for axis in range(4)])
@@ -209,7 +208,7 @@ def _are_sane(rows: Rows, halves: set[str], *, alone: bool) -> bool:
     if len(positions) < _FEW:
         return True
     middle, most = np.quantile(positions, (0.5, 0.9), axis=0)
-    # Integers that are read as half floats have all sizes, from tiny to large, along every axis.
+    # Integers read as half floats have magnitudes from tiny to large along every axis.
     if np.median(most / np.maximum(middle, _TINY)) > _MAX_SPREAD:
         return False
     return math.exp(min(_HUGE_LOG, float(np.median(scales)))) <= 2.0 * float(most.max())
@@ -229,15 +228,15 @@ def with_colour_range(blocks: Iterable[Rows], columns: ColumnMap, findings: list
     if not 0 < largest <= _BYTE:
         return columns
     at = next(index for index, one in enumerate(findings) if one.id == "rgb-colours")
-    findings[at] = colour_finding(columns.sh0, _BYTE, f": they are of 16 bits, and at most {largest}")
+    findings[at] = colour_finding(columns.sh0, _BYTE, f": they have 16 bits, but are at most {largest}")
     return replace(columns, colour_range=_BYTE)
 
 
 def alpha_of_logits(logits: NDArray[Any]) -> F32:
-    """Return opacities: the sigmoid of logits in float64, rounded once.
+    """Compute opacities: the sigmoid of logits in float64, rounded once.
 
-    Infinite logits give alpha 0 and 1; NaN stays NaN. Above a logit of 16, float32 alpha is too close to 1 to tell
-    neighbours apart; 17.33 and more give 1.
+    Infinite logits give alpha 0 and 1; NaN stays NaN. Above a logit of 16, float32 alpha is too close to 1 to
+    distinguish neighbouring values; 17.33 and more give 1.
 
     Args:
         logits: [N] floating.
@@ -255,7 +254,7 @@ def _alphas(logits: NDArray[Any]) -> F64:
 
 
 def logits_of_alpha(alpha: F32) -> F32:
-    """Return logits of opacities; those of 0 and 1 are finite and lead back to exactly 0 and 1.
+    """Compute logits of opacities; alphas 0 and 1 have finite logits whose sigmoids are exactly 0 and 1.
 
     Args:
         alpha: [N] float32 in [0, 1].
@@ -295,7 +294,7 @@ def _part(arrays: AttributeArrays, rows: slice) -> AttributeArrays:
 
 
 def _copy(rows: Rows, columns: ColumnMap, part: AttributeArrays) -> None:
-    """Copy all groups of columns of a block; opacities stay logits, rotations keep their lengths."""
+    """Copy all columns of a block; opacities stay logits, rotations keep their lengths."""
     _copy_group(rows, columns.means, part.means)
     _copy_group(rows, columns.quats, part.quats)
     _copy_group(rows, columns.scales, part.scales[:, : len(columns.scales)])
@@ -310,7 +309,7 @@ def _copy(rows: Rows, columns: ColumnMap, part: AttributeArrays) -> None:
 
 
 def _copy_group(rows: Rows, names: Sequence[str], target: NDArray[Any]) -> None:
-    """Copy columns `names` of a block to the last axis of `target` [n, len(names)]."""
+    """Copy columns of a block to the last axis of `target` [n, len(names)]."""
     view = _adjacent(rows, names)
     if view is not None:
         target[...] = view
@@ -320,7 +319,7 @@ def _copy_group(rows: Rows, names: Sequence[str], target: NDArray[Any]) -> None:
 
 
 def _adjacent(rows: Rows, names: Sequence[str]) -> NDArray[Any] | None:
-    """View columns as one array [n, len(names)] if they are adjacent and of one type, otherwise return `None`."""
+    """View columns as one array [n, len(names)] if they are adjacent and have one type; otherwise return `None`."""
     fields: dict[str, Any] = dict((rows.dtype.fields or {}).items())
     if not names:
         return None
@@ -329,7 +328,7 @@ def _adjacent(rows: Rows, names: Sequence[str]) -> NDArray[Any] | None:
         if fields[name][:2] != (kind, start + index * kind.itemsize):
             return None
     shape, strides = (len(rows), len(names)), (rows.dtype.itemsize, kind.itemsize)
-    # Through bytes: the buffer protocol does not take every name that a PLY may give a column.
+    # Via bytes, because the buffer protocol does not support every column name that a PLY may have.
     return np.ndarray(shape, kind, rows.view(np.uint8).data, start, strides)
 
 
@@ -341,19 +340,19 @@ def _count_nonzero_rows(rows: Rows, names: Sequence[str]) -> int:
 
 
 def _repair(part: AttributeArrays, columns: ColumnMap, statistics: RowStatistics, widths: F64 | None) -> int:
-    """Repair a block in place, moving the rows that are kept to the front; return their number.
+    """Repair a block in place, moving the remaining rows to the front; return their number.
 
     Args:
         part: the block with the values of the file.
         columns: meaning of the columns.
         statistics: updated.
-        widths: [n] standard deviations of the 3D filter, scene units; `None`: there is no filter.
+        widths: [n], standard deviations of the 3D filter, scene units; `None`: there is no filter.
     """
     scale_count = len(columns.scales)
     checked = [part.means, part.quats, part.scales[:, :scale_count], part.sh0, part.shN]
     checked += [] if widths is None else [widths]
     sums = [float(array.sum()) for array in (*checked, part.opacities)]
-    if not np.isfinite(sum(sums)):  # NaN, infinity, or large values whose sum overflows
+    if not np.isfinite(sum(sums)):  # NaN, infinity, or a sum of large values that overflows
         good = ~np.isnan(part.opacities)
         for array in checked:
             finite = np.isfinite(array.astype(np.float32))  # means may be float64
@@ -385,9 +384,9 @@ def _repair(part: AttributeArrays, columns: ColumnMap, statistics: RowStatistics
 
 
 def _extend_range(bounds: tuple[float, float], values: F32) -> tuple[float, float]:
-    """Return the range of earlier values and of these.
+    """Extend a range by some values.
 
-    A value below 0, beyond rounding, shows that values are not activated: the range does not matter from then on.
+    Once a value is negative beyond rounding, the values are not activated; the range is irrelevant and stays unchanged.
     """
     if bounds[0] < -_ROUNDING:
         return bounds
@@ -397,14 +396,14 @@ def _extend_range(bounds: tuple[float, float], values: F32) -> tuple[float, floa
 def _fuse_filter(scales: F32, alphas: F64, widths: F64) -> None:
     """Convolve splats with the 3D filter of Mip-Splatting, in place.
 
-    As in `create_fused_ply.py`, standard deviations become sqrt(s² + f²), and opacities are multiplied by
+    As in `create_fused_ply.py`, standard deviations s become sqrt(s² + f²), and opacities are multiplied by
     sqrt(Π s² / Π (s² + f²)), which preserves the mass of a splat (Yu et al., Mip-Splatting, CVPR 2024, equation 9).
-    Computed with logarithms, so that neither squares nor products leave float64; a width of 0 changes no bit.
+    The computation uses logarithms so that squares and products do not overflow. A width of 0 changes no bit.
 
     Args:
-        scales: [n, 3] natural logarithms of standard deviations.
-        alphas: [n] opacities, 0 to 1.
-        widths: [n] standard deviations of the filter, finite; the sign is ignored.
+        scales: [n, 3], natural logarithms of standard deviations.
+        alphas: [n], opacities, 0 to 1.
+        widths: [n], standard deviations f of the filter, finite; the sign is ignored.
     """
     rows = np.flatnonzero(widths)
     before = scales[rows].astype(np.float64)
@@ -414,11 +413,11 @@ def _fuse_filter(scales: F32, alphas: F64, widths: F64) -> None:
 
 
 def count_huge_rows(scales: NDArray[Any], *colours: NDArray[Any]) -> int:
-    """Count splats with values far beyond those of any scene.
+    """Count splats with implausibly large values.
 
     Args:
-        scales: [n, C] natural logarithms.
-        colours: [n, ...] coefficients.
+        scales: [n, C], natural logarithms.
+        colours: [n, ...], coefficients.
     """
     huge = None
     for array, limit in ((scales, _HUGE_LOG), *((one, _HUGE_COLOUR) for one in colours)):
@@ -443,14 +442,14 @@ def _repair_quats(quats: F32, statistics: RowStatistics) -> None:
 
 
 def list_findings(statistics: RowStatistics, count: int) -> list[Finding]:
-    """Return the findings that statistics of `count` rows give rise to."""
+    """Return the findings about `count` rows with these statistics."""
     s, (shortest, longest) = statistics, statistics.quat_lengths
     nonfinite = f"{counted(s.nonfinite, 'splat')} with NaN or infinity"
     quats = f"{counted(s.unnormalised, 'rotation')} not of unit length ({shortest:.3g} to {longest:.3g}): normalised"
     usual = _USUAL_LENGTHS[0] <= shortest and longest <= _USUAL_LENGTHS[1]
     zero = f"{counted(s.zero_quats, 'rotation')} of length 0: set to the identity"
     logits = f"{counted(s.infinite_logits, 'infinite logit')} of opacity: alpha 0 or 1"
-    normals = f"{counted(s.normals, 'splat')} with normals, which splats do not use: dropped"
+    normals = f"{counted(s.normals, 'splat')} with normals, which are not splat attributes: dropped"
     fused = f"the 3D filter of Mip-Splatting: fused into scales and opacities of {counted(s.filtered, 'splat')}"
     huge = f"log scales beyond ± {_HUGE_LOG:g} or colours beyond ± {_HUGE_COLOUR:g}"
     findings = [
@@ -468,7 +467,7 @@ def list_findings(statistics: RowStatistics, count: int) -> list[Finding]:
 
 
 def _suspicions(statistics: RowStatistics, kept: int) -> list[Finding]:
-    """Report ranges that no trained scene has: those of values after their activation."""
+    """Report ranges that indicate values after their activation, which trained scenes do not have."""
     found = []
     colours = statistics.colours
     if statistics.colour_range == 1.0 and kept and colours[1] > _LARGEST_COLOUR:
@@ -479,27 +478,27 @@ def _suspicions(statistics: RowStatistics, kept: int) -> list[Finding]:
     alphas = _lie_in(statistics.opacities, -_ROUNDING, 1.0 + _ROUNDING)
     if alphas or (_lie_in(statistics.opacities, 0.0, _BYTE) and statistics.opacities[1] > _HUGE_LOG):
         top = 1 if alphas else 255
-        text = f"all {kept} opacities lie in 0..{top}, as alphas do: read as logits; export them before the sigmoid"
+        text = f"all {kept} opacities are in 0..{top}, like alphas: read as logits; export them before the sigmoid"
         found.append(Finding("opacities-are-alphas", kept, text, "note"))
     if _lie_in(statistics.scales, 0.0, _HUGE_LOG) and _are_lengths(statistics):
-        text = f"no scale of {kept} splats is below 0, as lengths are: read as logarithms; export them before exp"
+        text = f"no scale of {kept} splats is negative, like lengths: read as logarithms; export them before exp"
         found.append(Finding("scales-are-linear", kept, text, "note"))
     if not statistics.colour_range and (
         _lie_in(colours, 0.0, 1.0) or (_lie_in(colours, 0.0, 255.0) and colours[1] > _BYTE_COLOUR)
     ):
         top = 1 if colours[1] <= 1.0 else 255
-        text = f"all f_dc of {kept} splats lie in 0..{top}, as colours do: read as SH coefficients"
+        text = f"all f_dc of {kept} splats are in 0..{top}, like colours: read as SH coefficients"
         text += "; name the columns red, green and blue if they are colours" if statistics.has_columns else ""
         found.append(Finding("colours-are-rgb", kept, text, "note"))
     return found
 
 
 def _are_lengths(statistics: RowStatistics) -> bool:
-    """Return True if scales above 0 fit the scene as lengths but not as logarithms."""
+    """Return True if positive scales are plausible as lengths but not as logarithms."""
     means, scales = (np.concatenate(arrays) for arrays in zip(*statistics.sample, strict=True))
     extent = float(np.subtract(*np.quantile(means, (0.95, 0.05), axis=0)).max())
     low, middle, high = np.quantile(scales, (0.05, 0.5, 0.95)).tolist()
-    # Lengths differ by factors; as logarithms they would make all splats about one unit large.
+    # Lengths vary by factors; read as logarithms they would give all splats a size of about one unit.
     alike = middle < 1.0 and high > _LENGTHS_RATIO * low
     return middle <= extent / 2.0 and (alike or math.exp(middle) > extent / 2.0)
 

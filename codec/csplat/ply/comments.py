@@ -2,12 +2,12 @@
 
 | comment | meaning |
 |---|---|
-| `csplat origin X Y Z` | x, y, z are relative to it |
+| `csplat origin X Y Z` | x, y, z are relative to this origin |
 | `csplat absolute_origin X Y Z` | x, y, z are absolute, in doubles |
 | `csplat coordinate_system RDF` | directions of the axes |
 | `csplat up X Y Z`, `csplat unit_metres U`, `csplat licence TEXT` | as in `SplatModel` |
-| `csplat training {JSON}`, `csplat view {JSON}` | the training (`csplat.training_record`) and the first view |
-| `SplatRenderMode: mip`, `SplatRenderMode: 2dgs` | antialiased, flat: the words of other programs |
+| `csplat training {JSON}`, `csplat view {JSON}` | the training (`csplat.training_record`) and the initial view |
+| `SplatRenderMode: mip`, `SplatRenderMode: 2dgs` | antialiased, flat; also used by other programs |
 """
 
 from __future__ import annotations
@@ -30,13 +30,12 @@ from csplat.training_record import TRAINING, VIEW, TrainingRecord
 from csplat.types import F32, F64
 
 _PREFIX = "csplat"
-_SHOWN = 80  # characters of a comment in a message
-#: ns-export of nerfstudio names the axis that points up. Brush writes the same axis for every scene, so its comment is
+_SHOWN = 80  # maximum number of characters of a comment in a message
+#: nerfstudio's ns-export names the axis that points up. Brush writes the same axis for every scene, so its comment is
 #: ignored.
 _VERTICAL_AXIS = re.compile(r"vertical axis\s*:\s*([+-]?)([xyz])", re.IGNORECASE)
 _BRUSH = "exported from brush"
-#: Comments of Brush and splat-transform for `antialiased` (mip) and `flat` (2dgs); Postshot writes the former in lower
-#: case.
+#: Comments of Brush and splat-transform for `antialiased` (mip) and `flat` (2dgs), and of Postshot for `antialiased`.
 _MODES: dict[tuple[str, ...], str] = {
     ("splatrendermode:", "default"): "",
     ("splatrendermode:", "mip"): "antialiased",
@@ -44,20 +43,20 @@ _MODES: dict[tuple[str, ...], str] = {
     ("antialiased", "0"): "",
     ("antialiased", "1"): "antialiased",
 }
-#: float64 positions keep origin 0 if their centre is nearer than this many spreads: then float32 relative to 0 is at
-#: most four bits coarser than relative to the centre.
+#: float64 positions keep origin 0 if the distance of their centre is at most this many spreads: float32 relative to 0
+#: is then at most four bits coarser than relative to the centre.
 _NEAR_SPREADS = 16.0
 
 
 @dataclass
 class CommentMetadata:
-    """Scene metadata from header comments, with defaults for what these leave out.
+    """Scene metadata from header comments, with defaults.
 
     Attributes:
-        origin: `None` if no comment names one.
-        origin_is_added: x, y and z of the file are absolute: the origin has been added to them.
+        origin: origin of the scene; `None` if no comment specifies one.
+        origin_is_added: True if x, y and z in the file are absolute, that is, include the origin.
         coordinate_system, unit_metres, antialiased, flat: as in `SplatModel`.
-        metadata: `comments` (the lines that are not ours), `licence`, `training`, `up`, `view`.
+        metadata: `comments` (lines that csplat does not interpret), `licence`, `training`, `up`, `view`.
         findings: findings about the comments of other programs.
     """
 
@@ -71,7 +70,7 @@ class CommentMetadata:
     findings: list[Finding] = field(default_factory=list)
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields that a `SplatModel` takes unchanged: all but the origin."""
+        """Return the fields of a `SplatModel` other than the origin."""
         names = ("coordinate_system", "unit_metres", "antialiased", "flat", "metadata")
         return {name: getattr(self, name) for name in names}
 
@@ -80,8 +79,8 @@ def parse_comments(comments: Sequence[str]) -> CommentMetadata:
     """Parse the comment lines of a header, without the word `comment`.
 
     Raises:
-        InputError: a line is ours but its value cannot be understood. Ignoring an origin would move the scene; ignoring
-            its background would spoil comparisons.
+        InputError: the value of a csplat comment is invalid. It is not ignored, because a wrong origin would move the
+            scene and a wrong background would invalidate comparisons.
     """
     metadata = CommentMetadata()
     others: list[str] = []
@@ -108,14 +107,14 @@ def parse_comments(comments: Sequence[str]) -> CommentMetadata:
 
 
 def format_comments(model: SplatModel, *, absolute: bool) -> list[str]:
-    """Return the metadata of a model as comment lines, without the word `comment`.
+    """Format the metadata of a model as comment lines, without the word `comment`.
 
     Args:
         model: the scene.
         absolute: positions are written with the origin added.
 
     Returns:
-        Lines of ASCII (other characters become question marks), none for defaults.
+        ASCII lines, without lines for defaults; other characters become question marks.
     """
     lines = [line for one in _strings(model.metadata.get("comments")) for line in one.splitlines()]
     if absolute or any(model.origin):
@@ -140,22 +139,22 @@ def format_comments(model: SplatModel, *, absolute: bool) -> list[str]:
         lines.append(f"{_PREFIX} {VIEW} {json.dumps(view)}")
     trained = TrainingRecord.of(model.metadata)
     if trained is not None:
-        lines.append(f"{_PREFIX} {TRAINING} {json.dumps(trained.as_json())}")  # ASCII, whatever names hold
+        lines.append(f"{_PREFIX} {TRAINING} {json.dumps(trained.as_json())}")
     return [line.encode("ascii", "replace").decode("ascii") for line in lines]
 
 
 def split_origin(means: NDArray[Any], metadata: CommentMetadata) -> tuple[F32, tuple[float, float, float], F64 | None]:
-    """Split the positions of a PLY into float32 means and the origin they are relative to.
+    """Split the positions of a PLY into float32 means and an origin.
 
     Args:
-        means: [N, 3] x, y, z of the file, float32 or float64.
-        metadata: metadata from the comments of the file, with their origin.
+        means: [N, 3], float32 or float64, x, y, z of the file.
+        metadata: metadata from the comments of the file.
 
     Returns:
-        [N, 3] float32 and three float64, in scene units; and the positions in doubles if the former do not represent
-        them exactly.
+        [N, 3] float32 means relative to the origin; the origin; and the positions in float64 if means and origin do
+        not represent them exactly, otherwise `None`.
     """
-    with np.errstate(over="ignore"):  # the model refuses what leaves float32
+    with np.errstate(over="ignore"):  # `SplatModel` refuses values beyond float32
         if means.dtype == np.float32:
             origin = None if metadata.origin_is_added else metadata.origin
             return means, origin or (0.0, 0.0, 0.0), None
@@ -171,7 +170,7 @@ def split_origin(means: NDArray[Any], metadata: CommentMetadata) -> tuple[F32, t
 
 
 def _set_vertical_axis(metadata: CommentMetadata, comments: Sequence[str]) -> Sequence[str]:
-    """Take the up axis from comments unless something else names it; return the comments to keep."""
+    """Set the up direction from comments on the vertical axis unless it is known; return the comments to keep."""
     if not comments:
         return ()
     directions = set()
@@ -181,20 +180,20 @@ def _set_vertical_axis(metadata: CommentMetadata, comments: Sequence[str]) -> Se
         sign, axis = found.groups()
         directions.add(tuple((-1.0 if sign == "-" else 1.0) * (axis.lower() == one) + 0.0 for one in "xyz"))
     if len(directions) > 1:
-        text = f"the comments {' and '.join(map(repr, comments))} contradict each other: none is taken"
+        text = f"the comments {' and '.join(map(repr, comments))} contradict each other: ignored"
         metadata.findings.append(Finding("vertical-axis", len(comments), text, "note"))
         return comments
     stated = up_of(metadata.metadata, metadata.coordinate_system)
     if stated is not None:
         return () if stated == directions.pop() else comments
     metadata.metadata[UP] = list(directions.pop())
-    text = f"the comment {comments[0]!r} says which axis is up"
+    text = f"the comment {comments[0]!r} specifies the up axis"
     metadata.findings.append(Finding("vertical-axis", 1, text, "note"))
     return ()
 
 
 def _set_field(metadata: CommentMetadata, key: str, values: Sequence[str]) -> bool:
-    """Set the field of a comment; return `False` if its key is not ours."""
+    """Set the field of a csplat comment; return False if its key is unknown."""
     if key in ("origin", "absolute_origin"):
         x, y, z = _numbers(key, values, 3)
         metadata.origin, metadata.origin_is_added = (x, y, z), key == "absolute_origin"
@@ -224,17 +223,18 @@ def _up(values: Sequence[str]) -> list[float]:
 
 
 def _training(comment: str) -> TrainingRecord:
+    value = _json(comment)
     try:
-        return TrainingRecord.from_json(_json(comment))
+        return TrainingRecord.from_json(value)
     except InputError as error:
         raise _comment_error(comment, str(error)) from None
 
 
 def _view(comment: str) -> dict[str, Any]:
-    """Parse a camera; only viewers of the scene use its members."""
+    """Parse a view; its members are checked where they are used."""
     view = _json(comment)
     if not isinstance(view, dict) or not _is_json(view):
-        raise _comment_error(comment, "wanted an object of finite numbers")
+        raise _comment_error(comment, "expected an object with finite numbers")
     return view
 
 
@@ -247,7 +247,7 @@ def _is_json(value: object) -> bool:
 
 
 def _json(comment: str) -> object:
-    """Parse the JSON after the first two words, keeping its spaces."""
+    """Parse the JSON after the first two words of a comment."""
     try:
         return json.loads("".join(comment.split(None, 2)[2:]))
     except RecursionError:
@@ -257,7 +257,7 @@ def _json(comment: str) -> object:
 
 
 def _comment_error(comment: str, reason: str) -> InputError:
-    return InputError(f"the header comment {comment[:_SHOWN]!r} cannot be understood: {reason}")
+    return InputError(f"the header comment {comment[:_SHOWN]!r} is invalid: {reason}")
 
 
 def _numbers(key: str, values: Sequence[str], count: int) -> list[float]:
@@ -267,7 +267,7 @@ def _numbers(key: str, values: Sequence[str], count: int) -> list[float]:
         numbers = []
     if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
         line = " ".join((_PREFIX, key, *values))
-        raise InputError(f"the header comment {line!r} does not hold {count} finite numbers")
+        raise InputError(f"the header comment {line!r} does not contain {count} finite numbers")
     return numbers
 
 
@@ -278,8 +278,8 @@ def _strings(value: object) -> list[str]:
 def _choose_origin(positions: F64) -> tuple[float, float, float]:
     """Choose an origin for float64 positions so that float32 loses nothing visible.
 
-    Zero if float32 is exact or the scene lies around zero; otherwise its centre (the median, which outliers do not
-    move), rounded to a power of two near the scene's spread.
+    The origin is zero if float32 is exact or the scene is around zero. Otherwise it is the scene's centre (the median,
+    which is robust to outliers), rounded to a multiple of a power of two near the scene's spread.
     """
     if len(positions) == 0 or np.array_equal(positions, positions.astype(np.float32)):
         return (0.0, 0.0, 0.0)

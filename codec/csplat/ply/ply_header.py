@@ -1,8 +1,8 @@
-"""Rewrite headers and text rows that plyfile does not accept but whose meaning is clear.
+"""Rewrite headers and text rows that plyfile does not accept although their meaning is clear.
 
-Headers: byte order marks, blank lines, keywords in capitals, spaces after `end_header`. Text rows: several on one line
-or one over several lines, decimal commas, the NaN and infinity of other languages. Ambiguous text is an error naming
-the number or the row.
+Headers may have byte order marks, blank lines, keywords in capitals and spaces after `end_header`. Text rows may share
+a line or span several lines, and may have decimal commas and NaN or infinity as other languages write them. Ambiguous
+text is an error that names the number or row.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from csplat.detect import KINDS, detect_content, is_ply, read_head, refusal
 from csplat.errors import InputError, counted
 from csplat.lint import Finding
 
-#: The element that holds the splats.
+#: The element of the splats.
 SPLAT_ELEMENT = "vertex"
 
 _END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", re.IGNORECASE)
@@ -25,7 +25,7 @@ _MAX_SIZE = 1 << 20
 _MARK = b"\xef\xbb\xbf"  # byte order mark of UTF-8
 _WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")  # byte order marks of UTF-16
 _LINE_END = re.compile(rb"\r\n|\r|\n")
-_FREE_TEXT = (b"comment", b"obj_info")  # keywords that are followed by free text, spaces included
+_FREE_TEXT = (b"comment", b"obj_info")  # keywords that are followed by free text
 
 
 @dataclass
@@ -34,9 +34,9 @@ class PlyElement:
 
     Attributes:
         name: name of the element.
-        count: number of rows; 0 if the header has no number.
+        count: number of rows; 0 if the header specifies no number.
         properties: names of the properties.
-        has_lists: one of the properties is a list.
+        has_lists: True if a property is a list.
     """
 
     name: str
@@ -50,10 +50,10 @@ class PlyHeader:
     """A header that plyfile can parse.
 
     Attributes:
-        start: bytes of the file before it.
+        start: offset of the header in the file.
         text: the header up to and including the line `end_header`, with the same length as in the file; ASCII.
-        is_text: the rows are numbers in ASCII.
-        elements: elements that it declares.
+        is_text: True if the rows are numbers in ASCII.
+        elements: the declared elements.
     """
 
     start: int
@@ -63,7 +63,7 @@ class PlyHeader:
 
     @property
     def end(self) -> int:
-        """Offset in the file where the rows begin."""
+        """Offset of the rows in the file."""
         return self.start + len(self.text)
 
 
@@ -76,7 +76,7 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         kind: name of the expected kind of PLY, a key of `csplat.detect.KINDS`.
 
     Raises:
-        InputError: the file is not such a PLY, or its header has no end.
+        InputError: the file is not a PLY of this kind, or its header has no end.
         OSError: the file cannot be read.
     """
     head = read_head(path)
@@ -93,7 +93,7 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         raise InputError(f"{path.name}: the PLY header has no line end_header")
     raw = data[: end.end()]
     if raw[3:5] not in (b"\r\n", b"\r") and raw[3:4] == b"\r" and raw.endswith(b"\r\n"):
-        raw = raw[:-1]  # lines end with CR: the LF is the first byte of a row
+        raw = raw[:-1]  # the lines end with CR, so the LF is the first byte of a row
     text, oddities = _rewrite_header(raw)
     if start:
         oddities.insert(0, "a byte order mark")
@@ -101,7 +101,7 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         findings.append(Finding("unusual-header", len(oddities), f"the header has {', '.join(oddities)}", "note"))
     if not raw.isascii():
         count = sum(byte > 127 for byte in raw)
-        note = f"{counted(count, 'byte')} of the header outside ASCII: read as question marks"
+        note = f"{counted(count, 'byte')} of the header are not ASCII: read as question marks"
         findings.append(Finding("non-ascii-header", count, note, "note"))
     text = bytes(byte if byte < 128 else ord("?") for byte in text)
     lines = [line.split() for line in text.splitlines()]
@@ -110,9 +110,9 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
 
 
 def _rewrite_header(raw: bytes) -> tuple[bytes, list[str]]:
-    """Rewrite a header for plyfile in the same number of bytes, and list what was unusual about it."""
+    """Rewrite a header for plyfile with the same length, and list its oddities."""
     first_end = _LINE_END.search(raw)
-    assert first_end is not None, "there is a line end_header"
+    assert first_end is not None, "the line end_header has an end"
     end = first_end[0]
     lines = raw.split(end)[:-1]
     normalised = [_normalise_line(line) for line in lines]
@@ -130,7 +130,7 @@ def _rewrite_header(raw: bytes) -> tuple[bytes, list[str]]:
     oddities += ["line ends of two kinds"] if len(kinds) > 1 else []
     kept = [line for line in normalised if line.strip()]
     text = b"\n".join([*kept, b""])
-    kept[1] += b" " * (len(raw) - len(text))  # plyfile finds the rows by their place in the file
+    kept[1] += b" " * (len(raw) - len(text))  # keeps the offset of the rows
     return b"\n".join([*kept, b""]), oddities
 
 
@@ -139,7 +139,7 @@ def _has_line_end(lines: list[bytes]) -> bool:
 
 
 def _normalise_line(line: bytes) -> bytes:
-    """Return a header line in lower case except for names and free text; never longer than before."""
+    """Return a header line in lower case except for names and free text; it never becomes longer."""
     words = line.split()
     keyword = words[0].lower() if words else b""
     if keyword in _FREE_TEXT:
@@ -177,7 +177,7 @@ def _count_findings(lines: list[list[bytes]], size: int) -> list[Finding]:
             findings.append(Finding("malformed", 1, text, "error"))
         elif words[2].isdigit():
             count = int(words[2])
-            if count > size:  # a row takes a byte at least: do not let anyone allocate for it
+            if count > size:  # a row has at least one byte; refuse before anything is allocated
                 text = f"{count} rows are declared, the file has {size} bytes"
                 findings.append(Finding("truncated", count, text, "error"))
     return findings
@@ -189,7 +189,7 @@ _TEXT_LINE_END = re.compile(r"\r\n|\r|\n")
 _NAN = re.compile(r"(?<!\S)[+-]?(?:nan\([a-z]*\)|1\.#(?:ind|[qs]nan)0*)(?!\S)", re.IGNORECASE)
 _INFINITY = re.compile(r"(?<!\S)([+-]?)1\.#inf0*(?!\S)", re.IGNORECASE)
 _EXPONENT = re.compile(r"(?<!\S)([+-]?(?:\d+\.?\d*|\.\d+))d([+-]?\d+)(?!\S)", re.IGNORECASE)
-#: Numbers as other languages write them: description for messages, pattern, and Python's spelling.
+#: Numbers as other languages write them: description for messages, pattern, Python's spelling.
 _SPELLINGS = {
     "NaN as Microsoft's C writes it": (_NAN, "nan"),
     "infinity as Microsoft's C writes it": (_INFINITY, r"\1inf"),
@@ -200,7 +200,7 @@ _NO_THOUSANDS = re.compile(r"\d,(?!\d{3}(?!\d))\d")  # not followed by three dig
 
 
 class _RowError(ValueError):
-    """Text that does not form the declared rows; the finding says why."""
+    """Text that does not form the declared rows, with a finding about the reason."""
 
     def __init__(self, finding: Finding) -> None:
         super().__init__(finding.text)
@@ -208,15 +208,15 @@ class _RowError(ValueError):
 
 
 def parse_text_rows(body: bytes, elements: Sequence[PlyElement]) -> tuple[TextRows | None, list[Finding]]:
-    """Split text into the rows of all elements, whatever its layout.
+    """Split text of any layout into the rows of all elements.
 
     Args:
         body: the file after its header.
-        elements: elements that the header declares.
+        elements: the declared elements.
 
     Returns:
-        The words of each row, and findings. The rows are `None` if fewer are there than declared, or if one has more
-        or fewer values.
+        The words of each row, and findings. The rows are `None` if rows are missing or a row has another number of
+        values than declared.
     """
     text = body.decode("ascii", "replace")
     oddities = []
@@ -238,12 +238,12 @@ def parse_text_rows(body: bytes, elements: Sequence[PlyElement]) -> tuple[TextRo
         if size:
             findings.append(Finding("trailing-bytes", size, f"{size} bytes after the last row: ignored", "repair"))
         return rows, findings
-    assert first is not None, "there is one way at least"
+    assert first is not None, "_separations returns at least one reading"
     return None, [first.finding]
 
 
 def _separations(text: str) -> list[tuple[str, str]]:
-    """Return the text with only spaces between numbers, once for each possible meaning of its commas."""
+    """Return the text with only spaces between numbers, for each possible meaning of its commas."""
     if "," not in text and ";" not in text:
         return [(text, "")]
     found = []
@@ -253,10 +253,10 @@ def _separations(text: str) -> list[tuple[str, str]]:
 
 
 def _split_rows(lines: TextRows, elements: Sequence[PlyElement]) -> tuple[TextRows, list[str], list[str]]:
-    """Return the rows, what is unusual about their lines, and the words after the last row.
+    """Return the rows, the oddities of their lines, and the words after the last row.
 
-    Rows may share a line or continue on the next one, as long as every line end is a row end or every row end is a
-    line end: so a missing value never shifts those after it.
+    Rows may share a line or continue on the next one, provided that every line end is a row end or every row end is a
+    line end. So a missing value never shifts the values after it.
     """
     blank = next((at for at in range(len(lines) - 1, -1, -1) if lines[at]), -1) + 1 - sum(map(bool, lines))
     oddities = ["blank lines"] if blank else []
@@ -290,11 +290,11 @@ def _split_rows(lines: TextRows, elements: Sequence[PlyElement]) -> tuple[TextRo
         at += count
     rest = [word for line in lines[at:] for word in line]
     if rest and len(rows) != at:
-        text = f"there are {counted(len(rest), 'value')} behind rows that are not in lines of their own"
+        text = f"found {counted(len(rest), 'value')} after rows that are not on separate lines"
         raise _RowError(Finding("malformed", len(rest), text, "error"))
     return rows, oddities, rest
 
 
 def _truncated(element: PlyElement, present: int) -> Finding:
-    text = f"{element.count} rows of {element.name} are declared, {present} are there: copy or download it again"
+    text = f"{element.count} rows of {element.name} are declared, {present} are present: copy or download it again"
     return Finding("truncated", element.count - present, text, "error")

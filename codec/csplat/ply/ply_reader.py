@@ -1,7 +1,7 @@
 """Read PLY files of 3D Gaussian splats.
 
-The only module that imports plyfile, which is GPL-3.0-or-later: programs that embed the decoder and never read a PLY
-do not load it.
+This is the only module that imports plyfile, which is GPL-3.0-or-later, so programs that embed the decoder and never
+read a PLY do not load it.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from csplat.ply.ply_header import SPLAT_ELEMENT, PlyHeader, parse_text_rows, rea
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, F64
 
-_EMPTY = Finding("empty", 0, "the file holds no splats", "note")
-_FRAME = "delta_vertex_"  # prefix of Brush's elements: differences of later frames from the first
-#: Elements of Apple's ml-sharp (gaussians.py): the camera of its image, and data that only its programs read.
+_EMPTY = Finding("empty", 0, "the file contains no splats", "note")
+_FRAME = "delta_vertex_"  # prefix of Brush's elements with the differences of later frames from the first
+#: Elements of Apple's ml-sharp (gaussians.py): the camera of its image, and data for its own programs.
 _SHARP = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space", "version"}
 _COLOUR_SPACE, _SRGB = "color_space", 0
-_BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time: they stay in the cache
+_BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time; they fit in the cache
 _EARLY_END = "early end-of-file"  # message of plyfile
-_SHOWN = 40  # characters of a word in a message
+_SHOWN = 40  # maximum number of characters of a word in a message
 
 
 def read_ply(
@@ -59,20 +59,20 @@ def read_ply(
 ) -> SplatModel:
     """Read a PLY of splats: binary of either byte order or ASCII, SH degree 0 to 3.
 
-    Columns that other programs name differently are recognised and reported (`csplat.lint`): those of CloudCompare,
+    Columns that other programs name differently are recognised and reported (`csplat.lint`): CloudCompare's names,
     red, green and blue in place of f_dc, and the filter of Mip-Splatting, which is fused into scales and opacities.
 
-    Opacities go through the sigmoid in float64 and are rounded once; above a logit of 16, float32 alpha is too close
-    to 1 to keep neighbours apart. Rotations are normalised. Positions in doubles get an `origin`, either the one that
-    a comment of the file names or one chosen so that float32 loses nothing. Header comments are kept in
+    The sigmoid of opacities is computed in float64 and rounded once; above a logit of 16, float32 alpha is too close to
+    1 to distinguish neighbouring values. Rotations are normalised. Positions in doubles get an `origin`, either from a
+    comment of the file or chosen so that float32 loses nothing visible. Header comments are kept in
     `metadata["comments"]`.
 
     Args:
-        file: its path; or an open binary file or the bytes, which are copied to a temporary file.
-        strict: refuse what would be repaired (`csplat.lint` lists it).
-        keep_extra: keep columns that splats do not have in `SplatModel.extra`.
-        sh_degree: drop the SH bands above it, also from a file of a higher degree than 3; `None`: keep all.
-        report: findings are appended to this list, repairs among them.
+        file: path of the file; or an open binary file or bytes, which are copied to a temporary file.
+        strict: refuse files that need repairs (`csplat.lint` lists them).
+        keep_extra: keep columns that are not splat attributes in `SplatModel.extra`.
+        sh_degree: drop the SH bands above this degree; the file's own degree may exceed 3. `None`: keep all.
+        report: findings, including repairs, are appended to this list.
 
     Examples:
         >>> import csplat
@@ -83,8 +83,8 @@ def read_ply(
         ((1000, 3), dtype('float32'))
 
     Raises:
-        InputError: the file is not a PLY of splats (the message names other splat formats and a converter), or it
-            cannot be repaired, or `strict` is set and it would have to be.
+        InputError: the file is not a PLY of splats (for other splat formats, the message names a converter), cannot
+            be repaired, or needs repairs and `strict` is set.
         OSError: the file cannot be read.
     """
     findings: list[Finding] = []
@@ -95,12 +95,12 @@ def read_ply(
         if report is not None:
             report.extend(findings)
     refuse(findings, strict=strict)
-    assert model is not None, "without an error there is a model"
+    assert model is not None, "only an error leaves no model"
     return model
 
 
 def lint_ply(file: File, *, sh_degree: int | None = None) -> list[Finding]:
-    """List what is wrong with a PLY of splats, without refusing it.
+    """List the defects of a PLY of splats without refusing it.
 
     Args:
         file: as in `read_ply`.
@@ -120,7 +120,7 @@ def lint_ply(file: File, *, sh_degree: int | None = None) -> list[Finding]:
             survey = _survey(ply, findings)
             if len(ply.rows) == 0:
                 findings.append(_EMPTY)
-            _empty_model(ply, survey)  # a model refuses what no finding is about
+            _empty_model(ply, survey)  # raises errors that no finding reports
             for _ in _model_blocks(ply, survey, keep_extra=False):
                 pass
     return findings
@@ -128,14 +128,15 @@ def lint_ply(file: File, *, sh_degree: int | None = None) -> list[Finding]:
 
 @contextmanager
 def open_ply(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
-    """Open a PLY to be read block by block (`csplat.formats.open_scene`); otherwise as `read_ply`.
+    """Open a PLY to read it block by block (`csplat.formats.open_scene`); otherwise as `read_ply`.
 
-    A first pass finds what depends on all splats: how many are kept, an origin for doubles, the thickness of discs.
+    A first pass determines values that depend on all splats: the number of splats that are kept, the origin of doubles,
+    and the thickness of discs.
     """
     findings: list[Finding] = []
     ply = _open(path, findings, keep_extra=True, strict=False, sh_degree=sh_degree)
     refuse(findings, strict=False)
-    assert ply is not None, "without an error there are rows"
+    assert ply is not None, "only an error leaves no rows"
     survey = _survey(ply, findings)
     refuse(findings, strict=False)
     metadata = _empty_model(ply, survey)
@@ -143,12 +144,12 @@ def open_ply(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
 
 
 class PlyContent(NamedTuple):
-    """Contents of a PLY of splats.
+    """The contents of a PLY of splats.
 
     Attributes:
         rows: scalar columns of the splats.
-        comments: lines of the header.
-        elements: names of the other elements, which are all dropped.
+        comments: comment lines of the header.
+        elements: names of the other elements, which are dropped.
     """
 
     rows: Rows
@@ -164,7 +165,7 @@ def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
         findings: findings are appended to this list.
 
     Returns:
-        The content; `None` if the findings hold an error.
+        The content; `None` if the findings contain an error.
 
     Raises:
         InputError: the file is not a PLY of splats, or its header cannot be parsed.
@@ -173,8 +174,8 @@ def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
     header = read_ply_header(path, findings)
     if any(not one.repairable for one in findings):
         return None
-    # Text numbers beyond their type become infinite, which is found later; NumPy warns about them, and about an empty
-    # table, which plyfile then refuses.
+    # NumPy warns about text numbers beyond their type, which become infinite and are dropped later, and about empty
+    # tables, which plyfile refuses.
     quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
     with _open_for_plyfile(path, header) as stream, np.errstate(over="ignore"), quiet:
         try:
@@ -204,7 +205,7 @@ def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
 
 @dataclass(frozen=True, eq=False)
 class _OpenPly:
-    """A parsed file whose columns and comments are understood."""
+    """A parsed file with the meaning of its columns and comments."""
 
     path: Path
     rows: Rows
@@ -218,7 +219,7 @@ class _OpenPly:
 def _open(
     path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool, sh_degree: int | None
 ) -> _OpenPly | None:
-    """Parse all but the values of the rows, appending to `findings`; return `None` if these hold an error."""
+    """Parse everything except the values of the rows; return `None` if the findings contain an error."""
     check_sh_degree(sh_degree)
     content = parse_ply(path, findings)
     if content is None:
@@ -232,7 +233,7 @@ def _open(
     findings += more
     if columns is None:
         return None
-    refuse(findings, strict=strict)  # before the work
+    refuse(findings, strict=strict)  # before all rows are read
     columns = with_colour_range(_row_blocks(path, rows), columns, findings)
     metadata = parse_comments(content.comments)
     findings += metadata.findings
@@ -242,7 +243,7 @@ def _open(
 def _load(
     path: Path, findings: list[Finding], *, keep_extra: bool, strict: bool, sh_degree: int | None
 ) -> SplatModel | None:
-    """Read a file in one pass, appending to `findings`; return `None` if these hold an error."""
+    """Read a file in one pass; return `None` if the findings contain an error."""
     ply = _open(path, findings, keep_extra=keep_extra, strict=strict, sh_degree=sh_degree)
     if ply is None:
         return None
@@ -263,12 +264,12 @@ _Positions = tuple[F32, tuple[float, float, float], F64 | None]  # means, origin
 
 
 class _Survey(NamedTuple):
-    """Properties of all splats of a file together.
+    """Values that depend on all splats of a file.
 
     Attributes:
-        kept_count: splats without those that are dropped.
-        thinnest: the smallest scale.
-        positions: the positions of all splats if the file has them in doubles.
+        kept_count: number of splats that are not dropped.
+        thinnest: smallest scale.
+        positions: positions of all splats if the file has doubles.
     """
 
     kept_count: int
@@ -277,7 +278,7 @@ class _Survey(NamedTuple):
 
 
 def _survey(ply: _OpenPly, findings: list[Finding]) -> _Survey:
-    """Go through all rows once, appending to `findings`."""
+    """Read all rows once, appending to `findings`."""
     statistics, kept_count, means, thinnest = RowStatistics(), 0, [], math.inf
     for block in ply.blocks(BLOCK_SPLATS):
         arrays = gather_arrays([block], len(block), ply.rows.dtype, ply.columns, statistics=statistics)
@@ -294,7 +295,7 @@ def _survey(ply: _OpenPly, findings: list[Finding]) -> _Survey:
 
 
 def _empty_model(ply: _OpenPly, survey: _Survey) -> SplatModel:
-    """Return a model of the metadata alone."""
+    """Return a model with the metadata and no splats."""
     arrays = gather_arrays([], 0, ply.rows.dtype, ply.columns, keep_extra=True)
     means, origin, doubles = split_origin(arrays.means, ply.metadata)
     if survey.positions is not None:
@@ -303,7 +304,7 @@ def _empty_model(ply: _OpenPly, survey: _Survey) -> SplatModel:
 
 
 def _model_blocks(ply: _OpenPly, survey: _Survey, *, keep_extra: bool) -> Iterator[SplatModel]:
-    """Yield the splats that are kept, at most `BLOCK_SPLATS` at a time."""
+    """Yield the remaining splats, at most `BLOCK_SPLATS` at a time."""
     start = 0
     for block in ply.blocks(BLOCK_SPLATS):
         arrays = gather_arrays(
@@ -343,7 +344,7 @@ def _build_model(arrays: AttributeArrays, positions: _Positions, ply: _OpenPly) 
 
 
 def _read_again(path: Path, header: PlyHeader, findings: list[Finding], error: Any) -> Any:
-    """Read a file that plyfile refused; return `None` if it stays refused, with the reason in the findings.
+    """Read a file that plyfile refused; return `None` and append a finding if that is not possible.
 
     Args:
         path: path of the file.
@@ -353,7 +354,7 @@ def _read_again(path: Path, header: PlyHeader, findings: list[Finding], error: A
     """
     if not header.is_text or error.message == _EARLY_END:
         present, declared = error.row or 0, error.element.count
-        text = f"{declared} rows of {error.element.name} are declared, {present} are there: copy or download it again"
+        text = f"{declared} rows of {error.element.name} are declared, {present} are present: copy or download it again"
         findings.append(Finding("truncated", declared - present, text, "error"))
         return None
     with path.open("rb") as stream:
@@ -371,7 +372,7 @@ def _read_again(path: Path, header: PlyHeader, findings: list[Finding], error: A
 
 
 def _row_finding(error: Any, rows: list[list[str]], header: PlyHeader) -> Finding:
-    """Report which value of a text row is wrong."""
+    """Report the invalid value of a text row."""
     name, row, text = error.element.name, error.row or 0, error.message
     at = [element.name for element in header.elements].index(name)
     element, before = header.elements[at], sum(one.count for one in header.elements[:at])
@@ -384,14 +385,14 @@ def _row_finding(error: Any, rows: list[list[str]], header: PlyHeader) -> Findin
 
 
 def _other_findings(others: list[Any]) -> list[Finding]:
-    """Report elements that hold no splats."""
+    """Report elements that contain no splats."""
     if not others:
         return []
     names = [element.name for element in others]
     text = f"elements besides {SPLAT_ELEMENT}: {', '.join(names)}: dropped"
     if not set(names) <= _SHARP:
         if any(name.startswith(_FRAME) for name in names):
-            text += "; they move the splats, of which the first moment is kept"
+            text += "; they move the splats, of which the first frame is kept"
         return [Finding("other-elements", len(others), text, "repair")]
     findings = [Finding("sharp-elements", len(others), f"{text}; they are the camera of ml-sharp", "note")]
     for element in others:
@@ -404,13 +405,13 @@ def _other_findings(others: list[Any]) -> list[Finding]:
 
 
 def _trailing_findings(path: Path, header: PlyHeader, end: int | None, row_count: int) -> list[Finding]:
-    """Report bytes after the last row; in an ASCII file (`end` is `None`) each row is a line."""
+    """Report bytes after the last row, which ends at `end`; in ASCII files (`None`) each row is a line."""
     if end is not None:
         count = path.stat().st_size - end
         if count and _is_changed_as_text(path, header, count):
             text = (
                 f"{counted(count, 'byte')} after the last row, and a carriage return before each line feed of the rows:"
-                " changed by a text-mode transfer (git autocrlf, FTP): copy it again as binary"
+                " corrupted by a text-mode transfer (git autocrlf, FTP): copy it again as binary"
             )
             return [Finding("malformed", count, text, "error")]
     else:
@@ -430,7 +431,7 @@ def _is_changed_as_text(path: Path, header: PlyHeader, surplus: int) -> bool:
     Args:
         path: path of the file.
         header: its header.
-        surplus: bytes after the last row.
+        surplus: number of bytes after the last row.
     """
     if not header.text.endswith(b"\r\n"):
         return False
@@ -447,7 +448,7 @@ def _is_changed_as_text(path: Path, header: PlyHeader, surplus: int) -> bool:
 
 
 def _scalar_columns(data: Rows) -> tuple[Rows, list[str]]:
-    """Drop the list properties; return contiguous rows and the names of what was dropped."""
+    """Drop list properties; return contiguous rows and the names of the dropped properties."""
     names = data.dtype.names or ()
     lists = [name for name in names if data.dtype[name].hasobject]
     if not lists:
@@ -460,12 +461,12 @@ def _scalar_columns(data: Rows) -> tuple[Rows, list[str]]:
 
 
 def _row_blocks(path: Path, rows: Rows, max_rows: int | None = None) -> Iterator[Rows]:
-    """Yield rows in blocks; rows of a memory map are read from the file instead: aligned, and not resident twice.
+    """Yield rows in blocks; memory-mapped rows are read from the file, which aligns them and saves memory.
 
     Args:
         path: path of the file.
         rows: as `parse_ply` returns them.
-        max_rows: rows of a block; `None`: the number that stays in the cache.
+        max_rows: rows per block; `None`: the number that fits in the cache.
     """
     step = max_rows or max(1, _BLOCK_SIZE // max(1, rows.dtype.itemsize))
     if not isinstance(rows, np.memmap):
@@ -482,13 +483,13 @@ def _row_blocks(path: Path, rows: Rows, max_rows: int | None = None) -> Iterator
 
 
 def _open_for_plyfile(path: Path, header: PlyHeader) -> IO[Any]:
-    """Open a PLY after its byte order mark, as text if it is text, with the header that plyfile accepts."""
+    """Open a PLY after its byte order mark, with the rewritten header; ASCII files are opened as text."""
     stream = _StreamWithHeader(path, header)
     return io.TextIOWrapper(stream, encoding="ascii", errors="replace") if header.is_text else stream
 
 
 class _StreamWithHeader(io.BufferedReader):
-    """A file whose first bytes are replaced by another header of the same length."""
+    """A file whose header is replaced by another one of the same length."""
 
     def __init__(self, path: Path, header: PlyHeader) -> None:
         super().__init__(io.FileIO(path))
@@ -504,6 +505,6 @@ class _StreamWithHeader(io.BufferedReader):
     def _with_header(self, data: bytes) -> bytes:
         if self._at >= len(self._header):
             return data
-        begin = self._header[self._at : self._at + len(data)]  # plyfile reads it a byte at a time: copy no more
+        begin = self._header[self._at : self._at + len(data)]  # plyfile reads byte by byte: do not copy the rest
         self._at += len(begin)
         return begin + data[len(begin) :]

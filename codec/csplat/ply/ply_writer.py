@@ -1,4 +1,4 @@
-"""Write a scene as a PLY in INRIA's layout, which every viewer of splats opens."""
+"""Write a scene as a PLY in INRIA's layout, which all splat viewers open."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from csplat.ply.columns import logits_of_alpha
 from csplat.ply.comments import format_comments
 from csplat.scene_source import SceneSource
 
-_BLOCK_SIZE = 1 << 20  # bytes of rows that are built at a time: they stay in the cache
+_BLOCK_SIZE = 1 << 20  # bytes of rows that are built at a time; they fit in the cache
 
 _PLY_TYPES = {
     "i1": "char",
@@ -32,14 +32,14 @@ _PLY_TYPES = {
 def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *, absolute: bool = False) -> None:
     """Write a binary little-endian PLY: INRIA's columns in INRIA's order, normals zero.
 
-    Opacities 0 and 1 become finite logits that lead back to exactly 0 and 1. Extra columns follow the others. Of the
-    metadata, only comments, licence, training, up and view are written; cameras are not.
+    Opacities 0 and 1 become finite logits whose sigmoids are exactly 0 and 1. Extra columns follow the others. Only the
+    metadata comments, licence, training, up and view is written; cameras are not.
 
     Args:
-        file: its path, where the file appears when it is complete, replacing an older one; or an open binary file.
+        file: path of the file, which appears when complete, replacing an older one; or an open binary file.
         model: the scene.
         absolute: write x, y and z as doubles with the origin added, for programs that read doubles. By default they
-            are floats relative to the origin, which a comment names.
+            are floats relative to the origin, which is stored in a comment.
 
     Examples:
         >>> import csplat
@@ -47,7 +47,7 @@ def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *,
         >>> csplat.write_ply("half.ply", model.select(slice(0, None, 2)))
 
     Raises:
-        InputError: an extra column has a name or type that a PLY cannot hold; or `model` is not a `SplatModel`.
+        InputError: an extra column has a name or type that PLY does not support; or `model` is not a `SplatModel`.
         OSError: the file cannot be written.
     """
     check_model("write_ply", model)
@@ -55,7 +55,7 @@ def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *,
 
 
 def write_scene_ply(file: str | os.PathLike[str] | BinaryWriter, scene: SceneSource, *, absolute: bool = False) -> None:
-    """Write a scene block by block; otherwise as `write_ply`."""
+    """Write a scene block by block; arguments are those of `write_ply`."""
     dtype = _row_dtype(scene.metadata_model, absolute=absolute)
     step = max(1, _BLOCK_SIZE // dtype.itemsize)
     with open_writer(file) as stream:
@@ -97,7 +97,7 @@ def _header(model: SplatModel, count: int, *, absolute: bool) -> bytes:
     lines += [f"property float {name}" for name in floats]
     for name, column in model.extra.items():
         if name in {"x", "y", "z", *floats}:
-            raise InputError(f"extra column {name!r} has the name of a column of every splat PLY")
+            raise InputError(f"extra column {name!r} has the name of a splat attribute in a PLY")
         lines.append(f"property {_ply_type(name, column.dtype)} {name}")
     lines += [f"comment {line}" for line in format_comments(model, absolute=absolute)]
     return "\n".join([*lines, "end_header\n"]).encode("ascii")
@@ -108,7 +108,7 @@ def _ply_type(name: str, dtype: np.dtype[Any]) -> str:
         raise InputError(f"extra column {name!r}: a PLY property is one word of ASCII")
     kind = _PLY_TYPES.get(f"{dtype.kind}{dtype.itemsize}")
     if kind is None:
-        raise InputError(f"extra column {name!r} is {dtype}, which no PLY property holds")
+        raise InputError(f"extra column {name!r} is {dtype}, which is not a PLY type")
     return kind
 
 

@@ -1,7 +1,7 @@
 """glTF 2.0 with the extension KHR_gaussian_splatting (ratified in 2026): .glb, and .gltf with its buffers.
 
-glTF specifies that y is up, that models face z, and that x points to their left: LUF. Metadata without a place in glTF
-is in `asset.extras.csplat`, as the comment lines that a PLY has. An origin is the translation of the node.
+glTF specifies that y is up, that models face +z, and that +x points to their left: LUF. Metadata for which glTF has no
+member is stored in `asset.extras.csplat` as the comment lines of a PLY. The origin is the translation of the node.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The parts of glTF 2.0 that splats need: containers, buffers, accessors and the transforms of nodes.
 
-Files are not trusted: every index, length and number is checked before it is used, and what breaks the rules of glTF is
-an `InputError` that names its place in the JSON.
+Files are not trusted: every index, length and number is checked before it is used. A violation of glTF raises an
+`InputError` with its path in the JSON.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from csplat.errors import InputError, counted
 from csplat.file_source import describe_substitute, map_file
 from csplat.types import F32, F64
 
-JsonPath = tuple[str | int, ...]  # place of a value in the JSON: ("nodes", 3, "mesh")
+JsonPath = tuple[str | int, ...]  # path of a value in the JSON, for example ("nodes", 3, "mesh")
 
 MAGIC = b"glTF"
 GLB_HEAD = struct.Struct("<4sII")  # magic, version, file size
@@ -34,25 +34,25 @@ _VERSION = 2
 
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_MAX_PRIMITIVES = 1 << 14  # primitives that nodes show: a small file could name one mesh very often
+_MAX_PRIMITIVES = 1 << 14  # primitives shown by all nodes: a small file could reference one mesh very often
 _NO_TRANSLATION = (0.0, 0.0, 0.0)
 _INSTANCING = "EXT_mesh_gpu_instancing"
 
 
 @dataclass(frozen=True)
 class Accessor:
-    """A view of numbers in a buffer.
+    """An accessor: a view of numbers in a buffer.
 
     Attributes:
         rows: [N, width], a view of the file.
-        normalised: integers represent fractions of the largest one.
+        normalised: integers represent fractions of the largest integer of their type.
     """
 
     rows: NDArray[Any]
     normalised: bool
 
     def values(self, part: slice) -> F32:
-        """Return some rows [n, width], with normalised integers as fractions."""
+        """Return some rows as float32 [n, width]; normalised integers become fractions."""
         rows = self.rows[part]
         if not self.normalised or rows.dtype.kind == "f":
             return np.array(rows, np.float32)
@@ -67,10 +67,10 @@ class PlacedPrimitive:
 
     Attributes:
         primitive: JSON of the primitive.
-        place: its place in the file.
+        place: path of the primitive in the JSON.
         matrix: [4, 4] from the primitive to the world, for column vectors.
         node: JSON of the node.
-        node_place: its place in the file.
+        node_place: path of the node in the JSON.
     """
 
     primitive: dict[str, Any]
@@ -82,14 +82,14 @@ class PlacedPrimitive:
 
 @dataclass(frozen=True)
 class GltfDocument:
-    """A file with parsed JSON.
+    """A glTF file with parsed JSON.
 
     Attributes:
         path: path of the file; buffers in separate files are in its folder.
         root: the JSON.
-        binary: the chunk BIN, if there is one.
-        tail: bytes after the end that a .glb declares.
-        short: messages about buffers that are shorter than declared, by index, once they are used.
+        binary: the chunk BIN; `None` if there is none.
+        tail: number of bytes after the declared end of a .glb.
+        short: by index, messages about used buffers that are shorter than declared.
     """
 
     path: Path
@@ -100,7 +100,7 @@ class GltfDocument:
     _buffers: dict[int, memoryview] = field(default_factory=dict)
 
     def error(self, place: JsonPath, reason: str) -> InputError:
-        """Return the error for a place in the JSON."""
+        """Return the error for a path in the JSON."""
         return InputError(f"{self.path.name}, {'/'.join(map(str, place))}: {reason}")
 
     def get(
@@ -109,7 +109,7 @@ class GltfDocument:
         """Return a member of a JSON object, or `default` if it is absent.
 
         Raises:
-            InputError: it has another type.
+            InputError: the member has another type.
         """
         value = holder.get(key, default)
         if value is not default and (not isinstance(value, kind) or (type(value) is bool) != (kind is bool)):
@@ -120,63 +120,62 @@ class GltfDocument:
         """Return an integer member >= 0, which is required unless there is a default.
 
         Raises:
-            InputError: it is absent or another value.
+            InputError: the member is absent or has another value.
         """
         value: Any = self.get(holder, place, key, int, default)
         if value is None or not 0 <= value < 1 << 53:
-            raise self.error((*place, key), f"found {_shorten(value)}, wanted a whole number")
+            raise self.error((*place, key), f"found {_shorten(value)}, expected a whole number")
         number: int = value
         return number
 
     def item(self, key: str, index: object) -> dict[str, Any]:
-        """Return an object of one of the lists of the root.
+        """Return an object from one of the top-level lists.
 
         Raises:
-            InputError: there is none of that index.
+            InputError: there is no object with that index.
         """
         values = self.root.get(key)
         if isinstance(values, list) and isinstance(index, int) and 0 <= index < len(values):
             found = values[index]
             if isinstance(found, dict):
                 return found
-        raise self.error((key, _shorten(index)), "there is none")
+        raise self.error((key, _shorten(index)), "there is no such object")
 
     def accessor(self, index: object, width: int) -> Accessor:
         """Return an accessor with rows of `width` numbers.
 
         Raises:
-            InputError: it does not exist, has another type, or exceeds its buffer.
+            InputError: the accessor does not exist, has another type, or exceeds its buffer.
         """
         record = self.item("accessors", index)
         place = ("accessors", _shorten(index))
         dtype, kind = _DTYPES.get(self.integer(record, place, "componentType")), self.get(record, place, "type", str)
         if dtype is None or _WIDTHS.get(kind) != width:
-            raise self.error(place, f"found {_shorten(kind)} of {record['componentType']}, wanted {width} numbers")
+            raise self.error(place, f"found {_shorten(kind)} of {record['componentType']}, expected {width} numbers")
         if "sparse" in record or "bufferView" not in record:
-            reason = (
-                "sparse accessors are not read" if "sparse" in record else "it has no bufferView: an extension has it"
+            raise self.error(
+                place, "sparse accessors are not supported" if "sparse" in record else "found no bufferView"
             )
-            raise self.error(place, reason)
         count, offset = self.integer(record, place, "count"), self.integer(record, place, "byteOffset", 0)
         data, stride = self.view(record["bufferView"])
         size = np.dtype(dtype).itemsize * width
         stride = stride or size
         if stride < size:
-            raise self.error(place, f"rows of {size} bytes every {stride}")
+            raise self.error(place, f"rows of {size} bytes have a stride of {stride}")
         if offset + stride * (count - 1) + size > len(data) and count:
-            raise self.error(place, f"{counted(count, 'row')} of {size} bytes, and {len(data)} bytes are there")
+            raise self.error(place, f"{counted(count, 'row')} of {size} bytes in a view of {len(data)} bytes")
         rows: NDArray[Any] = np.zeros((0, width), dtype)
         if count:
             rows = np.ndarray((count, width), dtype, data, offset, (stride, size // width))
         return Accessor(rows, self.get(record, place, "normalized", bool, False))
 
     def view(self, index: object) -> tuple[memoryview, int]:
-        """Return the bytes of a buffer view and its stride; 0: rows are adjacent."""
+        """Return the bytes of a buffer view and its stride, 0 if rows are adjacent."""
         record, place = self.item("bufferViews", index), ("bufferViews", _shorten(index))
         if record.get("extensions"):
             raise self.error(
                 (*place, "extensions"),
-                f"{_list_names(record['extensions'])}: packed buffers are not read, gltf-transform unpacks them",
+                f"{_list_names(record['extensions'])}: packed buffers are not supported, gltf-transform unpacks them",
             )
         buffer = self._buffer(self.integer(record, place, "buffer"))
         start, length = self.integer(record, place, "byteOffset", 0), self.integer(record, place, "byteLength")
@@ -194,9 +193,9 @@ class GltfDocument:
             elif index == 0 and self.binary is not None:
                 data = self.binary
             else:
-                raise self.error(place, "there are no bytes of it")
-            if length > len(data):  # the part that is used may be present all the same
-                self.short[index] = f"found {len(data):,} bytes, wanted {length:,}"
+                raise self.error(place, "it has neither a uri nor a BIN chunk")
+            if length > len(data):  # the part that splats use may still be present
+                self.short[index] = f"found {len(data):,} bytes, expected {length:,}"
             self._buffers[index] = data[:length]
         return self._buffers[index]
 
@@ -204,41 +203,41 @@ class GltfDocument:
         if uri.startswith("data:"):
             kind, _, text = uri.partition(",")
             if not kind.endswith(";base64"):
-                raise self.error(place, "wanted a data URI in base64")
+                raise self.error(place, "found a data URI of another encoding, expected base64")
             try:
                 return memoryview(base64.b64decode(text, validate=True))
             except (binascii.Error, ValueError) as error:
-                raise self.error(place, f"no base64: {error}") from None
+                raise self.error(place, f"found invalid base64: {error}") from None
         folder = self.path.resolve().parent
         name = unquote(uri)
         if "\\" in name and not (folder / name).exists():  # written on Windows
             name = name.replace("\\", "/")
         if not name.isprintable() or ":" in name or "\\" in name:
-            raise self.error(place, f"found {_shorten(uri)}, wanted a file beside it")
+            raise self.error(place, f"found {_shorten(uri)}, expected a file in the same folder")
         try:
             target = (folder / name).resolve()
-            if not target.is_relative_to(folder):  # neither .., nor absolute, nor by a link
-                raise self.error(place, f"{_shorten(uri)} is outside of the folder of {self.path.name}")
+            if not target.is_relative_to(folder):  # refuses .., absolute paths and links that lead out
+                raise self.error(place, f"{_shorten(uri)} is outside the folder of {self.path.name}")
             if not target.is_file():
                 same = [path.name for path in folder.iterdir() if path.name.casefold() == target.name.casefold()]
                 hint = f", but {_shorten(same[0])}: rename it" if same else ""
                 raise self.error(place, f"there is no file {_shorten(uri)}{hint}")
             data = memoryview(map_file(target))
-        except (OSError, RuntimeError) as error:  # the latter of links in a circle
+        except (OSError, RuntimeError) as error:  # RuntimeError: circular links
             raise self.error(place, f"{_shorten(uri)} cannot be read: {error}") from None
         if instead := describe_substitute(bytes(data[:64])):
             raise self.error(place, f"{_shorten(uri)} is {instead}")
         return data
 
     def size(self) -> int:
-        """Return the total bytes of all buffers that were used."""
+        """Return the total size in bytes of all buffers used so far."""
         return sum(map(len, self._buffers.values()))
 
     def placed_primitives(self) -> Iterator[PlacedPrimitive]:
         """Yield all primitives that the scene shows, in the order of its nodes.
 
         Raises:
-            InputError: nodes are missing, or have several parents.
+            InputError: a node is missing, or has several parents.
         """
         nodes = self._list(self.root, (), "nodes")
         if "scenes" in self.root:
@@ -267,12 +266,14 @@ class GltfDocument:
                 for at, primitive in enumerate(self._list(mesh, ("meshes", node["mesh"]), "primitives")):
                     spot = ("meshes", node["mesh"], "primitives", at)
                     shown += 1
-                    if not isinstance(primitive, dict) or shown > _MAX_PRIMITIVES:
-                        raise self.error(spot, f"found {_shorten(primitive)}, number {shown} of those that are shown")
+                    if not isinstance(primitive, dict):
+                        raise self.error(spot, f"found {_shorten(primitive)}, expected an object")
+                    if shown > _MAX_PRIMITIVES:
+                        raise self.error(spot, f"it is number {shown}, the scene may show {_MAX_PRIMITIVES}")
                     yield PlacedPrimitive(primitive, spot, matrix, node, place)
 
     def other_scenes(self) -> str:
-        """Describe the scenes that `placed_primitives` leaves out for lack of a default; "" if there are none."""
+        """Describe the scenes that `placed_primitives` ignores because no default is set; "" if there are none."""
         scenes = self.root.get("scenes")
         if not isinstance(scenes, list) or len(scenes) < 2 or "scene" in self.root:
             return ""
@@ -282,7 +283,7 @@ class GltfDocument:
         return f"{len(scenes)} scenes and no default: scene {labels[0]} is read, {shown} not"
 
     def instances(self, placed: PlacedPrimitive) -> NDArray[np.float64]:
-        """Return the matrices [I, 4, 4] from a primitive to the world: one, or those of EXT_mesh_gpu_instancing."""
+        """Return the matrices [I, 4, 4] from a primitive to the world: one per instance of EXT_mesh_gpu_instancing."""
         extension = _extension(placed.node, _INSTANCING)
         if not extension:
             return placed.matrix[None]
@@ -292,7 +293,7 @@ class GltfDocument:
         rows = {name: self.accessor(attributes[name], width) for name, width in widths.items() if name in attributes}
         counts = {len(one.rows) for one in rows.values()}
         if len(counts) != 1:
-            raise self.error(place, f"its attributes have {sorted(counts)} rows, wanted one number of instances")
+            raise self.error(place, f"its attributes have {sorted(counts)} rows, expected one number of instances")
         values = {name: one.values(slice(None)).astype(np.float64) for name, one in rows.items()}
         matrices = np.tile(np.eye(4), (counts.pop(), 1, 1))
         for index, quat in enumerate(values.get("ROTATION", ())):
@@ -319,7 +320,7 @@ class GltfDocument:
     def _rotation(self, quat: list[float], place: JsonPath) -> list[list[float]]:
         length = math.hypot(*quat)
         if not 0.0 < length < math.inf:
-            raise self.error(place, "wanted a unit quaternion")
+            raise self.error(place, f"found {quat}, expected a unit quaternion")
         x, y, z, w = (one / length for one in quat)
         return [
             [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
@@ -331,7 +332,7 @@ class GltfDocument:
         values = holder.get(key, list(default))
         good = isinstance(values, list) and len(values) == len(default)
         if not good or not all(type(value) in (int, float) and abs(value) < 1e300 for value in values):
-            raise self.error((*place, key), f"found {_shorten(values)}, wanted {len(default)} numbers")
+            raise self.error((*place, key), f"found {_shorten(values)}, expected {len(default)} numbers")
         return np.array(values, np.float64)
 
 
@@ -339,51 +340,51 @@ def open_document(path: Path) -> GltfDocument:
     """Read the JSON of a .glb or .gltf.
 
     Raises:
-        InputError: the file is no glTF, incomplete, or of another version.
+        InputError: the file is not glTF, incomplete, or of another version.
         OSError: the file cannot be read.
     """
     data = memoryview(map_file(path))
     text, binary, tail = _split_chunks(path, data) if data[:4] == MAGIC else (data, None, 0)
     try:
-        root = json.loads(bytes(text))  # UTF-8, with or without a mark, or UTF-16
+        root = json.loads(bytes(text))  # detects UTF-8 with or without a byte order mark, and UTF-16
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path.name}: its JSON cannot be read: {error}") from None
     if not isinstance(root, dict) or not isinstance(root.get("asset"), dict):
-        raise InputError(f"{path.name} is no glTF: its JSON has no asset")
+        raise InputError(f"{path.name} is not glTF: its JSON has no asset")
     version = root["asset"].get("version")
     if not isinstance(version, str) or version.partition(".")[0] != str(_VERSION):
-        raise InputError(f"{path.name} is glTF {_shorten(version)}, wanted {_VERSION}.0")
+        raise InputError(f"{path.name} is glTF {_shorten(version)}, expected {_VERSION}.0")
     return GltfDocument(path, root, binary, tail)
 
 
 def _split_chunks(path: Path, data: memoryview) -> tuple[memoryview, memoryview | None, int]:
-    """Return the chunks JSON and BIN of a .glb, and the number of bytes after its end."""
+    """Return the chunks JSON and BIN of a .glb, and the number of bytes after its declared end."""
     if len(data) < GLB_HEAD.size:
         raise InputError(f"{path.name} is truncated: {counted(len(data), 'byte')}")
     _, version, size = GLB_HEAD.unpack_from(data)
     if version != _VERSION:
-        raise InputError(f"{path.name} is binary glTF {version}, wanted {_VERSION}")
+        raise InputError(f"{path.name} is binary glTF {version}, expected {_VERSION}")
     if size > len(data):
-        raise InputError(f"{path.name} is truncated: found {len(data)} bytes, wanted {size}")
+        raise InputError(f"{path.name} is truncated: found {len(data)} bytes, expected {size}")
     found: list[tuple[bytes, memoryview]] = []
     at = GLB_HEAD.size
-    while at + _CHUNK_HEAD.size <= size and len(found) < 2:  # any others are ignored
+    while at + _CHUNK_HEAD.size <= size and len(found) < 2:  # further chunks are ignored
         length, kind = _CHUNK_HEAD.unpack_from(data, at)
         at += _CHUNK_HEAD.size
         if length > size - at:
             raise InputError(
-                f"{path.name}, byte {at - _CHUNK_HEAD.size}: a chunk of {length} bytes, {size - at} are left"
+                f"{path.name}, byte {at - _CHUNK_HEAD.size}: a chunk of {length} bytes, {size - at} remain"
             )
         found.append((kind, data[at : at + length]))
         at += length
     if not found or found[0][0] != JSON:
-        raise InputError(f"{path.name} does not begin with its JSON")
+        raise InputError(f"{path.name}: the first chunk is not JSON")
     binary = found[1][1] if len(found) > 1 and found[1][0] == BIN else None
     return found[0][1], binary, len(data) - size
 
 
 def _extension(holder: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return an extension object, empty if there is none."""
+    """Return an extension object; {} if it is absent."""
     extensions = holder.get("extensions")
     found = extensions.get(name) if isinstance(extensions, dict) else None
     return found if isinstance(found, dict) else {}
@@ -398,6 +399,6 @@ def _list_names(value: object) -> str:
 
 
 def _shorten(value: object) -> str:
-    """Return a JSON value as text for messages, at most 60 characters."""
+    """Format a JSON value for messages in at most 60 characters."""
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."

@@ -1,14 +1,14 @@
-"""Read splats of glTF: accessors of KHR_gaussian_splatting, or SPZ inside of it under any name of that extension.
+"""Read splats from glTF: accessors of KHR_gaussian_splatting, or SPZ under any name that its extension has had.
 
-Everything else in a file (meshes, materials, their compression) is ignored, even required extensions: only what the
-splats use has to be understood.
+Everything that splats do not use (meshes, materials, their compression) is ignored, even required extensions.
 
-The text of the SPZ extension unpacks positions along LUF; CesiumJS and the tilesets for it take them as stored. The
-bounds of POSITION, which every glTF has, tell the two apart.
+The SPZ extension specifies that positions are unpacked along LUF; CesiumJS and its tilesets use them as stored. The
+bounds of POSITION, which glTF requires, tell the two cases apart.
 
-Colours in linear light are fitted to sRGB. A polynomial of directions is no longer one after the transfer function of
-sRGB (IEC 61966-2-1): the nearest SH of the same degree are found by least squares. Without SH they are exact except for
-negative light. Splats blended in linear light look different from splats blended in sRGB, which no colours correct.
+Colours in linear light are fitted to sRGB. The transfer function of sRGB (IEC 61966-2-1) turns SH into functions that
+are no longer SH of finite degree, so the nearest SH of the same degree are found by least squares. At degree 0 the
+result is exact except for negative light. Splats blended in linear light look different from splats blended in sRGB;
+colours cannot correct that.
 """
 
 from __future__ import annotations
@@ -49,27 +49,27 @@ _SPZ = (
     "KHR_spz_gaussian_splats_compression",
     "KHR_spz_compression",
 )
-_WROTE_LOGS = re.compile(r"splat-transform v?([01]\.|2\.[0-3](\.|$))")  # mended in its pull request 268
+_WROTE_LOGS = re.compile(r"splat-transform v?([01]\.|2\.[0-3](\.|$))")  # fixed in its pull request 268
 #: Extensions of primitives that do not affect splats: materials and feature ids.
 _HARMLESS = {"KHR_materials_variants", "EXT_mesh_features", "EXT_structural_metadata", "KHR_mesh_quantization"}
 _THINNEST = np.float32(np.finfo(np.float32).tiny)  # replaces a scale of 0, so that its logarithm is finite
-_LARGE = 1e6  # only primitives with larger values are searched for huge ones
-_FAR = 4096.0  # scene units; a larger translation becomes an origin: float32 would resolve it to 0.0005 at best
-_ALIKE = 0.1  # fraction of the extent of a scene by which equivalent bounds may differ
-_SAMPLE = 4096  # splats whose fitted colours are measured
-_UNPACKED_RATIO = 1032  # largest expansion by deflate; several views may name the same bytes
+_LARGE = 1e6  # huge values are only counted in primitives with a value above this
+_FAR = 4096.0  # scene units; a larger translation becomes the origin: float32 resolves it to 0.0005 at best
+_ALIKE = 0.1  # fraction of the scene's extent by which equivalent bounds may differ
+_SAMPLE = 4096  # number of splats on which the error of fitted colours is measured
+_UNPACKED_RATIO = 1032  # maximum expansion by deflate; exceeded if several views share their bytes
 
 
 @dataclass(frozen=True)
 class _Instance:
-    """Splats of a primitive as a node shows them.
+    """The splats of a primitive, placed by a node.
 
     Attributes:
-        decode: makes a model of some splats, along the axes of the primitive and maybe with fewer SH bands than the
+        decode: returns a model of some splats in the primitive's coordinates; it may have fewer SH bands than the
             scene.
         count: N.
         linear: [3, 3], linear part of the node's transform.
-        translation: [3], position of the node.
+        translation: [3], translation of the node.
     """
 
     decode: Callable[[slice], SplatModel]
@@ -80,18 +80,18 @@ class _Instance:
 
 @dataclass
 class _GltfReading:
-    """The state of reading a file: unpacked data, statistics of the rows, findings.
+    """The state of reading a file: unpacked data, statistics of rows, findings.
 
     Attributes:
         required: extensions that the file requires.
-        sh_degree: the highest degree to read; `None`: all, up to three bands.
+        sh_degree: the highest degree to read; `None`: all, up to 3.
         scales, opacities: statistics of the finite rows of all primitives.
-        statistics: what findings report about rows.
-        infinite: number of rows whose opacity is infinite: a logit, or no opacity at all.
+        statistics: counts of rows for findings.
+        infinite: number of rows with infinite opacity, which is valid for logits only.
         are_logs, are_logits: scales are logarithms, opacities are logits; known after all primitives.
         antialiased: the flag of each SPZ.
-        linear_samples: read some splats of each primitive with linear colours.
-        packed: SPZ by index of their views.
+        linear_samples: functions that decode some splats of each primitive with linear colours.
+        packed: SPZ by index of their buffer views.
     """
 
     file: GltfDocument
@@ -111,7 +111,7 @@ class _GltfReading:
     unpacked_bytes: int = 0
 
     def instances(self, placed: PlacedPrimitive) -> Iterator[_Instance]:
-        """Yield an instance per node instance of a primitive; none if it has no splats."""
+        """Yield each instance of a primitive; none if the primitive has no splats."""
         place = (*placed.place, "extensions")
         extensions = self.file.get(placed.primitive, placed.place, "extensions", dict, {})
         extension = self.file.get(extensions, place, EXTENSION, dict, {})
@@ -122,7 +122,7 @@ class _GltfReading:
         unknown = [name for name in within if name not in _SPZ]
         unknown += [one for one in extensions if one in self.required and one not in {EXTENSION, *_SPZ, *_HARMLESS}]
         if unknown:
-            raise self.file.error(place, f"{', '.join(map(str, unknown))} is not understood, and the splats use it")
+            raise self.file.error(place, f"the splats use {', '.join(map(str, unknown))}, which is not supported")
         self._check(placed, extension, (*place, EXTENSION), packed=bool(packed))
         if packed:
             inner = (*place, packed) if packed in extensions else (*place, EXTENSION, "extensions", packed)
@@ -139,19 +139,19 @@ class _GltfReading:
             self.count += count
             self.statistics.nonfinite += bad
             self.infinite += infinite
-            # A small file could show one mesh very many times.
+            # A small file could reference one mesh very often.
             if self.count > self.file.size() + sum(one.count for one in self.packed.values()):
-                shown = f"shows {counted(self.count, 'splat')} or more, which is more than it has bytes"
+                shown = f"shows at least {counted(self.count, 'splat')}, more than it has bytes"
                 raise InputError(f"{self.file.path.name} {shown}")
             linear, translation = matrix[:3, :3], matrix[:3, 3]
             with np.errstate(all="ignore"):
                 lengths = np.linalg.svd(linear)[1] if np.isfinite(matrix).all() else np.zeros(3)
             if not 1e-30 < lengths.max() < 1e30 or lengths.min() < 1e-9 * lengths.max():
-                raise self.file.error(placed.place, "the node that shows it flattens it, or leaves float32")
+                raise self.file.error(placed.place, "the transform of its node is singular or exceeds float32")
             yield _Instance(block, count, linear, translation)
 
     def _report(self, finding: Finding) -> None:
-        """Add a finding, or its count to one of the same text about other primitives."""
+        """Add a finding; findings with the same text about several primitives are added up."""
         for index, one in enumerate(self.findings):
             if one.text == finding.text:
                 self.findings[index] = replace(one, count=one.count + finding.count)
@@ -159,18 +159,18 @@ class _GltfReading:
         self.findings.append(finding)
 
     def _check(self, placed: PlacedPrimitive, extension: dict[str, Any], place: JsonPath, *, packed: bool) -> None:
-        """Refuse other kernels, colour spaces and projections; drafts with SPZ name none of them."""
+        """Refuse unknown kernels, colour spaces and projections; drafts with SPZ may omit them."""
         absent = {None} if packed else set()
         known = {"kernel": {"ellipse"} | absent, "colorSpace": {COLOURS, _LINEAR} | absent}
         attributes = self.file.get(placed.primitive, placed.place, "attributes", dict, {})
         if not packed and "kernel" not in extension and f"{EXTENSION}:OPACITY" not in attributes:
-            draft = f"an early draft of {EXTENSION} (2025), which has no kernel, and opacities in COLOR_0"
+            draft = f"an early draft of {EXTENSION} (2025) without kernel and with opacities in COLOR_0"
             raise self.file.error(place, f"{draft}: export it again with a newer version of the program")
         for key, values in (*known.items(), ("projection", {"perspective", None})):
             found = self.file.get(extension, place, key, str)
             if found not in values:
-                wanted = " or ".join(str(one) for one in sorted(one for one in values if one))
-                raise self.file.error((*place, key), f"found {found!r}, which is not understood, wanted {wanted}")
+                expected = " or ".join(sorted(one for one in values if one))
+                raise self.file.error((*place, key), f"found {found!r}, expected {expected}")
 
     def _plain_block(self, placed: PlacedPrimitive) -> tuple[Callable[[slice], SplatModel], int, tuple[int, int]]:
         file, place = self.file, (*placed.place, "attributes")
@@ -200,8 +200,8 @@ class _GltfReading:
         """Update the statistics with the rows of a primitive.
 
         Returns:
-            Number of rows with NaN or an infinity other than an opacity, and number of other rows with an infinite
-            opacity.
+            The number of rows with NaN or with infinity outside the opacity; and the number of other rows with an
+            infinite opacity.
         """
         bad = infinite = 0
         for start in range(0, count, BLOCK_SPLATS):
@@ -214,7 +214,7 @@ class _GltfReading:
                 bad += len(good) - len(quats)
                 unbounded = np.isinf(values["OPACITY"])
                 infinite += int(np.count_nonzero(unbounded))
-                values["OPACITY"][unbounded] = np.nan  # not counted as a value
+                values["OPACITY"][unbounded] = np.nan  # `RangeStatistics` ignores NaN
             self.scales.add(values["SCALE"], self.count + start)
             self.opacities.add(values["OPACITY"], self.count + start)
             zero = np.logical_and.reduce([quats[:, part] == 0 for part in range(4)])
@@ -240,7 +240,7 @@ class _GltfReading:
             packed = read_spz_file(io.BytesIO(data), name, len(data), any_degree=self.sh_degree is not None)
             self.unpacked_bytes += sum(one.nbytes for one in packed.parts)
             if self.unpacked_bytes > _UNPACKED_RATIO * file.size():
-                raise InputError(f"{file.path.name}: several SPZ in it share their bytes, and unpack to too many")
+                raise InputError(f"{file.path.name}: its SPZ share their bytes and unpack to too many splats")
             self.packed[view] = packed
             self.antialiased.append(bool(packed.flags & ANTIALIASED))
         packed = self.packed[view]
@@ -253,7 +253,7 @@ class _GltfReading:
         rotation = axes_rotation(packed.axes, AXES)
         stored, by = self._lies_as_stored(packed, positions, rotation, draft=draft)
         if stored:
-            text = f"SPZ whose positions lie along the axes of glTF as they are stored, {by}: not turned to {AXES}"
+            text = f"SPZ whose stored positions already use the axes of glTF, {by}: not rotated to {AXES}"
             self._report(Finding("spz-axes", packed.count, text, "note"))
 
         def block(rows: slice) -> SplatModel:
@@ -267,7 +267,7 @@ class _GltfReading:
     def _lies_as_stored(
         self, packed: SpzArrays, positions: dict[str, Any], rotation: F64, *, draft: bool
     ) -> tuple[bool, str]:
-        """Return True if positions are stored along glTF's axes; and the evidence."""
+        """Return True if positions are stored along glTF's axes; and the evidence for messages."""
         bounds = [positions.get(name) for name in ("min", "max")]
         numbers = [one for each in bounds if isinstance(each, list) for one in each]
         if len(numbers) == 6 and packed.count and all(type(one) in (int, float) for one in numbers):
@@ -280,8 +280,8 @@ class _GltfReading:
             there = np.sort(both @ rotation.T, axis=0)
             off = [float(np.abs(one - wanted).max()) for one in (both, there)]
             if min(off) <= _ALIKE * float((high - low).max()) and off[0] != off[1]:
-                return off[0] < off[1], "as the bounds of POSITION say"
-        return draft, "as CesiumJS takes such drafts"
+                return off[0] < off[1], "according to the bounds of POSITION"
+        return draft, "as CesiumJS reads such drafts"
 
 
 @contextmanager
@@ -325,17 +325,17 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]
 
 
 def _conclude(reading: _GltfReading) -> None:
-    """Classify the values of all primitives, and add the findings about them."""
+    """Classify the values of all primitives and report findings about them."""
     generator = reading.file.root["asset"].get("generator")
     writer = generator[:60] if isinstance(generator, str) else ""
     reading.are_logs, found = classify_scales(reading.scales, "SCALE", strict=True, writer=writer)
     written = _WROTE_LOGS.match(writer)
     if written and not reading.are_logs and not found:
-        text = f"SCALE: {writer} wrote logarithms, and none is negative: read as standard deviations, as glTF has them"
+        text = f"SCALE: {writer} wrote logarithms, but none is negative: read as standard deviations, as glTF specifies"
         found = [Finding("unclear-scales", reading.count, text, "note")]
     reading.are_logits, more = classify_opacities(reading.opacities, "OPACITY")
     for index, length in reading.file.short.items():
-        text = f"buffers/{index}: {length}; all that the splats use is there"
+        text = f"buffers/{index}: {length}; the part that splats use is complete"
         reading.findings.append(Finding("short-buffer", 1, text, "note"))
     if reading.are_logits:
         reading.statistics.infinite_logits = reading.infinite
@@ -353,29 +353,29 @@ def _conclude(reading: _GltfReading) -> None:
             )
         except InputError as failure:
             raise InputError(f"{reading.file.path.name}: {failure}") from None
-        text = f"colours are linear ({_LINEAR}): fitted to sRGB, {error:.2f} of 255 steps off (rms)"
-        text += "; splats in front of one another blend in linear light there, and in sRGB here"
+        text = f"colours are linear ({_LINEAR}): fitted to sRGB, rms error {error:.2f} of 255 steps"
+        text += "; overlapping splats blend in linear light there, and in sRGB here"
         reading.findings.append(Finding("linear-colours", reading.count, text, "repair"))
 
 
 def sh_names(degree: int) -> list[str]:
-    """Return the attributes of a band, without the prefix."""
+    """Return the attribute names of an SH band, without the prefix."""
     return [f"SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
 
 
 def _finite_rows(arrays: dict[str, Accessor], rows: slice) -> tuple[NDArray[np.bool_] | None, float]:
-    """Find the rows without NaN and infinities; an opacity may be infinite.
+    """Find the rows without NaN and infinity; opacities may be infinite.
 
     Returns:
-        [n] True for finite rows, or `None` if all values are finite; and the largest magnitude of all values but
-        positions, infinite if there are rows that are not finite.
+        [n] True for finite rows, or `None` if all values are finite; and the largest magnitude of all values except
+        positions, infinite if a value is not finite.
     """
     largest, odd = 0.0, []
     for name, accessor in arrays.items():
         values = accessor.rows[rows]
         if values.dtype.kind == "f" and values.size:
             with np.errstate(invalid="ignore"):
-                most = max(abs(float(values.min())), abs(float(values.max())))  # both are NaN where one value is
+                most = max(abs(float(values.min())), abs(float(values.max())))  # NaN if any value is NaN
             if not np.isfinite(most):
                 odd.append((name, values))
             elif name != "POSITION":
@@ -389,7 +389,7 @@ def _finite_rows(arrays: dict[str, Accessor], rows: slice) -> tuple[NDArray[np.b
 
 
 def _decode_block(reading: _GltfReading, arrays: dict[str, Accessor], degree: int, rows: slice) -> SplatModel:
-    """Make a model of some splats along the axes of their primitive."""
+    """Return a model of some splats in the coordinates of their primitive."""
     values = {name: accessor.values(rows) for name, accessor in arrays.items()}
     good, _ = _finite_rows(arrays, rows) if reading.statistics.nonfinite else (None, 0.0)
     if good is not None:
@@ -419,13 +419,13 @@ def _decode_in_srgb(block: Callable[[slice], SplatModel], rows: slice) -> SplatM
 
 
 def _pad_bands(block: SplatModel, degree: int) -> SplatModel:
-    """Add zeros for the bands up to a degree."""
+    """Append zeros for missing bands up to a degree."""
     missing = (degree + 1) ** 2 - 1 - block.shN.shape[1]
     return replace(block, shN=np.pad(block.shN, ((0, 0), (0, missing), (0, 0)))) if missing else block
 
 
 def _place_block(block: SplatModel, instance: _Instance, metadata_model: SplatModel) -> SplatModel:
-    """Transform some splats to their place in the scene."""
+    """Transform some splats from their primitive to the scene."""
     if not np.array_equal(instance.linear, np.eye(3)):
         block = stretch_scene(block, instance.linear)
     offset = instance.translation - np.array(metadata_model.origin)
@@ -437,11 +437,10 @@ def _place_block(block: SplatModel, instance: _Instance, metadata_model: SplatMo
 
 
 def _read_metadata(file: GltfDocument) -> CommentMetadata:
-    """Read the metadata of the scene."""
     extras = file.root["asset"].get("extras")
     lines = extras.get("csplat", []) if isinstance(extras, dict) else []
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
-        raise InputError("asset/extras/csplat: wanted lines of text")
+        raise InputError("asset/extras/csplat is not a list of strings")
     metadata = parse_comments(lines)
     holder = file.root["asset"].get("copyright")
     if isinstance(holder, str):
@@ -449,21 +448,21 @@ def _read_metadata(file: GltfDocument) -> CommentMetadata:
     return metadata
 
 
-_DIRECTIONS = 96  # six per coefficient of degree 3; with 1,000 the colours of a scene differ by 0.01 of 255 steps
+_DIRECTIONS = 96  # six per coefficient of degree 3; 1,000 would change the colours of a scene by 0.01 of 255 steps
 _ROWS = 4096  # splats whose colours are fitted at a time
-#: Factor of the basis functions of each band, degrees 1 to 3.
+#: Factors that `sh_bands` omits, degrees 1 to 3.
 _FACTORS = (0.4886025119029199, 0.5462742152960396, 0.5900435899266435)
 
 
 def fit_srgb(model: SplatModel) -> SplatModel:
-    """Fit SH of sRGB to SH of linear light."""
+    """Convert SH of linear light to the SH of sRGB that fit best."""
     fitted = [coefficients for coefficients, _, _ in _fit_blocks(model)]
     both = np.concatenate([np.zeros((0, model.shN.shape[1] + 1, 3), np.float32), *fitted])
     return replace(model, sh0=np.ascontiguousarray(both[:, 0]), shN=np.ascontiguousarray(both[:, 1:]))
 
 
 def measure_srgb_error(model: SplatModel) -> float:
-    """Return the error of `fit_srgb`: rms over splats, directions and channels, in steps of 1/255."""
+    """Return the rms error of `fit_srgb` over splats, directions and channels, in steps of 1/255."""
     squares, count = 0.0, 0
     for _, found, wanted in _fit_blocks(model):
         squares += float(np.square(np.clip(found, 0, 1) - np.clip(wanted, 0, 1), dtype=np.float64).sum())
@@ -472,7 +471,7 @@ def measure_srgb_error(model: SplatModel) -> float:
 
 
 def _fit_blocks(model: SplatModel) -> Iterator[tuple[F32, F32, F32]]:
-    """Yield coefficients [n, K, 3] of some splats, with their fitted and their exact colours [n, D, 3]."""
+    """Yield coefficients [n, K, 3] of some splats, with their fitted and exact colours [n, D, 3]."""
     directions = sphere_lattice(_DIRECTIONS)
     bands = [factor * band for factor, band in zip(_FACTORS, sh_bands(directions), strict=True)]
     wide = np.concatenate(
@@ -481,7 +480,7 @@ def _fit_blocks(model: SplatModel) -> Iterator[tuple[F32, F32, F32]]:
     inverse, basis = np.linalg.pinv(wide).astype(np.float32), wide.astype(np.float32)
     for start in range(0, len(model), _ROWS):
         rows = slice(start, start + _ROWS)
-        with np.errstate(over="ignore", invalid="ignore"):  # a model refuses what leaves float32
+        with np.errstate(over="ignore", invalid="ignore"):  # `SplatModel` refuses values beyond float32
             linear = basis @ np.concatenate([model.sh0[rows, None], model.shN[rows]], axis=1) + np.float32(0.5)
             wanted = _srgb(np.maximum(linear, 0))
             coefficients = inverse @ (wanted - np.float32(0.5))

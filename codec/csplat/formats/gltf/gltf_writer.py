@@ -1,4 +1,4 @@
-"""Write glTF 2.0 with the extension KHR_gaussian_splatting, as one .glb."""
+"""Write glTF 2.0 with the extension KHR_gaussian_splatting as a single .glb file."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from csplat.scene_source import SceneSource
 from csplat.types import F32, F64
 
 _FLOAT, _BYTE, _ARRAY_BUFFER = 5126, 5121, 34962
-_LARGEST_FILE = (1 << 32) - 1  # bytes of a .glb: its length is a u32
+_LARGEST_FILE = (1 << 32) - 1  # bytes; the size of a .glb is a u32
 
 
 def write_gltf(path: Path, scene: SceneSource) -> None:
     """Write a scene (`Format.write`)."""
     if path.suffix.lower() == ".gltf":
-        raise InputError(f"{path.name}: glTF is written as one file, name it {path.with_suffix('.glb').name}")
+        raise InputError(f"{path.name}: glTF is written as a single file, name it {path.with_suffix('.glb').name}")
     if not scene.count:
         raise InputError(f"{path.name}: the scene has no splats, and glTF has no empty meshes")
     unit = scene.metadata_model.unit_metres
@@ -52,8 +52,8 @@ def write_gltf(path: Path, scene: SceneSource) -> None:
     start = GLB_HEAD.size + 8 + len(text) + 8
     if start + offsets[-1] > _LARGEST_FILE:
         raise InputError(
-            f"{path.name} would have {start + offsets[-1]:,} bytes, and a .glb has at most {_LARGEST_FILE:,}:"
-            f" write fewer splats, or fewer SH bands"
+            f"{path.name} would have {start + offsets[-1]:,} bytes, a .glb has at most {_LARGEST_FILE:,}:"
+            f" write fewer splats or fewer SH bands"
         )
     with atomic_writer(path) as stream:
         stream.write(GLB_HEAD.pack(MAGIC, 2, start + offsets[-1]) + struct.pack("<I4s", len(text), JSON) + text)
@@ -69,7 +69,7 @@ def write_gltf(path: Path, scene: SceneSource) -> None:
 
 @dataclass(frozen=True)
 class _Attribute:
-    """An attribute of the file."""
+    """A vertex attribute of the file."""
 
     name: str
     width: int
@@ -87,7 +87,7 @@ def _list_attributes(degree: int) -> list[_Attribute]:
 
 
 def _attributes(model: SplatModel) -> dict[str, NDArray[Any]]:
-    """Return all attributes of some splats."""
+    """Compute all attributes of some splats."""
     with np.errstate(over="ignore", under="ignore"):
         scales = np.exp(model.scales.astype(np.float64))
     names = [name for band in range(1, model.sh_degree + 1) for name in sh_names(band)]
@@ -103,7 +103,7 @@ def _attributes(model: SplatModel) -> dict[str, NDArray[Any]]:
 
 
 def _point_colours(model: SplatModel) -> NDArray[np.uint8]:
-    """Return colours for programs that draw points only: linear RGB and alpha, [N, 4] bytes."""
+    """Compute linear RGB and alpha [N, 4] for programs that only draw points."""
     srgb = np.clip(model.sh0 * np.float32(SH_C0) + np.float32(0.5), 0.0, 1.0)
     linear: F32 = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.rint(255.0 * np.concatenate([linear, model.opacities[:, None]], axis=1)).astype(np.uint8)

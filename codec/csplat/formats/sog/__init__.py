@@ -1,4 +1,4 @@
-"""SOG: splat attributes as lossless WebPs next to a meta.json, in a folder or a zip; or several of these, in levels."""
+"""SOG: splat attributes as lossless WebPs with a meta.json, in a folder or zip; streamed SOG has several, in levels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Find the files of a SOG in a folder or a zip, and read its JSON; neither is trusted."""
+"""Find the files of a SOG in a folder or zip, and read its JSON; neither is trusted."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import math
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn
@@ -25,13 +25,13 @@ _LARGEST_PART = 1 << 30  # bytes
 _LONGEST_NAME = 200  # characters
 _ONE, _LEVELS = "meta.json", "lod-meta.json"  # manifests of one scene, and of a scene in levels
 _OF_MACOS = "__MACOSX"  # folder with file attributes that macOS adds to zips
-_NAMED = 5  # scenes that a message names
-_EXPANSION = 4  # largest expansion of a member of a zip: images and short texts do not deflate to less
-_FREE = 1 << 20  # bytes of a member that are accepted whatever its expansion
+_NAMED = 5  # maximum number of scenes that a message lists
+_EXPANSION = 4  # maximum expansion of a zip member: images and short texts do not compress further
+_FREE = 1 << 20  # bytes of a member that are accepted regardless of its expansion
 
 
 class _ZipDirectory:
-    """The directory of a zip, read once; owns the open archive within `held`.
+    """The directory of a zip, which is read once; owns the open archive within `held`.
 
     Args:
         path: path of the zip.
@@ -52,7 +52,7 @@ class _ZipDirectory:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep the archive open until the context ends; otherwise every `read` opens it."""
+        """Keep the archive open until the context ends; otherwise each `read` opens it."""
         with self._opened() as archive:
             self._archive = archive
             try:
@@ -61,14 +61,14 @@ class _ZipDirectory:
                 self._archive = None
 
     def find(self, name: str) -> list[zipfile.ZipInfo]:
-        """Return the members of a name: exact matches, else with backslashes of Windows, else ignoring case."""
+        """Return the members with a name: exact matches, else matches after `use_slashes`, else ignoring case, too."""
         for key, named in zip(_NAME_KEYS, self._named, strict=True):
             if key(name) in named:
                 return named[key(name)]
         return []
 
     def read(self, info: zipfile.ZipInfo) -> bytes:
-        """Unpack a member; raise one of `DAMAGED` if that fails."""
+        """Unpack a member; raises one of `DAMAGED` if that fails."""
         if self._archive is not None:
             return self._archive.read(info)
         with zipfile.ZipFile(self._path) as archive:
@@ -83,7 +83,7 @@ class _ZipDirectory:
 
 
 def use_slashes(name: str) -> str:
-    """Return a name with slashes in place of the backslashes of Windows."""
+    """Replace the backslashes that Windows programs write in names."""
     return name.replace("\\", "/")
 
 
@@ -91,7 +91,7 @@ def _ignore_case(name: str) -> str:
     return use_slashes(name).casefold()
 
 
-#: Functions of names; names with the same result count as equal, tried in this order.
+#: Keys by which names are compared, tried in this order.
 _NAME_KEYS: tuple[Callable[[str], str], ...] = (str, use_slashes, _ignore_case)
 
 
@@ -100,11 +100,11 @@ class SogParts:
     """The files of one SOG, called parts, by name.
 
     Attributes:
-        path: the folder, or the zip.
+        path: path of the folder or zip.
         title: name for messages.
-        folder: folder inside the zip; `None`: there is no zip.
-        zip: the zip; `None`: the parts are files of a folder.
-        findings: what is unusual about the names in the zip.
+        folder: folder within the zip; `None` if there is no zip.
+        zip: the zip; `None` if the parts are files in a folder.
+        findings: findings about unusual names in the zip.
     """
 
     path: Path
@@ -115,15 +115,12 @@ class SogParts:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep a zip open until the context ends, so that its directory is not read for every part."""
-        if self.zip is None:
-            yield
-            return
-        with self.zip.held():
+        """Keep a zip open until the context ends, so its directory is not read for each part."""
+        with nullcontext() if self.zip is None else self.zip.held():
             yield
 
     def inner(self, name: str) -> tuple[SogParts, str]:
-        """Return the parts of a SOG inside of this one and the name of its JSON, as `find_parts` does.
+        """Return the parts of a nested SOG and the name of its JSON, as `find_parts` does.
 
         Raises:
             InputError: it does not exist, or its name leads out of the folder.
@@ -134,7 +131,7 @@ class SogParts:
             return find_parts(self.file(name), title)
         place = self._inside(name)
         if place.suffix.lower() != ".json":
-            self.refuse(f"{name[:80]} is a zip inside of a zip: unpack {self.title} and name its {_LEVELS}")
+            self.refuse(f"{name[:80]} is a zip within a zip: unpack {self.title} and name its {_LEVELS}")
         return SogParts(self.path, title, self.folder / place.parent, self.zip), place.name
 
     def read(self, name: str, most: int = _LARGEST_PART) -> bytes:
@@ -156,7 +153,7 @@ class SogParts:
         return data
 
     def file(self, name: str) -> Path:
-        """Return the path of a part in a folder; raises as `read`."""
+        """Return the path of a part in a folder; raises the errors of `read`."""
         path = self.path / self._inside(name)
         if self.folder is not None or not path.is_file():
             self.refuse(f"there is no {name[:80]}")
@@ -165,11 +162,11 @@ class SogParts:
     def _inside(self, name: str) -> PurePosixPath:
         place = PurePosixPath(name)
         if place.is_absolute() or ".." in place.parts or len(name) > _LONGEST_NAME or set(name) & {"\\", ":", "\0"}:
-            self.refuse(f"the part {name[:80]!r} would lie outside of it")
+            self.refuse(f"the part {name[:80]!r} would be outside of it")
         return place
 
     def _unzipped(self, name: str, most: int) -> bytes:
-        assert self.zip is not None, "a folder inside of a zip has the zip"
+        assert self.zip is not None, "`folder` is only set within a zip"
         found = self.zip.find(name)
         if not found:
             self.refuse(f"there is no {name[:80]}")
@@ -177,14 +174,14 @@ class SogParts:
             self.refuse(f"{' and '.join(info.filename[:80] for info in found[:2])} would both be {name[:80]}")
         info = found[-1]
         if info.file_size > min(most, _FREE + _EXPANSION * info.compress_size):
-            self.refuse(f"{name} of {info.compress_size:,} bytes says that {info.file_size:,} come out of it")
+            self.refuse(f"{name} of {info.compress_size:,} bytes declares an unpacked size of {info.file_size:,}")
         try:
             return self.zip.read(info)
         except DAMAGED as error:
             self.refuse(f"{name[:80]}: {' '.join(str(error).split())[:120] or type(error).__name__}")
 
     def json(self, name: str) -> JsonValue:
-        """Read and parse a part that holds JSON."""
+        """Read and parse a JSON part."""
         data = self.read(name, _LARGEST_JSON)
         try:
             value = json.loads(data)
@@ -200,7 +197,7 @@ class SogParts:
 
 @dataclass(frozen=True)
 class JsonValue:
-    """A JSON value and its place; methods raise `InputError` if it has another type."""
+    """A JSON value and its path; methods raise `InputError` if it has another type."""
 
     parts: SogParts
     place: str
@@ -218,29 +215,29 @@ class JsonValue:
     def list(self) -> list[JsonValue]:
         """Return the values of a list."""
         if not isinstance(self.value, list):
-            self.parts.refuse(f"{self.place} is no list")
+            self.parts.refuse(f"{self.place} is not a list")
         return [JsonValue(self.parts, self.place, one) for one in self.value]
 
     def text(self) -> str:
         """Return a string."""
         if not isinstance(self.value, str):
-            self.parts.refuse(f"{self.place} is no text")
+            self.parts.refuse(f"{self.place} is not a string")
         return self.value
 
     def whole(self, most: int) -> int:
         """Return an integer from 0 to `most`."""
         if type(self.value) is not int or not 0 <= self.value <= most:
-            self.parts.refuse(f"{self.place} is {str(self.value)[:40]}, wanted an integer from 0 to {most:,}")
+            self.parts.refuse(f"{self.place} is {str(self.value)[:40]}, expected an integer from 0 to {most:,}")
         return int(self.value)
 
     def numbers(self, least: int, most: int) -> NDArray[np.float64]:
-        """Return `least` to `most` finite numbers; a single one may be without brackets."""
+        """Return `least` to `most` finite numbers; a single number needs no brackets."""
         values = self.value if isinstance(self.value, list) else [self.value]
         if not least <= len(values) <= most:
-            self.parts.refuse(f"{self.place} has {len(values)} numbers, wanted {least if least == most else most}")
+            self.parts.refuse(f"{self.place} has {len(values)} numbers, expected {least if least == most else most}")
         for one in values:
             if type(one) not in (int, float) or not abs(one) <= 1e30 or not math.isfinite(one):
-                self.parts.refuse(f"{self.place} holds {str(one)[:40]}, wanted finite numbers")
+                self.parts.refuse(f"{self.place} contains {str(one)[:40]}, expected finite numbers")
         return np.array(values, np.float64)
 
 
@@ -252,14 +249,14 @@ def find_parts(path: Path, title: str | None = None) -> tuple[SogParts, str]:
         title: name for messages; `None`: the name of the path.
 
     Raises:
-        InputError: there is no SOG, or more than one scene.
+        InputError: the path contains no SOG, or several scenes.
         OSError: the path cannot be read.
     """
     title = title or path.name
     if path.is_dir():
         found = [PurePosixPath(name) for name in (_ONE, _LEVELS) if (path / name).is_file()]
         if not found:
-            SogParts(path, title).refuse(f"a folder without {_ONE}, no SOG")
+            SogParts(path, title).refuse(f"a folder without {_ONE}, not a SOG")
         return SogParts(path, title), str(_only_scene(SogParts(path, title), found))
     with path.open("rb") as stream:
         zipped = stream.read(2) == b"PK"
@@ -269,7 +266,7 @@ def find_parts(path: Path, title: str | None = None) -> tuple[SogParts, str]:
     names = [info.filename for info in whole.members]
     found = [one for one in map(PurePosixPath, map(use_slashes, names)) if _is_manifest(one)]
     if not found:
-        SogParts(path, title).refuse(f"a zip without {_ONE}, no SOG")
+        SogParts(path, title).refuse(f"a zip without {_ONE}, not a SOG")
     parts = SogParts(path, title, PurePosixPath(), whole)
     only = _only_scene(parts, found)
     oddities = ["backslashes in the names of the zip, read as slashes"] if any("\\" in name for name in names) else []
@@ -280,7 +277,7 @@ def find_parts(path: Path, title: str | None = None) -> tuple[SogParts, str]:
 
 
 def _report_others(parts: SogParts, only: PurePosixPath, names: Sequence[str]) -> list[Finding]:
-    """Report scenes of other formats in the folder of the SOG; refuse a zip with scenes elsewhere."""
+    """Report scenes of other formats in the folder of the SOG; refuse a zip with scenes in other folders."""
     places = [place for place in map(PurePosixPath, map(use_slashes, names)) if _OF_MACOS not in place.parts]
     others = [PurePosixPath(one) for one in scenes_of(map(str, places))]
     if not others:
@@ -296,11 +293,11 @@ def _is_manifest(place: PurePosixPath) -> bool:
 
 
 def _only_scene(parts: SogParts, found: Sequence[PurePosixPath]) -> PurePosixPath:
-    """Return the only JSON that is no part of another scene.
+    """Return the only manifest that is not part of another scene.
 
     Args:
-        parts: the folder, or all of the zip.
-        found: places of all `meta.json` and `lod-meta.json`.
+        parts: the folder or the whole zip.
+        found: paths of all manifests.
     """
     inside: set[PurePosixPath] = set()
     for one in found if len(found) > 1 else ():
@@ -317,7 +314,7 @@ def _only_scene(parts: SogParts, found: Sequence[PurePosixPath]) -> PurePosixPat
 
 def _refuse_several(parts: SogParts, scenes: Sequence[PurePosixPath]) -> NoReturn:
     remedy = "name one of these files" if parts.folder is None else "unpack it and name one of these files"
-    parts.refuse(f"it holds {len(scenes)} scenes, expected one ({_list_places(scenes)}): {remedy}")
+    parts.refuse(f"it contains {len(scenes)} scenes, expected one ({_list_places(scenes)}): {remedy}")
 
 
 def _list_places(places: Sequence[PurePosixPath]) -> str:
@@ -330,28 +327,28 @@ def decode_webp(parts: SogParts, name: str, data: bytes, fits: Any) -> NDArray[n
     Args:
         parts: the SOG of the image.
         name: name of the image, for messages.
-        data: bytes of the image.
+        data: the encoded image.
         fits: called with width and height before pixels are decoded; returns True if the size is acceptable.
 
     Raises:
-        InputError: the image is damaged, lossy or of another size; or Pillow is absent.
+        InputError: the image is damaged, lossy or of another size; or Pillow is not installed.
     """
     try:
         from PIL.Image import DecompressionBombError
-        from PIL.WebPImagePlugin import WebPImageFile  # Image.open loads all formats that Pillow knows
+        from PIL.WebPImagePlugin import WebPImageFile  # Image.open would load the plugins of all formats
     except ModuleNotFoundError as error:
         raise missing_package(error, "Pillow") from None
     if _is_lossy(data):
         parts.refuse(
-            f"{name} is a lossy WebP, expected a lossless one: its codes are changed; take the file as exported"
+            f"{name} is a lossy WebP, expected a lossless one: its codes are changed; use the file as exported"
         )
     try:
         with WebPImageFile(io.BytesIO(data)) as image:
             if not fits(*image.size):
-                parts.refuse(f"{name} has {image.size[0]} x {image.size[1]} pixels, which is not what was declared")
+                parts.refuse(f"{name} has {image.size[0]} x {image.size[1]} pixels, which does not match the metadata")
             return np.asarray(image.convert("RGBA"))
     except (*DAMAGED, DecompressionBombError) as error:
-        parts.refuse(f"{name} is no whole WebP: {' '.join(str(error).split())[:80] or type(error).__name__}")
+        parts.refuse(f"{name} is not a complete WebP: {' '.join(str(error).split())[:80] or type(error).__name__}")
 
 
 def _is_lossy(data: bytes) -> bool:

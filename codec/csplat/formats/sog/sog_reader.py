@@ -1,7 +1,7 @@
 """Read SOG, versions 1 and 2, and levels of streamed SOG.
 
-A byte of an image is an index: between two bounds in version 1, into a codebook in version 2. Follows the sources of
-splat-transform (MIT), `read-sog.ts` and `read-sog-v1.ts`. The axes are those of the PLY that a SOG was made from.
+A byte of an image interpolates between two bounds in version 1, and indexes a codebook in version 2. Follows
+`read-sog.ts` and `read-sog-v1.ts` of splat-transform (MIT). The axes are those of the PLY that was converted to SOG.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, U8, U16
 
 _MAX_OFFSET = 1 << 40  # splats
-#: Keys that the JSON of one scene, or that of levels, has.
-_KEYS = ("means", "quats", "scales", "sh0", "lodLevels", "tree")
+_KEYS = ("means", "quats", "scales", "sh0", "lodLevels", "tree")  # of the manifests; others than SOG have none of them
 _Range = tuple[int, int, int]  # file index, first splat, end
 
 
@@ -43,13 +42,13 @@ def _open_scene(path: Path, parts: SogParts, name: str, level: int) -> SceneSour
     meta = parts.json(name)
     if isinstance(meta.value, dict) and not any(one in meta for one in _KEYS):
         where = folder_refusal(parts.path) if parts.folder is None else zip_refusal(path)
-        parts.refuse(f"{name} is not that of SOG, which has {', '.join(_KEYS[:4])}; {where}")
+        parts.refuse(f"{name} is not the one of SOG, which has {', '.join(_KEYS[:4])}; {where}")
     if "lodLevels" in meta or "tree" in meta:
         scene = _open_streamed(parts, meta, level)
         scene.findings.extend(parts.findings)
         return scene
     if level:
-        parts.refuse(f"it has no levels, and level {level} is wanted")
+        parts.refuse(f"it has no levels: level {level} cannot be read")
     sog = read_meta(parts, name)
     images = SogImages.of(sog)
     degree = COEFFICIENTS.index(images.palette.shape[1])
@@ -79,16 +78,16 @@ def _empty_model(degree: int, *, antialiased: bool, flat: bool) -> SplatModel:
 def _list_findings(images: SogImages) -> list[Finding]:
     if not images.zeros:
         return []
-    text = f"{counted(images.zeros, 'rotation')} that none of four components is left out of: the identity"
+    text = f"{counted(images.zeros, 'rotation')} without a valid component tag: set to the identity"
     return [Finding("zero-quats", images.zeros, text, "repair")]
 
 
 def _open_streamed(parts: SogParts, meta: JsonValue, level: int) -> SceneSource:
-    """Open a level of streamed SOG and its environment, which are read one file at a time."""
+    """Open a level of streamed SOG with its environment; blocks are read one file at a time."""
     names, leaves = _read_leaves(parts, meta)
     last = max([max(one) for one in leaves], default=0)
     if level > last:
-        parts.refuse(f"level {level} is wanted, its levels are 0 to {last}")
+        parts.refuse(f"the level is {level}, expected 0 to {last}")
     findings: list[Finding] = []
     if any("\\" in name for name in names):
         findings.append(Finding("zip-names", 1, "backslashes in filenames, read as slashes", "note"))
@@ -101,7 +100,7 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int) -> SceneSource:
         sog = read_meta(*parts.inner(name))
         taken = [(0, sog.count)] if wanted is None else wanted
         if taken[-1][1] > sog.count:
-            parts.refuse(f"splats up to {taken[-1][1]:,} of {name} are wanted, it has {sog.count:,}")
+            parts.refuse(f"the level uses splats up to {taken[-1][1]:,} of {name}, which has {sog.count:,}")
         metas.append((sog, taken))
     degree = max([read_degree(sog) for sog, _ in metas], default=0)
     metadata_model = _empty_model(
@@ -137,9 +136,9 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int) -> SceneSource:
 
 
 def _read_leaves(parts: SogParts, meta: JsonValue) -> tuple[list[str], list[dict[int, _Range]]]:
-    """Return the names of the files, and per leaf of the tree the range of splats of each level."""
+    """Return the names of the files; and for each leaf of the tree, the range of splats of each level."""
     if "version" in meta and meta["version"].whole(1 << 30) != 1:
-        parts.refuse(f"it is of version {meta['version'].value} of streamed SOG, wanted 1")
+        parts.refuse(f"it is version {meta['version'].value} of streamed SOG, expected 1")
     names = [one.text() for one in meta["filenames"].list()]
     leaves: list[dict[int, _Range]] = []
     nodes = [meta["tree"]]
@@ -150,34 +149,34 @@ def _read_leaves(parts: SogParts, meta: JsonValue) -> tuple[list[str], list[dict
             continue
         lods = node["lods"].value
         if not isinstance(lods, dict):
-            parts.refuse(f"{node.place} lods is no object")
+            parts.refuse(f"{node.place} lods is not an object")
         leaf: dict[int, _Range] = {}
         for level, value in lods.items():
             reference = JsonValue(parts, f"{node.place} lods", value)
             file = reference["file"].whole(len(names) - 1)
             start = reference["offset"].whole(_MAX_OFFSET)
             if not (level.isdecimal() and level.isascii() and len(level) < 3):
-                parts.refuse(f"{level[:20]!r} is no level")
+                parts.refuse(f"the level is {level[:20]!r}, expected a number below 100")
             leaf[int(level)] = file, start, start + reference["count"].whole(_MAX_OFFSET)
         leaves += [leaf] if leaf else []
     return names, leaves
 
 
 def _range_at(leaf: dict[int, _Range], level: int) -> _Range:
-    """Return the range of a leaf at a level, else at the next coarser level, else at its coarsest."""
+    """Return the range of a leaf at a level, else at the next coarser one, else at its coarsest."""
     return leaf[min((one for one in leaf if one >= level), default=max(leaf))]
 
 
 def _collect_ranges(parts: SogParts, names: list[str], wanted: list[_Range]) -> dict[str, list[tuple[int, int]] | None]:
-    """Return the ranges of splats to read from each file, in order and without overlap."""
+    """Return the ranges of splats to read by file, in order; refuse overlaps."""
     found: dict[str, list[tuple[int, int]] | None] = {}
     before = (-1, 0, 0)
     for one in sorted(one for one in wanted if one[2] > one[1]):
         file, start, stop = one
         if file == before[0] and start < before[2]:
-            parts.refuse(f"splats {start:,} to {before[2]:,} of {names[file][:80]} are wanted twice")
+            parts.refuse(f"the level uses splats {start:,} to {before[2]:,} of {names[file][:80]} twice")
         if file != before[0] and names[file] in found:
-            parts.refuse(f"filenames has {names[file][:80]} twice")
+            parts.refuse(f"filenames contains {names[file][:80]} twice")
         ranges = found.setdefault(names[file], [])
         assert ranges is not None, "the environment is added later"
         ranges.append((start, stop))
@@ -186,14 +185,14 @@ def _collect_ranges(parts: SogParts, names: list[str], wanted: list[_Range]) -> 
 
 
 COEFFICIENTS = (0, 3, 8, 15)  #: number of SH coefficients per channel, by degree
-ENTRIES = 64  #: palette entries per row of their image
-LEAST_TAG = 252  #: fourth byte of a rotation without its first component; the next values are the other components
-_MAX_SPLATS = 1 << 28  # no WebP image has more pixels
+ENTRIES = 64  #: palette entries per row of the palette image
+LEAST_TAG = 252  #: fourth byte of a rotation: this plus the index of the omitted component
+_MAX_SPLATS = 1 << 28  # pixels of the largest WebP image
 _MAX_PALETTE = 1 << 16
-_FREE = 1 << 20  # splats that are accepted for any number of bytes
-_SPLATS_PER_BYTE = 8  # largest number of splats per byte of the images, beyond that
-_LARGEST_LOG = 88.0  # largest logarithm whose exponential is a float32
-_SPARE = 1 << 16  # pixels that an image may have beyond four per splat
+_FREE = 1 << 20  # splats that are accepted for any size of the images
+_SPLATS_PER_BYTE = 8  # beyond that: maximum number of splats per byte of the images
+_LARGEST_LOG = 88.0  # its exponential fits in float32
+_SPARE = 1 << 16  # pixels that an image may have in addition to four per splat
 
 
 @dataclass(frozen=True)
@@ -202,13 +201,13 @@ class SogMeta:
 
     Attributes:
         count: N.
-        degree: SH degree; `None` if only the width of an image determines it.
+        degree: SH degree; `None` if it follows from the width of an image.
         antialiased, flat: as in `SplatModel`.
-        bounds: [2, 3] float64, bounds of the signed logarithms of 1 + means.
+        bounds: [2, 3] float64, bounds of sign(means) · log(1 + |means|).
         scales, sh0: [3, 256] float32, values by code; NaN beyond the end of a codebook.
         alpha: [256] float32, values by code.
-        shN: [256] float32, values by code; `None`: no SH.
-        palette: number of entries; `None` if only the height of an image determines it.
+        shN: [256] float32, values by code; `None` without SH.
+        palette: number of palette entries; `None` if it follows from the height of an image.
     """
 
     parts: SogParts
@@ -229,13 +228,13 @@ def read_meta(parts: SogParts, name: str) -> SogMeta:
     """Read and check the JSON of a SOG.
 
     Raises:
-        InputError: a value is missing or not as expected.
+        InputError: a value is missing or invalid.
         OSError: the file cannot be read.
     """
     meta = parts.json(name)
     version = meta["version"].whole(1 << 30) if "version" in meta else 1
     if version not in (1, 2):
-        parts.refuse(f"it is of version {version} of SOG, wanted 1 or 2")
+        parts.refuse(f"it is version {version} of SOG, expected 1 or 2")
     old = version == 1
     if old and not meta["means"]["shape"].list():
         parts.refuse(f"{name} means shape is empty")
@@ -271,14 +270,14 @@ def read_meta(parts: SogParts, name: str) -> SogMeta:
 def _read_bounds(means: JsonValue) -> NDArray[np.float64]:
     bounds = np.stack(_read_ends(means, 3))
     if np.abs(bounds).max() > _LARGEST_LOG:
-        means.parts.refuse(f"{means.place} reaches beyond what float32 holds")
+        means.parts.refuse(f"the bounds of {means.place} exceed float32")
     return bounds
 
 
 def _read_ends(section: JsonValue, channels: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     low, high = (section[name].numbers(channels, channels) for name in ("mins", "maxs"))
     for channel in np.flatnonzero(crossed_bounds(low, high))[:1]:
-        reason = f"mins {low[channel]:.6g} above maxs {high[channel]:.6g}, expected at most that"
+        reason = f"mins {low[channel]:.6g}, expected at most maxs {high[channel]:.6g}"
         section.parts.refuse(f"{section.place} has {reason}")
     return low, high
 
@@ -291,7 +290,7 @@ def _interpolate(section: JsonValue, channels: int) -> F32:
 def _read_codebook(section: JsonValue) -> F32:
     values = section["codebook"].value
     if isinstance(values, list) and len(values) == 256 and values[0] is None:
-        # Early writers lost the first entry; as in PlayCanvas' engine, it is extrapolated.
+        # Early writers omitted the first entry; it is extrapolated as in PlayCanvas' engine.
         after = JsonValue(section.parts, section.place, values[1:]).numbers(255, 255)
         section.value["codebook"] = [float(after[0] + (after[0] - after[-1]) / 255), *values[1:]]
     codebook = np.full(256, np.nan, np.float32)
@@ -305,7 +304,9 @@ class SogImages:
     """The codes of all splats, 19 bytes each.
 
     Attributes:
-        means: [N, 3]; quats: [N, 4]; scales: [N, 3]; sh0: [N, 4]; labels: [N].
+        means, scales: [N, 3]
+        quats, sh0: [N, 4]
+        labels: [N], indices into the palette.
         palette: [P, K, 3] float32, SH coefficients by label.
         zeros: number of rotations without a valid tag, which become the identity.
     """
@@ -324,16 +325,16 @@ class SogImages:
         """Decode all images of a SOG.
 
         Raises:
-            InputError: an image is damaged, has another size, or codes without a value.
+            InputError: an image is damaged, has another size, or contains a code without a value.
             OSError: an image cannot be read.
         """
         parts, count = sog.parts, sog.count
         names = [_list_files(sog.meta[name], wanted) for name, wanted in (("means", 2), ("quats", 1), ("scales", 1))]
         names += [_list_files(sog.meta["sh0"], 1)] + ([_list_files(sog.meta["shN"], 2)] if sog.shN is not None else [])
         data = {name: parts.read(name) for group in names for name in group}
-        bytes_ = sum(map(len, data.values()))
-        if count > max(_FREE, _SPLATS_PER_BYTE * bytes_):
-            parts.refuse(f"{count:,} splats are declared, the pictures have {bytes_:,} bytes")
+        size_bytes = sum(map(len, data.values()))
+        if count > max(_FREE, _SPLATS_PER_BYTE * size_bytes):
+            parts.refuse(f"it declares {count:,} splats, its images have {size_bytes:,} bytes")
         size: list[tuple[int, int]] = []
 
         def fits(width: int, height: int) -> bool:
@@ -353,15 +354,15 @@ class SogImages:
             labels = pair[:, 0] | pair[:, 1] << np.uint16(8)
             if count and labels.max() >= len(palette):
                 worst = int(labels.argmax())
-                parts.refuse(f"splat {worst} has SH {labels[worst]} of a palette of {len(palette):,}")
-        for what, table, used in (("scales", sog.scales, scales), ("sh0", sog.sh0, sh0)):
+                parts.refuse(f"splat {worst} has SH label {labels[worst]} in a palette of {len(palette):,}")
+        for name, table, used in (("scales", sog.scales, scales), ("sh0", sog.sh0, sh0)):
             if count and np.isnan(table[0, used[:, :3].max()]):
-                parts.refuse(f"a splat has code {used[:, :3].max()} of {what}, whose codebook is shorter")
+                parts.refuse(f"a splat has code {used[:, :3].max()} of {name}, whose codebook is shorter")
         none = quats[:, 3] < LEAST_TAG
         return cls(sog, low | high << np.uint16(8), quats, scales, sh0, labels, palette, int(none.sum()))
 
     def blocks(self, degree: int) -> Iterator[dict[str, Any]]:
-        """Yield arrays of at most `BLOCK_SPLATS` splats, with zeros for missing SH up to a degree."""
+        """Yield arrays of at most `BLOCK_SPLATS` splats, with zeros for missing SH bands up to a degree."""
         sog, missing = self.sog, COEFFICIENTS[degree] - self.palette.shape[1]
         for start in range(0, sog.count, BLOCK_SPLATS):
             yield self._block(slice(start, start + BLOCK_SPLATS), missing)
@@ -384,7 +385,7 @@ class SogImages:
 
 
 def read_degree(sog: SogMeta) -> int:
-    """Return the SH degree of a SOG from its JSON, otherwise from its palette."""
+    """Return the SH degree of a SOG according to its JSON, else according to its palette image."""
     if sog.degree is not None:
         return sog.degree
     name = _list_files(sog.meta["shN"], 2)[0]
@@ -401,19 +402,19 @@ def _look_up(tables: F32, codes: NDArray[Any]) -> F32:
 def _list_files(section: JsonValue, count: int) -> list[str]:
     names = [one.text() for one in section["files"].list()]
     if len(names) != count or len(set(names)) != count:
-        section.parts.refuse(f"{section.place} files: {len(set(names))} names, wanted {count}")
+        section.parts.refuse(f"{section.place} files has {len(set(names))} names, expected {count}")
     return names
 
 
 def _read_palette(sog: SogMeta, name: str, data: bytes) -> F32:
     def fits(width: int, height: int) -> bool:
-        wanted = [sog.degree] if sog.degree is not None else [1, 2, 3]
+        degrees = [sog.degree] if sog.degree is not None else [1, 2, 3]
         rows = 1 if sog.palette is None else -(-sog.palette // ENTRIES)
-        return width in [ENTRIES * COEFFICIENTS[one] for one in wanted] and rows <= height <= _MAX_PALETTE // ENTRIES
+        return width in [ENTRIES * COEFFICIENTS[one] for one in degrees] and rows <= height <= _MAX_PALETTE // ENTRIES
 
     codes = decode_webp(sog.parts, name, data, fits)
     entries = codes[:, :, :3].reshape(len(codes) * ENTRIES, -1, 3)[: sog.palette]
-    assert sog.shN is not None, "a palette has values"
+    assert sog.shN is not None, "a palette has a codebook"
     found = sog.shN[entries]
     if np.isnan(found).any():
         sog.parts.refuse(f"{name} has codes beyond the codebook of shN")

@@ -1,4 +1,4 @@
-"""Write SOG, version 2: the same bytes for the same scene; codes are rounded, not truncated."""
+"""Write SOG, version 2, deterministically; codes are rounded, not truncated."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,24 +25,24 @@ from csplat.scene_source import SceneSource, join_blocks
 from csplat.types import F32, F64, U8, U32
 
 _LEAST_WEIGHT = 1e-3  # relative to a splat of opacity 1 and median area
-_LARGEST_SIDE = 16383  # pixels of a WebP
+_LARGEST_SIDE = 16383  # pixels, limit of WebP
 _CODES = 256
 _LLOYD_STEPS = 40
-_DATE = (1980, 1, 1, 0, 0, 0)  # date of the members of a zip: fixed, so the same scene gives the same bytes
+_DATE = (1980, 1, 1, 0, 0, 0)  # date of zip members: fixed, so the same scene gives the same bytes
 _NORM = 1000  # lattice steps of a long SH vector; searches are exact up to twice that
 _NEAR = 4  # groups of palette entries that are searched, out of 181 for 60,000 splats
-_ITERATIONS = 2  # of k-means; more gain 0.03 dB in three times the time
+_ITERATIONS = 2  # k-means iterations; more gain 0.03 dB in three times the time
 _LARGEST_PALETTE = 1 << 16
-_PIXELS_AT_ONCE = 1 << 23  # pixels of the images that are compressed in parallel, 70 bytes of memory per pixel
-_SAMPLE = 1 << 20  # splats from which codebooks and palette are computed
+_PIXELS_AT_ONCE = 1 << 23  # pixels of all images compressed in parallel, which take 70 bytes of memory each
+_SAMPLE = 1 << 20  # number of splats from which codebooks and palette are computed
 _CHANNELS = {"means_l.webp": 3, "means_u.webp": 3, "quats.webp": 4, "scales.webp": 3, "sh0.webp": 4}
 
 
 def write_sog(path: Path, scene: SceneSource) -> None:
-    """Write a zip or, for a path that ends in meta.json, files next to it (`Format.write`).
+    """Write a zip or, if the path ends in meta.json, files next to it (`Format.write`).
 
     Raises:
-        InputError: the scene has more splats than an image has pixels; or Pillow is absent.
+        InputError: the scene has more splats than an image can have pixels; or Pillow is not installed.
         OSError: a file cannot be written.
     """
     if path.name.lower() == "lod-meta.json":
@@ -52,7 +52,7 @@ def write_sog(path: Path, scene: SceneSource) -> None:
         path.parent.mkdir(exist_ok=True)
     with sorted_along_curve(scene, path.parent) as ordered:
         if is_folder:
-            for name, data in _encode_files(ordered):  # meta.json is the last
+            for name, data in _encode_files(ordered):  # meta.json comes last
                 with atomic_writer(path if name == "meta.json" else path.with_name(name)) as stream:
                     stream.write(data)
             return
@@ -62,15 +62,15 @@ def write_sog(path: Path, scene: SceneSource) -> None:
 
 
 def _encode_files(scene: SceneSource) -> Iterator[tuple[str, bytes]]:
-    """Yield each file, name and bytes. Memory holds 17 bytes per splat, 21 with SH."""
+    """Yield the name and bytes of each file. Takes 17 bytes of memory per splat, 21 with SH."""
     count = scene.count
     width = max(1, math.ceil(math.sqrt(count) / 4)) * 4
     height = max(1, math.ceil(count / width / 4)) * 4
     if max(width, height) > _LARGEST_SIDE:
-        raise InputError(f"{count:,} splats are more than the pictures of SOG hold")
+        raise InputError(f"the scene has {count:,} splats, SOG allows {_LARGEST_SIDE}² at most")
     low, high, sample = _sample(scene)
-    weights_of = _SplatWeights(float(np.median(_log_area(sample))) if count else 0.0)
-    # Roots of the weights: with few codes, the tails of the values show somewhere (donut: 60.6 dB, without roots 53.1).
+    weights_of = partial(_splat_weights, median_area=float(np.median(_log_area(sample))) if count else 0.0)
+    # Square roots keep the tails of the distribution accurate, which would be visible (donut: 60.6 dB, otherwise 53.1).
     roots = np.sqrt(weights_of(sample))
     scales, colours = _build_codebook(sample.scales, roots), _build_codebook(sample.sh0, roots)
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "csplat"}, "count": count}
@@ -115,7 +115,7 @@ def _encode_files(scene: SceneSource) -> Iterator[tuple[str, bytes]]:
 
 
 def _sample(scene: SceneSource) -> tuple[F64, F64, SplatModel]:
-    """Return the bounds of the logarithms of all positions, and at most `_SAMPLE` splats at equal steps."""
+    """Return the bounds of the logarithms of all positions, and at most `_SAMPLE` evenly spaced splats."""
     step = -(-scene.count // _SAMPLE) or 1
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     taken = []
@@ -134,34 +134,29 @@ def _signed_logs(means: F32) -> F64:
 
 
 def _log_area(model: SplatModel) -> F64:
-    """Return the logarithm of the area of each splat's largest cross-section."""
+    """Return the logarithm of the area of each splat's largest cross-section, up to a constant."""
     area: F64 = np.sort(model.scales, 1)[:, 1:].sum(1, dtype=np.float64)
     return area
 
 
-@dataclass(frozen=True)
-class _SplatWeights:
-    """Weights of splats by their share of a render: opacity times area relative to the scene's median."""
-
-    middle: float
-
-    def __call__(self, model: SplatModel) -> F32:
-        area = np.exp(_log_area(model) - self.middle).clip(1e-2, 1e2)
-        weights: F32 = (model.opacities * area + _LEAST_WEIGHT).astype(np.float32)
-        return weights
+def _splat_weights(model: SplatModel, median_area: float) -> F32:
+    """Weight splats by their share of a render: opacity times area relative to the scene's median (a logarithm)."""
+    area = np.exp(_log_area(model) - median_area).clip(1e-2, 1e2)
+    weights: F32 = (model.opacities * area + _LEAST_WEIGHT).astype(np.float32)
+    return weights
 
 
 def _shortest_decimals(values: F32) -> list[float]:
-    """Return the shortest decimals that round to the same float32."""
+    """Return the shortest decimals that round to the same float32 values."""
     return [float(str(one)) for one in values]
 
 
 def _build_codebook(columns: F32, weights: F32) -> F32:
-    """Return 256 values that represent all, by Lloyd's algorithm on sorted values: exact, and cheap for any number.
+    """Compute a codebook by Lloyd's algorithm on prefix sums of the sorted values.
 
     Args:
-        columns: [N, C].
-        weights: [N].
+        columns: [N, C], values.
+        weights: [N], weights of the rows.
 
     Returns:
         [256] float32, ascending.
@@ -174,7 +169,7 @@ def _build_codebook(columns: F32, weights: F32) -> F32:
     weight = np.repeat(weights.astype(np.float64), columns.shape[1])[order]
     mass = np.concatenate([[0.0], np.cumsum(weight)])
     moment = np.concatenate([[0.0], np.cumsum(weight * values)])
-    # The best density of codes is the cube root of that of the values (Panter and Dite).
+    # The optimal density of codes is proportional to the cube root of the density of values (Panter and Dite, 1951).
     edges = np.linspace(values[0], values[-1], 4097)
     density = np.diff(mass[np.searchsorted(values, edges[1:-1])], prepend=0.0, append=mass[-1]) ** (1 / 3)
     share = np.concatenate([[0.0], np.cumsum(density)])
@@ -192,16 +187,17 @@ def _build_codebook(columns: F32, weights: F32) -> F32:
 
 
 def _nearest_codes(codebook: F32, columns: F32) -> U8:
-    """Return the code of each value."""
     codes = np.searchsorted((codebook[1:].astype(np.float64) + codebook[:-1]) / 2, columns)
     return codes.astype(np.uint8)
 
 
-def _build_palette(scene: SceneSource, sample: SplatModel, weights_of: _SplatWeights) -> tuple[F32, U8, U32]:
+def _build_palette(
+    scene: SceneSource, sample: SplatModel, weights_of: Callable[[SplatModel], F32]
+) -> tuple[F32, U8, U32]:
     """Cluster the SH vectors of all splats.
 
     Returns:
-        The codebook of coefficients, the image of the palette, and the label of each splat.
+        The codebook of coefficients, the palette image, and the label of each splat.
     """
     coefficients = scene.metadata_model.shN.shape[1]
     lengths = np.sqrt(np.einsum("nkc,nkc->n", sample.shN, sample.shN))
@@ -209,12 +205,10 @@ def _build_palette(scene: SceneSource, sample: SplatModel, weights_of: _SplatWei
     limit = 2 * _NORM / (3 * coefficients) ** 0.5
 
     def points(model: SplatModel) -> NDArray[np.int16]:
-        found: NDArray[np.int16] = np.rint((model.shN.reshape(len(model), -1) / step).clip(-limit, limit)).astype(
-            np.int16
-        )
-        return found
+        steps: F32 = np.rint((model.shN.reshape(len(model), -1) / step).clip(-limit, limit))
+        return steps.astype(np.int16)
 
-    size = min(_LARGEST_PALETTE, 1 << max(10, scene.count.bit_length() - 1))  # as splat-transform has it
+    size = min(_LARGEST_PALETTE, 1 << max(10, scene.count.bit_length() - 1))  # as in splat-transform
     entries, labels = cluster(
         points(sample), weights_of(sample), size, seed=0, iterations=_ITERATIONS, near_groups=_NEAR
     )

@@ -30,7 +30,6 @@ import typer
 from csplat.editing.transform import DEFAULT_AXES
 from csplat.editing.up_axis import up_of_axes
 from csplat.formats import format_by_name, read, write
-from csplat.formats.csplat_format import FORMAT as CSPLAT
 from csplat.formats.format import Format
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat_bench.common.command import CACHE, EXTRA, JSON, MARKDOWN, PEERS, SCENES, listed, run
@@ -117,13 +116,13 @@ def main(
         for scene in find_scenes(listed(scenes), cache, extra):
             model, camera = looked_at(scene)
             forms = [format_by_name(name) for name in listed(formats)]
-            if CSPLAT in forms:
-                write(folder / f"{scene.name}.csplat", model, CSPLAT.name)
+            if any(form.name == "csplat" for form in forms):
+                write(folder / f"{scene.name}.csplat", model, "csplat")
                 model = read(folder / f"{scene.name}.csplat")
             pictures = {(name, _OURS): engine.drawn(model, camera, DEGREE) for name, engine in wanted}
             for form in forms:
                 path = folder / f"{scene.name}{form.suffixes[0]}"
-                if form is not CSPLAT:
+                if form.name != "csplat":
                     write(path, model, form.name)
                 for name, engine in wanted:
                     if form.name in engine.reads:
