@@ -34,8 +34,6 @@ SOURCES = {
     "c.md": "codec/c/README.md",
     "format.md": "spec/format.md",
     "conformance.md": "conformance/README.md",
-    "codec-figures.md": "codec/FIGURES.md",
-    "trainer-figures.md": "trainer/FIGURES.md",
     "extremes.md": "codec/EXTREMES.md",
     "architecture.md": "ARCHITECTURE.md",
     "contributing.md": "CONTRIBUTING.md",
