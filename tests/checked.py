@@ -1,17 +1,23 @@
-"""Files for tests: encoded with everything checked, or read along the axes of their format."""
+"""Helpers on models for tests: encode with everything checked, read along the axes of a format, covariances."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
 
 import csplat
 from csplat.disk_files import local_file
 from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.encoder.error_bounds import measured_sums
+from csplat.errors import InputError
 from csplat.formats import detect_format
+from csplat.model import normalise_quats
 from csplat_conformance.validator import validate
 
 
 def encoded(model, importance=None, **options):
-    """Encode, and check what must hold of any file."""
+    """Encode; assert that the file is valid and that its declared errors hold."""
     result = encode_with_report(model, EncodeOptions(**options), importance=importance)
     assert () == tuple(validate(result.data).violations)
     decoded = csplat.decode(result.data)
@@ -22,11 +28,62 @@ def encoded(model, importance=None, **options):
 
 
 def measure_errors(source, decoded, source_index):
-    """(max, rms) by measure of the spec of a decoded model against its source."""
+    """Return (max, rms) of a decoded model against its source, by measure of the spec."""
     return measured_sums(source, decoded, source_index).bounds()
 
 
 def checked(file):
-    """A scene along the axes of its file."""
+    """Read a scene along the axes of its file."""
     with local_file(file) as path, detect_format(path).open(path) as scene:
         return scene.model()
+
+
+def refusals(path, cases, read=csplat.read):
+    """Write each case to a file and read it; return the message of each InputError, and "" for each success."""
+    messages = []
+    for data in cases:
+        path.write_bytes(data)
+        try:
+            read(path)
+        except InputError as error:
+            messages.append(str(error))
+        else:
+            messages.append("")
+    return messages
+
+
+def flipped(data, places, mask=lambda at: 1 << at % 8):
+    """Yield the bytes with one of them changed by a mask, for each place."""
+    for at in places:
+        yield data[:at] + bytes([data[at] ^ mask(at)]) + data[at + 1 :]
+
+
+def covariances(quats, scales):
+    """Compute covariances in float64 from their definition.
+
+    Args:
+        quats: [n, 4], of any length.
+        scales: [n, 3], logarithms.
+
+    Returns:
+        [n, 3, 3].
+    """
+    w, x, y, z = (quats / np.linalg.norm(quats.astype(np.float64), axis=1)[:, None]).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    rotation = np.moveaxis(np.array(rows), 2, 0)
+    return np.einsum("nij,nj,nkj->nik", rotation, np.exp(2 * scales.astype(np.float64)), rotation)
+
+
+def disturbed(model, rng, sigma=1e-3):
+    """Return the model with normal noise on every value."""
+
+    def near(values):
+        return (values + rng.normal(0, sigma, values.shape)).astype(np.float32)
+
+    arrays = {name: near(getattr(model, name)) for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
+    arrays |= {"quats": normalise_quats(arrays["quats"]), "opacities": np.clip(arrays["opacities"], 0, 1)}
+    return replace(model, **arrays)

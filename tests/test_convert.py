@@ -1,4 +1,4 @@
-"""`csplat convert` and `csplat formats`: any format to any other, what is changed on the way, what is lost."""
+"""`csplat convert` and `csplat formats`: conversion between all formats, filters, reports of losses."""
 
 import inspect
 import json
@@ -35,7 +35,7 @@ def ply(tmp_path, make_model):
     return tmp_path / "in.ply"
 
 
-def test_a_ply_becomes_a_csplat_file_and_back(tmp_path, ply):
+def test_a_ply_is_converted_to_csplat_and_back(tmp_path, ply):
     said = json.loads(call("convert", ply, tmp_path / "a.csplat", "--json").stdout)
     assert ("ply", "csplat", 200, 2) == (said["source_format"], said["format"], said["splats"], said["sh_degree"])
     assert ((tmp_path / "a.csplat").stat().st_size, []) == (said["size_bytes"], said["lost"])
@@ -44,7 +44,7 @@ def test_a_ply_becomes_a_csplat_file_and_back(tmp_path, ply):
     assert (csplat.decode(tmp_path / "a.csplat").means == read_ply(tmp_path / "b.ply").means).all()
 
 
-def test_what_is_lost_is_said_refused_and_foretold(tmp_path, ply):
+def test_losses_are_reported_refused_and_predicted(tmp_path, ply):
     out = tmp_path / "out.csplat"
     assert "lost on the way: precision of means" in call("convert", ply, out, "--dry-run").stderr
     refused = call("convert", ply, out, "--no-loss", status=1).stderr
@@ -55,7 +55,7 @@ def test_what_is_lost_is_said_refused_and_foretold(tmp_path, ply):
     assert expected == pytest.approx((tmp_path / "out.ply").stat().st_size, rel=0.05)
 
 
-def test_columns_that_are_lost_are_named_by_every_command(tmp_path, make_model):
+def test_dropped_columns_are_reported_by_every_command(tmp_path, make_model):
     source = tmp_path / "a.ply"
     write_ply(source, replace(make_model(40, 0), extra={"motion_0": np.ones(40, np.float32)}))
     assert "lost on the way: extra columns motion_0" in call("convert", source, tmp_path / "a.spz").stderr
@@ -64,7 +64,7 @@ def test_columns_that_are_lost_are_named_by_every_command(tmp_path, make_model):
     assert "columns motion_0 are not splat attributes" in call("lint", source, status=1).stdout
 
 
-def test_degree_4_is_converted_encoded_and_fixed_where_fewer_bands_are_asked_for(tmp_path, ply):
+def test_degree_4_is_converted_encoded_and_fixed_with_fewer_bands(tmp_path, ply):
     header, _, body = ply.read_bytes().partition(b"end_header\n")
     width = len(body) // 200
     more = b"".join(b"property float f_rest_%d\n" % index for index in range(24, 72))
@@ -91,7 +91,7 @@ def test_degree_4_is_converted_encoded_and_fixed_where_fewer_bands_are_asked_for
         (("in.ply", "--force"), "is the input"),
     ],
 )
-def test_what_cannot_be_meant_is_refused(tmp_path, ply, monkeypatch, words, message):
+def test_invalid_arguments_are_refused(tmp_path, ply, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     before = ply.read_bytes()
     result = CliRunner().invoke(app, ["convert", "in.ply", *words])
@@ -101,7 +101,7 @@ def test_what_cannot_be_meant_is_refused(tmp_path, ply, monkeypatch, words, mess
     assert ["in.ply"] == [one.name for one in tmp_path.iterdir()]
 
 
-def test_a_scene_is_changed_in_the_order_that_help_says(tmp_path, ply):
+def test_filters_are_applied_in_the_documented_order(tmp_path, ply):
     call(
         "convert", ply, tmp_path / "out.ply", "--rotate", "0,0,90", "--scale", "2", "--translate", "1,0,0",
         "--crop-box", "-1,-1,-1,3,1,1", "--sh-degree", "1",
@@ -116,13 +116,13 @@ def test_a_scene_is_changed_in_the_order_that_help_says(tmp_path, ply):
     assert 1 == found.sh_degree
 
 
-def test_a_sphere_is_kept_around_the_places_that_people_see(make_model):
+def test_a_crop_sphere_is_in_world_coordinates(make_model):
     model = make_model(200, 0, origin=(100.0, 0.0, 0.0))
     kept = Filters(crop_sphere=(100.0, 0.0, 0.0, 0.7)).apply(source_from_model(model))
     assert (np.linalg.norm(model.means, axis=1) <= 0.7).sum() == kept.count == len(kept.model())
 
 
-def test_axes_are_turned_and_said(tmp_path, ply):
+def test_axes_are_converted_and_recorded(tmp_path, ply):
     call("convert", ply, tmp_path / "a.ply", "--to-axes", "RUB")
     call("convert", tmp_path / "a.ply", tmp_path / "b.ply", "--to-axes", "RDF")
     source, there, back = read_ply(ply), read_ply(tmp_path / "a.ply"), read_ply(tmp_path / "b.ply")
@@ -132,14 +132,14 @@ def test_axes_are_turned_and_said(tmp_path, ply):
 
 
 def lonely(seed=0):
-    """A ball of fine splats; three that float, of which one is so large that it has company."""
+    """Return a ball of fine splats and three floaters, one of them large enough to touch the ball."""
     rng = np.random.default_rng(seed)
     points = rng.standard_normal((3000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     return np.concatenate([points, [[3, 0, 0], [0, 50.0, 0], [2.5, 0, 0]]]), np.r_[np.full(3002, 0.03), 1.0]
 
 
-def test_splats_without_company_float():
+def test_floaters_are_splats_without_neighbours():
     points, sizes = lonely()
     assert [3000, 3001] == np.flatnonzero(find_floaters(points, sizes)).tolist()
     assert not find_floaters(points[:5], sizes[:5]).any()
@@ -160,7 +160,7 @@ def test_floaters_are_dropped():
     assert 3001 == left.count == len(left.model())
 
 
-def test_a_folder_of_sog_is_made(tmp_path, ply):
+def test_sog_is_written_to_a_folder(tmp_path, ply):
     call("convert", ply, tmp_path / "new" / "meta.json")
     assert 200 == len(csplat.read(tmp_path / "new"))
     assert "exists: --force" in call("convert", ply, tmp_path / "new" / "meta.json", status=1).stderr
@@ -174,16 +174,16 @@ def test_formats_are_listed():
     assert ".ply" in call("formats").stdout
 
 
-def test_info_and_lint_take_any_format(tmp_path, ply):
-    told = call("info", ply).stdout
-    assert "200, SH degree 2" in told
-    assert told.startswith("PLY, ")
+def test_info_and_lint_accept_any_format(tmp_path, ply):
+    text = call("info", ply).stdout
+    assert "200, SH degree 2" in text
+    assert text.startswith("PLY, ")
     assert 200 == json.loads(call("info", ply, "--json").stdout)["splats"]
     assert "nothing found" in call("lint", ply).stdout
     assert "E_INPUT" in call("info", ply, "--page", tmp_path / "p.html", status=1).stderr
 
 
-def test_what_has_fixed_axes_comes_back_as_it_went(tmp_path, ply):
+def test_formats_with_fixed_axes_convert_there_and_back(tmp_path, ply):
     there = json.loads(call("convert", ply, tmp_path / "a.spz", "--json").stdout)
     back = json.loads(call("convert", tmp_path / "a.spz", tmp_path / "b.ply", "--json").stdout)
     assert (["unspecified", "RUB"], ["RDF", "RDF"]) == (there["axes"], back["axes"])
@@ -198,7 +198,7 @@ BOTH = [one.name for one in formats.formats() if one.open is not None and one.wr
 
 
 def made(number):
-    """Return a scene of a few splats; its count, degree and sizes depend on the number."""
+    """Return a scene of a few splats, whose count, degree and sizes depend on the number."""
     rng, count, degree = np.random.default_rng(number), 1 + number % 5, number % 4
     return SplatModel(
         means=((1e-3, 1.0, 50.0)[number % 3] * rng.standard_normal((count, 3))).astype(np.float32),
@@ -211,19 +211,18 @@ def made(number):
 
 
 @pytest.mark.slow
-def test_what_two_formats_call_exact_is_exact_from_one_to_the_other(tmp_path):
+def test_arrays_that_are_exact_in_two_formats_are_converted_exactly(tmp_path):
     pairs = {f"{first} to {second}": (first, second) for first in BOTH for second in BOTH}
     cases = {name: (*pair, made(number)) for number, (name, pair) in enumerate(pairs.items())}
-    assert [] == failures(cases, lambda case: keeps_what_both_call_exact(tmp_path, *case))
+    assert [] == failures(cases, lambda case: assert_exact_arrays_are_kept(tmp_path, *case))
 
 
-def keeps_what_both_call_exact(tmp_path, first, second, model):
+def assert_exact_arrays_are_kept(tmp_path, first, second, model):
     one, other = formats.format_by_name(first), formats.format_by_name(second)
     a, b = tmp_path / f"a{one.suffixes[0]}", tmp_path / f"b{other.suffixes[0]}"
     formats.write(a, model, first)
-    converted = convert_file(
-        str(a), str(b), read_as=first, write_as=second, filters=Filters(to_axes=other.axes or "RDF")
-    )
+    filters = Filters(to_axes=other.axes or "RDF")
+    converted = convert_file(str(a), str(b), read_as=first, write_as=second, filters=filters)
     source, found = (
         convert_axes(source_from_model(formats.read(path, name)), "RDF").model()
         for path, name in ((a, first), (b, second))
@@ -239,13 +238,13 @@ def keeps_what_both_call_exact(tmp_path, first, second, model):
             assert np.allclose(left, right, rtol=2e-7, atol=0)
         else:
             assert (left == right).all(), name
-    places = (np.sort(one.means, axis=0) for one in (source, found))  # some formats have an order of their own
+    places = (np.sort(one.means, axis=0) for one in (source, found))  # some formats reorder splats
     assert np.allclose(*places, atol=1e-2 * max(1.0, np.abs(source.means).max()))
     assert min(source.sh_degree, other.degree) == found.sh_degree
 
 
 @pytest.mark.slow
-def test_every_command_that_reads_scenes_can_be_told_what_a_file_is(tmp_path, ply):
+def test_every_command_that_reads_scenes_has_the_option_from(tmp_path, ply):
     call("convert", ply, tmp_path / "a.splat")
     bare = tmp_path / "bare"
     (tmp_path / "a.splat").rename(bare)
@@ -260,7 +259,7 @@ def test_every_command_that_reads_scenes_can_be_told_what_a_file_is(tmp_path, pl
         assert "read_as" in inspect.signature(command_function(name)).parameters, name
 
 
-def test_a_packed_scene_that_fits_the_memory_is_unpacked_once(tmp_path, make_model, monkeypatch):
+def test_a_packed_scene_is_unpacked_once(tmp_path, make_model, monkeypatch):
     csplat.write(tmp_path / "a.spz", make_model(50, 1))
     unpacked, read = [], spz.read_spz_file
 
@@ -269,9 +268,8 @@ def test_a_packed_scene_that_fits_the_memory_is_unpacked_once(tmp_path, make_mod
         return read(*words, any_degree=any_degree)
 
     monkeypatch.setattr(spz, "read_spz_file", counting)
-    encode_file(
-        str(tmp_path / "a.spz"), str(tmp_path / "a.csplat"), EncodeOptions(), scale=OutOfCoreOptions(out_of_core=True)
-    )
+    scale = OutOfCoreOptions(out_of_core=True)
+    encode_file(str(tmp_path / "a.spz"), str(tmp_path / "a.csplat"), EncodeOptions(), scale=scale)
     assert 1 == len(unpacked)
     with open_scenes((tmp_path / "a.spz", tmp_path / "a.spz"), 1 << 30) as (one, _):
         assert 50 == one.count

@@ -9,6 +9,7 @@ import tracemalloc
 import zlib
 
 import pytest
+from tables import failures
 
 import csplat
 from csplat import _spec
@@ -33,7 +34,9 @@ from csplat_authoring.scene import Chunk
 from csplat_conformance.manifest import VECTORS
 
 SMALL = (VECTORS / "valid" / "worked_example.csplat").read_bytes()
-RICH = build(rich_scene()).data
+BUILT = build(rich_scene())
+RICH = BUILT.data
+SMALL_LIMITS = Limits(bytes=50_000_000, json_bytes=100_000)
 
 
 @pytest.mark.parametrize("data", [SMALL, RICH], ids=["small", "rich"])
@@ -58,8 +61,8 @@ def test_every_prefix_with_its_size_and_checksums_repaired_is_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize(("data", "stride"), [(SMALL, 1), (RICH, 37)], ids=["small", "rich"])
 def test_every_flipped_bit_is_refused(data, stride):
-    # CNF-3; of the larger file every 37th bit, which reaches each place within a byte. Behind magic and version
-    # it is a CRC that refuses (HDR-12).
+    # CNF-3; every 37th bit of the larger file, so that each bit position within a byte occurs. After magic and
+    # version a CRC refuses (HDR-12).
     named = 8 * _spec.HEADER_OFFSETS["profile"]
     for bit in range(0, 8 * len(data), stride):
         damaged = bytearray(data)
@@ -71,8 +74,8 @@ def test_every_flipped_bit_is_refused(data, stride):
 
 
 @pytest.mark.slow
-def test_flipped_bits_of_a_part_are_refused_by_who_reads_that_part_alone():
-    # HDR-12; every third bit, which reaches each place within a byte.
+def test_flipped_bits_of_a_part_are_refused_by_its_reader():
+    # HDR-12; every third bit, so that each bit position within a byte occurs.
     layer = read_header(SMALL).tiles[0].layers[0]
     for bit in range(8 * layer.offset, 8 * (layer.offset + layer.size), 3):
         damaged = bytearray(SMALL)
@@ -85,7 +88,7 @@ def test_flipped_bits_of_a_part_are_refused_by_who_reads_that_part_alone():
 @pytest.mark.slow
 def test_flipped_bits_with_all_checksums_repaired_are_refused_or_decoded():
     records = chunk_records(SMALL)
-    # Every seventh bit, which reaches each place within a byte.
+    # Every seventh bit, so that each bit position within a byte occurs.
     for bit in range(0, 8 * len(SMALL), 7):
         damaged = bytearray(SMALL)
         damaged[bit // 8] ^= 1 << bit % 8
@@ -104,16 +107,6 @@ def test_trailing_bytes_are_refused(extra):
     assert ("E_TRAILING", len(SMALL)) == (caught.value.code, caught.value.offset)
 
 
-@pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
-def test_any_buffer_is_decoded(kind):
-    assert 2 == len(csplat.decode(kind(SMALL)))
-
-
-BUILT = build(rich_scene())
-RICH_DATA = BUILT.data
-SMALL_LIMITS = Limits(bytes=50_000_000, json_bytes=100_000)
-
-
 def refusal(data, **arguments) -> CsplatError:
     with pytest.raises((FormatError, UnsupportedError, LimitError)) as caught:
         decode(data, **arguments)
@@ -123,13 +116,13 @@ def refusal(data, **arguments) -> CsplatError:
     return error
 
 
-def test_short_data_that_is_no_beginning_of_a_file():
+def test_short_data_is_truncated_or_no_csplat():
     assert "E_MAGIC" == refusal(b"ply\n").code
     assert "E_TRUNCATED" == refusal(b"").code
 
 
 def test_the_version_error_names_both_versions():
-    data = bytearray(RICH_DATA)
+    data = bytearray(RICH)
     data[8:12] = struct.pack("<HH", 3, 7)
     error = refusal(data)
     assert "E_VERSION" == error.code
@@ -137,8 +130,8 @@ def test_the_version_error_names_both_versions():
     assert "0.2" in str(error)
 
 
-def test_a_crc_error_says_what_was_found_and_computed():
-    data = bytearray(RICH_DATA)
+def test_a_crc_error_names_the_stored_and_computed_values():
+    data = bytearray(RICH)
     data[16] ^= 1
     computed = zlib.crc32(data[:28])
     stored = int.from_bytes(data[28:32], "little")
@@ -152,7 +145,7 @@ def test_huge_counts_in_a_small_index_cost_nothing():
         assert ("E_INDEX", "IDX-2") == (error.code, error.clause)
 
 
-def test_a_splat_count_that_the_tiles_do_not_hold():
+def test_a_splat_count_other_than_that_of_the_tiles_is_refused():
     assert "IDX-7" == refusal(BUILT.patched({"index.splat_count": 2**63})).clause
 
 
@@ -170,8 +163,8 @@ _EXTREMES = {
 
 
 def extremes(field):
-    """Yield what a field's bytes may become, its first component or its last at its extremes."""
-    now = RICH_DATA[field.offset : field.offset + field.size]
+    """Yield a field's bytes with its first or last component at each extreme."""
+    now = RICH[field.offset : field.offset + field.size]
     if field.format.endswith("s"):
         yield from (bytes(field.size), b"\xff" * field.size)
         return
@@ -184,7 +177,7 @@ def extremes(field):
 
 @pytest.mark.slow
 def test_every_field_at_its_extremes_is_refused_or_decoded_within_limits():
-    # The first and the last place of each field of a structure.
+    # The first and the last occurrence of each field of a structure.
     places = {}
     for name, field in BUILT.fields.items():
         if not name.endswith("crc"):
@@ -192,7 +185,7 @@ def test_every_field_at_its_extremes_is_refused_or_decoded_within_limits():
     tried = 0
     first = {names[0] for names in places.values()}
     for name in first | {names[-1] for names in places.values()}:
-        # Every other value at the last place of a field.
+        # Every other value at the last occurrence.
         for value in [*extremes(BUILT.fields[name])][:: 1 if name in first else 2]:
             check_one(BUILT.patched({name: value}))
             tried += 1
@@ -200,7 +193,7 @@ def test_every_field_at_its_extremes_is_refused_or_decoded_within_limits():
 
 
 def check_one(data: bytes) -> None:
-    """Decode both ways: no error but ours, and both ways agree."""
+    """Decode to floats and to integers; both succeed or both fail with an error of csplat."""
     errors = [error_of(function, data) for function in (decode, decode_integers)]
     assert (errors[0] is None) == (errors[1] is None)
     for error in filter(None, errors):
@@ -217,10 +210,10 @@ def error_of(function, data: bytes) -> FormatError | UnsupportedError | LimitErr
 
 
 @pytest.mark.slow
-def test_mutations_with_all_checksums_repaired():
+def test_mutations_with_all_checksums_repaired_are_refused_or_decoded():
     rng = random.Random(0)  # noqa: S311 - no secrets here
     for _ in range(int(os.environ.get("CSPLAT_MUTATIONS", "250"))):
-        data = bytearray(RICH_DATA)
+        data = bytearray(RICH)
         for _ in range(rng.choice((1, 1, 2, 4))):
             at = rng.randrange(_spec.HEADER_SIZE, len(data) - 8)
             if rng.random() < 0.5:
@@ -232,7 +225,7 @@ def test_mutations_with_all_checksums_repaired():
         check_one(repair(bytes(data), BUILT.records))
 
 
-def test_the_header_reader_refuses_no_less_of_the_index():
+def test_the_header_reader_checks_the_whole_index():
     for name in ("index.sh_degree", "index.scene_flags", "index.axes"):
         with pytest.raises((FormatError, UnsupportedError)):
             read_header(BUILT.patched({name: b"\7\7\7" if name.endswith("axes") else 255}))
@@ -248,36 +241,24 @@ def deflate(data: bytes) -> bytes:
     return packer.compress(data) + packer.flush()
 
 
-def read(
-    coded=b"abcd",
-    *,
-    width=1,
-    coder=STORED,
-    transforms=NONE,
-    reserved=0,
-    count=4,
-    packed=4,
-    coded_size=None,
-    wanted=4,
-    width_max=4,
-    **arguments,
-):
-    head = _spec.StreamHead(
-        width, coder, transforms, reserved, count, packed, len(coded) if coded_size is None else coded_size
-    )
-    data = memoryview(b"...." + _spec.pack_stream_head(head) + coded)
-    cursor = Cursor(data, 4, len(data), "TLE-3")
-    return read_stream(cursor, wanted, width_max, **arguments)
+def read(coded=b"abcd", *, expected=4, width_max=4, signed=False, count_max=None, **fields):
+    """Read a stream of these bytes, with changed fields in its head."""
+    head = {"width": 1, "coder": STORED, "transforms": NONE, "reserved": 0, "count": 4, "packed": 4}
+    head = {**head, "coded_size": len(coded), **fields}
+    data = memoryview(b"...." + _spec.pack_stream_head(_spec.StreamHead(*head.values())) + coded)
+    more = {} if count_max is None else {"count_max": count_max}
+    return read_stream(Cursor(data, 4, len(data), "TLE-3"), expected, width_max, signed=signed, **more)
 
 
-def test_a_stored_stream():
+def test_a_stored_stream_is_read():
     assert list(b"abcd") == read().tolist()
 
 
 def test_a_deflated_stream_of_three_byte_elements_is_signed():
     data = b"\xff\xff\xff\x00\x00\x80"
     expected = [-1, -(2**23)]
-    assert expected == read(deflate(data), width=3, coder=DEFLATE, count=2, packed=6, wanted=2, signed=True).tolist()
+    found = read(deflate(data), width=3, coder=DEFLATE, count=2, packed=6, expected=2, signed=True)
+    assert expected == found.tolist()
 
 
 @pytest.mark.parametrize(
@@ -301,7 +282,7 @@ def test_a_deflated_stream_of_three_byte_elements_is_signed():
         ({"reserved": 1}, "RES-1", "reserved_0"),
     ],
 )
-def test_heads_that_contradict_their_place(fields, clause, place):
+def test_inconsistent_stream_heads_are_refused(fields, clause, place):
     with pytest.raises(FormatError) as caught:
         read(**fields)
     assert (clause, 4 + _spec.STREAM_HEAD_OFFSETS[place]) == (caught.value.clause, caught.value.offset)
@@ -310,12 +291,12 @@ def test_heads_that_contradict_their_place(fields, clause, place):
 @pytest.mark.parametrize(
     ("fields", "clause"), [({"coder": 2}, "RES-2"), ({"coder": 255}, "RES-2"), ({"transforms": b"\5\0\0\0"}, "RES-2")]
 )
-def test_what_this_version_lacks(fields, clause):
+def test_unsupported_coders_and_transforms_are_refused(fields, clause):
     with pytest.raises(UnsupportedError, match=clause):
         read(**fields)
 
 
-def test_a_head_that_is_cut():
+def test_a_truncated_head_is_refused():
     with pytest.raises(FormatError, match="TLE-3"):
         read_stream(Cursor(memoryview(bytes(19)), 0, 19, "TLE-3"), 1, 1)
 
@@ -337,7 +318,7 @@ def test_a_head_that_is_cut():
         ({"coded": b"a\2\0", "transforms": RUNS, "packed": 3}, "TRF-1"),
     ],
 )
-def test_coded_bytes_that_do_not_give_what_they_should(fields, clause):
+def test_coded_bytes_of_another_size_or_coder_are_refused(fields, clause):
     with pytest.raises(FormatError, match=rf"E_CODER at byte \d+ \({clause}\)"):
         read(**fields)
 
@@ -351,49 +332,33 @@ def test_inflating_stops_at_the_announced_size():
     tracemalloc.stop()
 
 
-def test_a_text_that_exceeds_the_budget():
+def test_a_text_beyond_the_budget_is_refused():
     with pytest.raises(LimitError, match=r"E_LIMIT at byte 12 \(STR-8\)"):
-        read(count=2**32 - 1, packed=2**32 - 1, wanted=None, count_max=10)
+        read(count=2**32 - 1, packed=2**32 - 1, expected=None, count_max=10)
 
 
-def test_the_longest_runs():
-    assert 0 == read(b"\0\xff\xff", transforms=RUNS, count=65536, packed=3, wanted=65536).max()
+def test_the_longest_runs_are_read():
+    assert 0 == read(b"\0\xff\xff", transforms=RUNS, count=65536, packed=3, expected=65536).max()
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        b"",
-        b"{",
-        b"[]",
-        b"1",
-        b"{} x",
-        b"\xef\xbb\xbf{}",
-        b'{"a": NaN}',
-        b'{"a": Infinity}',
-        b'{"a": -Infinity}',
-        b'{"a": 1e999}',
-        b'{"a": ' + b"9" * 5000 + b"}",
-        b'{"a": 1, "a": 2}',
-        b'{"b": {"a": 1, "a": 2}}',
-        b'{"a": "\xff"}',
-        b'{"a": "\\ud800"}',
-        b'{"\\udfff": 1}',
-        b'{"a": "\x01"}',
-        b'{"a": 01}',
-        b"{'a': 1}",
-        b'{"a": ' + b"[" * 64 + b"]" * 64 + b"}",
-        b'{"a": ' + b"[" * 100_000 + b"]" * 100_000 + b"}",
-        b'{"a":' * 5000 + b"1" + b"}" * 5000,
-    ],
-    ids=lambda text: repr(text[:16]),
-)
-def test_what_is_not_strict_json_is_refused(text):
-    with pytest.raises(FormatError, match=r"E_JSON at byte 99 \(JSN-1\)"):
-        parse_json(text, dict, 99)
+NOT_JSON = (
+    b"", b"{", b"[]", b"1", b"{} x", b"\xef\xbb\xbf{}", b'{"a": NaN}', b'{"a": Infinity}', b'{"a": -Infinity}',
+    b'{"a": 1e999}', b'{"a": ' + b"9" * 5000 + b"}", b'{"a": 1, "a": 2}', b'{"b": {"a": 1, "a": 2}}', b'{"a": "\xff"}',
+    b'{"a": "\\ud800"}', b'{"\\udfff": 1}', b'{"a": "\x01"}', b'{"a": 01}', b"{'a': 1}",
+    b'{"a": ' + b"[" * 64 + b"]" * 64 + b"}", b'{"a": ' + b"[" * 100_000 + b"]" * 100_000 + b"}",
+    b'{"a":' * 5000 + b"1" + b"}" * 5000,
+)  # fmt: skip
 
 
-def test_what_is_strict_json_is_read():
+def test_invalid_json_is_refused():
+    def check(text):
+        with pytest.raises(FormatError, match=r"E_JSON at byte 99 \(JSN-1\)"):
+            parse_json(text, dict, 99)
+
+    assert [] == failures({repr(text[:40]): text for text in NOT_JSON}, check)
+
+
+def test_valid_json_is_read():
     deep = b'{"a": ' + b"[" * 63 + b"]" * 63 + b"}"
     assert "a" in parse_json(deep, dict, 0)
     assert {"a": "😀", "b": 10**200} == parse_json(b'{"a": "\\ud83d\\ude00", "b": 1' + b"0" * 200 + b"}", dict, 0)
@@ -401,16 +366,13 @@ def test_what_is_strict_json_is_read():
         parse_json(b"[1]", list, 0)
 
 
-def test_the_three_texts_reach_their_places():
-    data = build(
-        scene(
-            chunks=(
-                Chunk(_spec.CHUNK_METADATA, b'{"licence": "CC0"}'),
-                Chunk(_spec.CHUNK_CAMERAS, b'[{"W": 2}]'),
-                Chunk(_spec.CHUNK_OPTIONS, b'{"preset": "small"}'),
-            )
-        )
-    ).data
+def test_the_three_json_texts_are_read():
+    texts = {
+        _spec.CHUNK_METADATA: b'{"licence": "CC0"}',
+        _spec.CHUNK_CAMERAS: b'[{"W": 2}]',
+        _spec.CHUNK_OPTIONS: b'{"preset": "small"}',
+    }
+    data = build(scene(chunks=tuple(Chunk(*one) for one in texts.items()))).data
     model = decode(data)
     assert ({"licence": "CC0"}, [{"W": 2}]) == (model.metadata, model.cameras)
     assert ({"licence": "CC0"}, [{"W": 2}]) == (read_metadata(data), read_cameras(data))
@@ -427,7 +389,7 @@ def stated(source_count=2, pruned_count=0, flags=0, records=()):
     return build(scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, payload=head + b"".join(body)),))).data
 
 
-def test_stated_errors():
+def test_declared_errors_are_read():
     data = stated(source_count=5, pruned_count=3, flags=1, records=((1, 0.5, 0.25), (4, 1.0, 1.7)))
     errors = read_declared_bounds(data)
     assert errors == decode_scene(data).declared_bounds
@@ -450,6 +412,6 @@ def test_stated_errors():
         ({"flags": 2}, "RES-1"),
     ],
 )
-def test_stated_errors_that_cannot_be(fields, clause):
+def test_impossible_declared_errors_are_refused(fields, clause):
     with pytest.raises(FormatError, match=clause):
         decode(stated(**fields))

@@ -55,24 +55,24 @@ def assert_decodes(described):
     return model
 
 
-def test_a_file_with_everything_gives_what_the_slow_reference_says():
+def test_a_rich_scene_decodes_as_by_the_slow_reference():
     assert_decodes(rich_scene())
 
 
-def test_an_empty_scene():
+def test_an_empty_scene_is_decoded():
     model = assert_decodes(scene(3, ()))
     assert (0, 15, 3) == model.shN.shape
 
 
 @pytest.mark.parametrize("ycocg", [False, True])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_every_degree_and_colour_mapping(degree, ycocg):
+def test_every_degree_and_colour_mapping_is_decoded(degree, ycocg):
     described = scene(degree, (tile(1, 3, degree), tile(2, 5, degree)))
     assert_decodes(replace(described, attributes=attributes(degree, ycocg=ycocg, chroma_shift=3 * ycocg)))
 
 
 @pytest.mark.parametrize("escaped", [False, True])
-def test_one_codebook_for_all_bands(escaped):
+def test_one_codebook_may_serve_all_bands(escaped):
     entries = {band: rows_of(band, 5, 3 * (2 * band + 1), -60, 60) for band in (1, 2, 3)}
     indices = (0, 5 if escaped else 4, 3, 1)
     escapes = {
@@ -97,8 +97,8 @@ def test_one_codebook_for_all_bands(escaped):
 
 
 @pytest.mark.slow
-def test_tiles_longer_than_a_run_of_the_decoder():
-    # The slow reference computes some splats: the first, those around the end of the first run, the last.
+def test_tiles_longer_than_a_run_of_the_decoder_are_decoded():
+    # The slow reference computes the first and last splats, and those around the end of the first run.
     count, entries = 17_000, {1: rows_of(0, 5, 9, -60, 60)}
     blocks, index = tile(3, count, 0).blocks, np.array(rows_of(1, count, 1, 0, 5)).ravel()
     escapes, place = rows_of(2, np.count_nonzero(index == 5), 9, -900, 900), np.cumsum(index == 5) - 1
@@ -112,7 +112,7 @@ def test_tiles_longer_than_a_run_of_the_decoder():
         codebooks = (Codebook(4, _spec.CODEBOOK_KIND_SH, entries, (1, 1)),)
         return replace(made, attributes=attributes(1, ycocg=True), codebooks=codebooks)
 
-    box = {*means.argmin(axis=0).tolist(), *means.argmax(axis=0).tolist()}  # holds for part of the tile, too
+    box = {*means.argmin(axis=0).tolist(), *means.argmax(axis=0).tolist()}  # so that the part has the same box
     rows = sorted(box | {*range(100), *range(16_300, 16_500), *range(count - 50, count)})
     data, part = build(described(range(count))).data, described(rows)
     assert_same(decode(data, tiles=[0]), assert_decodes(part).select(slice(0, len(rows))), rows)
@@ -125,18 +125,18 @@ def test_tiles_longer_than_a_run_of_the_decoder():
 
 @pytest.mark.parametrize("how", [(), (1,), (2,), (1, 2), (1, 2, 3), (4,), (3, 4), (1, 2, 3, 4)])
 @pytest.mark.parametrize("coder", ["stored", "deflate_fixed", "deflate_dynamic"])
-def test_every_transform_and_coder(how, coder):
+def test_every_transform_and_coder_is_decoded(how, coder):
     described = scene(1, (tile(1, 6, 1),))
     assert_decodes(with_stream_codings(described, lambda stream: replace(stream, transforms=how, coder=coder)))
 
 
 @pytest.mark.parametrize("width", [2, 3, 7])
-def test_morton_of_any_width(width):
+def test_morton_codes_of_any_width_are_decoded(width):
     rows = means_rows(1, 9, 31)
     assert_decodes(scene(0, (tile(1, 9, 0, {_spec.ATTRIBUTE_MEANS: morton(rows, 5, Stream(width))}),)))
 
 
-def test_corners_and_axes_at_their_largest():
+def test_the_largest_corners_and_axes_are_decoded():
     rows = [[0, 0, 0], [2**24 - 1, 5, 2**24 - 1]]
     corner = (2**53 - 2**24 + 1, -(2**53), 0)
     assert_decodes(scene(0, (tile(1, 2, 0, {_spec.ATTRIBUTE_MEANS: axis(rows, Stream(3))}, corner=corner),)))
@@ -150,7 +150,7 @@ def test_the_model_passes_its_own_constructor():
     assert np.dtype("<u2") == model.extra["label"].dtype
 
 
-def test_any_buffer_will_do(tmp_path):
+def test_any_buffer_path_or_stream_is_decoded(tmp_path):
     path = tmp_path / "scene.csplat"
     path.write_bytes(RICH)
     full = decode(RICH)
@@ -177,7 +177,7 @@ def test_parts_equal_the_same_parts_of_the_whole(tiles, degree):
     assert everything["exponents"][tiles, : integers["exponents"].shape[1]].tolist() == integers["exponents"].tolist()
 
 
-def test_tiles_one_by_one():
+def test_tiles_are_decoded_one_by_one():
     # CNF-4
     full = decode(RICH)
     found = list(iter_tiles(RICH))
@@ -188,17 +188,17 @@ def test_tiles_one_by_one():
 
 
 @pytest.mark.parametrize("threads", [1, 2, 7])
-def test_threads_change_nothing(threads):
+def test_the_number_of_threads_does_not_change_the_result(threads):
     assert_same(decode(RICH), decode(RICH, threads=threads))
 
 
-def test_a_whole_decode_says_which_checks_it_made():
+def test_a_decode_reports_its_checks():
     assert "all_chunk_crcs" in decode_scene(RICH).checks
     assert "all_chunk_crcs" not in decode_scene(RICH, tiles=[0]).checks
     assert 0.25 == decode_scene(RICH).declared_bounds.records[0].rms
 
 
-def test_a_damaged_layer_spares_those_who_do_not_read_it():
+def test_a_damaged_layer_fails_only_when_read():
     layer = read_header(RICH).tiles[1].layers[2]
     data = bytearray(RICH)
     data[layer.offset + layer.size - 1] ^= 1
@@ -211,7 +211,7 @@ def test_a_damaged_layer_spares_those_who_do_not_read_it():
     decode(data, sh_degree=1)
 
 
-def test_the_header_needs_no_more_than_the_index():
+def test_the_header_is_read_from_the_first_bytes():
     header = read_header(RICH)
     assert header == read_header(RICH[: _spec.HEADER_SIZE + header.index_size])
     with pytest.raises(FormatError, match="E_TRUNCATED"):
@@ -234,7 +234,7 @@ def test_an_unknown_chunk_is_skipped_and_its_crc_checked():
     ("limits", "name"),
     [(Limits(splats=4), "splats"), (Limits(bytes=5 * (14 + 24) * 4), "bytes"), (Limits(json_bytes=15), "json_bytes")],
 )
-def test_limits(limits, name):
+def test_limits_are_enforced(limits, name):
     with pytest.raises(LimitError, match="E_LIMIT at byte") as caught:
         decode(RICH, limits=limits)
     assert name == caught.value.limit
@@ -249,7 +249,7 @@ def test_limits(limits, name):
         (_spec.CODEBOOK_KIND_SH, (2, 2), {2: 15}),
     ],
 )
-def test_a_budget_counts_four_bytes_for_each_entry_and_column_of_a_codebook(kind, bands, columns):
+def test_the_budget_includes_codebooks(kind, bands, columns):
     entries = {layer: [[0] * c] * 7 for layer, c in columns.items()}
     built = build(replace(scene(3), codebooks=(Codebook(4, kind, entries, bands),)))
     arrays = 2 * 4 * (3 + 4 + 3 + 1 + 3 * 16)
@@ -260,7 +260,7 @@ def test_a_budget_counts_four_bytes_for_each_entry_and_column_of_a_codebook(kind
         decode(built.data, limits=Limits(bytes=limit - 1))
 
 
-def test_limits_bind_the_chosen_tiles():
+def test_limits_apply_to_the_chosen_tiles():
     assert 2 == len(decode(RICH, limits=Limits(splats=2), tiles=[1]))
     assert 2 == len(list(iter_tiles(RICH, limits=Limits(splats=5))))
     with pytest.raises(LimitError, match="splats"):
@@ -270,12 +270,12 @@ def test_limits_bind_the_chosen_tiles():
 @pytest.mark.parametrize(
     "arguments", [{"tiles": [2]}, {"tiles": [-1]}, {"sh_degree": 4}, {"sh_degree": -1}, {"threads": 0}]
 )
-def test_arguments_at_fault(arguments):
+def test_invalid_arguments_are_refused(arguments):
     with pytest.raises(InputError):
         decode(RICH, **arguments)
 
 
-def test_codebooks_that_no_tile_names_are_checked_and_counted():
+def test_unused_codebooks_are_checked_and_counted():
     entries = {1: rows_of(1, 40, 9, -60, 60)}
     described = replace(scene(1), codebooks=(Codebook(4, _spec.CODEBOOK_KIND_SH, entries, (1, 1)),))
     built = build(described)

@@ -16,13 +16,13 @@ import csplat
 from csplat import SplatModel
 from csplat.encoder import PRESETS, EncodeOptions, encode, encode_with_report
 from csplat.encoder.error_bounds import ErrorSums
-from csplat.errors import CsplatError, InputError
+from csplat.errors import InputError
 
 PRESET_NAMES = tuple(PRESETS)
 
 
 def round_trip(model: SplatModel, importance: np.ndarray | None = None, **options: object):
-    """Encode, decode, and check the stated errors against the measured ones."""
+    """Encode and decode; assert that the declared errors bound the measured ones."""
     result = encode_with_report(model, EncodeOptions(**options), importance=importance)
     decoded = csplat.decode(result.data)
     assert len(model) == len(decoded)
@@ -37,15 +37,15 @@ def round_trip(model: SplatModel, importance: np.ndarray | None = None, **option
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_comes_back_within_stated_errors(make_model, preset, degree):
+def test_scenes_decode_within_declared_errors(make_model, preset, degree):
     # CNF-5, SRC-4
     decoded, _ = round_trip(make_model(500, degree), preset=preset)
     assert degree >= decoded.sh_degree
 
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
-def test_errors_of_far_doubles_are_stated_against_the_doubles(make_model, preset):
-    # 5.5: the distance of origin + mean from the source's centre; float32 leaves off what shows in the sixth digit
+def test_errors_of_means_in_doubles_are_declared_against_the_doubles(make_model, preset):
+    # 5.5: the distance of origin + mean from the source's mean. Rounding to float32 changes its sixth digit.
     origin = (481_250.0, 5_467_100.0, 310.0)
     doubles = np.random.default_rng(1).normal(0, 40, (400, 3)) + np.array(origin)
     means = (doubles - np.array(origin)).astype(np.float32)
@@ -63,26 +63,26 @@ def test_errors_of_far_doubles_are_stated_against_the_doubles(make_model, preset
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 99, 100, 101, 300])
-def test_any_count_comes_back(make_model, count):
+def test_scenes_of_any_count_decode(make_model, count):
     round_trip(make_model(count, 1), tile_splats=100)
 
 
 @pytest.mark.parametrize("coding", ["codebook", "scalar", "none"])
 @pytest.mark.parametrize("degree", [1, 2, 3])
-def test_every_sh_coding_comes_back(make_model, coding, degree):
+def test_every_sh_coding_decodes(make_model, coding, degree):
     decoded, result = round_trip(make_model(400, degree), sh_coding=coding, tile_splats=150)
     assert (0 if coding == "none" else degree) == decoded.sh_degree
     assert coding == result.report.options["sh_coding"]
 
 
 @pytest.mark.parametrize("escapes", [0.0, 0.1, 1.0])
-def test_codebooks_with_escapes_come_back(make_model, escapes):
+def test_codebooks_with_escapes_decode(make_model, escapes):
     round_trip(make_model(300, 2), sh_coding="codebook", codebook_size=16, escape_fraction=escapes)
 
 
 @pytest.mark.parametrize("means_coding", ["morton", "axis"])
 @pytest.mark.parametrize("deflate", ["libdeflate", "zlib"])
-def test_codings_change_bytes_but_not_what_is_decoded(make_model, means_coding, deflate):
+def test_codings_of_means_do_not_change_the_decoded_means(make_model, means_coding, deflate):
     model = make_model(300, 0)
     decoded, result = round_trip(model, means_coding=means_coding, deflate=deflate)
     reference, other = round_trip(model)
@@ -91,7 +91,7 @@ def test_codings_change_bytes_but_not_what_is_decoded(make_model, means_coding, 
     )
 
 
-def test_what_a_ply_forgets_comes_back(make_model):
+def test_all_metadata_decode(make_model):
     model = make_model(
         20,
         1,
@@ -112,7 +112,7 @@ def test_what_a_ply_forgets_comes_back(make_model):
         assert column.dtype == decoded.extra[name].dtype
 
 
-def test_extra_columns_stay_behind_unless_asked_for(make_model):
+def test_extra_columns_are_dropped_by_default(make_model):
     model = make_model(20, 0, extra={"id": np.arange(20, dtype=np.int32)})
     assert {} == dict(round_trip(model)[0].extra)
 
@@ -134,14 +134,14 @@ def test_extra_columns_keep_their_bits_in_any_byte_order(make_model, dtype):
     assert model.extra["id"][result.source_index].tobytes() == kept.tobytes()
 
 
-def test_absent_bands_cost_nothing(make_model):
+def test_bands_of_zeros_cost_nothing(make_model):
     model = make_model(2000, 1)
     silent = replace(model, shN=np.zeros((2000, 15, 3), np.float32))
     plain = replace(model, shN=np.zeros((2000, 0, 3), np.float32))
     assert len(encode(silent)) - len(encode(plain)) < 200
 
 
-def test_sh_degree_cuts_bands_and_states_what_that_costs(make_model):
+def test_sh_degree_drops_bands_and_declares_their_error(make_model):
     model = make_model(200, 3)
     decoded, result = round_trip(model, sh_degree=1)
     assert 1 == decoded.sh_degree
@@ -149,7 +149,7 @@ def test_sh_degree_cuts_bands_and_states_what_that_costs(make_model):
 
 
 @pytest.mark.parametrize("bits", [4, 10, 16])
-def test_means_in_bits_err_by_half_a_step_of_the_box(make_model, bits):
+def test_errors_of_means_are_within_half_a_step_of_the_box(make_model, bits):
     model = make_model(1000, 0)
     decoded, result = round_trip(model, position_bits=bits)
     extent = float(np.ptp(model.means, axis=0).max())
@@ -159,12 +159,12 @@ def test_means_in_bits_err_by_half_a_step_of_the_box(make_model, bits):
 
 @pytest.mark.parametrize("magnitude", [1e-30, 1e-10, 1.0, 1e7, 1e30])
 @pytest.mark.parametrize("preset", PRESET_NAMES)
-def test_coordinates_of_any_magnitude(make_model, magnitude, preset):
+def test_means_of_any_magnitude_decode(make_model, magnitude, preset):
     model = make_model(300, 0)
     round_trip(replace(model, means=(model.means * magnitude).astype(np.float32)), preset=preset)
 
 
-def test_a_scene_far_from_zero_keeps_what_float32_has(make_model):
+def test_a_scene_far_from_zero_keeps_the_precision_of_float32(make_model):
     model = make_model(300, 0)
     far = replace(model, means=(model.means * 50 + np.float32(1e7)).astype(np.float32))
     decoded, result = round_trip(far, position_bits=16)
@@ -178,14 +178,14 @@ def test_an_origin_keeps_a_far_scene_as_accurate_as_one_at_zero(make_model):
     np.testing.assert_array_equal(near.means, far.means)
 
 
-def test_all_splats_in_one_point(make_model):
+def test_splats_at_one_point_decode(make_model):
     model = make_model(100, 0)
     same = replace(model, means=np.full((100, 3), 3.14159, np.float32))
     decoded, _ = round_trip(same, position_bits=16)
     np.testing.assert_allclose(decoded.means, same.means, atol=float(np.spacing(np.float32(3.14159))))
 
 
-def test_what_lies_on_a_grid_of_powers_of_two_comes_back_as_it_was(make_model):
+def test_values_on_a_grid_of_powers_of_two_are_exact(make_model):
     model = make_model(800, 0)
     means, scales = np.rint(model.means * 1024) / 1024, np.rint(model.scales * 16) / 16
     decoded, result = round_trip(replace(model, means=means, scales=scales), attribute_psnr=80)
@@ -202,7 +202,7 @@ def test_what_lies_on_a_grid_of_powers_of_two_comes_back_as_it_was(make_model):
 
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
-def test_extreme_values_come_back(make_model, preset):
+def test_extreme_values_decode(make_model, preset):
     model = make_model(64, 3)
     scales = model.scales.copy()
     scales[:8], scales[8:16] = 60, -60
@@ -221,18 +221,18 @@ def test_extreme_values_come_back(make_model, preset):
 
 @pytest.mark.parametrize("step", [1e-250, 1e250])
 @pytest.mark.parametrize("magnitude", [1e-38, 1.0, 3e38])
-def test_any_step_for_any_magnitude(make_model, step, magnitude):
+def test_steps_of_any_size_decode(make_model, step, magnitude):
     model = make_model(60, 0)
     round_trip(replace(model, means=np.sign(model.means) * np.float32(magnitude)), position_step=step)
 
 
-def test_an_error_that_no_file_can_state_is_refused():
+def test_an_error_beyond_the_range_of_the_format_is_refused():
     with pytest.raises(InputError, match="covariance"):
         ErrorSums(3, {"covariance": 1e160}, {"covariance": math.inf}).declared()
 
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
-def test_the_ends_of_float32_come_back(make_model, preset):
+def test_values_at_the_ends_of_float32_decode(make_model, preset):
     model = make_model(64, 1)
     model.means[0], model.means[1] = 3e38, -3e38
     model.scales[2] = 3e38
@@ -241,7 +241,7 @@ def test_the_ends_of_float32_come_back(make_model, preset):
 
 
 @pytest.mark.parametrize("far", [1e3, 1e12, 3e38])
-def test_an_outlier_harms_nobody(make_model, far):
+def test_an_outlier_does_not_change_the_precision_of_others(make_model, far):
     model = make_model(3000, 0)
     alone, first = round_trip(model)
     outlier = np.concatenate([model.means, [[far, 0, 0]]]).astype(np.float32)
@@ -258,7 +258,7 @@ magnitudes = st.sampled_from([1e-38, 1e-30, 1e-7, 1e-3, 1.0, 1e3, 1e7, 1e20, 1e3
 
 @st.composite
 def wild_models(draw):
-    """Splats whose magnitudes differ as much as float32 lets them."""
+    """Draw models whose magnitudes span the range of float32."""
     count = draw(st.integers(0, 12))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
 
@@ -280,7 +280,7 @@ def wild_models(draw):
 @pytest.mark.slow
 @given(wild_models(), st.sampled_from(PRESET_NAMES), st.sampled_from(["scalar", "codebook"]))
 @settings(max_examples=40, suppress_health_check=list(HealthCheck))
-def test_mixtures_of_magnitudes_come_back_or_are_refused(model, preset, coding):
+def test_mixtures_of_magnitudes_decode_or_are_refused(model, preset, coding):
     # CNF-6
     with suppress(InputError):
         round_trip(model, preset=preset, sh_coding=coding)
@@ -295,29 +295,20 @@ def test_bytes_do_not_depend_on_threads(make_model, coding):
     assert one == two == four
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("preset", "tiny"),
-        ("position_bits", 17),
-        ("position_bits", 8.5),
-        ("sh_degree", 4),
-        ("quat_levels", 2),
-        ("deflate_level", 0),
-        ("scale_step", 0),
-        ("scale_step", float("nan")),
-        ("sh_step", "0.1"),
-        ("tile_splats", None),
-        ("seed", -1),
-        ("threads", 0),
-    ],
-)
-def test_refuses_options_out_of_range(name, value):
-    with pytest.raises(InputError, match=name):
-        EncodeOptions(**{name: value})
+OUT_OF_RANGE = (
+    ("preset", "tiny"), ("position_bits", 17), ("position_bits", 8.5), ("sh_degree", 4), ("quat_levels", 2),
+    ("deflate_level", 0), ("scale_step", 0), ("scale_step", math.nan), ("sh_step", "0.1"), ("tile_splats", None),
+    ("seed", -1), ("threads", 0),
+)  # fmt: skip
 
 
-def test_numpys_numbers_are_numbers(make_model):
+def test_options_out_of_range_are_refused():
+    for name, value in OUT_OF_RANGE:
+        with pytest.raises(InputError, match=name):
+            EncodeOptions(**{name: value})
+
+
+def test_options_accept_scalars_of_numpy(make_model):
     model = make_model(20, 1)
     options = EncodeOptions(position_bits=np.int64(12), scale_step=np.float32(0.25), sh_step=np.float64(0.1))
     assert encode(model, options) == encode(model, EncodeOptions(position_bits=12, scale_step=0.25, sh_step=0.1))
@@ -327,17 +318,17 @@ def test_numpys_numbers_are_numbers(make_model):
     "bad",
     [np.ones(3), -np.ones(10), np.full(10, np.nan), np.ones(10, complex), np.full(10, "1"), np.zeros(10, "M8[s]")],
 )
-def test_refuses_an_importance_that_does_not_fit(make_model, bad):
+def test_an_invalid_importance_is_refused(make_model, bad):
     with pytest.raises(InputError, match="importance"):
         encode_with_report(make_model(10, 1), importance=bad)
 
 
-def test_refuses_metadata_that_is_not_json(make_model):
+def test_metadata_beyond_json_are_refused(make_model):
     with pytest.raises(InputError, match="JSON"):
         encode(make_model(3, 0, metadata={"title": {1, 2}}))
 
 
-def test_importance_decides_who_is_coded_finely(make_model):
+def test_important_splats_have_smaller_errors(make_model):
     model = make_model(800, 3)
     importance = np.where(np.arange(800) < 80, 1.0, 1e-6)
     options = EncodeOptions(preset="small")
@@ -372,29 +363,29 @@ def test_coarse_chroma_does_not_wrap_at_the_end_of_its_type(make_model, shift, r
 
 
 @pytest.mark.parametrize("coding", ["codebook", "scalar"])
-def test_invisible_splats_are_no_special_case(make_model, coding):
+def test_transparent_splats_decode(make_model, coding):
     model = make_model(600, 2, opacities=np.zeros(600, np.float32))
     decoded, _ = round_trip(model, preset="small", sh_coding=coding, adaptive=1.0)
     assert decoded.shN.any()
 
 
-def test_wild_colours_of_an_invisible_splat_do_not_decide_how_sh_is_coded(make_model):
+def test_sh_outliers_of_a_transparent_splat_do_not_prevent_a_codebook(make_model):
     model = make_model(600, 2)
     model.shN[5] = 1e3
     model.opacities[5] = 0.0
     decoded, result = round_trip(model, sh_coding="codebook", escape_fraction=0.0)
     assert "codebook" == result.report.options["sh_coding"]
     place = int(np.flatnonzero(result.source_index == 5)[0])
-    assert np.abs(decoded.shN[place] - 1e3).max() < 1.0  # it was clipped for the clustering, so it escapes
+    assert np.abs(decoded.shN[place] - 1e3).max() < 1.0  # clipped for the clustering, it is coded as an escape
 
 
-def test_options_stand_in_the_file(make_model):
+def test_options_are_recorded_in_the_file(make_model):
     result = encode_with_report(make_model(10, 1), EncodeOptions(preset="small", seed=7))
     assert {"preset": "small", "seed": 7} == result.report.options["asked"]
     assert json.dumps(result.report.options, sort_keys=True)
 
 
-def test_progress_names_its_stages_and_ends_at_one(make_model):
+def test_progress_of_each_stage_ends_at_1(make_model):
     seen: dict[str, float] = {}
     encode_with_report(
         make_model(500, 2), EncodeOptions(sh_coding="codebook", tile_splats=100), progress=seen.__setitem__
@@ -402,7 +393,7 @@ def test_progress_names_its_stages_and_ends_at_one(make_model):
     assert {"codebook": 1.0, "tiles": 1.0} == seen
 
 
-def test_huge_values_get_tiles_of_their_own_and_are_named(make_model):
+def test_huge_values_get_tiles_of_their_own_and_are_reported(make_model):
     model = make_model(300, 1)
     assert () == encode_with_report(model).report.notes
     rest = model.shN.copy()
@@ -416,7 +407,7 @@ def test_huge_values_get_tiles_of_their_own_and_are_named(make_model):
 
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
-def test_sh_that_no_codebook_can_escape_is_coded_by_itself(make_model, preset):
+def test_sh_beyond_the_escapes_of_a_codebook_is_coded_as_scalars(make_model, preset):
     model = make_model(600, 2)
     rest = model.shN.copy()
     rest[5] = 3e38
@@ -428,8 +419,8 @@ def test_sh_that_no_codebook_can_escape_is_coded_by_itself(make_model, preset):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("preset", "seed"), [(name, seed) for seed, name in enumerate(PRESET_NAMES)])
-def test_large_mixtures_of_magnitudes_come_back(make_model, preset, seed):
-    """Enough splats for cut tiles and codebooks, with importances from nothing to huge."""
+def test_large_mixtures_of_magnitudes_decode(make_model, preset, seed):
+    # Enough splats for several tiles and codebooks.
     rng = np.random.default_rng(seed)
     model = make_model(500, 2, seed)
 
@@ -453,14 +444,10 @@ def test_large_mixtures_of_magnitudes_come_back(make_model, preset, seed):
             assert rms <= result.report.errors[name][1], name
 
 
-def test_zlib_serves_where_libdeflate_is_absent(make_model, monkeypatch):
+def test_zlib_replaces_an_absent_libdeflate(make_model, monkeypatch):
     monkeypatch.setitem(sys.modules, "deflate", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
     _, result = round_trip(make_model(50, 1))
     assert "zlib" == result.report.options["deflate"]
     with pytest.raises(InputError, match="deflate"):
         encode(make_model(5, 0), EncodeOptions(deflate="libdeflate"))
-
-
-def test_errors_are_ours():
-    assert issubclass(InputError, CsplatError)

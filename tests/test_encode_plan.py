@@ -37,7 +37,7 @@ OPTIONS = {
 
 
 @pytest.mark.parametrize("way", OPTIONS)
-def test_the_scene_is_what_a_decoder_sees_but_for_its_colours(make_model, way):
+def test_a_plan_holds_decoded_geometry_and_the_source_colours(make_model, way):
     model = make_model(260, 2)
     plan = EncodePlan.of(model, EncodeOptions(**OPTIONS[way]))
     result = encode_tiles(plan).write()
@@ -48,12 +48,12 @@ def test_the_scene_is_what_a_decoder_sees_but_for_its_colours(make_model, way):
         assert getattr(model, name).tobytes() == getattr(plan.scene, name).tobytes(), name
 
 
-def test_a_plan_makes_the_file_of_encode(make_model):
+def test_encoding_a_plan_equals_encode(make_model):
     model = make_model(300, 3)
     assert encode(model) == encode_tiles(EncodePlan.of(model)).write().data
 
 
-def test_other_colours_change_colours_alone(make_model):
+def test_new_colours_change_only_colours(make_model):
     model = make_model(260, 2)
     plan = EncodePlan.of(model, EncodeOptions(attribute_psnr=80.0))
     fitted = plan.with_colours(model.sh0 + 1, 0 * model.shN)
@@ -86,16 +86,16 @@ def test_a_file_is_written_twice_with_the_same_splats(make_model):
     assert np.array_equal(first.source_index, second.source_index)
 
 
-def test_what_is_said_stands_in_the_options(make_model):
-    said = {"simplified": {"why": "a test"}, "more": 7}
-    result = encode_with_report(make_model(50, 0), metadata=said)
+def test_metadata_is_recorded_in_the_options(make_model):
+    metadata = {"simplified": {"why": "a test"}, "more": 7}
+    result = encode_with_report(make_model(50, 0), metadata=metadata)
     options = read_options(result.data)
     assert result.report.options == options
-    assert said == {name: options[name] for name in said}
+    assert metadata == {name: options[name] for name in metadata}
     assert {"preset": "balanced"} == options["asked"]
 
 
-def test_a_file_says_what_it_stands_for(make_model):
+def test_a_file_declares_its_source_and_pruned_count(make_model):
     model, rows = make_model(300, 1), np.arange(100, 250)
     result = encode_tiles(EncodePlan.of(model.select(rows), origin=Origin(300, rows))).write()
     stated = read_declared_bounds(result.data)
@@ -109,26 +109,26 @@ def test_an_origin_of_other_splats_is_refused(make_model):
         EncodePlan.of(make_model(4, 0), origin=Origin(9, np.arange(5)))
 
 
-def test_the_geometry_of_a_refitted_file_is_proved(make_model):
+def test_the_geometry_of_a_refitted_file_is_verified(make_model):
     source, rows = make_model(400, 3), np.arange(100, 300)
     plan = EncodePlan.of(source.select(rows), origin=Origin(len(source), rows))
     result = encode_tiles(plan.with_colours(plan.scene.sh0 + 1, plan.scene.shN)).write()
     scene = decode_scene(result.data)
-    whole = verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index)
+
+    def verify(source, index=None):
+        return verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, index)
+
+    whole = verify(source, result.source_index)
     assert whole.holds
     assert whole.rms_verified
     assert ["means", "covariance", "opacities"] == [one.name for one in whole.measures if one.holds]
     assert ("sh0", "sh1", "sh2", "sh3") == whole.unverified
-    assert verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds).holds
-    moved = replace(source, means=source.means + np.float32(0.1))
-    assert not verify_bounds(
-        Source.of(moved), scene.model, scene.header, scene.declared_bounds, result.source_index
-    ).holds
-    other = verify_bounds(Source.of(source.select(slice(0, 399))), scene.model, scene.header, scene.declared_bounds)
-    assert "source of 400 splats" in other.failures[0]
+    assert verify(source).holds
+    assert not verify(replace(source, means=source.means + np.float32(0.1)), result.source_index).holds
+    assert "source of 400 splats" in verify(source.select(slice(0, 399))).failures[0]
 
 
-def test_a_file_of_adjusted_shapes_states_its_means_alone(make_model):
+def test_a_file_with_adjusted_shapes_declares_only_errors_of_means(make_model):
     source, rows = make_model(400, 3), np.arange(100, 300)
     adjusted = replace(source, scales=source.scales + np.float32(0.1)).select(rows)
     result = encode_with_report(adjusted, origin=Origin(len(source), rows, refitted=True, adjusted=True))
@@ -140,7 +140,7 @@ def test_a_file_of_adjusted_shapes_states_its_means_alone(make_model):
     assert not verify_bounds(Source.of(moved), scene.model, scene.header, scene.declared_bounds).holds
 
 
-def test_errors_are_stated_against_a_scene_that_was_not_drafted(make_model):
+def test_errors_may_be_declared_against_another_scene(make_model):
     source = make_model(150, 1)
     drawn = replace(source, means=source.means + np.float32(0.25))
     coded = encode_tiles(EncodePlan.of(drawn))
@@ -154,7 +154,7 @@ def test_errors_are_stated_against_a_scene_that_was_not_drafted(make_model):
         assert rms <= stated[1] <= rms * 1.0001 + 1e-11
 
 
-def test_values_that_were_not_touched_freeze_to_the_same_splats(make_model):
+def test_fixed_quantisation_of_unchanged_values_gives_the_same_splats(make_model):
     model = make_model(300, 2)
     plan = EncodePlan.of(model, EncodeOptions(sh_coding="scalar"))
     fixed = fix_quantisation(plan)
@@ -165,16 +165,16 @@ def test_values_that_were_not_touched_freeze_to_the_same_splats(make_model):
         assert np.array_equal(getattr(one, name), getattr(other, name)), name
 
 
-# absent bands
+# Absent bands.
 def sparse_model(source, share):
-    """Bands 2 and 3 of some splats are zero."""
+    """Return the model with bands 2 and 3 of some splats set to zero."""
     shN = 0.1 * source.shN
     shN[np.random.default_rng(0).random(len(source)) < share, 3:] = 0.0
     return replace(source, shN=shN.astype(np.float32))
 
 
 @pytest.mark.parametrize("options", [{}, {"tile_splats": 50}, {"deflate_level": 1}, {"adaptive": 0.5}])
-def test_absent_bands_are_decoded_as_zeros_and_the_others_as_without(make_model, options):
+def test_absent_bands_are_decoded_as_zeros(make_model, options):
     model = sparse_model(make_model(400, 3), 0.9)
     result = encode_with_report(model, EncodeOptions(sh_coding="scalar", **options), importance=np.ones(400))
     scene = decode_scene(result.data)
@@ -187,12 +187,12 @@ def test_absent_bands_are_decoded_as_zeros_and_the_others_as_without(make_model,
 
 
 @pytest.mark.slow
-def test_absent_bands_cost_next_to_nothing(make_model):
+def test_absent_bands_cost_almost_nothing(make_model):
     big, sizes, scalar = make_model(6_000, 3), {}, EncodeOptions(sh_coding="scalar")
     for share in (0.0, 0.95, 1.0):
         sizes[share] = len(encode(sparse_model(big, share), scalar))
     full = sizes[0.0] - sizes[1.0]
-    # A twentieth of the values, and two masks of at most three tenths of a bit and some.
+    # One twentieth of the values, and for each of two bands a mask of at most half a bit per splat.
     assert sizes[0.95] - sizes[1.0] < 0.05 * full + 2 * 6_000 * 0.5 / 8
 
 
@@ -201,7 +201,7 @@ def test_scenes_without_absent_bands_have_no_mask(make_model):
     assert {"signed"} == set(described["attributes"]["sh2"]["codings"])
 
 
-def test_those_who_use_the_encoder_import_none_of_its_modules():
+def test_other_packages_import_no_modules_of_the_encoder():
     places = [ROOT / "trainer", ROOT / "tools", ROOT / "conformance"]
     found = [
         f"{path.relative_to(ROOT)}: {line}"
@@ -225,7 +225,7 @@ def test_every_splat_is_in_one_tile(count):
     assert all(len(tile.rows) <= 100 for tile in tiles)
 
 
-def test_tiles_are_as_few_as_they_can_be():
+def test_the_number_of_tiles_is_minimal():
     assert 10 == len(cut_tiles(cloud(1000), Lattice(1e-3, 16), 100))
 
 
@@ -239,7 +239,7 @@ def test_an_outlier_gets_a_tile_of_its_own():
 @pytest.mark.parametrize("finest", [False, True])
 @pytest.mark.parametrize("bits", [2, 8, 16])
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
-def test_no_tile_needs_more_bits_than_it_may_use(bits, scale, finest):
+def test_no_tile_exceeds_its_bits(bits, scale, finest):
     means = (cloud(500) * scale).astype(np.float32)
     lattice = Lattice(scale / 2**bits, bits, finest)
     for tile in cut_tiles(means, lattice, 100):
@@ -251,7 +251,7 @@ def test_no_tile_needs_more_bits_than_it_may_use(bits, scale, finest):
             assert extent >= 2 ** (bits - 2)
 
 
-def test_magnitudes_from_denormal_to_huge_are_cut_apart():
+def test_means_from_denormal_to_huge_are_tiled():
     rng = np.random.default_rng(0)
     magnitudes = 10.0 ** rng.uniform(-38, 38, (2000, 1))
     means = (rng.choice([-1, 1], (2000, 3)) * magnitudes).astype(np.float32)
@@ -263,7 +263,7 @@ def test_magnitudes_from_denormal_to_huge_are_cut_apart():
 
 
 def read(stream: bytes) -> tuple[_spec.StreamHead, list[int]]:
-    """Undo a stream as specified in section 6, one integer at a time."""
+    """Undo a stream by section 6 of the spec, one integer at a time."""
     head = _spec.unpack_stream_head(stream)
     coded = stream[_spec.STREAM_HEAD_SIZE :]
     assert head.coded_size == len(coded)
@@ -324,7 +324,7 @@ def test_signed_streams_read_back_at_every_width(dtype, level):
     assert [int(v) % 2 ** (8 * head.width) for v in values] == read_back
 
 
-def test_elements_are_no_wider_than_the_largest_needs():
+def test_elements_have_the_smallest_sufficient_width():
     assert 1 == read(signed_stream(np.array([-128, 127], np.int32), DeflateSettings()))[0].width
     assert 2 == read(signed_stream(np.array([-129], np.int32), DeflateSettings()))[0].width
     assert 3 == read(unsigned_stream(np.array([1 << 16]), DeflateSettings()))[0].width
@@ -334,12 +334,12 @@ def test_a_constant_plane_costs_a_few_bytes():
     assert len(unsigned_stream(np.full(65536, 200), DeflateSettings(1))) <= _spec.STREAM_HEAD_SIZE + 3
 
 
-#: As the SH of splats of which some have none: noise, cut by runs of zeros.
+#: Like the SH of a scene where some splats have none: noise interrupted by runs of zeros.
 NOISE = RNG.integers(-20, 20, 60_000).astype(np.int8)
 CUT = np.where(np.repeat(RNG.random(20_000) < 0.6, 3), np.int8(0), NOISE)
 
 
-def test_short_runs_are_written_as_runs_where_that_is_smaller():
+def test_run_lengths_are_used_if_smaller():
     pairs = np.repeat(RNG.integers(-100, 100, 30_000).astype(np.int8), RNG.integers(1, 4, 30_000))
     assert _spec.TRANSFORM_RUN_LENGTH in read(signed_stream(pairs, DeflateSettings(12)))[0].transforms
     assert _spec.TRANSFORM_RUN_LENGTH not in read(signed_stream(NOISE, DeflateSettings(12)))[0].transforms
@@ -351,6 +351,6 @@ def test_the_lowest_level_finds_runs_and_no_matches_in_noise():
 
 
 @pytest.mark.parametrize("arguments", [(0,), (13,), (6, "gzip")])
-def test_refuses_a_level_or_library_that_does_not_exist(arguments):
+def test_unknown_levels_and_libraries_are_refused(arguments):
     with pytest.raises(InputError):
         DeflateSettings(*arguments)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from checked import measure_errors
+from checked import covariances, disturbed, measure_errors
 
 from csplat.encoder.error_bounds import ErrorSums
 from csplat.errors import InputError
@@ -15,46 +15,15 @@ from csplat_conformance.encoders.reference_ply import PlyRows, is_splat, source_
 from csplat_conformance.tolerance import bound_tolerance, is_valid_bound
 
 
-def covariance(quat: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    w, x, y, z = quat.astype(np.float64) / np.linalg.norm(quat.astype(np.float64))
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return rotation @ np.diag(np.exp(2.0 * scales.astype(np.float64))) @ rotation.T
-
-
-def disturbed(model, amount: float):
-    rng = np.random.default_rng(1)
-
-    def near(values: np.ndarray) -> np.ndarray:
-        return (values + rng.normal(0, amount, values.shape)).astype(np.float32)
-
-    return replace(
-        model,
-        means=near(model.means),
-        quats=normalise_quats(near(model.quats)),
-        scales=near(model.scales),
-        opacities=np.clip(near(model.opacities), 0, 1),
-        sh0=near(model.sh0),
-        shN=near(model.shN),
-    )
-
-
 def test_agrees_with_the_definition(make_model):
     source = make_model(60, 2)
     index = np.random.default_rng(0).permutation(60)[:50]
-    decoded = disturbed(source.select(index), 0.05)
+    decoded = disturbed(source.select(index), np.random.default_rng(1), 0.05)
     measured = measure_errors(source, decoded, index)
     distances = np.linalg.norm(source.means[index].astype(np.float64) - decoded.means, axis=1)
-    relative = []
-    for i, j in enumerate(index):
-        wanted, found = (covariance(m.quats[k], m.scales[k]) for m, k in ((source, j), (decoded, i)))
-        relative.append(np.linalg.norm(wanted - found) / np.linalg.norm(wanted))
-    expected = {"means": distances, "covariance": np.array(relative)}
+    theirs, ours = covariances(source.quats[index], source.scales[index]), covariances(decoded.quats, decoded.scales)
+    relative = np.linalg.norm(theirs - ours, axis=(1, 2)) / np.linalg.norm(theirs, axis=(1, 2))
+    expected = {"means": distances, "covariance": relative}
     for name, errors in expected.items():
         assert (errors.max(), np.sqrt(np.mean(errors**2))) == pytest.approx(measured[name], rel=1e-6)
     band = (source.shN[index, 3:8] - decoded.shN[:, 3:8]).astype(np.float64)
@@ -87,9 +56,9 @@ def test_a_band_that_only_one_model_has_is_measured_against_zero(make_model):
         assert largest == pytest.approx(float(np.abs(source.shN[:, 3:]).max()))
 
 
-def test_sums_add_up_in_parts(make_model):
+def test_errors_of_parts_combine(make_model):
     source = make_model(50, 1)
-    decoded = disturbed(source, 0.01)
+    decoded = disturbed(source, np.random.default_rng(1), 0.01)
     whole = measure_errors(source, decoded, np.arange(50))
     halves = [measure_errors(source, decoded.select(part), np.arange(50)[part]) for part in (slice(25), slice(25, 50))]
     assert whole["means"][0] == max(half["means"][0] for half in halves)
@@ -97,7 +66,7 @@ def test_sums_add_up_in_parts(make_model):
 
 
 @pytest.mark.parametrize("index", [np.arange(9), np.arange(10) - 1, np.arange(10) + 1])
-def test_refuses_an_index_that_does_not_fit(make_model, index):
+def test_an_invalid_index_is_refused(make_model, index):
     model = make_model(10, 0)
     with pytest.raises(InputError, match="source index"):
         measure_errors(model, model, index)
@@ -127,7 +96,7 @@ def twin_norm(matrix):
 
 
 def twin_errors(source, decoded, i, j):
-    """Components of the difference of decoded splat i and source splat j, by measure (spec 5.5)."""
+    """Return the differences of decoded splat i and source splat j, by measure (spec 5.5)."""
     centre = [float(a) + b for a, b in zip(decoded.means[i], decoded.origin, strict=True)]
     wanted = [float(a) + b for a, b in zip(source.means[j], source.origin, strict=True)]
     theirs, ours = (list(map(float, one)) for one in (source.scales[j], decoded.scales[i]))
@@ -149,7 +118,7 @@ def twin_errors(source, decoded, i, j):
 
 
 def twin(source, decoded, index):
-    """(max, rms) by measure."""
+    """Return (max, rms) by measure."""
     pairs = [twin_errors(source, decoded, i, int(j)) for i, j in enumerate(index)]
     return {
         name: (
@@ -161,7 +130,7 @@ def twin(source, decoded, index):
 
 
 def scene(count, degree, seed, *, doubles=False):
-    """A source and what a coarse encoder might make of it, in another order and a little fewer."""
+    """Return a source and a coarsely quantised, reordered part of it."""
     rng = np.random.default_rng(seed)
     coefficients = (degree + 1) ** 2 - 1
     means = rng.normal(0, 3, (count, 3))
@@ -189,8 +158,8 @@ def scene(count, degree, seed, *, doubles=False):
 
 @pytest.mark.parametrize("degree", [0, 1, 3, 4])
 @pytest.mark.parametrize("doubles", [False, True])
-def test_errors_are_those_of_the_slow_twin(degree, doubles):
-    # SRC-2, SER-5: bands that the file has not count against 0, degree 4 has no measure
+def test_errors_agree_with_the_slow_twin(degree, doubles):
+    # SRC-2, SER-5: bands that the file lacks count against 0; degree 4 has no measure.
     source, decoded, index = scene(60, degree, 5 + degree, doubles=doubles)
     expected, found = twin(source, decoded, index), measure_pairs(source, decoded, index)
     reach = source.reach(decoded.origin)
@@ -201,7 +170,7 @@ def test_errors_are_those_of_the_slow_twin(degree, doubles):
             assert abs(true - measured) <= bound_tolerance(name, true, reach) / 4, name
 
 
-def test_the_worst_splat_is_the_one_with_the_largest_error():
+def test_the_worst_splat_has_the_largest_error():
     source, decoded, index = scene(60, 2, 1)
     for name, found in measure_pairs(source, decoded, index).items():
         errors = twin_errors(source, decoded, found.worst, int(index[found.worst]))[name]
@@ -210,8 +179,8 @@ def test_the_worst_splat_is_the_one_with_the_largest_error():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("spread", [0.5, 3.0, 7.0])
-def test_a_checker_lets_pass_whoever_works_in_binary32(spread):
-    # SER-7: the rooms are wide enough for statements that were computed in single precision throughout
+def test_errors_declared_in_single_precision_pass(spread):
+    # SER-7: the tolerances admit declared errors that were computed entirely in single precision.
     rng, count = np.random.default_rng(3), 20_000
     raw = rng.normal(0, 1, (count, 4)).astype(np.float32)
     scales = rng.uniform(-spread, spread, (count, 3)).astype(np.float32)
@@ -246,7 +215,7 @@ def test_a_checker_lets_pass_whoever_works_in_binary32(spread):
     assert float(np.abs(alpha.astype(np.float64) - source_of_rows(rows).opacities).max()) < 2e-7 / 2
 
 
-# What the source is --------------------------------------------------------------------------------
+# The source --------------------------------------------------------------------------------
 def rows_of(count=8):
     rng = np.random.default_rng(0)
     return PlyRows(
@@ -259,10 +228,10 @@ def rows_of(count=8):
     )
 
 
-def test_rows_that_are_no_numbers_are_no_splats():
+def test_rows_with_non_finite_values_are_no_splats():
     # SRC-1
     rows = rows_of()
-    rows.means[0, 1] = 1e39  # finite in binary64 alone
+    rows.means[0, 1] = 1e39  # finite only in binary64
     rows.quats[1, 2] = np.nan
     rows.scales[2, 0] = -np.inf
     rows.logits[3], rows.logits[4], rows.logits[5] = np.nan, np.inf, -np.inf
@@ -272,7 +241,7 @@ def test_rows_that_are_no_numbers_are_no_splats():
     assert [1.0, 0.0] == source_of_rows(rows).opacities[:2].tolist()
 
 
-def test_a_source_is_alpha_and_unit_quaternions_in_binary32_and_centres_as_they_stand():
+def test_a_source_has_alphas_unit_quaternions_and_unchanged_means():
     # SRC-2
     rows = rows_of()
     rows.quats[3] = 0
@@ -287,7 +256,7 @@ def test_a_source_is_alpha_and_unit_quaternions_in_binary32_and_centres_as_they_
         np.testing.assert_allclose(source.quats[j], unit, rtol=1.2e-7)
 
 
-def test_a_source_about_another_origin_is_the_same():
+def test_a_source_about_another_origin_has_the_same_errors():
     source, decoded, index = scene(40, 0, 3, doubles=True)
     near = source.about(ORIGIN)
     ours, theirs = (measure_pairs(one, decoded, index)["means"].max for one in (source, near))

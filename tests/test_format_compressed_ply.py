@@ -1,9 +1,10 @@
-"""PlayCanvas' compressed PLY: files that are built here word by word, and what goes there and back."""
+"""PlayCanvas' compressed PLY: files built word by word, and round trips."""
 
 import struct
 
 import numpy as np
 import pytest
+from checked import flipped, refusals
 
 import csplat
 from csplat.errors import InputError
@@ -35,7 +36,7 @@ WORD = (2047 << 21 | 1023 << 11 | 0, 1 << 30 | 1023 << 20 | 511 << 10 | 512, 0, 
 SMALL = built([ROW], [WORD, (0, 0, 0xFFFFFFFF, 0)], [[0, 255, 128, *range(3, 9)], range(9)], comments=["made by hand"])
 
 
-def test_words_mean_what_they_say(tmp_path):
+def test_packed_words_are_read(tmp_path):
     (tmp_path / "a.ply").write_bytes(SMALL)
     model = csplat.read(tmp_path / "a.ply")
     assert [[4, 10, -1], [0, 10, -1]] == model.means.tolist()
@@ -49,17 +50,17 @@ def test_words_mean_what_they_say(tmp_path):
     assert {"comments": ["made by hand"]} == model.metadata
 
 
-def test_files_of_old_have_no_bounds_of_colour(tmp_path):
+def test_old_files_without_bounds_of_colours_are_read(tmp_path):
     (tmp_path / "a.ply").write_bytes(built([ROW[:12]], [WORD], colours=False))
     np.testing.assert_allclose(csplat.read(tmp_path / "a.ply").sh0[0] * 0.28209479 + 0.5, [1, 0, 1], atol=1e-6)
 
 
-def test_what_is_written_comes_back_within_a_step(tmp_path, make_model):
+def test_written_files_read_back_within_a_step(tmp_path, make_model):
     model = make_model(700, 3, antialiased=True, origin=(1.0, 2.0, 3.0), metadata={"licence": "CC0"})
     csplat.write(tmp_path / "a.compressed.ply", model)
     back = csplat.read(tmp_path / "a.compressed.ply")
     assert (True, (1.0, 2.0, 3.0), {"licence": "CC0"}) == (back.antialiased, back.origin, back.metadata)
-    # Splats change places; the nearest mean tells which is which.
+    # Splats are reordered; the nearest mean identifies each.
     rows = np.array([np.argmin(((model.means - one) ** 2).sum(1)) for one in back.means])
     assert 700 == len(set(rows))
     for name, error in (("means", 0.006), ("scales", 0.006), ("opacities", 0.002), ("sh0", 0.03), ("shN", 0.0157)):
@@ -68,7 +69,7 @@ def test_what_is_written_comes_back_within_a_step(tmp_path, make_model):
     assert np.abs((model.quats[rows] * back.quats).sum(1)).min() > 1 - 5e-6
 
 
-def test_blocks_are_of_whole_chunks(tmp_path, make_model):
+def test_blocks_consist_of_whole_chunks(tmp_path, make_model):
     model = make_model(300, 1)
     large = model.select(np.arange(BLOCK_SPLATS + 300) % 300)
     csplat.write(tmp_path / "a.compressed.ply", large)
@@ -77,22 +78,16 @@ def test_blocks_are_of_whole_chunks(tmp_path, make_model):
         assert np.abs(np.sort(large.means[:, 0]) - np.sort(scene.model().means[:, 0])).max() < 0.01
 
 
-def test_no_splats_are_a_scene(tmp_path, make_model):
+def test_an_empty_scene_is_written_and_read(tmp_path, make_model):
     csplat.write(tmp_path / "a.compressed.ply", make_model(0, 2))
-    assert (0, 2) == (
-        len(csplat.read(tmp_path / "a.compressed.ply")),
-        csplat.read(tmp_path / "a.compressed.ply").sh_degree,
-    )
+    model = csplat.read(tmp_path / "a.compressed.ply")
+    assert (0, 2) == (len(model), model.sh_degree)
 
 
-def test_it_is_told_from_a_plain_ply_by_its_words(tmp_path):
+def test_the_packed_columns_distinguish_it_from_a_plain_ply(tmp_path):
     (tmp_path / "a.ply").write_bytes(SMALL)
-    assert (
-        "compressed-ply"
-        == detect_format(tmp_path / "a.ply").name
-        == format_by_suffix(tmp_path / "b.Compressed.ply").name
-    )
-    assert "ply" == format_by_suffix(tmp_path / "b.ply").name
+    assert "compressed-ply" == detect_format(tmp_path / "a.ply").name
+    assert ["compressed-ply", "ply"] == [format_by_suffix(tmp_path / one).name for one in ("b.Compressed.ply", "b.ply")]
     with pytest.raises(InputError, match=r"a\.ply is compressed PLY.*csplat convert.*csplat\.read"):
         read_ply(tmp_path / "a.ply")
 
@@ -118,13 +113,13 @@ def test_it_is_told_from_a_plain_ply_by_its_words(tmp_path):
         (built([[ROW[3] + 1, *ROW[1:]]], [WORD]), "chunk 0 has min_x .*, expected at most max_x"),
     ],
 )
-def test_what_does_not_fit_is_refused(tmp_path, data, message):
+def test_inconsistent_files_are_refused(tmp_path, data, message):
     (tmp_path / "a.ply").write_bytes(data)
     with pytest.raises(InputError, match=message):
         csplat.read(tmp_path / "a.ply", "compressed-ply")
 
 
-def test_bounds_that_were_rounded_apart_are_read(tmp_path):
+def test_bounds_that_differ_by_rounding_are_read(tmp_path):
     above = float(np.nextafter(np.float32(4), np.float32(9)))
     (tmp_path / "a.ply").write_bytes(built([[above, *ROW[1:]]], [WORD]))
     assert [] == lint_file(tmp_path / "a.ply")
@@ -150,7 +145,7 @@ def test_sh_bands_above_the_requested_degree_are_left_out(tmp_path, degree):
         (SMALL + SMALL, ["trailing-bytes"]),
     ],
 )
-def test_what_is_unusual_is_read_and_told(tmp_path, data, found):
+def test_unusual_files_are_read_and_reported(tmp_path, data, found):
     (tmp_path / "a.ply").write_bytes(data)
     report = []
     assert csplat.read(tmp_path / "a.ply", report=report).means[0].tolist() == [4, 10, -1]
@@ -158,19 +153,9 @@ def test_what_is_unusual_is_read_and_told(tmp_path, data, found):
 
 
 def test_damage_is_refused_or_read(tmp_path):
-    path = tmp_path / "a.ply"
-    damaged = [SMALL[:size] for size in range(0, len(SMALL), 17)]
-    for place in range(0, len(SMALL), 3):
-        data = bytearray(SMALL)
-        data[place] ^= 1 << place % 8
-        damaged.append(bytes(data))
-    messages = []
-    for data in damaged:
-        path.write_bytes(data)
-        try:
-            csplat.read(path, "compressed-ply")
-        except InputError as error:
-            messages.append(str(error))
+    damaged = [SMALL[:size] for size in range(0, len(SMALL), 17)] + [*flipped(SMALL, range(0, len(SMALL), 3))]
+    messages = refusals(tmp_path / "a.ply", damaged, lambda path: csplat.read(path, "compressed-ply"))
+    messages = [one for one in messages if one]
     assert len(messages) > 150
     assert all(one.startswith("a.ply") for one in messages)
 

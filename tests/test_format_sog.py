@@ -1,4 +1,4 @@
-"""SOG, versions 1 and 2, in folders, zips and levels: files that are built here byte by byte, and what is written."""
+"""SOG, versions 1 and 2, in folders, zips and levels: files built byte by byte, and round trips."""
 
 import io
 import json
@@ -6,6 +6,8 @@ import zipfile
 
 import numpy as np
 import pytest
+from checked import flipped, refusals
+from tables import failures
 
 import csplat
 from csplat.errors import InputError
@@ -28,7 +30,7 @@ def pixels(seed, shape=(4, 4)):
 
 
 def splats(version=2, sh=True):
-    """The parts of a SOG of five splats."""
+    """Return the metadata and images of a SOG of five splats."""
     names = ("means_l", "means_u", "quats", "scales", "sh0")
     pictures = {f"{name}.webp": pixels(seed) for seed, name in enumerate(names)}
     pictures["quats.webp"][..., 3] = 252 + np.arange(16).reshape(4, 4) % 4
@@ -82,7 +84,7 @@ def means_of(pictures):
     return np.sign(logs) * (np.exp(np.abs(logs)) - 1)
 
 
-def test_version_2_means_what_it_says(tmp_path):
+def test_version_2_is_read(tmp_path):
     meta, pictures = splats()
     model = csplat.read(zipped(tmp_path / "a.sog", files_of(meta, pictures)))
     flat = {name: one.reshape(-1, 4)[:COUNT].astype(int) for name, one in pictures.items() if name != "palette.webp"}
@@ -91,14 +93,14 @@ def test_version_2_means_what_it_says(tmp_path):
     np.testing.assert_allclose(model.sh0, flat["sh0.webp"][:, :3] / 64 - 2)
     np.testing.assert_allclose(model.opacities, flat["sh0.webp"][:, 3] / 255, rtol=1e-6)
     np.testing.assert_allclose(model.shN[0], pictures["palette.webp"][0, -3:, :3] / 128 - 1)
-    three = (flat["quats.webp"][1, :3] / 255 * 2 - 1) / 2**0.5  # x of splat 1 is left out
+    three = (flat["quats.webp"][1, :3] / 255 * 2 - 1) / 2**0.5  # x of splat 1 is omitted
     quat = np.array([three[0], np.sqrt(max(0, 1 - (three**2).sum())), *three[1:]])
     np.testing.assert_allclose(model.quats[1], quat / np.linalg.norm(quat), atol=1e-6)
     assert model.antialiased
     assert not model.flat
 
 
-def test_version_1_means_what_it_says(tmp_path):
+def test_version_1_is_read(tmp_path):
     meta, pictures = splats(1)
     model = csplat.read(foldered(tmp_path / "a", files_of(meta, pictures)))
     flat = {name: one.reshape(-1, 4)[:COUNT].astype(int) for name, one in pictures.items() if name != "palette.webp"}
@@ -109,7 +111,7 @@ def test_version_1_means_what_it_says(tmp_path):
     np.testing.assert_allclose(model.shN[4], pictures["palette.webp"][0, -3:, :3] / 255 - 0.5, atol=1e-6)
 
 
-def test_folder_json_and_zip_are_the_same_scene(tmp_path):
+def test_folder_json_and_zip_give_the_same_scene(tmp_path):
     files = files_of(*splats())
     folder = foldered(tmp_path / "a", files)
     paths = [folder, folder / "meta.json", zipped(tmp_path / "b", files, "inside/", zipfile.ZIP_DEFLATED)]
@@ -118,7 +120,7 @@ def test_folder_json_and_zip_are_the_same_scene(tmp_path):
     assert all((one.means == models[0].means).all() and (one.shN == models[0].shN).all() for one in models)
 
 
-def test_rotations_without_a_tag_are_none_and_said(tmp_path):
+def test_rotations_without_a_tag_become_the_identity_and_are_reported(tmp_path):
     meta, pictures = splats()
     pictures["quats.webp"][0, 0, 3] = 17
     with open_scene(zipped(tmp_path / "a.sog", files_of(meta, pictures))) as scene:
@@ -126,7 +128,7 @@ def test_rotations_without_a_tag_are_none_and_said(tmp_path):
         assert [("zero-quats", 1)] == [(one.id, one.count) for one in scene.findings]
 
 
-def test_the_first_entry_that_early_writers_lost_continues_the_others(tmp_path):
+def test_a_missing_first_entry_of_a_codebook_is_extrapolated(tmp_path):
     meta, pictures = splats(sh=False)
     meta["scales"]["codebook"][0] = None
     pictures["scales.webp"][:] = 0
@@ -135,7 +137,7 @@ def test_the_first_entry_that_early_writers_lost_continues_the_others(tmp_path):
 
 
 def levels(tmp_path, **changes):
-    """Streamed SOG: two files of the finest level, a coarser one, surroundings."""
+    """Write a streamed SOG: two files of the finest level, a coarser one, and an environment."""
     files = {}
     for number, name in enumerate(("0_0", "0_1", "1_0", "env")):
         meta, pictures = splats(sh=number == 1)
@@ -151,7 +153,7 @@ def levels(tmp_path, **changes):
     return foldered(tmp_path / "a", {**files, "lod-meta.json": json.dumps(meta).encode()})
 
 
-def test_a_part_without_a_level_has_its_nearest(tmp_path):
+def test_a_part_without_a_level_uses_its_nearest(tmp_path):
     one = {"1": {"file": 0, "offset": 0, "count": 5}}
     two = {"0": {"file": 1, "offset": 1, "count": 3}}
     path = levels(tmp_path, tree={"children": [{"lods": one}, {"lods": two}]})
@@ -160,7 +162,7 @@ def test_a_part_without_a_level_has_its_nearest(tmp_path):
             assert [0] * 5 + [1] * 3 + [3] * 5 == scene.model().sh0[:, 0].tolist()
 
 
-def test_of_levels_the_finest_is_the_scene(tmp_path):
+def test_the_finest_level_is_read_by_default(tmp_path):
     path = levels(tmp_path)
     for place in (path, path / "lod-meta.json"):
         with open_scene(place) as scene:
@@ -181,13 +183,13 @@ def test_of_levels_the_finest_is_the_scene(tmp_path):
 
 
 def zipped_folder(path, folder, within="", more=()):
-    """A zip of all files of a folder, and of more."""
+    """Zip all files of a folder and some more."""
     files = {one.relative_to(folder).as_posix(): one.read_bytes() for one in folder.rglob("*") if one.is_file()}
     return zipped(path, {**{within + name: data for name, data in files.items()}, **dict(more)})
 
 
 @pytest.mark.parametrize("within", ["", "a/b/"])
-def test_levels_in_a_zip_are_those_of_the_folder(tmp_path, within):
+def test_levels_in_a_zip_equal_those_in_a_folder(tmp_path, within):
     folder = levels(tmp_path)
     junk = {"__MACOSX/meta.json": b"", "__MACOSX/0_0/._meta.json": b""}
     path = zipped_folder(tmp_path / "a.zip", folder, within, junk)
@@ -197,12 +199,9 @@ def test_levels_in_a_zip_are_those_of_the_folder(tmp_path, within):
             assert np.array_equal(expected.model().means, scene.model().means)
 
 
-def test_a_zip_of_several_scenes_is_refused_with_their_names(tmp_path):
+def test_a_zip_of_several_scenes_is_refused(tmp_path):
     folder, other = levels(tmp_path), files_of(*splats())
-    two = {
-        **{f"one/{name}": data for name, data in other.items()},
-        **{f"two/{name}": data for name, data in other.items()},
-    }
+    two = {f"{folder}/{name}": data for folder in ("one", "two") for name, data in other.items()}
     more = {f"b/{name}": data for name, data in other.items()}
     bundle = {"lod-meta.json": (folder / "lod-meta.json").read_bytes().replace(b"0_0/meta.json", b"0_0.sog")}
     for path, message in (
@@ -220,7 +219,7 @@ def test_a_zip_of_several_scenes_is_refused_with_their_names(tmp_path):
     assert 13 == len(csplat.read(folder / "lod-meta.json"))
 
 
-def test_other_scenes_in_a_zip_are_named(tmp_path):
+def test_other_scenes_in_a_zip_are_reported(tmp_path):
     files = {f"a/{name}": data for name, data in files_of(*splats()).items()}
     report = []
     assert 5 == len(csplat.read(zipped(tmp_path / "a.zip", {**files, "a/b/scene.PLY": b"ply"}), report=report))
@@ -230,7 +229,7 @@ def test_other_scenes_in_a_zip_are_named(tmp_path):
         csplat.read(zipped(tmp_path / "a.zip", {**files, "scene.ply": b"ply"}))
 
 
-def test_the_directory_of_a_zip_is_not_read_for_each_part(tmp_path, monkeypatch):
+def test_the_directory_of_a_zip_is_read_once(tmp_path, monkeypatch):
     path = zipped_folder(tmp_path / "a.zip", levels(tmp_path))
     opened = []
     whole = zipfile.ZipFile
@@ -239,7 +238,7 @@ def test_the_directory_of_a_zip_is_not_read_for_each_part(tmp_path, monkeypatch)
     assert len(opened) < 5
 
 
-def test_the_list_of_files_may_have_backslashes(tmp_path):
+def test_the_list_of_files_may_contain_backslashes(tmp_path):
     folder = levels(tmp_path, filenames=[rf"{name}\meta.json" for name in ("0_0", "0_1", "1_0")])
     for path in (folder, zipped_folder(tmp_path / "a.zip", folder)):
         report = []
@@ -247,7 +246,7 @@ def test_the_list_of_files_may_have_backslashes(tmp_path):
         assert ["backslashes in filenames, read as slashes"] == [one.text for one in report]
 
 
-def test_names_in_a_zip_may_have_backslashes_and_capitals(tmp_path):
+def test_names_in_a_zip_may_contain_backslashes_and_capitals(tmp_path):
     files = files_of(*splats())
     expected = csplat.read(zipped(tmp_path / "a.sog", files))
     loud = {name.upper() if name == "meta.json" else name: data for name, data in files.items()}
@@ -267,7 +266,7 @@ def test_names_in_a_zip_may_have_backslashes_and_capitals(tmp_path):
         csplat.read(zipped(tmp_path / "f.sog", two))
 
 
-def test_a_meta_json_of_another_program_is_no_sog(tmp_path):
+def test_a_meta_json_of_another_program_is_refused(tmp_path):
     files = {"meta.json": b'{"app": "a scanner"}', "room.ply": b"ply"}
     message = "meta.json is not the one of SOG, which has means, quats, scales, sh0; .*"
     with pytest.raises(InputError, match=message + r"a zip that contains room\.ply: unzip it"):
@@ -276,7 +275,7 @@ def test_a_meta_json_of_another_program_is_no_sog(tmp_path):
         csplat.read(foldered(tmp_path / "a", files))
 
 
-def test_a_zip_within_a_zip_is_refused_by_name(tmp_path):
+def test_a_zip_within_a_zip_is_refused(tmp_path):
     path = levels(tmp_path, filenames=["0_0.sog", "0_1/meta.json", "1_0/meta.json"])
     (path / "0_0" / "meta.json").unlink()
     with pytest.raises(InputError, match=r"0_0.sog is a zip within a zip: unpack a.zip"):
@@ -296,7 +295,7 @@ def test_a_zip_within_a_zip_is_refused_by_name(tmp_path):
         ({"tree": {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 2}}}] * 2}}, "meta.json twice"),
     ],
 )
-def test_levels_that_do_not_fit_are_refused(tmp_path, changes, message):
+def test_inconsistent_levels_are_refused(tmp_path, changes, message):
     with pytest.raises(InputError, match=message):
         csplat.read(levels(tmp_path, **changes))
 
@@ -333,7 +332,7 @@ BAD = {
     "bounds of version 1 the wrong way round": (changed(["scales", "mins"], [9, 9, 9], 1), "scales has mins 9"),
     "a pointer for a picture": (
         changed([], 0, quats=b"version https://git-lfs.github.com/spec/v1\noid"),
-        "quats.webp is a pointer of Git LFS",
+        "quats.webp is a pointer of",
     ),
     "a list for an object": (changed(["means"], []), "means mins is missing"),
     "a short codebook": (changed(["scales", "codebook"], [1.0]), "codebook is shorter"),
@@ -358,14 +357,16 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_what_does_not_fit_is_refused(tmp_path, name):
-    files, message = BAD[name]
-    with pytest.raises(InputError, match=rf"^a\.sog: .*{message}"):
-        csplat.read(zipped(tmp_path / "a.sog", files))
+def test_inconsistent_files_are_refused(tmp_path):
+    def check(case):
+        files, message = case
+        with pytest.raises(InputError, match=rf"^a\.sog: .*{message}"):
+            csplat.read(zipped(tmp_path / "a.sog", files))
+
+    assert [] == failures(BAD, check)
 
 
-def test_bombs_are_not_unpacked(tmp_path):
+def test_zip_bombs_are_not_unpacked(tmp_path):
     files = files_of(*splats()) | {"meta.json": b" " * 30_000_000}
     with pytest.raises(InputError, match="unpacked size of 30,000,000"):
         csplat.read(zipped(tmp_path / "a.sog", files, how=zipfile.ZIP_DEFLATED))
@@ -373,18 +374,9 @@ def test_bombs_are_not_unpacked(tmp_path):
 
 def test_damage_is_refused_or_read(tmp_path):
     whole = zipped(tmp_path / "a.sog", files_of(*splats(1, sh=False))).read_bytes()
-    damaged = [whole[:size] for size in range(0, len(whole), 61)]
-    for place in range(0, len(whole), 11):
-        data = bytearray(whole)
-        data[place] ^= 1 << place % 8
-        damaged.append(bytes(data))
-    messages = []
-    for data in damaged:
-        (tmp_path / "a.sog").write_bytes(data)
-        try:
-            csplat.read(tmp_path / "a.sog", "sog")
-        except InputError as error:
-            messages.append(str(error))
+    damaged = [whole[:size] for size in range(0, len(whole), 61)] + [*flipped(whole, range(0, len(whole), 11))]
+    messages = refusals(tmp_path / "a.sog", damaged, lambda path: csplat.read(path, "sog"))
+    messages = [one for one in messages if one]
     assert len(messages) > len(damaged) / 2
     assert all(one.startswith("a.sog") and "\n" not in one for one in messages)
 
@@ -393,28 +385,20 @@ def test_damaged_pictures_of_a_folder_are_refused_or_read(tmp_path):
     files = files_of(*splats(1, sh=False))
     folder = foldered(tmp_path / "a", files)
     whole = files["sh0.webp"]
-    for place in range(0, len(whole), 2):
-        data = bytearray(whole)
-        data[place] ^= 1 << place // 2 % 8
-        (folder / "sh0.webp").write_bytes(data)
-        try:
-            csplat.read(folder)
-        except InputError as error:
-            if not str(error).startswith("a: sh0.webp"):
-                raise
+    damaged = flipped(whole, range(0, len(whole), 2), lambda at: 1 << at // 2 % 8)
+    messages = refusals(folder / "sh0.webp", damaged, lambda _: csplat.read(folder))
+    assert all(not one or one.startswith("a: sh0.webp") for one in messages)
 
 
 # Writing -------------------------------------------------------------------------------------------
-
-
-def test_what_is_written_comes_back_within_a_step(tmp_path, make_model):
+def test_written_files_read_back_within_a_step(tmp_path, make_model):
     model = make_model(600, 1, antialiased=True)
     csplat.write(tmp_path / "a.sog", model)
     back = csplat.read(tmp_path / "a.sog")
     assert back.antialiased
     rows = np.array([np.argmin(((model.means - one) ** 2).sum(1)) for one in back.means])
     assert 600 == len(set(rows))
-    # Half a step of 65,535 in the logarithms, where a step is largest.
+    # Half of the largest step: 65,535 steps divide the logarithms.
     logs = np.log1p(np.abs(model.means.astype(float)).max()) / 65535
     assert np.abs(model.means[rows] - back.means).max() < logs * (1 + np.abs(model.means).max())
     assert np.abs(model.opacities[rows] - back.opacities).max() <= 0.5 / 255 + 1e-7
@@ -423,7 +407,7 @@ def test_what_is_written_comes_back_within_a_step(tmp_path, make_model):
         assert np.sqrt(np.mean((getattr(model, name)[rows] - getattr(back, name)) ** 2)) < most
 
 
-def test_the_same_scene_is_the_same_bytes_in_a_zip_and_in_a_folder(tmp_path, make_model):
+def test_zip_and_folder_have_the_same_bytes(tmp_path, make_model):
     model = make_model(300, 2, flat=True)
     for name in ("a.sog", "b.sog", "c/meta.json"):
         csplat.write(tmp_path / name, model)
@@ -446,7 +430,7 @@ def test_few_splats_are_written_and_read(tmp_path, make_model, count, degree):
         np.testing.assert_allclose(wanted, found, atol=1e-3 if name == "shN" else 1e-4)
 
 
-def test_splats_in_one_place_are_written(tmp_path, make_model):
+def test_splats_at_one_point_are_written(tmp_path, make_model):
     model = make_model(3, 0)
     model.means[:] = 2.5
     csplat.write(tmp_path / "a.sog", model)

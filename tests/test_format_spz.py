@@ -1,4 +1,4 @@
-"""SPZ: every version read from bytes written by hand, every broken file refused."""
+"""SPZ: every version read from bytes written by hand; damaged files are refused."""
 
 import gzip
 import os
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from checked import checked
+from checked import checked, flipped, refusals
 from conftest import of_peers
 
 import csplat
@@ -26,7 +26,7 @@ AXES = struct.pack("<IIII", 0xABCD0001, 4, 7, 0xADBE0003) + struct.pack("<II", 4
 
 
 def spz(version, parts, *, degree=0, bits=8, flags=0, count=None, extensions=b"", bare=False):
-    """A file of an SPZ version with these bytes for positions, alphas, colours, scales, rotations, SH."""
+    """Return a file of an SPZ version with these bytes of positions, alphas, colours, scales, rotations and SH."""
     count = len(parts[1]) if count is None else count
     head = struct.pack("<4sIIBBB", b"NGSP", version, count, degree, bits, flags)
     if version < 4:
@@ -40,7 +40,7 @@ def spz(version, parts, *, degree=0, bits=8, flags=0, count=None, extensions=b""
 
 
 def splats(version, count=2, degree=0):
-    """Bytes of random splats."""
+    """Return the bytes of random splats."""
     rng = np.random.default_rng(version)
     widths = (*WIDTHS[version], 3 * ((degree + 1) ** 2 - 1))
     parts = [rng.integers(0, 256, count * width, np.uint8).tobytes() for width in widths]
@@ -48,7 +48,7 @@ def splats(version, count=2, degree=0):
 
 
 def word(index, *three):
-    """Three components of a rotation in units of sqrt(1/2) / 511, and which of x y z w is left out."""
+    """Pack three components of a rotation, in units of sqrt(1/2) / 511; `index` is the omitted one of x y z w."""
     fields = [abs(one) | (512 if one < 0 else 0) for one in three]
     return struct.pack("<I", index << 30 | fields[0] << 20 | fields[1] << 10 | fields[2])
 
@@ -63,7 +63,7 @@ def word(index, *three):
         (4, bytes([128, 1, 0, 0, 254, 255, 64, 0, 0]), word(0, 511, 0, -511), False),
     ],
 )
-def test_the_bytes_of_each_version_mean_what_the_format_says(version, positions, rotation, bare):
+def test_each_version_is_read(version, positions, rotation, bare):
     data = [positions, b"\x33", bytes([0, 51, 255]), bytes([0, 160, 255]), rotation, bytes([0, 128, 255] * 3)]
     model = checked(spz(version, data, degree=1, flags=1, bare=bare))
     assert [[1.5, -2.0, 0.25]] == model.means.tolist()
@@ -73,12 +73,12 @@ def test_the_bytes_of_each_version_mean_what_the_format_says(version, positions,
     np.testing.assert_allclose([[-0.5 / 0.15, -0.3 / 0.15, 0.5 / 0.15]], model.sh0, rtol=1e-6)
     half = sqrt(0.5)
     wanted = {3: [0, half, -half, 0], 4: [-half, 0, half, 0]}.get(version, [0, sqrt(1 / 3), -sqrt(1 / 3), -sqrt(1 / 3)])
-    np.testing.assert_allclose([wanted], model.quats, atol=4e-4)  # the root of what rounding leaves of 0
+    np.testing.assert_allclose([wanted], model.quats, atol=4e-4)  # the root of a rounding error
     assert ("RUB", True) == (model.coordinate_system, model.antialiased)
 
 
 @pytest.mark.parametrize("largest", range(4))
-def test_the_component_that_is_left_out_stands_in_its_place(largest):
+def test_the_omitted_component_of_a_rotation_is_restored(largest):
     model = checked(spz(3, [bytes(9), b"\1", bytes(3), bytes(3), word(largest, 73, 146, -219)]))
     three = [sqrt(0.5) / 511 * value for value in (73, 146, -219)]
     xyzw = [*three[:largest], sqrt(1 - np.square(three).sum()), *three[largest:]]
@@ -86,7 +86,7 @@ def test_the_component_that_is_left_out_stands_in_its_place(largest):
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_axes_of_an_extension_count_and_others_are_skipped(version):
+def test_the_axes_extension_is_read_and_others_are_skipped(version):
     data = spz(version, splats(version), flags=2, extensions=AXES)
     assert "RDF" == checked(data).coordinate_system
     assert "RUB" == checked(spz(version, splats(version), extensions=AXES)).coordinate_system
@@ -119,7 +119,7 @@ def test_sh_bands_above_the_requested_degree_are_left_out(tmp_path):
         assert np.array_equal(expected, read.shN)
 
 
-def test_what_follows_the_splats_is_told(tmp_path):
+def test_bytes_after_the_splats_are_reported(tmp_path):
     def found(data):
         (tmp_path / "a.spz").write_bytes(data)
         report = []
@@ -129,7 +129,7 @@ def test_what_follows_the_splats_is_told(tmp_path):
     whole = spz(3, splats(3))
     assert [] == found(whole) == found(spz(3, splats(3), flags=2, extensions=AXES))
     assert [("trailing-bytes", len(gzip.decompress(whole)))] == found(whole + whole)
-    assert [("trailing-bytes", 2)] == found(spz(2, splats(3)))  # a version that has a byte less for each splat
+    assert [("trailing-bytes", 2)] == found(spz(2, splats(3)))  # version 2 has one byte less per splat
 
 
 MANY = spz(4, [bytes(n * (1 << 22)) for n in (9, 1, 3, 3, 4)])
@@ -152,7 +152,7 @@ MANY = spz(4, [bytes(n * (1 << 22)) for n in (9, 1, 3, 3, 4)])
         (spz(1, [b"\xff\xff" * 3, b"\1", bytes(3), bytes(3), bytes(3)]), "NaN or infinite"),
     ],
 )
-def test_what_is_no_spz_or_too_much_is_refused(tmp_path, data, message):
+def test_invalid_or_oversized_files_are_refused(tmp_path, data, message):
     (tmp_path / "a.spz").write_bytes(data)
     with pytest.raises(InputError, match=message):
         checked(tmp_path / "a.spz")
@@ -162,44 +162,28 @@ def test_what_is_no_spz_or_too_much_is_refused(tmp_path, data, message):
 def test_a_damaged_file_is_refused_or_read(tmp_path, version):
     whole = spz(version, splats(version, degree=1), degree=1, flags=2, extensions=AXES)
     path = tmp_path / "a.spz"
-
-    def read(data):
-        path.write_bytes(data)
-        try:
-            checked(path)
-        except InputError as error:
-            return str(error)
-        return ""
-
-    assert not read(whole)
-    assert all(read(whole[:size]) for size in range(0, len(whole), 3))
-    assert read(whole[:-1])
-    for at in range(len(whole)):
-        message = read(whole[:at] + bytes([whole[at] ^ (255 >> at % 8)]) + whole[at + 1 :])
+    assert [""] == refusals(path, [whole], checked)
+    assert all(refusals(path, (whole[:size] for size in (*range(0, len(whole), 3), len(whole) - 1)), checked))
+    for message in refusals(path, flipped(whole, range(len(whole)), lambda at: 255 >> at % 8), checked):
         assert not message or ("a.spz" in message and "\n" not in message)
 
 
 def fields(path):
-    """Version, count, degree, fractional bits and flags of a file."""
+    """Return version, count, degree, fractional bits and flags of a file."""
     data = path.read_bytes()
     return struct.unpack_from("<IIBBB", gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data, 4)
 
 
 @pytest.mark.parametrize(("name", "version"), [("a.spz", 3), ("a.v4.spz", 4)])
-def test_what_is_written_comes_back_within_half_a_step(tmp_path, make_model, name, version):
+def test_written_files_read_back_within_half_a_step(tmp_path, make_model, name, version):
     model = make_model(200, 3, coordinate_system="RUB", antialiased=True)
     shN = np.clip(model.shN / 3, -1, 0.97)
     model = csplat.SplatModel(**{**vars(model), "shN": shN, "sh0": np.clip(model.sh0, -3, 3)})
     csplat.write(tmp_path / name, model)
     assert (version, 200, 3, 12, 1) == fields(tmp_path / name)
     found = checked(tmp_path / name)
-    for array, step in {
-        "means": 2**-12,
-        "scales": 1 / 16,
-        "opacities": 1 / 255,
-        "sh0": 1 / 38.25,
-        "shN": 1 / 32,
-    }.items():
+    steps = {"means": 2**-12, "scales": 1 / 16, "opacities": 1 / 255, "sh0": 1 / 38.25, "shN": 1 / 32}
+    for array, step in steps.items():
         np.testing.assert_allclose(getattr(found, array), getattr(model, array), atol=step / 2 + 1e-6, rtol=0)
     turned = 2 * np.arccos(np.minimum(1, np.abs(np.einsum("ij,ij->i", found.quats.astype(float), model.quats))))
     assert np.degrees(turned.max()) < 0.3
@@ -207,7 +191,7 @@ def test_what_is_written_comes_back_within_half_a_step(tmp_path, make_model, nam
     assert (tmp_path / name).read_bytes() == (tmp_path / f"again.{name}").read_bytes()
 
 
-def test_values_beyond_the_range_become_its_ends(tmp_path, make_model):
+def test_values_beyond_the_range_are_clipped(tmp_path, make_model):
     model = make_model(2, 1, sh0=np.array([[9, -9, 0]] * 2, "f4"), shN=np.full((2, 3, 3), [2, -2, 0.99], "f4"))
     scales, opacities = np.array([[-30, 30, 0]] * 2, "f4"), np.array([0, 1], "f4")
     model = csplat.SplatModel(**{**vars(model), "scales": scales, "opacities": opacities, "coordinate_system": "RUB"})
@@ -219,7 +203,7 @@ def test_values_beyond_the_range_become_its_ends(tmp_path, make_model):
     np.testing.assert_allclose(found.sh0[0, :2], [0.5 / 0.15, -0.5 / 0.15], rtol=1e-6)
 
 
-def test_positions_have_as_fine_a_step_as_splats_want_and_the_scene_allows(tmp_path, make_model):
+def test_the_step_of_positions_fits_splats_and_extent(tmp_path, make_model):
     def bits(reach, scale):
         means = np.linspace(-reach, reach, 30, dtype="f4").reshape(10, 3)
         csplat.write(tmp_path / "a.spz", make_model(10, 0, means=means, scales=np.full((10, 3), scale, "f4")))
@@ -236,7 +220,7 @@ def test_positions_have_as_fine_a_step_as_splats_want_and_the_scene_allows(tmp_p
     assert 12 == bits(0, 0)
 
 
-def test_a_scene_without_axes_is_taken_as_right_down_forward(tmp_path, make_model):
+def test_a_scene_without_axes_is_written_as_rdf(tmp_path, make_model):
     model = make_model(5, 3, means=np.arange(15, dtype="f4").reshape(5, 3))
     csplat.write(tmp_path / "a.spz", model)
     found = checked(tmp_path / "a.spz")
@@ -247,27 +231,27 @@ def test_a_scene_without_axes_is_taken_as_right_down_forward(tmp_path, make_mode
     assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
 
 
-#: Tests of SPZ's repository that fail on csplat, by the beginning of their names, and why.
+#: Tests of SPZ's repository that fail on csplat, by the beginning of their names, with reasons.
 FAIL_ON_CSPLAT = {
-    # the fourth band of SH is left out
+    # The fourth band of SH is left out.
     "test_cross_family_round_trip[4-", "test_sh_degree_4_", "test_sh_rotation_higher_bands_orthogonal[3]",
     "test_sh_rotation_higher_bands_four_cycle[4]", "test_spz_version_3_or_higher_sh_degree_4",
     "test_version_3_or_higher_with_all_features",
-    # versions 3 and 4 are written, without extensions, with 6 bits for each coefficient of SH
+    # Versions 3 and 4 are written, without extensions, with 6 bits per SH coefficient.
     "test_all_versions_round_trip[2-", "test_spz_version_2_first_three", "test_spz_version_compatibility_positions",
     "test_version_roundtrip_consistency", "test_coordinate_system_extension_overrides_pack_to",
     "test_coordinate_system_extension_used_on_unpack", "test_coordinate_system_extension_unspecified_uses_rub",
     "test_coordinate_system_extension_rotated_family", "test_safe_orbit_extension_round_trip",
     "test_toc_byte_offset_advances_with_extensions", "test_sh_quantization_8bit",
-    # rotations are of unit length in every file
+    # Rotations have unit length in every file.
     "test_save_load_ply[", "test_io_consistency_ply_format",
-    # no counterpart: the median volume, and what their binding does with arrays of wrong types and lengths
+    # No counterpart: the median volume, and how their binding treats arrays of wrong types and lengths.
     "test_edge_cases_empty_cloud", "test_gaussian_cloud_median_volume", "test_error_handling_invalid_arrays",
     "test_gaussian_cloud_array_dtype_handling",
 }  # fmt: skip
 
 
-def test_tests_of_its_repository_pass_but_for_what_csplat_does_otherwise(tmp_path):
+def test_tests_of_its_repository_pass_except_for_known_differences(tmp_path):
     folder = of_peers("spz/tests/python").parents[1]
     code = "import sys, spz_shim; sys.modules['spz'] = spz_shim; import pytest; sys.exit(pytest.main(sys.argv[1:]))"
     paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from checked import flipped, refusals
 
 import csplat
 from csplat.errors import InputError
@@ -337,22 +338,9 @@ def test_invalid_tensors_are_refused(torch, make_model, tmp_path):
 @pytest.mark.area(name="torch")
 def test_a_damaged_checkpoint_is_refused_or_read(torch, make_model, tmp_path):
     whole, path = saved(torch, {"splats": to_gsplat(make_model(3, 0), device="cpu")}), tmp_path / "a.ckpt"
-
-    def read(data):
-        path.write_bytes(data)
-        try:
-            csplat.read(path)
-        except InputError as error:
-            return str(error)
-        return ""
-
-    assert not read(whole)
-    assert all("a.ckpt" in read(whole[:size]) for size in range(0, len(whole), 311))
-    for at in range(0, len(whole), 29):
-        read(whole[:at] + bytes([whole[at] ^ (1 << at % 8)]) + whole[at + 1 :])
-
-
-NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+    assert [""] == refusals(path, [whole])
+    assert all("a.ckpt" in one for one in refusals(path, (whole[:size] for size in range(0, len(whole), 311))))
+    refusals(path, flipped(whole, range(0, len(whole), 29)))
 
 
 @pytest.fixture
@@ -363,14 +351,14 @@ def model(make_model):
 
 
 def assert_near(a, b):
-    for name in NAMES:
+    for name in ARRAYS:
         assert np.allclose(getattr(a, name), getattr(b, name), rtol=1e-6, atol=2e-7), name
 
 
 def test_parameters_are_logarithms_and_logits(model):
     splats = csplat.to_gsplat(model)
-    assert NAMES == tuple(splats)
-    assert [(20, 3), (20, 4), (20, 3), (20,), (20, 1, 3), (20, 8, 3)] == [splats[name].shape for name in NAMES]
+    assert ARRAYS == tuple(splats)
+    assert [(20, 3), (20, 4), (20, 3), (20,), (20, 1, 3), (20, 8, 3)] == [splats[name].shape for name in ARRAYS]
     assert np.array_equal(model.scales, splats["scales"])
     assert np.allclose(1.0 / (1.0 + np.exp(-splats["opacities"].astype(np.float64))), model.opacities, atol=1e-7)
     assert np.isfinite(splats["opacities"]).all()

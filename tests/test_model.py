@@ -1,3 +1,5 @@
+"""`SplatModel`: its fields, checks and selections."""
+
 import time
 from dataclasses import replace
 
@@ -8,7 +10,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats
 
 
-def test_defaults_fill_what_is_not_given(make_model):
+def test_fields_have_defaults(make_model):
     model = make_model(4, 0)
     bare = SplatModel(
         means=model.means, quats=model.quats, scales=model.scales, opacities=model.opacities, sh0=model.sh0
@@ -21,17 +23,9 @@ def test_defaults_fill_what_is_not_given(make_model):
     assert ({}, {}) == (dict(bare.metadata), dict(bare.extra))
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_sh_degree_follows_from_the_shape(make_model, degree):
-    assert degree == make_model(5, degree).sh_degree
-
-
-def test_length_is_the_number_of_splats(make_model):
-    assert 7 == len(make_model(7))
-    assert 0 == len(make_model(0))
-
-
-def test_repr_is_short(make_model):
+def test_sh_degree_and_length_follow_from_the_shapes(make_model):
+    assert [0, 1, 2, 3] == [make_model(5, degree).sh_degree for degree in range(4)]
+    assert (7, 0) == (len(make_model(7)), len(make_model(0)))
     assert "SplatModel(7 splats, sh_degree=2)" == repr(make_model(7, 2))
 
 
@@ -63,36 +57,27 @@ def test_repr_is_short(make_model):
         ("extra", {"id": np.zeros(10, bool)}, "extra column 'id' is bool"),
     ],
 )
-def test_refuses_what_is_no_model(make_model, field, value, message):
+def test_invalid_fields_are_refused(make_model, field, value, message):
     with pytest.raises(InputError, match=message):
         make_model(10, **{field: value})
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh0", "shN"])
-def test_refuses_values_that_are_not_finite(make_model, field, value):
+def test_values_that_are_not_finite_are_refused(make_model, field, value):
     array = getattr(make_model(), field).copy()
     array.flat[-1] = value
     with pytest.raises(InputError, match=f"{field} contains 1 values that are NaN or infinite"):
         make_model(**{field: array})
 
 
-def test_accepts_finite_values_whose_sum_overflows(make_model):
-    means = np.full((10, 3), 3e38, np.float32)
+def test_values_at_their_limits_are_accepted(make_model):
+    means = np.full((10, 3), 3e38, np.float32)  # their sum overflows
     assert np.array_equal(make_model(means=means).means, means)
-
-
-def test_accepts_alpha_of_exactly_0_and_1(make_model):
     assert 2 == len(make_model(2, opacities=np.array([0, 1], np.float32)))
-
-
-@pytest.mark.parametrize("letters", ["RDF", "RUB", "LUF", "FRU", "BLD"])
-def test_accepts_coordinate_systems_of_three_directions(make_model, letters):
-    assert letters == make_model(coordinate_system=letters).coordinate_system
-
-
-def test_origin_may_be_any_three_numbers(make_model):
     assert (1e7, 2.0, 3.0) == make_model(origin=np.array([1e7, 2, 3])).origin
+    for letters in ("RDF", "RUB", "LUF", "FRU", "BLD"):
+        assert letters == make_model(coordinate_system=letters).coordinate_system
 
 
 def with_doubles(make_model):
@@ -102,7 +87,7 @@ def with_doubles(make_model):
     return make_model(10, 0, means=means, origin=origin, means_double=doubles)
 
 
-def test_doubles_go_with_their_means(make_model):
+def test_doubles_have_to_match_their_means(make_model):
     model = with_doubles(make_model)
     some = model.select(np.array([3, 1]))
 
@@ -113,7 +98,7 @@ def test_doubles_go_with_their_means(make_model):
             replace(model, **wrong)
 
 
-def test_a_model_does_not_copy_its_arrays(make_model):
+def test_arrays_are_not_copied(make_model):
     model = make_model()
     again = make_model(means=model.means)
     assert again.means is model.means
@@ -129,7 +114,7 @@ def test_select_keeps_rows_of_every_array(make_model, index):
     assert (model.origin, model.coordinate_system) == (part.origin, part.coordinate_system)
 
 
-def test_normalised_quats_are_unit_and_stay_so():
+def test_normalised_quats_have_unit_length_and_stay_unchanged():
     rng = np.random.default_rng(1)
     quats = (rng.standard_normal((10_000, 4)) * rng.choice([1e-30, 1, 1e30], (10_000, 1))).astype(np.float32)
     once = normalise_quats(quats)

@@ -14,7 +14,7 @@ from mmap import mmap
 
 import numpy as np
 import pytest
-from checked import measure_errors
+from checked import covariances, disturbed, measure_errors
 from typer.testing import CliRunner
 
 from csplat import _spec
@@ -22,7 +22,6 @@ from csplat.decoder import decode, decode_scene, open_tiles, read_header
 from csplat.disk_files import read_array
 from csplat.encoder import EncodeOptions, encode, encode_with_report
 from csplat.errors import CsplatError, InputError
-from csplat.model import normalise_quats
 from csplat.ply import write_ply
 from csplat.scene_source import source_from_model
 from csplat.system import CAN_FORK
@@ -49,42 +48,15 @@ def measure_pairs(source, *rest, **options):
     return {name: found[:2] for name, found in measured(Source.of(source), *rest, **options).items()}
 
 
-def moved(model, rng, sigma=1e-3):
-    """Return the scene with every value changed a little."""
-    return replace(
-        model,
-        means=model.means + rng.normal(0, sigma, model.means.shape).astype(np.float32),
-        quats=normalise_quats(model.quats + rng.normal(0, sigma, model.quats.shape).astype(np.float32)),
-        scales=model.scales + rng.normal(0, sigma, model.scales.shape).astype(np.float32),
-        opacities=np.clip(model.opacities + np.float32(sigma), 0, 1),
-        sh0=model.sh0 + rng.normal(0, sigma, model.sh0.shape).astype(np.float32),
-        shN=model.shN + rng.normal(0, sigma, model.shN.shape).astype(np.float32),
-    )
-
-
-def covariance(quat, scales):
-    """Compute a covariance from its definition, as a slow twin."""
-    w, x, y, z = quat / np.linalg.norm(quat)
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return rotation @ np.diag(np.exp(2 * scales)) @ rotation.T
-
-
 # Errors of pairs ----------------------------------------------------------------------------------
 def test_covariance_errors_agree_with_the_definition(make_model):
     source = make_model(60, 0)
-    decoded = moved(source, np.random.default_rng(1), 0.1)
+    decoded = disturbed(source, np.random.default_rng(1), 0.1)
     rows = np.arange(60)
     found = differences(source, decoded, rows, rows)["covariance"][:, 0]
-    for row in rows:
-        theirs = covariance(source.quats[row].astype(float), source.scales[row].astype(float))
-        ours = covariance(decoded.quats[row].astype(float), decoded.scales[row].astype(float))
-        assert found[row] == pytest.approx(np.linalg.norm(ours - theirs) / np.linalg.norm(theirs), rel=1e-9)
+    theirs, ours = (covariances(one.quats, one.scales) for one in (source, decoded))
+    expected = np.linalg.norm(ours - theirs, axis=(1, 2)) / np.linalg.norm(theirs, axis=(1, 2))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_log_scales_of_any_size_have_covariance_errors(make_model):
@@ -117,7 +89,7 @@ def test_agrees_with_the_encoder(make_model):
     source = make_model(9000, 3)
     rng = np.random.default_rng(2)
     index = rng.permutation(9000)[:8500]
-    decoded = moved(source.select(index), rng)
+    decoded = disturbed(source.select(index), rng)
     ours, theirs = measure_pairs(source, decoded, index), measure_errors(source, decoded, index)
     assert set(ours) == set(theirs)
     for name, pair in ours.items():
@@ -126,7 +98,7 @@ def test_agrees_with_the_encoder(make_model):
 
 def test_does_not_depend_on_threads(make_model):
     source = make_model(20000, 1)
-    decoded = moved(source, np.random.default_rng(3))
+    decoded = disturbed(source, np.random.default_rng(3))
     index = np.arange(20000)
     assert measure_pairs(source, decoded, index, threads=1) == measure_pairs(source, decoded, index, threads=3)
 
@@ -156,7 +128,7 @@ def test_finds_partners(make_model, sigma):
     source = make_model(5000, 1)
     rng = np.random.default_rng(4)
     index = rng.permutation(5000)
-    decoded = moved(source.select(index), rng, sigma)
+    decoded = disturbed(source.select(index), rng, sigma)
     bounds = bounds_of(source, decoded, index)
     found = match(source, decoded, bounds, np.full(5000, sigma))
     assert (found >= 0).all()
@@ -166,7 +138,7 @@ def test_finds_partners(make_model, sigma):
 
 def test_a_radius_that_is_too_small_only_costs_time(make_model):
     source = make_model(500, 0)
-    decoded = moved(source, np.random.default_rng(5), 0.05)
+    decoded = disturbed(source, np.random.default_rng(5), 0.05)
     bounds = bounds_of(source, decoded, np.arange(500))
     assert (match(source, decoded, bounds, np.full(500, 1e-9)) >= 0).all()
     assert (match(source, decoded, bounds, np.zeros(500)) >= 0).all()
@@ -175,7 +147,7 @@ def test_a_radius_that_is_too_small_only_costs_time(make_model):
 @pytest.mark.parametrize("attribute", ["means", "scales", "opacities", "sh0", "shN"])
 def test_a_splat_without_a_partner_is_reported(make_model, attribute):
     source = make_model(300, 1)
-    decoded = moved(source, np.random.default_rng(6))
+    decoded = disturbed(source, np.random.default_rng(6))
     bounds = bounds_of(source, decoded, np.arange(300))
     array = getattr(decoded, attribute).copy()
     array[17] = 0.5 * array[17] + 0.3

@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from checked import measure_errors
+from checked import covariances, measure_errors
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -58,7 +58,7 @@ def test_colours_stay_within_a_step_and_a_chroma_step(shift, scale):
 
 @pytest.mark.slow
 @given(st.integers(-(2**20), 2**20), st.integers(-(2**20), 2**20), st.integers(-(2**20), 2**20))
-def test_integers_come_back_within_one_step_without_a_shift(r, g, b):
+def test_without_a_shift_colours_stay_within_one_step(r, g, b):
     rgb = np.array([[r], [g], [b]], np.float64)
     columns = quantisation.colour_integers(rgb, 0)
     assert float(np.abs(quantisation.colour_lifted(columns, 0) - rgb).max()) <= 1
@@ -72,7 +72,7 @@ def test_coarse_colours_are_multiples_on_the_same_lattice():
 
 
 @pytest.mark.parametrize("largest", [0.0, 1.0, 1e6, 1e20, 3e38])
-def test_lattice_exponents_keep_integers_within_what_the_format_holds(largest):
+def test_lattice_exponents_keep_integers_within_the_range_of_the_format(largest):
     exponent = quantisation.lattice_exponent(largest, 1e-3)
     assert largest / quantisation.lattice_step(1e-3, exponent) <= 2**21
     assert exponent == 0 or largest / quantisation.lattice_step(1e-3, exponent - 2) >= 2**20
@@ -85,18 +85,6 @@ def test_means_at_the_end_of_float32_do_not_become_infinite():
     assert np.isfinite(quantisation.lattice_values(n, 1.7e36)).all()
 
 
-def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """[n, 3, 3] from [n, 4] and [n, 3], in float64."""
-    w, x, y, z = (quats.astype(np.float64) / np.linalg.norm(quats.astype(np.float64), axis=1)[:, None]).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    rotation = np.moveaxis(np.array(rows), 2, 0)
-    return np.einsum("nij,nj,nkj->nik", rotation, np.exp(2 * scales.astype(np.float64)), rotation)
-
-
 def random_shapes(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     quats = rng.standard_normal((count, 4))
@@ -104,7 +92,7 @@ def random_shapes(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return quats.astype(np.float32), rng.normal(0, 2, (count, 3)).astype(np.float32)
 
 
-def test_keeps_the_covariance():
+def test_canonical_axis_order_keeps_the_covariance():
     quats, scales = random_shapes(5000, 0)
     rotation, ordered = canonicalise_shape(quats, scales)
     before, after = covariances(quats, scales), covariances(rotation.T, ordered.T)
@@ -112,7 +100,7 @@ def test_keeps_the_covariance():
     assert float((np.linalg.norm(after - before, axis=(1, 2)) / size).max()) < 1e-5
 
 
-def test_sorts_the_scales_and_makes_w_largest():
+def test_canonical_axis_order_sorts_scales_and_makes_w_largest():
     quats, scales = random_shapes(5000, 1)
     rotation, ordered = canonicalise_shape(quats, scales)
     assert (np.diff(ordered, axis=0) <= 0).all()
@@ -123,7 +111,7 @@ def test_sorts_the_scales_and_makes_w_largest():
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
 @pytest.mark.parametrize("sign", [1, -1])
-def test_descriptions_of_one_ellipsoid_become_one(order, sign):
+def test_equivalent_shapes_get_the_same_canonical_form(order, sign):
     quats, scales = random_shapes(64, 2)
     axes = np.eye(3)[list(order)].T
     if np.linalg.det(axes) < 0:
@@ -171,7 +159,7 @@ OPTIONS = {
 
 
 def moved(fixed, seed=1, share=0.3):
-    """Return values after a random walk, further than any tuning goes."""
+    """Return values after a random walk, which goes further than any tuning."""
     values, rng = fixed.start(), np.random.default_rng(seed)
     for name in ("means", "quats", "scales", "sh0", "sh", "sizes"):
         array = getattr(values, name)
@@ -193,7 +181,7 @@ def assert_dequantised_as_decoded(fixed, values, result):
 
 
 @pytest.mark.parametrize("options_name", OPTIONS)
-def test_dequantised_values_are_decoded_at_the_start_and_moved(make_model, options_name):
+def test_values_are_decoded_as_dequantised_at_the_start_and_moved(make_model, options_name):
     model = make_model(260, 3)
     fixed = fix_quantisation(EncodePlan.of(model, EncodeOptions(**OPTIONS[options_name])))
     for values in (fixed.start(), moved(fixed)):
@@ -232,7 +220,7 @@ def test_negative_w_is_the_same_rotation_with_the_other_sign(make_model):
     assert np.array_equal(before.quats, fixed.dequantise(values).quats)
 
 
-def test_centres_stay_in_their_tiles(make_model):
+def test_means_stay_in_their_tiles(make_model):
     fixed = fix_quantisation(EncodePlan.of(make_model(300, 0), EncodeOptions(tile_splats=100, position_bits=16)))
     values = fixed.start()
     values.means *= np.float32(50.0)
@@ -288,31 +276,25 @@ def test_extra_columns_follow_their_splats(make_model):
     assert np.array_equal(result.source_index, decode_scene(result.data).model.extra["id"])
 
 
-def test_refuses_a_scene_without_splats(make_model):
+def test_no_splats_or_a_part_without_its_source_are_refused(make_model):
     with pytest.raises(InputError, match="without splats"):
         fix_quantisation(EncodePlan.of(make_model(0, 0)))
-
-
-def test_refuses_a_part_without_its_source(make_model):
     with pytest.raises(InputError, match="source"):
         fix_quantisation(EncodePlan.of(make_model(5, 0), origin=Origin(9, np.arange(5))))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"preset": "small"},
-        {"sh_coding": "scalar", "attribute_psnr": 40.0},
-        {"shape_codebook_size": 200},
-        {},
-        {"tile_splats": 160},
-    ],
-)
-def test_the_sample_is_decoded_as_dequantised(sample_path, options):
-    fixed = fix_quantisation(EncodePlan.of(read_ply(sample_path).select(slice(0, None, 15)), EncodeOptions(**options)))
+def assert_moved_as_decoded(model, options):
+    fixed = fix_quantisation(EncodePlan.of(model, EncodeOptions(**options)))
     values = moved(fixed, share=0.02)
     assert_dequantised_as_decoded(fixed, values, fixed.encode(values).write())
+
+
+@pytest.mark.slow
+def test_the_sample_is_decoded_as_dequantised(sample_path):
+    model = read_ply(sample_path).select(slice(0, None, 15))
+    scalar = {"sh_coding": "scalar", "attribute_psnr": 40.0}
+    for options in ({}, {"preset": "small"}, scalar, {"shape_codebook_size": 200}, {"tile_splats": 160}):
+        assert_moved_as_decoded(model, options)
 
 
 @pytest.mark.parametrize(
@@ -326,9 +308,7 @@ def test_the_sample_is_decoded_as_dequantised(sample_path, options):
     ],
 )
 def test_shared_scenes_are_decoded_as_dequantised(data_dir, name, options):
-    fixed = fix_quantisation(EncodePlan.of(read_ply(data_dir / "ply" / f"{name}.ply"), EncodeOptions(**options)))
-    values = moved(fixed, share=0.02)
-    assert_dequantised_as_decoded(fixed, values, fixed.encode(values).write())
+    assert_moved_as_decoded(read_ply(data_dir / "ply" / f"{name}.ply"), options)
 
 
 def test_bytes_do_not_depend_on_threads(make_model):

@@ -12,6 +12,7 @@ from itertools import permutations, product
 
 import numpy as np
 import pytest
+from checked import covariances
 from posed_sets import write_blender, write_colmap_set, write_transforms
 from typer.testing import CliRunner
 
@@ -238,15 +239,8 @@ ANY = np.linalg.qr(np.random.default_rng(5).standard_normal((3, 3)))[0]
 CAMERA = {"K": [[50.0, 0, 30], [0, 50.0, 20], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 64, "H": 48, "near": 0.1}
 
 
-def covariances(model):
-    w, x, y, z = model.quats.T.astype(np.float64)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    root = np.moveaxis(np.array(rows), 2, 0) * np.exp(model.scales.astype(np.float64))[:, None]
-    return root @ root.transpose(0, 2, 1)
+def shapes(model):
+    return covariances(model.quats, model.scales)
 
 
 def colours(model, directions):
@@ -272,7 +266,7 @@ def test_rotation_turns_shapes_and_colours(make_model, matrix):
     directions = np.random.default_rng(1).standard_normal((30, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     assert np.abs(model.means @ matrix.T - after.means).max() < 1e-6
-    assert np.abs(matrix @ covariances(model) @ matrix.T - covariances(after)).max() < 1e-6
+    assert np.abs(matrix @ shapes(model) @ matrix.T - shapes(after)).max() < 1e-6
     assert np.abs(colours(model, directions) - colours(after, directions @ matrix.T)).max() < 2e-6
     assert (model.scales[:, 2] == after.scales[:, 2]).all()  # the third scale of a disc has no meaning
 
@@ -281,8 +275,8 @@ def test_rotation_turns_shapes_and_colours(make_model, matrix):
 def test_a_linear_map_transforms_covariances(make_model, matrix):
     model = make_model(20, 1, origin=(1.0, 2.0, 3.0))
     after = stretch_scene(model, matrix)
-    expected = np.dot(matrix, covariances(model)).swapaxes(0, 1) @ np.transpose(matrix)
-    assert np.abs(expected - covariances(after)).max() < 1e-6
+    expected = np.dot(matrix, shapes(model)).swapaxes(0, 1) @ np.transpose(matrix)
+    assert np.abs(expected - shapes(after)).max() < 1e-6
     world = np.dot(model.means + model.origin, np.transpose(matrix))
     assert np.abs(world - after.means - after.origin).max() < 1e-5
 

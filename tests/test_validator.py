@@ -35,7 +35,7 @@ INVALID = [vector for vector in VECTOR_LIST if vector.error]
 RICH = build(rich_scene())
 SMALL = build(scene())
 
-#: Vectors whose defect the validator finds at a better place than the manifest's: rms itself, not the max next to it.
+#: Vectors whose defect the validator reports at a better offset than the manifest: rms itself, not the max before it.
 ELSEWHERE = {
     f"invalid/{name}": ("SERR/record[means].rms", "SERR/record[means].max")
     for name in (
@@ -46,11 +46,11 @@ ELSEWHERE = {
     )
 }
 
-#: Clauses that no file can break, and why.
+#: Clauses that no file can violate, with the reason.
 UNBREAKABLE = {"AXI-1": "a stream of AXIS has three bytes at most (STR-2), which hold no more than 24 bits"}
 
-#: Clauses of sections 2 to 8 that are not about a file's bytes: decoders, readers of parts, editors, permissions; and
-#: CBK-6 and CBK-7, which say where other clauses hold.
+#: Clauses of sections 2 to 8 that do not constrain the bytes of a file but decoders, readers of parts and editors, or
+#: that are permissions; CBK-6 and CBK-7 only delimit other clauses.
 NOT_ABOUT_FILES = {
     "NUM-1", "ORD-1", "ANC-1", "ANC-2", "ANC-3", "HDR-12", "IDX-9", "DIR-3", "TIL-4", "COV-2", "CHK-2", "CHK-5",
     "CHK-6", "CHK-7", "COD-4", "CBK-6", "CBK-7", "SER-6", "SER-7", "SRC-1", "SRC-2", "SRC-3", "SRC-4",
@@ -72,12 +72,12 @@ def sound():
 
 @pytest.fixture(scope="module")
 def broken():
-    """Return the violations in each invalid vector, by name, within the budget that their errors are defined for."""
+    """Return the violations in each invalid vector, by name, within the budget for which their errors are defined."""
     return {vector.name: validate(vector.data, splats_max=SPLATS_MAX).violations for vector in INVALID}
 
 
 # Vectors -------------------------------------------------------------------------------------------
-def test_valid_vectors_break_nothing(sound):
+def test_valid_vectors_have_no_violations(sound):
     def check(vector):
         found, header = sound[vector.name], vector.expect["header"]
         assert ((), ()) == (found.violations, found.unread)
@@ -87,7 +87,7 @@ def test_valid_vectors_break_nothing(sound):
 
 
 @pytest.mark.slow
-def test_invalid_vectors_break_their_clause_at_their_byte(broken):
+def test_invalid_vectors_violate_their_clause_at_their_offset(broken):
     def check(vector):
         offset = vector.error["offset"]
         if vector.name in ELSEWHERE:
@@ -100,8 +100,8 @@ def test_invalid_vectors_break_their_clause_at_their_byte(broken):
 
 
 @pytest.mark.slow
-def test_one_defect_is_few_violations(broken):
-    # What follows from a defect is named too, but a file with one defect must not drown it.
+def test_one_defect_causes_few_violations(broken):
+    # Consequences of a defect are reported too, but must not bury the defect.
     assert {} == {name: len(violations) for name, violations in broken.items() if len(violations) > 9}
 
 
@@ -112,7 +112,7 @@ def test_one_defect_is_few_violations(broken):
         ("extreme/deflate_unused_bits", "unused bits after the final block"),
     ],
 )
-def test_what_a_writer_should_not_do_is_remarked(name, part, sound):
+def test_recommendations_that_are_not_followed_are_remarked(name, part, sound):
     (remark,) = sound[name].remarks
     assert part in remark
 
@@ -125,7 +125,7 @@ def test_sound_files_get_no_remark(sound):
 
 # Clauses -------------------------------------------------------------------------------------------
 def requirements():
-    """Clause to sentence, of the sections on streams."""
+    """Return the sentences of the sections on streams, by clause."""
     body = TEXT.split("## 2 Conventions")[1].split("## 9 Conformance")[0]
     body = re.sub(r"```.*?```", "", body, flags=re.DOTALL)
     return {
@@ -138,7 +138,7 @@ def test_every_clause_about_files_has_its_code():
     assert set(requirements()) - NOT_ABOUT_FILES == set(CODES)
 
 
-def test_codes_are_those_of_the_text():
+def test_codes_agree_with_the_spec():
     texts = requirements()
 
     assert [] == [
@@ -155,7 +155,7 @@ def test_every_clause_is_reached_by_a_vector_or_a_test_of_this_file(broken):
 
 
 # More than one defect ------------------------------------------------------------------------------
-def test_all_defects_of_a_file_are_named():
+def test_all_defects_of_a_file_are_reported():
     changes = {
         "header.profile": 9,
         "header.reserved_0": 1,
@@ -180,11 +180,11 @@ def test_all_defects_of_a_file_are_named():
 
     elsewhere = {"tile[1].extent", "attribute[sh1].chroma_shift", "tile[1].layer[0].crc"}
     assert set() == set(changes) - elsewhere - found
-    assert "tile[1].corner" in found  # TIL-10 names the box by its first field
+    assert "tile[1].corner" in found  # TIL-10 names a box by its first field
     assert "TILE.1.0" in found  # CHK-1 names the chunk
 
 
-def test_offsets_are_those_of_the_fields():
+def test_violations_have_the_offsets_of_their_fields():
     changes = {"index.unit_metres": -1.0, "tile[1].level": 3, "TILE.0.2/sh2.reserved_0": 1, "SERR/head.error_flags": 8}
     found = {one.field: one.offset for one in validate(RICH.patched(changes)).violations}
 
@@ -199,7 +199,7 @@ def test_a_damaged_stream_does_not_hide_the_next():
     ]
 
 
-def test_what_cannot_be_told_apart_is_listed():
+def test_bytes_of_unknown_structure_are_listed_as_unread():
     found = validate(RICH.patched({"TILE.0.0/scales.coding": 99}))
 
     assert ["BLK-1"] == [one.clause for one in found.violations]
@@ -222,7 +222,7 @@ def test_a_violation_is_one_line(broken):
 
 
 @pytest.mark.slow
-def test_a_file_of_nothing_but_violations_ends():
+def test_the_number_of_violations_is_bounded():
     names = [Chunk(b"prv%c" % (65 + i % 26), payload=b"", flags=0xFF00) for i in range(60)]
     data = bytearray(build(scene(chunks=names)).data)
     header = _spec.unpack_header(data)
@@ -238,13 +238,13 @@ def test_a_file_of_nothing_but_violations_ends():
     assert "more than" in found.remarks[-1]
 
 
-# Clauses that no decoder looks at, or no vector shows -----------------------------------------------
+# Clauses that no decoder checks or no vector covers -----------------------------------------------
 def stated(*records, pruned=0, degree=0):
     errors = StatedErrors(2 + pruned, pruned, degree, 0, records)
     return build(scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=errors),))).data
 
 
-def test_stated_errors_that_no_scene_can_have_are_found():
+def test_impossible_declared_errors_are_found():
     means, opacities, sh2 = _spec.MEASURE_MEANS, _spec.MEASURE_OPACITIES, _spec.MEASURE_SH2
     assert set() == clauses_of(stated((means, 0.5, 0.5 / 2**0.5), (opacities, 1.0, 1.0)))
     assert "SER-5" in clauses_of(stated((means, 0.5, 0.3)))  # one of two splats alone gives 0.35
@@ -253,7 +253,7 @@ def test_stated_errors_that_no_scene_can_have_are_found():
     assert set() == clauses_of(stated((sh2, 0.5, 0.5), degree=2))
 
 
-def test_what_exceeds_the_budget_of_splats_is_not_read():
+def test_a_file_beyond_the_budget_of_splats_is_not_read():
     assert "LIM-1" in clauses_of(RICH.data, splats_max=4)
     assert set() == clauses_of(RICH.data, splats_max=5)
 
@@ -273,7 +273,7 @@ def test_a_text_beyond_the_budget_is_not_read():
         (b'""', ""),
     ],
 )
-def test_texts_are_parsed(text, value):
+def test_json_texts_are_parsed(text, value):
     found = parse_json(text)
 
     assert value is None or value == found
@@ -287,7 +287,7 @@ def test_texts_are_parsed(text, value):
         b'"\\udc00\\ud800"', b'{"a":1,"\\u0061":2}',
     ],
 )  # fmt: skip
-def test_texts_that_are_no_json_are_refused(text):
+def test_invalid_json_texts_are_refused(text):
     with pytest.raises(JsonError):
         parse_json(text)
 
@@ -296,7 +296,7 @@ def test_texts_that_are_no_json_are_refused(text):
 @pytest.mark.slow
 @pytest.mark.parametrize(("built", "count"), [(SMALL, len(SMALL.data)), (RICH, 150)], ids=["small", "rich"])
 def test_prefixes_are_found(built, count):
-    # Every one of the small file; the decoder meets every one of the rich file in test_damage.py.
+    # All prefixes of the small file; test_damage.py passes all those of the rich file to the decoder.
     found = prefixes(built.data, count)
 
     assert (count, []) == (found.count, found.missed)
@@ -305,7 +305,7 @@ def test_prefixes_are_found(built, count):
 
 @pytest.mark.slow
 def test_every_flipped_bit_of_a_small_file_is_found():
-    # Every seventh bit, which reaches each place within a byte.
+    # Every seventh bit, so that each bit position within a byte occurs.
     for bit in range(0, 8 * len(SMALL.data), 7):
         assert validate(flip(SMALL.data, bit)).violations
 
@@ -318,7 +318,7 @@ def test_flipped_bits_of_a_real_file_are_found(sample_path):
 
     assert [] == plain.missed
     assert 16 == plain.found
-    assert repaired.found < repaired.count  # the checksums are what finds the rest
+    assert repaired.found < repaired.count  # the rest is found only by checksums
     assert [] == prefixes(data, 10).missed
 
 
@@ -345,7 +345,7 @@ def test_the_validator_agrees_with_the_decoder_on_damaged_files():
 
 
 def error_of(data):
-    """Clause and code with which the decoder refuses a file, None if it does not."""
+    """Return the clause and code of the decoder's error, or None."""
     try:
         csplat.decode(data, threads=1)
     except csplat.CsplatError as error:
@@ -353,7 +353,7 @@ def error_of(data):
     return None
 
 
-def test_nothing_that_a_file_holds_raises():
+def test_no_content_of_a_file_raises():
     def check(seed):
         rng = random.Random(seed)  # noqa: S311 - repeatable, no secret
         data = bytearray(RICH.data)
@@ -372,15 +372,15 @@ def test_any_buffer_is_validated(kind):
     assert validate(kind(SMALL.data)).conforms
 
 
-def test_levels_that_are_none_do_not_overflow():
-    # A count of levels beyond ATT-4 whose square leaves 64 bits
+def test_huge_counts_of_levels_do_not_overflow():
+    # A count of levels beyond ATT-4 whose square exceeds 64 bits.
     made = attributes() | {3: Attribute(_spec.MAPPING_UNIT_W, levels=2**32 - 1)}
 
     assert {"ATT-4"} == clauses_of(build(scene(attributes=made)).data)
 
 
 def test_overlapping_chunks_are_read_once():
-    # Or an index could make a validator read the same megabytes a million times.
+    # Otherwise an index could make a validator read the same megabytes a million times.
     twins = build(scene(tiles=[tile(1), tile(2)]))
     found = validate(twins.patched({"tile[1].layer[0].offset": twins.spans["TILE.0.0"][0]}))
 
@@ -388,7 +388,7 @@ def test_overlapping_chunks_are_read_once():
 
 
 @pytest.mark.slow
-def test_the_validator_shares_nothing_with_the_decoder_nor_the_encoder_suite_with_encoder_and_renderer():
+def test_validator_and_encoder_suite_import_no_decoder_encoder_or_renderer():
     code = (
         "import sys, csplat_conformance.validator; print(*sorted(sys.modules))\n"
         "import csplat_conformance.encoders; print(*sorted(sys.modules))"
@@ -397,7 +397,7 @@ def test_the_validator_shares_nothing_with_the_decoder_nor_the_encoder_suite_wit
     by_validator, by_suite = (line.split() for line in done.stdout.splitlines())
     loaded = [name for name in by_validator if name.startswith("csplat")]
 
-    # `csplat.file_source` releases memory that was read and `csplat.types` names array types: neither knows the format.
+    # `csplat.file_source` releases memory that was read, `csplat.types` names array types: neither knows the format.
     assert {"csplat", "csplat._spec", "csplat.file_source", "csplat.types", "csplat_conformance"} == {
         name for name in loaded if not name.startswith("csplat_conformance.")
     }
@@ -413,7 +413,7 @@ SIZE = 2000
 
 
 def by_zlib(coded, size=SIZE):
-    """Output and bytes read, or what is wrong, or that there is more output than `size`."""
+    """Return output and bytes read, "refused", or "long" for more output than `size`."""
     inflater = zlib.decompressobj(-15)
     try:
         out = inflater.decompress(coded, size + 1)
@@ -433,7 +433,7 @@ def by_validator(coded, size=SIZE):
     return "long" if len(out) > size else (out, inflater.used)
 
 
-def test_sound_streams_give_their_output():
+def test_valid_deflate_streams_give_their_output():
     def check(case):
         size = len(case.output)
         assert (case.output, len(case.coded)) == by_zlib(case.coded, size)
@@ -442,7 +442,7 @@ def test_sound_streams_give_their_output():
     assert [] == failures(sound_streams(), check)
 
 
-def test_broken_streams_are_refused_for_their_clause():
+def test_invalid_deflate_streams_are_refused_with_their_clause():
     def check(case):
         assert "refused" == by_zlib(case.coded, len(case.output))
         with pytest.raises(CodedError) as caught:
@@ -469,11 +469,11 @@ def damaged(count):
 
 
 @pytest.mark.slow
-def test_the_slow_inflate_reads_what_zlib_reads_and_refuses_the_rest():
+def test_inflate_accepts_the_same_streams_as_zlib():
     verdicts = [(by_zlib(coded), by_validator(coded)) for coded in damaged(1500)]
 
     assert [] == [pair for pair in verdicts if pair[0] != pair[1]]
-    refused = sum(zlib_says == "refused" for zlib_says, _ in verdicts)
+    refused = sum(expected == "refused" for expected, _ in verdicts)
     assert 375 < refused < 1300
 
 
