@@ -40,8 +40,8 @@ def path(tmp_path):
     return tmp_path / "a.ply"
 
 
-def put(path, rows, after=b"", **words):
-    path.write_bytes(header(rows, **words) + rows.tobytes() + after)
+def put(path, rows, trailing=b"", **words):
+    path.write_bytes(header(rows, **words) + rows.tobytes() + trailing)
 
 
 def found(path):
