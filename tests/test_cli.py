@@ -191,7 +191,7 @@ def test_help_of_encode_fits_a_screen_and_the_rest_is_behind_help_all(monkeypatc
         ("position-bits=9,position_bits=10", "given twice"),
         ("position-bits=nine", "wanted an integer"),
         ("scale-step=wide", "wanted a number"),
-        ("position-bits=40", "wanted an integer, 2 to 16"),
+        ("position-bits=40", "expected an integer, 2 to 16"),
     ],
 )
 def test_wrong_settings_are_usage_errors(tmp_path, ply, setting, expected):

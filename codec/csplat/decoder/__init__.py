@@ -1,21 +1,21 @@
-"""Decode `.csplat` files into arrays, with every clause of the specification checked.
+"""Decode `.csplat` files into arrays, checking every clause of the specification.
 
-Written from `spec/format.md` alone; it shares with the encoder only the registry's constants, the errors and
-`SplatModel`.
+Written from `spec/format.md` alone: it shares only the registry's constants, the errors and `SplatModel` with the
+encoder.
 
 | function | returns |
 |---|---|
-| `decode` | a `SplatModel`, of the whole file or of chosen tiles and SH bands |
+| `decode` | a `SplatModel` of the whole file, or of some tiles and SH bands |
 | `decode_scene` | the same, with header, options, declared error bounds and the checks made |
 | `iter_tiles` | the splats tile by tile, in bounded memory |
-| `open_tiles` | metadata, and the tiles as models, any number of times |
+| `open_tiles` | metadata, and the tiles as models, which can be decoded repeatedly |
 | `read_header` | header and index; the beginning of a file suffices |
 | `decode_integers` | the integer arrays of spec 9.2, for conformance |
 | `read_metadata`, `read_cameras`, `read_options`, `read_declared_bounds` | one chunk |
 
-Modules, each built on those before it: `container` (file header, frames of chunks), `index`, `entropy` (streams),
-`blocks` (integers of one attribute), `reconstruct` (integers to values), `codebooks`, `tiles`, `limits`, `metadata`,
-`decode_api`.
+Modules, each of which builds on the previous ones: `container` (file header, frames of chunks), `index`, `entropy`
+(streams), `blocks` (integers of one attribute), `reconstruct` (integers to values), `codebooks`, `tiles`, `limits`,
+`metadata`, `decode_api`.
 """
 
 from csplat.decoder.container import ExtraColumn, SceneHeader, Tile

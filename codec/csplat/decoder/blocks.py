@@ -1,7 +1,7 @@
-"""Hold blocks of integers, and read the codings of one stream: LEVELS, MORTON, AXIS, OFFSET, SIGNED (spec 6.4).
+"""Represent blocks of integers, and read codings of a single stream: LEVELS, MORTON, AXIS, OFFSET, SIGNED (spec 6.4).
 
-Every kind of block has `rows(start, stop, dtype)`, the lattice integers or levels of a run of splats, and `bound`, the
-largest magnitude that can occur on the way to them.
+Every block has `rows(start, stop, dtype)`, which returns the integers of a run of splats, and `bound`, the largest
+magnitude that can occur while they are computed.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.decoder.container import Cursor, SceneHeader, Tile, check_reserved
+from csplat.decoder.container import Cursor, SceneHeader, Tile, check_reserved, refuse_field
 from csplat.decoder.entropy import Ints, read_stream
 from csplat.decoder.index import SINGLE_MAX, SINGLE_MIN, scaled_step
 from csplat.errors import FormatError, UnsupportedError
 
-_RUN_ELEMENTS = 1 << 18  # integers that are processed together: they fit the second-level cache
-_RUN_SPLATS = 1 << 14  # splats that are processed together
+_RUN_ELEMENTS = 1 << 18  # integers per run, which fit the second-level cache
+_RUN_SPLATS = 1 << 14  # splats per run
 
 #: Every third bit is compacted in five steps, each of which halves the number of gaps: shift, and mask of the bits to
-#: keep. Enough for 21 bits per axis; the format has 17.
+#: keep. Sufficient for 21 bits per axis; the format has 17.
 _EVERY_THIRD_BIT = 0x1249249249249249
 _MORTON_STEPS = (
     (2, 0x10C30C30C30C30C3),
@@ -35,14 +35,14 @@ _MORTON_STEPS = (
 
 @dataclass(frozen=True)
 class ColumnBlock:
-    """A block whose integers are in the stream: offset plus element.
+    """A block of integers offset + element.
 
     Attributes:
         elements: [C, n], in the type of the stream.
-        offsets: C summands, one per column.
+        offsets: offset of each column, [C].
         exponent: the block's lattice is coarser by 2^exponent.
-        at: offset in the file where the stream begins.
-        lows: smallest integer of each column, offset included.
+        at: offset of the stream in the file.
+        lows: smallest integer of each column.
         highs: largest integer of each column.
         bound: largest magnitude of an offset, an element or a sum.
     """
@@ -65,12 +65,9 @@ class ColumnBlock:
         object.__setattr__(self, "bound", max(map(abs, (*low, *high, *lows, *highs, *self.offsets))))
 
     def rows(self, start: int, stop: int, dtype: np.dtype[np.signedinteger]) -> Ints:
-        """Return the integers of splats `start` to `stop`, [C, stop − start], a new array.
+        """Return the integers of the splats `start` to `stop` - 1, [C, stop - start], in a new array.
 
-        Args:
-            start: first splat.
-            stop: the splat after the last.
-            dtype: signed, wide enough for `bound`.
+        `dtype` is signed and wide enough for `bound`.
         """
         out = self.elements[:, start:stop].astype(dtype)
         if any(self.offsets):
@@ -80,13 +77,12 @@ class ColumnBlock:
 
 @dataclass
 class Codebook:
-    """A codebook: its layers that were read.
+    """A codebook, as far as it was read.
 
     Attributes:
-        record: its record in the index.
-        entries: for each layer (0, or an SH band) [size, C] integers.
-        values: [size, K, 3] float32: the coefficients of the loaded bands, from `band_first`
-            on, for SH codebooks.
+        record: record in the index.
+        entries: integers [size, C] by layer (0, or an SH band).
+        values: [size, K, 3] float32, the dequantised bands from `band_first` on; only for SH codebooks.
     """
 
     record: _spec.CodebookRecord
@@ -96,13 +92,13 @@ class Codebook:
 
 @dataclass(frozen=True)
 class Indices:
-    """The indices of a tile's first block of a codebook, which its other blocks use too.
+    """The assignment of a tile's splats to a codebook, stored in the codebook's first block.
 
     Attributes:
         book: the codebook.
         attribute: attribute id of the first block.
-        places: [n], the entry of each splat; the size of the codebook if it is escaped.
-        escaped: places of the splats without an entry, ascending.
+        places: [n], the entry of each splat; the codebook's size for escaped splats.
+        escaped: indices of the escaped splats, ascending.
     """
 
     book: Codebook
@@ -113,15 +109,15 @@ class Indices:
 
 @dataclass(frozen=True)
 class CodebookBlock:
-    """A block coded CODEBOOK: the integers are entries, in scales plus a summand (spec 6.4.5).
+    """A block coded CODEBOOK: the integers are entries, plus a summand for scales (spec 6.4.5).
 
     Attributes:
         indices: the entry of each splat.
-        entries: [size, C], the columns of this block's attribute.
-        escapes: the integers of the escaped splats.
+        entries: [size, C], the columns of the block's attribute.
+        escapes: integers of the escaped splats.
         summand: for scales, one column that is added to all three.
-        at: offset in the file where the block begins.
-        exponent: 0; blocks coded CODEBOOK are on the file's lattice.
+        at: offset of the block in the file.
+        exponent: 0: the block is on the file's lattice.
         bound: largest magnitude of an integer, or of a part of a sum.
     """
 
@@ -139,8 +135,8 @@ class CodebookBlock:
         object.__setattr__(self, "bound", max(total, self.escapes.bound if self.escapes else 0))
 
     def rows(self, start: int, stop: int, dtype: np.dtype[np.signedinteger]) -> Ints:
-        """Return the integers of splats `start` to `stop`, as `ColumnBlock.rows` does."""
-        # An escaped splat's index is the codebook's size: `clip` gives it the last entry for now.
+        """Return the integers of some splats; see `ColumnBlock.rows`."""
+        # The index of an escaped splat is the codebook's size: `clip` assigns the last entry for now.
         rows = np.take(self.entries, self.indices.places[start:stop], axis=0, mode="clip")
         out = np.ascontiguousarray(rows.T, dtype)
         if self.summand:
@@ -154,10 +150,10 @@ class CodebookBlock:
 
 @dataclass(frozen=True)
 class SparseBlock:
-    """A block coded SPARSE: the integers of some splats, those of the others are 0 (spec 6.4.7).
+    """A block coded SPARSE: the integers of the masked splats; those of the others are 0 (spec 6.4.7).
 
     Attributes:
-        values: integers of the splats that the mask names.
+        values: integers of the masked splats.
         places: indices of these splats, ascending.
     """
 
@@ -166,7 +162,7 @@ class SparseBlock:
 
     @property
     def at(self) -> int:
-        """Offset in the file where the stream of the values begins."""
+        """Offset in the file of the stream of values."""
         return self.values.at
 
     @property
@@ -180,7 +176,7 @@ class SparseBlock:
         return self.values.bound
 
     def rows(self, start: int, stop: int, dtype: np.dtype[np.signedinteger]) -> Ints:
-        """Return the integers of splats `start` to `stop`, as `ColumnBlock.rows` does."""
+        """Return the integers of some splats; see `ColumnBlock.rows`."""
         out = np.zeros((len(self.values.elements), stop - start), dtype)
         first, last = np.searchsorted(self.places, (start, stop))
         out[:, self.places[first:last] - start] = self.values.rows(int(first), int(last), dtype)
@@ -195,9 +191,9 @@ class TileBlocks:
     """The integers of a tile.
 
     Attributes:
-        tile: its record.
-        blocks: by attribute id, those the tile has.
-        extra: the bits of the extra columns of known types, in the order of their records.
+        tile: the tile's record.
+        blocks: blocks by attribute id.
+        extra: bits of the extra columns of known types, in the order of their records.
     """
 
     tile: Tile
@@ -206,59 +202,52 @@ class TileBlocks:
 
 
 def work_dtype(bound: int) -> np.dtype[np.signedinteger]:
-    """Return the narrowest signed type, of two bytes at least, that holds ±bound."""
+    """Return the narrowest signed type of at least two bytes that holds ±bound."""
     if bound < 1 << 15:
         return np.dtype(np.int16)
     return np.dtype(np.int32) if bound < 1 << 31 else np.dtype(np.int64)
 
 
 def runs(count: int, columns: int) -> Iterator[tuple[int, int]]:
-    """Cut `count` splats into runs whose integers fit the cache."""
+    """Yield (start, stop) of runs of splats whose integers fit the cache."""
     step = min(_RUN_SPLATS, max(1, _RUN_ELEMENTS // columns))
     for start in range(0, count, step):
         yield start, min(count, start + step)
 
 
 def read_block_head(cursor: Cursor, attribute: int, legal: tuple[int, ...] | None = None) -> int:
-    """Read a block head, or that of an escape block if `legal` codings are given; return the coding."""
-    at = cursor.take(_spec.BLOCK_HEAD_SIZE)
+    """Read a block head and return the coding; for an escape block, `legal` codings are given."""
+    at, places = cursor.take(_spec.BLOCK_HEAD_SIZE), _spec.BLOCK_HEAD_OFFSETS
     head = _spec.unpack_block_head(cursor.view, at)
-    check_reserved(head, at, _spec.BLOCK_HEAD_OFFSETS)
-    place = at + _spec.BLOCK_HEAD_OFFSETS["coding"]
+    check_reserved(head, at, places)
+    place = at + places["coding"]
     if head.attribute != attribute:
-        raise FormatError(
-            _spec.ERROR_STREAM, at, "CBK-5" if legal else "TLE-2", "attribute", found=head.attribute, wanted=attribute
-        )
+        clause = "CBK-5" if legal else "TLE-2"
+        refuse_field(_spec.ERROR_STREAM, clause, head, at, places, "attribute", attribute)
     if head.coding not in _spec.CODING_NAMES:
         raise UnsupportedError(f"attribute coding {head.coding}", offset=place, clause="BLK-1")
     if legal is not None and head.coding not in legal:
-        raise FormatError(
-            _spec.ERROR_STREAM, place, "CBK-5", "coding of an escape block", found=head.coding, wanted=legal
-        )
-    if _spec.CODING_NAMES[head.coding] not in _spec.ATTRIBUTE_CODINGS[attribute]:
-        raise FormatError(
-            _spec.ERROR_VALUE,
-            place,
-            "BLK-1",
-            f"coding of {_spec.ATTRIBUTE_NAMES[attribute]}",
-            found=_spec.CODING_NAMES[head.coding],
-            wanted=" or ".join(_spec.ATTRIBUTE_CODINGS[attribute]),
-        )
+        detail = "coding of an escape block"
+        raise FormatError(_spec.ERROR_STREAM, place, "CBK-5", detail, found=head.coding, wanted=legal)
+    found, allowed = _spec.CODING_NAMES[head.coding], _spec.ATTRIBUTE_CODINGS[attribute]
+    if found not in allowed:
+        detail = f"coding of {_spec.ATTRIBUTE_NAMES[attribute]}"
+        raise FormatError(_spec.ERROR_VALUE, place, "BLK-1", detail, found=found, wanted=" or ".join(allowed))
     return head.coding
 
 
 def read_columns(
     cursor: Cursor, header: SceneHeader, attribute: int, coding: int, count: int, escape: bool = False
 ) -> ColumnBlock:
-    """Read the rest of a block after its head, parameters and stream; ranges checked.
+    """Read the parameters and the stream of a block, and check the range of its integers.
 
     Args:
-        cursor: behind the block head.
-        header: the scene.
+        cursor: after the block head.
+        header: header and index.
         attribute: attribute id of the block.
         coding: LEVELS, OFFSET or SIGNED.
-        count: splats of the block.
-        escape: it is an escape block.
+        count: number of splats in the block.
+        escape: True for an escape block.
     """
     columns = _spec.ATTRIBUTE_COLUMNS[attribute]
     record = header.attribute(attribute)
@@ -277,31 +266,27 @@ def read_columns(
 
 
 def read_exponent(cursor: Cursor, record: _spec.AttributeRecord, *, fixed: bool) -> int:
-    """Read lattice parameters: LAT-1, or LAT-2 if the exponent is fixed at 0."""
+    """Read lattice parameters and check LAT-1, or LAT-2 if the exponent is fixed at 0."""
     at = cursor.take(_spec.LATTICE_PARAMS_SIZE)
     params = _spec.unpack_lattice_params(cursor.view, at)
     check_reserved(params, at, _spec.LATTICE_PARAMS_OFFSETS)
     if fixed and params.exponent != 0:
-        raise FormatError(_spec.ERROR_VALUE, at, "LAT-2", "exponent", found=params.exponent, wanted=0)
+        refuse_field(_spec.ERROR_VALUE, "LAT-2", params, at, _spec.LATTICE_PARAMS_OFFSETS, "exponent", 0)
     if not fixed:
         check_step(record, params.exponent, at)
     return params.exponent
 
 
 def check_step(record: _spec.AttributeRecord, exponent: int, at: int) -> None:
-    """LAT-1: step × 2^exponent is normal and finite in binary32; levels have no step."""
+    """Check LAT-1: step × 2^exponent is normal and finite in binary32. Levels have no step."""
     scaled = scaled_step(record.step, exponent, SINGLE_MIN)
     if record.step and (scaled is None or scaled > SINGLE_MAX):
-        raise FormatError(
-            _spec.ERROR_VALUE,
-            at,
-            "LAT-1",
-            f"{record.step} x 2^{exponent} is not finite in binary32 and at least 2^-126",
-        )
+        detail = f"{record.step} x 2^{exponent} is not finite in binary32 and at least 2^-126"
+        raise FormatError(_spec.ERROR_VALUE, at, "LAT-1", detail)
 
 
 def read_signed(cursor: Cursor, record: _spec.AttributeRecord, exponent: int, count: int) -> ColumnBlock:
-    """Read a stream of signed integers in columns, [C, count] (LAT-4)."""
+    """Read a stream of signed integers in columns, [C, count], and check LAT-4."""
     at, columns = cursor.at, _spec.ATTRIBUTE_COLUMNS[record.attribute]
     elements = read_stream(cursor, columns * count, _spec.CODING_WIDTH_MAX[_spec.CODING_SIGNED], signed=True)
     block = ColumnBlock(elements.reshape(columns, count), (0,) * columns, exponent, at)
@@ -310,33 +295,20 @@ def read_signed(cursor: Cursor, record: _spec.AttributeRecord, exponent: int, co
 
 
 def read_offsets(cursor: Cursor, columns: int) -> tuple[int, ...]:
-    """Read i32[columns], the offsets (LAT-3)."""
-    at = cursor.take(4 * columns)
+    """Read the offsets, i32[columns], and check LAT-3."""
+    at, wanted = cursor.take(4 * columns), f"at most {_spec.COLUMN_MAX} in magnitude"
     offsets = tuple(int(value) for value in np.frombuffer(cursor.view, "<i4", columns, at))
     for i, offset in enumerate(offsets):
         if abs(offset) > _spec.COLUMN_MAX:
-            raise FormatError(
-                _spec.ERROR_VALUE,
-                at + 4 * i,
-                "LAT-3",
-                "offset",
-                found=offset,
-                wanted=f"{_spec.COLUMN_MAX} in magnitude at most",
-            )
+            raise FormatError(_spec.ERROR_VALUE, at + 4 * i, "LAT-3", "offset", found=offset, wanted=wanted)
     return offsets
 
 
 def check_integers(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.AttributeRecord, at: int) -> None:
-    """Check the extremes of columns by LEV-1, QUA-1 or LAT-4, whichever applies to the attribute.
-
-    Args:
-        lows: smallest integer of each column.
-        highs: largest integer of each column.
-        record: the attribute.
-        at: offset in the file for the error.
+    """Check the smallest and largest integers of columns by LEV-1, QUA-1 or LAT-4, depending on the attribute.
 
     Raises:
-        FormatError: E_RANGE.
+        FormatError: E_RANGE at the offset `at`.
     """
     if record.attribute == _spec.ATTRIBUTE_OPACITIES:
         _check_level(highs[0], 0, record.levels, at, "LEV-1")
@@ -353,27 +325,17 @@ def _check_level(found: int, low: int, high: int, at: int, clause: str) -> None:
 
 
 def _check_columns(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.AttributeRecord, at: int) -> None:
-    """LAT-4: each integer, after its chroma shift, is at most COLUMN_MAX in magnitude."""
+    """Check LAT-4: each integer, after its chroma shift, is at most COLUMN_MAX in magnitude."""
     for column, (low, high) in enumerate(zip(lows, highs, strict=True)):
         shift = record.chroma_shift if 3 * column >= len(lows) else 0
         found = max(-low, high) << shift
         if found > _spec.COLUMN_MAX:
-            raise FormatError(
-                _spec.ERROR_RANGE,
-                at,
-                "LAT-4",
-                f"integer of column {column}",
-                found=found,
-                wanted=f"{_spec.COLUMN_MAX} in magnitude at most",
-            )
+            detail, wanted = f"integer of column {column}", f"at most {_spec.COLUMN_MAX} in magnitude"
+            raise FormatError(_spec.ERROR_RANGE, at, "LAT-4", detail, found=found, wanted=wanted)
 
 
 def morton_axes(codes: Ints) -> Ints:
-    """Return [3, n] uint32: "Bit 3·b + a of a code is bit b of the integer q of axis a".
-
-    Args:
-        codes: [n], unsigned.
-    """
+    """Return [3, n] uint32 of codes [n]: "Bit 3·b + a of a code is bit b of the integer q of axis a"."""
     out = np.empty((3, len(codes)), np.uint32)
     for start, stop in runs(len(codes), 3):
         wide = codes[start:stop].astype(np.uint64)

@@ -1,4 +1,4 @@
-"""Read codebooks, the tables of integer vectors that tiles refer to (spec 5.3)."""
+"""Read codebooks, tables of integer vectors that tiles refer to (spec 5.3)."""
 
 from __future__ import annotations
 
@@ -8,17 +8,16 @@ import numpy as np
 
 from csplat import _spec
 from csplat.decoder.blocks import Codebook, ColumnBlock, check_integers
-from csplat.decoder.container import SceneHeader, Tile, check_reserved, open_chunk
+from csplat.decoder.container import SceneHeader, Tile, check_reserved, open_chunk, refuse_field
 from csplat.decoder.entropy import Ints, read_stream
 from csplat.decoder.reconstruct import check_values, quat_rows, write_colour
-from csplat.errors import FormatError
 
 _ENTRY_WIDTH_MAX = 4  # STR-2: "4 for codebooks' entries"
 _ATTRIBUTE_OF = {name: attribute for attribute, name in _spec.ATTRIBUTE_NAMES.items()}
 
 
 def layer_columns(record: _spec.CodebookRecord, layer: int) -> int:
-    """Return C of a CODB chunk: columns of the band, or of the kind's attributes together."""
+    """Return the number of columns of a CODB chunk: those of the band, or of all attributes of the kind."""
     if record.kind == _spec.CODEBOOK_KIND_SH:
         return _spec.ATTRIBUTE_COLUMNS[_spec.ATTRIBUTE_SH0 + layer]
     names = _spec.CODEBOOK_KIND_ATTRIBUTES[record.kind]
@@ -26,7 +25,7 @@ def layer_columns(record: _spec.CodebookRecord, layer: int) -> int:
 
 
 def attribute_columns(record: _spec.CodebookRecord, attribute: int) -> slice | None:
-    """Return the columns of an attribute in its layer's entries, `None` if CBK-1 refuses it."""
+    """Return the columns of an attribute in the entries of its layer, `None` if CBK-1 forbids it."""
     if record.kind == _spec.CODEBOOK_KIND_SH:
         band = attribute - _spec.ATTRIBUTE_SH0
         legal = 1 <= band <= _spec.SH_DEGREE_MAX and record.band_first <= band <= record.band_last
@@ -41,13 +40,13 @@ def attribute_columns(record: _spec.CodebookRecord, attribute: int) -> slice | N
 
 
 def table_bytes(header: SceneHeader, tiles: Iterable[Tile], degree: int, *, whole: bool) -> int:
-    """Return the bytes that LIM-1 counts for codebooks, four for each entry and column, from the index alone.
+    """Return the size of the codebooks by LIM-1: four bytes per entry and column.
 
     Args:
-        header: the scene.
-        tiles: the tiles to decode.
+        header: header and index.
+        tiles: tiles to decode.
         degree: highest SH band to decode.
-        whole: include the codebooks that no tile names: a whole decode checks them.
+        whole: include codebooks that no tile refers to, which a whole decode checks.
     """
     books = {book.codebook_id: book for book in header.codebooks}
     elements = 0
@@ -58,7 +57,7 @@ def table_bytes(header: SceneHeader, tiles: Iterable[Tile], degree: int, *, whol
 
 
 def read_codebooks(view: memoryview, header: SceneHeader, tiles: Iterable[Tile], degree: int) -> dict[int, Codebook]:
-    """Read the codebooks that some tiles name, their bands up to `degree`."""
+    """Read the codebooks that some tiles refer to, bands up to `degree`."""
     records = {book.codebook_id: book for book in header.codebooks}
     books: dict[int, Codebook] = {}
     for record in wanted_codebooks(header, tiles, degree):
@@ -71,7 +70,7 @@ def read_codebooks(view: memoryview, header: SceneHeader, tiles: Iterable[Tile],
 
 
 def check_unnamed_codebooks(view: memoryview, header: SceneHeader) -> None:
-    """Read the codebooks that no tile names, to check them."""
+    """Read the codebooks that no tile refers to, to check them."""
     records = {book.codebook_id: book for book in header.codebooks}
     named = {identity for tile in header.tiles for identity in tile.codebook_ids}
     for record in _codebook_chunks(header):
@@ -84,7 +83,7 @@ def _codebook_chunks(header: SceneHeader) -> list[_spec.DirectoryRecord]:
 
 
 def wanted_codebooks(header: SceneHeader, tiles: Iterable[Tile], degree: int) -> list[_spec.DirectoryRecord]:
-    """Return the records of those chunks of codebooks that some tiles name, their bands up to `degree`."""
+    """Return the records of the codebook chunks that some tiles refer to, bands up to `degree`."""
     ids = {identity for tile in tiles for identity in tile.codebook_ids}
     chunks = [record for record in _codebook_chunks(header) if record.id in ids and record.layer <= degree]
     return sorted(chunks, key=lambda record: (record.id, record.layer))
@@ -97,38 +96,25 @@ def _read_chunk(
     at = cursor.take(_spec.CODEBOOK_HEAD_SIZE)
     head = _spec.unpack_codebook_head(view, at)
     check_reserved(head, at, _spec.CODEBOOK_HEAD_OFFSETS)
-    for name, found, wanted in (
-        ("codebook_id", head.codebook_id, book.codebook_id),
-        ("layer", head.layer, record.layer),
-    ):
-        if found != wanted:
-            raise FormatError(
-                _spec.ERROR_INDEX, at + _spec.CODEBOOK_HEAD_OFFSETS[name], "CDB-1", name, found=found, wanted=wanted
-            )
+    for name, wanted in (("codebook_id", book.codebook_id), ("layer", record.layer)):
+        if getattr(head, name) != wanted:
+            refuse_field(_spec.ERROR_INDEX, "CDB-1", head, at, _spec.CODEBOOK_HEAD_OFFSETS, name, wanted)
     columns, stream_at = layer_columns(book, record.layer), cursor.at
     elements = read_stream(cursor, book.size * columns, _ENTRY_WIDTH_MAX, signed=True).reshape(columns, book.size)
     _check_entries(elements, header, book, record.layer, stream_at)
     cursor.finish()
-    # One row per entry, so that a gather copies whole rows; a copy, which does not refer to the file.
+    # One row per entry, so that a gather copies whole rows; a copy, so that it does not keep the file alive.
     return np.array(elements.T, order="C")
 
 
 def _check_entries(entries: Ints, header: SceneHeader, book: _spec.CodebookRecord, layer: int, at: int) -> None:
-    """CBK-7.
-
-    Args:
-        entries: [C, size].
-        header: the scene.
-        book: the codebook's record.
-        layer: layer of the chunk.
-        at: offset of the stream in the file.
-    """
+    """Check CBK-7 for the entries [C, size] of a layer, whose stream is at `at`."""
     for attribute, record in enumerate(header.attributes, _spec.ATTRIBUTE_OPACITIES):
         columns = attribute_columns(book, attribute)
         if columns is None or _spec.ATTRIBUTE_LAYER[attribute] != layer:
             continue
         if attribute == _spec.ATTRIBUTE_SCALES:
-            continue  # CBK-6 bounds their sums with the summand instead
+            continue  # CBK-6 bounds the sums of entry and summand instead
         block = ColumnBlock(entries[columns], (0,) * _spec.ATTRIBUTE_COLUMNS[attribute], 0, at)
         check_integers(block.lows, block.highs, record, at)
         if attribute == _spec.ATTRIBUTE_QUATS:
@@ -139,7 +125,7 @@ def _check_entries(entries: Ints, header: SceneHeader, book: _spec.CodebookRecor
 
 
 def _fill_values(book: Codebook, header: SceneHeader) -> None:
-    """Compute the coefficients of each entry once, so that splats copy them."""
+    """Dequantise the entries of an SH codebook once, so that splats copy float32 rows."""
     count = sum(2 * band + 1 for band in book.entries)
     book.values = np.empty((book.record.size, count, 3), np.float32)
     row = 0

@@ -1,7 +1,6 @@
 """Read the file header and the frames of chunks, and check their CRCs (spec 4.2, 5.1).
 
-All modules of the decoder read from one `memoryview` of the whole file, so that offsets in errors are offsets in the
-file.
+The whole decoder reads from one `memoryview` of the file, so that offsets in errors are offsets in the file.
 """
 
 from __future__ import annotations
@@ -12,26 +11,26 @@ import os
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 from csplat import _spec
 from csplat.errors import FormatError, InputError, UnsupportedError
 from csplat.file_source import File, describe_substitute, map_file
 
-#: All flags that the specification defines for a chunk of a tile.
+#: Flags of a TILE chunk.
 TILE_FLAGS = sum(flag for flag, name in _spec.CHUNK_FLAG_NAMES.items() if name in _spec.CHUNK_FLAGS[_spec.CHUNK_TILE])
 
-_CRC_SIZE = 4
-_STAND_IN_SIZE = 64  # bytes from which content of another kind is recognised
+_CRC_SIZE = 4  # bytes
+_SUBSTITUTE_SIZE = 64  # bytes that `describe_substitute` needs
 
 
 @dataclass(frozen=True, slots=True)
 class ExtraColumn:
-    """One further column per splat.
+    """An extra column of the splats.
 
     Attributes:
-        name: as in `SplatModel.extra`.
-        dtype: NumPy name of its type, `<u2`; `None` if this version does not know it: then it is not returned.
+        name: key in `SplatModel.extra`.
+        dtype: NumPy dtype, `<u2`; `None` if this version does not know the type, in which case the column is skipped.
     """
 
     name: str
@@ -43,16 +42,16 @@ class Tile:
     """A tile record with its layer records and codebook ids (spec 4.3.5).
 
     Attributes:
-        index: place of the record in the index.
-        offset: byte of the file where the record begins.
-        start: place of the tile's first splat in a whole decode.
-        splat_count: its splats.
-        exponent: its lattice of means has step × 2^exponent.
-        corner: lattice integers of the box's smallest corner.
-        extent: largest minus smallest lattice integer.
-        max_scale: largest of its scales (natural logarithm).
-        layers: layer records by layer id, including those of unknown layers.
-        codebook_ids: ids of the codebooks it may use.
+        index: position of the record in the index.
+        offset: offset of the record in the file.
+        start: index of the tile's first splat in a whole decode.
+        splat_count: number of splats.
+        exponent: the step of the means is step × 2^exponent.
+        corner: smallest lattice integer per axis.
+        extent: largest minus smallest lattice integer per axis.
+        max_scale: largest log scale.
+        layers: layer records by layer id, including unknown layers.
+        codebook_ids: ids of the codebooks that the tile may use.
     """
 
     index: int
@@ -67,11 +66,7 @@ class Tile:
     codebook_ids: tuple[int, ...]
 
     def corners(self, step: float) -> tuple[list[float], list[float]]:
-        """Return the corners of the box around its centres (spec 4.3.5), scene units.
-
-        Args:
-            step: step of the means' attribute record.
-        """
+        """Return the corners of the box around the centres (spec 4.3.5), scene units; `step` is the file's."""
         scaled = math.ldexp(step, self.exponent)
         low = [corner * scaled for corner in self.corner]
         return low, [(corner + extent) * scaled for corner, extent in zip(self.corner, self.extent, strict=True)]
@@ -79,22 +74,18 @@ class Tile:
 
 @dataclass(frozen=True)
 class SceneHeader:
-    """A file's header and index, all of their clauses checked.
+    """Header and index of a file, checked.
 
     Attributes:
         version: (major, minor).
-        profile: name in the registry of profiles, `base`.
-        file_size: bytes of the file.
-        index_size: bytes of the index.
+        profile: name of the profile, `base`.
+        file_size: size of the file, bytes.
+        index_size: size of the index, bytes.
         splat_count: N.
         sh_degree: 0 to 3.
-        antialiased: trained with the mip-splatting low-pass filter.
-        flat: splats are discs; the smallest scale has no meaning.
-        coordinate_system: as in `SplatModel`.
-        unit_metres: metres per scene unit, `None` if unknown.
-        origin: the point that the means are relative to.
-        attributes: attribute records in the order of their ids.
-        codebooks: codebook records in the order of their ids.
+        antialiased, flat, coordinate_system, unit_metres, origin: as in `SplatModel`.
+        attributes: attribute records, ids ascending.
+        codebooks: codebook records, ids ascending.
         extras: extra columns.
         directory: records of all chunks that are not tiles.
         tiles: tiles in the order of their splats.
@@ -118,25 +109,25 @@ class SceneHeader:
     tiles: tuple[Tile, ...]
 
     def attribute(self, attribute: int) -> _spec.AttributeRecord:
-        """Return an attribute's record; `KeyError` for a band above the scene's degree."""
-        # ATT-1: the records are opacities, scales, quats, means, sh0 and the bands, ids from 1 on.
+        """Return an attribute's record; raise `KeyError` for a band above the scene's degree."""
+        # ATT-1: the ids of the records are 1, 2, 3, ...
         if not 1 <= attribute <= len(self.attributes):
             raise KeyError(attribute)
         return self.attributes[attribute - 1]
 
     def chunk(self, kind: bytes) -> _spec.DirectoryRecord | None:
-        """Return the directory record of META, CAMS, OPTS or SERR, `None` if there is none."""
+        """Return the directory record of the META, CAMS, OPTS or SERR chunk, `None` if there is none."""
         return next((record for record in self.directory if record.type == kind), None)
 
 
 class Cursor:
-    """A place in the file that moves forward and never past the end of its payload.
+    """A read position in a payload, which moves forward and never past the end.
 
     Args:
         view: the whole file.
         at: offset of the next byte.
-        end: offset behind the payload; the caller has checked that the file is that long.
-        clause: the clause that requires the payload to end with its last structure.
+        end: offset of the payload's end, at most the size of the file.
+        clause: clause that requires the payload to end with its last structure.
     """
 
     def __init__(self, view: memoryview, at: int, end: int, clause: str) -> None:
@@ -147,64 +138,62 @@ class Cursor:
 
     def take(self, size: int) -> int:
         """Step over `size` bytes and return their offset; E_STREAM if fewer are left."""
-        at = self.at
-        if size > self.end - at:
-            raise FormatError(
-                _spec.ERROR_STREAM,
-                at,
-                self.clause,
-                "the payload ends within a structure",
-                found=f"{self.end - at} bytes",
-                wanted=f"{size} bytes",
-            )
+        at, left = self.at, self.end - self.at
+        if size > left:
+            detail = "the payload ends within a structure"
+            found, wanted = f"{left} bytes", f"{size} bytes"
+            raise FormatError(_spec.ERROR_STREAM, at, self.clause, detail, found=found, wanted=wanted)
         self.at = at + size
         return at
 
     def finish(self) -> None:
-        """Refuse bytes behind the last structure."""
+        """Refuse bytes after the last structure."""
         if self.at != self.end:
-            raise FormatError(
-                _spec.ERROR_STREAM,
-                self.at,
-                self.clause,
-                "bytes follow the last structure of the payload",
-                found=f"{self.end - self.at} bytes",
-            )
+            detail = "bytes follow the last structure of the payload"
+            raise FormatError(_spec.ERROR_STREAM, self.at, self.clause, detail, found=f"{self.end - self.at} bytes")
 
 
 def view_of(data: File) -> memoryview:
-    """Return the bytes of a file; those in memory are not copied, a path's are mapped.
+    """Return the bytes of a file: a view of bytes in memory, a mapping of a path.
 
     Args:
         data: a path; a binary file, which is read to its end; or a buffer (bytes, bytearray, memoryview, mmap).
 
     Raises:
-        InputError: it is none of these, or a buffer that is not contiguous, or a file of text.
-        OSError: it cannot be read.
+        InputError: `data` has another type, is a buffer that is not contiguous, or is a file in text mode.
+        OSError: the file cannot be read.
     """
     if isinstance(data, (str, os.PathLike)):
         return memoryview(map_file(data))
     try:
-        # An mmap is a buffer and a file; other files must return bytes.
+        # An mmap is both a buffer and a file.
         read = None if isinstance(data, mmap.mmap) else getattr(data, "read", None)
-        return memoryview(data if read is None else read()).cast("B")  # type: ignore[arg-type]  # the except says so
+        return memoryview(data if read is None else read()).cast("B")  # type: ignore[arg-type]  # raises TypeError
     except (TypeError, ValueError) as error:
-        raise InputError(
-            f"data is a {type(data).__name__}, expected a path, a binary file or contiguous bytes: {error}"
-        ) from None
+        name = type(data).__name__
+        raise InputError(f"data is a {name}, expected a path, a binary file or contiguous bytes: {error}") from None
 
 
 def check_reserved(record: Any, at: int, offsets: Mapping[str, int]) -> None:
-    """RES-1: "A reserved field or bit MUST be 0".
+    """RES-1: "A reserved field or bit MUST be 0"; arguments as in `refuse_field`."""
+    for name in offsets:
+        if name.startswith("reserved_") and getattr(record, name) != 0:
+            refuse_field(_spec.ERROR_RESERVED, "RES-1", record, at, offsets, name, 0)
+
+
+def refuse_field(
+    code: str, clause: str, record: Any, at: int, offsets: Mapping[str, int], name: str, wanted: object = None
+) -> NoReturn:
+    """Raise the `FormatError` for a field of a structure.
 
     Args:
+        code, clause, wanted: as in `FormatError`.
         record: a structure of `_spec`.
-        at: its offset in the file.
-        offsets: its `..._OFFSETS`.
+        at: offset of the structure in the file.
+        offsets: the structure's `..._OFFSETS`.
+        name: name of the field.
     """
-    for name, place in offsets.items():
-        if name.startswith("reserved_") and getattr(record, name) != 0:
-            raise FormatError(_spec.ERROR_RESERVED, at + place, "RES-1", name, found=getattr(record, name), wanted=0)
+    raise FormatError(code, at + offsets[name], clause, name, found=getattr(record, name), wanted=wanted)
 
 
 def read_file_header(view: memoryview) -> _spec.Header:
@@ -212,19 +201,12 @@ def read_file_header(view: memoryview) -> _spec.Header:
     magic = bytes(view[: len(_spec.MAGIC)])
     if len(view) < _spec.HEADER_SIZE:
         if _spec.MAGIC.startswith(magic):
-            raise FormatError(
-                _spec.ERROR_TRUNCATED,
-                len(view),
-                "HDR-11",
-                "the data ends within the header",
-                found=f"{len(view)} bytes",
-                wanted=f"{_spec.HEADER_SIZE} bytes",
-            )
+            refuse_length(_spec.ERROR_TRUNCATED, "HDR-11", "the data ends within the header", view, _spec.HEADER_SIZE)
         raise FormatError(_spec.ERROR_MAGIC, 0, "HDR-11", found=magic.hex(" "), wanted=_spec.MAGIC.hex(" "))
     header = _spec.unpack_header(view)
     places = _spec.HEADER_OFFSETS
     if header.magic != _spec.MAGIC:
-        instead = describe_substitute(bytes(view[:_STAND_IN_SIZE]))
+        instead = describe_substitute(bytes(view[:_SUBSTITUTE_SIZE]))
         detail = "a PLY, which csplat.read_ply reads" if magic[:4] in (b"ply\n", b"ply\r") else instead
         raise FormatError(_spec.ERROR_MAGIC, 0, "HDR-1", detail, found=magic.hex(" "), wanted=_spec.MAGIC.hex(" "))
     version = (header.version_major, header.version_minor)
@@ -240,43 +222,28 @@ def read_file_header(view: memoryview) -> _spec.Header:
     if header.profile not in _spec.PROFILE_NAMES:
         raise UnsupportedError(f"profile {header.profile}", offset=places["profile"], clause="HDR-4")
     check_reserved(header, 0, places)
-    room = header.file_size - _spec.HEADER_SIZE
-    if not _spec.INDEX_HEAD_SIZE + _CRC_SIZE <= header.index_size <= room:
-        raise FormatError(
-            _spec.ERROR_VALUE,
-            places["index_size"],
-            "HDR-7",
-            "index_size",
-            found=header.index_size,
-            wanted=f"{_spec.INDEX_HEAD_SIZE + _CRC_SIZE} to {room}",
-        )
+    least, most = _spec.INDEX_HEAD_SIZE + _CRC_SIZE, header.file_size - _spec.HEADER_SIZE
+    if not least <= header.index_size <= most:
+        refuse_field(_spec.ERROR_VALUE, "HDR-7", header, 0, places, "index_size", f"{least} to {most}")
     return header
 
 
 def check_length(view: memoryview, file_size: int) -> None:
-    """Refuse data that is not the file, complete and nothing else (HDR-5, HDR-6)."""
+    """Refuse data that is shorter or longer than the file (HDR-5, HDR-6)."""
     if len(view) < file_size:
-        raise FormatError(
-            _spec.ERROR_TRUNCATED,
-            len(view),
-            "HDR-5",
-            "the data ends early",
-            found=f"{len(view)} bytes",
-            wanted=f"{file_size} bytes",
-        )
+        refuse_length(_spec.ERROR_TRUNCATED, "HDR-5", "the data ends early", view, file_size)
     if len(view) > file_size:
-        raise FormatError(
-            _spec.ERROR_TRAILING,
-            file_size,
-            "HDR-6",
-            "bytes follow the end of the file",
-            found=f"{len(view)} bytes",
-            wanted=f"{file_size} bytes",
-        )
+        refuse_length(_spec.ERROR_TRAILING, "HDR-6", "bytes follow the end of the file", view, file_size)
+
+
+def refuse_length(code: str, clause: str, detail: str, view: memoryview, size: int) -> NoReturn:
+    """Raise the `FormatError` for data of the wrong length, expected to be `size` bytes."""
+    at, found = min(len(view), size), f"{len(view)} bytes"
+    raise FormatError(code, at, clause, detail, found=found, wanted=f"{size} bytes")
 
 
 def check_index_crc(view: memoryview, start: int, size: int) -> None:
-    """Check IDX-1; the caller has checked that the data holds the index."""
+    """Check IDX-1; the data must contain the index."""
     end = start + size - _CRC_SIZE
     _check_crc(view[start:end], int.from_bytes(view[end : end + _CRC_SIZE], "little"), end, "IDX-1")
 
@@ -284,27 +251,24 @@ def check_index_crc(view: memoryview, start: int, size: int) -> None:
 def open_chunk(
     view: memoryview, record: _spec.DirectoryRecord | _spec.LayerRecord, kind: bytes, flags: int, clause: str
 ) -> Cursor:
-    """Check CRC and header of a chunk (CHK-1, CHK-3) and return a cursor at the beginning of its payload.
+    """Check CRC and header of a chunk (CHK-1, CHK-3), and return a cursor at the beginning of its payload.
 
     Args:
-        view: the whole file; COV-1 has shown that the chunk lies within.
-        record: the one that names the chunk; its size is at least that of a chunk header.
-        kind: type of the record, or TILE.
-        flags: flags of the record, or those registered for TILE.
-        clause: the cursor's clause, for a payload that is too long or too short.
+        view: the whole file.
+        record: record of the chunk, which lies within the file (COV-1) and has at least the size of a chunk header.
+        kind: expected type.
+        flags: expected flags.
+        clause: clause of the cursor.
     """
     offset, end = record.offset, record.offset + record.size
     _check_crc(view[offset:end], record.crc, offset, "CHK-1")
     head = _spec.unpack_chunk_header(view, offset)
     places = _spec.CHUNK_HEADER_OFFSETS
     check_reserved(head, offset, places)
-    for name, found, wanted in (
-        ("type", head.type, kind),
-        ("flags", head.flags, flags),
-        ("payload_size", head.payload_size, record.size - _spec.CHUNK_HEADER_SIZE),
-    ):
-        if found != wanted:
-            raise FormatError(_spec.ERROR_INDEX, offset + places[name], "CHK-3", name, found=found, wanted=wanted)
+    payload_size = record.size - _spec.CHUNK_HEADER_SIZE
+    for name, wanted in (("type", kind), ("flags", flags), ("payload_size", payload_size)):
+        if getattr(head, name) != wanted:
+            refuse_field(_spec.ERROR_INDEX, "CHK-3", head, offset, places, name, wanted)
     return Cursor(view, offset + _spec.CHUNK_HEADER_SIZE, end, clause)
 
 

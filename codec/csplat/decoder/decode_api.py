@@ -1,4 +1,4 @@
-"""Decode whole scenes, chosen tiles and SH bands, at once or tile by tile."""
+"""Decode whole scenes, or some tiles and SH bands, at once or tile by tile."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from csplat.decoder.reconstruct import (
     write_tile,
 )
 from csplat.decoder.tiles import read_tile
-from csplat.errors import InputError, LimitError
+from csplat.errors import InputError, LimitError, counted
 from csplat.file_source import PageReleaser
 from csplat.model import SplatModel, trusted_model
 from csplat.types import F32
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from csplat.decoder.blocks import TileBlocks
     from csplat.file_source import File
 
-_THREADS_MAX = 8  # default maximum; memory bandwidth is the limit beyond that
+_THREADS_MAX = 8  # maximum by default; more threads are limited by memory bandwidth
 
 _Texts = tuple[Mapping[str, Any], Sequence[Mapping[str, Any]] | None]  # metadata, cameras
 _T = TypeVar("_T")
@@ -48,10 +48,10 @@ class DecodedScene:
 
     Attributes:
         header: header and index.
-        model: the splats, or those of the chosen tiles.
-        options: the encoder's record of its options (`None`: there is none, or a part was decoded).
-        declared_bounds: the file's declared error bounds (`None`: likewise).
-        checks: the checks made: `header_crc`, `index_crc`, `chunk_crc` (of every chunk read), `all_chunk_crcs`.
+        model: the splats of the file or of the chosen tiles.
+        options: the encoder's record of its options; `None` if there is none, or only a part was decoded.
+        declared_bounds: declared error bounds; `None` likewise.
+        checks: checks made: `header_crc`, `index_crc`, `chunk_crc` (of every chunk read), `all_chunk_crcs`.
     """
 
     header: SceneHeader
@@ -63,10 +63,10 @@ class DecodedScene:
 
 @dataclass(frozen=True)
 class DecodedTile:
-    """The splats of one tile, in arrays of its own.
+    """The decoded splats of one tile.
 
     Attributes:
-        tile: its record.
+        tile: the tile's record.
         means: [n, 3] float32.
         quats: [n, 4] float32, w, x, y, z.
         scales: [n, 3] float32, natural logarithms.
@@ -95,7 +95,7 @@ class DecodeRequest:
         header: header and index, checked.
         tiles: tiles to decode, in the order requested.
         degree: highest SH band to decode.
-        limits: limits on what decoding may take.
+        limits: limits on the size of the result.
         whole: True if all tiles and bands are decoded.
     """
 
@@ -109,12 +109,12 @@ class DecodeRequest:
 
 @dataclass(frozen=True)
 class TileReader:
-    """An open file whose tiles are decoded on demand; all other chunks are checked already.
+    """An open file whose tiles are decoded on demand. All other chunks have been checked.
 
     Attributes:
         metadata_model: the scene without its splats.
-        options: the encoder's record of its options (`None`: there is none).
-        declared_bounds: the file's declared error bounds (`None`: there are none).
+        options: the encoder's record of its options, if there is one.
+        declared_bounds: declared error bounds, if there are any.
         request: the file.
         threads: as in `decode`.
     """
@@ -131,10 +131,10 @@ class TileReader:
         return self.request.header
 
     def models(self, tiles: Sequence[int] | None = None) -> Iterator[SplatModel]:
-        """Decode tiles one after the other into models with the metadata of `metadata_model`.
+        """Decode tiles one after the other, each to a model with the metadata of `metadata_model`.
 
         Args:
-            tiles: indices of the tiles to decode, in the order requested; by default all.
+            tiles: indices of the tiles to decode, in the order requested; default: all.
         """
         header = self.header
         chosen = header.tiles if tiles is None else [header.tiles[index] for index in tiles]
@@ -151,17 +151,17 @@ def decode(
     sh_degree: int | None = None,
     threads: int | None = None,
 ) -> SplatModel:
-    """Decode a file, or chosen tiles and SH bands of it.
+    """Decode a file, or some tiles and SH bands of it.
 
     Args:
-        data: the whole file: its path, which is mapped into memory; an open binary file; or its bytes.
-        limits: limits on size and memory; by default the registry's.
-        tiles: indices of the tiles to decode, in the order requested; by default all.
-        sh_degree: highest SH band to decode; by default all of the file's.
-        threads: number of threads; by default one per processor, up to 8.
+        data: the whole file: a path, which is mapped into memory; an open binary file; or bytes.
+        limits: limits on size and memory; default: the registry's.
+        tiles: indices of the tiles to decode, in the order requested; default: all.
+        sh_degree: highest SH band to decode; default: all.
+        threads: number of threads; default: one per processor, up to 8.
 
     Returns:
-        The splats. A part equals the same part of a whole decode, bit for bit.
+        The splats. A part is bit for bit the same part of a whole decode.
 
     Examples:
         >>> import csplat
@@ -172,8 +172,8 @@ def decode(
         (1000, 3, 3)
 
     Raises:
-        FormatError: the file breaks a clause. A whole decode checks all of them, including the CRC of every chunk;
-            a part checks what it reads.
+        FormatError: the file breaks a clause. A whole decode checks all clauses, including the CRC of every chunk; a
+            partial decode checks what it reads.
         UnsupportedError: the file needs a feature that this version does not have.
         LimitError: the file exceeds `limits`.
         InputError: an argument is invalid.
@@ -190,7 +190,7 @@ def decode_scene(
     sh_degree: int | None = None,
     threads: int | None = None,
 ) -> DecodedScene:
-    """Decode as `decode` does; return the other content of the file and the checks made as well."""
+    """Decode a file, and return its other content and the checks made as well; arguments and errors as in `decode`."""
     request = prepare_decode(data, limits, tiles, sh_degree)
     header, degree = request.header, request.degree
     check_budget(header, request.tiles, degree, float_bytes(header, degree), request.limits, whole=request.whole)
@@ -244,17 +244,16 @@ def iter_tiles(
     sh_degree: int | None = None,
     threads: int = 1,
 ) -> Iterator[DecodedTile]:
-    """Decode tile by tile, in memory for one tile per thread and the codebooks.
+    """Decode tile by tile; memory holds the codebooks and one tile per thread.
 
     An iteration over all tiles checks every other chunk before the first tile; a damaged tile raises at its turn.
-    `limits.bytes` applies to one tile at a time.
 
     Args:
         data: as in `decode`; a path or an `mmap` may be larger than memory.
-        limits: as in `decode`.
+        limits: as in `decode`; `limits.bytes` applies to each tile.
         tiles: as in `decode`.
         sh_degree: as in `decode`.
-        threads: number of tiles that are decoded at the same time.
+        threads: number of tiles decoded at the same time.
     """
     request = _prepare_tiles(data, limits, tiles, sh_degree)
 
@@ -269,12 +268,12 @@ def iter_tiles(
 
 
 def open_tiles(data: File, *, limits: Limits | None = None, threads: int | None = None) -> TileReader:
-    """Open a file whose tiles are decoded one after the other, on demand.
+    """Open a file to decode its tiles on demand.
 
     Args:
         data: as in `iter_tiles`.
         limits: as in `iter_tiles`.
-        threads: as in `decode`. Tiles come in their order for any number of threads.
+        threads: as in `decode`. The order of the tiles does not depend on it.
 
     Raises:
         CsplatError: as in `decode`; a damaged tile raises at its turn.
@@ -301,7 +300,7 @@ def prepare_decode(
     if tiles is not None:
         for index in tiles:
             if not 0 <= index < len(header.tiles):
-                raise InputError(f"tile {index} is wanted of a file that has {len(header.tiles)}")
+                raise InputError(f"tile {index} does not exist, the file has {counted(len(header.tiles), 'tile')}")
         chosen = [header.tiles[index] for index in tiles]
     whole = tiles is None and degree == header.sh_degree
     return DecodeRequest(view, header, chosen, degree, limits or Limits(), whole)
@@ -310,7 +309,7 @@ def prepare_decode(
 def _prepare_tiles(
     data: File, limits: Limits | None, tiles: Sequence[int] | None, sh_degree: int | None
 ) -> DecodeRequest:
-    """Prepare a decode that has one tile in memory at a time."""
+    """Prepare a decode that holds one tile in memory at a time."""
     request = prepare_decode(data, limits, tiles, sh_degree)
     header, degree = request.header, request.degree
     splat_bytes = float_bytes(header, degree)
@@ -322,13 +321,13 @@ def _allocate(count: int, make: Callable[[], _T], request: DecodeRequest) -> _T:
     try:
         return make()
     except MemoryError:
-        wanted = count * float_bytes(request.header, request.degree)
+        size_bytes = count * float_bytes(request.header, request.degree)
         at = _spec.HEADER_SIZE + _spec.INDEX_HEAD_OFFSETS["splat_count"]
-        raise LimitError("memory of this machine", wanted, offset=at, clause="LIM-1") from None
+        raise LimitError("memory of this machine", size_bytes, offset=at, clause="LIM-1") from None
 
 
 def read_side_chunks(request: DecodeRequest) -> tuple[dict[str, Any] | None, DeclaredBounds | None]:
-    """Read and check the chunks that no tile refers to (CHK-2), for a whole decode."""
+    """For a whole decode, read and check the chunks that no tile refers to (CHK-2); return options and bounds."""
     if not request.whole:
         return None, None
     view, header = request.view, request.header
@@ -348,13 +347,7 @@ def _read_texts(request: DecodeRequest) -> _Texts:
 
 
 def _write_all(request: DecodeRequest, write: Callable[[int, int, TileBlocks], None], threads: int | None) -> None:
-    """Decode all tiles into arrays that exist already.
-
-    Args:
-        request: the tiles.
-        write: writes one tile: its place in `request.tiles`, its first splat, its blocks.
-        threads: as in `decode`.
-    """
+    """Decode all tiles by calling `write` with each tile's position in `request.tiles`, first splat and blocks."""
     starts = [0]
     for tile in request.tiles:
         starts.append(starts[-1] + tile.splat_count)
@@ -367,42 +360,41 @@ def _write_all(request: DecodeRequest, write: Callable[[int, int, TileBlocks], N
 
 
 def _iterate(request: DecodeRequest, threads: int | None) -> Iterator[tuple[Tile, SplatArrays]]:
-    """Decode tiles in their order, each into arrays of its own."""
+    """Decode tiles in order, each to arrays of its own."""
     header = request.header
     table = opacity_table(header.attribute(_spec.ATTRIBUTE_OPACITIES))
-    let_go = PageReleaser(request.view)
+    pages = PageReleaser(request.view)
 
     def convert(_place: int, source: TileBlocks) -> tuple[Tile, SplatArrays]:
         arrays = SplatArrays.empty(source.tile.splat_count, request.degree, header)
         write_tile(source, header, request.degree, table, arrays)
         return source.tile, arrays
 
-    # One more tile than there are threads: no thread waits for the caller.
+    # With one more tile than threads, no thread waits for the caller.
     for done in _each_tile(request, convert, threads, ahead=1):
-        let_go.after(sum(layer.size for layer in done[0].layers.values()))
+        pages.after(sum(layer.size for layer in done[0].layers.values()))
         yield done
 
 
 def _each_tile(
     request: DecodeRequest, convert: Callable[[int, TileBlocks], _T], threads: int | None, *, ahead: int
 ) -> Iterator[_T]:
-    """Read and convert tiles in threads: NumPy and zlib release the GIL on large data.
+    """Read and convert tiles in threads; NumPy and zlib release the GIL on large data.
 
-    Results come in the order of the tiles, and the error of the first damaged tile is raised, for any number of
-    threads.
+    Yields results in the order of the tiles and raises the error of the first damaged tile, for any number of threads.
 
     Args:
         request: the tiles.
-        convert: makes the result from a tile's place in `request.tiles` and its blocks.
+        convert: returns the result for a tile's position in `request.tiles` and its blocks.
         threads: as in `decode`.
-        ahead: tiles that may be finished or waiting in addition to those being decoded.
+        ahead: number of tiles, finished or waiting, in addition to those being decoded.
     """
     view, header, degree, tiles = request.view, request.header, request.degree, request.tiles
     with np.errstate(all="ignore"):
         books = read_codebooks(view, header, tiles, degree)
 
     def decode_tile(place: int) -> _T:
-        # The reconstruction checks for overflow where it can occur; NumPy need not warn of it.
+        # No warnings: the reconstruction checks for overflow itself.
         with np.errstate(all="ignore"):
             return convert(place, read_tile(view, header, tiles[place], degree, books))
 
@@ -433,7 +425,7 @@ def _thread_count(threads: int | None, task_count: int) -> int:
 
 
 def _model_of(header: SceneHeader, arrays: SplatArrays, texts: _Texts) -> SplatModel:
-    """Make the model; the clauses of spec 7, just checked, are stricter than its constructor."""
+    """Make the model without its constructor's checks: the clauses of spec 7 are stricter."""
     metadata, cameras = texts
     return trusted_model(
         **vars(arrays),

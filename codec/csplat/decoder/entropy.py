@@ -1,4 +1,4 @@
-"""Read streams: a head, one coder, up to four transforms (spec 6.1 to 6.3)."""
+"""Read streams: head, coder and transforms (spec 6.1 to 6.3)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from csplat.errors import FormatError, LimitError, UnsupportedError
 Ints = NDArray[Any]
 
 _PLACES = _spec.STREAM_HEAD_OFFSETS
-#: Clauses by the last word of zlib's message; COD-2 if it is none of these.
+#: Clauses by the last word of zlib's message; otherwise COD-2.
 _ZLIB_CLAUSES = {
     "symbols": "COD-5",  # too many length or distance symbols
     "set": "COD-6",  # invalid code lengths set, invalid literal/lengths set, invalid distances set
@@ -31,18 +31,18 @@ _ZLIB_CLAUSES = {
 def read_stream(
     cursor: Cursor, count: int | None, width_max: int, *, signed: bool = False, count_max: int | None = None
 ) -> Ints:
-    """Read one stream and step over it.
+    """Read a stream and step over it.
 
     Args:
         cursor: at the stream's head.
-        count: required number of elements; `None`: the stream specifies it (JSON).
-        width_max: maximum width of an element in bytes.
-        signed: read the elements as two's complement of `width` bytes.
+        count: required number of elements; `None`: any number (JSON).
+        width_max: maximum bytes per element.
+        signed: read elements as two's complement of `width` bytes.
         count_max: the caller's limit if `count` is `None`.
 
     Returns:
-        [count] little-endian integers of 1, 2, 4 or 8 bytes, the narrowest that hold `width`
-        bytes. The array may be a read-only view of the file.
+        [count] little-endian integers of 1, 2, 4 or 8 bytes, the smallest size that holds `width` bytes. The array may
+        be a read-only view of the file.
     """
     at = cursor.take(_spec.STREAM_HEAD_SIZE)
     head = _spec.unpack_stream_head(cursor.view, at)
@@ -50,14 +50,7 @@ def read_stream(
     if count_max is not None and head.count > count_max:
         raise LimitError("json_bytes", head.count, count_max, offset=at + _PLACES["count"], clause="STR-8")
     if head.coded_size > cursor.end - cursor.at:
-        raise FormatError(
-            _spec.ERROR_STREAM,
-            at + _PLACES["coded_size"],
-            "STR-6",
-            "coded_size",
-            found=head.coded_size,
-            wanted=f"{cursor.end - cursor.at} at most",
-        )
+        _refuse(at, "coded_size", "STR-6", head.coded_size, f"at most {cursor.end - cursor.at}")
     start = cursor.take(head.coded_size)
     packed: bytes | memoryview | Ints = _undo_coder(head, cursor.view[start : start + head.coded_size], start)
     if _spec.TRANSFORM_RUN_LENGTH in head.transforms:
@@ -96,7 +89,7 @@ def _refuse(at: int, name: str, clause: str, found: object, wanted: object) -> N
 
 
 def _undo_coder(head: _spec.StreamHead, coded: memoryview, at: int) -> bytes | memoryview:
-    """Return exactly `packed_size` bytes; E_CODER at the first coded byte otherwise."""
+    """Return exactly `packed_size` bytes; otherwise raise E_CODER at the first coded byte."""
     if head.coder == _spec.CODER_STORED:
         if head.coded_size != head.packed_size:
             raise FormatError(
@@ -109,7 +102,7 @@ def _undo_coder(head: _spec.StreamHead, coded: memoryview, at: int) -> bytes | m
 def _inflate(coded: memoryview, size: int, at: int) -> bytes:
     inflater = zlib.decompressobj(-zlib.MAX_WBITS)
     try:
-        # COD-4: one byte more than `size` reveals a stream that is too long, and lets inflate reach the end of others.
+        # COD-4: asking for one more byte detects a stream that is too long, and lets inflate reach the stream's end.
         packed = inflater.decompress(coded, size + 1)
     except zlib.error as error:
         clause = _ZLIB_CLAUSES.get(str(error).split()[-1], "COD-2")
@@ -146,9 +139,9 @@ def undo_transforms(packed: bytes | memoryview | Ints, transforms: bytes, count:
 
     Args:
         packed: `count` × `width` bytes.
-        transforms: ids; RUN_LENGTH, already undone, and NONE are ignored.
-        count: elements.
-        width: bytes of an element, 1 to 8.
+        transforms: ids; NONE and RUN_LENGTH, which is undone before, are ignored.
+        count: number of elements.
+        width: bytes per element, 1 to 8.
     """
     data = np.frombuffer(packed, np.uint8)
     if _spec.TRANSFORM_BYTE_PLANES in transforms:
@@ -165,7 +158,7 @@ def undo_transforms(packed: bytes | memoryview | Ints, transforms: bytes, count:
 
 
 def _join_planes(planes: Ints) -> Ints:
-    """Turn [width, count] bytes, lowest first, into [count] integers."""
+    """Join byte planes [width, count], lowest first, to integers [count]."""
     width, count = planes.shape
     if width == 1:
         only: Ints = planes[0]
@@ -180,7 +173,7 @@ def _join_planes(planes: Ints) -> Ints:
 def _undo_zigzag(elements: Ints, width: int) -> Ints:
     one = elements.dtype.type(1)
     out = elements & one
-    np.negative(out, out=out)  # all ones where the sign bit is set, modulo 2^bits
+    np.negative(out, out=out)  # all ones if the sign bit is set, modulo 2^bits
     out ^= elements >> one
     return _wrap(out, width)
 
@@ -188,7 +181,7 @@ def _undo_zigzag(elements: Ints, width: int) -> Ints:
 def _undo_delta(elements: Ints, width: int) -> Ints:
     dtype = elements.dtype
     if dtype.itemsize < 4:
-        # Four bytes run several times as fast as one, and agree modulo 2^(8 width).
+        # Sums of four bytes are several times faster than of one, and equal modulo 2^(8 width).
         narrow: Ints = np.cumsum(elements, dtype="<u4").astype(dtype)
         return narrow
     return _wrap(np.cumsum(elements, dtype=dtype), width)

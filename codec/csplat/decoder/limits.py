@@ -1,4 +1,4 @@
-"""Check a caller's limits (LIM-1) against the index, before anything is allocated."""
+"""Check the caller's limits (LIM-1) against the index before anything is allocated."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from csplat.errors import InputError, LimitError
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of one decode; the defaults of `bytes` and `json_bytes` are the registry's.
+    """Limits of one decode, by default those of the registry.
 
     Attributes:
-        splats: splats of a decode of the whole scene, or of the chosen tiles; by default any number.
-        bytes: memory of the returned arrays and of the codebooks.
-        json_bytes: length of one JSON text.
+        splats: maximum number of splats decoded; default: no limit.
+        bytes: maximum size of the returned arrays and the codebooks.
+        json_bytes: maximum size of a JSON text.
     """
 
     splats: int = sys.maxsize
@@ -36,13 +36,13 @@ class Limits:
 
 
 def float_bytes(header: SceneHeader, degree: int) -> int:
-    """Return the bytes of one splat in the arrays of section 3."""
+    """Return the bytes per splat in the arrays of spec 3."""
     floats = 3 + 4 + 3 + 1 + 3 * (degree + 1) ** 2
     return 4 * floats + sum(np.dtype(column.dtype).itemsize for column in header.extras if column.dtype)
 
 
 def integer_bytes(degree: int) -> int:
-    """Return the bytes of one splat in the integer arrays of section 9.2."""
+    """Return the bytes per splat in the integer arrays of spec 9.2."""
     return 4 + 8 * 3 + 4 * 3 + 8 * 3 + 8 * 3 * (degree + 1) ** 2
 
 
@@ -56,19 +56,19 @@ def check_budget(
     whole: bool,
     at_once: bool = True,
 ) -> None:
-    """Refuse a decode that exceeds the limits, from the index alone.
+    """Refuse a decode that would exceed the limits.
 
     Args:
-        header: the scene.
-        tiles: the tiles to decode.
+        header: header and index.
+        tiles: tiles to decode.
         degree: highest SH band to decode.
-        splat_bytes: bytes that one splat takes in the result.
-        limits: limits set by the caller.
-        whole: True if the whole file is decoded, and so every codebook is read.
-        at_once: all tiles lie in memory together; otherwise one at a time.
+        splat_bytes: bytes per splat of the result.
+        limits: the caller's limits.
+        whole: the whole file is decoded, which reads every codebook.
+        at_once: the result holds all tiles, not one at a time.
 
     Raises:
-        LimitError: E_LIMIT by LIM-1; `limit` is the name of the field of `Limits`.
+        LimitError: E_LIMIT by LIM-1; `limit` is a field of `Limits`.
     """
     counts = [tile.splat_count for tile in tiles]
     at = _spec.HEADER_SIZE + _spec.INDEX_HEAD_OFFSETS["splat_count"]

@@ -1,4 +1,4 @@
-"""Read the chunks that are not about splats: JSON texts (spec 5.4) and declared error bounds (spec 5.5)."""
+"""Read the chunks other than tiles and codebooks: JSON texts (spec 5.4) and declared error bounds (spec 5.5)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from csplat import _spec
-from csplat.decoder.container import SceneHeader, check_reserved, open_chunk, view_of
+from csplat.decoder.container import SceneHeader, check_reserved, open_chunk, refuse_field, view_of
 from csplat.decoder.entropy import read_stream
 from csplat.decoder.index import parse_header
 from csplat.decoder.limits import Limits
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _BOM = b"\xef\xbb\xbf"
 _INT_DIGITS = 300  # digits; longer integers are read as binary64
 
-
+#: Components of each measure, for SER-2.
 _BOUND_COMPONENTS = {
     _spec.MEASURE_MEANS: 1,
     _spec.MEASURE_COVARIANCE: 1,
@@ -36,12 +36,12 @@ _SLACK = 1.0 + 2.0**-20  # SER-2: tolerance for the rounding of both numbers
 
 @dataclass(frozen=True)
 class DeclaredBound:
-    """A declared error bound of a file, for one measure.
+    """The declared error bound of one measure.
 
     Attributes:
         measure: name in the registry, `means`.
-        max: largest error over the splats kept.
-        rms: root of the mean square over the splats kept.
+        max: maximum error of a splat in the file.
+        rms: root mean square error of the splats in the file.
     """
 
     measure: str
@@ -51,14 +51,14 @@ class DeclaredBound:
 
 @dataclass(frozen=True)
 class DeclaredBounds:
-    """The declared error bounds of a file, against the model that was encoded.
+    """The declared error bounds of a file, relative to the model that was encoded.
 
     Attributes:
-        source_count: splats of the source.
-        pruned_count: splats of the source that the file does not hold.
+        source_count: number of splats of the source.
+        pruned_count: number of these that are not in the file.
         source_sh_degree: SH degree of the source.
-        refitted: attributes were refitted; those without a record can only be verified by renders.
-        records: declared errors by measure.
+        refitted: attributes were refitted; measures without a record can only be verified by renders.
+        records: bound of each measure.
     """
 
     source_count: int
@@ -93,16 +93,10 @@ def read_declared_bounds(data: File) -> DeclaredBounds | None:
 
 
 def json_chunk(view: memoryview, header: SceneHeader, kind: bytes, json_bytes: int) -> Any:
-    """Return the value of the META, CAMS or OPTS chunk, `None` if the file has none.
-
-    Args:
-        view: the whole file.
-        header: its header.
-        kind: type of the chunk.
-        json_bytes: budget for the text.
+    """Return the content of a META, CAMS or OPTS chunk, `None` if the file has none.
 
     Raises:
-        FormatError: E_JSON, or its stream breaks a clause.
+        FormatError: E_JSON, or the stream breaks a clause.
         LimitError: the text is longer than `json_bytes`.
     """
     record = header.chunk(kind)
@@ -116,12 +110,12 @@ def json_chunk(view: memoryview, header: SceneHeader, kind: bytes, json_bytes: i
 
 
 def parse_json(text: bytes, kind: type[dict[str, Any] | list[Any]], at: int) -> Any:
-    """Parse a text by JSN-1.
+    """Parse a JSON text and check JSN-1.
 
     Args:
         text: UTF-8.
         kind: `dict`, or `list` for an array of objects.
-        at: offset in the file where its stream begins, for errors.
+        at: offset of the stream in the file, for errors.
     """
     try:
         if text.startswith(_BOM):
@@ -152,17 +146,10 @@ def bounds_chunk(view: memoryview, header: SceneHeader) -> DeclaredBounds | None
     at = cursor.take(_spec.STATED_ERRORS_HEAD_SIZE)
     head = _spec.unpack_stated_errors_head(view, at)
     if head.error_flags & ~sum(_spec.ERROR_FLAG_NAMES):
-        place = at + _spec.STATED_ERRORS_HEAD_OFFSETS["error_flags"]
-        raise FormatError(_spec.ERROR_RESERVED, place, "RES-1", "error_flags", found=head.error_flags)
+        refuse_field(_spec.ERROR_RESERVED, "RES-1", head, at, _spec.STATED_ERRORS_HEAD_OFFSETS, "error_flags")
     if head.source_count - head.pruned_count != header.splat_count:
-        raise FormatError(
-            _spec.ERROR_VALUE,
-            at,
-            "SER-4",
-            "source_count - pruned_count",
-            found=head.source_count - head.pruned_count,
-            wanted=header.splat_count,
-        )
+        found, wanted = head.source_count - head.pruned_count, header.splat_count
+        raise FormatError(_spec.ERROR_VALUE, at, "SER-4", "source_count - pruned_count", found=found, wanted=wanted)
     records: list[DeclaredBound] = []
     last = 0
     for _ in range(head.record_count):
@@ -232,20 +219,13 @@ def _check_tree(value: Any) -> None:
 
 
 def _check_bound_record(record: _spec.StatedErrorRecord, at: int, last: int) -> int:
-    """SER-1, SER-2; return the measure."""
+    """Check SER-1 and SER-2; return the measure."""
     places = _spec.STATED_ERROR_RECORD_OFFSETS
     check_reserved(record, at, places)
     if record.measure not in _spec.MEASURE_NAMES or record.measure <= last:
-        raise FormatError(
-            _spec.ERROR_VALUE, at, "SER-1", "measure", found=record.measure, wanted="registered, ascending"
-        )
+        refuse_field(_spec.ERROR_VALUE, "SER-1", record, at, places, "measure", "registered ids, ascending")
     bound = record.max * math.sqrt(_BOUND_COMPONENTS[record.measure]) * _SLACK
     if not (0.0 <= record.max < math.inf and 0.0 <= record.rms < math.inf and record.rms <= bound):
-        raise FormatError(
-            _spec.ERROR_VALUE,
-            at + places["max"],
-            "SER-2",
-            f"max and rms of {_spec.MEASURE_NAMES[record.measure]}",
-            found=(record.max, record.rms),
-        )
+        detail = f"max and rms of {_spec.MEASURE_NAMES[record.measure]}"
+        raise FormatError(_spec.ERROR_VALUE, at + places["max"], "SER-2", detail, found=(record.max, record.rms))
     return record.measure

@@ -1,7 +1,7 @@
 """Reconstruct float32 values from integers (spec 7): one product in binary64, rounded once.
 
-Each `write_…` fills an output array for one tile. `lattice_rows` and `quat_rows` yield the checked integers, colours
-as red, green and blue; `write_integers` copies the same ones (spec 9.2).
+Each `write_…` fills the output of one tile. `lattice_rows` and `quat_rows` yield checked integers, colours as red,
+green and blue; `write_integers` copies the same integers (spec 9.2).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.decoder.blocks import Block, CodebookBlock, ColumnBlock, SparseBlock, TileBlocks, runs, work_dtype
-from csplat.decoder.container import SceneHeader
+from csplat.decoder.container import SceneHeader, refuse_field
 from csplat.decoder.entropy import Ints
 from csplat.errors import FormatError
 from csplat.types import F32, F64
@@ -30,7 +30,7 @@ _BAND_NAMES = {band: _spec.ATTRIBUTE_NAMES[_spec.ATTRIBUTE_SH0 + band] for band 
 
 @dataclass(frozen=True)
 class SplatArrays:
-    """The arrays of section 3, for a scene or a tile of it.
+    """The arrays of spec 3, of a scene or a tile.
 
     Attributes:
         means: [N, 3].
@@ -52,7 +52,7 @@ class SplatArrays:
 
     @classmethod
     def empty(cls, count: int, sh_degree: int, header: SceneHeader) -> SplatArrays:
-        """Allocate arrays for `count` splats, not filled."""
+        """Allocate uninitialised arrays for `count` splats."""
         return cls(
             means=np.empty((count, 3), np.float32),
             quats=np.empty((count, 4), np.float32),
@@ -77,14 +77,14 @@ class SplatArrays:
 
 
 def write_tile(source: TileBlocks, header: SceneHeader, degree: int, opacities: F32, out: SplatArrays) -> None:
-    """Reconstruct a tile's values.
+    """Reconstruct the values of a tile.
 
     Args:
         source: the tile's integers.
-        header: the scene.
+        header: header and index.
         degree: highest SH band to decode.
-        opacities: alpha of each level, `opacity_table`.
-        out: the tile's part of the arrays.
+        opacities: alpha of each level, from `opacity_table`.
+        out: output, the tile's part of the arrays.
     """
     blocks = source.blocks
     write_opacities(blocks[_spec.ATTRIBUTE_OPACITIES], opacities, out.opacities)
@@ -105,7 +105,7 @@ def write_tile(source: TileBlocks, header: SceneHeader, degree: int, opacities: 
 
 
 def empty_integers(count: int, tile_count: int, degree: int) -> dict[str, NDArray[Any]]:
-    """Allocate the arrays of 9.2; bands and exponents without a block stay 0."""
+    """Allocate the arrays of spec 9.2; bands and exponents without a block stay 0."""
     arrays: dict[str, NDArray[Any]] = {
         "opacities": np.empty(count, np.uint32),
         "scales": np.empty((count, 3), np.int64),
@@ -121,20 +121,20 @@ def empty_integers(count: int, tile_count: int, degree: int) -> dict[str, NDArra
 
 
 def integer_part(arrays: dict[str, NDArray[Any]], start: int, stop: int) -> dict[str, NDArray[Any]]:
-    """Return views of some splats, without the arrays that have a row per tile."""
+    """Return views of some splats, omitting the arrays with a row per tile."""
     return {name: a[start:stop] for name, a in arrays.items() if name not in ("tile_splats", "exponents")}
 
 
 def write_integers(
     source: TileBlocks, header: SceneHeader, out: dict[str, NDArray[Any]], exponents: NDArray[Any]
 ) -> None:
-    """Write a tile's integers; the clauses checked are those of `write_tile`.
+    """Write the integers of a tile; check the same clauses as `write_tile`.
 
     Args:
-        source: the tile's blocks.
-        header: the scene.
-        out: the tile's part of the arrays.
-        exponents: the tile's row, zeros.
+        source: the tile's integers.
+        header: header and index.
+        out: output, the tile's part of the arrays.
+        exponents: output, the tile's row of zeros.
     """
     count = source.tile.splat_count
     for attribute, block in source.blocks.items():
@@ -162,19 +162,13 @@ def write_integers(
 
 
 def check_max_scale(source: TileBlocks, record: _spec.AttributeRecord, largest: int) -> None:
-    """Check TIL-11: values grow with their integers, so the largest integer has the largest value."""
+    """Check TIL-11 with the largest integer, which has the largest value."""
     step = np.ldexp(record.step, source.blocks[_spec.ATTRIBUTE_SCALES].exponent)
-    value = np.float32(np.float64(largest) * step)
-    # Bit for bit: NaN differs from everything, and +0 from −0.
-    if struct.pack("<f", source.tile.max_scale) != value.tobytes():
-        raise FormatError(
-            _spec.ERROR_BOX,
-            source.tile.offset + _spec.TILE_RECORD_OFFSETS["max_scale"],
-            "TIL-11",
-            "max_scale",
-            found=source.tile.max_scale,
-            wanted=float(value),
-        )
+    value, tile = np.float32(np.float64(largest) * step), source.tile
+    # Compare bits, so that NaN and −0 are refused.
+    if struct.pack("<f", tile.max_scale) != value.tobytes():
+        offsets = _spec.TILE_RECORD_OFFSETS
+        refuse_field(_spec.ERROR_BOX, "TIL-11", tile, tile.offset, offsets, "max_scale", float(value))
 
 
 # Lattices: means, scales, colours (7.1, 7.2, 7.4) --------------------------------------------------
@@ -184,7 +178,7 @@ def tile_boxes(header: SceneHeader) -> F64:
     """Return the boxes around the centres of each tile's splats (spec 4.3.5).
 
     Returns:
-        [T, 2, 3] float64: smallest and largest corner; scene units, relative to the origin, as the means.
+        [T, 2, 3] float64: smallest and largest corner in scene units, relative to the origin.
     """
     step = header.attribute(_spec.ATTRIBUTE_MEANS).step
     boxes = np.empty((len(header.tiles), 2, 3), np.float64)
@@ -196,14 +190,14 @@ def tile_boxes(header: SceneHeader) -> F64:
 def lattice_rows(
     block: Block, record: _spec.AttributeRecord, count: int
 ) -> Iterator[tuple[int, int, tuple[Ints, Ints, Ints]]]:
-    """Yield runs of lattice integers: start, stop and three arrays [C / 3, stop − start].
+    """Yield runs of lattice integers: start, stop and three arrays [C / 3, stop - start].
 
-    The three are x, y, z of means and scales, red, green, blue of colours.
+    The arrays are x, y, z of means and scales, or red, green, blue of colours.
 
     Args:
         block: a block of means, scales, sh0 or an SH band.
-        record: its attribute record.
-        count: splats of the block.
+        record: record of the attribute.
+        count: number of splats in the block.
 
     Raises:
         FormatError: E_RANGE by LAT-5 or MEA-1: a value is not finite in binary32.
@@ -226,14 +220,14 @@ def lattice_rows(
 
 
 def check_values(block: Block, record: _spec.AttributeRecord, count: int) -> None:
-    """Raise what `lattice_rows` raises, without reading the integers if their bound is small enough."""
+    """Check as `lattice_rows` does, without reading the integers if their bound is small enough."""
     if not _is_finite(_bound(block, record), math.ldexp(record.step, block.exponent)):
         for _ in lattice_rows(block, record, count):
             pass
 
 
 def _bound(block: Block, record: _spec.AttributeRecord) -> int:
-    """Return the largest magnitude of a lattice integer of the block and of its intermediate values."""
+    """Return a bound of the magnitudes of the block's lattice integers and their intermediate values."""
     bound = max(1, block.bound)
     if record.mapping == _spec.MAPPING_YCOCG:  # |Y| + 2 (|Co| + |Cg|), shifted, covers R, G, B
         bound += bound << (record.chroma_shift + 2)
@@ -245,14 +239,7 @@ def _is_finite(integer: int, step: float) -> bool:
 
 
 def lift(y: Ints, co: Ints, cg: Ints, chroma_shift: int) -> tuple[Ints, Ints, Ints]:
-    """Turn Y, Co, Cg into R, G, B (7.1), in place.
-
-    Args:
-        y: signed integers, wide enough for all that comes out.
-        co: like `y`.
-        cg: like `y`.
-        chroma_shift: k.
-    """
+    """Convert Y, Co, Cg to R, G, B in place (7.1); the signed integers must be wide enough for the results."""
     if chroma_shift:
         scale = co.dtype.type(1 << chroma_shift)
         co *= scale
@@ -279,7 +266,7 @@ def write_lattice(block: Block, record: _spec.AttributeRecord, out: F32) -> int:
 
 
 def write_colour(block: Block, record: _spec.AttributeRecord, out: F32) -> None:
-    """Write coefficients of one band, [n, 2 l + 1, 3]."""
+    """Write the coefficients of a band, [n, 2 l + 1, 3]."""
     step = math.ldexp(record.step, block.exponent)
     for start, stop, parts in lattice_rows(block, record, len(out)):
         for channel, part in enumerate(parts):
@@ -288,12 +275,12 @@ def write_colour(block: Block, record: _spec.AttributeRecord, out: F32) -> None:
 
 
 def write_bands(blocks: dict[int, Block], records: dict[int, _spec.AttributeRecord], out: F32) -> None:
-    """Write all higher coefficients of a tile, [n, K, 3]; bands without a block become +0.
+    """Write the higher coefficients of a tile, [n, K, 3]; bands without a block become +0.
 
     Args:
-        blocks: by band, those the tile has.
-        records: by band, all bands to write.
-        out: the tile's part of shN.
+        blocks: blocks of the tile by band.
+        records: attribute records of all bands to write.
+        out: output, the tile's part of shN.
     """
     copied = _copy_entries(blocks, records, out)
     for band, record in records.items():
@@ -311,7 +298,7 @@ def write_bands(blocks: dict[int, Block], records: dict[int, _spec.AttributeReco
 
 
 def _copy_entries(blocks: dict[int, Block], records: dict[int, _spec.AttributeRecord], out: F32) -> bool:
-    """Copy rows of float32 if all bands have the same codebook and indices; otherwise return False."""
+    """Copy float32 rows if all bands use the same codebook and indices; return False otherwise."""
     first = blocks.get(1)
     if not isinstance(first, CodebookBlock) or len(blocks) != len(records):
         return False
@@ -332,7 +319,7 @@ def _write_some(places: NDArray[np.intp], columns: ColumnBlock, record: _spec.At
 
 
 def _scale(integers: Ints, step: float, out: F32, *, wide: bool = False) -> None:
-    """Compute float32(float64(n) × s), rounded once; except for means, one product in binary32 is the same (7.2)."""
+    """Compute float32(float64(n) × step), rounded once; except for means, a product in binary32 is the same (7.2)."""
     if wide:
         np.multiply(integers, step, out=out, dtype=np.float64, casting="same_kind")
     else:
@@ -340,22 +327,18 @@ def _scale(integers: Ints, step: float, out: F32, *, wide: bool = False) -> None
 
 
 def _check_finite(parts: tuple[Ints, Ints, Ints], step: float, record: _spec.AttributeRecord, at: int) -> None:
-    largest = max(max(-int(part.min()), int(part.max())) for part in parts)
-    # Values grow with their integers, so the largest integer has the largest value.
+    largest = max(max(-int(part.min()), int(part.max())) for part in parts)  # has the largest value
     if not np.isfinite(np.float32(float(largest) * step)):
-        raise FormatError(
-            _spec.ERROR_RANGE,
-            at,
-            "MEA-1" if record.attribute == _spec.ATTRIBUTE_MEANS else "LAT-5",
-            f"{_spec.ATTRIBUTE_NAMES[record.attribute]}: {largest} x {step} is not finite in binary32",
-        )
+        clause = "MEA-1" if record.attribute == _spec.ATTRIBUTE_MEANS else "LAT-5"
+        detail = f"{_spec.ATTRIBUTE_NAMES[record.attribute]}: {largest} x {step} is not finite in binary32"
+        raise FormatError(_spec.ERROR_RANGE, at, clause, detail)
 
 
 # Levels: opacities, quats (7.3, 7.5) ---------------------------------------------------------------
 
 
 def opacity_table(record: _spec.AttributeRecord) -> F32:
-    """Return alpha for q = 0 .. levels (7.3)."""
+    """Return alpha for q = 0, ..., levels (7.3)."""
     q = np.arange(record.levels + 1, dtype=np.float64)
     if record.mapping == _spec.MAPPING_SQUARE:  # q² and M² stay below 2^32: exact in binary64
         return (q * q / float(record.levels * record.levels)).astype(np.float32)
@@ -363,7 +346,7 @@ def opacity_table(record: _spec.AttributeRecord) -> F32:
 
 
 def write_opacities(block: Block, table: F32, out: F32) -> None:
-    """Write opacities, [n]; LEV-1 has been checked, so each level has its place in the table."""
+    """Write opacities, [n], by a table of all levels, which LEV-1 has bounded."""
     for start, stop in runs(len(out), 1):
         levels = block.rows(start, stop, _INT32)[0]
         np.take(table, levels, out=out[start:stop], mode="clip")
@@ -372,10 +355,10 @@ def write_opacities(block: Block, table: F32, out: F32) -> None:
 def quat_rows(
     block: Block, record: _spec.AttributeRecord, count: int
 ) -> Iterator[tuple[int, int, NDArray[np.float64], NDArray[np.float64]]]:
-    """Yield start, stop, q1 to q3 as [3, stop − start] and R, both exact in binary64.
+    """Yield start, stop, q = (q1, q2, q3) [3, stop - start] and R = 2 M² - |q|² (7.5), both exact in binary64.
 
     Raises:
-        FormatError: E_RANGE by QUA-2.
+        FormatError: E_RANGE by QUA-2: R is negative.
     """
     for start, stop in runs(count, 3):
         q = block.rows(start, stop, _INT32).astype(np.float64)
@@ -386,14 +369,8 @@ def quat_rows(
             r -= square
         lowest = r.min()
         if lowest < 0:
-            raise FormatError(
-                _spec.ERROR_RANGE,
-                block.at,
-                "QUA-2",
-                f"R of splat {start + int(r.argmin())} of the block",
-                found=int(lowest),
-                wanted="0 or more",
-            )
+            detail = f"R of splat {start + int(r.argmin())} of the block"
+            raise FormatError(_spec.ERROR_RANGE, block.at, "QUA-2", detail, found=int(lowest), wanted="at least 0")
         yield start, stop, q, r
 
 

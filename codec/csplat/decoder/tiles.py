@@ -1,4 +1,4 @@
-"""Read the blocks of tiles: every attribute coding (spec 5.2, 6.4), ranges checked."""
+"""Read the blocks of tiles, in every attribute coding, and check the ranges of their integers (spec 5.2, 6.4)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from csplat.decoder.blocks import (
     runs,
 )
 from csplat.decoder.codebooks import attribute_columns
-from csplat.decoder.container import TILE_FLAGS, Cursor, SceneHeader, Tile, check_reserved, open_chunk
+from csplat.decoder.container import TILE_FLAGS, Cursor, SceneHeader, Tile, check_reserved, open_chunk, refuse_field
 from csplat.decoder.entropy import Ints, read_stream
 from csplat.errors import FormatError
 
@@ -35,7 +35,7 @@ _ESCAPE_CODINGS = (_spec.CODING_OFFSET, _spec.CODING_SIGNED)
 
 _WIDE = np.dtype(np.int64)
 
-#: By coding except CODEBOOK and RAW: size of its parameters, one i32 per column or none, number of streams.
+#: For each coding except CODEBOOK and RAW: size of the parameters, True if offsets follow, number of streams.
 _SHAPES = {
     _spec.CODING_LEVELS: (0, False, 1),
     _spec.CODING_MORTON: (_spec.MORTON_PARAMS_SIZE, False, 1),
@@ -48,12 +48,12 @@ _SHAPES = {
 
 @dataclass
 class TileContext:
-    """The data that the blocks of one tile may refer to.
+    """Data that the blocks of a tile may refer to.
 
     Attributes:
-        header: the scene.
+        header: header and index.
         tile: the tile.
-        books: the codebooks that were read.
+        books: the codebooks by id.
         first: indices of the tile's first block of each codebook, by codebook id.
     """
 
@@ -64,14 +64,14 @@ class TileContext:
 
 
 def wanted_layers(tile: Tile, degree: int) -> list[_spec.LayerRecord]:
-    """Return the layers of a tile that are read: all but the SH bands above `degree`."""
+    """Return the layers of a tile to read: all but the SH bands above `degree`."""
     return [layer for layer in tile.layers.values() if not degree < layer.layer <= _spec.SH_DEGREE_MAX]
 
 
 def read_tile(
     view: memoryview, header: SceneHeader, tile: Tile, degree: int, books: Mapping[int, Codebook]
 ) -> TileBlocks:
-    """Read layer 0, the SH layers up to `degree` and the extra layer of a tile; only the frame of others."""
+    """Read layer 0, the SH layers up to `degree` and the extra layer of a tile; check the frames of unknown layers."""
     context = TileContext(header, tile, books)
     result = TileBlocks(tile)
     for layer in wanted_layers(tile, degree):
@@ -99,18 +99,18 @@ def read_tile(
 
 
 def codebook_references(view: memoryview, header: SceneHeader, layer: _spec.LayerRecord) -> Iterator[tuple[int, int]]:
-    """Find the u16 that name codebooks in a tile's chunk of layer 0 or of an SH band.
+    """Find the codebook ids in a tile's chunk of layer 0 or of an SH band, without decoding streams.
 
     Args:
         view: the file, at least up to the end of the chunk.
-        header: the scene.
+        header: header and index.
         layer: the chunk's record.
 
     Yields:
-        Offset in the file, and the id stored there.
+        Offset of each id in the file, and the id.
 
     Raises:
-        FormatError: the chunk's frame or a structure breaks a clause; streams are not decoded.
+        FormatError: the chunk's frame or a structure breaks a clause.
     """
     cursor = open_chunk(view, layer, _spec.CHUNK_TILE, TILE_FLAGS, "TLE-3")
     cursor.take(_spec.TILE_HEAD_SIZE)
@@ -129,23 +129,14 @@ def _read_tile_head(view: memoryview, at: int, layer: int, block_count: int) -> 
     head = _spec.unpack_tile_head(view, at)
     places = _spec.TILE_HEAD_OFFSETS
     check_reserved(head, at, places)
-    for name, found, wanted, code, clause in (
-        ("layer", head.layer, layer, _spec.ERROR_INDEX, "TLE-1"),
-        # A layer of more than 255 extra columns cannot be counted and is refused here.
-        ("block_count", head.block_count, block_count, _spec.ERROR_STREAM, "TLE-2"),
-    ):
-        if found != wanted:
-            raise FormatError(code, at + places[name], clause, name, found=found, wanted=wanted)
+    if head.layer != layer:
+        refuse_field(_spec.ERROR_INDEX, "TLE-1", head, at, places, "layer", layer)
+    if head.block_count != block_count:  # always the case for more than 255 extra columns: the count is one byte
+        refuse_field(_spec.ERROR_STREAM, "TLE-2", head, at, places, "block_count", block_count)
 
 
 def read_block(cursor: Cursor, context: TileContext, attribute: int) -> Block:
-    """Read the block of an attribute and step over it.
-
-    Args:
-        cursor: at the block head.
-        context: the tile.
-        attribute: the block that TLE-2 requires here.
-    """
+    """Read the block of an attribute and step over it."""
     at = cursor.at
     coding = read_block_head(cursor, attribute)
     count = context.tile.splat_count
@@ -159,41 +150,33 @@ def read_block(cursor: Cursor, context: TileContext, attribute: int) -> Block:
 
 
 def read_sparse(cursor: Cursor, context: TileContext, attribute: int) -> SparseBlock:
-    """Read mask and values: SPA-1 to SPA-3, LAT-1, LAT-4."""
+    """Read the rest of a SPARSE block; check SPA-1 to SPA-3, LAT-1 and LAT-4."""
     at, places = cursor.take(_spec.SPARSE_PARAMS_SIZE), _spec.SPARSE_PARAMS_OFFSETS
     params = _spec.unpack_sparse_params(cursor.view, at)
     check_reserved(params, at, places)
     record, count = context.header.attribute(attribute), context.tile.splat_count
     check_step(record, params.exponent, at + places["exponent"])
     if not 1 <= params.present_count <= count:
-        raise FormatError(
-            _spec.ERROR_VALUE,
-            at + places["present_count"],
-            "SPA-1",
-            "present_count",
-            found=params.present_count,
-            wanted=f"1 to {count}",
-        )
+        refuse_field(_spec.ERROR_VALUE, "SPA-1", params, at, places, "present_count", f"1 to {count}")
     mask_at = cursor.at
     bits = np.unpackbits(read_stream(cursor, (count + 7) >> 3, 1), bitorder="little")
     if bits[count:].any():
         raise FormatError(_spec.ERROR_RANGE, mask_at, "SPA-3", "bits of the mask beyond the last splat", wanted=0)
     present = np.flatnonzero(bits)
     if len(present) != params.present_count:
-        raise FormatError(
-            _spec.ERROR_RANGE, mask_at, "SPA-2", "bits of the mask", found=len(present), wanted=params.present_count
-        )
+        found, wanted = len(present), params.present_count
+        raise FormatError(_spec.ERROR_RANGE, mask_at, "SPA-2", "bits of the mask", found=found, wanted=wanted)
     return SparseBlock(read_signed(cursor, record, params.exponent, len(present)), present)
 
 
 def read_raw(cursor: Cursor, context: TileContext, column: int) -> Ints:
-    """Read the block of an extra column: [n] unsigned integers, the bits of its values."""
+    """Read the block of an extra column; return the bits of its values, unsigned integers [n]."""
     coding = read_block_head(cursor, _spec.ATTRIBUTE_EXTRA)
     at = cursor.take(_spec.RAW_PARAMS_SIZE)
     params = _spec.unpack_raw_params(cursor.view, at)
     check_reserved(params, at, _spec.RAW_PARAMS_OFFSETS)
     if params.column != column:
-        raise FormatError(_spec.ERROR_STREAM, at, "RAW-1", "column", found=params.column, wanted=column)
+        refuse_field(_spec.ERROR_STREAM, "RAW-1", params, at, _spec.RAW_PARAMS_OFFSETS, "column", column)
     width_at = cursor.at
     elements = read_stream(cursor, context.tile.splat_count, _spec.CODING_WIDTH_MAX[coding])
     width, dtype = cursor.view[width_at], context.header.extras[column].dtype
@@ -203,17 +186,16 @@ def read_raw(cursor: Cursor, context: TileContext, column: int) -> Ints:
 
 
 def read_means(cursor: Cursor, context: TileContext, coding: int) -> ColumnBlock:
-    """Read the means of a tile, as lattice integers."""
+    """Read the rest of a MORTON or AXIS block, the lattice integers of the means."""
     tile = context.tile
     count, width_max = tile.splat_count, _spec.CODING_WIDTH_MAX[coding]
     if coding == _spec.CODING_MORTON:
-        params_at = cursor.take(_spec.MORTON_PARAMS_SIZE)
+        params_at, places = cursor.take(_spec.MORTON_PARAMS_SIZE), _spec.MORTON_PARAMS_OFFSETS
         params = _spec.unpack_morton_params(cursor.view, params_at)
-        check_reserved(params, params_at, _spec.MORTON_PARAMS_OFFSETS)
+        check_reserved(params, params_at, places)
         if not 1 <= params.bits <= _spec.MORTON_BITS_MAX:
-            raise FormatError(
-                _spec.ERROR_VALUE, params_at, "MOR-1", "bits", found=params.bits, wanted=f"1 to {_spec.MORTON_BITS_MAX}"
-            )
+            wanted = f"1 to {_spec.MORTON_BITS_MAX}"
+            refuse_field(_spec.ERROR_VALUE, "MOR-1", params, params_at, places, "bits", wanted)
         at = cursor.at
         codes = read_stream(cursor, count, width_max)
         _check_bits(codes, 3 * params.bits, at, "MOR-2")
@@ -225,14 +207,9 @@ def read_means(cursor: Cursor, context: TileContext, coding: int) -> ColumnBlock
     block = ColumnBlock(q, tile.corner, tile.exponent, at)
     far = tuple(corner + extent for corner, extent in zip(tile.corner, tile.extent, strict=True))
     if block.lows != tile.corner or block.highs != far:
-        raise FormatError(
-            _spec.ERROR_BOX,
-            tile.offset + _spec.TILE_RECORD_OFFSETS["corner"],
-            "TIL-10",
-            "the tile's box",
-            found=f"{tile.corner} to {far}",
-            wanted=f"{block.lows} to {block.highs}, the box of its splats",
-        )
+        at, found = tile.offset + _spec.TILE_RECORD_OFFSETS["corner"], f"{tile.corner} to {far}"
+        wanted = f"{block.lows} to {block.highs}, the box of its splats"
+        raise FormatError(_spec.ERROR_BOX, at, "TIL-10", "the tile's box", found=found, wanted=wanted)
     return block
 
 
@@ -243,19 +220,15 @@ def _check_bits(elements: Ints, bits: int, at: int, clause: str) -> None:
 
 
 def read_codebook_block(cursor: Cursor, context: TileContext, attribute: int, at: int) -> CodebookBlock:
-    """Read the rest of the block whose head is at `at`: indices, summand, escape block; CBK-1 to CBK-6."""
+    """Read the rest of a CODEBOOK block whose head is at `at`: indices, summand, escapes; check CBK-1 to CBK-6."""
     params_at = cursor.take(_spec.CODEBOOK_PARAMS_SIZE)
     params = _spec.unpack_codebook_params(cursor.view, params_at)
     check_reserved(params, params_at, _spec.CODEBOOK_PARAMS_OFFSETS)
     book = context.books.get(params.codebook_id)
     columns = attribute_columns(book.record, attribute) if book else None
     if book is None or columns is None or params.codebook_id not in context.tile.codebook_ids:
-        raise FormatError(
-            _spec.ERROR_CODEBOOK,
-            params_at,
-            "CBK-1",
-            f"codebook {params.codebook_id} is not of the tile or not for {_spec.ATTRIBUTE_NAMES[attribute]}",
-        )
+        detail = f"codebook {params.codebook_id} is not of the tile or not for {_spec.ATTRIBUTE_NAMES[attribute]}"
+        raise FormatError(_spec.ERROR_CODEBOOK, params_at, "CBK-1", detail)
     indices = _indices(cursor, context, attribute, book, params, params_at)
     summand = None
     if attribute == _spec.ATTRIBUTE_SCALES:
@@ -268,12 +241,12 @@ def read_codebook_block(cursor: Cursor, context: TileContext, attribute: int, at
     layer = _spec.ATTRIBUTE_LAYER[attribute]
     block = CodebookBlock(indices, book.entries[layer][:, columns], escapes, summand, at)
     if summand is not None:
-        _check_sums(block, context)  # in other blocks, CBK-7 has already checked the entries
+        _check_sums(block, context)  # for other attributes, CBK-7 has bounded the entries
     return block
 
 
 def holds_indices(book: _spec.CodebookRecord, attribute: int) -> bool:
-    """Return True if the block of that attribute holds the indices of a codebook, which its other blocks use."""
+    """Return True if blocks of this attribute store the indices of the codebook."""
     if book.kind == _spec.CODEBOOK_KIND_SH:
         return attribute == _spec.ATTRIBUTE_SH0 + book.band_first
     return _spec.ATTRIBUTE_NAMES[attribute] == _spec.CODEBOOK_KIND_ATTRIBUTES[book.kind][0]
@@ -282,22 +255,16 @@ def holds_indices(book: _spec.CodebookRecord, attribute: int) -> bool:
 def _indices(
     cursor: Cursor, context: TileContext, attribute: int, book: Codebook, params: _spec.CodebookParams, at: int
 ) -> Indices:
-    """Read the indices, or find those of the tile's first block of the codebook (CBK-4)."""
-    name = _spec.ATTRIBUTE_NAMES[attribute]
+    """Read the indices, or return those of the codebook's first block in the tile (CBK-4)."""
     if holds_indices(book.record, attribute):
         indices = _read_indices(cursor, context, attribute, book, params.escape_count, at)
         context.first[params.codebook_id] = indices
         return indices
     known = context.first.get(params.codebook_id)
     if known is None or len(known.escaped) != params.escape_count:
-        raise FormatError(
-            _spec.ERROR_CODEBOOK,
-            at,
-            "CBK-4",
-            f"{name} follows no block of the codebook's first attribute with as many escapes",
-            found=params.escape_count,
-            wanted=None if known is None else len(known.escaped),
-        )
+        detail = f"{_spec.ATTRIBUTE_NAMES[attribute]} disagrees with the codebook's first block in the escape count"
+        found, wanted = params.escape_count, "a first block" if known is None else len(known.escaped)
+        raise FormatError(_spec.ERROR_CODEBOOK, at, "CBK-4", detail, found=found, wanted=wanted)
     return known
 
 
@@ -309,24 +276,17 @@ def _read_indices(
     places = read_stream(cursor, count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK])
     largest = int(places.max())
     if largest > size:
-        raise FormatError(
-            _spec.ERROR_CODEBOOK, stream_at, "CBK-2", "index of an entry", found=largest, wanted=f"at most {size}"
-        )
+        wanted = f"at most {size}"
+        raise FormatError(_spec.ERROR_CODEBOOK, stream_at, "CBK-2", "index of an entry", found=largest, wanted=wanted)
     escaped = np.flatnonzero(places == size)
     if len(escaped) != escape_count:
-        raise FormatError(
-            _spec.ERROR_CODEBOOK,
-            at + _spec.CODEBOOK_PARAMS_OFFSETS["escape_count"],
-            "CBK-3",
-            "escape_count",
-            found=escape_count,
-            wanted=len(escaped),
-        )
+        at += _spec.CODEBOOK_PARAMS_OFFSETS["escape_count"]
+        raise FormatError(_spec.ERROR_CODEBOOK, at, "CBK-3", "escape_count", found=escape_count, wanted=len(escaped))
     return Indices(book, attribute, places, escaped)
 
 
 def _read_summand(cursor: Cursor, context: TileContext, attribute: int) -> ColumnBlock:
-    """Read the common summand of scales, which is on the file's lattice as their entries are."""
+    """Read the common summand of the scales, which is on the file's lattice."""
     read_exponent(cursor, context.header.attribute(attribute), fixed=True)
     offsets = read_offsets(cursor, 1)
     at = cursor.at
@@ -336,7 +296,7 @@ def _read_summand(cursor: Cursor, context: TileContext, attribute: int) -> Colum
 
 
 def _check_sums(block: CodebookBlock, context: TileContext) -> None:
-    """Check CBK-6: LAT-4 holds for the sums of scales as for integers in a stream."""
+    """Check CBK-6: the sums of the scales obey LAT-4."""
     if block.bound <= _spec.COLUMN_MAX:
         return
     record = context.header.attribute(_spec.ATTRIBUTE_SCALES)
