@@ -323,7 +323,7 @@ def rules_of(registry: Registry) -> Iterator[tuple[str, Field, Registry]]:
                 found = {"error": USUAL_ERRORS.get(kind)} | rule
                 where = f"registry: {structure['name']}.{name}: {rule}"
                 if set(found) - {kind, "of", "clause", "error", "skipped"} or found["error"] not in codes:
-                    raise SystemExit(f"{where}: wanted one of {', '.join(USUAL_ERRORS)}, and of, clause, error")
+                    raise SystemExit(f"{where}: expected one of {', '.join(USUAL_ERRORS)}, and of, clause, error")
                 if kind == "range" and not fits(found["range"], field[1]):
                     raise SystemExit(f"{where}: not a range of {field[1]}")
                 if kind != "range" and rule[kind]:

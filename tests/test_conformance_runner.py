@@ -574,7 +574,7 @@ def test_every_edit_finds_what_it_changes():
 
 
 def test_an_edit_that_finds_nothing_to_change_is_an_error():
-    with pytest.raises(ValueError, match="wanted once"):
+    with pytest.raises(ValueError, match="expected once"):
         edited_module(ModuleEdit("container.mjs", {"another text": ""}))
 
 
@@ -586,7 +586,7 @@ def test_clauses_that_0_2_added_or_changed_have_wrong_decoders_of_their_own():
 
 
 def test_words_that_a_function_lacks_are_an_error():
-    with ExitStack() as stack, pytest.raises(ValueError, match="wanted once"):
+    with ExitStack() as stack, pytest.raises(ValueError, match="expected once"):
         edited("read_sparse", {"another text": ""})(stack)
 
 

@@ -104,8 +104,8 @@ def test_a_mistaken_renderer_stays_below_what_is_wanted(mistake):
     ("fault", "status", "message"),
     [
         ("none", Status.PASSED, ""),
-        ("shifted", Status.FAILED, "wanted 45"),
-        ("small", Status.WRONG_ANSWER, "128x127 pixels, wanted 128x128"),
+        ("shifted", Status.FAILED, "expected 45"),
+        ("small", Status.WRONG_ANSWER, "128x127 pixels, expected 128x128"),
         ("text", Status.WRONG_ANSWER, "not a PNG"),
         ("nothing", Status.NO_OUTPUT, "0 PNG files"),
         ("status", Status.REFUSED, "exit status 1"),

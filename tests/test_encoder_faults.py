@@ -122,7 +122,7 @@ def check_report(name, report):
     assert (sign.status is Status.WARNED) == (fault.harm is Harm.COARSE)
     assert level == sign.level
     assert not clause or clause in sign.clauses
-    assert level != "L4" or " dB, wanted " in sign.message
+    assert level != "L4" or " dB, expected " in sign.message
 
 
 def reported(report_of, names):

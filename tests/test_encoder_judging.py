@@ -357,7 +357,7 @@ def test_sizes_and_figures_of_others_stand_next_to_the_picture(altered, monkeypa
     assert "41.20 dB in 4,183 bytes" == message({"other": {}}).message
     short = message({PLAIN: {"csplat": ours}}, 25.0, psnr_min=26.0)
     assert (
-        "25.00 dB, wanted 26 at least, in 4,183 bytes (csplat 40.90 in 4,800); with the source's means 25.0,"
+        "25.00 dB, expected at least 26, in 4,183 bytes (csplat 40.90 in 4,800); with the source's means 25.0,"
         " shapes 25.0, opacities 25.0, colours 25.0"
     ) == short.message
 

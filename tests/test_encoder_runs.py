@@ -242,7 +242,7 @@ def test_what_an_earlier_run_left_is_no_excuse(encoded, tmp_path):
     [
         (lambda index: index + 1, "splat "),
         (np.argsort, "numbers of the index are wrong"),
-        (lambda index: index[:-1], "wanted integers of shape [216]"),
+        (lambda index: index[:-1], "expected integers of shape [216]"),
         (lambda index: index.astype(np.float64), "the source index is float64"),
         (lambda index: index[:, None], "shape [216, 1]"),
         (

@@ -53,13 +53,13 @@ class DecoderSuiteOptions:
 
     def __post_init__(self) -> None:
         if not self.levels or any(level not in LEVELS for level in self.levels):
-            raise InputError(f"levels {list(self.levels)}, wanted some of {list(LEVELS)}")
+            raise InputError(f"levels {list(self.levels)}, expected some of {list(LEVELS)}")
         if not self.timeout > 0:
-            raise InputError(f"a timeout of {self.timeout:g} s, wanted more than 0")
+            raise InputError(f"a timeout of {self.timeout:g} s, expected more than 0")
         if self.jobs is not None and self.jobs < 1:
-            raise InputError(f"{self.jobs} jobs, wanted 1 or more")
+            raise InputError(f"{self.jobs} jobs, expected 1 or more")
         if self.by not in CLASSES:
-            raise InputError(f"the class {self.by!r} of decoders, wanted {' or '.join(CLASSES)}")
+            raise InputError(f"the class {self.by!r} of decoders, expected {' or '.join(CLASSES)}")
 
     @property
     def near(self) -> FloatsByVector | None:
@@ -76,9 +76,9 @@ def parse_levels(text: str) -> tuple[int, ...]:
     try:
         numbers = [int(part.strip().upper().removeprefix("L")) for part in text.split(",")]
     except ValueError:
-        raise InputError(f"the level {text!r}, wanted 1 to {LEVELS[-1]}, or some of them as 1,3") from None
+        raise InputError(f"the level {text!r}, expected 1 to {LEVELS[-1]}, or some of them as 1,3") from None
     if any(number not in LEVELS for number in numbers):
-        raise InputError(f"the level {text!r}, wanted 1 to {LEVELS[-1]}, or some of them as 1,3")
+        raise InputError(f"the level {text!r}, expected 1 to {LEVELS[-1]}, or some of them as 1,3")
     return tuple(level for level in LEVELS if level <= numbers[0]) if len(numbers) == 1 else tuple(sorted(set(numbers)))
 
 

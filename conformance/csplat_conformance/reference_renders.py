@@ -109,7 +109,7 @@ def _score_view(vector: Vector, number: int, command: str, timeout: float) -> Ou
         found = sorted(outdir.rglob("*.png"))
         if len(found) != 1:
             wrong = Status.WRONG_ANSWER if found else Status.NO_OUTPUT
-            return _outcome(vector, number, wrong, f"{len(found)} PNG files were written, wanted one", seconds)
+            return _outcome(vector, number, wrong, f"{len(found)} PNG files were written, expected one", seconds)
         try:
             return _compare_render(vector, number, read_png(found[0].read_bytes()), seconds)
         except InputError as error:
@@ -120,7 +120,7 @@ def _compare_render(vector: Vector, number: int, image: U8, seconds: float) -> O
     view = vector.views[number]
     found = psnr(read_png((VECTORS / view["picture"]).read_bytes()), image)
     passed = found >= view["psnr"]
-    message = "" if passed else f"{found:.1f} dB against {view['picture']}, wanted {view['psnr']:g}"
+    message = "" if passed else f"{found:.1f} dB against {view['picture']}, expected {view['psnr']:g}"
     status = Status.PASSED if passed else Status.FAILED
     return _outcome(vector, number, status, message, seconds, psnr=round(found, 2))
 
@@ -140,7 +140,7 @@ def psnr(reference: U8, image: U8) -> float:
     """
     if reference.shape != image.shape:
         sizes = [f"{shape[1]}x{shape[0]}" for shape in (image.shape, reference.shape)]
-        raise InputError(f"the picture has {sizes[0]} pixels, wanted {sizes[1]}")
+        raise InputError(f"the picture has {sizes[0]} pixels, expected {sizes[1]}")
     error = float(np.mean((reference.astype(np.float64) - image.astype(np.float64)) ** 2))
     return min(PSNR_CAP, 10.0 * math.log10(255.0**2 / error)) if error else PSNR_CAP
 
@@ -185,7 +185,7 @@ def _decode_png(data: bytes) -> U8:
         at += 12 + size
     width, height, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", head)
     if depth != 8 or colour not in _CHANNELS or interlace:
-        raise InputError(f"a PNG of {depth} bits, colour type {colour}: wanted 8 bits, RGB, not interlaced")
+        raise InputError(f"a PNG of {depth} bits, colour type {colour}: expected 8 bits, RGB, not interlaced")
     if not (1 <= width <= _SIDE_MAX and 1 <= height <= _SIDE_MAX):
         raise InputError(f"a PNG of {width}x{height} pixels")
     channels = _CHANNELS[colour]

@@ -210,6 +210,6 @@ def _bound(wrong: Wrong, right: Wrong) -> Wrong:
 def _edited_text(name: str, text: str, edits: Mapping[str, str]) -> str:
     for old, new in edits.items():
         if text.count(old) != 1:
-            raise ValueError(f"{name} has {old!r} {text.count(old)} times, wanted once: mend the fault")
+            raise ValueError(f"{name} has {old!r} {text.count(old)} times, expected once: mend the fault")
         text = text.replace(old, new)
     return text

@@ -260,7 +260,7 @@ def check_source_index(
     """
     if index.shape != (decoded_count,) or index.dtype.kind not in "iu":
         found = f"{index.dtype} of shape {list(index.shape)}"
-        raise InputError(f"the source index is {found}, wanted integers of shape [{decoded_count}]")
+        raise InputError(f"the source index is {found}, expected integers of shape [{decoded_count}]")
     seen = np.zeros(source_count if once else 0, bool)
     for start in range(0, decoded_count, block):  # the index may be larger than memory
         part = index[start : start + block]

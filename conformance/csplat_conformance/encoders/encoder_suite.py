@@ -100,7 +100,7 @@ def run_encoder(
     split_command(command, PLACES, OPTIONAL_PLACES)
     unknown = [level for level in options.levels if level not in LEVELS]
     if unknown:
-        raise InputError(f"there is no level {', '.join(unknown)}, wanted {', '.join(LEVELS)}")
+        raise InputError(f"there is no level {', '.join(unknown)}, expected {', '.join(LEVELS)}")
     inputs = select_inputs(options.pattern)
     checks = CheckOptions(options.levels, options.psnr_min, render_score, no_render_reason)
     outcomes: list[Outcome] = []

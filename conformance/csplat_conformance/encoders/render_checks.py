@@ -50,7 +50,7 @@ def check_renders(
         details["exact"] = exact = _score_exact_attributes(model, decoded, pairs, render_score)
         cost = ", ".join(f"{name} {value:.1f}" for name, value in exact.items())
         blame = f"; with the source's {cost}" if cost else ""
-        return Verdict(Status.FAILED, f"{psnr:.2f} dB, wanted {wanted:g} at least, {size}{blame}", details=details)
+        return Verdict(Status.FAILED, f"{psnr:.2f} dB, expected at least {wanted:g}, {size}{blame}", details=details)
     return Verdict(Status.PASSED, f"{psnr:.2f} dB {size}", details=details)
 
 

@@ -40,7 +40,7 @@ def check_declared_bounds(payload: Payload, index: Index) -> None:
         if measure not in _spec.MEASURE_NAMES:
             log.add_field("SER-1", record, "measure", f"{measure} is no measure of the registry")
         elif measure <= last:
-            log.add_field("SER-1", record, "measure", f"{measure} after {last}, wanted ascending measures")
+            log.add_field("SER-1", record, "measure", f"{measure} after {last}, expected ascending measures")
         last = max(last, measure)
         if _check_bound(log, record) and measure in _spec.MEASURE_NAMES:
             _check_bound_possible(log, record, index, stated.source_sh_degree)
@@ -52,7 +52,7 @@ def _check_bound(log: ViolationLog, record: PlacedRecord[_spec.StatedErrorRecord
     largest, rms = record.record.max, record.record.rms
     wrong = [key for key, value in (("max", largest), ("rms", rms)) if not 0.0 <= value < math.inf]
     for key in wrong:
-        log.add_field("SER-2", record, key, f"{getattr(record.record, key)}, wanted finite and not negative")
+        log.add_field("SER-2", record, key, f"{getattr(record.record, key)}, expected finite and not negative")
     if wrong:
         return False
     components = _COMPONENTS.get(_spec.MEASURE_NAMES.get(record.record.measure, ""))

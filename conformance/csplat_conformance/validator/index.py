@@ -112,21 +112,21 @@ def _check_head(log: ViolationLog, head: Head) -> None:
     for kind, least in _SIZES_MIN.items():
         size = getattr(record, f"{kind}_size")
         if size < least:
-            log.add_field("IDX-8", head, f"{kind}_size", f"{size}, wanted {least} at least")
+            log.add_field("IDX-8", head, f"{kind}_size", f"{size}, expected at least {least}")
     if record.sh_degree > _spec.SH_DEGREE_MAX:
-        log.add_field("IDX-3", head, "sh_degree", f"{record.sh_degree}, wanted {_spec.SH_DEGREE_MAX} at most")
+        log.add_field("IDX-3", head, "sh_degree", f"{record.sh_degree}, expected at most {_spec.SH_DEGREE_MAX}")
     unlisted = record.scene_flags & 0x0F & ~sum(_spec.SCENE_FLAG_NAMES)
     if unlisted:
         log.add_field("RES-1", head, "scene_flags", f"bits {unlisted:#04x} are reserved")
     letters = [_spec.DIRECTION_LETTER.get(axis) for axis in record.axes]
     if any(record.axes) and {_AXIS_OF_DIRECTION.get(letter or "") for letter in letters} != {0, 1, 2}:
-        log.add_field("IDX-4", head, "axes", f"{list(record.axes)}, wanted zeros or directions along three lines")
+        log.add_field("IDX-4", head, "axes", f"{list(record.axes)}, expected zeros or directions along three lines")
     if not 0.0 <= record.unit_metres < math.inf:
-        log.add_field("IDX-5", head, "unit_metres", f"{record.unit_metres}, wanted 0, or positive and finite")
+        log.add_field("IDX-5", head, "unit_metres", f"{record.unit_metres}, expected 0, or positive and finite")
     for axis, value in enumerate(record.origin):
         if not math.isfinite(value):
             log.add_field(
-                "IDX-6", head, "origin", f"component {axis} is {value}, wanted a finite number", within=8 * axis
+                "IDX-6", head, "origin", f"component {axis} is {value}, expected a finite number", within=8 * axis
             )
 
 
@@ -138,14 +138,14 @@ def _read_attributes(view: memoryview, at: int, end: int, index: Index, log: Vio
     bands = 0 if index.degree is None else index.degree
     wanted = [value for value, layer in _spec.ATTRIBUTE_LAYER.items() if layer <= bands]
     if index.degree is not None and count != len(wanted):
-        log.add_field("ATT-1", index.head, "attribute_count", f"{count}, wanted {len(wanted)} for SH degree {bands}")
+        log.add_field("ATT-1", index.head, "attribute_count", f"{count}, expected {len(wanted)} for SH degree {bands}")
     for i in range(_count_fitting(index, at, end, count, index.size_of("attribute"))):
         attribute = view[at]
         name = f"attribute[{_spec.ATTRIBUTE_NAMES.get(attribute, attribute)}]"
         placed = read_record(view, _spec.unpack_attribute_record, _spec.ATTRIBUTE_RECORD_OFFSETS, at, name)
         log.check_reserved(placed)
         if count == len(wanted) and index.degree is not None and attribute != wanted[i]:
-            log.add_field("ATT-1", placed, "attribute", f"{attribute}, wanted {wanted[i]} in place {i}")
+            log.add_field("ATT-1", placed, "attribute", f"{attribute}, expected {wanted[i]} in place {i}")
         if attribute in _spec.ATTRIBUTE_NAMES and attribute not in index.attributes:
             index.attributes[attribute] = placed
             _check_attribute(log, placed, index)
@@ -157,13 +157,13 @@ def _check_attribute(log: ViolationLog, placed: AttributeAt, index: Index) -> No
     record = placed.record
     legal = _spec.ATTRIBUTE_MAPPINGS[record.attribute]
     if _spec.MAPPING_NAMES.get(record.mapping) not in legal:
-        log.add_field("ATT-2", placed, "mapping", f"{record.mapping}, wanted {' or '.join(legal) or 'none'}")
+        log.add_field("ATT-2", placed, "mapping", f"{record.mapping}, expected {' or '.join(legal) or 'none'}")
     if record.chroma_shift > _spec.CHROMA_SHIFT_MAX:
         log.add_field(
-            "ATT-8", placed, "chroma_shift", f"{record.chroma_shift}, wanted {_spec.CHROMA_SHIFT_MAX} at most"
+            "ATT-8", placed, "chroma_shift", f"{record.chroma_shift}, expected at most {_spec.CHROMA_SHIFT_MAX}"
         )
     if record.chroma_shift and record.mapping != _spec.MAPPING_YCOCG:
-        log.add_field("ATT-9", placed, "chroma_shift", f"{record.chroma_shift}, wanted 0 without YCOCG")
+        log.add_field("ATT-9", placed, "chroma_shift", f"{record.chroma_shift}, expected 0 without YCOCG")
     kind = _spec.ATTRIBUTE_KIND[record.attribute]
     if kind == "lattice":
         _check_lattice(log, placed, index)
@@ -179,19 +179,19 @@ def _check_levels(log: ViolationLog, placed: AttributeAt, index: Index) -> None:
     if low <= record.levels <= high:
         index.levels[record.attribute] = record.levels
     else:
-        log.add_field(clause, placed, "levels", f"{record.levels}, wanted {low} to {high}")
+        log.add_field(clause, placed, "levels", f"{record.levels}, expected {low} to {high}")
     if record.step != 0.0 or math.copysign(1.0, record.step) < 0.0:
-        log.add_field("ATT-7", placed, "step", f"{record.step} for an attribute of levels, wanted +0")
+        log.add_field("ATT-7", placed, "step", f"{record.step} for an attribute of levels, expected +0")
 
 
 def _check_lattice(log: ViolationLog, placed: AttributeAt, index: Index) -> None:
     record = placed.record
     if record.levels:
-        log.add_field("ATT-5", placed, "levels", f"{record.levels} for a lattice, wanted 0")
+        log.add_field("ATT-5", placed, "levels", f"{record.levels} for a lattice, expected 0")
     if not 2.0**-1022 <= record.step < math.inf:
-        log.add_field("ATT-6", placed, "step", f"{record.step}, wanted positive, finite and at least 2^-1022")
+        log.add_field("ATT-6", placed, "step", f"{record.step}, expected positive, finite and at least 2^-1022")
     elif record.attribute != _spec.ATTRIBUTE_MEANS and not _is_single(Fraction(record.step)):
-        log.add_field("ATT-10", placed, "step", f"{record.step}, wanted a binary32 value of at least 2^-126")
+        log.add_field("ATT-10", placed, "step", f"{record.step}, expected a binary32 value of at least 2^-126")
     else:
         index.steps[record.attribute] = record.step
 
@@ -215,7 +215,7 @@ def _read_codebooks(view: memoryview, at: int, end: int, index: Index, log: Viol
         placed = read_record(view, _spec.unpack_codebook_record, _spec.CODEBOOK_RECORD_OFFSETS, at, name)
         log.check_reserved(placed)
         if identity <= last:
-            log.add_field("CBR-1", placed, "codebook_id", f"{identity} after {last}, wanted ascending ids")
+            log.add_field("CBR-1", placed, "codebook_id", f"{identity} after {last}, expected ascending ids")
         last = identity
         index.codebook_ids.add(identity)
         if _is_sound_codebook(log, placed, index):
@@ -235,9 +235,9 @@ def _is_sound_codebook(log: ViolationLog, placed: CodebookAt, index: Index) -> b
         if not 1 <= first <= last <= highest:
             log.add_field("CBR-2", placed, "band_first", f"bands {first} to {last} in a scene of degree {highest}")
     elif first or last:
-        log.add_field("CBR-2", placed, "band_first", f"bands {first} to {last} of a kind without bands, wanted 0")
+        log.add_field("CBR-2", placed, "band_first", f"bands {first} to {last} of a kind without bands, expected 0")
     if not 1 <= record.size <= _spec.CODEBOOK_ENTRIES_MAX:
-        log.add_field("CBR-4", placed, "size", f"{record.size} entries, wanted 1 to {_spec.CODEBOOK_ENTRIES_MAX}")
+        log.add_field("CBR-4", placed, "size", f"{record.size} entries, expected 1 to {_spec.CODEBOOK_ENTRIES_MAX}")
     return len(log.violations) == before
 
 
@@ -252,7 +252,7 @@ def _read_extras(view: memoryview, at: int, end: int, index: Index, log: Violati
         if record.dtype < _spec.ANCILLARY_ID_MIN and record.dtype not in _spec.EXTRA_DTYPE_NAMES:
             log.add_field("RES-2", placed, "dtype", f"{record.dtype} is no type of the registry")
         if not 1 <= record.name_size <= _spec.EXTRA_NAME_MAX:
-            log.add_field("EXR-1", placed, "name_size", f"{record.name_size}, wanted 1 to {_spec.EXTRA_NAME_MAX}")
+            log.add_field("EXR-1", placed, "name_size", f"{record.name_size}, expected 1 to {_spec.EXTRA_NAME_MAX}")
         else:
             _check_name(log, placed, names)
         index.extras.append(_spec.EXTRA_DTYPE_BYTES.get(record.dtype))
@@ -373,14 +373,14 @@ def _check_type(log: ViolationLog, placed: PlacedRecord[_spec.DirectoryRecord]) 
         log.add_field("DIR-1", placed, "type", "TILE, which layer records name")
         return
     if not all(0x20 <= byte <= 0x7E for byte in kind):
-        log.add_field("DIR-1", placed, "type", f"{kind!r}, wanted bytes 0x20 to 0x7E")
+        log.add_field("DIR-1", placed, "type", f"{kind!r}, expected bytes 0x20 to 0x7E")
     flags = record.flags & 0x00FF  # the others are ancillary
     unlisted = flags & ~sum(_spec.CHUNK_FLAG_NAMES)
     if unlisted:
         log.add_field("RES-1", placed, "flags", f"bits {unlisted:#06x} are reserved")
     if kind in _spec.CHUNK_NAMES:
         if flags & ~unlisted != registered_flags(kind):
-            log.add_field("CHK-4", placed, "flags", f"{record.flags:#06x}, wanted {registered_flags(kind):#06x}")
+            log.add_field("CHK-4", placed, "flags", f"{record.flags:#06x}, expected {registered_flags(kind):#06x}")
     elif kind == _spec.CHUNK_TREE:
         log.add_field("RES-2", placed, "type", f"{kind.decode()} is reserved")
     elif flags & _spec.CHUNK_FLAG_CRITICAL:
@@ -398,7 +398,7 @@ def _check_single(log: ViolationLog, chunks: Sequence[Chunk]) -> None:
             log.add_field("DIR-4", chunk.record, "type", f"a second {chunk.kind.decode()}")
         if chunk.identity or chunk.layer:
             where = f"id {chunk.identity} and layer {chunk.layer}"
-            log.add_field("DIR-4", chunk.record, "type", f"{chunk.kind.decode()} with {where}, wanted 0 and 0")
+            log.add_field("DIR-4", chunk.record, "type", f"{chunk.kind.decode()} with {where}, expected 0 and 0")
         seen.add(chunk.kind)
 
 
@@ -474,7 +474,7 @@ def check_frame(view: memoryview, chunk: Chunk, clause: str, log: ViolationLog) 
     for key, wanted in (("type", chunk.kind), ("flags", chunk.flags), ("payload_size", payload_size)):
         found = getattr(header.record, key)
         if found != wanted:
-            log.add_field("CHK-3", header, key, f"{found!r}, its record wants {wanted!r}")
+            log.add_field("CHK-3", header, key, f"{found!r}, its record has {wanted!r}")
     # The payload ends by the size in the record, which COV-1 confirmed.
     return Payload(view, at + _spec.CHUNK_HEADER_SIZE, end, chunk.name, clause, log)
 
@@ -550,9 +550,9 @@ def _read_tile(view: memoryview, at: int, number: int, index: Index, log: Violat
     log.check_reserved(placed)
     tile = Tile(number, placed)
     if placed.record.level:
-        log.add_field("RES-1", placed, "level", f"{placed.record.level} is reserved, wanted 0")
+        log.add_field("RES-1", placed, "level", f"{placed.record.level} is reserved, expected 0")
     if not 1 <= tile.count <= _spec.TILE_SPLATS_MAX:
-        log.add_field("TIL-1", placed, "splat_count", f"{tile.count}, wanted 1 to {_spec.TILE_SPLATS_MAX}")
+        log.add_field("TIL-1", placed, "splat_count", f"{tile.count}, expected 1 to {_spec.TILE_SPLATS_MAX}")
     _check_tile_box(log, tile, index)
     at += index.size_of("tile")
     _read_layers(view, at, tile, index, log)
@@ -567,7 +567,7 @@ def _check_tile_box(log: ViolationLog, tile: Tile, index: Index) -> None:
             message = f"axis {axis} reaches from {corner} to {corner + extent}, beyond {_spec.INTEGER_MAX}"
             log.add_field("TIL-7", tile.record, "corner", message, within=8 * axis)
         if extent >= 1 << _spec.AXIS_BITS_MAX:
-            message = f"axis {axis} has {extent}, wanted less than 2^{_spec.AXIS_BITS_MAX}"
+            message = f"axis {axis} has {extent}, expected less than 2^{_spec.AXIS_BITS_MAX}"
             log.add_field("TIL-8", tile.record, "extent", message, within=4 * axis)
     step = index.steps.get(_spec.ATTRIBUTE_MEANS)
     if step is not None and scaled_step(step, record.exponent) is None:
@@ -585,9 +585,9 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: Viola
         placed = read_record(view, _spec.unpack_layer_record, _spec.LAYER_RECORD_OFFSETS, at, name)
         log.check_reserved(placed)
         if i == 0 and layer != _spec.LAYER_GEOMETRY:
-            log.add_field("TIL-2", placed, "layer", f"the first is {layer}, wanted {_spec.LAYER_GEOMETRY}")
+            log.add_field("TIL-2", placed, "layer", f"the first is {layer}, expected {_spec.LAYER_GEOMETRY}")
         elif layer <= last:
-            log.add_field("TIL-2", placed, "layer", f"{layer} after {last}, wanted ascending layers")
+            log.add_field("TIL-2", placed, "layer", f"{layer} after {last}, expected ascending layers")
         if layer < _spec.ANCILLARY_ID_MIN and layer not in _spec.LAYER_NAMES:
             log.add_field("RES-2", placed, "layer", f"{layer} is no layer that this version uses")
         if index.degree is not None and layer in _SH_LAYERS and layer > index.degree:
@@ -597,7 +597,7 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: Viola
         last = max(last, layer)
         at += index.size_of("layer")
     if not tile.chunks:
-        log.add("TIL-2", start, f"{tile.record.name}.layer", "no layer, wanted layer 0")
+        log.add("TIL-2", start, f"{tile.record.name}.layer", "no layer, expected layer 0")
         return  # TIL-5 follows from this
     has_extra = any(chunk.layer == _spec.LAYER_EXTRA for chunk in tile.chunks)
     if has_extra != bool(index.head.record.extra_count):
@@ -612,7 +612,7 @@ def _read_codebook_ids(view: memoryview, at: int, tile: Tile, index: Index, log:
         identity = int.from_bytes(view[at : at + 2], "little")
         name = f"{tile.record.name}.table[{k}]"
         if identity <= last:
-            log.add("TIL-6", at, name, f"{identity} after {last}, wanted ascending ids")
+            log.add("TIL-6", at, name, f"{identity} after {last}, expected ascending ids")
         elif identity not in index.codebook_ids:
             log.add("TIL-6", at, name, f"{identity} is the id of no codebook")
         tile.codebook_ids.add(identity)

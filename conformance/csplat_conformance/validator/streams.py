@@ -94,10 +94,10 @@ def _check_counts(log: ViolationLog, head: PlacedRecord[_spec.StreamHead], count
     found, width = head.record.count, head.record.width
     if found != (max(1, found) if count is None else count):
         wanted = "1 or more" if count is None else f"{count}, as its place requires"
-        log.add_field("STR-1", head, "count", f"{found} elements, wanted {wanted}")
+        log.add_field("STR-1", head, "count", f"{found} elements, expected {wanted}")
         sound = False
     if not 1 <= width <= width_max:
-        log.add_field("STR-2", head, "width", f"elements of {width} bytes, wanted 1 to {width_max}")
+        log.add_field("STR-2", head, "width", f"elements of {width} bytes, expected 1 to {width_max}")
         sound = False
     return sound
 
@@ -111,7 +111,7 @@ def _check_transforms(log: ViolationLog, head: PlacedRecord[_spec.StreamHead]) -
         log.add_field("RES-2", head, "transforms", f"{unknown[0]} is no transform of the registry")
         return False  # STR-3 assumes known ids
     if any(a >= b for a, b in pairwise(used)) or 0 in used:
-        log.add_field("STR-3", head, "transforms", f"{list(listed)}, wanted strictly ascending values, then zeros")
+        log.add_field("STR-3", head, "transforms", f"{list(listed)}, expected strictly ascending values, then zeros")
         return False
     return True
 
@@ -127,7 +127,7 @@ def _check_packed(log: ViolationLog, head: PlacedRecord[_spec.StreamHead], sound
             return False
     elif packed % 3 or not 3 <= packed <= 3 * size:
         log.add_field(
-            "STR-5", head, "packed_size", f"{packed} bytes of runs, wanted a multiple of 3 from 3 to {3 * size}"
+            "STR-5", head, "packed_size", f"{packed} bytes of runs, expected a multiple of 3 from 3 to {3 * size}"
         )
         return False
     return True
@@ -156,7 +156,7 @@ def _elements(
         total = int(lengths.sum())
         wanted = record.count * record.width
         if total != wanted:
-            log.add("TRF-1", coded_at, head.path("coded"), f"the runs give {total} bytes, wanted {wanted}")
+            log.add("TRF-1", coded_at, head.path("coded"), f"the runs give {total} bytes, expected {wanted}")
             return None
         data = np.repeat(runs[0], lengths)
     width, count = record.width, record.count

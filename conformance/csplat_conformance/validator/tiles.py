@@ -76,7 +76,7 @@ class TileChecker:
         blocks = self._wanted(chunk.layer)
         announced = head.record.block_count
         if announced != len(blocks):
-            log.add_field("TLE-2", head, "block_count", f"{announced} blocks, wanted {len(blocks)}")
+            log.add_field("TLE-2", head, "block_count", f"{announced} blocks, expected {len(blocks)}")
         for number, attribute in enumerate(blocks):
             if number >= announced and not payload.left:
                 return
@@ -95,14 +95,14 @@ class TileChecker:
         name = f"extra[{number}]" if attribute == _spec.ATTRIBUTE_EXTRA else _spec.ATTRIBUTE_NAMES.get(attribute, "?")
         head = read_block_head(payload, name)
         if attribute != wanted:
-            message = f"{attribute}, wanted {wanted} ({_spec.ATTRIBUTE_NAMES[wanted]}) in place {number}"
+            message = f"{attribute}, expected {wanted} ({_spec.ATTRIBUTE_NAMES[wanted]}) in place {number}"
             self.log.add_field("TLE-2", head, "attribute", message)
             if attribute not in _spec.ATTRIBUTE_NAMES:
                 raise UnreadableError
         coding = head.record.coding
         if _spec.CODING_NAMES.get(coding) not in _spec.ATTRIBUTE_CODINGS[attribute]:
             code = "" if coding in _spec.CODING_NAMES else _spec.ERROR_UNSUPPORTED
-            message = f"{coding}, wanted {' or '.join(_spec.ATTRIBUTE_CODINGS[attribute])}"
+            message = f"{coding}, expected {' or '.join(_spec.ATTRIBUTE_CODINGS[attribute])}"
             self.log.add_field("BLK-1", head, "coding", message, code)
             raise UnreadableError
         if coding == _spec.CODING_CODEBOOK:
@@ -124,7 +124,7 @@ class TileChecker:
         exponent, announced, count = params.record.exponent, params.record.present_count, self.tile.count
         sound = self.check_step(params, exponent, attribute)
         if not 1 <= announced <= count:
-            self.log.add_field("SPA-1", params, "present_count", f"{announced}, wanted 1 to {count}")
+            self.log.add_field("SPA-1", params, "present_count", f"{announced}, expected 1 to {count}")
         mask = read_stream(payload, f"{name}.mask", -(-count // 8), 1)
         where = (mask.head.offset, f"{payload.name}/{name}.mask")
         if mask.elements is not None:
@@ -178,19 +178,19 @@ class TileChecker:
             )
             bits = params.record.bits
             if not 1 <= bits <= _spec.MORTON_BITS_MAX:
-                self.log.add_field("MOR-1", params, "bits", f"{bits}, wanted 1 to {_spec.MORTON_BITS_MAX}")
+                self.log.add_field("MOR-1", params, "bits", f"{bits}, expected 1 to {_spec.MORTON_BITS_MAX}")
             stream = read_stream(payload, f"{name}.stream", count, width_max)
             rows = None if stream.elements is None else _axes(stream.elements.astype(np.int64))
             largest = 0 if stream.elements is None else int(stream.elements.max())
             if 1 <= bits <= _spec.MORTON_BITS_MAX and largest >> _MORTON_AXES * bits:
-                message = f"a code of {largest}, wanted less than 2^{_MORTON_AXES * bits}"
+                message = f"a code of {largest}, expected less than 2^{_MORTON_AXES * bits}"
                 self.log.add("MOR-2", stream.head.offset, f"{payload.name}/{name}.stream", message)
                 rows = None
         else:
             stream = read_stream(payload, f"{name}.stream", _MORTON_AXES * count, width_max)
             rows = None if stream.elements is None else stream.elements.astype(np.int64).reshape(_MORTON_AXES, count)
             if rows is not None and int(rows.max()) >> _spec.AXIS_BITS_MAX:
-                message = f"an integer of {int(rows.max())}, wanted less than 2^{_spec.AXIS_BITS_MAX}"
+                message = f"an integer of {int(rows.max())}, expected less than 2^{_spec.AXIS_BITS_MAX}"
                 self.log.add("AXI-1", stream.head.offset, f"{payload.name}/{name}.stream", message)
                 rows = None
         if rows is not None:
@@ -210,7 +210,7 @@ class TileChecker:
             _spec.unpack_raw_params, _spec.RAW_PARAMS_SIZE, _spec.RAW_PARAMS_OFFSETS, f"{name}.params"
         )
         if params.record.column != number:
-            self.log.add_field("RAW-1", params, "column", f"{params.record.column}, wanted {number}")
+            self.log.add_field("RAW-1", params, "column", f"{params.record.column}, expected {number}")
         width_max = _spec.CODING_WIDTH_MAX[_spec.CODING_RAW]
         stream = read_stream(payload, f"{name}.stream", self.tile.count, width_max)
         size = self.index.extras[number] if number < len(self.index.extras) else None
@@ -258,7 +258,7 @@ def read_exponent(reader: TileChecker, payload: Payload, name: str, attribute: i
     )
     exponent = params.record.exponent
     if fixed and exponent:
-        reader.log.add_field("LAT-2", params, "exponent", f"{exponent}, wanted 0")
+        reader.log.add_field("LAT-2", params, "exponent", f"{exponent}, expected 0")
         return exponent, False
     return exponent, fixed or reader.check_step(params, exponent, attribute)
 
@@ -270,7 +270,7 @@ def read_offsets(payload: Payload, name: str, columns: int) -> tuple[list[int], 
     sound = True
     for i, offset in enumerate(offsets):
         if abs(offset) > _spec.COLUMN_MAX:
-            message = f"offset {i} is {offset}, wanted {_spec.COLUMN_MAX} in magnitude at most"
+            message = f"offset {i} is {offset}, expected at most {_spec.COLUMN_MAX} in magnitude"
             payload.log.add("LAT-3", at + 4 * i, f"{payload.name}/{name}", message)
             sound = False
     return offsets, sound
@@ -355,7 +355,7 @@ def _read_indices(
     stream = read_stream(payload, f"{name}.indices", reader.tile.count, _INDEX_WIDTH_MAX)
     indices = stream.elements
     if indices is not None and int(indices.max()) > size:
-        message = f"an index of {int(indices.max())} into {size} entries, wanted {size} at most"
+        message = f"an index of {int(indices.max())} into {size} entries, expected at most {size}"
         log.add("CBK-2", stream.head.offset, f"{payload.name}/{name}.indices", message)
         indices = None
     escaped = None if indices is None else np.asarray(indices == size)
@@ -405,7 +405,7 @@ def _read_escapes(
     what = f"{name}.escape"
     head = read_block_head(payload, what)
     if head.record.attribute != attribute:
-        message = f"{head.record.attribute}, wanted that of its block, {attribute}"
+        message = f"{head.record.attribute}, expected that of its block, {attribute}"
         reader.log.add_field("CBK-5", head, "attribute", message)
     coding = head.record.coding
     legal = (_spec.CODING_SIGNED,) if attribute == _spec.ATTRIBUTE_QUATS else _ESCAPE_CODINGS
@@ -415,7 +415,7 @@ def _read_escapes(
         raise UnreadableError
     if coding not in legal:
         names = " or ".join(_spec.CODING_NAMES[one] for one in legal)
-        reader.log.add_field("CBK-5", head, "coding", f"{_spec.CODING_NAMES[coding]}, wanted {names}")
+        reader.log.add_field("CBK-5", head, "coding", f"{_spec.CODING_NAMES[coding]}, expected {names}")
         raise UnreadableError
     rows, _ = read_columns(reader, payload, what, attribute, coding, params.record.escape_count, escape=True)
     return rows

@@ -147,7 +147,7 @@ def _read_header(view: memoryview, log: ViolationLog) -> Header | None:
     header = read_record(view, _spec.unpack_header, _spec.HEADER_OFFSETS, 0, "header")
     record = header.record
     if magic != _spec.MAGIC:
-        log.add_field("HDR-1", header, "magic", f"{magic.hex(' ')}, wanted {_spec.MAGIC.hex(' ')}")
+        log.add_field("HDR-1", header, "magic", f"{magic.hex(' ')}, expected {_spec.MAGIC.hex(' ')}")
         return None
     version = (record.version_major, record.version_minor)
     wanted = (_spec.VERSION_MAJOR, _spec.VERSION_MINOR)
@@ -180,7 +180,7 @@ def _index_end(view: memoryview, header: Header, log: ViolationLog) -> int | Non
     least = _spec.INDEX_HEAD_SIZE + _CRC_SIZE
     end = _spec.HEADER_SIZE + size
     if size < least or end > file_size:
-        message = f"{size}, wanted {least} to {file_size - _spec.HEADER_SIZE}"
+        message = f"{size}, expected {least} to {file_size - _spec.HEADER_SIZE}"
         log.add_field("HDR-7", header, "index_size", message)
     if size < least or end > len(view):
         return None

@@ -45,19 +45,19 @@ def check_integers(log: ViolationLog, index: Index, attribute: int, rows: I64, e
 def _check_levels(log: ViolationLog, rows: I64, levels: int, where: Place) -> None:
     high = int(rows.max())
     if high > levels:
-        log.add("LEV-1", *where, f"a level of {high}, wanted {levels} at most")
+        log.add("LEV-1", *where, f"a level of {high}, expected at most {levels}")
 
 
 def _check_quats(log: ViolationLog, rows: I64, levels: int, where: Place) -> None:
     largest = max(abs(int(rows.min())), abs(int(rows.max())))
     if largest > levels:
-        log.add("QUA-1", *where, f"a component of magnitude {largest}, wanted {levels} at most")
+        log.add("QUA-1", *where, f"a component of magnitude {largest}, expected at most {levels}")
         if largest > _spec.QUAT_LEVELS_MAX:
             return  # squares could leave 64 bits
     radicands = 2 * levels * levels - np.square(rows).sum(axis=0)
     lowest = int(radicands.min())
     if lowest < 0 and largest <= levels:
-        message = f"R is {lowest} for splat {int(radicands.argmin())}, wanted 0 or more"
+        message = f"R is {lowest} for splat {int(radicands.argmin())}, expected 0 or more"
         log.add("QUA-2", *where, message)
 
 
@@ -69,7 +69,7 @@ def _check_lattice(
         shift = record.chroma_shift if column >= third and record.mapping == _spec.MAPPING_YCOCG else 0
         largest = max(abs(int(row.min())), abs(int(row.max()))) << shift
         if largest > _spec.COLUMN_MAX:
-            message = f"column {column} has an integer of magnitude {largest}, wanted {_spec.COLUMN_MAX} at most"
+            message = f"column {column} has an integer of magnitude {largest}, expected at most {_spec.COLUMN_MAX}"
             log.add("LAT-4", *where, message)
             return
     step = index.steps.get(record.attribute)
@@ -121,7 +121,7 @@ def check_box(
     lows, highs = rows.min(axis=1).tolist(), rows.max(axis=1).tolist()
     for axis, (low, high, extent) in enumerate(zip(lows, highs, record.extent, strict=True)):
         if low != 0 or high != extent:
-            message = f"axis {axis}: q reaches from {low} to {high}, wanted 0 to the extent {extent}"
+            message = f"axis {axis}: q reaches from {low} to {high}, expected 0 to the extent {extent}"
             log.add("TIL-10", *box, message)
     step = index.steps.get(_spec.ATTRIBUTE_MEANS)
     scale = None if step is None or not sound else scaled_step(step, record.exponent)

@@ -146,7 +146,7 @@ class ViolationLog:
         for key in placed.places:
             value = getattr(placed.record, key)
             if key.startswith("reserved_") and value != 0:
-                self.add_field("RES-1", placed, key, f"reserved, holds {value}, wanted 0")
+                self.add_field("RES-1", placed, key, f"reserved, holds {value}, expected 0")
 
     def skip(self, name: str, reason: str) -> None:
         """Add a part that is not checked."""
