@@ -771,7 +771,7 @@ def test_a_wrong_index_is_refused(tmp_path, ply, csplat_file):
     np.save(wrong, index)
     result = invoke("verify", csplat_file, "--source", ply, "--source-index", wrong)
     assert result.exit_code == 1
-    assert "the source index calls splats 0 and 1 both splat" in result.stderr
+    assert "splats 0 and 1 both have the source index" in result.stderr
     assert invoke("verify", csplat_file, "--source-index", wrong).exit_code == 2
 
 

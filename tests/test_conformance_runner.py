@@ -177,10 +177,10 @@ VALID_FAULTS = {
     "header": (Status.WRONG_ANSWER, ("L1", "L2", "L3"), "header.json is not a JSON object"),
     "fact": (Status.FAILED, ("L1",), "header.splat_count: 3 for 5"),
     "missing": (Status.WRONG_ANSWER, ("L2",), "integers.means is missing"),
-    "extra": (Status.FAILED, ("L3",), "floats.colours: not asked for"),
-    "unknown file": (Status.WRONG_ANSWER, ("L1", "L2", "L3"), "log.txt is no file of the protocol"),
-    "partial": (Status.PARTIAL_OUTPUT, ("L3",), "floats.means: 59 bytes for 60"),
-    "longer": (Status.FAILED, ("L3",), "floats.means: 61 bytes for 60"),
+    "extra": (Status.FAILED, ("L3",), "floats.colours: unexpected array"),
+    "unknown file": (Status.WRONG_ANSWER, ("L1", "L2", "L3"), "log.txt is not a file of the protocol"),
+    "partial": (Status.PARTIAL_OUTPUT, ("L3",), "floats.means has 59 bytes, expected 60"),
+    "longer": (Status.FAILED, ("L3",), "floats.means has 61 bytes, expected 60"),
     "rounding": (Status.FAILED, ("L3",), "floats.means differs"),
 }
 
@@ -237,7 +237,7 @@ def test_a_broken_payload_may_be_accepted_by_decoders_that_leave_it_unread(fault
     assert len(names) == len(run_command(faulty("silent"), DecoderSuiteOptions(pattern=pattern, exact=True)).failures)
 
 
-MISTAKE = "each accepted one is a mistake if your decoder reads META (CHK-7)"
+MISTAKE = "each accepted one is an error if your decoder reads META (CHK-7)"
 
 
 @pytest.mark.parametrize(
@@ -348,10 +348,10 @@ def test_a_pattern_that_matches_nothing_is_named(choice, message):
     ("fault", "by", "message"),
     [
         ("2 ulp", "renderer", ""),
-        ("3 ulp", "renderer", "floats.means: 15 of 15 values too far"),
+        ("3 ulp", "renderer", "floats.means: 15 of 15 values are too far"),
         ("2 ulp", "exact", "floats.means differs"),
         ("missing", "renderer", "integers.means is missing"),
-        ("longer", "renderer", "61 bytes for 60"),
+        ("longer", "renderer", "61 bytes, expected 60"),
     ],
 )
 def test_the_class_says_how_near_floats_must_be(faulty, fault, by, message):
@@ -364,7 +364,7 @@ def test_the_class_says_how_near_floats_must_be(faulty, fault, by, message):
 def test_a_report_names_the_class_that_is_not_exact(by):
     report = run_builtin(DecoderSuiteOptions(pattern="valid/quats", by=by))
 
-    assert (["judged as a decoder of the class renderer"] if by == "renderer" else []) == [*report.notes]
+    assert (["compared with the tolerances of the class renderer"] if by == "renderer" else []) == [*report.notes]
 
 
 # The command ---------------------------------------------------------------------------------------

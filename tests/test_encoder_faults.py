@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from encoder_faults import file_bytes, run
 from encoder_faults.fault import EncoderFault, Harm
+from encoder_faults.run import FAULTS, GROUPS, honest
 from encoder_faults.run import encode as encode_wrongly
-from encoder_faults.run import honest
-from encoder_faults.table import FAULTS, GROUPS
 from tables import failures
 
 import csplat
@@ -149,7 +148,7 @@ ENDS = {
     "writes_nothing": Status.NO_OUTPUT,
     "status_3": Status.WRONG_STATUS,
     "silent_refusal": Status.WRONG_ANSWER,
-    "max_halved": Status.FAILED,
+    "max_overstated": Status.FAILED,
 }
 
 

@@ -80,7 +80,7 @@ REFITTED = stating(refitted=lambda _: True, records=without("sh0", "sh1"))
         ({"coordinate_system": "RDF"}, "axes is RDF"),
         ({"unit_metres": 1.0}, "unit_metres is 1.0"),
         ({"antialiased": True}, "antialiased is True"),
-        ({"extra": {"id": np.zeros(216, "<u4")}}, "the extra column 'id' is none of the source's"),
+        ({"extra": {"id": np.zeros(216, "<u4")}}, "the source has no extra column 'id'"),
     ],
 )
 def test_facts_that_the_source_does_not_say_break_their_clause(plain, fact, message):
@@ -113,7 +113,9 @@ def test_splats_that_are_nowhere_near_are_named(plain):
     assert (Status.FAILED, ("CNF-6", "SER-5")) == (content.status, content.clauses)
     far, near, _ = content.message.split("; ")
     assert re.fullmatch(r"3 splats of the file, the first splat \d+, are not within 0.03 of a splat of the source", far)
-    assert re.fullmatch(r"splat \d+ of the file is near a splat of the source that another stands for already", near)
+    assert re.fullmatch(
+        r"splat \d+ of the file is near a splat of the source that another splat already represents", near
+    )
     assert Status.SKIPPED is errors.status
 
 
@@ -130,8 +132,8 @@ def test_what_is_not_stated_is_not_proved(plain):
 def test_what_was_fitted_anew_is_not_proved_and_the_rest_is(plain):
     _, errors, alone = judged(PLAIN, plain, REFITTED)
 
-    assert (Status.NOT_PROVED, "sh0, sh1: fitted anew, nothing is stated") == (errors.status, errors.message)
-    assert "sh0, sh1 fitted anew" == alone
+    assert (Status.NOT_PROVED, "sh0, sh1: refitted, no error is stated") == (errors.status, errors.message)
+    assert "sh0, sh1 refitted" == alone
     assert errors.details["means"]["holds"]
 
 
@@ -271,7 +273,7 @@ def test_values_that_are_cut_are_told_from_rounded_ones(tmp_path, name, cut):
     lines = find_truncation(one.source(), scene.model, scene.header, pairs.source_index, every)
 
     assert ["means", "opacities", "scales", "quats", "sh0"] == [line.partition(":")[0] for line in lines][:5]
-    assert all(line.endswith("cut instead of rounded?") for line in lines), lines
+    assert all(line.endswith("truncated instead of rounded?") for line in lines), lines
     assert [] == find_truncation(one.source(), scene.model, scene.header, pairs.source_index, frozenset())
 
 
@@ -316,7 +318,7 @@ def statuses(report):
     return [(one.level, one.status) for one in report.outcomes]
 
 
-@pytest.mark.parametrize(("change", "why"), [(silent, "the file states no errors"), (REFITTED, "sh0, sh1 fitted anew")])
+@pytest.mark.parametrize(("change", "why"), [(silent, "the file states no errors"), (REFITTED, "sh0, sh1 refitted")])
 def test_where_errors_prove_nothing_pictures_judge_whatever_was_asked_for(altered, change, why):
     seen = altered(change, render_score=lambda *_: 41.0)
     assert [("L1", Status.PASSED), ("L2", Status.PASSED), ("L3", Status.NOT_PROVED), ("L4", Status.PASSED)] == (
@@ -329,7 +331,7 @@ def test_where_errors_prove_nothing_pictures_judge_whatever_was_asked_for(altere
 
     blind = altered(change)
     assert ("L4", Status.FAILED) == statuses(blind)[-1]
-    assert f"{why}: only pictures can judge it, and no numba" == blind.outcomes[-1].message
+    assert f"{why}: only renders can check it, and no numba" == blind.outcomes[-1].message
 
 
 def test_pictures_are_asked_for_where_they_say_something_and_errors_were_asked_for(altered):

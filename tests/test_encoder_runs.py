@@ -80,8 +80,8 @@ def test_ours_passes_in_this_process(encoded):
     [
         (lambda at: at.ply.write_bytes(at.ply.read_bytes() + b"\n") and None, "the input was modified"),
         (lambda at: at.ply.unlink(), "the input is gone"),
-        (lambda at: (at.out.parent / "x.tmp").touch(), "left x.tmp beside the output"),
-        (lambda at: (at.out.parent / "cache").mkdir(), "left cache beside the output"),
+        (lambda at: (at.out.parent / "x.tmp").touch(), "left x.tmp next to the output"),
+        (lambda at: (at.out.parent / "cache").mkdir(), "left cache next to the output"),
     ],
 )
 def test_what_a_run_does_beside_its_output_is_a_failure(encoded, change, message):
@@ -99,7 +99,7 @@ def test_a_refusal_leaves_nothing(encoded, name):
 
     report = run_encoder(COMMAND, EncoderSuiteOptions(name, ("L1",)), run=running(encoded, refuse))
 
-    message = "refused, but left out.npy beside the output; refused, but left x.tmp beside the output"
+    message = "refused, but left out.npy next to the output; refused, but left x.tmp next to the output"
     assert (Status.FAILED, (), message) == first(report)
 
 
@@ -186,7 +186,7 @@ def test_lengths_that_differ_are_told(encoded):
 def test_a_second_run_gives_the_same_index(encoded):
     other = changed_the_second_time(lambda at: np.save(at.index, encoded[1][::-1]))
 
-    assert (Status.FAILED, ("CNF-10",), "two runs gave the same file and different source indices") == first(
+    assert (Status.FAILED, ("CNF-10",), "two runs gave the same file but different source indices") == first(
         run_encoder(COMMAND, FILES, run=running(encoded, other))
     )
 
@@ -198,7 +198,7 @@ def test_a_second_run_ends_as_the_first(encoded):
 
     report = run_encoder(COMMAND, FILES, run=running(encoded, changed_the_second_time(refuse)))
 
-    assert "a second run ended otherwise: exit status 1, no file; its last line: error: no" == first(report)[2]
+    assert "a second run ended differently: exit status 1, no file; its last line: error: no" == first(report)[2]
 
 
 def test_processes_run_again_in_another_second(encoded, tmp_path):
@@ -231,7 +231,7 @@ def test_what_an_earlier_run_left_is_no_excuse(encoded, tmp_path):
         report = run_encoder(
             COMMAND, choice, run=running(encoded, lambda at: (at.out.parent / "tmp").write_text("") and None)
         )
-        assert "left tmp beside the output" in first(report)[2]
+        assert "left tmp next to the output" in first(report)[2]
 
 
 # The source index ----------------------------------------------------------------------------------
@@ -247,11 +247,11 @@ def test_what_an_earlier_run_left_is_no_excuse(encoded, tmp_path):
         (lambda index: index[:, None], "shape [216, 1]"),
         (
             lambda index: np.where(np.arange(216) == 5, index[6], index),
-            "the source index calls splats 5 and 6 both splat",
+            "splats 5 and 6 both have the source index",
         ),
         (
             lambda index: np.where(np.arange(216) == 5, -1, index),
-            "the source index calls splat 5 splat -1 of the source, which has",
+            "the source index of splat 5 is -1, expected 0 to",
         ),
         (lambda index: np.where(np.arange(216) == 5, 2**40, index), "which has 216, from 0 on"),
     ],
@@ -270,7 +270,7 @@ def test_a_wrong_number_names_splat_claim_and_nearest(encoded):
     report = run_encoder(COMMAND, MAPS, run=running(encoded, lambda at: np.save(at.index, wrong)))
 
     assert (
-        f"splat 3 is called splat {wrong[3]} of the source, nearest is {wrong[7]}"
+        f"the source index of splat 3 is {wrong[3]}, but the nearest source splat is {wrong[7]}"
         " (2 of 216 numbers of the index are wrong)"
     ) == first(report)[2]
 

@@ -303,7 +303,7 @@ def test_extra_columns_are_verified(make_model):
     assert verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index).holds
     other = replace(source, extra={"label": np.zeros(50, np.int16)})
     proof = verify_bounds(Source.of(other), scene.model, scene.header, scene.declared_bounds, result.source_index)
-    assert proof.failures == ("the extra column 'label' does not hold what the source's does",)
+    assert proof.failures == ("the extra column 'label' differs from that of the source",)
     assert proof.clauses == ("SRC-3",)
 
 
@@ -493,9 +493,9 @@ def test_cells_have_similar_numbers_of_splats(make_model):
 @pytest.mark.parametrize(
     ("index", "message"),
     [
-        (np.array([0, 1, 1]), "splats 1 and 2 both splat 1"),
-        (np.array([2, 0, 2]), "splats 0 and 2 both splat 2"),
-        (np.array([0, 1, 5]), "splat 2 splat 5"),
+        (np.array([0, 1, 1]), "splats 1 and 2 both have the source index 1"),
+        (np.array([2, 0, 2]), "splats 0 and 2 both have the source index 2"),
+        (np.array([0, 1, 5]), "splat 2 is 5"),
     ],
 )
 def test_invalid_source_indices_are_found_in_blocks(index, message):

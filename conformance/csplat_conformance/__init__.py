@@ -1,5 +1,5 @@
-"""Conformance vectors of the csplat format: what a file must decode to, and why a broken one is refused.
+"""Conformance tests of the csplat format: vectors with their expected results, runners and a validator.
 
-The vectors and the manifest are dedicated to the public domain (CC0 1.0). They come from
-`csplat_authoring`, which a checkout has, and which writes every byte and computes every expected number itself.
+The vectors and the manifest are dedicated to the public domain (CC0 1.0). `csplat_authoring`, which is only in a
+checkout, writes every byte of them and computes every expected number without the encoder and the decoders.
 """

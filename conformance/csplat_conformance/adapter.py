@@ -33,12 +33,12 @@ _FLOATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
 def answer(data: bytes, limits: Limits | None = None, threads: int | None = None) -> Answer:
-    """Decode a file to floats and to integers; both must accept it, or refuse it alike.
+    """Decode a file to floats and to integers; both must accept it, or refuse it with the same error.
 
     Args:
         data: the file.
-        limits: budgets; the registry's if left out.
-        threads: as for `csplat.decode`.
+        limits: budgets; default: those of the registry.
+        threads: see `csplat.decode`.
     """
     began = time.monotonic()
     try:
@@ -59,7 +59,7 @@ def exact_floats(name: str) -> dict[str, NDArray[np.float32]]:
     """Decode the float arrays of a valid vector, whose hashes are in the manifest.
 
     Raises:
-        AssertionError: a hash differs: csplat's decoder is broken.
+        AssertionError: a hash differs, which is a defect of csplat's decoder.
     """
     from csplat import decoder
 
@@ -76,7 +76,7 @@ class _DifferError(Exception):
 
 def _decoded(data: bytes, limits: Limits | None, threads: int | None) -> tuple[dict[str, Any], dict[str, bytes]]:
     """Return header fields, and raw values by `part.name`."""
-    from csplat import decoder  # whoever reads the manifest alone need not load it
+    from csplat import decoder  # not needed to read the manifest
 
     results: list[Any] = []
     for decode in (decoder.decode, decoder.decode_integers):
@@ -86,7 +86,7 @@ def _decoded(data: bytes, limits: Limits | None, threads: int | None) -> tuple[d
             results.append(error)
     model, integers = results
     if isinstance(model, CsplatError) or isinstance(integers, CsplatError):
-        # A budget counts the bytes of arrays, and the two ways return other ones.
+        # A budget counts the bytes of the returned arrays, which differ between the two functions.
         if _place(model) != _place(integers) and not any(isinstance(result, LimitError) for result in results):
             words = [str(result) if isinstance(result, CsplatError) else "accepted" for result in results]
             raise _DifferError(f"decode and decode_integers differ: {words[0]}; {words[1]}")
@@ -107,7 +107,7 @@ def _raw(array: NDArray[Any]) -> bytes:
 
 
 def _facts(header: Any) -> dict[str, Any]:
-    """Return the header fields as the manifest has them."""
+    """Return the header fields in the form of the manifest."""
     flags = {_spec.SCENE_FLAG_ANTIALIASED: header.antialiased, _spec.SCENE_FLAG_FLAT: header.flat}
     return {
         "profile": header.profile,
@@ -122,10 +122,10 @@ def _facts(header: Any) -> dict[str, Any]:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Answer by the protocol: files and status 0, or a line of JSON and status 1.
+    """Decode a file by the protocol: write files and return 0, or print a line of JSON and return 1.
 
     Args:
-        words: arguments of the command line; default: those of this process.
+        words: command-line arguments; default: those of this process.
     """
     parser = argparse.ArgumentParser(prog="csplat_conformance.adapter", description=__doc__)
     parser.add_argument("input", type=Path)

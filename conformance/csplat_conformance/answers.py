@@ -39,8 +39,8 @@ class Answer:
         status: PASSED if the file was decoded, REFUSED if it was refused, otherwise the kind of failure.
         message: one line about the failure.
         header: fields of header and index.
-        arrays: size in bytes and SHA-256 of the raw little-endian values, by `part.name`, as `floats.means`.
-        floats: raw values by name, as `means`, if they were kept for the class renderer.
+        arrays: size in bytes and SHA-256 of the raw little-endian values, by `part.name`, such as `floats.means`.
+        floats: raw values by name, such as `means`, if they were kept for the class renderer.
         code: error code of a refusal.
         clause: clause of a refusal, if reported.
         offset: offset in the file of a refusal, if reported.
@@ -105,30 +105,31 @@ def compare_answer(
 
 
 def _check_refused(vector: Vector, answer: Answer, exact: bool) -> Outcome:
-    wanted = vector.error
+    expected = vector.error
     status, message = answer.status, answer.message
     details = {}
-    if wanted["optional"] and wanted["code"] != _spec.ERROR_LIMIT and status in (Status.PASSED, Status.REFUSED):
-        details = {"payload": wanted["optional"], "accepted": status is Status.PASSED}  # budgets: others may have more
+    # Budgets do not count: another decoder may have a larger one.
+    if expected["optional"] and expected["code"] != _spec.ERROR_LIMIT and status in (Status.PASSED, Status.REFUSED):
+        details = {"payload": expected["optional"], "accepted": status is Status.PASSED}
     if status is Status.PASSED:
-        optional = wanted["optional"] and not exact
+        optional = expected["optional"] and not exact
         status, message = (Status.PASSED, "") if optional else (Status.FAILED, "accepted")
     elif status is Status.REFUSED:
-        status, message = _match_refusal(answer, wanted, exact)
+        status, message = _match_refusal(answer, expected, exact)
     clauses = tuple(vector.clauses)
     if status not in (Status.PASSED, Status.SKIPPED):
-        clauses = (wanted["clause"], *(clause for clause in clauses if clause != wanted["clause"]))
+        clauses = (expected["clause"], *(clause for clause in clauses if clause != expected["clause"]))
     return Outcome(vector.name, level_name(1), status, clauses, answer.code, message, answer.seconds, details)
 
 
-def _match_refusal(answer: Answer, wanted: Mapping[str, Any], exact: bool) -> tuple[Status, str]:
-    """Compare a refusal; only `exact` compares its code, since another order of checks may find another code first."""
+def _match_refusal(answer: Answer, expected: Mapping[str, Any], exact: bool) -> tuple[Status, str]:
+    """Compare a refusal. Only `exact` compares codes: another order of checks may find another code first."""
     found = _describe_error(answer.code, answer.clause, answer.offset)
-    planted = f"planted {_describe_error(wanted['code'], wanted['clause'], wanted['offset'])}, reported {found}"
+    planted = f"planted {_describe_error(expected['code'], expected['clause'], expected['offset'])}, reported {found}"
     if exact:
-        same = (answer.code, answer.clause, answer.offset) == (wanted["code"], wanted["clause"], wanted["offset"])
+        same = (answer.code, answer.clause, answer.offset) == (expected["code"], expected["clause"], expected["offset"])
         return (Status.PASSED, "") if same else (Status.FAILED, planted)
-    return Status.PASSED, "" if answer.code in (wanted["code"], *wanted["also"]) else planted
+    return Status.PASSED, "" if answer.code in (expected["code"], *expected["also"]) else planted
 
 
 def _describe_error(code: str, clause: str | None, offset: int | None) -> str:
@@ -137,7 +138,7 @@ def _describe_error(code: str, clause: str | None, offset: int | None) -> str:
 
 
 def check_payload_consistency(outcomes: Iterable[Outcome]) -> tuple[list[Outcome], list[str]]:
-    """Check CHK-7: a decoder reads every payload of a chunk type by all clauses, or none (CHK-6).
+    """Check CHK-7: a decoder enforces all clauses on every payload of a chunk type, or leaves all unread (CHK-6).
 
     Args:
         outcomes: the results of `compare_answer` for all vectors.
@@ -156,9 +157,9 @@ def check_payload_consistency(outcomes: Iterable[Outcome]) -> tuple[list[Outcome
             names = ", ".join(result[i].name for i in accepted)
             counts = f"{len(places) - len(accepted)} refused, {len(accepted)} accepted"
             notes.append(
-                f"reads {kind}: {counts}: each accepted one is a mistake if your decoder reads {kind} (CHK-7): {names}"
+                f"reads {kind}: {counts}: each accepted one is an error if your decoder reads {kind} (CHK-7): {names}"
             )
-            message = f"accepted, and others of {kind} refused (CHK-7)"
+            message = f"accepted, while others of {kind} were refused (CHK-7)"
             for i in accepted:
                 result[i] = replace(result[i], status=Status.FAILED, message=message)
     return result, notes
@@ -179,14 +180,14 @@ def _compare(vector: Vector, answer: Answer, parts: tuple[str, ...], near: Float
             found += _compare_size(key, summary, answer.arrays.get(key)) or _compare_values(vector, answer, key, near)
         more = [key for key in answer.arrays if key.split(".", 1)[0] == part]
         extra = [key for key in more if key.split(".", 1)[1] not in vector.expect[part]]
-        found += [(Status.FAILED, f"{key}: not asked for") for key in extra]
+        found += [(Status.FAILED, f"{key}: unexpected array") for key in extra]
     if not found:
         return Status.PASSED, ""
     return max((status for status, _ in found), key=_severity), "; ".join(text for _, text in found)
 
 
 def _severity(status: Status) -> int:
-    """Rank a failure of an array; of several failures of a vector, the one with the largest rank is reported."""
+    """Rank the failure of an array. The failure with the largest rank is the status of the vector."""
     return -[Status.WRONG_ANSWER, Status.PARTIAL_OUTPUT, Status.FAILED].index(status)
 
 
@@ -203,9 +204,9 @@ def _compare_header(expect: Mapping[str, Any], found: Mapping[str, Any]) -> tupl
     for key, value in expect.items():
         have = found.get(key)
         if key == "scene_flags" and isinstance(have, list):
-            have, value = sorted(map(str, have)), sorted(value)  # noqa: PLW2901 - a set: its order means nothing
+            have, value = sorted(map(str, have)), sorted(value)  # noqa: PLW2901 - a set, whose order has no meaning
         if have != value:
-            wrong.append(f"header.{key}: {have!r} for {value!r}")
+            wrong.append(f"header.{key} is {have!r}, expected {value!r}")
     return (Status.FAILED, "; ".join(wrong)) if wrong else (Status.PASSED, "")
 
 
@@ -216,7 +217,7 @@ def _compare_size(key: str, summary: list[Any], found: tuple[int, str] | None) -
     size = math.prod(shape) * int(dtype[1:])
     if found[0] != size:
         status = Status.PARTIAL_OUTPUT if found[0] < size else Status.FAILED
-        return [(status, f"{key}: {found[0]} bytes for {size}, {dtype} {shape}")]
+        return [(status, f"{key} has {found[0]} bytes, expected {size}, {dtype} {shape}")]
     return []
 
 

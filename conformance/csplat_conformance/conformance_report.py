@@ -14,9 +14,9 @@
     L2          1       1       0        0
     all         2       1       1        0
 
-A suite makes one `Outcome` for each check, that is for each vector or input and level. `failed` and everything that a
-process can do instead of an answer (`crashed`, `hung` and so on) count as failures; the status tells what to fix in
-the program. Statuses that only some suites have are columns of their reports alone (`ConformanceReport.extra`).
+A suite makes one `Outcome` for each check: one level of one vector or input. `failed` and the ways in which a process
+can end without an answer (`crashed`, `hung` and so on) count as failures. Statuses that only some suites use are
+columns only in their reports (`ConformanceReport.extra`).
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ class Status(StrEnum):
     """The result of a check. The statuses from `FAILED` to `REFUSED` are failures."""
 
     PASSED = "passed"
-    WARNED = "warned"  #: passed: valid, but far worse than necessary
+    WARNED = "warned"  #: passed, but much worse than necessary
     DECLINED = "declined"  #: refused an input that may be refused
     NOT_PROVED = "not proved"  #: neither confirmed nor contradicted
     FAILED = "failed"  #: the answer is wrong
     CRASHED = "crashed"  #: ended by a signal
     HUNG = "hung"  #: did not end in time
-    WRONG_STATUS = "wrong status"  #: an exit status that the protocol does not have
-    WRONG_ANSWER = "wrong answer"  #: the status of the protocol, without the line or the files that go with it
-    NO_OUTPUT = "no output"  #: success is claimed, nothing was written
-    PARTIAL_OUTPUT = "partial output"  #: a file was left that is cut short, or by a run that failed
+    WRONG_STATUS = "wrong status"  #: an exit status that the protocol does not define
+    WRONG_ANSWER = "wrong answer"  #: a valid exit status, without the line or the files that it requires
+    NO_OUTPUT = "no output"  #: exit status 0, but nothing was written
+    PARTIAL_OUTPUT = "partial output"  #: a truncated file, or a file left by a failed run
     REFUSED = "refused"  #: refused an input that must be accepted
     SKIPPED = "skipped"  #: not checked; the message gives the reason
 
@@ -65,11 +65,11 @@ class Outcome:
         name: the vector or input, with its group, `invalid/index_crc`.
         level: the level that was checked, `L1`.
         status: the result.
-        clauses: broken clauses of the spec or, if unknown, the clauses that the check covers.
+        clauses: violated clauses of the spec or, if unknown, the clauses that the check covers.
         code: error code that was reported or found, `E_CRC`.
-        message: one line: the reason of a failure, or a remark.
-        seconds: time of the run.
-        details: JSON-compatible facts for programs, such as measured numbers.
+        message: one line: the reason for a failure, or a remark.
+        seconds: duration of the run.
+        details: JSON-compatible values for programs, such as measured numbers.
     """
 
     name: str
@@ -93,7 +93,7 @@ class ConformanceReport:
 
     Attributes:
         suite: `decoder` or `encoder`.
-        subject: what was tested: a command line, or a description.
+        subject: the tested program: a command line, or a description.
         outcomes: in the order of the run.
         notes: lines about the run as a whole.
         extra: statuses that this suite counts in addition to passed, failed and skipped.
@@ -120,7 +120,7 @@ class ConformanceReport:
         return {level: self.counts(level) for level in _levels(self)}
 
     def counts(self, level: str | None = None) -> dict[str, int]:
-        """Return the number of checks of a level, or of all, and how many passed, failed, were skipped and so on."""
+        """Return the number of checks of a level, or of all levels, in total and by result."""
         return _counts((one for one in self.outcomes if level in (None, one.level)), self.extra)
 
 
@@ -137,11 +137,11 @@ def _counts(outcomes: Iterable[Outcome], extra: Sequence[Status]) -> dict[str, i
 
 
 def to_table(report: ConformanceReport, *, verbose: bool = False) -> str:
-    """Return the failures, warnings, skips and remarks, a line each, and the counts by level.
+    """Return one line for each failure, warning, skip and remark, followed by the counts by level.
 
     Args:
         report: the run.
-        verbose: a line for every check.
+        verbose: include a line for every check.
     """
     shown = [one for one in report.outcomes if verbose or one.message or not one.good]
     lines = _aligned([(one.level, _word(one.status), one.name, _remark(one)) for one in shown])
@@ -154,7 +154,7 @@ def to_table(report: ConformanceReport, *, verbose: bool = False) -> str:
 
 
 def _word(status: Status) -> str:
-    """Return the word for a status, in capitals for failures, which makes them easy to find."""
+    """Return the word for a status, in capitals for failures."""
     return "ok" if status is Status.PASSED else str(status) if status in _GOOD else str(status).upper()
 
 
@@ -167,7 +167,7 @@ def _remark(one: Outcome) -> str:
 
 
 def _aligned(rows: Sequence[Sequence[str]], *, right: bool = False) -> list[str]:
-    """Align columns; all but the first to the right if requested."""
+    """Align columns to the left or, except for the first, to the right."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
     lines = []
     for row in rows:
@@ -180,7 +180,7 @@ def _aligned(rows: Sequence[Sequence[str]], *, right: bool = False) -> list[str]
 
 
 def to_json(report: ConformanceReport) -> dict[str, Any]:
-    """Return the run as JSON-compatible values: `suite`, `subject`, `passed`, `levels`, `notes`, `outcomes`."""
+    """Return the report as JSON-compatible values: `suite`, `subject`, `passed`, `levels`, `notes`, `outcomes`."""
     return {
         "suite": report.suite,
         "subject": report.subject,
@@ -205,7 +205,7 @@ def _outcome_json(one: Outcome) -> dict[str, Any]:
 
 
 def to_junit(report: ConformanceReport) -> str:
-    """Return the run as JUnit XML: a test suite for each level, a test case for each check."""
+    """Return the report as JUnit XML, with a test suite for each level and a test case for each check."""
     suites = [_junit_suite(report, level) for level in _levels(report)]
     head = f'<testsuites name="csplat {_xml(report.suite)}" {_junit_totals(report.outcomes)}>'
     return "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', head, *suites, "</testsuites>", ""])

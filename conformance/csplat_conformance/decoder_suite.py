@@ -1,11 +1,11 @@
-"""Run a decoder over the vectors and compare what it returns with the manifest.
+"""Run a decoder over the vectors and compare its results with the manifest.
 
     >>> from csplat_conformance.decoder_suite import DecoderSuiteOptions, run_builtin
     >>> run_builtin(DecoderSuiteOptions(pattern="valid/*")).passed
     True
 
-`run_builtin` calls `csplat.decoder` in this process; `run_command` starts another decoder for each vector, by the
-protocol of `protocol`. The levels are described in `answers` and `reference_renders`.
+`run_builtin` calls `csplat.decoder` in this process. `run_command` starts another decoder for each vector, by the
+protocol described in `protocol`. `answers` and `reference_renders` describe the levels.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class DecoderSuiteOptions:
 
     Attributes:
         pattern: shell patterns of names of vectors, `valid/sh*,valid/rich`; None for all.
-        clause: shell patterns of clauses, `HDR-*,LIM-1`, to select the vectors that cover them; None for all.
+        clause: shell patterns of clauses, `HDR-*,LIM-1`; only vectors that cover one of them are run. None for all.
         levels: levels to check, 1 to 4.
         exact: require refusals to match in code, clause and offset, even optional ones, as csplat's own decoders must.
         timeout: time limit of a process, seconds.
@@ -53,17 +53,17 @@ class DecoderSuiteOptions:
 
     def __post_init__(self) -> None:
         if not self.levels or any(level not in LEVELS for level in self.levels):
-            raise InputError(f"levels {list(self.levels)}, expected some of {list(LEVELS)}")
+            raise InputError(f"the levels are {list(self.levels)}, expected some of {list(LEVELS)}")
         if not self.timeout > 0:
-            raise InputError(f"a timeout of {self.timeout:g} s, expected more than 0")
+            raise InputError(f"the timeout is {self.timeout:g} s, expected more than 0")
         if self.jobs is not None and self.jobs < 1:
-            raise InputError(f"{self.jobs} jobs, expected 1 or more")
+            raise InputError(f"the number of jobs is {self.jobs}, expected 1 or more")
         if self.by not in CLASSES:
-            raise InputError(f"the class {self.by!r} of decoders, expected {' or '.join(CLASSES)}")
+            raise InputError(f"the class of decoders is {self.by!r}, expected {' or '.join(CLASSES)}")
 
     @property
     def near(self) -> FloatsByVector | None:
-        """The exact floats by vector, for decoders of the class renderer; None if floats must be equal bit for bit."""
+        """A function that returns exact floats, for the class renderer; None if floats must be equal bit for bit."""
         return adapter.exact_floats if self.by == RENDERER else None
 
 
@@ -76,9 +76,9 @@ def parse_levels(text: str) -> tuple[int, ...]:
     try:
         numbers = [int(part.strip().upper().removeprefix("L")) for part in text.split(",")]
     except ValueError:
-        raise InputError(f"the level {text!r}, expected 1 to {LEVELS[-1]}, or some of them as 1,3") from None
+        raise InputError(f"the level is {text!r}, expected 1 to {LEVELS[-1]}, or a list such as 1,3") from None
     if any(number not in LEVELS for number in numbers):
-        raise InputError(f"the level {text!r}, expected 1 to {LEVELS[-1]}, or some of them as 1,3")
+        raise InputError(f"the level is {text!r}, expected 1 to {LEVELS[-1]}, or a list such as 1,3")
     return tuple(level for level in LEVELS if level <= numbers[0]) if len(numbers) == 1 else tuple(sorted(set(numbers)))
 
 
@@ -177,5 +177,5 @@ def _make_report(
             progress(done, vector_count)
     outcomes, notes = check_payload_consistency(outcomes)
     if options.by != EXACT:
-        notes.append(f"judged as a decoder of the class {options.by}")
+        notes.append(f"compared with the tolerances of the class {options.by}")
     return ConformanceReport("decoder", subject, outcomes, notes)

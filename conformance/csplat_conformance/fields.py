@@ -71,13 +71,13 @@ class Writer:
 
 
 def read_fields(data: bytes) -> tuple[dict[str, Field], dict[str, tuple[int, int]]]:
-    """Locate the fields of header, index records and chunk frames in a valid file of any origin.
+    """Locate the fields of header, index records and chunk headers in any valid file.
 
     Returns:
         Places of the fields by name; offset and size of each chunk by name, in the order of the file.
 
     Raises:
-        ValueError: the index holds more than its records.
+        ValueError: the records do not fill the index.
     """
     out = Writer()
     out.structure("header", "header", _spec.unpack_header(data))
@@ -113,7 +113,7 @@ def read_fields(data: bytes) -> tuple[dict[str, Field], dict[str, tuple[int, int
             spans[f"TILE.{i}.{k}"] = (layer.offset, layer.size)
         out.raw(f"tile[{i}].tables", data[len(out.data) : len(out.data) + 2 * tile.table_count])
     if len(out.data) + _CRC_SIZE != _spec.HEADER_SIZE + index_size:
-        raise ValueError("the index holds more than its records")
+        raise ValueError("the records do not fill the index")
     for name, (offset, _) in spans.items():
         for key, place in _spec.CHUNK_HEADER_OFFSETS.items():
             out.fields[f"{name}/header.{key}"] = Field(offset + place, "<H" if key in ("flags", "reserved_0") else "<I")

@@ -1,4 +1,4 @@
-"""The manifest: each vector, and the result that a decoder must give for it."""
+"""The manifest: the vectors and their expected results."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class Vector:
         name: group and name, `valid/rich`.
         file: path below the folder of the vectors.
         sha256: SHA-256 of the file.
-        why: one line: its purpose.
+        why: its purpose, one line.
         clauses: clauses that the vector covers.
         since: version of the format.
         expect: `header`, `integers`, `floats`, `extra`; empty for a refusal.
-        error: `code`, `clause`, `offset`, `also` (codes that do as well), `optional` (type
-            of the chunk whose payload CHK-6 lets a decoder leave unread and so accept the file, or nothing).
-        views: renderings: `camera`, `picture` (path below the folder of the vectors), `sha256`, `psnr` (dB at least).
+        error: `code`, `clause`, `offset`, `also` (other acceptable codes), `optional` (chunk type whose payload has the
+            defect, if CHK-6 lets a decoder leave it unread and accept the file; otherwise empty).
+        views: renders: `camera`, `picture` (path below the folder of the vectors), `sha256`, `psnr` (minimum, dB).
     """
 
     name: str
@@ -81,7 +81,7 @@ def _summary(array: NDArray[Any]) -> list[Any]:
 
 
 def to_json(vectors: Sequence[Vector]) -> str:
-    """Return the text of manifest.json, with a line per vector."""
+    """Return the text of manifest.json, with one line per vector."""
     entries = [{key: value for key, value in vars(vector).items() if key != "views" or value} for vector in vectors]
     lines = [json.dumps(entry, ensure_ascii=False, separators=(",", ":")) for entry in entries]
     head = json.dumps({"format": f"csplat {_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}", "licence": "CC0-1.0"})
@@ -92,10 +92,10 @@ def select_names(patterns: str | None, names: Collection[str], what: str) -> set
     """Return the names that match any of some shell patterns; all names for None.
 
     Args:
-        patterns: separated by commas: `valid/sh*,valid/absent_*`. A pattern matches whole names, or the part before a
-            hyphen: `MOR` means `MOR-*`, a chapter of clauses.
+        patterns: patterns separated by commas: `valid/sh*,valid/absent_*`. A pattern matches a whole name, or the part
+            before a hyphen: `MOR` means `MOR-*`, a chapter of clauses.
         names: names to select from.
-        what: kind of thing, for messages.
+        what: noun for the names, for messages.
 
     Raises:
         InputError: a pattern matches none of them.

@@ -1,12 +1,12 @@
-"""The protocol by which any decoder can be tested: one process for each vector.
+"""The protocol to test any decoder: one process for each vector.
 
     my-decoder INPUT OUTDIR
 
-The decoder exits with status 0 and leaves in OUTDIR `header.json` and a file of raw values for each array,
+The decoder exits with status 0 and writes to OUTDIR `header.json` and a file of raw values for each array,
 little-endian, in C order: `integers.NAME.bin`, `floats.NAME.bin`, `extra.NAME.bin` (names of columns percent-encoded).
 Or it exits with status 1, its last line on standard output is JSON, `{"code": "E_CRC"}`, and OUTDIR stays empty.
 
-`run_program` starts any program with a time limit and returns how it ended:
+`run_program` runs any program with a time limit:
 
     >>> places = {"input": "a b.ply", "out": "x"}
     >>> end = run_program("my-tool {input} {out}", places, timeout_seconds=60)    # doctest: +SKIP
@@ -14,8 +14,8 @@ Or it exits with status 1, its last line on standard output is JSON, `{"code": "
     (None, 0)
 
 A command line is split as by a shell, but runs without one: no pipes, no variables. Names in braces are replaced after
-the split, so that file names may have spaces. See `run_program` for file names if the program has its own working
-directory.
+the split, so that file names may contain spaces. `run_program` describes the treatment of file names if the program
+runs in another working directory.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def ask_decoder(command: str, path: Path, timeout: float, *, keep_floats: bool =
     Args:
         command: command line with `{input}` and `{outdir}`.
         path: the file.
-        timeout: time limit in seconds; then the process and its children are killed.
+        timeout: time limit in seconds, after which the process and its children are killed.
         keep_floats: keep the values of float arrays in the answer, not only their hashes.
     """
     with tempfile.TemporaryDirectory(prefix="csplat-conformance-") as folder:
@@ -58,7 +58,7 @@ def ask_decoder(command: str, path: Path, timeout: float, *, keep_floats: bool =
 
 
 def read_answer(end: ProcessEnd, outdir: Path, *, keep_floats: bool = False) -> Answer:
-    """Read the answer that a decoder left.
+    """Read a decoder's answer.
 
     Args:
         end: the end of its process.
@@ -88,7 +88,7 @@ def _read_refusal(end: ProcessEnd, left: list[str]) -> Answer:
 
 
 def last_words(end: ProcessEnd) -> str:
-    """Return the last line of standard error as the end of a sentence, or an empty string."""
+    """Return a colon and the last line of standard error, or an empty string."""
     lines = end.stderr.decode("utf-8", "replace").split("\n")
     words = next((line.strip() for line in reversed(lines) if line.strip()), "")
     return f": {words[:_MESSAGE_MAX]}" if words else ""
@@ -115,11 +115,11 @@ def _read_arrays(outdir: Path, left: list[str], seconds: float, *, keep_floats: 
             if keep_floats and part == "floats":
                 floats[array] = path.read_bytes()
         else:
-            return Answer(Status.WRONG_ANSWER, f"{name} is no file of the protocol", seconds=seconds)
+            return Answer(Status.WRONG_ANSWER, f"{name} is not a file of the protocol", seconds=seconds)
     return Answer(Status.PASSED, header=header, arrays=arrays, floats=floats, seconds=seconds)
 
 
-_OUTPUT_MAX = 1 << 20  # bytes of each stream to keep; a program may print forever
+_OUTPUT_MAX = 1 << 20  # bytes of each stream to keep; the rest is dropped
 _SIGKILL = 9  # number of SIGKILL, which Windows does not name
 _WINDOWS_EXCEPTION = 0xC0000000  # smallest exit status of a Windows program that crashed
 
@@ -177,8 +177,9 @@ def run_program(
         command: with the keys of `places` in braces.
         places: values to insert, by name.
         timeout_seconds: wall-clock limit.
-        cwd: working directory. Paths are still relative to this process's directory: the program if it has a slash,
-            and words, or values of options after `=`, that look like a path (a slash, or a suffix) and exist there.
+        cwd: working directory. Paths are still relative to this process's directory: the program if it contains a
+            slash, and words, or values of options after `=`, that look like a path (with a slash or a suffix) and
+            exist.
 
     Raises:
         InputError: the command line cannot be used, or there is no such program.
@@ -190,11 +191,11 @@ def run_program(
     start = time.perf_counter()
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         try:
-            process = subprocess.Popen(  # noqa: S603 - to run the caller's command is what this is for
+            process = subprocess.Popen(  # noqa: S603 - runs the caller's command on purpose
                 words, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True, cwd=cwd
             )
         except OSError as error:
-            raise InputError(f"{words[0]}: {error.strerror or error}; is it installed, and its name right?") from None
+            raise InputError(f"{words[0]}: {error.strerror or error}; is it installed and spelled correctly?") from None
         status: Status | None = None
         try:
             returncode = process.wait(timeout_seconds)
@@ -217,16 +218,16 @@ def run_program(
 
 
 def _make_absolute(word: str) -> str:
-    """Make a word absolute if it names something in the working directory."""
+    """Make a word absolute if it is an existing path."""
     option, equals, path = word.partition("=") if word.startswith("-") else ("", "", word)
     like_a_path = _has_separator(path) or bool(Path(path).suffix)
-    # Path.exists() raises for words that are too long to be one.
+    # Path.exists() raises an error for words that are too long for a path.
     found = like_a_path and os.path.exists(path)  # noqa: PTH110 - see above
     return option + equals + _absolute_path(path) if found else word
 
 
 def _absolute_path(path: str) -> str:
-    # Do not resolve links: a virtual environment is found by the path of its program.
+    # Do not resolve links: Python locates a virtual environment by the path of its executable.
     return str(Path(path).absolute()).replace("{", "{{").replace("}", "}}")
 
 

@@ -1,13 +1,13 @@
 """L4: compare renders of a scene, for given cameras, with reference images.
 
-A reference image is what the equations give in binary64 (`csplat_render.reference_rasteriser`), over black, clipped to
-0..1, times 255 and rounded; IMPLEMENTERS.md lists the conventions. A renderer is a command
+Reference images are computed from the equations in binary64 (`csplat_render.reference_rasteriser`) over black, clipped
+to 0..1, multiplied by 255 and rounded; IMPLEMENTERS.md lists the conventions. A renderer is a command
 
     my-renderer INPUT CAMERA OUT
 
-INPUT is a `.csplat` file, CAMERA a JSON file with a list of one camera, OUT the PNG to write. With `{outdir}` in place
-of `{out}`, the renderer may write one PNG of any name to that folder. PNG files have 8 bits per channel, and are read
-and written without an imaging library.
+INPUT is a `.csplat` file, CAMERA a JSON file with a list of one camera, and OUT the PNG to write. With `{outdir}`
+instead of `{out}`, the renderer may write one PNG of any name to that folder. PNG files have 8 bits per channel; they
+are read and written without an imaging library.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ def can_render() -> bool:
 
 
 def quantise_render(rgb: NDArray[Any]) -> U8:
-    """Return the 8-bit values of a render: clipped to 0..1, times 255, rounded."""
+    """Convert a render to 8 bits: clip to 0..1, multiply by 255, round."""
     image: U8 = np.rint(np.clip(rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
     return image
 
 
 def reference_render(floats: Mapping[str, NDArray[Any]], camera: Mapping[str, Any], antialiased: bool) -> U8:
     """Render the expected arrays of a scene from the equations, in binary64. Needs the extra `render`."""
-    from csplat_render.camera import Camera  # needs the extra `render`, which the rest of the suite does not
+    from csplat_render.camera import Camera  # only this level needs the extra `render`
     from csplat_render.reference_rasteriser import render_exact
 
     splats: Any = SimpleNamespace(**floats)
@@ -88,7 +88,7 @@ def score_renderer(vector: Vector, command: str, timeout: float) -> list[Outcome
 
 
 def skip_views(vector: Vector, why: str) -> list[Outcome]:
-    """Return skipped outcomes with the reason why nothing was rendered."""
+    """Return a skipped outcome for each view, with the reason."""
     return [_outcome(vector, number, Status.SKIPPED, why) for number in range(len(vector.views))]
 
 
@@ -120,7 +120,7 @@ def _compare_render(vector: Vector, number: int, image: U8, seconds: float) -> O
     view = vector.views[number]
     found = psnr(read_png((VECTORS / view["picture"]).read_bytes()), image)
     passed = found >= view["psnr"]
-    message = "" if passed else f"{found:.1f} dB against {view['picture']}, expected {view['psnr']:g}"
+    message = "" if passed else f"PSNR of {view['picture']} is {found:.1f} dB, expected {view['psnr']:g}"
     status = Status.PASSED if passed else Status.FAILED
     return _outcome(vector, number, status, message, seconds, psnr=round(found, 2))
 
@@ -170,7 +170,7 @@ def read_png(data: bytes) -> U8:
     try:
         return _decode_png(data)
     except (struct.error, zlib.error, ValueError) as error:
-        raise InputError(f"not a PNG that can be read: {error}") from None
+        raise InputError(f"the PNG cannot be read: {error}") from None
 
 
 def _decode_png(data: bytes) -> U8:
@@ -185,9 +185,9 @@ def _decode_png(data: bytes) -> U8:
         at += 12 + size
     width, height, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", head)
     if depth != 8 or colour not in _CHANNELS or interlace:
-        raise InputError(f"a PNG of {depth} bits, colour type {colour}: expected 8 bits, RGB, not interlaced")
+        raise InputError(f"the PNG has {depth} bits, colour type {colour}, expected 8 bits, RGB, not interlaced")
     if not (1 <= width <= _SIDE_MAX and 1 <= height <= _SIDE_MAX):
-        raise InputError(f"a PNG of {width}x{height} pixels")
+        raise InputError(f"the PNG has {width}x{height} pixels, expected at most {_SIDE_MAX}x{_SIDE_MAX}")
     channels = _CHANNELS[colour]
     raw = zlib.decompressobj().decompress(coded, height * (width * channels + 1))
     rows = np.frombuffer(raw, np.uint8).reshape(height, width * channels + 1)
@@ -210,7 +210,7 @@ def _undo_filters(rows: U8, channels: int) -> U8:
         elif kind == 0:
             out[y] = line
         else:
-            raise InputError(f"a PNG whose row {y} has the filter {kind}")
+            raise InputError(f"row {y} of the PNG has filter {kind}, expected 0 to 4")
         above = out[y]
     return out
 

@@ -1,12 +1,13 @@
-"""Compute the values that a GPU reconstructs, section 7 in single precision, and their distance from exact values.
+"""Reconstruct values in single precision as a GPU does (spec 7), and measure their distance from exact values.
 
 Usage:
     python -m csplat_conformance.single_precision                # all valid vectors, and seeded integers
     python -m csplat_conformance.single_precision FILE.csplat... # files
 
-The table has the largest distance of each array by the accuracy of the arithmetic. WGSL and GLSL ES let a product be
-either neighbour of the exact one, a quotient 2.5 ulp off and a square root 4.5 (as 1 / inverseSqrt), and let subnormal
-numbers become zeros. All errors here go the same way, which is the worst that they can do to products.
+The table lists the largest distance for each array and accuracy of arithmetic. WGSL and GLSL ES permit a product to be
+either neighbour of the exact one, errors of 2.5 ulp for quotients and 4.5 ulp for square roots (as 1 / inverseSqrt),
+and flushing of subnormal numbers to zero. Here, all errors have the same direction, which is the worst case for
+products.
 """
 
 from __future__ import annotations
@@ -41,11 +42,11 @@ class GpuArithmetic:
     """The arithmetic of a GPU in binary32.
 
     Attributes:
-        product: ulp by which products may be off, 0.5 being the nearest.
-        quotient: the same of quotients.
-        root: the same of square roots.
-        away: errors go away from zero, otherwise towards it.
-        flush: subnormal numbers become zeros, as operands and as results.
+        product: largest error of products, ulp; 0.5 is rounding to nearest.
+        quotient: the same for quotients.
+        root: the same for square roots.
+        away: whether errors point away from zero; otherwise they point towards it.
+        flush: whether subnormal operands and results become zero.
     """
 
     product: float = _NEAREST
@@ -59,7 +60,7 @@ class GpuArithmetic:
         return self._off(self._in(a) * self._in(b), self.product)
 
     def over(self, a: F32, b: float) -> F32:
-        """Divide by a number of binary32."""
+        """Divide by a binary32 number."""
         return self._off(self._in(a) / np.float64(b), self.quotient)
 
     def sqrt(self, a: F32) -> F32:
@@ -73,7 +74,7 @@ class GpuArithmetic:
     def _off(self, exact: NDArray[np.float64], allowed: float) -> F32:
         """Round to binary32 with the largest allowed error in ulp."""
         if allowed != _NEAREST:
-            ulp = np.where(exact == 0, 0.0, np.ldexp(1.0, np.frexp(exact)[1] - _BITS))  # nought stays nought
+            ulp = np.where(exact == 0, 0.0, np.ldexp(1.0, np.frexp(exact)[1] - _BITS))  # zero is exact
             end = exact + np.copysign(allowed * ulp, exact) * (1 if self.away else -1)
             value = np.clip(end, -_LARGEST, _LARGEST).astype(np.float32)
             beyond = np.abs(value) > np.abs(end) if self.away else np.abs(value) < np.abs(end)
@@ -83,7 +84,7 @@ class GpuArithmetic:
         return np.where(np.abs(value) < _SMALLEST, np.float32(0), value) if self.flush else value
 
 
-#: By name: the arithmetic of the table.
+#: The columns of the table, each with its variants of arithmetic.
 GPUS: Final = {
     "nearest": (GpuArithmetic(),),
     "nearest, flush": (GpuArithmetic(flush=True),),
@@ -99,7 +100,7 @@ def lattice_values(n: Ints, step: float, exponent: int, gpu: GpuArithmetic) -> F
     """Return n, rounded to binary32, times s, rounded once; powers of two are applied separately (7.2, 7.4).
 
     Args:
-        n: int64, within 2^53: made of integers, whatever their size.
+        n: int64, at most 2^53 in magnitude.
         step: step in the attribute's record.
         exponent: exponent of the tile or block.
         gpu: arithmetic.
@@ -182,7 +183,7 @@ def _file_values(files: Iterable[bytes]) -> Iterator[tuple[str, str, F32, F32]]:
 
 
 def _seeded_values(seed: int = 1, count: int = 20000) -> Iterator[tuple[str, str, F32, F32]]:
-    """Yield the same for seeded rotations of 500 levels, means of 500 steps, and all opacities of 500 levels."""
+    """Yield the same for random rotations of 500 levels, means of 500 steps, and all opacities of 500 levels."""
     rng = np.random.default_rng(seed)
     for levels in (3, *rng.integers(4, _spec.QUAT_LEVELS_MAX, 498).tolist(), _spec.QUAT_LEVELS_MAX):
         q = rng.integers(-levels, levels + 1, (count, 3))
@@ -222,7 +223,7 @@ def main() -> int:
     farthest: dict[str, dict[str, tuple[int, float]]] = {}
     for source in sources if files else [*sources, _seeded_values()]:
         for name, accuracy, values, exact in source:
-            # Subnormal values, which may be flushed to zero, are left out.
+            # Subnormal values are excluded, because they may be flushed to zero.
             kept = (exact == 0) | (np.abs(exact) >= _SMALLEST)
             distances = np.abs(values[kept].astype(np.float64) - exact[kept])
             old = farthest.setdefault(name, {}).get(accuracy, (0, 0.0))

@@ -1,4 +1,4 @@
-"""Tolerances: how far two correct results may differ (spec SER-5, SER-7 for errors; 9.2, CNF-7 for floats)."""
+"""Tolerances of comparisons: SER-5 and SER-7 for declared errors, CNF-7 for floats."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 #: The classes of decoders (spec 9.2): floats equal bit for bit, or within the tolerance of CNF-7.
 CLASSES: Final = (EXACT := "exact", RENDERER := "renderer")
 
-_EXCESS, _EXCESS_FLOOR = 1e-4, 1e-12  # relative and absolute; by how much a bound may exceed the true error (SER-5)
-_ROUNDING = 1e-9  # relative; sums in binary64 in another order (SER-7)
-_COORDINATE_ROUNDING = 2.0**-50  # relative to the largest coordinate, added and subtracted in binary64 (SER-7)
-#: Absolute, by measure. SER-7 leaves open whether alpha and unit quaternions are rounded to binary32 first.
+_EXCESS, _EXCESS_FLOOR = 1e-4, 1e-12  # relative and absolute excess of a bound over the true error (SER-5)
+_ROUNDING = 1e-9  # relative; the order of sums in binary64 is free (SER-7)
+_COORDINATE_ROUNDING = 2.0**-50  # relative to the largest coordinate; rounding of sums in binary64 (SER-7)
+#: Absolute, by measure; rounding alpha and unit quaternions to binary32 is optional (SER-7).
 _ROUNDING_OF_MEASURE = {"opacities": 2e-7, "covariance": 2e-6}
 
 _ULPS: Final = 2  # CNF-7
-_FLOOR: Final = 2.0**-125  # absolute distance that any array may have (CNF-7)
+_FLOOR: Final = 2.0**-125  # absolute tolerance of all other arrays (CNF-7)
 _FLOOR_OF_ARRAY: Final = {"quats": 2.0**-20, "opacities": 2.0**-20}
 
 
@@ -25,7 +25,7 @@ _FLOOR_OF_ARRAY: Final = {"quats": 2.0**-20, "opacities": 2.0**-20}
 
 
 def bound_tolerance(measure: str, error: float, reach: float) -> float:
-    """Return how far two correct computations of an error may differ (SER-7).
+    """Return the largest difference between two correct computations of an error (SER-7).
 
     Args:
         measure: name in the registry of measures.
@@ -37,7 +37,7 @@ def bound_tolerance(measure: str, error: float, reach: float) -> float:
 
 
 def is_valid_bound(measure: str, declared: float, measured: float, reach: float) -> bool:
-    """Return True if a file may declare this bound: not below the measured error, and hardly above it (SER-5).
+    """Return True if a declared bound is not below the measured error, and not too far above it (SER-5).
 
     Args:
         measure: name in the registry of measures.
@@ -50,7 +50,7 @@ def is_valid_bound(measure: str, declared: float, measured: float, reach: float)
 
 
 def least_true_error(measure: str, declared: float) -> float:
-    """Return the smallest true error for which this bound may be declared; for means near coordinate 0.
+    """Return the smallest true error for which a bound is valid; means are assumed near coordinate 0.
 
     Args:
         measure: name in the registry of measures.
@@ -63,7 +63,7 @@ def least_true_error(measure: str, declared: float) -> float:
 
 
 def ulps_between(values: NDArray[np.float32], exact: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return the distances in ulp; +0 and -0 are one number."""
+    """Return the distances in ulp; +0 and -0 count as equal."""
     distances: NDArray[np.int64] = np.abs(_ordinals(values) - _ordinals(exact))
     return distances
 
@@ -73,15 +73,15 @@ def _ordinals(values: NDArray[np.float32]) -> NDArray[np.int64]:
     return np.where(np.signbit(values), -magnitudes, magnitudes)
 
 
-def describe_deviation(name: str, found: bytes, wanted: NDArray[Any]) -> str:
+def describe_deviation(name: str, found: bytes, expected: NDArray[Any]) -> str:
     """Return a line about values beyond the tolerance of CNF-7, or an empty string.
 
     Args:
-        name: name of the array, as `means`.
-        found: raw values, with the size of `wanted`.
-        wanted: exact values, float32.
+        name: name of the array, such as `means`.
+        found: raw values, with the size of `expected`.
+        expected: exact values, float32.
     """
-    values, exact = np.frombuffer(found, "<f4").astype(np.float32), wanted.ravel()
+    values, exact = np.frombuffer(found, "<f4").astype(np.float32), expected.ravel()
     ulps = ulps_between(values, exact)
     with np.errstate(invalid="ignore"):  # signalling NaN
         distances = np.abs(values.astype(np.float64) - exact)
@@ -89,4 +89,5 @@ def describe_deviation(name: str, found: bytes, wanted: NDArray[Any]) -> str:
     if near.all():
         return ""
     at = int(np.argmax(np.where(near, -1, ulps)))
-    return f"{np.count_nonzero(~near)} of {exact.size} values too far, as {values[at]} for {exact[at]}, {ulps[at]} ulp"
+    count = np.count_nonzero(~near)
+    return f"{count} of {exact.size} values are too far, such as {values[at]}, expected {exact[at]}, {ulps[at]} ulp"

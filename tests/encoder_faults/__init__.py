@@ -1,12 +1,12 @@
-"""Encoders as others may write them: csplat's own with one planted fault at a time, and the table of what finds it.
+"""Faulty encoders: csplat's encoder with one planted fault at a time, to test the conformance suite.
 
 Usage:
-    python tests/encoder_faults --table                      # every fault, and which level and clause find it
-    python tests/encoder_faults --table --groups statements  # those of some modules
-    python tests/encoder_faults FAULT in.ply out.csplat      # one of them, as the conformance suite starts it
+    python tests/encoder_faults --table                      # every fault, with the level and clause that catch it
+    python tests/encoder_faults --table --groups statements  # the faults of some modules
+    python tests/encoder_faults FAULT in.ply out.csplat      # encode with one fault, as the conformance suite does
 
-A fault is planted where a third party would make it: in reading the PLY (`ply_reader`), in what is made of the scene
-before it is coded (`preparation`), where values become integers (`quantisation`), in blocks, streams and chunks
-(`coding`), in the bytes of the file (`file_bytes`), in what the file states (`statements`), or in how the program ends
-and what it leaves behind (`behaviour`). Some are none: freedoms that encoders have, which the suite must not report.
+Each fault is a mistake that the author of another encoder could make: in reading the PLY (`ply_reader`), in preparing
+the scene (`preparation`), in converting values to integers (`quantisation`), in blocks, streams, chunks and bytes of
+the file (`file_bytes`), in the errors and counts that the file states (`statements`), or in the way the program ends
+and in the files it leaves behind (`behaviour`). Some are harmless choices, which the suite must not report.
 """

@@ -1,4 +1,4 @@
-"""The table of the faulty encoders, or one of them."""
+"""Print the table of faulty encoders, or run one of them."""
 
 import argparse
 import sys
@@ -11,19 +11,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # `python tests
 import encoder_faults
 from csplat_conformance.encoders import LEVELS, all_inputs
 from encoder_faults.fault import Harm
-from encoder_faults.run import find, first_sign, inputs_of, status_of
-from encoder_faults.table import FAULTS, GROUPS
+from encoder_faults.run import FAULTS, GROUPS, find, first_sign, inputs_of, status_of
 
-HEADER = ("fault", "harm", "what the author believed", "caught by", "of inputs", "first")
-SHOWN = 120  # characters of a message
+HEADER = ("fault", "harm", "mistaken belief", "caught by", "of inputs", "first message")
+SHOWN = 120  # characters of a message; longer ones are cut
 
 
 def main():
     parser = argparse.ArgumentParser(
         prog="encoder_faults", description=encoder_faults.__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--table", action="store_true", help="every fault, and what the suite says first")
-    parser.add_argument("--groups", nargs="*", default=list(GROUPS), choices=list(GROUPS), help="modules of faults")
+    parser.add_argument("--table", action="store_true", help="list every fault with the suite's first message")
+    parser.add_argument("--groups", nargs="*", default=list(GROUPS), choices=list(GROUPS), help="modules to list")
     parser.add_argument("places", nargs="*", metavar="FAULT PLY OUT [INDEX]", help="encode with a fault")
     args = parser.parse_args()
     if args.table:
@@ -32,7 +31,7 @@ def main():
 
 
 def table(names):
-    """Print the faults as a table in Markdown; the status is 1 if one goes unnoticed."""
+    """Print the faults as a Markdown table; return exit status 1 if a fault is not caught."""
     began, missed = time.process_time(), []
     print(f"| {' | '.join(HEADER)} |\n|{'---|' * len(HEADER)}")
     for name in names:
@@ -48,9 +47,9 @@ def table(names):
 
 
 def found(name):
-    """Run the suite on a fault's own inputs and the small ordinary ones; return three cells and whether it is caught.
+    """Run the suite on a fault's own inputs and the small ordinary ones; return three cells, and True if it is caught.
 
-    Faults in how the program ends run on their own inputs only.
+    Faults with an `end` run on their own inputs only.
     """
     fault = FAULTS[name]
     own = inputs_of(fault)
@@ -65,8 +64,8 @@ def found(name):
     earliest = min(signs.values(), key=lambda one: one.level)
     levels = ", ".join(sorted({f"{one.level} {one.status}" for one in report.failures or [first]}))
     message = " ".join(earliest.message.split())[:SHOWN].replace("|", "/")
-    said = f"{earliest.name}: {earliest.level} {message}"
-    return [" ".join([levels, *earliest.clauses]), f"{len(signs)} of {len(names)}", said], True
+    shown = f"{earliest.name}: {earliest.level} {message}"
+    return [" ".join([levels, *earliest.clauses]), f"{len(signs)} of {len(names)}", shown], True
 
 
 if __name__ == "__main__":

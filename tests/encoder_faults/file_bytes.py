@@ -1,20 +1,66 @@
-"""Faults in the bytes of the file. Checksums are repaired unless they are the fault."""
+"""Faults in blocks, streams, chunks and bytes of the file, and output that depends on chance."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
 import struct
+import time
 import zlib
 
 import numpy as np
 
 from csplat import _spec
+from csplat.encoder import container, entropy, pipeline, sh_codebook, tiling
 from csplat_selftest.fuzzing.damage import built_from
-from encoder_faults.fault import EncoderFault, Harm
+from encoder_faults.fault import DEGREE_3, PLAIN, EncoderFault, Harm, replaced
+
+BROKEN = Harm.VALIDITY
+CHANCE = (Harm.DETERMINISM, ("L1", ""))
+
+# Stages of the encoder ------------------------------------------------------------------------------
+
+
+def swapped_blocks(tile_payload):
+    def run(layer, parts):
+        order = [0, 2, 1, *range(3, len(parts))] if layer == 0 else range(len(parts))
+        return tile_payload(layer, [parts[place] for place in order])
+
+    return run
+
+
+def with_a_tail(deflate):
+    return lambda raw, coding: deflate(raw, coding) + b"\0\0"
+
+
+def reversed_transforms(pack):
+    def run(head):
+        steps = head.transforms.rstrip(b"\0")
+        return pack(head._replace(transforms=steps[::-1].ljust(_spec.TRANSFORMS_MAX, b"\0")))
+
+    return run
+
+
+def payload_crc(_chunk_crc):
+    return lambda _kind, payload: zlib.crc32(payload)
+
+
+# Chance ---------------------------------------------------------------------------------------------
+
+
+def seeded_by_chance(cluster):
+    return lambda *args, **options: cluster(*args, **{**options, "seed": int.from_bytes(os.urandom(4), "little")})
+
+
+def with_time(settings):
+    return lambda *args: {**settings(*args), "encoded_ns": time.time_ns()}
+
+
+# Bytes of the file: checksums are repaired unless they are the fault ---------------------------------
 
 
 def serr_at(data):
-    """Return where the payload of the stated errors begins."""
+    """Return the offset of the payload of the stated errors."""
     index = [
         entry
         for name, entry in built_from(data).fields.items()
@@ -25,7 +71,7 @@ def serr_at(data):
 
 
 def stated(change):
-    """Return a change of every record of the stated errors."""
+    """Return a change of a file: `change` maps each record of the stated errors to a new one."""
 
     def run(data):
         built, at, out = built_from(data), serr_at(data), bytearray(data)
@@ -40,7 +86,7 @@ def stated(change):
 
 
 def head(**fields):
-    """Return a change of the head of the stated errors; each field is made of the one that stands there."""
+    """Return a change of a file: each function maps a field of the head of the stated errors to a new value."""
 
     def run(data):
         built, at = built_from(data), serr_at(data)
@@ -62,7 +108,7 @@ refitted = head(error_flags=lambda _: _spec.ERROR_FLAG_REFITTED)
 
 
 def bounded(bounds):
-    """Return a change of the file: it states these, by measure."""
+    """Return a change of a file: it states the given (max, rms) by measure."""
 
     def run(record):
         most, rms = bounds[_spec.MEASURE_NAMES[record.measure]]
@@ -72,7 +118,7 @@ def bounded(bounds):
 
 
 def index_field(name, change):
-    """Return a change of one field of the index; checksums are repaired."""
+    """Return a change of one field of the index, with repaired checksums."""
 
     def run(data):
         built = built_from(data)
@@ -85,7 +131,7 @@ def index_field(name, change):
 
 
 def swapped_layers(data):
-    """Exchange the records of the first two layers of the first tile, if it has two."""
+    """Swap the records of the first two layers of the first tile, if it has two."""
     built = built_from(data)
     if "tile[0].layer[1].layer" not in built.fields:
         return data
@@ -97,7 +143,7 @@ def swapped_layers(data):
 
 
 def crc_from_the_start(data):
-    """Let the CRC of the index cover the header too."""
+    """Compute the CRC of the index over header and index."""
     at = _spec.HEADER_SIZE + _spec.unpack_header(data).index_size - 4
     return data[:at] + zlib.crc32(data[:at]).to_bytes(4, "little") + data[at + 4 :]
 
@@ -111,14 +157,67 @@ def relative_offsets(data):
     return built.patched(offsets)
 
 
-BROKEN = Harm.VALIDITY
 FAULTS = {
-    "index_crc_of_header": EncoderFault(
-        "the CRC of the index begins with the header", BROKEN, ("L1", "IDX-1"), data=crc_from_the_start
+    # stages of the encoder
+    "no_tile_limit": EncoderFault(
+        "a tile may have any number of splats",
+        BROKEN,
+        ("L1", "TIL-1"),
+        "ordinary/two_tiles",
+        stage=replaced(tiling, "cut_tiles", lambda cut: lambda means, lattice, _: cut(means, lattice, len(means))),
+        options={"means_coding": "axis"},
     ),
-    "layers_swapped": EncoderFault("layers come in any order", BROKEN, ("L1", "TIL-2"), data=swapped_layers),
+    "morton_signed_shift": EncoderFault(
+        "bits of codes are counted from 1",
+        BROKEN,
+        ("L1", "MOR-2"),
+        stage=replaced(
+            entropy, "morton_block", lambda block: lambda codes, bits, coding: block(codes * 2, bits, coding)
+        ),
+    ),
+    "blocks_swapped": EncoderFault(
+        "rotations come before scales",
+        BROKEN,
+        ("L1", "TLE-2"),
+        stage=replaced(pipeline, "tile_payload", swapped_blocks),
+    ),
+    "deflate_tail": EncoderFault(
+        "trailing bytes after a DEFLATE stream are ignored",
+        BROKEN,
+        ("L1", "COD-2"),
+        DEGREE_3,
+        stage=replaced(entropy, "_deflate", with_a_tail),
+    ),
+    "transforms_reversed": EncoderFault(
+        "transforms are listed in decoding order",
+        BROKEN,
+        ("L1", "STR-3"),
+        stage=replaced(_spec, "pack_stream_head", reversed_transforms),
+    ),
+    "crc_of_payload": EncoderFault(
+        "a chunk's CRC is that of its payload",
+        BROKEN,
+        ("L1", "CHK-1"),
+        stage=replaced(container, "chunk_crc", payload_crc),
+    ),
+    # chance
+    "seed_by_chance": EncoderFault(
+        "k-means may start from any seed",
+        *CHANCE,
+        DEGREE_3,
+        stage=replaced(sh_codebook, "cluster", seeded_by_chance),
+        options={"sh_coding": "codebook", "codebook_size": 160},
+    ),
+    "time_in_options": EncoderFault(
+        "a file records its time of creation", *CHANCE, PLAIN, stage=replaced(pipeline, "encoding_settings", with_time)
+    ),
+    # bytes of the file
+    "index_crc_of_header": EncoderFault(
+        "the CRC of the index covers the header", BROKEN, ("L1", "IDX-1"), data=crc_from_the_start
+    ),
+    "layers_swapped": EncoderFault("layers may have any order", BROKEN, ("L1", "TIL-2"), data=swapped_layers),
     "offsets_from_index": EncoderFault(
-        "offsets count from the end of the index", BROKEN, ("L1", "COV-1"), data=relative_offsets
+        "offsets are relative to the end of the index", BROKEN, ("L1", "COV-1"), data=relative_offsets
     ),
     "box_one_too_large": EncoderFault(
         "an extent is a number of cells",
@@ -133,18 +232,12 @@ FAULTS = {
         data=index_field("tile[0].max_scale", lambda scale: float(np.float32(np.exp(scale)))),
     ),
     "reserved_used": EncoderFault(
-        "reserved fields are free to use",
+        "reserved fields may be used freely",
         BROKEN,
         ("L1", "RES-1"),
         data=index_field("tile[0].reserved_0", lambda _: 7),
     ),
     "line_feed_at_end": EncoderFault(
         "files end in a line feed", BROKEN, ("L1", "HDR-6"), data=lambda data: data + b"\n"
-    ),
-    "chroma_shift_off": EncoderFault(
-        "the chroma shift counts from 1",
-        Harm.PICTURE,
-        ("L3", "SER-5"),
-        data=index_field("attribute[4].chroma_shift", lambda shift: shift + 1),
     ),
 }

@@ -1,4 +1,4 @@
-"""Run an encoder with a planted fault, ours, and the conformance suite on it."""
+"""Run our encoder with a planted fault, and the conformance suite on it."""
 
 from __future__ import annotations
 
@@ -21,24 +21,34 @@ from csplat.errors import CsplatError
 from csplat_conformance.conformance_report import ConformanceReport, Outcome, Status
 from csplat_conformance.encoders import LEVELS, EncoderSuiteOptions, all_inputs, run_encoder
 from csplat_conformance.protocol import ProcessEnd
-from encoder_faults.fault import EncoderFault
-from encoder_faults.file_bytes import bounded
-from encoder_faults.source import true_errors
-from encoder_faults.table import FAULTS
+from encoder_faults import behaviour, file_bytes, ply_reader, preparation, quantisation, statements
+from encoder_faults.fault import EncoderFault, true_errors
+
+#: All faults by module, in the order of the encoder.
+GROUPS = {
+    "ply_reader": ply_reader.FAULTS,
+    "preparation": preparation.FAULTS,
+    "quantisation": quantisation.FAULTS,
+    "file_bytes": file_bytes.FAULTS,
+    "statements": statements.FAULTS,
+    "behaviour": behaviour.FAULTS,
+}
+FAULTS = {name: fault for group in GROUPS.values() for name, fault in group.items()}
+assert len(FAULTS) == sum(map(len, GROUPS.values())), "two faults have one name"
 
 
 def encode(fault, ply, out, index=None):
-    """Read, encode, write.
+    """Encode a PLY with a fault.
 
     Args:
         fault: the fault.
-        ply, out: input and output.
-        index: path for the map from splats of the file to those of the source, if requested.
+        ply, out: paths of input and output.
+        index: path for the source index, if requested.
     """
     with np.errstate(all="ignore"):  # a faulty encoder may divide by zero
         data, source_index = _encoded(fault, ply)
     if fault.honest is not None:
-        data = bounded(true_errors(fault.honest(ply), csplat.decode(data), source_index))(data)
+        data = file_bytes.bounded(true_errors(fault.honest(ply), csplat.decode(data), source_index))(data)
     if fault.data is not None:
         data = fault.data(data)
     if fault.end is None:
@@ -51,7 +61,7 @@ def encode(fault, ply, out, index=None):
 
 
 def _encoded(fault, ply):
-    """Return the file, and which splat of the input each of its splats is."""
+    """Return the encoded file and its source index."""
     if fault.is_late:
         return honest(ply.read_bytes(), tuple(fault.options.items()))
     with fault.stage():
@@ -68,7 +78,7 @@ def _encoded(fault, ply):
 
 @cache
 def honest(content, options=()):
-    """Return what our encoder makes of a PLY: the file, and which splat of the input each of its splats is.
+    """Encode a PLY without a fault; return the file and its source index.
 
     Args:
         content: the PLY.
@@ -94,28 +104,28 @@ def _read_input(fault, ply):
 
 FOLDER = Path(__file__).parent
 PLACES = "{ply} {out} {index}"
-#: Statuses that are no failures and say something all the same.
+#: Statuses that are not failures but report a defect.
 SIGNS = (Status.WARNED, Status.NOT_PROVED)
 
 
 def command_of(name: str) -> str:
-    """The command line that starts a faulty encoder."""
+    """Return the command line that starts a faulty encoder."""
     return f"{shlex.quote(sys.executable)} {shlex.quote(str(FOLDER))} {name} {PLACES}"
 
 
 def inputs_of(fault: EncoderFault) -> list[str]:
-    """Names of the reference inputs that show a fault; none if there is no such input."""
+    """Return the names of the reference inputs that reveal a fault."""
     patterns = fault.inputs.split(",")
     return [one.name for one in all_inputs() if any(fnmatch(one.name, pattern) for pattern in patterns)]
 
 
 def find(name: str, *, names: list[str] | None = None, levels: tuple[str, ...] | None = None) -> ConformanceReport:
-    """Run the conformance suite over a fault; return its report.
+    """Run the conformance suite on a faulty encoder.
 
     Args:
         name: name of the fault.
         names: names of the inputs; default: the fault's own.
-        levels: levels to check; default: all but renders, which are added if nothing else shows the fault.
+        levels: levels to check; default: all except renders, which are included only if the fault is caught there.
     """
     fault = FAULTS[name]
     names = inputs_of(fault) if names is None else names
@@ -136,7 +146,7 @@ def first_sign(report: ConformanceReport):
 
 
 def run_here(command, places, _seconds):
-    """Encode as `main` does with this command line, in this process."""
+    """Run a command line of `command_of` in this process."""
     began = time.perf_counter()
     index = places.get("index")
     out, err = io.StringIO(), io.StringIO()
@@ -162,25 +172,23 @@ def status_of(name, ply, out, index=None):
     return 0
 
 
-#: Views of a picture: how many, and pixels.
+#: Number of views, and their width and height in pixels.
 VIEWS = (8, 160, 120)
 
 
 def psnr(source, decoded):
-    """Return the PSNR of small renders; the judge of a source is made once."""
+    """Return the PSNR of small renders. The scorer of each source is cached."""
     key = b"".join(
         values.tobytes()
         for values in (source.means, source.quats, source.scales, source.opacities, source.sh0, source.shN)
     )
-    judge = _judges().get(key)
-    if judge is None:
+    scorer = _scorers.get(key)
+    if scorer is None:
         from csplat_render.scorer import Scorer
         from csplat_render.virtual_cameras import virtual_cameras
 
-        judge = _judges()[key] = Scorer.of_source(source, virtual_cameras(source, *VIEWS, seed=0))
-    return judge.psnr(decoded)
+        scorer = _scorers[key] = Scorer.of_source(source, virtual_cameras(source, *VIEWS, seed=0))
+    return scorer.psnr(decoded)
 
 
-@cache
-def _judges():
-    return {}
+_scorers = {}

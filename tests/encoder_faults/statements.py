@@ -1,4 +1,4 @@
-"""Faults in what a file states of its errors, of its source, and of what it leaves out."""
+"""Faults in the errors that a file states, in its statements about the source, and in omitted statements."""
 
 import contextlib
 from unittest import mock
@@ -7,23 +7,23 @@ import numpy as np
 
 from csplat import _spec, ply
 from csplat.encoder import encode_plan, error_bounds, pipeline
-from encoder_faults.fault import DEGREE_3, DENSE, PLAIN, STRONG, EncoderFault, Harm, changed, replaced
+from encoder_faults.fault import DEGREE_3, EncoderFault, Harm, changed, in_binary64, replaced
 from encoder_faults.file_bytes import counts, head, refitted, stated
-from encoder_faults.ply_reader import without_band_sign
-from encoder_faults.source import in_binary64
 
 MEASURES = ("means", "covariance", "opacities", "sh0", "sh1", "sh2", "sh3")
+#: Other faults understate the other numbers.
+UNDERSTATED = (("means", "rms"), ("opacities", "max"), ("sh2", "max"), ("sh3", "rms"))
 COMPONENTS = {"sh0": 3, "sh1": 9, "sh2": 15, "sh3": 21}
 L3 = ("L3", "SER-5")
 
 
-def told(change):
-    """Return a stage change: what is stated, by measure, is made of what would be."""
+def restated(change):
+    """Return a stage in which `change` maps the stated errors by measure to those to state instead."""
     return replaced(pipeline, "declared_errors", lambda states: lambda errors, origin: change(states(errors, origin)))
 
 
 def scaled(only, kind, factor):
-    """State one number of one measure, or of all, by a factor."""
+    """Return a stage that multiplies the max or the rms of some measures by a factor."""
 
     def run(bounds):
         return {
@@ -34,11 +34,11 @@ def scaled(only, kind, factor):
             for name, (most, rms) in bounds.items()
         }
 
-    return told(run)
+    return restated(run)
 
 
 def in_single(_errors):
-    """Measure in float32, sums and all."""
+    """Compute differences and sums in float32."""
 
     def run(source, decoded):
         difference = decoded.astype(np.float32) - source.astype(np.float32)
@@ -57,7 +57,7 @@ def by_axis(distance):
 
 
 def not_relative(_errors):
-    """Leave ‖Σj‖ out, but for the largest variance."""
+    """Divide by the largest variance instead of ‖Σj‖."""
 
     def run(source_quats, source_scales, quats, scales):
         wide = np.clip(source_scales, -88, 88).astype(np.float64)
@@ -70,34 +70,13 @@ def not_relative(_errors):
     return run
 
 
-def with_w_of_the_source(errors):
-    """Measure with the rotation's x, y, z as quantised and w as it was."""
-
-    def run(source_quats, source_scales, quats, scales):
-        mixed = quats.astype(np.float64)
-        mixed[0] *= 1.0 + 1e-3
-        return errors(source_quats, source_scales, mixed, scales)
-
-    return run
-
-
 def over_components(bounds):
     return {name: (most, rms / COMPONENTS.get(name, 1) ** 0.5) for name, (most, rms) in bounds.items()}
 
 
-def over_the_source(states):
-    """Divide by the splats of the source, pruned ones among them."""
-
-    def run(errors, origin):
-        share = (errors.count / origin.source_count) ** 0.5
-        return {name: (most, rms * share) for name, (most, rms) in states(errors, origin).items()}
-
-    return run
-
-
 @contextlib.contextmanager
 def dropped_rows_counted():
-    """Count rows that the reader drops as splats that were pruned."""
+    """Count rows that the reader drops as pruned splats."""
     findings, read, pack = [], ply.read_ply, _spec.pack_stated_errors_head
 
     def with_dropped(head):
@@ -115,8 +94,14 @@ def without_chunk(chunks):
     return lambda *args: [one for one in chunks(*args) if one.type != _spec.CHUNK_STATED_ERRORS]
 
 
+def without_band_sign(model):
+    changed_sign = model.shN.copy()
+    changed_sign[:, :3] *= -1.0
+    return changed_sign
+
+
 def none_of(*names):
-    return told(lambda bounds: {name: pair for name, pair in bounds.items() if name not in names})
+    return restated(lambda bounds: {name: pair for name, pair in bounds.items() if name not in names})
 
 
 @contextlib.contextmanager
@@ -126,13 +111,13 @@ def scales_without_bound():
 
 
 def one_number_less(measure_name, kind):
-    words = {"max": "the largest error of a sample is the largest", "rms": "a sample says what the mean is"}
+    words = {"max": "the maximum of a sample is the maximum", "rms": "the mean of a sample is the mean"}
     return EncoderFault(words[kind], Harm.BOUND, L3, DEGREE_3, stage=scaled((measure_name,), kind, 0.99))
 
 
 FAULTS = {
-    # a little less, a little more
-    **{f"{name}_{kind}_understated": one_number_less(name, kind) for name in MEASURES for kind in ("max", "rms")},
+    # slightly too small or too large
+    **{f"{name}_{kind}_understated": one_number_less(name, kind) for name, kind in UNDERSTATED},
     "max_overstated": EncoderFault(
         "one percent more is on the safe side", Harm.BOUND, L3, DEGREE_3, stage=scaled(MEASURES, "max", 1.01)
     ),
@@ -140,47 +125,25 @@ FAULTS = {
         "one percent more is on the safe side", Harm.BOUND, L3, DEGREE_3, stage=scaled(MEASURES, "rms", 1.01)
     ),
     "rounded_up": EncoderFault(
-        "SER-5 leaves one part in ten thousand",
+        "SER-5 permits an excess of one part in ten thousand",
         Harm.HARMLESS,
         inputs=DEGREE_3,
-        stage=told(lambda bounds: {name: (most * 1.00009, rms * 1.00009) for name, (most, rms) in bounds.items()}),
-    ),
-    "binary64_errors": EncoderFault(
-        "errors are those of alpha and rotations that nobody rounded",
-        Harm.HARMLESS,
-        inputs=f"{DEGREE_3},ordinary/quaternions,ordinary/transparent_and_opaque",
-        honest=in_binary64,
+        stage=restated(lambda bounds: {name: (most * 1.00009, rms * 1.00009) for name, (most, rms) in bounds.items()}),
     ),
     "binary64_errors_fine": EncoderFault(
-        "the same, with as many levels as there may be",
+        "errors may be computed from alpha and rotations that are not rounded, even with the finest levels",
         Harm.HARMLESS,
         inputs=f"{DEGREE_3},ordinary/quaternions,ordinary/transparent_and_opaque",
         honest=in_binary64,
         options={"opacity_levels": _spec.OPACITY_LEVELS_MAX, "quat_levels": _spec.QUAT_LEVELS_MAX, "scale_step": 1e-5},
     ),
-    "max_halved": EncoderFault(
-        "an error of rounding is half a step",
-        Harm.BOUND,
-        L3,
-        data=stated(lambda r: r._replace(max=r.max / 2, rms=r.rms / 2)),
-    ),
-    "rms_too_generous": EncoderFault(
-        "a bound may be generous", Harm.BOUND, L3, data=stated(lambda r: r._replace(max=r.max * 1.5))
-    ),
-    # measured otherwise
+    # other ways to measure
     "measured_in_single": EncoderFault(
-        "float32 is enough to measure",
+        "float32 is accurate enough to measure errors",
         Harm.BOUND,
         L3,
         f"{DEGREE_3},ordinary/plane",
         stage=replaced(pipeline, "value_errors", in_single),
-    ),
-    "stated_in_single": EncoderFault(
-        "an error can be a float32, rounded to the nearest",
-        Harm.BOUND,
-        L3,
-        f"{DEGREE_3},{PLAIN}",
-        data=stated(lambda r: r._replace(max=float(np.float32(r.max)), rms=float(np.float32(r.rms)))),
     ),
     "means_by_axis": EncoderFault(
         "max is over components, of means too", Harm.BOUND, L3, stage=replaced(pipeline, "distance_errors", by_axis)
@@ -198,25 +161,11 @@ FAULTS = {
         "nasty/*scale*",
         stage=scales_without_bound,
     ),
-    "covariance_not_normalised": EncoderFault(
-        "w of the source is as good as the decoded one",
-        Harm.BOUND,
-        L3,
-        inputs=f"{DEGREE_3},{STRONG}",
-        stage=replaced(pipeline, "covariance_errors", with_w_of_the_source),
-    ),
-    "rms_over_components": EncoderFault("a mean is over all numbers", Harm.BOUND, L3, stage=told(over_components)),
-    "rms_over_source": EncoderFault(
-        "a mean is over all splats that there were",
-        Harm.BOUND,
-        L3,
-        keep=lambda m: np.flatnonzero(m.opacities >= 0.5),
-        stage=replaced(pipeline, "declared_errors", over_the_source),
-    ),
+    "rms_over_components": EncoderFault("a mean is over all numbers", Harm.BOUND, L3, stage=restated(over_components)),
     # statements about the source
-    "pruned_invented": EncoderFault("counts are decoration", Harm.FACTS, ("L2", "SRC-1"), data=counts(3, 3)),
+    "pruned_invented": EncoderFault("counts do not matter", Harm.FACTS, ("L2", "SRC-1"), data=counts(3, 3)),
     "nan_rows_counted": EncoderFault(
-        "rows with NaN are splats that were pruned",
+        "rows with NaN are pruned splats",
         Harm.FACTS,
         ("L2", "SRC-1"),
         "nasty/not_a_number",
@@ -231,32 +180,23 @@ FAULTS = {
         stage=none_of("sh2", "sh3"),
         data=head(source_sh_degree=lambda _: 1),
     ),
-    # not stated
+    # omitted statements
     "refitted_halved": EncoderFault(
-        "of what was fitted anew any error may be stated",
+        "any error may be stated for refitted attributes",
         Harm.BOUND,
         ("L3", "SER-5"),
         data=lambda data: refitted(stated(lambda r: r._replace(max=r.max / 2, rms=r.rms / 2))(data)),
     ),
     "refitted_claimed": EncoderFault(
-        "whoever says that colours were fitted anew may write any",
+        "with REFITTED, colours may have any values",
         Harm.PICTURE,
         ("L4", ""),
         scene=changed(sh0=lambda m: m.sh0[:, ::-1].copy()),
         stage=none_of("sh0", "sh1"),
         data=refitted,
     ),
-    "refitted_rotations": EncoderFault(
-        "the flag is for rotations, too",
-        Harm.PICTURE,
-        ("L4", ""),
-        DENSE,
-        scene=changed(quats=lambda m: m.quats * np.float32([1, -1, -1, -1])),
-        stage=none_of("covariance"),
-        data=refitted,
-    ),
     "errors_left_out": EncoderFault(
-        "what nothing is stated of may be anything",
+        "without stated errors, values may be arbitrary",
         Harm.PICTURE,
         ("L4", ""),
         DEGREE_3,
@@ -264,7 +204,7 @@ FAULTS = {
         stage=replaced(pipeline, "file_chunks", without_chunk),
     ),
     "some_errors_left_out": EncoderFault(
-        "the others are stated",
+        "some of the errors may be omitted",
         Harm.PICTURE,
         ("L3", "SER-6"),
         DEGREE_3,

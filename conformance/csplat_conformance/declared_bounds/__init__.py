@@ -4,7 +4,7 @@
     >>> verify_bounds(Source.of(model), scene.model, scene.header, scene.declared_bounds).holds     # doctest: +SKIP
     True
 
-`csplat verify` and the encoder suite use this package; our encoder measures by code of its own.
+`csplat verify` and the encoder suite use this package. Our encoder measures errors with separate code.
 """
 
 from __future__ import annotations

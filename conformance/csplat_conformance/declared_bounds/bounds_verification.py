@@ -34,8 +34,8 @@ _Bounds = dict[str, tuple[float, float]]
 #: The clause and a line about each contradiction.
 _Contradictions = list[tuple[str, str]]
 
-_SEARCHED_MAX, _SEARCHED_MIN = 100, 10  # splats without a partner whose nearest source splats are searched
-_DISTANCES_MAX = 10**8  # distances to compute for all of them, about
+_SEARCHED_MAX, _SEARCHED_MIN = 100, 10  # splats without a partner for which to search the nearest source splats
+_DISTANCES_MAX = 10**8  # approximate number of distances to compute for all of these splats
 _NEAREST = 8  # source splats to compare with each of them
 _NEEDS_INDEX = "rms and counts are not proved without a source index"
 
@@ -65,7 +65,7 @@ class MeasureVerification:
         name: name in the registry of measures.
         declared_max, declared_rms: bounds in the file; `None` if it declares none of this measure.
         measured_max, measured_rms: errors of the pairs; `None` without a source index.
-        holds: whether nothing contradicts the bounds; `None` if there are none, or if it could not be decided.
+        holds: whether the bounds hold as far as checked; `None` if there are none, or if it is undecided.
         worst: the splat with the largest error. Without a source index, `None` unless a splat has no partner because
             of this measure.
     """
@@ -86,7 +86,7 @@ class BoundsVerification:
     Attributes:
         measures: in the order of the registry.
         failures: a line for each contradiction; empty if the bounds hold.
-        clauses: the clauses of the spec that the failures break.
+        clauses: the clauses of the spec that the failures violate.
         unverified: measures without a declared bound: refitted ones, or all.
         rms_verified: whether rms and counts were verified, too.
     """
@@ -109,9 +109,7 @@ class BoundsVerification:
         if self.measures and not self.rms_verified:
             notes.append(_NEEDS_INDEX)
         if self.unverified:
-            notes.append(
-                f"not proved: {', '.join(self.unverified)}: no error of them is stated, renders are their judge"
-            )
+            notes.append(f"not proved: {', '.join(self.unverified)}: the file states no error of them, compare renders")
         return tuple(notes)
 
     def as_json(self) -> dict[str, Any]:
@@ -155,7 +153,7 @@ def verify_bounds(
         progress: called with the progress of the search for partners.
 
     Raises:
-        InputError: `source_index` is not one index of a source splat for each splat of the file.
+        InputError: `source_index` does not contain one index of a source splat for each splat of the file.
     """
     return verify_with(_InMemoryComparison(source, decoded, header, progress), header, stated, source_index)
 
@@ -193,19 +191,19 @@ class SplatComparison(Protocol):
         ...
 
     def pairs(self, source_index: NDArray[Any]) -> PairErrors:
-        """Measure the pairs that a source index names.
+        """Measure the pairs of a source index.
 
         Raises:
-            InputError: `source_index` is not one index of a source splat for each splat of the file.
+            InputError: `source_index` does not contain one index of a source splat for each splat of the file.
         """
         ...
 
     def matches(self, bounds: Mapping[str, float]) -> NDArray[Any]:
-        """Return for each splat of the file `UNMATCHED`, `UNDECIDED`, or another number if it has a partner."""
+        """Return `UNMATCHED`, `UNDECIDED`, or another number for a partner, for each splat of the file."""
         ...
 
     def farthest(self, bounds: Mapping[str, float], rows: I64) -> dict[str, WorstSplat]:
-        """Return by measure the splat that exceeds its bound most, of the given ones, which have no partner."""
+        """Return by measure which of the given splats, which have no partner, exceeds its bound most."""
         ...
 
 
@@ -215,7 +213,7 @@ def verify_with(
     stated: DeclaredBounds | None,
     source_index: NDArray[Any] | None = None,
 ) -> BoundsVerification:
-    """Verify error bounds as `verify_bounds` does, by any way of comparing splats."""
+    """Verify error bounds like `verify_bounds`, with any `SplatComparison`."""
     if stated is None:
         return BoundsVerification(
             failures=("the file states no errors",), clauses=("SER-6",), unverified=tuple(scenes.names)
@@ -230,7 +228,7 @@ def verify_with(
         measures, wrong = _verify_pairs(scenes, header, bounds, source_index)
     elif not wrong and "means" in bounds:
         measures, wrong = _verify_partners(scenes, bounds)
-    elif not wrong:  # there is no bound to search within
+    elif not wrong:  # without a bound of means there is no search radius
         unverified = tuple(scenes.names) if header.splat_count else ()
     measures.sort(key=lambda one: scenes.names.index(one.name))
     clauses = tuple(dict.fromkeys(clause for clause, _ in wrong))
@@ -244,9 +242,9 @@ def _different_scenes(scenes: SplatComparison, stated: DeclaredBounds) -> Iterat
     """Yield differences that rule out a comparison: splat count, SH degree."""
     count, degree = scenes.source_count, scenes.source_degree
     if count != stated.source_count:
-        yield f"the file stands for a source of {stated.source_count} splats, this one has {count}"
+        yield f"the source has {count} splats, the file states {stated.source_count}"
     if degree != stated.source_sh_degree:
-        yield f"the file stands for a source of SH degree {stated.source_sh_degree}, this one has {degree}"
+        yield f"the source has SH degree {degree}, the file states {stated.source_sh_degree}"
 
 
 def _verify_pairs(
@@ -271,7 +269,7 @@ def _verify_pairs(
 def find_contradictions(
     name: str, found: tuple[float, float], stated: tuple[float, float], reach: float, worst: WorstSplat | None
 ) -> list[str]:
-    """Return a line for each declared bound that is below the true error, or above it by more than SER-5 allows.
+    """Return a line for each declared bound that is below the true error, or further above it than SER-5 allows.
 
     Args:
         name: name of the measure.
@@ -307,7 +305,7 @@ def _verify_partners(scenes: SplatComparison, bounds: _Bounds) -> tuple[list[Mea
     undecided = int(np.count_nonzero(found == UNDECIDED))
     lines = []
     if undecided:
-        lines.append(f"{undecided} splats have too many equals in the source to tell: give a source index")
+        lines.append(f"{undecided} splats have too many similar splats in the source: specify a source index")
     worst: dict[str, WorstSplat] = {}
     some = min(_SEARCHED_MAX, max(_SEARCHED_MIN, _DISTANCES_MAX // max(1, scenes.source_count)))
     if len(alone):
@@ -319,7 +317,7 @@ def _verify_partners(scenes: SplatComparison, bounds: _Bounds) -> tuple[list[Mea
             f" nearest source splat {one.source_splat}"
             for name, one in worst.items()
         ]
-    # Of the splats that were not searched it is unknown which bounds they exceed.
+    # It is unknown which bounds the other splats without a partner exceed.
     undecided_bounds = len(alone) > some
     measures = [
         MeasureVerification(
@@ -337,7 +335,7 @@ def _verify_partners(scenes: SplatComparison, bounds: _Bounds) -> tuple[list[Mea
 
 @dataclass(frozen=True, eq=False)
 class _InMemoryComparison:
-    """A `SplatComparison` of scenes that are in memory as a whole."""
+    """A `SplatComparison` of scenes in memory."""
 
     source: Source
     decoded: SplatModel
@@ -384,7 +382,7 @@ def find_worst(
 ) -> dict[str, WorstSplat]:
     """Return by measure the splat of `rows` that exceeds its bound most.
 
-    Each is compared with the source splat that breaks the fewest bounds, of those with the nearest centres.
+    Each splat is compared with the one of the nearest source splats that exceeds the fewest bounds.
     """
     worst: dict[str, WorstSplat] = {}
     if not len(source):
@@ -393,7 +391,7 @@ def find_worst(
     means = source.means.astype(np.float64)
     for done, row in enumerate(rows.tolist()):
         if progress is not None:
-            progress("looking for what is nearest", done / len(rows))
+            progress("searching the nearest splats", done / len(rows))
         near = nearest_points(means, decoded.means[row])
         errors = pair_differences(source, decoded, near, np.full(len(near), row))
         largest = {name: np.abs(errors[name]).max(axis=1) for name in bounds if name in errors}

@@ -1,7 +1,7 @@
 """Measure the differences between decoded splats and those of their source (spec 5.5, 5.6).
 
-The code is independent of the encoder's, so that each finds the other's mistakes. Arithmetic is float64, in blocks
-that stay in the cache; sums do not depend on the number of threads.
+The code is independent of the encoder's, so that each reveals errors of the other. Arithmetic is float64, in blocks
+that fit the cache. Sums do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """The scene that a file was encoded from: M splats by section 5.6 of the spec, of SH degree 0 to 4.
+    """The scene that a file was encoded from: M splats (spec 5.6) of SH degree 0 to 4.
 
     Attributes:
         means: [M, 3] float32 or float64, centres relative to `origin`.
@@ -140,7 +140,7 @@ def measure_names(source: Source | SplatModel, decoded: SplatModel) -> list[str]
 
 
 def _bands(source: Source | SplatModel, decoded: SplatModel) -> range:
-    """Return the SH bands that the registry has and that at least one of the two has."""
+    """Return the SH bands that have a measure and that at least one of the two scenes has."""
     return range(1, min(MAX_SH_DEGREE, max(source.sh_degree, decoded.sh_degree)) + 1)
 
 
@@ -156,8 +156,8 @@ def measure_pairs(
         threads: number of threads, one per core by default. The result does not depend on it.
 
     Returns:
-        The errors by measure. The maximum is over components, the square of a vector is the sum over them. A band
-        that only one of the two has counts as zero in the other.
+        The errors by measure. The maximum is over components; the square of a vector is the sum over components. A
+        band that only one of the two has counts as zero in the other.
 
     Raises:
         InputError: `source_index` is not one valid index for each decoded splat.
@@ -267,23 +267,21 @@ def check_source_index(
         outside = (part < 0) | (part >= source_count)
         if outside.any():
             first = int(outside.argmax())
-            what = f"splat {start + first} splat {part[first]} of the source, which has {source_count}, from 0 on"
-            raise InputError(f"the source index calls {what}")
+            what = f"splat {start + first} is {part[first]}, expected 0 to {source_count - 1}"
+            raise InputError(f"the source index of {what}")
         if once:
             values = np.sort(part)
             again = np.concatenate([values[1:][values[1:] == values[:-1]], part[seen[part]]])
             if len(again):
                 first, second = np.flatnonzero(index == again[0])[:2]
-                raise InputError(
-                    f"the source index calls splats {first} and {second} both splat {again[0]} of the source"
-                )
+                raise InputError(f"splats {first} and {second} both have the source index {again[0]}")
             seen[part] = True
 
 
 def _reduce(values: F64, start: int) -> tuple[float, float, int]:
-    """Return the largest magnitude, the sum of squares, and the splat of the former.
+    """Return the largest magnitude, the sum of squares, and the splat with the largest magnitude.
 
-    BLAS is not used because its sums depend on the number of threads.
+    BLAS is not used, because its sums depend on the number of threads.
     """
     magnitudes = np.abs(values)
     place = int(magnitudes.argmax())
@@ -308,7 +306,7 @@ def _distances(source: Source, decoded: SplatModel, source_rows: SplatRows, deco
     shift = np.subtract(decoded.origin, source.origin)
     if shift.any():
         moved += shift
-    # Squares of float32 values neither overflow nor vanish in float64; those of an origin of 1e200 are infinite.
+    # Squares of float32 values neither overflow nor vanish in float64, but an origin of 1e200 overflows.
     with np.errstate(over="ignore"):
         distances: F64 = np.sqrt(np.einsum("ij,ij->i", moved, moved))
     return distances
@@ -317,7 +315,7 @@ def _distances(source: Source, decoded: SplatModel, source_rows: SplatRows, deco
 def _covariance_errors(
     source: Source, decoded: SplatModel, source_rows: SplatRows, decoded_rows: SplatRows | slice
 ) -> F64:
-    """Compute |S' - S| / |S|, both over the source's largest variance; logarithms beyond ± 88 count as 88 (SER-5)."""
+    """Compute |S' - S| / |S|, scaled by the source's largest variance; logarithms beyond ±88 count as ±88 (5.5)."""
     scales = source.scales[source_rows].clip(-88.0, 88.0)
     x, y, z = scales.T  # NumPy is slow along an axis of three
     largest = np.maximum(np.maximum(x, y), z).astype(np.float64)
@@ -357,9 +355,9 @@ def _frobenius(entries: F64) -> F64:
 
 
 def find_wrong_extras(source: Source, decoded: SplatModel, source_index: SplatRows) -> list[str]:
-    """Return a line for each extra column of a file that differs from its source's (SRC-3).
+    """Return a line for each extra column of a file that differs from its source (SRC-3).
 
-    Normals are not compared: any splat PLY may have them, and splats do not use them.
+    Normals are not compared: any splat PLY may contain them, but splats do not use them.
     """
     lines = []
     for name, column in decoded.extra.items():
@@ -367,7 +365,7 @@ def find_wrong_extras(source: Source, decoded: SplatModel, source_index: SplatRo
         if name in _NORMALS:
             continue
         if other is None:
-            lines.append(f"the extra column {name!r} is none of the source's")
+            lines.append(f"the source has no extra column {name!r}")
         elif column.tobytes() != other[source_index].astype(column.dtype).tobytes():
-            lines.append(f"the extra column {name!r} does not hold what the source's does")
+            lines.append(f"the extra column {name!r} differs from that of the source")
     return lines

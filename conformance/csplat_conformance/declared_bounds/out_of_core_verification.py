@@ -1,9 +1,9 @@
 """Verify declared error bounds out of core, if file and source do not fit into memory.
 
-Without a source index, space is cut into cells of about equal splat counts, and the source's splats are sorted by cell
-in a temporary file. The tiles near a cell are decoded and matched with it: first within the distance that the file's
-lattice implies, then, for the few splats without a partner, up to the declared maximum. With a source index, the
-source's splats are sorted by the tiles that they became.
+Without a source index, space is divided into cells of about equal splat counts, and the source's splats are sorted by
+cell in a temporary file. The tiles near a cell are decoded and matched with it: first within the distance that the
+file's lattice implies, then, for the few splats without a partner, up to the declared maximum. With a source index, the
+source's splats are sorted by tile instead.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from csplat_conformance.tolerance import bound_tolerance
 _COMPARE_FACTOR = 2.2  # memory to compare two scenes, as a multiple of their arrays
 _SPLAT_BYTES = 80  # bytes per source splat in addition to its arrays: keys, order, centres in doubles
 _PART_FACTOR = 5  # memory for a part, as a multiple of its arrays: records, source, tiles and their selection
-_BASE_BYTES = 200_000_000  # bytes of the program, tiles that are being decoded, splats that wait to be written
+_BASE_BYTES = 200_000_000  # bytes of the program, of tiles during decoding, and of splats waiting to be written
 _WORKER_BYTES = 50_000_000  # bytes of a process in addition to its part
 _INDEX_BLOCK = 1 << 20  # numbers of a source index
 
@@ -62,8 +62,8 @@ class PartSizes:
 
     Attributes:
         least: minimum, even if there is less memory.
-        most: maximum, even if there is more memory: caches are small, and larger parts are hardly faster.
-        worth_a_process: smallest part for which another process pays: work at the edges of parts is done twice.
+        most: maximum, even if there is more memory, because larger parts are hardly faster.
+        worth_a_process: smallest part that justifies another process, because work at the edges of parts is repeated.
     """
 
     least: int = 1 << 14
@@ -82,8 +82,8 @@ def fits_memory(opened: TileReader, source_count: int, source_bytes: int, memory
     """
     splat_bytes = _splat_bytes(opened)
     source = max(source_count * (_COMPARE_FACTOR * splat_bytes + _SPLAT_BYTES), source_bytes)
-    wanted = source + opened.header.splat_count * _COMPARE_FACTOR * splat_bytes
-    return wanted <= (default_memory_bytes() if memory_bytes is None else memory_bytes)
+    needed = source + opened.header.splat_count * _COMPARE_FACTOR * splat_bytes
+    return needed <= (default_memory_bytes() if memory_bytes is None else memory_bytes)
 
 
 def _splat_bytes(opened: TileReader) -> int:
@@ -102,16 +102,16 @@ def verify_out_of_core(
     sizes: PartSizes | None = None,
     progress: Progress | None = None,
 ) -> BoundsVerification:
-    """Verify the error bounds of a file against its source, with the result of `verify_bounds`.
+    """Verify the error bounds of a file against its source, with the same result as `verify_bounds`.
 
-    An unnamed file in the folder for temporary files (TMPDIR) takes as many bytes as the source's arrays. It vanishes
+    The arrays of the source are copied to an unnamed file in the folder for temporary files (TMPDIR). The file vanishes
     when the program ends, even if it is killed.
 
     Args:
         scene: the source.
         opened: the file.
         source_index: see `verify_bounds`; may be memory-mapped.
-        memory_bytes: approximate memory limit, without a few bytes per splat; `None`: half of the free memory.
+        memory_bytes: approximate memory limit, excluding a few bytes per splat; `None`: half of the free memory.
         sizes: limits on the sizes of parts; the result does not depend on them.
         progress: called with the progress of the comparison.
 
@@ -136,7 +136,7 @@ class _OutOfCoreComparison:
     _reach: float = field(default=0.0, init=False)
 
     def close(self) -> None:
-        """Close, and so remove, the temporary file."""
+        """Close and thereby remove the temporary file."""
         if self._spool is not None:
             self._spool.stream.close()
 
@@ -157,7 +157,7 @@ class _OutOfCoreComparison:
 
     @property
     def _memory(self) -> int:
-        """Memory for parts, in bytes: the limit without what the program itself takes."""
+        """Memory for parts, in bytes: the limit without that of the program itself."""
         return (default_memory_bytes() if self.memory_bytes is None else self.memory_bytes) - _BASE_BYTES
 
     @property
@@ -223,7 +223,7 @@ class _OutOfCoreComparison:
         return found
 
     def farthest(self, bounds: Mapping[str, float], rows: I64) -> dict[str, WorstSplat]:
-        """Implement `SplatComparison.farthest`: gather near splats of all parts and compare them as in memory."""
+        """Implement `SplatComparison.farthest` with the nearest source splats of all parts."""
         if self._spool is None or not len(rows):
             return {}
         header = self.opened.header
@@ -263,7 +263,7 @@ class _OutOfCoreComparison:
     # With a source index ---------------------------------------------------------------------------
 
     def pairs(self, source_index: NDArray[Any]) -> PairErrors:
-        """Implement `SplatComparison.pairs`, with four or eight bytes of memory per source splat."""
+        """Implement `SplatComparison.pairs`; takes four or eight bytes of memory per source splat."""
         count = self.opened.header.splat_count
         check_source_index(source_index, self.scene.count, count)
         groups = self._groups()
@@ -305,7 +305,7 @@ class _OutOfCoreComparison:
 
 
 def _invert_index(source_index: NDArray[Any], source_count: int) -> NDArray[Any]:
-    """Return for each source splat the splat of the file that it became, or the dtype's largest number if none."""
+    """Return for each source splat the index of its splat in the file, or the dtype's largest number if none."""
     dtype = np.uint32 if len(source_index) < 2**32 - 1 else np.uint64
     became = np.full(source_count, np.iinfo(dtype).max, dtype)
     base = source_index.base
@@ -335,7 +335,7 @@ class CellTree:
 
     @classmethod
     def of(cls, header: SceneHeader, count: int, most: int) -> CellTree:
-        """Cut space so that each cell has about `most` of `count` splats; tiles tell how splats are distributed."""
+        """Divide space into cells of about `most` of `count` splats, estimated from the tiles of a file."""
         boxes = tile_boxes(header)
         points = (boxes[:, None, 0] + _OCTANT_CENTRES * (boxes[:, None, 1] - boxes[:, None, 0])).reshape(-1, 3)
         weights = np.repeat([float(tile.splat_count) for tile in header.tiles], len(_OCTANT_CENTRES))
@@ -365,7 +365,7 @@ class CellTree:
         return node - len(self.axes)
 
 
-FOUND = 0  #: a partner was found; which one is not recorded
+FOUND = 0  #: a partner was found; its index is not recorded
 
 
 @dataclass(frozen=True, eq=False)
@@ -392,7 +392,7 @@ class PartnerSearch:
         """Search partners for splats that have none; yield the number of source splats of each searched cell.
 
         Args:
-            found: [N], `FOUND`, `UNMATCHED` or `UNDECIDED` by splat of the file. Changed in place at the end, so that
+            found: [N], `FOUND`, `UNMATCHED` or `UNDECIDED` by splat of the file. Updated in place at the end, so that
                 the order of the cells does not matter.
             far: search up to the bound, not only within the distance that the file's lattice implies.
 
@@ -410,7 +410,7 @@ class PartnerSearch:
         found[:] = after
 
     def search_cell(self, cell: int, found: I8, *, far: bool) -> Iterator[tuple[I64, I8]]:
-        """Yield splats that may have a partner in a cell, and the results for them."""
+        """Yield splats that may have a partner in a cell, with their results."""
         for source, _ in self.spool.sources(cell, self.most):
             columns = source.about(self.opened.metadata_model.origin).means.T
             low, high = (np.array([end(column) for column in columns], np.float64) for end in (np.min, np.max))
@@ -420,7 +420,7 @@ class PartnerSearch:
                 yield splats, np.where(partners >= 0, FOUND, partners).astype(np.int8)
 
     def _near(self, low: F64, high: F64, found: I8, *, far: bool) -> Iterator[tuple[SplatModel, F64, I64]]:
-        """Yield splats without a partner that may lie within their radius of a box: splats, radii and indices."""
+        """Yield splats without a partner whose radius may reach a box: splats, radii and indices."""
         header, (boxes, widths) = self.opened.header, self._boxes
         bound = self.bounds["means"]
         most = (bound + bound_tolerance("means", bound, self.reach)) * (1.0 + 1e-6)
@@ -450,10 +450,10 @@ class PartnerSearch:
 
     @cached_property
     def _boxes(self) -> tuple[F64, F64]:
-        """Boxes of the tiles, [T, 2, 3], and the distances within which partners of their splats are expected, [T]."""
+        """Boxes of the tiles, [T, 2, 3], and the distances within which their splats' partners are expected, [T]."""
         tiles, step = self.opened.header.tiles, self.opened.header.attribute(_spec.ATTRIBUTE_MEANS).step
         boxes = tile_boxes(self.opened.header)
-        # The diagonal of a cell, and the rounding of the centre to float32 and back.
+        # The diagonal of a cell, plus the rounding of the centre to float32.
         return boxes, np.array([np.ldexp(step, tile.exponent) for tile in tiles]) + np.abs(boxes).max((1, 2)) * 2.0**-21
 
     def _splats(self, tile: int) -> slice:

@@ -1,8 +1,8 @@
 """Find a source splat within given bounds for each decoded splat, if no source index is known.
 
-Source splats are sorted by the cell of a grid over centre, opacity and green. Cells are twice as wide as the bounds, so
-a splat's partner is in its own cell or, along each axis, in the nearer neighbour. Most are found in the first of these
-32 cells. Memory is a few numbers per splat, plus blocks of fixed size.
+Source splats are sorted by the cells of a grid over centre, opacity and green. Cells are twice as wide as the bounds,
+so a splat's partner is in its own cell or, along each axis, in the nearer neighbour. Most partners are found in the
+first of these 32 cells. The search uses a few numbers per splat, plus blocks of fixed size.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _AXES = 5  # x, y, z, alpha, green
 _BLOCK = 1 << 16  # splats per task of a thread
 _FIRST = frozenset(("means", "opacities", "sh0"))  # measures to compare first, the cheap ones
 _PAIR_BLOCK = 4096  # pairs to compare at a time
-_CANDIDATES_MAX = 1000  # splats of one cell to compare; scenes of equal splats would take forever
+_CANDIDATES_MAX = 1000  # splats of one cell to compare; bounds the time for scenes of equal splats
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -61,7 +61,7 @@ def find_partners(
         reach: `Source.reach` of the whole scene, if these splats are a part of it.
         candidates_max: largest number of splats of one cell to compare with one splat.
         threads: number of threads, one per core by default. The result does not depend on it.
-        progress: called with the share of the splats that have a partner.
+        progress: called with the fraction of the splats that have a partner.
 
     Returns:
         [N] index of a source splat within the bounds, `UNMATCHED` or `UNDECIDED`.
@@ -90,7 +90,7 @@ def find_partners(
 
 
 def _radius_levels(radii: F64, bound: float) -> F64:
-    """Round radii up to powers of two, which limits the number of grids; none exceeds the bound."""
+    """Round radii up to powers of two, but not beyond the bound, to limit the number of grids."""
     with np.errstate(divide="ignore"):
         exponents = np.ceil(np.log2(radii))
     rounded: F64 = np.minimum(np.exp2(np.maximum(exponents, -1000.0)), bound)
@@ -129,7 +129,7 @@ def _cells(values: F64, width: float) -> tuple[F64, F64]:
 
 
 def _hash(cells: list[F64]) -> U64:
-    """Mix the bits of the cells. If unequal cells have equal hashes, that costs a comparison only."""
+    """Mix the bits of the cells. A collision only costs a comparison."""
     mixed = np.zeros(len(cells[0]), np.uint64)
     for cell in cells:
         mixed ^= (cell + 0.0).view(np.uint64)  # -0 becomes 0
@@ -153,7 +153,7 @@ def _search_grid(
         if not len(left):
             break
         keys = _hash([pair[probe >> axis & 1][left] for axis, pair in enumerate(cells)])
-        order = np.argsort(keys)  # halves the time: neighbouring keys lie near each other in memory
+        order = np.argsort(keys)  # halves the time, because neighbouring keys are then adjacent in memory
         left, keys = left[order], keys[order]
         place = np.searchsorted(grid.keys, keys)
         for nth in range(candidates_max + 1):
@@ -189,7 +189,7 @@ def _pairs_within(
 def lattice_radii(decoded: SplatModel, header: SceneHeader) -> F64:
     """Return the distance within which the source of each splat is expected.
 
-    It is half the diagonal of the splat's lattice cell, and the error of rounding to float32.
+    This is half the diagonal of the splat's lattice cell, plus the error of rounding to float32.
     """
     radii = np.empty(len(decoded))
     for tile in header.tiles:

@@ -1,4 +1,4 @@
-"""Store splats of a source in a temporary file, sorted by integer keys: their cells, or the tiles that they became."""
+"""Store splats of a source in a temporary file, sorted by integer keys: cells of space, or groups of tiles."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from csplat_conformance.declared_bounds.measurement import Source
 
 RecordArray = NDArray[Any]  # structured, a record per splat
 
-_PENDING_BYTES_MAX = 1 << 25  # splats that wait to be written, so that parts of the file are large enough to read
+_PENDING_BYTES_MAX = 1 << 25  # size of the write buffer; small parts of the file would be slow to read
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
@@ -63,7 +63,7 @@ class RecordLayout:
 
 @dataclass(eq=False)
 class SplatSpool:
-    """Splats in an unnamed file, by keys. Owns the splats that wait to be written.
+    """Splats in an unnamed file, by key. Owns the write buffer.
 
     Attributes:
         stream: the file, which has no name.
@@ -78,7 +78,7 @@ class SplatSpool:
     _size: int = 0
 
     def add(self, source: Source, rows: NDArray[Any], keys: I64, numbers: I64) -> None:
-        """Add splats. Splats of one key keep the order in which they are added.
+        """Add splats. Splats of one key keep the order of addition.
 
         Args:
             source: a source of this layout.
@@ -101,7 +101,7 @@ class SplatSpool:
             self.flush()
 
     def flush(self) -> None:
-        """Write the splats that wait.
+        """Write the buffered splats.
 
         Raises:
             OSError: the file cannot be written.
@@ -162,5 +162,5 @@ def open_spool(layout: RecordLayout, count: int) -> SplatSpool:
         OSError: the file cannot be created.
     """
     folder = tempfile.gettempdir()
-    check_free_space(folder, count * layout.dtype.itemsize, "the source is compared: TMPDIR names another folder")
+    check_free_space(folder, count * layout.dtype.itemsize, "the source is compared: set TMPDIR to another folder")
     return SplatSpool(tempfile.TemporaryFile(), layout)

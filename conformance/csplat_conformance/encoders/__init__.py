@@ -4,17 +4,17 @@
     >>> run_encoder("my-encoder {ply} {out}").passed                                 # doctest: +SKIP
     True
 
-Four levels, each built on the one before:
+There are four levels, each built on the previous one:
 
 | level | the encoder |
 |---|---|
-| L1 | ends with the right status and writes a valid file, always the same, and nothing else |
+| L1 | ends with the right status, and always writes the same valid file and nothing else |
 | L2 | keeps every splat of the source, or declares how many it pruned; guesses no metadata |
 | L3 | declares correct error bounds (SER-5) that are not absurdly large |
 | L4 | preserves renders: PSNR compared with the source |
 
-`encoder_run` runs it and checks the run (L1), `file_checks` checks the file and its content (L1, L2), `error_checks`
-the bounds (L3), `render_checks` the renders (L4).
+`encoder_run` runs the encoder and checks the run (L1). `file_checks` checks the file and its contents (L1, L2),
+`error_checks` the bounds (L3), and `render_checks` the renders (L4).
 """
 
 from __future__ import annotations

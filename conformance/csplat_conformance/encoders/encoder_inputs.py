@@ -1,8 +1,8 @@
-"""Reference inputs for encoders: PLY files made by recipe, and the sources that they hold.
+"""Reference inputs for encoders: generated PLY files and their sources.
 
-An encoder must accept `ordinary/`; it may refuse `nasty/` with status 1 and a line with the reason, but must not get
-them wrong; it must refuse `broken/`. Splats keep a distance of `separation`, so that only one source splat is near each
-decoded splat.
+An encoder must accept `ordinary/`. It may refuse `nasty/` with status 1 and a line with the reason, but must not encode
+them incorrectly. It must refuse `broken/`. Splats are at least `separation` apart, so that only one source splat is
+near each decoded splat.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from csplat_conformance.encoders.surface_scenes import SPACING_MIN, surface_scen
 
 PSNR_MIN = 30.0  #: lowest PSNR of renders, dB, unless an input sets another one
 PITCH = 0.1  #: scene units between neighbours
-_JITTER = 0.2  # fraction of the pitch, to either side
+_JITTER = 0.2  # fraction of the pitch, in each direction
 SEPARATION = PITCH * (1.0 - 2.0 * _JITTER)  #: smallest distance between neighbours of a cloud, scene units
 
 _MANY = 65_536 + 600  # splats; more than a tile holds
@@ -31,14 +31,14 @@ class EncoderInput:
 
     Attributes:
         name: group and name, `ordinary/degree_3`.
-        why: one line: its purpose or difficulty.
+        why: its purpose or difficulty, one line.
         make: returns the bytes of the PLY.
-        source: returns the scene in it; `None` if there is nothing to encode.
-        separation: smallest distance between different splats, scene units.
-        may_refuse: whether an encoder may refuse it, with status 1 and a line.
-        renders: whether renders of it are meaningful.
-        psnr_min: lowest PSNR of renders at the default quality, dB. Renders of csplat's coarsest preset exceed it by
-            at least 1 dB; defects that harm renders fall below it.
+        source: returns its scene; `None` if there is nothing to encode.
+        separation: smallest distance between distinct centres, scene units.
+        may_refuse: whether an encoder may refuse it, with status 1 and a line with the reason.
+        renders: whether renders of it are informative.
+        psnr_min: lowest PSNR of renders at the default quality, dB. csplat's coarsest preset exceeds it by at least
+            1 dB; defects that harm renders fall below it.
     """
 
     name: str
@@ -56,7 +56,7 @@ class EncoderInput:
         return self.source is None
 
     def psnr_required(self, psnr_min: float) -> float:
-        """Return the lowest PSNR of renders, dB, if `psnr_min` replaces `PSNR_MIN`; all inputs shift equally."""
+        """Return the lowest PSNR of renders, dB, if `psnr_min` replaces `PSNR_MIN`: all inputs shift equally."""
         return self.psnr_min + psnr_min - PSNR_MIN
 
 
@@ -75,7 +75,7 @@ def rows_input(
     renders: bool = True,
     psnr_min: float = PSNR_MIN,
 ) -> EncoderInput:
-    """Return an input that holds rows; encoders may refuse it if its name begins with `nasty/`."""
+    """Return an input with the given rows; encoders may refuse it if its name begins with `nasty/`."""
     kept = cache(splats)
     may_refuse = name.startswith("nasty/")
     return EncoderInput(
@@ -91,7 +91,7 @@ def rows_input(
 
 
 def cloud(count: int, degree: int, seed: int = 0) -> PlyRows:
-    """Return splats on a jittered grid, with colours that vary smoothly and a little at random."""
+    """Return splats on a jittered grid, with smooth colours plus noise."""
     rng = np.random.default_rng(seed)
     side = int(np.ceil(count ** (1.0 / 3.0)))
     grid = np.stack(np.unravel_index(np.arange(count), (side, side, side)), axis=1)
@@ -115,38 +115,38 @@ def ordinary_inputs() -> list[EncoderInput]:
     def degree(number: int) -> Callable[[], PlyRows]:
         return lambda: cloud(216, number, number)
 
-    few = lambda: cloud(64, 1, 9)  # noqa: E731 - one of many recipes, used by several inputs
+    few = lambda: cloud(64, 1, 9)  # noqa: E731 - shared by several inputs
     return [
         *(rows_input(f"ordinary/degree_{d}", f"SH degree {d}", degree(d)) for d in range(4)),
-        rows_input("ordinary/one_splat", "a scene of one", lambda: cloud(1, 3, 5), renders=False),
+        rows_input("ordinary/one_splat", "one splat", lambda: cloud(1, 3, 5), renders=False),
         rows_input("ordinary/ascii", "numbers as text", few, PlyLayout(format="ascii")),
-        rows_input("ordinary/big_endian", "bytes in the other order", few, PlyLayout(format="binary_big_endian")),
-        rows_input("ordinary/double", "all columns as doubles that binary32 holds", few, PlyLayout(dtype="f8")),
+        rows_input("ordinary/big_endian", "big-endian numbers", few, PlyLayout(format="binary_big_endian")),
+        rows_input("ordinary/double", "all columns as doubles, with binary32 values", few, PlyLayout(dtype="f8")),
         rows_input("ordinary/no_normals", "without the columns nx, ny, nz", few, PlyLayout(normals=False)),
         rows_input("ordinary/normals", "columns nx, ny, nz that are not zero", _with_normals),
-        rows_input("ordinary/column_order", "columns in the opposite order", few, PlyLayout(reverse=True)),
+        rows_input("ordinary/column_order", "columns in reverse order", few, PlyLayout(reverse=True)),
         rows_input(
             "ordinary/comments", "comments that name axes and more", few, PlyLayout(comments=("up is Y", "", "x" * 300))
         ),
         rows_input(
-            "ordinary/obj_info", "lines obj_info, the other kind of comment", few, PlyLayout(obj_info=("num 64", ""))
+            "ordinary/obj_info", "obj_info lines, which are like comments", few, PlyLayout(obj_info=("num 64", ""))
         ),
-        rows_input("ordinary/extra_columns", "columns that splats do not have", _with_extra),
-        rows_input("ordinary/quaternions", "lengths from 0.001 to 1000, w below 0 and at −0", _long_quats),
+        rows_input("ordinary/extra_columns", "columns that splats do not use", _with_extra),
+        rows_input("ordinary/quaternions", "lengths from 0.001 to 1000, negative w and w of −0", _long_quats),
         rows_input(
             "ordinary/transparent_and_opaque", "logits from −200 to 200: alpha 0, denormal, 1", _transparent_and_opaque
         ),
-        # A small turn moves the tip of a needle out of its pixels.
+        # A small rotation moves the tip of a needle by more than a pixel.
         rows_input("ordinary/needles_and_discs", "one axis a thousand times the others", _needles, psnr_min=28.0),
         rows_input("ordinary/plane", "all centres in one plane", _plane),
         rows_input(
             "ordinary/elongated",
-            "a row of splats, thousands of times as long as wide",
+            "a row of splats, thousands of times longer than wide",
             _elongated,
             separation=10.0,
             renders=False,
         ),
-        rows_input("ordinary/all_alike", "one size, rotation, opacity and base colour for all", _uniform),
+        rows_input("ordinary/all_alike", "the same size, rotation, opacity and base colour for all splats", _uniform),
         rows_input("ordinary/strong_colours", "coefficients of ±20", _strong_colours),
         rows_input("ordinary/two_tiles", f"{_MANY} splats, more than a tile holds", lambda: cloud(_MANY, 0, 3)),
     ]
@@ -180,7 +180,7 @@ def _long_quats() -> PlyRows:
 def _transparent_and_opaque() -> PlyRows:
     splats = cloud(125, 0, 13)
     splats.logits = np.linspace(-40.0, 40.0, 125).astype(np.float32)
-    # Alpha leaves binary32's normal numbers at −87.3 and becomes 0 at −104; 1 it is from 17.3.
+    # In binary32, alpha is subnormal below −87.3, 0 below −104, and 1 above 17.3.
     splats.logits[::8] = [-200, -105, -103, -100, -90, -88, -50, -20, 16.5, 17, 17.3, 18, 20, 50, 100, 200]
     return splats
 
@@ -226,7 +226,7 @@ def _strong_colours() -> PlyRows:
 
 
 def surface_inputs() -> list[EncoderInput]:
-    """Return the inputs whose renders show every mistake, in the order of a run."""
+    """Return the inputs whose renders reveal every mistake, in the order of a run."""
 
     def surfaces(name: str, why: str, scene: Callable[[], PlyRows]) -> EncoderInput:
         return rows_input(f"ordinary/{name}", why, scene, separation=SPACING_MIN, psnr_min=32.0)
@@ -234,19 +234,19 @@ def surface_inputs() -> list[EncoderInput]:
     return [
         surfaces(
             "surfaces",
-            "discs on a torus, a ball and a box, as in trained scenes: a mistake in any attribute shows",
+            "discs on a torus, a ball and a box, like a trained scene: reveals mistakes in any attribute",
             lambda: surface_scene(0.9, 0.02, 51),
         ),
         surfaces(
             "glossy",
-            "the same with highlights that follow the eye: SH far beyond ±1",
+            "the same with view-dependent highlights: SH far beyond ±1",
             lambda: surface_scene(4.5, 0.0, 52),
         ),
     ]
 
 
 def unusual_value_inputs() -> list[EncoderInput]:
-    """Return inputs with extreme values, which an encoder may refuse but must not get wrong, in the order of a run."""
+    """Return inputs with extreme values, which an encoder may refuse, in the order of a run."""
     no_splats = np.zeros(0, np.intp)
     return [
         rows_input("nasty/empty", "no splats", lambda: cloud(1, 0).select(no_splats), renders=False),
@@ -256,7 +256,7 @@ def unusual_value_inputs() -> list[EncoderInput]:
         rows_input("nasty/infinite_logits", "logits of ±infinity: alpha 1 and 0", _infinite_logits),
         rows_input("nasty/zero_quaternion", "rotations of length 0", _zero_quats),
         rows_input(
-            "nasty/tiny_and_huge_quaternions", "lengths of 1e−45 to 6e38, whose squares leave binary32", _extreme_quats
+            "nasty/tiny_and_huge_quaternions", "lengths of 1e−45 to 6e38, with squares beyond binary32", _extreme_quats
         ),
         rows_input("nasty/huge_scales", "logarithms of ±60", _huge_scales, renders=False),
         rows_input("nasty/scales_beyond_88", "logarithms beyond ±88, which count as ±88", _scales_88, renders=False),
@@ -265,25 +265,25 @@ def unusual_value_inputs() -> list[EncoderInput]:
         rows_input("nasty/far_coordinates", "centres about 1,000,000", _far, separation=30.0),
         rows_input(
             "nasty/far_doubles",
-            "centres about 4,000,000 in doubles: binary32 holds them not exactly, relative to any origin",
+            "centres about 4,000,000 in doubles, not exact in binary32 relative to any origin",
             _far_doubles,
             PlyLayout(means_dtype="f8"),
         ),
-        rows_input("nasty/outlier", "one splat 100,000 times as far as the others", _outlier, renders=False),
+        rows_input("nasty/outlier", "one splat 100,000 times farther than the others", _outlier, renders=False),
         rows_input(
-            "nasty/edge_of_float", "one centre at 3e38 and −3e38, near the end of binary32", _edge, renders=False
+            "nasty/edge_of_float", "one centre at 3e38 and −3e38, near the limit of binary32", _edge, renders=False
         ),
         rows_input("nasty/duplicates", "every third splat four times", _duplicates),
         rows_input("nasty/one_place", "one splat 20,000 times", _one_place, renders=False),
         rows_input("nasty/tiny_scene", "a scene of a millionth of a unit", _tiny, separation=SEPARATION * 1e-6),
-        rows_input("nasty/huge_colours", "coefficients of ±1e6 beside small ones", _huge_colours, renders=False),
+        rows_input("nasty/huge_colours", "coefficients of ±1e6 next to small ones", _huge_colours, renders=False),
         rows_input("nasty/not_a_number", "NaN in three rows", _with_nan, renders=False),
-        rows_input("nasty/infinities", "infinite centres, rotations and colours: four rows are no splats", _infinities),
         rows_input(
-            "nasty/infinite_scales", "scales of ±infinity, two rows of discs: none is a splat", _infinite_scales
+            "nasty/infinities", "infinite centres, rotations and colours: four rows are not splats", _infinities
         ),
+        rows_input("nasty/infinite_scales", "scales of ±infinity: four rows are not splats", _infinite_scales),
         rows_input(
-            "nasty/beyond_float", "doubles beyond binary32: two rows are no splats", _beyond, PlyLayout(dtype="f8")
+            "nasty/beyond_float", "doubles beyond binary32: two rows are not splats", _beyond, PlyLayout(dtype="f8")
         ),
     ]
 
@@ -317,7 +317,7 @@ def _huge_scales() -> PlyRows:
 
 
 def _scales_88() -> PlyRows:
-    """Half of the splats lie beyond with all their scales: their errors are 0, whatever becomes of the scales."""
+    """Put all scales of half of the splats beyond ±88, so that their errors are 0 for any stored scales beyond it."""
     splats = cloud(64, 0, 33)
     ends = np.array([88.0, 88.5, 88.7229, 89.0, 104.0], np.float32)
     splats.scales[:5, 0], splats.scales[5:10, 1] = ends, -ends
@@ -388,7 +388,7 @@ def _tiny() -> PlyRows:
 def _huge_colours() -> PlyRows:
     splats = cloud(64, 1, 28)
     splats.sh0[3], splats.sh0[4], splats.shN[5] = 1e6, -1e6, 1e6
-    splats.sh0[6] = (1e6, -1e6, 1e6)  # grey has no chroma
+    splats.sh0[6] = (1e6, -1e6, 1e6)  # large chroma; the rows above are grey
     return splats
 
 
@@ -425,41 +425,39 @@ _CAMERA = (("element camera 1", "property double x", "property uchar kind"), byt
 
 
 def unusual_inputs() -> list[EncoderInput]:
-    """Return inputs of unusual make, which an encoder may refuse but must not get wrong, in the order of a run."""
-    few = lambda: cloud(64, 1, 41)  # noqa: E731 - one of many recipes, used by several inputs
+    """Return inputs with an unusual layout, which an encoder may refuse, in the order of a run."""
+    few = lambda: cloud(64, 1, 41)  # noqa: E731 - shared by several inputs
     lists = [bytes(range(row % 4)) for row in range(64)]
     return [
-        rows_input("nasty/face_first", "elements before the splats, one of them of rows of any length", few, _first()),
+        rows_input("nasty/face_first", "elements before the splats, one with rows of variable length", few, _first()),
         rows_input("nasty/camera_last", "an element after the splats", few, PlyLayout(after=_CAMERA)),
         rows_input(
-            "nasty/list_property", "a list among a splat's columns: rows of any length", few, PlyLayout(lists=lists)
+            "nasty/list_property", "a list property of splats: rows of variable length", few, PlyLayout(lists=lists)
         ),
-        rows_input(
-            "nasty/crlf_header", "lines of the header end in CR LF, rows are binary", few, PlyLayout(line_end="\r\n")
-        ),
+        rows_input("nasty/crlf_header", "header lines end in CR LF, rows are binary", few, PlyLayout(line_end="\r\n")),
         rows_input(
             "nasty/trailing_bytes",
-            "bytes after the last row, two rows long",
+            "trailing bytes after the last row, more than a row long",
             few,
             PlyLayout(after=((), b"\n\0not a row " * 16)),
         ),
         rows_input(
             "nasty/foreign_comments",
-            "comments of UTF-8 and of bytes that are none",
+            "comments in UTF-8 and in bytes that are not UTF-8",
             few,
             PlyLayout(comments=("Größe: 3 µm, 雪", "\udcff\udcfe caf\udce9", "element vertex 5", "end_header?")),
         ),
         rows_input(
             "nasty/degree_4",
-            "72 columns f_rest: csplat ends at degree 3, and a file says so",
+            "72 columns f_rest: csplat's highest degree is 3, and the file has to state the source's",
             lambda: cloud(64, 4, 42),
             renders=False,
         ),
         rows_input(
-            "nasty/double_means", "x, y, z in doubles beside columns in floats", few, PlyLayout(means_dtype="f8")
+            "nasty/double_means", "x, y, z in doubles, other columns in floats", few, PlyLayout(means_dtype="f8")
         ),
         rows_input("nasty/nan_normals", "NaN and infinities in normals, which splats do not use", _nan_normals),
-        rows_input("nasty/nan_extra", "NaN in a column that splats do not have", _nan_extra),
+        rows_input("nasty/nan_extra", "NaN in a column that splats do not use", _nan_extra),
     ]
 
 
@@ -490,24 +488,22 @@ def invalid_inputs() -> list[EncoderInput]:
     ten = PlyLayout(renamed={"nx": "f_rest_9"})
     hole = PlyLayout(renamed={"f_rest_4": "f_rest_9"})
     return [
-        EncoderInput("broken/nothing", "no bytes at all", lambda: b"", None),
-        EncoderInput("broken/no_ply", "a text that is no PLY", lambda: b"splats, but not here\n" * 9, None),
+        EncoderInput("broken/nothing", "an empty file", lambda: b"", None),
+        EncoderInput("broken/no_ply", "a text that is not a PLY", lambda: b"splats, but not here\n" * 9, None),
         EncoderInput(
-            "broken/header_without_end", "a header that ends nowhere", lambda: whole().partition(b"end_h")[0], None
+            "broken/header_without_end", "a header without an end", lambda: whole().partition(b"end_h")[0], None
         ),
         EncoderInput("broken/cut", "the last splats are missing", lambda: whole()[:-400], None),
         EncoderInput(
-            "broken/countless", "10^12 splats are declared, 64 are there", lambda: of(PlyLayout(count=10**12)), None
+            "broken/countless", "10^12 splats are declared, 64 are present", lambda: of(PlyLayout(count=10**12)), None
         ),
-        EncoderInput(
-            "broken/negative_count", "fewer splats than none are declared", lambda: of(PlyLayout(count=-64)), None
-        ),
+        EncoderInput("broken/negative_count", "a negative count is declared", lambda: of(PlyLayout(count=-64)), None),
         EncoderInput("broken/no_colour", "a PLY of points, not of splats", _point_cloud, None),
         EncoderInput("broken/no_opacity", "no column opacity", lambda: of(PlyLayout(renamed={"opacity": ""})), None),
         EncoderInput("broken/no_rotation", "no column rot_3", lambda: of(PlyLayout(renamed={"rot_3": ""})), None),
-        EncoderInput("broken/ten_f_rest", "ten columns f_rest are no SH degree", lambda: of(ten), None),
+        EncoderInput("broken/ten_f_rest", "ten columns f_rest, which match no SH degree", lambda: of(ten), None),
         EncoderInput("broken/hole_in_f_rest", "nine columns f_rest without number 4", lambda: of(hole), None),
-        EncoderInput("broken/no_number", "a word where a number belongs", _word_for_number, None),
+        EncoderInput("broken/no_number", "a word instead of a number", _word_for_number, None),
     ]
 
 

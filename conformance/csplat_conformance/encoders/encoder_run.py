@@ -1,4 +1,4 @@
-"""Run an encoder on an input; check how it ended, what it left behind, and whether it repeats its output (L1)."""
+"""Run an encoder on an input, and check its exit status, side effects and repeatability (L1)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from csplat_conformance.encoders.encoder_inputs import EncoderInput
 from csplat_conformance.fields import read_fields
 from csplat_conformance.protocol import ProcessEnd, run_program
 
-#: The broken clause, empty if there is none, and a line about the defect.
+#: The violated clause, or an empty string, and a line about the defect.
 Defect = tuple[str, str]
 
 _LINES_MAX = 2  # lines of a verdict to show
@@ -32,7 +32,7 @@ class Verdict:
     Attributes:
         status: the result.
         message: the reason, or a remark.
-        clauses: broken clauses.
+        clauses: violated clauses.
         code: error code of the first violation.
         details: numbers for programs.
     """
@@ -51,15 +51,15 @@ def failed_verdict(wrong: list[Defect], details: dict[str, Any]) -> Verdict:
 
 
 def join_lines(lines: tuple[str, ...]) -> str:
-    """Join the first lines to one, and add the number of the others."""
+    """Join the first lines into one, and add the number of the others."""
     rest = f"; and {len(lines) - _LINES_MAX} more" if len(lines) > _LINES_MAX else ""
     return "; ".join(lines[:_LINES_MAX]) + rest
 
 
-#: Runs a command line in this process: the line, the values of its places, the time limit in seconds.
+#: Runs a command line in this process; called with the line, the values of its places, and the time limit in seconds.
 CommandRunner = Callable[[str, Mapping[str, str], float], ProcessEnd]
 
-#: Places that a command line must have, and may have.
+#: Required and optional places of a command line.
 PLACES, OPTIONAL_PLACES = ("ply", "out"), ("index",)
 REPEAT_SECONDS = 1.1  #: between a run and its repetition, so that time stamps in seconds differ
 
@@ -98,7 +98,7 @@ def run_once(command: str, case: EncoderInput, folder: Path, seconds: float, run
         case: the input.
         folder: folder for input and output; it is emptied first.
         seconds: time limit.
-        run: runs the command line in this process; default: start a process, in an empty working directory.
+        run: runs the command line in this process; default: start a process in an empty working directory.
 
     Raises:
         InputError: there is no such program.
@@ -126,7 +126,7 @@ def run_once(command: str, case: EncoderInput, folder: Path, seconds: float, run
     # A refusal that leaves an output is reported by `check_end`.
     outputs = {_NAMES["ply"], _NAMES["out"]} | ({_NAMES["index"]} if end.returncode == 0 else set())
     left = [name for name in _names(folder) if name not in outputs]
-    traces = [*_input_changes(places["ply"], ply), *(f"left {name} beside the output" for name in left), *traces]
+    traces = [*_input_changes(places["ply"], ply), *(f"left {name} next to the output" for name in left), *traces]
     return EncoderRun(end, places["out"], places.get("index"), tuple(traces), started)
 
 
@@ -154,9 +154,9 @@ def check_end(case: EncoderInput, run: EncoderRun) -> Verdict | None:
     if end.returncode == 1:
         return _check_refusal(case, run)
     if not run.out.is_file():
-        return Verdict(Status.NO_OUTPUT, "exit status 0, and there is no file")
+        return Verdict(Status.NO_OUTPUT, "exit status 0, but no file was written")
     if case.must_refuse:
-        return Verdict(Status.FAILED, "accepted, though there are no splats in it")
+        return Verdict(Status.FAILED, "accepted an input without splats")
     return None
 
 
@@ -165,10 +165,10 @@ def _check_refusal(case: EncoderInput, run: EncoderRun) -> Verdict:
     if _TRACEBACK in end.stderr:
         return Verdict(Status.CRASHED, _with_line("a traceback", end))
     if run.out.exists():
-        return Verdict(Status.PARTIAL_OUTPUT, "exit status 1, and there is a file")
+        return Verdict(Status.PARTIAL_OUTPUT, "exit status 1, but a file was written")
     line = _last_line(end)
     if not line:
-        return Verdict(Status.WRONG_ANSWER, "exit status 1 without a line that says why")
+        return Verdict(Status.WRONG_ANSWER, "exit status 1 without a line with the reason")
     if not (case.must_refuse or case.may_refuse):
         return Verdict(Status.REFUSED, line)
     if run.traces:
@@ -201,7 +201,7 @@ def find_side_effects(first: EncoderRun, again: EncoderRun | None) -> list[Defec
         return wrong
     if not again.wrote:
         how = again.end.message or f"exit status {again.end.returncode}, {'a' if again.out.is_file() else 'no'} file"
-        return [*wrong, ("CNF-10", _with_line(f"a second run ended otherwise: {how}", again.end))]
+        return [*wrong, ("CNF-10", _with_line(f"a second run ended differently: {how}", again.end))]
     one, other = first.out.read_bytes(), again.out.read_bytes()
     if one != other:
         at = _first_difference(one, other)
@@ -210,7 +210,7 @@ def find_side_effects(first: EncoderRun, again: EncoderRun | None) -> list[Defec
         text = f"two runs gave different files{sizes}: first at byte {at}{f', in {where}' if where else ''}"
         wrong.append(("CNF-10", text))
     elif first.index is not None and again.index is not None and _index_bytes(first) != _index_bytes(again):
-        wrong.append(("CNF-10", "two runs gave the same file and different source indices"))
+        wrong.append(("CNF-10", "two runs gave the same file but different source indices"))
     return wrong
 
 

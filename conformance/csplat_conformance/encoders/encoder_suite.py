@@ -51,11 +51,10 @@ class EncoderSuiteOptions:
 
     Attributes:
         pattern: shell patterns of the inputs' names, `ordinary/*,nasty/empty`; `None` for all.
-        levels: levels to report. Each depends on the ones before it, which are checked but not reported. If L3 cannot
+        levels: levels to report. Each depends on the previous ones, which are checked but not reported. If L3 cannot
             verify any error, L4 is reported, too.
         timeout_seconds: time limit for one input.
-        psnr_min: lowest PSNR that passes L4, dB. Inputs with a limit of their own keep their difference from the
-            default.
+        psnr_min: lowest PSNR that passes L4, dB. Inputs with their own limit keep its difference from the default.
         jobs: number of processes at a time; default: one per core.
         keep: folder that keeps inputs and results, in a folder per input; `None`: they are removed.
     """
@@ -79,17 +78,17 @@ def run_encoder(
 ) -> ConformanceReport:
     """Run an encoder over the reference inputs and check what it writes.
 
-    The encoder is started for each input. It must end with status 0 and a complete file at `{out}`, or with status 1, a
-    line with the reason and no file. If it wrote a file, it is started again after all other inputs, and must write
-    the same bytes.
+    The encoder is started once for each input. It must either exit with status 0 and write a complete file to `{out}`,
+    or exit with status 1, print a line with the reason and write no file. If it wrote a file, it is started again after
+    all inputs have run once, and must write the same bytes.
 
     Args:
         command: command line with `{ply}` and `{out}`, optionally with `{index}`, the path of the source index.
         options: settings of the run.
         render_score: computes the PSNR for L4. Without it the level is skipped, or fails if no other level can check
             the input.
-        no_render_reason: the reason if there is no `render_score`.
-        progress: called with the number of steps done and the total.
+        no_render_reason: the reason for the lack of a `render_score`.
+        progress: called with the number of completed steps and the total.
         run: runs the command line in this process, on `options.jobs` threads. Default: start processes, each in an
             empty working directory, and wait `REPEAT_SECONDS` before a repetition.
 
@@ -100,7 +99,7 @@ def run_encoder(
     split_command(command, PLACES, OPTIONAL_PLACES)
     unknown = [level for level in options.levels if level not in LEVELS]
     if unknown:
-        raise InputError(f"there is no level {', '.join(unknown)}, expected {', '.join(LEVELS)}")
+        raise InputError(f"the level is {', '.join(unknown)}, expected {', '.join(LEVELS)}")
     inputs = select_inputs(options.pattern)
     checks = CheckOptions(options.levels, options.psnr_min, render_score, no_render_reason)
     outcomes: list[Outcome] = []
@@ -174,7 +173,7 @@ def select_inputs(pattern: str | None) -> list[EncoderInput]:
 def _check_input_safely(
     case: EncoderInput, first: EncoderRun, again: EncoderRun | None, checks: CheckOptions
 ) -> list[Outcome]:
-    """Check an input; a file that cannot be read or rendered fails this input alone."""
+    """Check an input; a file that cannot be read or rendered fails only this input."""
     outcomes: list[Outcome] = []
     try:
         outcomes.extend(check_input(case, first, again, checks))
@@ -240,14 +239,14 @@ def _run_all(
 
 
 def _remove_repetition(folder: Path, case: EncoderInput, first: EncoderRun, again: EncoderRun | None) -> None:
-    """Remove a repetition that gave the same file; if the files differ, keep both."""
+    """Remove a repetition if it gave the same file."""
     if again is not None and again.wrote and first.out.read_bytes() == again.out.read_bytes():
         place = _input_folder(folder, case)
         shutil.rmtree(place.with_name(place.name + _REPEATED))
 
 
 def _declined_notes(declined: dict[str, bool]) -> list[str]:
-    """Return a line for each group of inputs that may be refused: how many were; a warning if all were."""
+    """Return a line with the number of declined inputs for each group, as a warning if all were declined."""
     notes = []
     for group in dict.fromkeys(name.partition("/")[0] for name in declined):
         those = [was_declined for name, was_declined in declined.items() if name.partition("/")[0] == group]
@@ -336,13 +335,13 @@ def _check_renders(
         checks: the checks to make.
     """
     if not case.renders or case.source is None:
-        return Verdict(Status.SKIPPED, "pictures of this scene say nothing")
+        return Verdict(Status.SKIPPED, "renders of this scene are not informative")
     if not (alone or "L4" in checks.levels):
         return Verdict(Status.SKIPPED)
     if checks.render_score is not None:
         return check_renders(case, case.source(), scene, pairs, size_bytes, checks.render_score, checks.psnr_min)
     if alone:
-        return Verdict(Status.FAILED, f"{alone}: only pictures can judge it, and {checks.no_render_reason}")
+        return Verdict(Status.FAILED, f"{alone}: only renders can check it, and {checks.no_render_reason}")
     return Verdict(Status.SKIPPED, checks.no_render_reason)
 
 
@@ -373,7 +372,7 @@ def _expected_json(case: EncoderInput, data: bytes) -> dict[str, Any] | None:
 
 def _row_count(data: bytes) -> int:
     """Return the number of rows in the header: 64 for `element vertex 64`."""
-    # Comments may hold anything, `end_header` and `element vertex 9` included.
+    # Comments may contain anything, including `end_header` and `element vertex 9`.
     for line in data.split(b"\n"):
         words = line.split()
         if words[:2] == [b"element", b"vertex"]:

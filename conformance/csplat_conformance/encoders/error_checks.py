@@ -1,7 +1,7 @@
 """L3: check the error bounds that a file declares, and warn of bounds that are correct but probably unintended.
 
-Files with coarse values are valid. A warning means that they are coarser than anyone is likely to intend. `separation`
-is the smallest distance between centres of the input:
+Files with coarse values are valid. A warning means that the values are probably coarser than intended. `separation` is
+the smallest distance between centres of the input:
 
 | bound | warning above | csplat's coarsest preset reaches |
 |---|---|---|
@@ -14,15 +14,16 @@ is the smallest distance between centres of the input:
 
 An unrelated rotation gives a covariance error of 1.41 for needles, and about 1.1 for splats as thick as most here.
 
-An encoder that truncates instead of rounding is valid, too, if its bounds cover the error, but twice as coarse. Two
-signs of it are looked for in the measures that a file declares:
+An encoder that truncates instead of rounding is valid, too, if its bounds cover the error, but its errors are twice as
+large. Two signs of truncation are searched for in the measures that a file declares:
 
-- Means and opacities lie on a lattice that the file names. Rounding leaves at most half a step, truncation up to one.
+- Means and opacities lie on a lattice that the file specifies. Rounding causes errors of at most half a step,
+  truncation of up to one step.
 - Errors of scales, rotations and colours have either sign equally often. If nearly all have one sign, or point towards
-  0, values were truncated. Equal source values count once, since their errors are equal; values that became 0 do not
-  count, since rounding makes them smaller.
+  0, values were truncated. Equal source values count once, because their errors are equal. Values that became 0 do not
+  count, because rounding also moves them towards 0.
 
-Neither sign is a proof: encoders that weigh bytes against errors may prefer smaller integers.
+Neither sign is a proof, because encoders that optimise rate and distortion may prefer smaller integers.
 """
 
 from __future__ import annotations
@@ -51,16 +52,16 @@ OPACITIES_MAX = 0.25
 SH_MAX, SH_PER_LARGEST = 0.3, 0.04
 
 # Signs of truncation.
-STEPS_MAX = 0.75  #: lattice steps; rounding leaves 0.5, or 0.71 next to alpha 0 if it searches the nearest alpha
-ONE_SIDED = 0.95  #: share of the errors with one sign; 40 fair coins are this one-sided once in 10^9 throws
+STEPS_MAX = 0.75  #: lattice steps; rounding causes 0.5, or 0.71 next to alpha 0 if it searches the nearest alpha
+ONE_SIDED = 0.95  #: fraction of the errors with one sign; 40 random signs are this one-sided once in 10^9 times
 _TRUNCATED_STEPS_MAX = 1.05  # lattice steps; truncation alone leaves at most 1
 _VALUES_MIN = 40  # different values, below which signs mean nothing
-_ROWS_MAX = 4096  # splats to look at
+_ROWS_MAX = 4096  # splats to examine
 _SAME_ROTATION_MIN = 0.8  # smallest cosine of half the angle between rotations that are compared
 
-_NOT_PAIRED = "which splat is which is not known"
+_NOT_PAIRED = "the source splat of each splat is unknown"
 _NO_BOUNDS = "the file states no errors"
-_TRUNCATED = "cut instead of rounded?"
+_TRUNCATED = "truncated instead of rounded?"
 
 
 def check_errors(case: EncoderInput, scene: DecodedScene, pairs: SplatPairs) -> tuple[Verdict, str]:
@@ -72,7 +73,7 @@ def check_errors(case: EncoderInput, scene: DecodedScene, pairs: SplatPairs) -> 
         pairs: the source splat of each decoded splat.
 
     Returns:
-        The verdict, and the reason why only renders can check the rest; empty if they need not.
+        The verdict, and the reason why only renders can check the rest; empty if they are not needed.
     """
     source = case.source() if case.source is not None else None
     if source is None or pairs.strays or pairs.surplus:
@@ -86,9 +87,9 @@ def check_errors(case: EncoderInput, scene: DecodedScene, pairs: SplatPairs) -> 
     verification = verify_bounds(source, scene.model, scene.header, stated, pairs.source_index)
     details = verification.as_json()["measures"]
     unverified = (
-        f"{', '.join(verification.unverified)}: fitted anew, nothing is stated" if verification.unverified else ""
+        f"{', '.join(verification.unverified)}: refitted, no error is stated" if verification.unverified else ""
     )
-    why = f"{', '.join(verification.unverified)} fitted anew" if verification.unverified and stated.refitted else ""
+    why = f"{', '.join(verification.unverified)} refitted" if verification.unverified and stated.refitted else ""
     if not verification.holds:
         return Verdict(Status.FAILED, join_lines(verification.failures), verification.clauses, details=details), why
     coarse = coarse_errors(case, source, verification)
@@ -145,10 +146,10 @@ def find_truncation(
         decoded: the decoded file.
         header: header of the file.
         index: [N], source splat of each decoded splat.
-        stated: names of the measures to look at.
+        stated: names of the measures to examine.
 
     Returns:
-        A line for each attribute with signs.
+        A line for each attribute that shows signs.
     """
     return [line for measure, line in _truncated_attributes(source, decoded, header, index) if measure in stated]
 
@@ -161,8 +162,8 @@ def _truncated_attributes(
         ("opacities", _opacity_steps(source, decoded, header, index)),
     ):
         if steps > STEPS_MAX:
-            what = _TRUNCATED if steps < _TRUNCATED_STEPS_MAX else "not rounded to the nearest?"
-            yield measure, f"{measure}: up to {steps:.2f} lattice steps off, rounding leaves 0.5: {what}"
+            what = _TRUNCATED if steps < _TRUNCATED_STEPS_MAX else "not rounded to nearest?"
+            yield measure, f"{measure}: errors up to {steps:.2f} lattice steps, expected at most 0.5: {what}"
     rows = np.linspace(0, len(decoded) - 1, min(len(decoded), _ROWS_MAX)).astype(np.int64)
     theirs = index[rows]
     # Axes may be permuted: compare sorted scales.
@@ -183,7 +184,7 @@ def _truncated_attributes(
 
 
 def _mean_steps(source: Source, decoded: SplatModel, header: SceneHeader, index: I64) -> float:
-    """Return the largest error along an axis in steps of the tile's lattice, without the rounding of binary32."""
+    """Return the largest error along an axis in steps of the tile's lattice, excluding the rounding to binary32."""
     step = header.attribute(_spec.ATTRIBUTE_MEANS).step
     near, reach = source.about(decoded.origin), source.reach(decoded.origin)
     largest = 0.0
@@ -198,7 +199,7 @@ def _mean_steps(source: Source, decoded: SplatModel, header: SceneHeader, index:
 
 
 def _opacity_steps(source: Source, decoded: SplatModel, header: SceneHeader, index: I64) -> float:
-    """Return the largest error in steps, of alpha or of its root, as the file has it."""
+    """Return the largest error in steps of alpha, or of its root if the file's mapping is SQUARE."""
     record = header.attribute(_spec.ATTRIBUTE_OPACITIES)
     ours, theirs = decoded.opacities.astype(np.float64), source.opacities[index].astype(np.float64)
     if record.mapping == _spec.MAPPING_SQUARE:
@@ -221,16 +222,16 @@ def _one_sided(
         return
     ours, theirs = ours[kept], theirs[kept]
     below, towards = float((ours < theirs).mean()), float((np.abs(ours) < np.abs(theirs)).mean())
-    sides = {"below": below, "above": 1.0 - below, "nearer to 0 than": towards, "farther from 0 than": 1.0 - towards}
+    sides = {"below": below, "above": 1.0 - below, "closer to 0 than": towards, "farther from 0 than": 1.0 - towards}
     side = max(sides, key=sides.__getitem__)
     if sides[side] >= ONE_SIDED:
-        yield measure, f"{name}: {100.0 * sides[side]:.0f} % of the values lie {side} the source's: {_TRUNCATED}"
+        yield measure, f"{name}: {100.0 * sides[side]:.0f} % of the values are {side} the source's: {_TRUNCATED}"
 
 
 def _coded_colours(
     source: NDArray[np.float32], decoded: NDArray[np.float32], header: SceneHeader, attribute: int
 ) -> tuple[F64, F64]:
-    """Return the values that the encoder rounds: R, G, B, or Co and Cg. Y is left out, since it compensates them."""
+    """Return the values that the encoder rounds: R, G, B, or Co and Cg. Y is excluded: it compensates errors."""
     theirs, ours = source.astype(np.float64), decoded.astype(np.float64)
     if header.attribute(attribute).mapping != _spec.MAPPING_YCOCG:
         return theirs, ours
@@ -240,13 +241,14 @@ def _coded_colours(
 def _chroma(rgb: F64) -> F64:
     r, g, b = rgb[..., 0], rgb[..., 1], rgb[..., 2]
     chroma: F64 = np.stack([r - b, g - (r + b) / 2.0])
-    return np.where(np.abs(chroma) > 1e-6 * np.abs(rgb).max(initial=0.0), chroma, 0.0)  # 0 but for rounding
+    # Differences of this size are rounding errors.
+    return np.where(np.abs(chroma) > 1e-6 * np.abs(rgb).max(initial=0.0), chroma, 0.0)
 
 
 def _aligned_quats(source: NDArray[np.float32], decoded: NDArray[np.float32]) -> tuple[F64, F64]:
-    """Return x, y, z of rotations, the source's with the axis order and signs of the file's.
+    """Return x, y, z of the rotations of both, with the source's in the axis order and sign of the file's.
 
-    Splats whose rotations differ too much are left out.
+    Splats whose rotations differ too much are omitted.
     """
     theirs, ours = source.astype(np.float64), decoded.astype(np.float64)
     turned = np.einsum("nq,tqp->tnp", theirs, _AXIS_ROTATIONS)  # [24, n, 4]
@@ -261,7 +263,7 @@ def _aligned_quats(source: NDArray[np.float32], decoded: NDArray[np.float32]) ->
 def _axis_rotations() -> F64:
     """Return the rotations that map axes to axes as right factors of quaternions, [24, 4, 4]."""
     halves = [np.array(q, np.float64) for q in itertools.product((-1, 0, 1), repeat=4) if sum(map(abs, q)) in (1, 2, 4)]
-    units = [q / np.sqrt(np.square(q).sum()) for q in halves if q[np.flatnonzero(q)[0]] > 0]  # −q turns as q does
+    units = [q / np.sqrt(np.square(q).sum()) for q in halves if q[np.flatnonzero(q)[0]] > 0]  # −q is the same rotation
     return np.stack([_right_factor(q) for q in units])
 
 

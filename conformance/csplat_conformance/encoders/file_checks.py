@@ -1,4 +1,4 @@
-"""Check a file that an encoder wrote: is it valid (L1), and does it hold its source (L2)?"""
+"""Check that a file of an encoder is valid (L1) and contains its source (L2)."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from csplat_conformance.encoders.encoder_inputs import EncoderInput
 from csplat_conformance.encoders.encoder_run import Defect, Verdict, failed_verdict
 from csplat_conformance.validator import validate
 
-_PRUNED_MAX = 0.25  # fraction of the splats; an encoder that prunes more is warned about
+_PRUNED_MAX = 0.25  # fraction of the splats; pruning more causes a warning
 _TRUNCATION = frozenset((_spec.ERROR_TRUNCATED,))
 _VIOLATIONS_MAX = 3
 
 
 def check_stream(data: bytes) -> tuple[Verdict, DecodedScene | None]:
-    """Check L1: the file breaks no clause (CNF-1, CNF-5). Return the verdict, and the scene if it passes."""
+    """Check L1: the file violates no clause (CNF-1, CNF-5). Return the verdict, and the scene if it passes."""
     if not data:
-        return Verdict(Status.PARTIAL_OUTPUT, "an empty file"), None
+        return Verdict(Status.PARTIAL_OUTPUT, "the file is empty"), None
     validation = validate(data)
     found = validation.violations
     if found:
@@ -41,9 +41,7 @@ def check_stream(data: bytes) -> tuple[Verdict, DecodedScene | None]:
         return Verdict(status, message, clauses, found[0].code), None
     try:
         scene = decode_scene(data)
-    except (
-        CsplatError
-    ) as error:  # the validator finds nothing: one of the two is wrong, and this is the place to see it
+    except CsplatError as error:  # a defect of the validator or of the decoder
         return Verdict(Status.FAILED, f"csplat's decoder refuses it: {error}", (), error.code), None
     return Verdict(Status.PASSED, "; ".join(validation.remarks), details={"bytes": len(data)}), scene
 
@@ -51,7 +49,7 @@ def check_stream(data: bytes) -> tuple[Verdict, DecodedScene | None]:
 def check_content(
     case: EncoderInput, source: Source, scene: DecodedScene, index: Path | None
 ) -> tuple[Verdict, SplatPairs]:
-    """Check L2: each splat of the source is there once or counted as pruned, and no metadata is guessed.
+    """Check L2: each splat of the source is present once or counted as pruned, and no metadata is guessed.
 
     Args:
         case: the input.
@@ -76,7 +74,7 @@ def check_content(
     if wrong:
         return failed_verdict(wrong, details), pairs
     if pairs.missing > _PRUNED_MAX * len(source):
-        return Verdict(Status.WARNED, f"{pairs.missing} of {len(source)} splats left out", details=details), pairs
+        return Verdict(Status.WARNED, f"{pairs.missing} of {len(source)} splats pruned", details=details), pairs
     remark = f"{pairs.missing} splats pruned" if pairs.missing else ""
     return Verdict(Status.PASSED, remark, details=details), pairs
 
@@ -88,7 +86,7 @@ def _wrong_splats(case: EncoderInput, pairs: SplatPairs) -> list[Defect]:
         wrong.append(("CNF-6", f"{_count_text(pairs.strays, pairs.examples[0])} {far}"))
     if pairs.surplus:
         many = _count_text(pairs.surplus, pairs.examples[1])
-        wrong.append(("CNF-6", f"{many} near a splat of the source that another stands for already"))
+        wrong.append(("CNF-6", f"{many} near a splat of the source that another splat already represents"))
     return wrong
 
 
@@ -101,21 +99,21 @@ def _count_text(count: int, first: int) -> str:
 def _wrong_counts(source: Source, scene: DecodedScene, pairs: SplatPairs) -> list[Defect]:
     stated = scene.declared_bounds
     if stated is None:
-        text = f"{pairs.missing} splats of the source are missing, and nothing says so"
+        text = f"{pairs.missing} splats of the source are missing, and the file does not state it"
         return [("SER-5", text)] if pairs.missing else []
     wrong = []
     if stated.source_count != len(source):
-        wrong.append(("SRC-1", f"a source of {stated.source_count} splats is stated, it has {len(source)}"))
+        wrong.append(("SRC-1", f"the stated source_count is {stated.source_count}, expected {len(source)}"))
     elif stated.pruned_count != pairs.missing:
-        wrong.append(("SER-5", f"{stated.pruned_count} pruned splats are stated, {pairs.missing} are missing"))
+        wrong.append(("SER-5", f"the stated pruned_count is {stated.pruned_count}, expected {pairs.missing}"))
     if stated.source_sh_degree != source.sh_degree:
-        text = f"a source of SH degree {stated.source_sh_degree} is stated, it has {source.sh_degree}"
+        text = f"the stated source_sh_degree is {stated.source_sh_degree}, expected {source.sh_degree}"
         wrong.append(("SER-5", text))
     return wrong
 
 
 def _wrong_metadata(source: Source, decoded: SplatModel) -> list[Defect]:
-    """Return metadata that the encoder has guessed: a PLY does not specify axes, unit and filters."""
+    """Return metadata that the encoder guessed, because a PLY does not specify axes, unit and filters."""
     facts = {
         "axes": (decoded.coordinate_system, UNSPECIFIED),
         "unit_metres": (decoded.unit_metres, None),
@@ -123,12 +121,12 @@ def _wrong_metadata(source: Source, decoded: SplatModel) -> list[Defect]:
         "flat": (decoded.flat, False),
     }
     wrong = [
-        ("SRC-3", f"{name} is {found}, of which the source says nothing")
-        for name, (found, wanted) in facts.items()
-        if found != wanted
+        ("SRC-3", f"{name} is {found}, but the source does not specify it")
+        for name, (found, expected) in facts.items()
+        if found != expected
     ]
     if decoded.sh_degree > source.sh_degree:
-        wrong.append(("SRC-3", f"SH degree {decoded.sh_degree}, the source has {source.sh_degree}"))
+        wrong.append(("SRC-3", f"the SH degree is {decoded.sh_degree}, but the source has {source.sh_degree}"))
     return wrong
 
 
@@ -161,15 +159,15 @@ def check_index(path: Path, source: Source, count: int, pairs: SplatPairs) -> tu
     off = paired[(source.means[index[paired]] != source.means[near]).any(axis=1)]
     if len(off):
         text = (
-            f"splat {off[0]} is called splat {index[off[0]]} of the source, nearest is {pairs.source_index[off[0]]}"
-            f" ({len(off)} of {count} numbers of the index are wrong)"
+            f"the source index of splat {off[0]} is {index[off[0]]}, but the nearest source splat is"
+            f" {pairs.source_index[off[0]]} ({len(off)} of {count} numbers of the index are wrong)"
         )
         return pairs, [(_INDEX_CLAUSE, text)]
     return replace(pairs, source_index=index) if len(paired) == count else pairs, []
 
 
 _NONE = -1
-_CELL_MAX = 2.0**40  # cells from the origin; centres beyond share a cell, which costs comparisons only
+_CELL_MAX = 2.0**40  # cells from the origin; centres beyond share a cell, which only costs comparisons
 _MIX = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F), np.uint64(0x165667B19E3779F9))
 
 
@@ -196,10 +194,10 @@ def pair_splats(source: F64, decoded: F64, separation: float) -> SplatPairs:
     """Pair splats by their centres.
 
     Args:
-        source: [M, 3] centres. Different ones are at least `separation` apart; equal ones are duplicates, which are
-            paired one by one.
+        source: [M, 3] centres. Distinct centres are at least `separation` apart. Equal centres are duplicates, which
+            are paired one by one.
         decoded: [N, 3] centres.
-        separation: a decoded splat belongs to the source centre that is nearer than half of this distance.
+        separation: distance; a decoded splat belongs to the source centre that is nearer than half of it.
     """
     if not len(source) or not len(decoded):
         first_stray = 0 if len(decoded) else _NONE
@@ -232,11 +230,11 @@ def _nearest(centres: F64, decoded: F64, separation: float) -> I64:
     own = _cells(decoded, separation)
     found = np.full(len(decoded), _NONE, np.int64)
     left = np.arange(len(decoded))
-    # The own cell comes first: it is enough for most splats.
+    # A splat's own cell comes first, because it is sufficient for most splats.
     for step in sorted(product((-1, 0, 1), repeat=3), key=lambda step: sum(map(abs, step))):
-        wanted = _keys(own[left] + np.array(step, np.int64))
-        first, last = np.searchsorted(keys, wanted, "left"), np.searchsorted(keys, wanted, "right")
-        # A cell holds few centres, since its side is their smallest distance.
+        probes = _keys(own[left] + np.array(step, np.int64))
+        first, last = np.searchsorted(keys, probes, "left"), np.searchsorted(keys, probes, "right")
+        # A cell has few centres, because its side is their smallest distance.
         for nth in range(int((last - first).max(initial=0))):
             more = first + nth < last
             rows, candidates = left[more], order[first[more] + nth]
@@ -255,7 +253,7 @@ def _cells(points: F64, side: float) -> I64:
 
 
 def _keys(cells: I64) -> NDArray[np.uint64]:
-    """Hash cells. If unequal cells have equal keys, that costs a comparison only."""
+    """Hash cells. A collision only costs a comparison."""
     keys = np.zeros(len(cells), np.uint64)
     for axis, factor in enumerate(_MIX):
         keys ^= cells[:, axis].astype(np.uint64) * factor

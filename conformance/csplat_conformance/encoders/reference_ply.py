@@ -1,4 +1,4 @@
-"""Write PLY files as trainers do, and return the sources that they hold, independently of the PLY reader under test.
+"""Write PLY files like those of trainers, and return their sources independently of the PLY reader under test.
 
 The columns are those of the reference implementation of 3D Gaussian splatting: centres, base colour `f_dc`, higher
 coefficients `f_rest` channel by channel, the logit of the opacity, logarithms of the standard deviations, and a
@@ -22,13 +22,13 @@ _TYPE_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i2": "short", "i4"
 
 @dataclass
 class PlyRows:
-    """The rows of a PLY: float32, or float64 for values that a PLY of doubles holds.
+    """The rows of a PLY: float32, or float64 for values of a PLY with doubles.
 
     Attributes:
         means: [N, 3].
         quats: [N, 4], w x y z, of any length.
         scales: [N, 3], natural logarithms.
-        logits: [N], of the opacity.
+        logits: [N], logits of the opacities.
         sh0: [N, 3].
         shN: [N, K, 3].
         normals: [N, 3], unused by splats.
@@ -59,7 +59,7 @@ class PlyRows:
 
 
 def is_splat(splats: PlyRows) -> NDArray[np.bool_]:
-    """Return which rows are splats of the source (SRC-1): finite in binary32, but logits may be infinite."""
+    """Return a mask of the rows that are splats of the source (SRC-1): finite in binary32, except for logits."""
     good: NDArray[np.bool_] = ~np.isnan(splats.logits)
     with np.errstate(over="ignore"):
         for array in (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN):
@@ -68,7 +68,7 @@ def is_splat(splats: PlyRows) -> NDArray[np.bool_]:
 
 
 def source_of_rows(splats: PlyRows) -> Source:
-    """Return the source that the rows hold (SRC-1, SRC-2), with alpha for logits and unit quaternions."""
+    """Return the source of the rows (SRC-1, SRC-2), with alpha instead of logits and with unit quaternions."""
     splats = splats.select(np.flatnonzero(is_splat(splats)))
     with np.errstate(over="ignore"):
         alpha = 1.0 / (1.0 + np.exp(-splats.logits.astype(np.float32).astype(np.float64)))  # ±Inf are alpha 1 and 0
@@ -92,18 +92,18 @@ class PlyLayout:
 
     Attributes:
         format: format in the header: `ascii`, `binary_little_endian` or `binary_big_endian`.
-        normals: whether to write columns nx, ny, nz, as most trainers do; zero unless the rows have values.
-        dtype: type of all columns but the extra ones, `f4` or `f8`.
+        normals: whether to write columns nx, ny, nz, like most trainers; zero unless the rows have values.
+        dtype: type of all columns except the extra ones, `f4` or `f8`.
         means_dtype: type of x, y, z, if it differs.
         comments: comment lines of the header, with any characters; bytes that are not UTF-8 as surrogates.
         obj_info: `obj_info` lines of the header.
-        reverse: write the columns in the opposite order.
-        renamed: new names of columns; an empty name leaves the column out.
+        reverse: whether to write the columns in reverse order.
+        renamed: new names of columns; an empty name drops the column.
         count: number of rows in the header, if wrong on purpose.
-        line_end: end of the header's lines.
-        lists: [N] lists of small numbers, a property of that kind before all others; not in `ascii`.
+        line_end: line ending of the header.
+        lists: [N] lists of small numbers, written as a list property before all others; not in `ascii`.
         before: header lines and bytes of elements before the splats.
-        after: header lines and bytes of elements after them; without lines, trailing bytes.
+        after: header lines and bytes of elements after the splats; without lines, trailing bytes.
     """
 
     format: str = "binary_little_endian"
@@ -128,7 +128,7 @@ def write_ply(splats: PlyRows, layout: PlyLayout | None = None) -> bytes:
     head = _header_bytes(columns, len(splats.means), layout)
     if layout.format == "ascii":
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-        body = "".join(" ".join(map(_format_number, row)) + "\n" for row in rows).encode("ascii")
+        body = "".join(" ".join(map(repr, row)) + "\n" for row in rows).encode("ascii")
     else:
         kinds = [(name, _ENDIAN[layout.format] + column.dtype.str[1:]) for name, column in columns.items()]
         table = np.empty(len(splats.means), kinds)
@@ -160,7 +160,7 @@ def _columns(splats: PlyRows, layout: PlyLayout) -> dict[str, NDArray[Any]]:
         normals = np.zeros((count, 3), np.float32) if splats.normals is None else splats.normals
         named |= {f"n{axis}": column for axis, column in zip("xyz", normals.T, strict=True)}
     named |= {f"f_dc_{i}": column for i, column in enumerate(splats.sh0.T)}
-    # Channel by channel: all red coefficients, then all green ones.
+    # Channel by channel: all red coefficients, then green, then blue.
     rest = splats.shN.transpose(0, 2, 1).reshape(count, 3 * splats.shN.shape[1])
     named |= {f"f_rest_{i}": column for i, column in enumerate(rest.T)}
     named["opacity"] = splats.logits
@@ -173,8 +173,3 @@ def _columns(splats: PlyRows, layout: PlyLayout) -> dict[str, NDArray[Any]]:
         columns = dict(reversed(columns.items()))
     names = {name: layout.renamed.get(name, name) for name in columns}
     return {names[name]: column for name, column in columns.items() if names[name]}
-
-
-def _format_number(value: float) -> str:
-    """Return the shortest digits that give the same binary64."""
-    return repr(value)

@@ -1,4 +1,4 @@
-"""L4: compare renders of a file with those of its source."""
+"""Compare renders of a file with those of its source (L4)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from csplat_conformance.encoders.encoder_inputs import EncoderInput
 from csplat_conformance.encoders.encoder_run import Verdict
 from csplat_conformance.encoders.file_checks import SplatPairs
 
-#: Returns the PSNR of renders of a decoded scene compared with its source, dB; called with source and decoded scene.
+#: Returns the PSNR of renders in dB; called with the source and the decoded scene.
 RenderScore = Callable[[SplatModel, SplatModel], float]
 
 
@@ -30,7 +30,7 @@ def check_renders(
     render_score: RenderScore,
     psnr_min: float,
 ) -> Verdict:
-    """Check L4: renders of the file look like those of the source.
+    """Check L4: renders of the file match those of the source.
 
     Args:
         case: the input.
@@ -39,25 +39,25 @@ def check_renders(
         pairs: the source splat of each decoded splat.
         size_bytes: size of the file.
         render_score: computes the PSNR.
-        psnr_min: lowest PSNR that passes, dB; inputs shift it by their own difference from the default.
+        psnr_min: lowest PSNR that passes, dB; see `EncoderInput.psnr_required`.
     """
     model, decoded = source.to_model(scene.model.origin), scene.model
     psnr = render_score(model, decoded)
-    figures, wanted = peer_figures(case.name), case.psnr_required(psnr_min)
-    details = {"psnr": psnr, "wanted": wanted, "bytes": size_bytes, "beside": figures}
+    figures, required = peer_figures(case.name), case.psnr_required(psnr_min)
+    details = {"psnr": psnr, "wanted": required, "bytes": size_bytes, "beside": figures}
     size = f"in {size_bytes:,} bytes{format_figures(figures)}"
-    if not psnr >= wanted:
+    if not psnr >= required:
         details["exact"] = exact = _score_exact_attributes(model, decoded, pairs, render_score)
         cost = ", ".join(f"{name} {value:.1f}" for name, value in exact.items())
         blame = f"; with the source's {cost}" if cost else ""
-        return Verdict(Status.FAILED, f"{psnr:.2f} dB, expected at least {wanted:g}, {size}{blame}", details=details)
+        return Verdict(Status.FAILED, f"{psnr:.2f} dB, expected at least {required:g}, {size}{blame}", details=details)
     return Verdict(Status.PASSED, f"{psnr:.2f} dB {size}", details=details)
 
 
 def _score_exact_attributes(
     source: SplatModel, decoded: SplatModel, pairs: SplatPairs, render_score: RenderScore
 ) -> dict[str, float]:
-    """Return the PSNR with the source's values of one attribute: the largest gain shows the costliest attribute."""
+    """Return the PSNR with exact values of one attribute at a time; the largest gain shows the worst attribute."""
     if pairs.strays or pairs.surplus:
         return {}
     theirs = source.select(pairs.source_index)
@@ -75,12 +75,12 @@ _DISPLAY_NAMES = {"spz": "SPZ"}
 
 
 def peer_figures(name: str) -> dict[str, dict[str, Any]]:
-    """Return `bytes` and `psnr` of an input by encoder; empty if none were measured."""
+    """Return `bytes` and `psnr` of an input by encoder, as far as measured."""
     return _all_figures().get(name, {})
 
 
 def format_figures(figures: dict[str, dict[str, Any]]) -> str:
-    """Return figures as text after a blank: ` (csplat 40.90 in 4,800, SPZ 39.10 in 7,900)`."""
+    """Format figures with a leading blank: ` (csplat 40.90 in 4,800, SPZ 39.10 in 7,900)`."""
     words = []
     for encoder, numbers in figures.items():
         psnr = f"{numbers['psnr']:.2f}" if numbers.get("psnr") is not None else ""

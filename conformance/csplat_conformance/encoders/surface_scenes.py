@@ -1,4 +1,4 @@
-"""Build scenes for renders: closed surfaces of discs, as in trained scenes, dense enough that every mistake shows.
+"""Build scenes for renders: closed surfaces of discs, like trained scenes, dense enough to reveal every mistake.
 
 The other inputs are sparse random clouds, in which a wrong rotation or opacity hardly changes a render.
 """
@@ -10,24 +10,24 @@ import numpy as np
 from csplat.types import F64
 from csplat_conformance.encoders.reference_ply import PlyRows
 
-Surface = tuple[F64, F64, float]  # centres, normals, about how far apart the centres are
+Surface = tuple[F64, F64, float]  # centres, normals, approximate distance between centres
 
-SPACING_MIN = 0.04  #: scene units; no two centres are nearer to each other
+SPACING_MIN = 0.04  #: smallest distance between two centres, scene units
 
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
-#: Directions and colours of what shines on the scene.
+#: Directions and colours of the lights.
 _LIGHTS = np.array(((0.8, -0.3, 0.5), (-0.7, 0.2, -0.6), (0.2, -0.3, -0.9), (-0.5, 0.3, 0.8)))
 _LIGHT_COLOURS = np.array(((1.0, 0.9, 0.7), (0.2, 0.5, 1.0), (0.9, 0.3, 0.2), (0.3, 0.9, 0.4)))
 _FACETS = 150
-_LOBE = (1.0, 0.8, 0.6)  # a highlight's share by band
+_LOBE = (1.0, 0.8, 0.6)  # weight of a highlight by band
 
 
 def surface_scene(gloss: float, noise: float, seed: int) -> PlyRows:
     """Return a scene of discs on a torus, a ball and a box.
 
     Args:
-        gloss: about how bright highlights are.
-        noise: standard deviation by which each splat's coefficients differ from its neighbours'.
+        gloss: approximate brightness of highlights.
+        noise: standard deviation of the random part of each splat's coefficients.
         seed: seed of all random choices.
     """
     rng = np.random.default_rng(seed)
@@ -89,8 +89,8 @@ def _box(side: int) -> list[Surface]:
 
 
 def _facing(normals: F64, rng: np.random.Generator) -> F64:
-    """Return rotations that bring z to the normals, turned about them at random, of either sign and any length."""
-    # Half-way between z and the normal is half the turn; to the opposite of z one turns about x.
+    """Return rotations that map z to the normals, with a random rotation about the normal, sign and length."""
+    # The vector half-way between z and the normal gives half the rotation; the opposite of z is reached about x.
     half = np.stack([1.0 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(len(normals))], axis=1)
     half[half[:, 0] < 1e-9] = (0.0, 1.0, 0.0, 0.0)
     twist = rng.uniform(0.0, np.pi, len(normals))
@@ -101,12 +101,12 @@ def _facing(normals: F64, rng: np.random.Generator) -> F64:
 
 
 def _permuted(quats: F64, scales: F64, rng: np.random.Generator) -> tuple[F64, F64]:
-    """Return the same splats with their axes in any of the six orders: trained scenes have them so."""
+    """Return the same splats with their axes in a random order, as in trained scenes."""
     quats, scales = quats.copy(), scales.copy()
     for first in (0, 1, 0):
         rows = rng.random(len(quats)) < 0.5
         w, x, y, z = quats[rows].T
-        # Half a turn about the bisector of two axes exchanges them.
+        # A half turn about the bisector of two axes exchanges them.
         turned = (-x - y, w - z, w + z, x - y) if first == 0 else (-y - z, y - z, w - x, w + x)
         quats[rows] = np.sqrt(0.5) * np.stack(turned, axis=1)
         scales[rows, first : first + 2] = scales[rows, first : first + 2][:, ::-1]
@@ -117,20 +117,20 @@ def _permuted(quats: F64, scales: F64, rng: np.random.Generator) -> tuple[F64, F
 
 
 def _faceted(normals: F64) -> F64:
-    """Return for each normal the nearest of those of a cut stone: splats of a facet shine alike."""
+    """Return for each normal the nearest facet normal, so that splats of one facet have the same highlights."""
     facets = _ball(_FACETS)[1]
     nearest: F64 = facets[np.argmax(normals @ facets.T, axis=1)]
     return nearest
 
 
 def _highlights(normals: F64) -> F64:
-    """Return coefficients of bands 1 to 3, [N, 15, 3]: each light a lobe about where it is mirrored to the eye."""
+    """Return coefficients of bands 1 to 3, [N, 15, 3]: for each light, a lobe about its mirror direction."""
     shares = np.repeat(_LOBE, (3, 5, 7))
     total = np.zeros((len(normals), 15, 3))
     for place, colour in zip(_LIGHTS, _LIGHT_COLOURS, strict=True):
         light = place / np.sqrt(np.square(place).sum())
         facing = normals @ light
-        # Directions go from the eye to the splat.
+        # Directions point from the camera to the splat.
         mirrored = light - 2.0 * facing[:, None] * normals
         lobe = _harmonics(mirrored) * shares * np.clip(facing, 0.0, 1.0)[:, None]
         total += lobe[:, :, None] * colour
@@ -138,7 +138,7 @@ def _highlights(normals: F64) -> F64:
 
 
 def _harmonics(directions: F64) -> F64:
-    """Return the basis functions 1 to 15, [N, 15], as renderers of splats have them."""
+    """Return the basis functions 1 to 15, [N, 15], in the convention of splat renderers."""
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
     one, two, three = np.sqrt(np.array((3.0, 15.0, 35.0)) / (4.0 * np.pi))
