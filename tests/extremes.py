@@ -1,13 +1,13 @@
-"""Scenes at the extremes, as PLY files hold them: shared by the tests of the group `extremes`.
+"""Extreme scenes as PLY columns, for the tests marked `extremes`.
 
-All are made of one ordinary object, a shell of 300 overlapping splats about two units across. `CONDITIONS` names them;
-`codec/EXTREMES.md` describes the result of each. `python tests/extremes.py` prints that page's figures.
+All are variants of one object, a shell of 300 overlapping splats about two units across. `CONDITIONS` names them;
+`tools/docs/results/extremes.md` describes the results, whose figures are `EXPECTED`.
 """
 
 from __future__ import annotations
 
+import json
 import math
-import re
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,30 +16,32 @@ from pathlib import Path
 
 import numpy as np
 
-from csplat import EncodeOptions, decode, read_ply
+from csplat import EncodeOptions, read_ply
 from csplat.encoder import EncodeResult, encode_with_report
 from csplat.lint import Finding
 from csplat.model import SplatModel, normalise_quats
 
-GUIDE = Path(__file__).resolve().parent.parent / "codec" / "EXTREMES.md"
+RESULTS = Path(__file__).resolve().parent.parent / "tools" / "benchmarks" / "results" / "extremes.json"
+#: Bytes per splat, PSNR and the like of each condition, as `python tests/extremes_chain.py` measured them.
+EXPECTED = {row["scene"]: row for row in json.loads(RESULTS.read_text("utf-8"))["rows"]}
 COUNT = 300
 FAR = 10_000.0
 TINY = 1e-42  # denormal
 PRESETS = ("fast", "balanced", "small")
-COPIES = 2_000  # stands in for a million identical splats, each of which every training step would visit
+COPIES = 2_000  # replaces a million identical splats in training, which visits every splat in each step
 
 Columns = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
 class Condition:
-    """A scene.
+    """An extreme scene.
 
     Attributes:
-        make: its columns, `means`, `quats`, `scales`, `logits`, `sh0`, `shN`, by row, as a PLY holds them.
+        make: returns the columns `means`, `quats`, `scales`, `logits`, `sh0`, `shN` of the PLY.
         comments: comments in the PLY's header.
-        dropped: rows that a reader drops.
-        repairs: defects that `strict` refuses.
+        dropped: number of rows that a reader drops.
+        repairs: ids of the defects that `strict` refuses.
     """
 
     make: Callable[[], Columns]
@@ -49,7 +51,7 @@ class Condition:
 
 
 def ordinary(count: int = COUNT, coefficients: int = 8) -> Columns:
-    """The object that all scenes are made of."""
+    """Return the object that all scenes are variants of."""
     rng = np.random.default_rng(0)
     means = rng.standard_normal((count, 3))
     means /= np.linalg.norm(means, axis=1, keepdims=True)
@@ -84,7 +86,7 @@ def identical(count: int = 1_000_000) -> Columns:
 
 
 def needles() -> Columns:
-    """Axes that differ by e^20: needles, discs, and blades, a third each."""
+    """Return needles, discs and blades, a third each, with axes 1 : e^20."""
     columns = ordinary()
     columns["scales"][0::3] = [-1.0, -21.0, -21.0]
     columns["scales"][1::3] = [-21.0, -1.0, -1.0]
@@ -93,7 +95,7 @@ def needles() -> Columns:
 
 
 def giant_background() -> Columns:
-    """The object a hundredth as large, amid twenty splats that are a million times larger than it."""
+    """Return the object at a hundredth of its size, amid twenty splats a million times larger."""
     columns = ordinary()
     columns["means"] *= np.float32(0.01)
     columns["scales"] += np.float32(math.log(0.01))
@@ -105,14 +107,14 @@ def giant_background() -> Columns:
 
 
 def transparent() -> Columns:
-    """Alpha 0 and alpha 1/8100, which is below what is drawn."""
+    """Return splats with alpha 0 or 1/8100, which is too faint to be drawn."""
     columns = ordinary()
     columns["logits"][:] = np.where(np.arange(COUNT) % 2, -np.inf, -9.0)
     return columns
 
 
 def saturated() -> Columns:
-    """Every third splat has coefficients of ± 1e4 alone: white from one side, black from another."""
+    """Return a scene in which every third splat has coefficients of ±1e4: white from one side, black from another."""
     columns = ordinary()
     for name, middle in (("sh0", 0.5), ("shN", 0.0)):
         columns[name][::3] = np.where(columns[name][::3] > middle, np.float32(1e4), np.float32(-1e4))
@@ -120,7 +122,7 @@ def saturated() -> Columns:
 
 
 def half_nan() -> Columns:
-    """Every other row holds a NaN, or an infinity, now in this column and now in that."""
+    """Return a scene with NaN or infinity in every other row, in alternating columns."""
     columns = ordinary()
     names = list(columns)
     for number, row in enumerate(range(0, COUNT, 2)):
@@ -131,7 +133,7 @@ def half_nan() -> Columns:
 
 
 def denormals() -> Columns:
-    """Denormal numbers in every column, rotations of denormal length, and one of length 0."""
+    """Return denormal numbers in every column, rotations of denormal length, and one of length 0."""
     columns = ordinary()
     columns["means"][0::3] *= np.float32(1e-40)
     columns["quats"][1::3] *= np.float32(TINY)
@@ -144,7 +146,7 @@ def denormals() -> Columns:
 
 
 def float32_limits() -> Columns:
-    """Centres at the ends of float32, log scales of ± 60 and ± 88, logits and rotations as large as they come."""
+    """Return centres, logits and rotations at the limits of float32, and log scales of ±60 and ±88."""
     columns = ordinary()
     columns["means"][:4] = 3e38 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, -1], [-1, 1, 1]])
     for row, value in enumerate((60.0, -60.0, 88.0, -88.0)):
@@ -156,7 +158,7 @@ def float32_limits() -> Columns:
 
 
 def exploded() -> Columns:
-    """Colours and log scales of ± 3e38, as training that went wrong leaves them, in eight splats."""
+    """Return eight splats with colours and log scales of ±3e38, as diverged training leaves them."""
     columns = ordinary()
     for row, value in enumerate((3e38, -3e38)):
         columns["sh0"][40 + row] = value
@@ -182,12 +184,12 @@ CONDITIONS = {
     "exploded": Condition(exploded),
 }
 NAMES = tuple(CONDITIONS)
-#: Conditions that can be rendered at 640×480: a million splats that fill it are more than the renderer takes.
+#: Conditions that can be rendered at 640×480; a million splats that fill the image exceed the renderer's limit.
 DRAWN = tuple(name for name in NAMES if name != "a million identical")
 
 
 def write_columns(path: Path, columns: Columns, comments: tuple[str, ...] = ()) -> Path:
-    """Write columns as they are, NaN and all, in INRIA's layout."""
+    """Write columns unchanged, including NaN, in INRIA's layout."""
     count, rest = len(columns["means"]), columns["shN"].shape[1] * 3
     names = ["f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{k}" for k in range(rest))]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
@@ -211,7 +213,7 @@ def write_scene(folder: Path, name: str) -> Path:
 
 
 def write_small_scene(folder: Path, name: str) -> Path:
-    """Write the same, in fewer copies if it is a million."""
+    """Write the PLY of a condition, with `COPIES` instead of a million splats."""
     if name in DRAWN:
         return write_scene(folder, name)
     return write_columns(folder / "scene.ply", identical(COPIES))
@@ -219,7 +221,7 @@ def write_small_scene(folder: Path, name: str) -> Path:
 
 @cache
 def scene(name: str) -> tuple[SplatModel, tuple[Finding, ...]]:
-    """The scene of a condition, and what its reader reported."""
+    """Return the scene of a condition, and the reader's findings."""
     findings: list[Finding] = []
     with tempfile.TemporaryDirectory() as folder:
         return read_ply(write_scene(Path(folder), name), report=findings), tuple(findings)
@@ -227,47 +229,15 @@ def scene(name: str) -> tuple[SplatModel, tuple[Finding, ...]]:
 
 @cache
 def encoded(name: str, preset: str, quality: float | None = None) -> EncodeResult:
-    """A file of a condition."""
+    """Encode a condition."""
     return encode_with_report(scene(name)[0], EncodeOptions(preset=preset, attribute_psnr=quality))
 
 
 @cache
-def judge(name: str, size: tuple[int, int] = (640, 480)):
-    """Return a judge that compares renders with those of a condition, from the cameras of `psnr`."""
+def scorer(name: str, size: tuple[int, int] = (640, 480)):
+    """Return a scorer of renders against those of a condition, from eight virtual cameras."""
     from csplat_render.scorer import Scorer
     from csplat_render.virtual_cameras import virtual_cameras
 
     model = scene(name)[0]
     return Scorer.of_source(model, virtual_cameras(model, 8, *size), (0.0, 0.0, 0.0))
-
-
-def guide_rows() -> list[list[str]]:
-    """The rows of the guide's tables that begin with a condition."""
-    lines = GUIDE.read_text("utf-8").splitlines()
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
-    return [row for row in rows if row[0] in CONDITIONS]
-
-
-def guide_figures() -> dict[str, list[tuple[float, float]]]:
-    """Return the guide's bytes per splat and dB, by preset, for each condition that is rendered."""
-    found = {}
-    for name, *cells in guide_rows():
-        pairs = [re.fullmatch(r"([0-9.]+), ([0-9.]+)", cell) for cell in cells]
-        if len(pairs) == len(PRESETS) and all(pairs):
-            found[name] = [(float(pair[1]), float(pair[2])) for pair in pairs if pair]
-    return found
-
-
-def figures(name: str) -> list[str]:
-    """The row of a condition in the guide's table: bytes and dB, by preset."""
-    cells = [name]
-    for preset in PRESETS:
-        data = encoded(name, preset).data
-        size = f"{len(data) / len(scene(name)[0]):.{1 if len(data) > len(scene(name)[0]) else 4}f}"
-        cells.append(f"{size}, {judge(name).psnr(decode(data)):.1f}" if name in DRAWN else f"{size}, –")
-    return cells
-
-
-if __name__ == "__main__":
-    for each in NAMES:
-        print("| " + " | ".join(figures(each)) + " |")

@@ -1,32 +1,19 @@
-"""Scenes at the extremes: from PLY to file, back, and to pictures. Figures and words stand in codec/EXTREMES.md.
+"""Extreme scenes: read, encoded, decoded and rendered. tools/docs/results/extremes.md describes the results.
 
-Every condition goes through all stages once (`chains`). Presets and qualities are crossed for two conditions, learning
-is tried on two; all others, and the million splats, are in the area `extremes`.
+Every condition goes through all stages once (`chains`). Presets and qualities are crossed for two conditions, and two
+go through learning; the others, and the million splats, are in the area `extremes`.
 """
 
 import numpy as np
 import pytest
-from extremes import (
-    CONDITIONS,
-    COPIES,
-    COUNT,
-    DRAWN,
-    FAR,
-    NAMES,
-    PRESETS,
-    encoded,
-    guide_figures,
-    guide_rows,
-    judge,
-    scene,
-)
+from extremes import CONDITIONS, COPIES, COUNT, DRAWN, EXPECTED, FAR, NAMES, PRESETS, encoded, scene, scorer
 
-pytest.importorskip("numba", reason="pictures need numba: pip install 'csplat[render]'")
+pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
 pytest.importorskip("scipy", reason="training needs scipy: pip install 'csplat[render]'")
 
-# Importing it needs what is looked for above.
+# These imports need numba and scipy.
 from checked import measure_errors
-from extremes_chain import LEARNT, assert_finite, chain_of
+from extremes_chain import ARRAYS, TRAINED, assert_finite, chain_of, verify
 
 from csplat import decode, read_ply, write_ply
 from csplat.decoder import read_declared_bounds, read_header
@@ -38,21 +25,20 @@ from csplat_render.virtual_cameras import virtual_cameras
 
 pytestmark = [pytest.mark.extremes, pytest.mark.slow]
 
-ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-QUALITIES = {10.0: 12.0, 120.0: 44.0}  # dB that are asked of each attribute, and that the pictures keep at least
-THROUGHOUT = ("needles", "half the rows NaN")  # with every preset and quality in the usual tests
+QUALITIES = {10.0: 12.0, 120.0: 44.0}  # attribute_psnr, and the least PSNR of renders, dB
+QUICK = ("needles", "half the rows NaN")  # crossed with presets and qualities outside the area, too
 LONG = pytest.mark.area(name="extremes")
-MOST = [pytest.param(name, marks=() if name in THROUGHOUT else LONG) for name in DRAWN]
+EACH = [pytest.param(name, marks=() if name in QUICK else LONG) for name in DRAWN]
 
 
 @pytest.fixture(scope="module")
 def chains(once):
-    """Every condition after all stages."""
+    """Return every condition after all stages."""
     return once("extremes", lambda: {name: chain_of(name) for name in NAMES})
 
 
 def assert_each(chains, check):
-    """Call a check with the name and the chain of each condition; fail with the names of conditions that fail."""
+    """Call `check(name, chain)` for each condition; fail with the names of those that fail."""
     failures = {}
     for name, chain in chains.items():
         try:
@@ -62,60 +48,54 @@ def assert_each(chains, check):
     assert {} == failures
 
 
-def assert_proved(name, result):
-    """The stated errors hold, rms and counts too."""
-    source, decoded = scene(name)[0], decode(result.data)
-    stated = read_declared_bounds(result.data)
-    proof = verify_bounds(Source.of(source), decoded, read_header(result.data), stated, result.source_index)
-    assert ((), True) == (proof.failures, proof.rms_verified)
+def assert_within_bounds(name, result):
+    """Fail unless the declared bounds, rms and counts hold; return the decoded scene."""
+    decoded = decode(result.data)
+    verification = verify(scene(name)[0], result, decoded)
+    assert ((), True) == (verification.failures, verification.rms_verified)
     return decoded
 
 
-def assert_picture_is_finite(picture):
+def assert_render_is_finite(result):
     for name in ("rgb", "alpha", "depth"):
-        assert np.isfinite(getattr(picture, name)).all(), name
-    assert 0.0 <= picture.alpha.min() <= picture.alpha.max() <= 1.0
+        assert np.isfinite(getattr(result, name)).all(), name
+    assert 0.0 <= result.alpha.min() <= result.alpha.max() <= 1.0
 
 
-# each condition
+# Each condition
 
 
-def test_a_reader_repairs_what_is_safe_and_strict_refuses_it(chains):
+def test_reading_repairs_defects_and_strict_reading_refuses_them(chains):
     def check(name, chain):
         repairs = CONDITIONS[name].repairs
         assert repairs == tuple(one.id for one in chain.findings if one.kind == "repair")
         assert repairs == chain.linted
         assert (repairs[0] in chain.refusal) if repairs else (chain.refusal == "")
-        wanted = COUNT - CONDITIONS[name].dropped
-        assert {"one splat": 1, "a million identical": COPIES}.get(name, wanted) == len(chain.source)
+        count = COUNT - CONDITIONS[name].dropped
+        assert {"one splat": 1, "a million identical": COPIES}.get(name, count) == len(chain.source)
 
     assert_each(chains, check)
 
 
-def test_decoded_scenes_lie_within_the_stated_errors(chains):
+def test_decoded_scenes_are_within_the_declared_bounds(chains):
     def check(_, chain):
-        assert ((), True) == (chain.proof.failures, chain.proof.rms_verified)
+        assert ((), True) == (chain.verification.failures, chain.verification.rms_verified)
         assert list(range(len(chain.source))) == sorted(chain.result.source_index.tolist())
         assert chain.source.origin == chain.decoded.origin
 
     assert_each(chains, check)
 
 
-def test_the_stated_maxima_are_proved_without_an_index_too(chains):
+def test_declared_maxima_can_be_verified_without_a_source_index(chains):
     def check(name, chain):
-        data = chain.result.data
         if name in DRAWN:
-            assert (
-                ()
-                == verify_bounds(
-                    Source.of(chain.source), chain.decoded, read_header(data), read_declared_bounds(data)
-                ).failures
-            )
+            header, bounds = read_header(chain.result.data), read_declared_bounds(chain.result.data)
+            assert () == verify_bounds(Source.of(chain.source), chain.decoded, header, bounds).failures
 
     assert_each(chains, check)
 
 
-def test_decoded_scenes_survive_a_ply(chains, tmp_path):
+def test_decoded_scenes_survive_writing_and_reading_a_ply(chains, tmp_path):
     def check(_, chain):
         decoded = chain.decoded
         write_ply(tmp_path / "back.ply", decoded)
@@ -129,17 +109,17 @@ def test_decoded_scenes_survive_a_ply(chains, tmp_path):
     assert_each(chains, check)
 
 
-def test_pictures_of_source_and_file_are_finite(chains):
+def test_renders_of_source_and_file_are_finite(chains):
     def check(_, chain):
-        for picture in chain.pictures:
-            assert_picture_is_finite(picture)
+        for result in chain.renders:
+            assert_render_is_finite(result)
 
     assert_each(chains, check)
 
 
-def test_a_little_learning_leaves_splats_finite_and_brings_the_loss_down(chains):
+def test_a_little_learning_keeps_splats_finite_and_lowers_the_loss(chains):
     def check(name, chain):
-        if name not in LEARNT:
+        if name not in TRAINED:
             return
         learnt = chain.learnt
         assert len(chain.source) // 2 == len(learnt.half)
@@ -155,7 +135,7 @@ def test_a_little_learning_leaves_splats_finite_and_brings_the_loss_down(chains)
     assert_each(chains, check)
 
 
-def test_identical_splats_come_back_identical(chains):
+def test_identical_splats_decode_identically(chains):
     chain = chains["a million identical"]
     assert len(chain.result.data) < 3_000
     for array in ARRAYS:
@@ -164,64 +144,65 @@ def test_identical_splats_come_back_identical(chains):
     assert (0.0, 0.0) == measure_errors(chain.source, chain.decoded, np.arange(COPIES))["means"]
 
 
-def test_lint_names_exploded_splats_and_no_others(chains):
-    noted = {name: [one.count for one in chains[name].findings if one.id == "huge-values"] for name in NAMES}
-    assert {name: [8] if name == "exploded" else [] for name in NAMES} == noted
+def test_lint_reports_exploded_splats_and_no_others(chains):
+    counts = {name: [one.count for one in chains[name].findings if one.id == "huge-values"] for name in NAMES}
+    assert {name: [8] if name == "exploded" else [] for name in NAMES} == counts
 
 
-# presets and qualities
+# Presets and qualities
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", [*MOST, pytest.param("a million identical", marks=LONG)])
-def test_each_preset_lies_within_the_stated_errors(name, preset):
+@pytest.mark.parametrize("name", [*EACH, pytest.param("a million identical", marks=LONG)])
+def test_each_preset_is_within_the_declared_bounds(name, preset):
     if (name, preset) == ("a million identical", "small"):
-        pytest.skip("a scene of SH degree 0 takes the same path as with balanced")
+        pytest.skip("with SH degree 0 small takes the same path as balanced")
     result = encoded(name, preset)
-    decoded = assert_proved(name, result)
+    decoded = assert_within_bounds(name, result)
     assert list(range(len(scene(name)[0]))) == sorted(result.source_index.tolist())
     assert scene(name)[0].origin == decoded.origin
 
 
 @pytest.mark.parametrize("quality", QUALITIES)
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("name", MOST)
-def test_the_ends_of_quality_hold_what_they_state(name, preset, quality):
-    decoded = assert_proved(name, encoded(name, preset, quality))
-    if preset == "balanced" and name != "exploded":  # any step moves the edges of its infinitely bright splats
-        assert judge(name, (160, 120)).psnr(decoded) >= QUALITIES[quality]
+@pytest.mark.parametrize("name", EACH)
+def test_lowest_and_highest_quality_are_within_the_declared_bounds(name, preset, quality):
+    decoded = assert_within_bounds(name, encoded(name, preset, quality))
+    if preset == "balanced" and name != "exploded":  # any step moves the edges of infinitely bright splats
+        assert scorer(name, (160, 120)).psnr(decoded) >= QUALITIES[quality]
 
 
 @LONG
-@pytest.mark.parametrize(
-    ("name", "preset"),
-    [(name, preset) for name in DRAWN for preset in PRESETS],
-)
-def test_pictures_are_as_good_as_the_guide_says(name, preset):
-    size, psnr = guide_figures()[name][PRESETS.index(preset)]
-    result = encoded(name, preset)
-    assert judge(name).psnr(decode(result.data)) >= psnr - 0.5
-    assert len(result.data) / len(result.source_index) <= 1.02 * size + 0.05
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("name", DRAWN)
+def test_size_and_psnr_are_those_of_the_results(name, preset):
+    result, expected = encoded(name, preset), EXPECTED[name][preset]
+    assert scorer(name).psnr(decode(result.data)) >= expected["psnr"] - 0.5
+    assert len(result.data) / len(result.source_index) <= 1.02 * expected["bytes_per_splat"] + 0.05
 
 
-# one by one
+def test_the_results_contain_every_condition():
+    assert list(NAMES) == list(EXPECTED)
 
 
-def test_an_origin_keeps_what_float32_loses_ten_kilometres_away():
+# Single conditions
+
+
+def test_an_origin_preserves_precision_ten_kilometres_away():
     def lost(name):
         model = scene(name)[0]
         return np.abs(model.means.astype(np.float64) + model.origin - true).max()
 
     true = scene("10 km away, origin")[0].means.astype(np.float64) + FAR
     assert (FAR, FAR, FAR) == scene("10 km away, origin")[0].origin
-    assert 2e-4 < lost("10 km away") <= 2.0**-11  # half of what float32 tells apart there
+    assert 2e-4 < lost("10 km away") <= 2.0**-11  # half of float32's resolution there
     assert lost("10 km away, doubles") <= 2.0**-23
-    # The errors that a file states do not hold what was lost before it was made.
+    # Declared errors do not include what was lost before encoding.
     errors = [encoded(name, "balanced", 120.0).report.errors["means"][0] for name in NAMES[:2]]
     assert (0.0, True) == (errors[0], 0.0 < errors[1] < 1e-4)
 
 
-def test_an_origin_is_told_from_coordinates_in_doubles(tmp_path):
+def test_an_origin_is_derived_from_coordinates_in_doubles(tmp_path):
     model = scene("10 km away, doubles")[0]
     assert all(abs(value - FAR) < 1.0 for value in model.origin)
     decoded = decode(encoded("10 km away, doubles", "balanced").data)
@@ -231,8 +212,8 @@ def test_an_origin_is_told_from_coordinates_in_doubles(tmp_path):
     np.testing.assert_allclose(decoded.means, again.means, rtol=0, atol=1e-6)
 
 
-def test_pictures_lose_little_ten_kilometres_away():
-    """Float32 coordinates cost 45 dB at worst, an origin nothing, as the same camera moved along shows."""
+def test_renders_lose_little_ten_kilometres_away():
+    """Renders with float32 coordinates keep 45 dB or more of those with an origin, from the same relative camera."""
     K = intrinsics(160, 120, 60.0)
     near, far = (
         render(scene(name)[0], look_at(np.array([0.0, -1.0, 3.0]) + at, np.full(3, at), (0, -1, 0), K, 160, 120)).rgb
@@ -242,7 +223,7 @@ def test_pictures_lose_little_ten_kilometres_away():
 
 
 @LONG
-def test_a_million_identical_splats_are_a_few_kilobytes():
+def test_a_million_identical_splats_take_a_few_kilobytes():
     source = scene("a million identical")[0]
     for preset in PRESETS:
         data = encoded("a million identical", preset).data
@@ -255,17 +236,17 @@ def test_a_million_identical_splats_are_a_few_kilobytes():
 
 
 @LONG
-def test_a_million_identical_splats_are_drawn_small_and_refused_large():
+def test_a_million_identical_splats_are_rendered_in_one_tile_and_refused_in_many():
     source = scene("a million identical")[0]
     K = intrinsics(48, 36, 60.0)
-    # So far away that one tile holds them all: what is seen is the pile's colour.
+    # Far enough away for one tile to contain them all; the colour is that of the pile.
     eye = source.means[0] + np.array([0.0, 0.0, 12.0])
     camera = look_at(eye, source.means[0], (0, -1, 0), K, 48, 36)
-    pictures = [render(model, camera) for model in (source, decode(encoded("a million identical", "fast").data))]
-    for picture in pictures:
-        assert_picture_is_finite(picture)
-        assert picture.alpha.max() > 0.999
-    assert np.square(np.clip(pictures[0].rgb, 0, 1) - np.clip(pictures[1].rgb, 0, 1)).mean() < 1e-3
+    renders = [render(model, camera) for model in (source, decode(encoded("a million identical", "fast").data))]
+    for result in renders:
+        assert_render_is_finite(result)
+        assert result.alpha.max() > 0.999
+    assert np.square(np.clip(renders[0].rgb, 0, 1) - np.clip(renders[1].rgb, 0, 1)).mean() < 1e-3
     with pytest.raises(LimitError, match="MAX_INTERSECTIONS"):
         render(source, virtual_cameras(source, 1)[0])
 
@@ -275,13 +256,13 @@ def test_transparent_scenes_stay_transparent():
     model = decode(result.data)
     np.testing.assert_array_equal(model.opacities == 0.0, result.source_index % 2 == 1)
     assert model.opacities.max() < 1 / 255
-    picture = render(model, virtual_cameras(model, 1, 64, 48)[0], background=(0.25, 0.5, 0.75))
-    np.testing.assert_array_equal(picture.rgb, np.broadcast_to(np.float32([0.25, 0.5, 0.75]), (48, 64, 3)))
+    result = render(model, virtual_cameras(model, 1, 64, 48)[0], background=(0.25, 0.5, 0.75))
+    np.testing.assert_array_equal(result.rgb, np.broadcast_to(np.float32([0.25, 0.5, 0.75]), (48, 64, 3)))
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_exploded_splats_harm_no_others(preset):
-    """Values that no lattice holds get tiles of their own; the rest errs as much as without them."""
+def test_exploded_splats_do_not_affect_others(preset):
+    """Values outside every lattice get their own tiles; errors of the other splats stay as they are without them."""
     source, result = scene("exploded")[0], encoded("exploded", preset)
     assert any(note.startswith("sh0: huge values coarsen 1 of") for note in result.report.notes)
     decoded = decode(result.data)
@@ -293,8 +274,3 @@ def test_exploded_splats_harm_no_others(preset):
     assert errors["sh1"][0] <= 2.0 * steps["sh_step"]
     scales = np.sort(decoded.scales[rest], axis=1) - np.sort(source.scales[result.source_index[rest]], axis=1)
     assert np.abs(scales).max() <= 0.51 * steps["scale_step"]
-
-
-def test_the_guide_names_every_condition():
-    assert list(DRAWN) == list(guide_figures())
-    assert sorted(2 * NAMES) == sorted(row[0] for row in guide_rows() if len(row) == 4)

@@ -1,4 +1,4 @@
-"""Scenes at the extremes on the command line: exit codes, one-line errors, nothing half-written, no warnings."""
+"""Extreme scenes on the command line: exit codes, one-line errors, no partial output, no warnings."""
 
 import json
 import re
@@ -8,8 +8,8 @@ import pytest
 from extremes import CONDITIONS, DRAWN, NAMES, write_columns, write_scene
 from typer.testing import CliRunner
 
-pytest.importorskip("numba", reason="pictures need numba: pip install 'csplat[render]'")
-pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
+pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
+pytest.importorskip("PIL.Image", reason="rendering needs pillow: pip install 'csplat[render]'")
 
 from csplat import read_ply
 from csplat_tools.cli.app import app
@@ -18,17 +18,17 @@ pytestmark = [pytest.mark.extremes, pytest.mark.slow, pytest.mark.usefixtures("s
 
 LONG = pytest.mark.area(name="extremes")
 FEW = ("--views", 3, "--view-size", "40x30", "--effort", 1)
-USUAL = ("half the rows NaN",)  # conditions of the usual tests
+QUICK = ("half the rows NaN",)  # conditions that are tested outside the area, too
 
 
 @pytest.fixture
-def unseen(monkeypatch):
-    """No scene is looked at after encoding."""
+def without_estimate(monkeypatch):
+    """Skip the PSNR estimate after encoding."""
     monkeypatch.setattr("csplat_tools.cli.encode.estimate_psnr", lambda *_args, **_options: None)
 
 
 def run(*words):
-    """Run a command; whatever NumPy warns of is an error here, and errors that are not ours are raised."""
+    """Run a command. Warnings of NumPy are errors, and exceptions other than ours are raised."""
     done = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
     assert "Traceback" not in done.stderr
     assert "Warning" not in done.stderr
@@ -36,7 +36,7 @@ def run(*words):
 
 
 def refused(*words):
-    """Run a command that is to fail: one line gives the reason."""
+    """Run a command that fails with one line on standard error; return that line."""
     done = run(*words)
     assert 1 == done.exit_code
     errors = [line for line in done.stderr.splitlines() if not line.startswith(("note: ", "repair: "))]
@@ -49,7 +49,7 @@ def names_in(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in USUAL else LONG) for name in DRAWN])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK else LONG) for name in DRAWN])
 def test_the_whole_chain(name, tmp_path):
     ply, file, back = write_scene(tmp_path, name), tmp_path / "scene.csplat", tmp_path / "back.ply"
     condition = CONDITIONS[name]
@@ -86,7 +86,7 @@ def test_strict_refuses_in_one_line_and_writes_nothing(name, tmp_path):
 
 
 @LONG
-def test_a_million_identical_splats_become_a_file_that_is_too_much_for_a_picture(tmp_path):
+def test_a_million_identical_splats_are_encoded_but_not_rendered(tmp_path):
     ply, file = write_scene(tmp_path, "a million identical"), tmp_path / "scene.csplat"
     assert 0 == run("encode", ply, file, "--preset", "fast").exit_code
     assert file.stat().st_size < 6_000
@@ -97,9 +97,9 @@ def test_a_million_identical_splats_become_a_file_that_is_too_much_for_a_picture
     assert ["scene.csplat", "scene.ply"] == names_in(tmp_path)
 
 
-@pytest.mark.usefixtures("unseen")
-def test_a_splat_of_huge_and_of_small_scales_has_a_stated_error(tmp_path):
-    """A lattice that holds a log scale of -3e38 takes one of -1000 for 0."""
+@pytest.mark.usefixtures("without_estimate")
+def test_a_splat_with_huge_and_small_scales_has_declared_bounds(tmp_path):
+    """A lattice that contains a log scale of -3e38 rounds one of -1000 to 0."""
     columns = CONDITIONS["exploded"].make()
     columns["scales"][50] = [-3e38, -1000.0, -1000.0]
     ply = write_columns(tmp_path / "scene.ply", columns)
@@ -110,8 +110,8 @@ def test_a_splat_of_huge_and_of_small_scales_has_a_stated_error(tmp_path):
     assert 0 == run("verify", file, "--source", ply).exit_code
 
 
-@pytest.mark.usefixtures("unseen")
-def test_a_scene_without_splats_becomes_an_empty_file_and_one_of_nothing_but_nan_none(tmp_path):
+@pytest.mark.usefixtures("without_estimate")
+def test_a_scene_without_splats_gives_an_empty_file_and_one_of_nan_is_refused(tmp_path):
     columns = CONDITIONS["needles"].make()
     ply, file = tmp_path / "scene.ply", tmp_path / "scene.csplat"
     write_columns(ply, {name: array[:0] for name, array in columns.items()})
@@ -125,7 +125,7 @@ def test_a_scene_without_splats_becomes_an_empty_file_and_one_of_nothing_but_nan
     assert ["pictures", "scene.csplat", "scene.ply"] == names_in(tmp_path)
 
 
-def test_encoding_says_no_more_than_what_was_repaired(tmp_path):
+def test_quiet_encoding_prints_only_repairs(tmp_path):
     ply = write_scene(tmp_path, "half the rows NaN")
     done = run("encode", ply, tmp_path / "scene.csplat", "-q")
     assert (0, "") == (done.exit_code, done.stdout)

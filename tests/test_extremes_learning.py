@@ -1,40 +1,37 @@
-"""Scenes at the extremes: simplified, trained on, tuned. Figures and words stand in codec/EXTREMES.md.
+"""Extreme scenes: simplified, trained on, fine-tuned. tools/docs/results/extremes.md describes the results.
 
-The usual tests refuse what cannot be learnt from, and see that a little learning survives (test_extremes.py); how good
-it gets is in the area `extremes`.
+test_extremes.py checks that a little learning survives; tests of the quality it reaches are in the area `extremes`.
 """
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from extremes import COUNT, NAMES, encoded, guide_rows, judge
+from extremes import COUNT, EXPECTED, NAMES, encoded, scorer
 
-pytest.importorskip("numba", reason="learning needs numba: pip install 'csplat[render]'")
+pytest.importorskip("numba", reason="training needs numba: pip install 'csplat[render]'")
 pytest.importorskip("scipy", reason="training needs scipy: pip install 'csplat[render]'")
 
-# Importing it needs what is looked for above.
+# These imports need numba and scipy.
 from captures import views_of
-from extremes_learnt import (
-    BLACK,
-    COARSE,
+from extremes_chain import (
     FEW,
     QUICK,
     SHORT,
-    before_and_after,
+    assert_finite,
     half,
-    learnt_from,
-    photographs,
-    small_judge,
+    images,
+    small_scene,
+    small_scorer,
     trained,
+    tune_on_renders,
     tuned,
+    verify,
 )
 
 from csplat import EncodeOptions, decode, encode
-from csplat.decoder import read_declared_bounds, read_header
-from csplat.encoder import EncodePlan, encode_with_report, fix_quantisation
+from csplat.encoder import encode_with_report
 from csplat.errors import InputError
-from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.optimise.pruning import simplify
 from csplat_tools.optimise.target_encoding import encode_to
@@ -45,53 +42,33 @@ from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.training_checkpoint import fit_to_options
 from csplat_trainer.training_loop import train
-from csplat_trainer.tuning import renders_of, split_views, tune
 
-pytestmark = [
-    pytest.mark.extremes,
-    pytest.mark.slow,
-    pytest.mark.usefixtures("small_views"),
-]
+pytestmark = [pytest.mark.extremes, pytest.mark.slow, pytest.mark.usefixtures("small_views")]
 LONG = pytest.mark.area(name="extremes")
 
-ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
-
-def assert_finite(model):
-    for name in ARRAYS:
-        assert np.isfinite(getattr(model, name)).all(), name
-
-
-def told(name, column):
-    """Return a cell about a condition in the guide's second table."""
-    return next(row[column] for row in guide_rows() if row[0] == name and len(row) == 4 and "→" in row[2])
-
-
-# simplification
+# Simplification
 
 
 @LONG
 @pytest.mark.parametrize("name", NAMES)
-def test_half_the_splats_keep_what_the_guide_says(name):
-    source, found = learnt_from(name), half(name)
+def test_half_the_splats_keep_the_psnr_of_the_results(name):
+    source, found = small_scene(name), half(name)
     assert max(1, len(source) // 2) == len(found.model)
     assert_finite(found.model)
-    assert small_judge(name).psnr(found.model) >= float(told(name, 1)) - 0.3
+    assert small_scorer(name).psnr(found.model) >= EXPECTED[name]["half_psnr"] - 0.3
     assert found.report["check_psnr"] >= found.report["check_psnr_pruned"] - 1.0
 
 
 @LONG
 @pytest.mark.parametrize("name", NAMES)
-def test_a_simplified_file_states_what_holds(name):
-    source = learnt_from(name)
+def test_a_simplified_file_is_within_its_declared_bounds(name):
+    source = small_scene(name)
     views, options = find_view_set(source, count=10, size=(60, 45)), FEW
     result = encode_to(source, keep=0.5, views=views, simplifying=options).result
     decoded = decode(result.data)
     assert max(1, len(source) // 2) == len(decoded)
-    proof = verify_bounds(
-        Source.of(source), decoded, read_header(result.data), read_declared_bounds(result.data), result.source_index
-    )
-    assert () == proof.failures
+    assert () == verify(source, result, decoded).failures
     assert_finite(decoded)
 
 
@@ -100,24 +77,24 @@ def test_a_simplified_file_states_what_holds(name):
     ("name", "most"), [("all transparent", 0.1), ("saturated SH", 1.0), ("a million identical", 0.25)]
 )
 def test_a_target_psnr_is_reached(name, most):
-    source = learnt_from(name)
+    source = small_scene(name)
     found = simplify(source, psnr=33.0, views=views_of(virtual_cameras(source, 16, 60, 45)), options=FEW)
     assert found.report["validation_psnr"] >= 33.0
     assert len(found.model) <= most * len(source)
 
 
 @LONG
-def test_a_fit_that_saturated_colours_mislead_is_refused():
-    """The fit counts colours beyond 1 as they are, pictures do not show them."""
-    found = simplify(learnt_from("saturated SH"), keep=0.97, options=FEW)
+def test_a_refit_misled_by_saturated_colours_is_refused():
+    """The loss of the refit includes colours above 1, which images clip."""
+    found = simplify(small_scene("saturated SH"), keep=0.97, options=FEW)
     assert found.report["check_psnr"] >= found.report["check_psnr_pruned"] - 1.0
     assert found.report["refit_refused"]
 
 
 @LONG
-def test_measured_importances_serve_what_stands_before_a_giant_background():
-    """By opacity and size the background owns the codebook."""
-    source = learnt_from("giant background")
+def test_measured_importances_serve_the_object_in_front_of_a_giant_background():
+    """Ranked by opacity and size, the background would own the codebook."""
+    source = small_scene("giant background")
     found = measure_sensitivity(source, virtual_cameras(source, 32, 160, 120))
     importance = StoredSensitivity.of(source, found).importance()
     guessed = encoded("giant background", "balanced").data
@@ -125,49 +102,49 @@ def test_measured_importances_serve_what_stands_before_a_giant_background():
     scalar = encode(source, EncodeOptions(sh_coding="scalar"))
     assert len(measured) < 1.02 * len(guessed)
     assert len(scalar) < 1.26 * len(guessed)
-    found = [judge("giant background").psnr(decode(data)) for data in (guessed, measured, scalar)]
+    found = [scorer("giant background").psnr(decode(data)) for data in (guessed, measured, scalar)]
     assert [found[0], found[2]] == pytest.approx([28.7, 41.0], abs=0.7)
-    assert found[1] == pytest.approx(40.4, abs=2.5)  # the clusters of 300 splats depend on the last digit of a weight
+    assert found[1] == pytest.approx(40.4, abs=2.5)  # clusters of 300 splats depend on rounding of the weights
 
 
 @LONG
-def test_a_pile_of_identical_splats_wants_a_finer_quality():
-    """Compare with the guide's figures: errors of alpha add up in a pile of identical splats."""
-    source, judged = learnt_from("a million identical"), small_judge("a million identical")
-    told = ("small", None, 22.3), ("balanced", None, 30.0), ("fast", None, 35.1), ("balanced", 70.0, 37.9)
-    for preset, quality, psnr in told:
-        found = judged.psnr(decode(encode(source, EncodeOptions(preset=preset, attribute_psnr=quality))))
-        assert found == pytest.approx(psnr, abs=0.5)
+def test_a_pile_of_identical_splats_requires_a_finer_quality():
+    """Errors of alpha add up; the figures are those of the results page."""
+    source, views = small_scene("a million identical"), small_scorer("a million identical")
+    expected = ("small", None, 22.3), ("balanced", None, 30.0), ("fast", None, 35.1), ("balanced", 70.0, 37.9)
+    for preset, quality, psnr in expected:
+        data = encode(source, EncodeOptions(preset=preset, attribute_psnr=quality))
+        assert views.psnr(decode(data)) == pytest.approx(psnr, abs=0.5)
 
 
-# training
+# Training
 
 
 @LONG
 @pytest.mark.parametrize("name", NAMES)
-def test_training_begins_at_centres_and_brings_the_loss_down(name):
+def test_training_from_centres_lowers_the_loss(name):
     result = trained(name)
     losses = result.log["losses"]
     assert_finite(result.model)
     assert COUNT == len(result.model)
-    # Points without colours start with the photographs' colours, nearly the final ones if all splats are alike.
+    # Points without colours start with those of the images, which are nearly final if all splats are alike.
     assert np.mean(losses[-10:]) < max(0.92 * np.mean(losses[:10]), 0.03)
 
 
 @LONG
 @pytest.mark.parametrize("name", ["giant background", "float32 limits", "exploded", "a million identical"])
 def test_splitting_and_cloning_keep_splats_finite(name):
-    """The gradient strategy draws the halves of a split from its shape, however large."""
+    """The gradient strategy samples the halves of a split from its shape, however large."""
     options = replace(QUICK, strategy="gradient", init="points", max_splats=2 * COUNT, grad_threshold=0.0)
-    result = train(photographs(name, learnt_from(name).means[:COUNT]), options)
+    result = train(images(name, small_scene(name).means[:COUNT]), options)
     assert_finite(result.model)
     assert len(result.model) > COUNT
 
 
 @LONG
 @pytest.mark.parametrize("name", ["10 km away", "giant background", "all transparent", "half the rows NaN"])
-def test_training_begins_in_a_box(name):
-    result = train(photographs(name), QUICK)
+def test_training_from_random_points_does_not_raise_the_loss(name):
+    result = train(images(name), QUICK)
     assert_finite(result.model)
     assert result.log["losses"][-1] <= result.log["losses"][0]
 
@@ -177,14 +154,14 @@ def test_training_learns_transparency():
     assert trained("all transparent").metrics["psnr_mean"] > 40.0
 
 
-def test_splats_that_start_in_one_place_are_as_large_as_if_they_filled_the_scene():
-    data = photographs("a million identical", learnt_from("a million identical").means[:COUNT])
+def test_splats_that_start_in_one_place_get_sizes_that_fill_the_scene():
+    data = images("a million identical", small_scene("a million identical").means[:COUNT])
     scales = train(data, replace(QUICK, iterations=1, init="points")).model.scales
     assert (-4.0, 1.0) < (scales.min(), scales.max()) < (1.0, 1.0)
 
 
-def test_a_checkpoint_of_exploded_splats_goes_on_with_those_most_visible():
-    model = learnt_from("exploded")
+def test_resuming_with_fewer_splats_keeps_the_most_visible():
+    model = small_scene("exploded")
     parameters = Parameters.starting_at(from_model(model, 1))
     left = fit_to_options(parameters, replace(QUICK, max_splats=40), np.random.default_rng(0))
     largest = {tuple(row) for row in model.means[[44, 46]].tolist()}
@@ -192,38 +169,35 @@ def test_a_checkpoint_of_exploded_splats_goes_on_with_those_most_visible():
     assert largest <= {tuple(row) for row in left.values["means"].tolist()}
 
 
-def test_points_that_are_not_finite_are_refused_and_left_out_of_files(tmp_path):
+def test_points_that_are_not_finite_are_refused_by_training_and_skipped_in_files(tmp_path):
     points = np.zeros((4, 3), np.float32)
     points[1, 2], points[3, 0] = np.nan, np.inf
     with pytest.raises(InputError, match="2 of the data set's 4 points are NaN or infinite"):
-        train(photographs("needles", points), replace(QUICK, init="points"))
+        train(images("needles", points), replace(QUICK, init="points"))
     rows = ("1 nan 0 0 9 9 9 0", "2 1e300 0 0 9 9 9 0", "3 1 2 3 255 0 0 0", "4 0 -inf 0 9 9 9 0")
     (tmp_path / "points3D.txt").write_text("\n".join(rows))
     kept, colours = read_points(tmp_path / "points3D.txt")
     assert ([[1.0, 2.0, 3.0]], [[1.0, 0.0, 0.0]]) == (kept.tolist(), colours.tolist())
 
 
-# fine-tuning
+# Fine-tuning
 
 
 @LONG
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "exploded"])
 def test_a_tuned_file_is_no_worse_than_before(name):
-    _, result, aside = tuned(name)
-    decoded = before_and_after(name)
+    *decoded, result, views = tuned(name)
     assert_finite(decoded[1])
-    before, after = (aside.psnr(model) for model in decoded)
-    assert after >= before - 0.5  # SSIM and L1 decide which step is best
+    before, after = map(views.psnr, decoded)
+    assert after >= before - 0.5  # the best step is chosen by SSIM and L1
     assert after == pytest.approx(min(result.log["best_psnr"], 99.0), abs=0.01)
     if name in ("a million identical", "half the rows NaN", "10 km away"):
         assert after >= before + 1.0
 
 
 def test_splats_wider_than_float32_are_tuned():
-    """Their standard deviation is e^100."""
-    source = learnt_from("needles").select(slice(40))
-    source = replace(source, scales=np.full_like(source.scales, 100.0))
-    views = split_views(renders_of(source, virtual_cameras(source, 6, 32, 24), BLACK, None), BLACK, validation_count=2)
-    fixed = fix_quantisation(EncodePlan.of(source, COARSE))
-    result = tune(fixed, views, replace(SHORT, iterations=20))
+    source = small_scene("needles").select(slice(40))
+    source = replace(source, scales=np.full_like(source.scales, 100.0))  # standard deviation e^100
+    cameras = virtual_cameras(source, 6, 32, 24)
+    fixed, result, _ = tune_on_renders(source, cameras, 2, replace(SHORT, iterations=20))
     assert_finite(decode(fixed.encode(result.best_values).write().data))

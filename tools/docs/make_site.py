@@ -34,7 +34,6 @@ SOURCES = {
     "c.md": "codec/c/README.md",
     "format.md": "spec/format.md",
     "conformance.md": "conformance/README.md",
-    "extremes.md": "codec/EXTREMES.md",
     "architecture.md": "ARCHITECTURE.md",
     "contributing.md": "CONTRIBUTING.md",
     "changelog.md": "CHANGELOG.md",
