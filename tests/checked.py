@@ -12,7 +12,7 @@ from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.encoder.error_bounds import measured_sums
 from csplat.errors import InputError
 from csplat.formats import detect_format
-from csplat.model import normalise_quats
+from csplat.model import SplatModel, normalise_quats
 from csplat_conformance.validator import validate
 
 
@@ -56,6 +56,19 @@ def flipped(data, places, mask=lambda at: 1 << at % 8):
     """Yield the bytes with one of them changed by a mask, for each place."""
     for at in places:
         yield data[:at] + bytes([data[at] ^ mask(at)]) + data[at + 1 :]
+
+
+def cloud(means, sizes=0.03, **fields):
+    """Return a scene of grey splats of alpha 0.9 at these means; a size may be infinite."""
+    count, sizes = len(means), np.asarray(sizes, np.float32).reshape(-1, 1)
+    arrays = {
+        "means": np.asarray(means, np.float32),
+        "quats": np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        "scales": np.broadcast_to(np.log(sizes), (count, 3)).astype(np.float32),
+        "opacities": np.full(count, 0.9, np.float32),
+        "sh0": np.zeros((count, 3), np.float32),
+    }
+    return SplatModel(**{**arrays, **fields})
 
 
 def covariances(quats, scales):

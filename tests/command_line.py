@@ -23,6 +23,13 @@ def invoke(*words):
     return CliRunner().invoke(app, [str(word) for word in words])
 
 
+def call(*words, status=0):
+    """Run `csplat WORDS`, assert its exit status, and return the result."""
+    result = invoke(*words)
+    assert status == result.exit_code, (result.output, result.exception)
+    return result
+
+
 class InThisProcess:
     """A worker of `csplat batch` without a process, which counts its runs."""
 

@@ -1,4 +1,4 @@
-"""Tiny data sets of each kind, written to disk: a few cameras that look at three dots."""
+"""Tiny data sets of each kind on disk: a few cameras that look at three dots."""
 
 import json
 import struct
@@ -15,7 +15,7 @@ COLOURS = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]])
 
 
 def cameras(count, width=W, height=H, up=(0, 0, 1)):
-    """Around the origin, z up or another axis."""
+    """Return cameras around the origin."""
     K = intrinsics(width, height, 50.0)
     angles = np.linspace(0.3, 5.0, count)
     above = np.array(up, np.float64)
@@ -25,7 +25,7 @@ def cameras(count, width=W, height=H, up=(0, 0, 1)):
 
 
 def write_picture(path, camera, mode="RGB", scale=1):
-    """Black, with a dot where each point falls."""
+    """Write a black image with a dot at the projection of each point."""
     width, height = camera.W // scale, camera.H // scale
     pixels = np.zeros((height, width, len(mode)), np.uint8)
     for point, colour in zip(POINTS, COLOURS, strict=True):
@@ -76,7 +76,7 @@ def write_transforms(folder, missing=(), up=(0, 0, 1), at=(0, 0, 0)):
 
 
 def quaternion(rotation):
-    """w x y z (Bar-Itzhack: the eigenvector of the largest eigenvalue)."""
+    """Return w x y z of a rotation (Bar-Itzhack: the eigenvector of the largest eigenvalue)."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
     lower = [
         [xx + yy + zz, 0, 0, 0],
@@ -91,7 +91,7 @@ MODELS = {"PINHOLE": 1, "FULL_OPENCV": 6}
 
 
 def write_colmap(folder, shots, model="PINHOLE", parameters=None, text=False, width=W, height=H, at=(0, 0, 0)):
-    """A sparse model of cameras and the three points, with all coordinates around another place."""
+    """Write a sparse model of cameras and the three points, with coordinates around `at`."""
     shots, points = [relative_to(np.negative(at), one) for one in shots], POINTS + at
     folder.mkdir(parents=True, exist_ok=True)
     K = shots[0].K
@@ -133,7 +133,7 @@ def write_colmap_set(folder, text=False, up=(0, 0, 1), at=(0, 0, 0)):
 
 
 def rename_in_images_txt(folder, name):
-    """Write the model as text again, with other names of the images."""
+    """Write the model again as text, with other names of the images."""
     write_colmap(folder / "sparse" / "0", cameras(9), text=True)
     for file in (folder / "sparse" / "0").glob("*.bin"):
         file.unlink()
@@ -144,6 +144,10 @@ def rename_in_images_txt(folder, name):
     for i in range(9):
         text = text.replace(f"<{i}>", name(i))
     file.write_text(text)
+
+
+def frames_of(folder):
+    return json.loads((folder / "transforms.json").read_text())["frames"]
 
 
 def change_transforms(folder, **changes):

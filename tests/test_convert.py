@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from checked import cloud
+from command_line import call, invoke
 from tables import failures
-from typer.testing import CliRunner
 
 import csplat
 from csplat import formats
@@ -17,16 +18,10 @@ from csplat.formats import spz
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply import read_ply, write_ply
 from csplat.scene_source import source_from_model
-from csplat_tools.cli.app import app, command_function
+from csplat_tools.cli.app import command_function
 from csplat_tools.convert_file import Filters, convert_file, find_floaters
 from csplat_tools.encode_file import OutOfCoreOptions, encode_file
 from csplat_tools.scene_files import open_scenes
-
-
-def call(*words, status=0):
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    assert status == result.exit_code, (result.output, result.exception)
-    return result
 
 
 @pytest.fixture
@@ -94,7 +89,7 @@ def test_degree_4_is_converted_encoded_and_fixed_with_fewer_bands(tmp_path, ply)
 def test_invalid_arguments_are_refused(tmp_path, ply, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     before = ply.read_bytes()
-    result = CliRunner().invoke(app, ["convert", "in.ply", *words])
+    result = invoke("convert", "in.ply", *words)
     assert result.exit_code in (1, 2)
     assert message in result.stderr
     assert before == ply.read_bytes()
@@ -147,16 +142,7 @@ def test_floaters_are_splats_without_neighbours():
 
 
 def test_floaters_are_dropped():
-    points, sizes = lonely()
-    n = len(points)
-    model = SplatModel(
-        means=points.astype(np.float32),
-        quats=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-        scales=np.log(np.tile(sizes[:, None], 3)).astype(np.float32),
-        opacities=np.full(n, 0.9, np.float32),
-        sh0=np.zeros((n, 3), np.float32),
-    )
-    left = Filters(drop_floaters=True).apply(source_from_model(model))
+    left = Filters(drop_floaters=True).apply(source_from_model(cloud(*lonely())))
     assert 3001 == left.count == len(left.model())
 
 

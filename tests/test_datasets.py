@@ -1,4 +1,4 @@
-"""Readers of data sets, on tiny ones made here and on the shared ones."""
+"""Readers of data sets, on tiny sets and on the shared ones."""
 
 import json
 from dataclasses import replace
@@ -14,9 +14,8 @@ pytest.importorskip("numba", reason="the trainer needs numba: pip install 'cspla
 pytest.importorskip("scipy", reason="undistortion needs scipy: pip install 'csplat[render]'")
 Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
 
-# Importing them needs what is looked for above.
 from PIL import ExifTags, ImageFile  # noqa: E402
-from posed_sets import (  # noqa: E402
+from posed_sets import (  # noqa: E402  # noqa: E402  # noqa: E402
     COLOURS,
     POINTS,
     H,
@@ -24,6 +23,7 @@ from posed_sets import (  # noqa: E402
     assert_dots_are_where_points_fall,
     cameras,
     change_transforms,
+    frames_of,
     rename_in_images_txt,
     to_opengl,
     write_blender,
@@ -76,7 +76,7 @@ def test_blender_sets_keep_their_split_and_their_transparency(blender):
     assert_dots_are_where_points_fall([*data.train, *data.test])
 
 
-def test_validation_pictures_are_those_that_are_there(blender):
+def test_validation_images_may_be_missing(blender):
     document = json.loads((blender / "transforms_test.json").read_text())
     (blender / "transforms_val.json").write_text(json.dumps(document))
     assert 3 == len(load(blender).val)
@@ -88,7 +88,7 @@ def test_validation_pictures_are_those_that_are_there(blender):
     assert any("transforms_val.json: 3 of 3 images are missing" in line for line in data.report)
 
 
-def test_transforms_json_reports_missing_pictures_and_splits_every_eighth(ngp):
+def test_missing_images_are_reported_and_every_eighth_is_a_test_image(ngp):
     data = load(ngp)
     assert (7, 2) == (len(data.train), len(data.test))
     assert ["images/0000.png", "images/0009.png"] == [picture.camera.image for picture in data.test]
@@ -97,26 +97,23 @@ def test_transforms_json_reports_missing_pictures_and_splits_every_eighth(ngp):
     assert len(load(ngp / "transforms.json", test_every=0).train) == 9
 
 
-def test_transforms_json_may_name_its_test_pictures(ngp):
-    document = json.loads((ngp / "transforms.json").read_text())
-    document["test_filenames"] = ["./images/0003.png", "images/0004.png"]
-    (ngp / "transforms.json").write_text(json.dumps(document))
+def test_transforms_json_may_name_its_test_images(ngp):
+    change_transforms(ngp, test_filenames=["./images/0003.png", "images/0004.png"])
     data = load(ngp)
     assert ["images/0003.png"] == [picture.camera.image for picture in data.test]
 
 
 def test_frames_may_have_intrinsics_of_their_own_and_a_world_scale(ngp):
-    document = json.loads((ngp / "transforms.json").read_text())
-    frame = document["frames"][1]
-    frame["fl_x"] = frame["fl_y"] = 77.0
-    frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([2.0, 2.0, 2.0, 1.0])).tolist()
-    (ngp / "transforms.json").write_text(json.dumps(document))
+    frames = frames_of(ngp)
+    frames[1] |= {"fl_x": 77.0, "fl_y": 77.0}
+    frames[1]["transform_matrix"] = (np.array(frames[1]["transform_matrix"]) @ np.diag([2.0, 2.0, 2.0, 1.0])).tolist()
+    change_transforms(ngp, frames=frames)
     picture = next(p for p in load(ngp).train if p.camera.image == "images/0001.png")
     assert 77.0 == picture.camera.K[0, 0]
     assert np.allclose(cameras(10)[1].viewmat, picture.camera.viewmat)
 
 
-def test_colmap_sets_bring_points_and_colours(colmap):
+def test_colmap_sets_have_points_and_colours(colmap):
     data = load(colmap)
     assert (7, 2) == (len(data.train), len(data.test))
     assert ["im 000.png", "im 008.png"] == [picture.camera.image for picture in data.test]
@@ -129,7 +126,7 @@ def test_colmap_sets_bring_points_and_colours(colmap):
     assert_dots_are_where_points_fall([*data.train, *data.test])
 
 
-def test_test_txt_names_the_test_pictures(colmap):
+def test_test_txt_names_the_test_images(colmap):
     (colmap / "sparse" / "0" / "test.txt").write_text("im 002.png\nim 005.png\n")
     data = load(colmap)
     assert ["im 002.png", "im 005.png"] == [picture.camera.image for picture in data.test]
@@ -138,7 +135,7 @@ def test_test_txt_names_the_test_pictures(colmap):
     assert ["im 002.png"] == [picture.camera.image for picture in load(colmap).test]
 
 
-def test_a_list_of_test_images_that_are_not_there_is_reported(colmap_set):
+def test_missing_test_images_of_a_list_are_reported(colmap_set):
     (colmap_set / "test.txt").write_text("im 002.png\nother.png\n")
     data = load(colmap_set)
     assert ["im 002.png"] == [picture.camera.image for picture in data.test]
@@ -149,7 +146,7 @@ def test_a_list_of_test_images_that_are_not_there_is_reported(colmap_set):
     assert "test.txt names 1 test image, none of them is there; missing: other.png" in data.report
 
 
-def test_images_of_one_name_in_two_folders_are_told_apart(colmap_set):
+def test_images_of_one_name_in_two_folders_are_distinguished(colmap_set):
     for number in range(4):
         for camera in "ab":
             file = colmap_set / "images" / camera / f"{number}.png"
@@ -176,16 +173,15 @@ def test_images_of_one_name_in_two_folders_are_told_apart(colmap_set):
     ],
 )
 def test_transforms_json_may_list_its_split(ngp, lists, split, message):
-    change_transforms(
-        ngp, **{f"{role}_filenames": [f"images/{i:04}.png" for i in part] for role, part in lists.items()}
-    )
+    named = {f"{role}_filenames": [f"images/{i:04}.png" for i in part] for role, part in lists.items()}
+    change_transforms(ngp, **named)
     data = load(ngp)
     assert split == (len(data.train), len(data.val), len(data.test))
     assert any(message in line for line in data.report)
     assert data.test_every is None
 
 
-def test_points_are_those_of_ply_file_path(ngp):
+def test_points_are_read_from_ply_file_path(ngp):
     rows = "".join(f"{x} {y} {z} {r} {g} {b}\n" for (x, y, z), (r, g, b) in zip(POINTS, COLOURS, strict=True))
     columns = "".join(f"property float {name}\n" for name in "xyz")
     columns += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
@@ -224,7 +220,7 @@ def test_points_of_colmap_may_be_a_ply(colmap_set):
     assert data.points_rgb is None
 
 
-def test_images_txt_may_leave_out_the_lines_of_keypoints(tmp_path):
+def test_lines_of_keypoints_may_be_absent(tmp_path):
     write_colmap_set(tmp_path, text=True)
     file = tmp_path / "sparse" / "0" / "images.txt"
     lines = file.read_text().splitlines()
@@ -243,7 +239,7 @@ def test_images_txt_may_leave_out_the_lines_of_keypoints(tmp_path):
         load(tmp_path)
 
 
-def test_the_model_of_most_images_is_read(colmap_set):
+def test_the_model_with_most_images_is_read(colmap_set):
     shots = cameras(9)
     (colmap_set / "sparse" / "0").rename(colmap_set / "sparse" / "10")
     write_colmap(colmap_set / "sparse" / "0", shots[:3])
@@ -253,7 +249,7 @@ def test_the_model_of_most_images_is_read(colmap_set):
     assert "there are 3 models: sparse/10 is read, with 9 images; sparse/0 has 3, sparse/2 has 4" in data.report
 
 
-def test_an_image_that_is_twice_in_a_model_is_refused(colmap_set):
+def test_a_duplicated_image_of_a_model_is_refused(colmap_set):
     rename_in_images_txt(colmap_set, lambda i: f"im 00{max(i, 1)}.png")
     with pytest.raises(InputError, match=r"im 001\.png is there twice, with different poses"):
         load(colmap_set)
@@ -275,9 +271,9 @@ def test_an_image_that_is_twice_in_a_model_is_refused(colmap_set):
         ({"mask_path": ""}, "", 10),
     ],
 )
-def test_frames_that_are_no_use_are_left_out(tmp_path, change, words, count):
+def test_unusable_frames_are_left_out(tmp_path, change, words, count):
     write_transforms(tmp_path)
-    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    frames = frames_of(tmp_path)
     frames[3] |= change
     change_transforms(tmp_path, frames=frames)
     data = load(tmp_path, test_every=0)
@@ -285,7 +281,7 @@ def test_frames_that_are_no_use_are_left_out(tmp_path, change, words, count):
     assert not words or f"transforms.json: {words}" in data.report
 
 
-def test_intrinsics_of_other_programs(ngp):
+def test_intrinsics_of_other_programs_are_read(ngp):
     document = json.loads((ngp / "transforms.json").read_text())
     matrix = [[60.0, 0, 25.0, 0], [0, 61.0, 17.0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     change_transforms(ngp, frames=[{**frame, "intrinsic_matrix": matrix} for frame in document["frames"]])
@@ -299,8 +295,8 @@ def test_intrinsics_of_other_programs(ngp):
         load(ngp)
 
 
-def test_a_frame_that_is_there_twice_is_read_once(ngp):
-    frames = json.loads((ngp / "transforms.json").read_text())["frames"]
+def test_a_duplicated_frame_is_read_once(ngp):
+    frames = frames_of(ngp)
     change_transforms(ngp, frames=[*frames, {**frames[3], "file_path": "./images//0003.png"}])
     data = load(ngp, test_every=0)
     assert 9 == len(data.train)
@@ -310,8 +306,8 @@ def test_a_frame_that_is_there_twice_is_read_once(ngp):
         load(ngp)
 
 
-def test_frames_for_test_may_be_a_list_of_their_own(ngp):
-    frames = json.loads((ngp / "transforms.json").read_text())["frames"]
+def test_test_frames_may_be_a_list_of_their_own(ngp):
+    frames = frames_of(ngp)
     change_transforms(ngp, frames=frames[:8], test_frames=frames[8:])
     data = load(ngp)
     assert (7, ["images/0008.png", "images/0009.png"]) == (len(data.train), [one.camera.image for one in data.test])
@@ -336,27 +332,27 @@ def test_a_blender_set_may_have_no_test_frames(blender):
         ("train_test_lists.json", '{"train": ["images/0001.png"], "test": ["0003.png"]}', (1, 0, 1)),
     ],
 )
-def test_lists_of_images_may_lie_next_to_transforms_json(ngp, name, text, split):
+def test_lists_of_images_may_be_next_to_transforms_json(ngp, name, text, split):
     (ngp / name).write_text(text)
     data = load(ngp)
     assert split == (len(data.train), len(data.val), len(data.test))
 
 
-def test_cameras_that_contradict_their_text_are_reported(colmap_set):
+def test_binary_and_text_cameras_that_differ_are_reported(colmap_set):
     for text, message in (("PINHOLE 48 32 51.47 51.47 24 16", False), ("PINHOLE 48 32 99 99 24 16", True)):
         (colmap_set / "sparse" / "0" / "cameras.txt").write_text(f"  # comment\n7 {text}\n")
         report = load(colmap_set).report
         assert message == ("cameras.txt holds other cameras than cameras.bin, which is read" in report), report
 
 
-def test_images_that_contradict_their_text_are_reported(colmap_set):
+def test_binary_and_text_images_that_differ_are_reported(colmap_set):
     write_colmap(colmap_set / "away", cameras(9), text=True)
     (colmap_set / "away" / "images.txt").rename(colmap_set / "sparse" / "0" / "images.txt")
     write_colmap(colmap_set / "sparse" / "0", cameras(3))
     assert "images.txt holds 9 images, images.bin 3: images.bin is read" in load(colmap_set).report
 
 
-def test_the_largest_of_models_in_several_folders_is_read(colmap_set):
+def test_the_largest_model_of_several_folders_is_read(colmap_set):
     write_colmap(colmap_set / "colmap" / "sparse" / "0", cameras(4))
     write_colmap(colmap_set / "sparse", cameras(2))
     write_colmap(colmap_set / "sparse" / "1", cameras(9))
@@ -367,7 +363,7 @@ def test_the_largest_of_models_in_several_folders_is_read(colmap_set):
     assert f"there are 4 models: sparse/0 is read, with 9 images; {others}" in data.report
 
 
-def test_names_of_lists_may_hold_what_separates_others(colmap_set):
+def test_names_in_lists_may_contain_separators(colmap_set):
     names = {3: "a,3.png", 4: "#4.png", 5: "'5'.png"}
     rename_in_images_txt(colmap_set, lambda i: names.get(i, f"im {i:03}.png"))
     for i, name in names.items():
@@ -377,7 +373,7 @@ def test_names_of_lists_may_hold_what_separates_others(colmap_set):
     assert [*names.values(), "im 006.png"] == [picture.camera.image for picture in data.test]
 
 
-def test_an_image_may_have_a_name_of_numbers_or_keypoints_that_are_none(tmp_path):
+def test_names_may_be_numbers_and_keypoints_may_be_nan(tmp_path):
     write_colmap_set(tmp_path, text=True)
     rename_in_images_txt(tmp_path, lambda i: "7 8 0" if i == 3 else f"im {i:03}.png")
     (tmp_path / "images" / "im 003.png").rename(tmp_path / "images" / "7 8 0")
@@ -386,14 +382,14 @@ def test_an_image_may_have_a_name_of_numbers_or_keypoints_that_are_none(tmp_path
     assert 9 == len(load(tmp_path, test_every=0).train)
 
 
-def test_test_images_that_are_for_training_too_are_reported(ngp):
-    frames = json.loads((ngp / "transforms.json").read_text())["frames"]
+def test_test_images_that_are_training_images_are_reported(ngp):
+    frames = frames_of(ngp)
     change_transforms(ngp, test_frames=frames[:2])
     assert any("2 test images used for training, too" in line for line in load(ngp).report)
 
 
-def test_numbers_beyond_float64_are_refused_in_a_line(ngp):
-    frames = json.loads((ngp / "transforms.json").read_text())["frames"]
+def test_numbers_beyond_float64_are_refused(ngp):
+    frames = frames_of(ngp)
     frames[3]["transform_matrix"][0][3] = 10**400
     change_transforms(ngp, frames=frames)
     with pytest.raises(InputError, match="frame 3: transform_matrix is not a matrix of numbers"):
@@ -404,7 +400,7 @@ def test_numbers_beyond_float64_are_refused_in_a_line(ngp):
 
 
 def test_names_with_control_characters_are_refused(ngp):
-    frames = json.loads((ngp / "transforms.json").read_text())["frames"]
+    frames = frames_of(ngp)
     change_transforms(ngp, frames=[{**frames[0], "file_path": "a\nb.png"}])
     with pytest.raises(InputError, match="frame 0: file_path holds control characters"):
         load(ngp)
@@ -416,19 +412,19 @@ def test_names_with_control_characters_are_refused(ngp):
 
 
 def test_a_last_row_may_be_rounded(ngp):
-    frames = json.loads((ngp / "transforms.json").read_text())["frames"]
+    frames = frames_of(ngp)
     frames[3]["transform_matrix"][3] = [0.0, -1e-17, 0.0, 1.0000001]
     change_transforms(ngp, frames=frames)
     assert 9 == len(load(ngp, test_every=0).train)
 
 
 def test_distortion_params_of_nerfstudio_are_read(ngp):
-    frames = json.loads((ngp / "transforms.json").read_text())["frames"]
+    frames = frames_of(ngp)
     change_transforms(ngp, frames=[{**frame, "distortion_params": [0.1, 0, 0, 0, 0, 0]} for frame in frames])
     assert any("lens distortion is undone" in line for line in load(ngp).report)
 
 
-def test_an_empty_file_of_a_model_gives_way_to_its_text(colmap_set):
+def test_text_replaces_an_empty_binary_file_of_a_model(colmap_set):
     write_colmap(colmap_set / "sparse" / "0", cameras(9), text=True)
     (colmap_set / "sparse" / "0" / "cameras.bin").write_bytes(b"")
     assert 7 == len(load(colmap_set).train)
@@ -450,7 +446,7 @@ def test_text_files_may_begin_with_a_byte_order_mark(tmp_path, encoding):
     assert 10 == len(load(document, test_every=0).train)
 
 
-def test_text_in_another_encoding_is_refused_in_a_line(colmap_set):
+def test_text_in_another_encoding_is_refused(colmap_set):
     for name, data, message in (
         ("cp1252", "im 002.png\nK\xf6ln.png".encode("cp1252"), r"byte 12 is 0xf6"),
         ("UTF-16 without a mark", "im 002.png".encode("utf-16-le"), "byte 1 is 0"),
@@ -462,7 +458,7 @@ def test_text_in_another_encoding_is_refused_in_a_line(colmap_set):
         assert name
 
 
-def test_the_smallest_sufficient_folder_of_pictures_is_read(tmp_path):
+def test_the_smallest_sufficient_folder_of_images_is_read(tmp_path):
     shots = cameras(9, 96, 64)
     for scale, folder in ((1, "images"), (2, "images_2"), (4, "images_4")):
         for i, camera in enumerate(shots):
@@ -495,7 +491,7 @@ def test_a_smaller_size_scales_each_axis_by_itself(blender):
     assert np.allclose(np.diag([0.5, 0.25, 1.0]) @ cameras(5)[0].K, picture.camera.K)
 
 
-def test_colours_do_not_bleed_from_where_nothing_is(tmp_path):
+def test_colours_of_transparent_pixels_do_not_bleed(tmp_path):
     pixels = np.zeros((H, W, 4), np.uint8)
     pixels[:, : W // 2] = (200, 100, 50, 255)
     pixels[:, W // 2 :] = (0, 255, 0, 0)
@@ -519,7 +515,7 @@ FAR_PLACES = {"UTM": (500123.25, 4649876.5, 214.75), "ECEF": (-2.7e6, -4.3e6, 3.
 
 @pytest.mark.parametrize("write", [write_colmap_set, partial(write_colmap_set, text=True), write_transforms])
 @pytest.mark.parametrize("place", FAR_PLACES)
-def test_a_set_far_from_0_is_measured_from_an_origin_near_it(tmp_path, write, place):
+def test_a_set_far_from_0_gets_an_origin(tmp_path, write, place):
     at = np.array(FAR_PLACES[place])
     write(tmp_path / "near")
     write(tmp_path / "far", at=at)
@@ -546,7 +542,7 @@ def test_a_set_near_0_keeps_its_coordinates(tmp_path, at):
     assert (0.0, 0.0, 0.0) == load(tmp_path / "transforms.json").origin
 
 
-def test_cameras_far_from_all_others_are_named_and_do_not_count(tmp_path):
+def test_outlier_cameras_are_reported_and_ignored(tmp_path):
     write_colmap_set(tmp_path)
     usual = load(tmp_path).train[0].camera.near
     for moved, words in (
@@ -564,12 +560,8 @@ def test_cameras_far_from_all_others_are_named_and_do_not_count(tmp_path):
         assert usual == pytest.approx(data.train[0].camera.near, rel=0.05)
         assert measure_extent(data.inliers).extent < 5.0
         assert (0.0, 0.0, 0.0) == data.origin
-    assert not any("usual distance" in line for line in reports_of_near_sets(tmp_path / "near"))
-
-
-def reports_of_near_sets(folder):
-    write_colmap_set(folder)
-    return load(folder).report
+    write_colmap_set(tmp_path / "near")
+    assert not any("usual distance" in line for line in load(tmp_path / "near").report)
 
 
 def test_a_camera_beyond_float32_is_refused(tmp_path):
@@ -581,7 +573,7 @@ def test_a_camera_beyond_float32_is_refused(tmp_path):
         load(tmp_path)
 
 
-def test_refuses_what_is_no_data_set(tmp_path):
+def test_other_files_and_folders_are_refused(tmp_path):
     with pytest.raises(InputError, match="is no data set"):
         load(tmp_path)
     with pytest.raises(InputError, match="neither a folder"):
@@ -598,7 +590,7 @@ def test_refuses_what_is_no_data_set(tmp_path):
 
 
 @pytest.mark.parametrize("model", ["sparse", "sparse/model", "colmap/sparse/0", "distorted/sparse/0", "."])
-def test_models_lie_in_several_folders(colmap_set, model):
+def test_models_are_found_in_several_folders(colmap_set, model):
     target = colmap_set / model
     for file in sorted((colmap_set / "sparse" / "0").iterdir()):
         target.mkdir(parents=True, exist_ok=True)
@@ -618,9 +610,8 @@ def test_models_lie_in_several_folders(colmap_set, model):
         ({"k1": -30.0}, "cannot be undone"),
     ],
 )
-def test_refuses_broken_transforms(ngp, change, message):
-    document = json.loads((ngp / "transforms.json").read_text())
-    (ngp / "transforms.json").write_text(json.dumps({**document, **change}))
+def test_invalid_fields_of_transforms_json_are_refused(ngp, change, message):
+    change_transforms(ngp, **change)
     with pytest.raises(InputError, match=message):
         load(ngp)
 
@@ -628,57 +619,51 @@ def test_refuses_broken_transforms(ngp, change, message):
 @pytest.mark.parametrize(
     "matrix", [[], [[1]], np.zeros((4, 4)).tolist(), np.diag([1.0, 1, -1, 1]).tolist(), [["x"] * 4] * 4]
 )
-def test_refuses_poses_that_are_none(ngp, matrix):
-    document = json.loads((ngp / "transforms.json").read_text())
-    document["frames"][2]["transform_matrix"] = matrix
-    (ngp / "transforms.json").write_text(json.dumps(document))
+def test_invalid_poses_are_refused(ngp, matrix):
+    frames = frames_of(ngp)
+    frames[2]["transform_matrix"] = matrix
+    change_transforms(ngp, frames=frames)
     with pytest.raises(InputError, match="frame 2"):
         load(ngp)
 
 
-def test_refuses_a_set_without_pictures(ngp):
+def test_missing_invalid_and_truncated_images_are_refused(ngp):
+    path = ngp / "images" / "0001.png"
+    path.write_bytes(path.read_bytes()[:60])
+    data = load(ngp)
+    with pytest.raises(InputError, match=r"0001\.png is not an image that can be read"):
+        data.read()
+    path.write_text("not a picture")
+    with pytest.raises(InputError, match=r"0001\.png"):
+        load(ngp)
     for path in (ngp / "images").iterdir():
         path.unlink()
     with pytest.raises(InputError, match="none of its 10 images"):
         load(ngp)
 
 
-def test_refuses_a_file_that_is_no_picture(ngp):
-    (ngp / "images" / "0001.png").write_text("not a picture")
-    with pytest.raises(InputError, match=r"0001\.png"):
-        load(ngp)
-
-
-def test_a_picture_that_is_cut_short_is_refused_when_all_are_read(ngp):
-    path = ngp / "images" / "0001.png"
-    path.write_bytes(path.read_bytes()[:60])
-    data = load(ngp)
-    with pytest.raises(InputError, match=r"0001\.png is not an image that can be read"):
-        data.read()
-
-
 @pytest.mark.parametrize("kind", ["blender", "ngp", "colmap"])
 @pytest.mark.parametrize("size", [None, (24, 16)])
-def test_nothing_is_decoded_before_it_is_asked_for(request, monkeypatch, kind, size):
+def test_images_are_decoded_lazily(request, monkeypatch, kind, size):
     folder = request.getfixturevalue(kind if kind != "colmap" else "colmap_set")
     decoded = set()
     decode = ImageFile.ImageFile.load
     monkeypatch.setattr(ImageFile.ImageFile, "load", lambda file: decoded.add(file.filename) or decode(file))
     data = load(folder, size)
     wanted = (size or (W, H))[::-1]
-    assert (kind == "blender") == len(decoded)  # one image is enough to tell whether there is transparency
+    assert (kind == "blender") == len(decoded)  # one image shows that there is transparency
     assert all(picture.has_alpha == (kind == "blender") for picture in (*data.train, *data.test))
     assert data.background == ((1.0, 1.0, 1.0) if kind == "blender" else (0.0, 0.0, 0.0))
     decoded.clear()
     assert wanted == data.test[0].pixels.shape[:2]
     assert wanted == replace(data.test[0], camera=data.test[0].camera).pixels.shape[:2]
-    assert 1 == len(decoded)  # a picture with another camera shares what was read
+    assert 1 == len(decoded)  # an image with another camera shares the pixels
     data.read()
     assert len(data.train) + len(data.test) == len(decoded)
 
 
 @pytest.mark.parametrize("orientation", [6, 8])
-def test_a_picture_on_its_side_is_turned_where_its_lens_is_that_of_the_upright_one(ngp, orientation):
+def test_exif_rotation_is_applied_if_the_camera_is_upright(ngp, orientation):
     for path in sorted((ngp / "images").glob("*.png")):
         with Image.open(path) as shown:
             lying = shown.transpose(Image.Transpose.ROTATE_90 if orientation == 6 else Image.Transpose.ROTATE_270)
@@ -688,14 +673,13 @@ def test_a_picture_on_its_side_is_turned_where_its_lens_is_that_of_the_upright_o
     data = load(ngp)
     assert {(W, H)} == {(picture.camera.W, picture.camera.H) for picture in data.train}
     assert_dots_are_where_points_fall([*data.train, *data.test])
-    document = json.loads((ngp / "transforms.json").read_text())
-    (ngp / "transforms.json").write_text(json.dumps({**document, "w": H, "h": W, "cx": H / 2, "cy": W / 2}))
+    change_transforms(ngp, w=H, h=W, cx=H / 2, cy=W / 2)
     as_stored = load(ngp).train[0]
     assert (H, W) == (as_stored.camera.W, as_stored.camera.H) == as_stored.pixels.shape[1::-1]
 
 
 def _hide(path, size):
-    """A mask: black on the left third."""
+    """Write a mask with a black left third."""
     width, height = size
     values = np.full((height, width), 255, np.uint8)
     values[:, : width // 3] = 0
@@ -705,12 +689,12 @@ def _hide(path, size):
 
 @pytest.mark.parametrize("kind", ["ngp", "colmap"])
 @pytest.mark.parametrize(("size", "sides"), [(None, (W, H)), ((24, 16), (W, H)), (None, (2 * W, 2 * H))])
-def test_a_mask_says_which_pixels_count(request, kind, size, sides):
+def test_a_mask_excludes_pixels(request, kind, size, sides):
     folder = request.getfixturevalue("ngp" if kind == "ngp" else "colmap_set")
     if kind == "ngp":
-        document = json.loads((folder / "transforms.json").read_text())
-        document["frames"][1]["mask_path"] = "masks/one.png"
-        (folder / "transforms.json").write_text(json.dumps(document))
+        frames = frames_of(folder)
+        frames[1]["mask_path"] = "masks/one.png"
+        change_transforms(folder, frames=frames)
         _hide(folder / "masks" / "one.png", sides)
     else:
         _hide(folder / "masks" / "im 001.png.png", sides)
@@ -723,10 +707,10 @@ def test_a_mask_says_which_pixels_count(request, kind, size, sides):
     assert all(picture.mask is None for picture in (*others, *data.test))
 
 
-def test_a_mask_that_is_not_there_or_hides_all_is_refused(ngp):
-    document = json.loads((ngp / "transforms.json").read_text())
-    document["frames"][1]["mask_path"] = "masks/one.png"
-    (ngp / "transforms.json").write_text(json.dumps(document))
+def test_a_missing_or_black_mask_is_refused(ngp):
+    frames = frames_of(ngp)
+    frames[1]["mask_path"] = "masks/one.png"
+    change_transforms(ngp, frames=frames)
     with pytest.raises(InputError, match=r"no mask 'masks/one\.png'.* images/0001\.png"):
         load(ngp)
     (ngp / "masks").mkdir()
@@ -735,7 +719,7 @@ def test_a_mask_that_is_not_there_or_hides_all_is_refused(ngp):
         load(ngp).read()
 
 
-def test_alpha_that_is_1_all_over_is_none(ngp):
+def test_opaque_alpha_is_ignored(ngp):
     for number in (1, 2, 3):
         with Image.open(ngp / "images" / f"000{number}.png") as image:
             image.convert("RGBA").save(ngp / "images" / f"000{number}.png")
@@ -751,7 +735,7 @@ def test_alpha_that_is_1_all_over_is_none(ngp):
     assert "4 of 9 images have transparency: the background of all is black" in data.report
 
 
-def test_a_palette_with_transparency_is_seen_before_it_is_decoded(blender):
+def test_transparency_of_a_palette_is_known_before_decoding(blender):
     path = blender / "train" / "r_0.png"
     with Image.open(path) as image:
         image.quantize(16).save(path, transparency=0)
@@ -770,24 +754,24 @@ def test_a_palette_with_transparency_is_seen_before_it_is_decoded(blender):
         ("colmap_set", {"size": (24, 16), "near": 0.004}, {"size": [24, 16], "near": 0.004, "test_every": 8}),
     ],
 )
-def test_a_set_says_how_it_was_read(request, kind, options, expected):
+def test_a_set_records_its_options(request, kind, options, expected):
     data = load(request.getfixturevalue(kind), **options)
-    said = data.trained_on(data.background).as_json()
-    assert expected == {name: said[name] for name in expected}
-    assert {"background", "near", *expected, *(("test_every",) if kind != "blender" else ())} == set(said)
+    record = data.trained_on(data.background).as_json()
+    assert expected == {name: record[name] for name in expected}
+    assert {"background", "near", *expected, *(("test_every",) if kind != "blender" else ())} == set(record)
     assert data.coordinate_system == ("RFU" if kind == "blender" else "unspecified")
     assert (0, 0, 1) == data.up
     assert any("up is 0 0 1 by the cameras" in line for line in data.report) == (kind != "blender")
 
 
-def test_a_blender_set_in_other_coordinates_does_not_get_the_axes_of_blender(tmp_path):
+def test_a_blender_set_in_other_coordinates_has_unspecified_axes(tmp_path):
     write_blender(tmp_path, up=(0, -1, 0))
     data = load(tmp_path)
     assert ("unspecified", (0, -1, 0)) == (data.coordinate_system, data.up)
     assert any("mostly have other axes" in line for line in data.report)
 
 
-def test_refuses_text_that_is_no_json(tmp_path):
+def test_invalid_json_is_refused(tmp_path):
     (tmp_path / "transforms.json").write_text("{")
     with pytest.raises(InputError, match="not a JSON file"):
         load(tmp_path)
@@ -797,7 +781,7 @@ def test_refuses_text_that_is_no_json(tmp_path):
 @pytest.mark.parametrize(
     "write", [write_blender, write_transforms, write_colmap_set, partial(write_colmap_set, text=True)]
 )
-def test_a_damaged_set_is_read_or_refused_in_a_line(tmp_path, write):
+def test_a_damaged_set_is_read_or_refused(tmp_path, write):
     write(tmp_path)
     (tmp_path / "test.txt").write_text("im 002.png\n0003.png\n")
     files = sorted(path for path in tmp_path.rglob("*") if path.is_file() and path.suffix != ".png")
@@ -815,7 +799,7 @@ def test_a_damaged_set_is_read_or_refused_in_a_line(tmp_path, write):
 
 
 def damaged(data, rng):
-    """Change bytes, cut some out, or put in words that readers may stumble over."""
+    """Change, remove or insert bytes, some of them words that are special to readers."""
     words = (b"nan", b"-nan(ind)", b"1e400", b"null", b"[]", b"..", b"\\", b"\xff", b"\0", b"\n", b"#", b"9" * 12, b'"')
     result = bytearray(data)
     for _ in range(rng.choice((1, 1, 3))):
@@ -848,7 +832,7 @@ def test_every_prefix_of_colmap_files_is_refused(tmp_path):
             read(tmp_path / name)
 
 
-def test_points_with_a_number_that_is_none_are_left_out(tmp_path):
+def test_points_with_non_finite_values_are_left_out(tmp_path):
     rows = ("1 0 0 1 255 0 51", "2 0 nan 0 1 2 3", "3 0 0 1e300 1 2 3", "4 0 0 1 1 inf 3", "5 0 1 0 0 0 0")
     (tmp_path / "points3D.txt").write_text("\n".join(rows))
     points, colours = read_points(tmp_path / "points3D.txt")
@@ -858,14 +842,14 @@ def test_points_with_a_number_that_is_none_are_left_out(tmp_path):
     assert 0 == len(read_points(tmp_path / "points3D.txt")[0])
 
 
-def test_refuses_text_lines_that_are_none(tmp_path):
+def test_invalid_lines_of_images_txt_are_refused(tmp_path):
     for text in ("1 2 3\n", "1 a b c d e f g 7 name\n", "1 0 0 0 0 0 0 0 7 name\n", "1 1 0 0 0 0 0 0 x name\n"):
         (tmp_path / "images.txt").write_text(text)
         with pytest.raises(InputError, match="line 1"):
             read_images(tmp_path / "images.txt")
 
 
-def test_shared_lego(data_dir):
+def test_shared_lego_agrees_with_its_cameras(data_dir):
     data = load(data_dir / "images" / "lego200")
     assert (100, 200) == (len(data.train), len(data.test))
     assert (200, 200, 4) == data.train[0].pixels.shape
@@ -875,7 +859,7 @@ def test_shared_lego(data_dir):
         assert np.isclose(camera["K"][0][0] / camera["W"], picture.camera.K[0, 0] / 200)
 
 
-def test_shared_fox(data_dir):
+def test_shared_fox_agrees_with_its_cameras(data_dir):
     data = load(data_dir / "images" / "fox", (270, 480))
     assert (43, 7) == (len(data.train), len(data.test))
     assert any("17 of 67 images are missing" in line for line in data.report)
@@ -886,7 +870,7 @@ def test_shared_fox(data_dir):
         assert np.allclose(camera["K"], picture.camera.K, atol=2.0)
 
 
-def test_shared_desk_points_fall_where_their_colour_is(data_dir):
+def test_points_of_shared_desk_have_the_colours_of_its_images(data_dir):
     data = load(data_dir / "images" / "desk29")
     assert (25, 4) == (len(data.train), len(data.test))
     assert (7562, 3) == data.points.shape

@@ -1,6 +1,5 @@
 """Images of data sets: names and the files they are found to be; values of every kind of pixel, and masks."""
 
-import json
 import re
 import struct
 import unicodedata
@@ -8,13 +7,14 @@ import zlib
 
 import numpy as np
 import pytest
-from PIL import ExifTags, Image  # it needs what is looked for above
-from posed_sets import (  # it needs what is looked for above
+from PIL import ExifTags, Image
+from posed_sets import (
     H,
     W,
     assert_dots_are_where_points_fall,
     cameras,
     change_transforms,
+    frames_of,
     rename_in_images_txt,
     to_opengl,
     write_blender,
@@ -35,9 +35,10 @@ from csplat_trainer.data import load
 from csplat_trainer.data.image_files import match_names
 from csplat_trainer.data.image_pixels import mask_values, open_image, read_image_header, rgb_pixels
 
+NFC, NFD = (unicodedata.normalize(form, "Köln.png") for form in ("NFC", "NFD"))
 POSES = [to_opengl(camera) for camera in cameras(10)]  # poses of the frames of `write_transforms`
 
-#: Listed name, existing names, the one that matches or the text of the error; words of the note.
+#: Listed name, existing names, the one that matches or the text of the error, words of the note.
 NAMES = {
     "as it is": ("a/1.png", ["a/1.png", "1.png", "A/1.PNG"], "a/1.png", None),
     "a dot": ("./a//1.png", ["a/1.png"], "a/1.png", None),
@@ -53,12 +54,7 @@ NAMES = {
     "another case rather than another ending": ("1.JPG", ["1.jpg", "1.png"], "1.jpg", "in another case"),
     "another case, two files": ("img_1.png", ["IMG_1.png", "Img_1.png"], "fits 2 names", None),
     "another case and ending": ("img_1.jpg", ["IMG_1.PNG"], "IMG_1.PNG", "with another ending"),
-    "another Unicode form": (
-        unicodedata.normalize("NFD", "Köln.png"),
-        [unicodedata.normalize("NFC", "Köln.png")],
-        unicodedata.normalize("NFC", "Köln.png"),
-        "in another case",
-    ),
+    "another Unicode form": (NFD, [NFC], NFC, "in another case"),
     "a URL": ("a/my%20file.png", ["a/my file.png"], "a/my file.png", "as a URL"),
     "a percent sign": ("100%25.png", ["100%25.png", "100%.png"], "100%25.png", None),
     "a file URL": ("file:///home/x/a/1.png", ["a/1.png"], "a/1.png", "without leading folders"),
@@ -71,7 +67,7 @@ NAMES = {
 }
 
 
-def test_names_are_read_more_loosely_only_if_they_are_not_found_as_written():
+def test_names_are_matched_loosely_only_without_an_exact_match():
     def check(case):
         listed, known, expected, words = case
         if expected is not None and "fits" in expected:
@@ -85,7 +81,7 @@ def test_names_are_read_more_loosely_only_if_they_are_not_found_as_written():
     assert [] == failures(NAMES, check)
 
 
-def test_a_missing_name_is_not_looked_for_in_other_folders_if_others_are_found():
+def test_a_missing_name_is_not_searched_in_other_folders_if_others_are_found():
     known = ["images/1.png", "images_2/1.png", "images_2/2.png", "2.png"]
     assert ({"images/1.png": "images/1.png"}, []) == match_names(["images/1.png", "images/2.png"], known, "x")
 
@@ -109,7 +105,7 @@ def transforms(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("folder", "says"),
+    ("folder", "note"),
     [
         ("Images", "images from Images"),
         ("input", "images from input"),
@@ -118,11 +114,11 @@ def transforms(tmp_path):
         ("images/deeper", "9 names of images.txt found in folders below"),
     ],
 )
-def test_images_of_colmap_lie_in_folders_of_several_names(colmap_set, folder, says):
+def test_images_of_colmap_are_found_in_several_folders(colmap_set, folder, note):
     rename_in_images_txt(colmap_set, "im {:03}.png".format)
     move(colmap_set / "images", colmap_set / folder)
     data = load(colmap_set)
-    assert any(says in line for line in data.report)
+    assert any(note in line for line in data.report)
     assert_dots_are_where_points_fall([*data.train, *data.test])
 
 
@@ -136,7 +132,7 @@ def test_originals_belong_to_the_distorted_model(colmap_set):
 @pytest.mark.parametrize(
     "name", ["IM {:03}.PNG", "photos/im {:03}.png", "D:\\photos\\im {:03}.png", "im {:03}.jpg", "./im {:03}.png"]
 )
-def test_images_of_colmap_have_names_of_another_machine(colmap_set, name):
+def test_names_of_images_of_another_machine_are_found(colmap_set, name):
     rename_in_images_txt(colmap_set, name.format)
     data = load(colmap_set)
     assert (7, 2) == (len(data.train), len(data.test))
@@ -178,7 +174,7 @@ def test_the_message_names_the_folders_that_were_tried(colmap_set):
         ("photos/{:04}", "PHOTOS"),
     ],
 )
-def test_frames_name_images_of_another_machine(transforms, path, folder):
+def test_paths_of_frames_of_another_machine_are_found(transforms, path, folder):
     move(transforms / "images", transforms / folder)
     frames = [{"file_path": path.format(i), "transform_matrix": matrix} for i, matrix in enumerate(POSES)]
     change_transforms(transforms, frames=frames)
@@ -188,7 +184,7 @@ def test_frames_name_images_of_another_machine(transforms, path, folder):
     assert any("10 names of transforms.json found" in line or "images from images" in line for line in data.report)
 
 
-def test_frames_without_images_do_not_take_those_of_others(tmp_path):
+def test_frames_without_images_are_left_out(tmp_path):
     write_transforms(tmp_path)
     (tmp_path / "images" / "0003.png").rename(tmp_path / "0003.png")
     data = load(tmp_path, test_every=0)
@@ -196,7 +192,7 @@ def test_frames_without_images_do_not_take_those_of_others(tmp_path):
     assert "transforms.json: 1 of 10 images are missing and left out: images/0003.png" in data.report
 
 
-def test_training_and_test_images_of_blender_are_not_the_same_files(tmp_path):
+def test_training_and_test_images_must_be_different_files(tmp_path):
     write_blender(tmp_path)
     move(tmp_path / "train", tmp_path)
     move(tmp_path / "test", tmp_path / "away")
@@ -206,14 +202,14 @@ def test_training_and_test_images_of_blender_are_not_the_same_files(tmp_path):
     assert 5 == len(load(tmp_path).train)
 
 
-def test_images_of_transforms_json_may_be_taken_from_a_folder_that_is_named(transforms):
+def test_another_folder_of_images_may_be_chosen(transforms):
     for i, camera in enumerate(cameras(10)):
         write_picture(transforms / "images_2" / f"{i:04}.png", camera, scale=2)
     assert W // 2 == load(transforms, images="images_2").train[0].camera.W
     assert W == load(transforms).train[0].camera.W
 
 
-def test_masks_are_found_as_images_are(transforms):
+def test_masks_are_found_like_images(transforms):
     (transforms / "masks").mkdir()
     for i, camera in enumerate(cameras(10)):
         write_picture(transforms / "masks" / f"{i:04}.png", camera)
@@ -225,9 +221,8 @@ def test_masks_are_found_as_images_are(transforms):
     change_transforms(transforms, frames=frames)
     data = load(transforms)
     assert "masks hide parts of 10 images: they do not count" in data.report
-    assert any(
-        "10 names of transforms.json found with / for \\, without spaces around it" in line for line in data.report
-    )
+    note = "10 names of transforms.json found with / for \\, without spaces around it"
+    assert any(note in line for line in data.report)
 
 
 def test_a_link_to_nowhere_is_a_missing_image(colmap_set):
@@ -251,18 +246,13 @@ def test_masks_that_fit_no_image_are_reported(colmap_set):
     assert any("1 name of masks/ found in another case: im 003.png is IM 003.png" in line for line in report)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "masks/im 003.png",
-        "masks/im 003.png.png",
-        "masks/im 003.jpg",
-        "Masks/im 003.png",
-        "mask/im 003_mask.png",
-        "masks/mask_im 003.jpg",
-        "masks/im 003.mask.png",
-    ],
-)
+MASK_NAMES = [
+    "masks/im 003.png", "masks/im 003.png.png", "masks/im 003.jpg", "Masks/im 003.png", "mask/im 003_mask.png",
+    "masks/mask_im 003.jpg", "masks/im 003.mask.png",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MASK_NAMES)
 def test_masks_have_names_of_several_programs(colmap_set, name):
     (colmap_set / name).parent.mkdir()
     write_picture(colmap_set / name, cameras(9)[3])
@@ -271,7 +261,7 @@ def test_masks_have_names_of_several_programs(colmap_set, name):
     assert ["im 003.png"] == [picture.camera.image for picture in data.train if picture.masked is not None]
 
 
-def test_hidden_files_are_no_candidates(tmp_path):
+def test_hidden_files_are_ignored(tmp_path):
     shots = cameras(3)
     write_colmap(tmp_path / "sparse" / "0", shots)
     for i, camera in enumerate(shots):
@@ -291,16 +281,17 @@ def move(source, target):
         source.rmdir()
 
 
-RAMP = np.linspace(0.0, 1.0, W * H).reshape(H, W)  # 0 to 1 in every kind
+RAMP = np.linspace(0.0, 1.0, W * H).reshape(H, W)
 GREY = np.rint(255.0 * RAMP).astype(np.uint8)
 RGB = np.stack([GREY, GREY[::-1], GREY[:, ::-1]], axis=2)
 HALF_SEEN = np.where(RAMP < 0.5, 0, 200).astype(np.uint8)
 RGBA = np.dstack([RGB, HALF_SEEN])
 UINT16 = np.rint(65535.0 * RAMP).astype(np.uint16)
+SWAPPED = UINT16.astype(">u2").tobytes()
 
 
 def tiff(path, values, bits, kind, *, channels=1, photometric=1, planes=1):
-    """Write a TIFF of one strip a plane, in kinds that pillow does not write: 1 unsigned, 2 signed, 3 float."""
+    """Write a TIFF with one strip per plane, in kinds that Pillow does not write: 1 unsigned, 2 signed, 3 float."""
     data = np.ascontiguousarray(values).tobytes()
     size = len(data) // (channels if planes == 2 else 1)
     strips = channels if planes == 2 else 1
@@ -328,7 +319,7 @@ def tiff(path, values, bits, kind, *, channels=1, photometric=1, planes=1):
 
 
 def png_16(path, colours):
-    """Write a PNG of 16 bits RGB, which pillow does not: [H, W, 3], big-endian."""
+    """Write [H, W, 3] big-endian as a 16-bit RGB PNG, which Pillow does not."""
     rows = b"".join(b"\0" + row.tobytes() for row in colours)
     head = struct.pack(">IIBBBBB", colours.shape[1], colours.shape[0], 16, 2, 0, 0, 0)
     chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
@@ -336,6 +327,10 @@ def png_16(path, colours):
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
     ]
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(whole))
+
+
+def saved(pixels):
+    return lambda path: Image.fromarray(pixels).save(path)
 
 
 def palette(path):
@@ -348,66 +343,33 @@ def transparent_grey(path):
     Image.fromarray(UINT16).save(path, transparency=int(UINT16[0, 0]))
 
 
-#: File, how it is written, and its pixels to within the number that follows.
+#: File, writer, expected pixels, and their tolerance.
 READ = {
-    "RGB": ("a.png", lambda p: Image.fromarray(RGB).save(p), RGB, 0),
-    "RGBA": ("a.png", lambda p: Image.fromarray(RGBA).save(p), RGBA, 0),
-    "grey": ("a.png", lambda p: Image.fromarray(GREY).save(p), GREY, 0),
-    "grey and alpha": (
-        "a.png",
-        lambda p: Image.fromarray(np.dstack([GREY, HALF_SEEN])).save(p),
-        np.dstack([GREY, GREY, GREY, HALF_SEEN]),
-        0,
-    ),
-    "1 bit": ("a.png", lambda p: Image.fromarray(RAMP > 0.5).save(p), 255 * (RAMP > 0.5), 0),
-    "palette with transparency": (
-        "a.png",
-        palette,
-        np.where((GREY > 127)[..., None], (40, 50, 60, 255), (200, 10, 30, 0)),
-        0,
-    ),
+    "RGB": ("a.png", saved(RGB), RGB, 0),
+    "RGBA": ("a.png", saved(RGBA), RGBA, 0),
+    "grey": ("a.png", saved(GREY), GREY, 0),
+    "grey and alpha": ("a.png", saved(np.dstack([GREY, HALF_SEEN])), np.dstack([GREY, GREY, GREY, HALF_SEEN]), 0),
+    "1 bit": ("a.png", saved(RAMP > 0.5), 255 * (RAMP > 0.5), 0),
+    "palette": ("a.png", palette, np.where((GREY > 127)[..., None], (40, 50, 60, 255), (200, 10, 30, 0)), 0),
     "CMYK": ("a.tif", lambda p: Image.fromarray(RGB).convert("CMYK").save(p), RGB, 1),
     "YCbCr": ("a.tif", lambda p: Image.fromarray(RGB).convert("YCbCr").save(p), RGB, 3),
     "LAB": ("a.tif", lambda p: Image.fromarray(RGB).convert("RGB").convert("LAB").save(p), (H, W, 3), 0),
-    "16-bit grey PNG": ("a.png", lambda p: Image.fromarray(UINT16).save(p), GREY, 0),
-    "16-bit grey with a transparent value": (
-        "a.png",
-        transparent_grey,
-        np.dstack([GREY, GREY, GREY, 255 * (UINT16 != UINT16[0, 0])]),
-        0,
-    ),
-    "16-bit grey TIFF": ("a.tif", lambda p: Image.fromarray(UINT16).save(p), GREY, 0),
-    "16-bit grey, bytes swapped": (
-        "a.tif",
-        lambda p: Image.frombytes("I;16B", (W, H), UINT16.astype(">u2").tobytes()).save(p),
-        GREY,
-        0,
-    ),
+    "16-bit grey PNG": ("a.png", saved(UINT16), GREY, 0),
+    "transparent value": ("a.png", transparent_grey, np.dstack([GREY] * 3 + [255 * (UINT16 != UINT16[0, 0])]), 0),
+    "16-bit grey TIFF": ("a.tif", saved(UINT16), GREY, 0),
+    "16-bit grey, bytes swapped": ("a.tif", lambda p: Image.frombytes("I;16B", (W, H), SWAPPED).save(p), GREY, 0),
     "16-bit grey, white is 0": ("a.tif", lambda p: tiff(p, 65535 - UINT16, 16, 1, photometric=0), GREY, 0),
-    "16-bit grey PGM": (
-        "a.pgm",
-        lambda p: p.write_bytes(f"P5 {W} {H} 65535 ".encode() + UINT16.astype(">u2").tobytes()),
-        GREY,
-        0,
-    ),
+    "16-bit grey PGM": ("a.pgm", lambda p: p.write_bytes(f"P5 {W} {H} 65535 ".encode() + SWAPPED), GREY, 0),
     "16-bit RGB": ("a.tif", lambda p: tiff(p, RGB.astype(np.uint16) * 257, 16, 1, channels=3, photometric=2), RGB, 0),
     "16-bit RGB PNG": ("a.png", lambda p: png_16(p, np.ascontiguousarray(RGB.astype(">u2") * 257, ">u2")), RGB, 0),
-    "float TIFF": ("a.tif", lambda p: Image.fromarray(RAMP.astype(np.float32)).save(p), GREY, 0),
+    "float TIFF": ("a.tif", saved(RAMP.astype(np.float32)), GREY, 0),
 }
 
-#: File, how it is written, and the text of the error.
+#: File, writer, and the text of the error.
 REFUSED = {
-    "float beyond 1": (
-        "a.tif",
-        lambda p: Image.fromarray((255 * RAMP).astype(np.float32)).save(p),
-        "holds floats from 0 to 255, expected 0 to 1",
-    ),
-    "float that is none": (
-        "a.tif",
-        lambda p: Image.fromarray(np.full((H, W), np.nan, np.float32)).save(p),
-        "holds floats from nan to nan",
-    ),
-    "32-bit grey": ("a.tif", lambda p: Image.fromarray(UINT16.astype(np.int32)).save(p), "grey of 32 bits"),
+    "float beyond 1": ("a.tif", saved((255 * RAMP).astype(np.float32)), "holds floats from 0 to 255, expected 0 to 1"),
+    "NaN": ("a.tif", saved(np.full((H, W), np.nan, np.float32)), "holds floats from nan to nan"),
+    "32-bit grey": ("a.tif", saved(UINT16.astype(np.int32)), "grey of 32 bits"),
     "signed 16 bits": ("a.tif", lambda p: tiff(p, (UINT16 // 2).astype(np.int16), 16, 2), "or with a sign"),
     "16-bit RGB in planes": (
         "a.tif",
@@ -432,31 +394,31 @@ def pixels_of(path):
         return rgb_pixels(image, path)
 
 
-def test_every_kind_of_pixel_is_read_for_what_it_means(tmp_path):
+def test_pixels_of_every_kind_are_read(tmp_path):
     def check(case):
-        name, write, wanted, tolerance = case
+        name, write, expected, tolerance = case
         path = tmp_path / name
         write(path)
         found = pixels_of(path)
         assert np.uint8 == found.dtype
         assert read_image_header(path).has_alpha == (found.shape[2] == 4)
         assert (W, H) == read_image_header(path).size
-        if isinstance(wanted, tuple):
-            assert wanted == found.shape
+        if isinstance(expected, tuple):
+            assert expected == found.shape
             return
-        wanted = np.repeat(wanted[..., None], 3, axis=2) if wanted.ndim == 2 else wanted
-        assert wanted.shape == found.shape
-        assert np.abs(found.astype(int) - wanted).max() <= tolerance
+        expected = np.repeat(expected[..., None], 3, axis=2) if expected.ndim == 2 else expected
+        assert expected.shape == found.shape
+        assert np.abs(found.astype(int) - expected).max() <= tolerance
 
     assert [] == failures(READ, check)
 
 
-def test_other_kinds_are_refused_by_name(tmp_path):
+def test_other_kinds_of_pixels_are_refused(tmp_path):
     def check(case):
-        name, write, says = case
+        name, write, message = case
         path = tmp_path / name
         write(path)
-        with pytest.raises(InputError, match=says):
+        with pytest.raises(InputError, match=message):
             pixels_of(path)
 
     assert [] == failures(REFUSED, check)
@@ -491,7 +453,7 @@ def test_a_set_reports_how_its_pixels_are_read(tmp_path):
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6])
-def test_a_turn_that_nothing_decides_is_reported(tmp_path, orientation):
+def test_an_ambiguous_exif_rotation_is_reported(tmp_path, orientation):
     write_transforms(tmp_path)
     for path in sorted((tmp_path / "images").glob("*.png")):
         exif = Image.Exif()
@@ -500,12 +462,12 @@ def test_a_turn_that_nothing_decides_is_reported(tmp_path, orientation):
             image.save(path, exif=exif)
     data = load(tmp_path)
     assert_dots_are_where_points_fall([*data.train, *data.test])
-    told = [line for line in data.report if "EXIF" in line]
-    assert (orientation == 3) == bool(told)  # 6 would swap the sides, which the cameras' sizes contradict
-    assert all("orientation 3): read as stored" in line for line in told)
+    notes = [line for line in data.report if "EXIF" in line]
+    assert (orientation == 3) == bool(notes)  # 6 would swap the sides, which contradicts the cameras
+    assert all("orientation 3): read as stored" in line for line in notes)
 
 
-def test_a_square_image_on_its_side_is_undecided(tmp_path):
+def test_the_exif_rotation_of_a_square_image_is_reported(tmp_path):
     write_transforms(tmp_path)
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 6
@@ -520,7 +482,7 @@ LABELS = SHAPE.astype(np.uint8)
 VOC = Image.fromarray(LABELS, "P")
 VOC.putpalette([0, 0, 0, 128, 0, 0])
 
-#: Files of a mask, and whether how it was understood is reported.
+#: Images of a mask, and whether its interpretation is reported.
 MASKS = {
     "0 and 255": (Image.fromarray(255 * LABELS), False),
     "1 bit": (Image.fromarray(SHAPE), False),
@@ -538,15 +500,15 @@ MASKS = {
 }
 
 
-def test_masks_of_every_kind_count_the_same(tmp_path):
+def test_masks_of_every_kind_are_read_alike(tmp_path):
     def check(case):
-        image, told = case
+        image, is_reported = case
         path = tmp_path / "mask.tif"
         image.save(path)
         with open_image(path) as opened:
             found = mask_values(opened, path)
         assert ((found.values >= 128) == SHAPE).all()
-        assert told == bool(found.taken_as)
+        assert is_reported == bool(found.taken_as)
 
     assert [] == failures(MASKS, check)
 
@@ -554,7 +516,7 @@ def test_masks_of_every_kind_count_the_same(tmp_path):
 def test_masks_of_0_and_1_are_reported_and_grey_ones_refused(tmp_path):
     write_transforms(tmp_path)
     Image.fromarray(LABELS).save(tmp_path / "mask.png")
-    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    frames = frames_of(tmp_path)
     change_transforms(tmp_path, frames=[{**frame, "mask_path": "mask.png"} for frame in frames])
     data = load(tmp_path)
     assert "masks as mask.png: values are 0 and 1: 1 counts as white" in data.report

@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from PIL import Image  # it needs what is looked for above
+from PIL import Image
 from posed_sets import (
     H,
     W,
     cameras,
     change_transforms,
+    frames_of,
     to_opengl,
     write_colmap,
     write_colmap_set,
@@ -36,7 +37,7 @@ LENS_W, LENS_H = 120, 90
 FOCAL = [100.0, 98.0, 62.0, 44.0]
 ONE_FOCAL = [100.0, 61.0, 44.0]
 
-#: Parameters of the models of COLMAP that are read, with the distortions of ordinary lenses.
+#: Parameters of COLMAP's models with the distortions of ordinary lenses; None for models that are refused.
 MODELS = {
     "SIMPLE_PINHOLE": ONE_FOCAL,
     "PINHOLE": FOCAL,
@@ -60,7 +61,7 @@ MODELS = {
 
 
 def colmap_pixel(model, parameters, x, y):
-    """Project the direction (x, y, 1) one at a time, as COLMAP's documentation of each model has it."""
+    """Project the direction (x, y, 1) by COLMAP's documentation of the model."""
     if len(parameters) > 3 and model not in ("SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"):
         fx, fy, cx, cy, *extra = parameters
     else:
@@ -96,7 +97,7 @@ def read_lens(folder, model, parameters):
     return read_cameras(path)[1]
 
 
-def test_every_model_of_colmap_puts_pixels_where_colmap_does(tmp_path):
+def test_lens_models_agree_with_the_documentation_of_colmap(tmp_path):
     rng = np.random.default_rng(3)
     points = rng.uniform(-0.6, 0.6, (40, 2))
 
@@ -115,7 +116,7 @@ def test_every_model_of_colmap_puts_pixels_where_colmap_does(tmp_path):
     assert [] == failures({model: (model, parameters) for model, parameters in MODELS.items()}, check)
 
 
-def test_models_of_binary_files_have_the_numbers_of_colmap(tmp_path):
+def test_lens_models_of_binary_files_have_the_numbers_of_colmap(tmp_path):
     file = tmp_path / "cameras.bin"
 
     def check(case):
@@ -144,12 +145,12 @@ def test_a_lens_without_distortion_is_a_pinhole(tmp_path, text):
 
 
 def scene(x, y):
-    """A smooth image over directions: red, green, blue, 0..255."""
+    """Return a smooth function of directions: red, green, blue, 0..255."""
     return 127.5 + 100.0 * np.stack([np.sin(9 * x + 2 * y), np.cos(8 * y - 3 * x), np.sin(7 * x * y + 5 * x)], axis=-1)
 
 
 def photograph(lens, path):
-    """Paint the scene as a lens sees it: directions of pixels are found step by step."""
+    """Write an image of the scene through a lens, whose inverse is found by iteration."""
     v, u = np.mgrid[0:LENS_H, 0:LENS_W] + 0.5
     plain = Lens(LENS_W, LENS_H, lens.fx, lens.fy, lens.cx, lens.cy)
     at_u, at_v = u.copy(), v.copy()
@@ -162,7 +163,7 @@ def photograph(lens, path):
 
 
 def assert_is_straight(picture, what):
-    """Compare an undistorted image with the scene as its pinhole sees it: interpolation errs by a few levels."""
+    """Compare an undistorted image with the scene through its pinhole; interpolation errs by a few levels."""
     K = picture.camera.K
     v, u = np.mgrid[0:LENS_H, 0:LENS_W] + 0.5
     wanted = scene((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1])
@@ -171,7 +172,7 @@ def assert_is_straight(picture, what):
     assert error.max() < 4.0, what
 
 
-def test_images_of_every_model_are_straight(tmp_path):
+def test_images_of_every_lens_model_are_undistorted(tmp_path):
     def check(case):
         model, parameters = case
         folder = tmp_path / model
@@ -180,8 +181,8 @@ def test_images_of_every_model_are_straight(tmp_path):
         write_colmap(folder / "sparse", cameras(1), model, parameters, text=True, width=LENS_W, height=LENS_H)
         data = load(folder, test_every=0)
         assert_is_straight(data.train[0], model)
-        told = [line for line in data.report if "distortion is undone" in line or "fisheye images are cut" in line]
-        assert (0 if not lens.distorts else 2 if "FISHEYE" in model else 1) == len(told)
+        notes = [line for line in data.report if "distortion is undone" in line or "fisheye images are cut" in line]
+        assert (0 if not lens.distorts else 2 if "FISHEYE" in model else 1) == len(notes)
 
     assert [] == failures({model: (model, values) for model, values in MODELS.items() if values}, check)
 
@@ -193,7 +194,7 @@ def write_lens_transforms(folder, **values):
     (folder / "transforms.json").write_text(json.dumps(document))
 
 
-def test_transforms_json_states_the_same_lenses(tmp_path):
+def test_lenses_of_transforms_json_are_undistorted(tmp_path):
     k = dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), MODELS["FULL_OPENCV"][4:], strict=True))
     fisheye = dict(zip(("k1", "k2", "k3", "k4"), MODELS["OPENCV_FISHEYE"][4:], strict=True))
 
@@ -213,7 +214,7 @@ def test_transforms_json_states_the_same_lenses(tmp_path):
     assert [] == failures(cases, check)
 
 
-def test_factors_that_a_model_does_not_have_are_refused(tmp_path):
+def test_factors_of_other_lens_models_are_refused(tmp_path):
     Image.new("RGB", (LENS_W, LENS_H)).save(tmp_path / "a.png")
     (tmp_path / "images").mkdir()
     (tmp_path / "a.png").rename(tmp_path / "images" / "a.png")
@@ -235,8 +236,8 @@ def test_factors_that_a_model_does_not_have_are_refused(tmp_path):
     assert [] == failures(cases, check)
 
 
-def test_distortion_moves_pixels_as_opencv_says():
-    """One point worked out by hand: x = 0.5, y = -0.25, r² = 0.3125."""
+def test_distortion_agrees_with_opencv():
+    # One point worked out by hand: x = 0.5, y = -0.25, r² = 0.3125.
     lens = Lens(100, 80, 100.0, 90.0, 50.0, 40.0, (0.1, -0.02), (0.01, -0.03))
     straight = Lens(100, 80, 100.0, 90.0, 50.0, 40.0)
     radial = 1 + 0.1 * 0.3125 - 0.02 * 0.3125**2
@@ -256,19 +257,17 @@ def test_distortion_moves_pixels_as_opencv_says():
         ((0.0, 0.0, 0.1), (0.0, 0.0)),
     ],
 )
-def test_undistortion_never_looks_beyond_the_picture(radial, tangential):
+def test_undistortion_stays_within_the_image(radial, tangential):
     lens = Lens(540, 960, 688.0, 687.0, 277.0, 482.0, radial, tangential)
     v, u = np.mgrid[0:960, 0:540] + 0.5
     x, y = distorted(u, v, lens, undistorted_lens(lens))
-    assert x.min() >= 0.0
-    assert x.max() <= 540.0
-    assert y.min() >= 0.0
-    assert y.max() <= 960.0
+    assert 0.0 <= x.min() < x.max() <= 540.0
+    assert 0.0 <= y.min() < y.max() <= 960.0
 
 
 POSE = np.array(to_opengl(cameras(10)[0]))
 SHEARED = POSE @ np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-PIXELS = 51.47  # the focal length of the set, about
+PIXELS = 51.47  # pixels; the approximate focal length of the set
 
 #: Fields of transforms.json, and the text of the error.
 FIELDS = {
@@ -306,7 +305,7 @@ MATRICES = {
 
 
 def refusals(folder, cases, change):
-    """Check that a set with each of the changes is refused in the words of the case."""
+    """Return the cases whose change of a set is not refused with their message."""
     write_transforms(folder)
     file = folder / "transforms.json"
     whole = json.loads(file.read_text())
@@ -320,11 +319,11 @@ def refusals(folder, cases, change):
     return failures(cases, check)
 
 
-def test_fields_that_contradict_each_other_are_refused(tmp_path):
+def test_contradictory_fields_are_refused(tmp_path):
     assert [] == refusals(tmp_path, FIELDS, lambda _, fields: fields)
 
 
-def test_matrices_that_are_no_poses_are_refused(tmp_path):
+def test_invalid_matrices_are_refused(tmp_path):
     def change(whole, matrix):
         return {"frames": [{**whole["frames"][0], "transform_matrix": matrix.tolist()}, *whole["frames"][1:]]}
 
@@ -332,9 +331,9 @@ def test_matrices_that_are_no_poses_are_refused(tmp_path):
     assert [] == refusals(tmp_path, cases, change)
 
 
-def test_a_length_of_one_frame_counts_more_than_an_angle_of_all(tmp_path):
+def test_the_focal_length_of_a_frame_overrides_the_angle_of_all(tmp_path):
     write_transforms(tmp_path)
-    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    frames = frames_of(tmp_path)
     own = [{**frame, "fl_x": 77.0, "fl_y": 77.0} for frame in frames]
     change_transforms(tmp_path, frames=own, camera_angle_x=0.5)
     assert {77.0} == {picture.camera.K[0, 0] for picture in load(tmp_path).train}
@@ -357,7 +356,7 @@ def test_an_image_of_another_shape_than_its_camera_is_reported(tmp_path):
 
 def test_a_mask_of_another_shape_than_its_image_is_refused(tmp_path):
     write_transforms(tmp_path)
-    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    frames = frames_of(tmp_path)
     change_transforms(tmp_path, frames=[{**frame, "mask_path": "mask.png"} for frame in frames])
     Image.new("L", (W // 2, H // 2), 255).save(tmp_path / "mask.png")
     assert load(tmp_path).train[0].mask.all()
@@ -366,9 +365,9 @@ def test_a_mask_of_another_shape_than_its_image_is_refused(tmp_path):
         load(tmp_path)
 
 
-def test_the_scale_of_a_world_is_taken_off_and_reported(tmp_path):
+def test_the_scale_of_poses_is_removed_and_reported(tmp_path):
     write_transforms(tmp_path)
-    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    frames = frames_of(tmp_path)
     assert not any("scaled" in line for line in load(tmp_path).report)
     scaled = (np.array(frames[1]["transform_matrix"]) @ np.diag([2.0, 2.0, 2.0, 1.0])).tolist()
     change_transforms(tmp_path, frames=[frames[0], {**frames[1], "transform_matrix": scaled}, *frames[2:]])
@@ -382,7 +381,7 @@ def test_smaller_images_may_be_rounded_either_way(tmp_path):
     files = sorted((tmp_path / "images").glob("*.png"))
 
     def notes(width, height, of):
-        """Return lines on shapes, of images of one size and a camera of another."""
+        """Return the notes on shapes for images of one size and a camera of another."""
         for path in files:
             Image.new("RGB", (width, height)).save(path)
         w, h = of
@@ -416,7 +415,7 @@ def test_a_rotation_of_another_length_is_normalised_and_reported(tmp_path):
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_cameras_and_poses_that_are_no_use_do_not_refuse_a_set(tmp_path, text):
+def test_invalid_cameras_and_poses_are_left_out(tmp_path, text):
     write_colmap_set(tmp_path, text=text)
     model = tmp_path / "sparse" / "0"
     if text:
@@ -452,7 +451,7 @@ def test_doubtful_lenses_and_poses_are_reported(tmp_path):
     inverse = [replace(shot, viewmat=np.linalg.inv(shot.viewmat)) for shot in shots]
     write_colmap(tmp_path / "sparse" / "0", inverse)
     line = "9 of 9 cameras (im 001.png, …) see none of the points: with inverted poses they would: the file holds"
-    assert any(line in said for said in load(tmp_path).report)
+    assert any(line in note for note in load(tmp_path).report)
 
 
 @pytest.mark.parametrize(
@@ -465,7 +464,7 @@ def test_doubtful_lenses_and_poses_are_reported(tmp_path):
 )
 def test_poses_of_other_conventions_are_reported(tmp_path, change, message):
     write_transforms(tmp_path)
-    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    frames = frames_of(tmp_path)
     for frame in frames:
         frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
     change_transforms(tmp_path, frames=frames)
@@ -473,9 +472,9 @@ def test_poses_of_other_conventions_are_reported(tmp_path, change, message):
     assert [] == found if message is None else message in found[0]
 
 
-def test_one_camera_far_away_does_not_make_the_others_look_inverted(tmp_path):
+def test_an_outlier_camera_does_not_make_the_others_look_inverted(tmp_path):
     write_transforms(tmp_path)
-    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    frames = frames_of(tmp_path)
     frames[2]["transform_matrix"][0][3] += 5000.0
     change_transforms(tmp_path, frames=frames)
     report = load(tmp_path).report
@@ -483,7 +482,7 @@ def test_one_camera_far_away_does_not_make_the_others_look_inverted(tmp_path):
     assert any("the camera of images/0002.png stands 4,9" in line or "stands 5,0" in line for line in report)
 
 
-def test_points_of_one_colour_get_those_of_the_images(tmp_path):
+def test_points_of_one_colour_get_colours_of_the_images(tmp_path):
     write_colmap_set(tmp_path, text=True)
     file = tmp_path / "sparse" / "0" / "points3D.txt"
     file.write_text("1 0 0 0 0 0 0 1\n2 0.4 0.1 0.2 0 0 0 1\n")

@@ -12,9 +12,9 @@ from itertools import permutations, product
 
 import numpy as np
 import pytest
-from checked import covariances
+from checked import cloud, covariances
+from command_line import call
 from posed_sets import write_blender, write_colmap_set, write_transforms
-from typer.testing import CliRunner
 
 from csplat import decode, encode, read_ply, write_ply
 from csplat.editing.transform import (
@@ -27,7 +27,6 @@ from csplat.editing.transform import (
 )
 from csplat.editing.up_axis import unit_up, up_of, with_up
 from csplat.errors import InputError
-from csplat.model import SplatModel
 from csplat.scene_source import source_from_model
 
 pytest.importorskip("numba", reason="the renderer needs numba: pip install 'csplat[render]'")
@@ -39,7 +38,6 @@ from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_paths import orbit_cameras
 from csplat_render.up_estimate import estimate_up, with_estimated_up
-from csplat_tools.cli.app import app
 from csplat_tools.cli.shared_options import parse_up, up_word
 from csplat_tools.views import display_cameras, find_view_set
 from csplat_trainer.data import load
@@ -123,15 +121,7 @@ def photographed_from(up, seed=0, **fields):
     unseen = places @ np.array(up, float) < -0.2
     kept = ~unseen | (np.arange(4000) % 40 == 0)
     sizes = np.where(unseen, 0.3, 0.03)[kept]
-    n = int(kept.sum())
-    return SplatModel(
-        means=places[kept].astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-        scales=np.log(np.tile(sizes[:, None], 3)).astype(np.float32),
-        opacities=np.full(n, 0.9, np.float32),
-        sh0=np.zeros((n, 3), np.float32),
-        **fields,
-    )
+    return cloud(places[kept], sizes, **fields)
 
 
 @pytest.mark.parametrize("up", AXES)
@@ -374,12 +364,6 @@ ALMOST_NONE = {"max_splats": 40, "sh_degree": 0, "iterations": 1, "strategy": "n
 TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # -y to z
 
 
-def call(*words):
-    done = CliRunner().invoke(app, [str(word) for word in words])
-    assert 0 == done.exit_code, (done.stderr, done.exception)
-    return done.stdout
-
-
 def trained(write, up):
     @functools.cache
     def known(folder):
@@ -431,12 +415,12 @@ def test_all_commands_agree_on_up(tmp_path, make_model, make, words, axes, up):
     call("decode", tmp_path / "a.csplat", tmp_path / "b.ply")
     call("encode", tmp_path / "b.ply", tmp_path / "b.csplat", "--preset", "fast", "-q")
     for path in (tmp_path / "a.csplat", tmp_path / "b.csplat"):
-        info = json.loads(call("info", path, "--json"))
+        info = json.loads(call("info", path, "--json").stdout)
         assert (axes, None if up is None else list(up)) == (info["coordinate_system"], info["up"])
     scene, wishes = in_page(path)
     assert (up, {}) == (up_of(scene.metadata, scene.coordinate_system), wishes)
     shown = "unknown" if up is None else " ".join(f"{value:g}" for value in up)
-    assert f"\nup           {shown}\n" in call("info", tmp_path / "b.csplat")
+    assert f"\nup           {shown}\n" in call("info", tmp_path / "b.csplat").stdout
     model = read_ply(tmp_path / "b.ply")
     assert (scene.coordinate_system, scene.metadata.get("up")) == (model.coordinate_system, model.metadata.get("up"))
     upright(orbit_cameras(model, 2, 64, 48), up or (0, -1, 0))  # without a recorded up: as in a PLY

@@ -6,12 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-# Importing them needs what is looked for above.
-# Importing them needs what is looked for above.
 from captures import H, W, as_colmap, cameras, photograph, photograph_object, shell
+from command_line import call
 from PIL import Image
-from typer.testing import CliRunner
 
 from csplat.errors import InputError
 from csplat.ply import read_ply
@@ -25,7 +22,6 @@ pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'cspl
 from csplat_render.camera import relative_to, resized
 from csplat_render.camera_files import save_cameras
 from csplat_render.scorer import renderer
-from csplat_tools.cli.app import app
 from csplat_tools.views import BLACK, WHITE, DataOptions, ViewSet, find_view_set
 from csplat_tools.views.view_sets import pose_key
 from csplat_trainer.posed_images import evaluate
@@ -35,7 +31,7 @@ KINDS = ("rgb", "rgba", "colmap")
 
 @pytest.fixture(scope="module")
 def sets(tmp_path_factory):
-    """The same sixteen photographs: transforms.json without and with alpha, and COLMAP."""
+    """Write the same sixteen images as transforms.json without and with alpha, and as COLMAP."""
     rgb = photograph(shell(3).select(slice(0, 100)), tmp_path_factory.mktemp("rgb"))
     folders = {"rgb": rgb}
     for kind in KINDS[1:]:
@@ -61,11 +57,11 @@ def numbers(seen_from):
     return [int(camera.image[-6:-4]) for camera in seen_from]
 
 
-# roles
+# Roles.
 @pytest.mark.parametrize("size", [None, (24, 20)])
 @pytest.mark.parametrize("every", [5, 10])
 @pytest.mark.parametrize("kind", KINDS)
-def test_photographs_have_one_role_each(sets, scene, kind, every, size):
+def test_each_image_has_one_role(sets, scene, kind, every, size):
     views = find_view_set(scene, data=DataOptions(str(sets[kind]), size, test_every=every))
     assert list(range(0, 16, every)) == numbers(views.test)
     roles = poses(views)
@@ -81,7 +77,7 @@ def test_photographs_have_one_role_each(sets, scene, kind, every, size):
 @pytest.mark.parametrize(
     ("count", "judging", "virtual"), [(3, 3, True), (39, 39, True), (40, 10, False), (120, 24, False)]
 )
-def test_a_camera_file_is_parted_where_it_holds_enough(scene, tmp_path, count, judging, virtual):
+def test_a_camera_file_is_split_if_it_has_enough_views(scene, tmp_path, count, judging, virtual):
     save_cameras(tmp_path / "cameras.json", cameras(count))
     views = find_view_set(scene, cameras=str(tmp_path / "cameras.json"), count=20)
     assert (judging, virtual) == (len(views.test), views.virtual)
@@ -91,14 +87,14 @@ def test_a_camera_file_is_parted_where_it_holds_enough(scene, tmp_path, count, j
     assert virtual or count == sum(map(len, roles))
 
 
-def test_virtual_views_judge_on_black_whatever_is_behind_the_others(scene):
+def test_virtual_test_views_have_a_black_background(scene):
     views = find_view_set(scene, count=5, validation_count=2, background=WHITE)
     assert (21, 2, 8) == tuple(map(len, poses(views)))
     assert BLACK == views.test_scorer(scene).background
     assert WHITE == views.validation_scorer(scene).background
 
 
-def test_as_many_decide_as_are_asked_for(sets, scene):
+def test_the_number_of_validation_views_may_be_chosen(sets, scene):
     data = DataOptions(str(sets["rgb"]))
     assert 0 == len(find_view_set(scene, data=data, validation_count=0).validation)
     views = find_view_set(scene, data=data, validation_count=4)
@@ -107,7 +103,7 @@ def test_as_many_decide_as_are_asked_for(sets, scene):
         find_view_set(scene, data=data, validation_count=14)
 
 
-def test_validation_photographs_of_a_set_decide(sets, scene, tmp_path):
+def test_validation_images_of_a_set_are_validation_views(sets, scene, tmp_path):
     shutil.copytree(sets["rgb"], tmp_path, dirs_exist_ok=True)
     document = json.loads((tmp_path / "transforms.json").read_text())
     for part, rows in (("train", slice(8)), ("val", slice(8, 12)), ("test", slice(12, 16))):
@@ -123,22 +119,22 @@ def test_validation_photographs_of_a_set_decide(sets, scene, tmp_path):
     assert (0, 0, 8) == tuple(map(len, poses(find_view_set(scene, data=data, split="train"))))
 
 
-def test_the_training_judges_alone(sets, scene):
+def test_the_training_split_may_be_scored_alone(sets, scene):
     views = find_view_set(scene, data=DataOptions(str(sets["rgb"])), split="train")
     assert (0, 0, 14) == tuple(map(len, poses(views)))
 
 
-def test_a_view_of_two_roles_is_refused_in_any_size(scene):
+def test_a_view_of_two_roles_is_refused_at_any_size(scene):
     one, other = cameras(2)
     ViewSet("own", BLACK, [one], [], [other], origin=scene.origin)
     with pytest.raises(InputError, match="own: a view is both a training and a test view"):
         ViewSet("own", BLACK, [one], [], [other, resized(one, 2 * W, 2 * H)])
 
 
-# what the scene says
-def test_the_scene_says_how_its_photographs_are_taken(sets, scene):
-    said = TrainingRecord((0.0, 1.0, 0.0), 5, (24, 20), 0.05)
-    trained = replace(scene, metadata={**scene.metadata, TRAINING: said.as_json()})
+# Recorded training options.
+def test_recorded_training_options_are_the_defaults(sets, scene):
+    record = TrainingRecord((0.0, 1.0, 0.0), 5, (24, 20), 0.05)
+    trained = replace(scene, metadata={**scene.metadata, TRAINING: record.as_json()})
     views = find_view_set(trained, data=DataOptions(str(sets["rgba"])))
     assert [0, 5, 10, 15] == numbers(views.test)
     assert ((0.0, 1.0, 0.0), 24, 0.05) == (views.background, views.test[0].W, views.test[0].near)
@@ -152,7 +148,7 @@ def test_the_scene_says_how_its_photographs_are_taken(sets, scene):
     ] == [line for line in views.notes if "trained" in line]
 
 
-def test_a_scene_that_says_nothing_is_noted_once(sets, scene):
+def test_a_scene_without_a_training_record_is_noted_once(sets, scene):
     for kind in ("rgb", "rgba"):
         views = find_view_set(scene, data=DataOptions(str(sets[kind])))
         assert BLACK == views.background
@@ -160,16 +156,10 @@ def test_a_scene_that_says_nothing_is_noted_once(sets, scene):
     assert () == find_view_set(scene, count=2).notes
 
 
-# commands
-def invoke(*words):
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    assert result.exit_code == 0, (result.stderr, result.exception)
-    return result
-
-
+# Commands.
 @pytest.fixture
 def made(monkeypatch):
-    """The view sets that a command makes."""
+    """Record the view sets that a command makes."""
     known, check = [], ViewSet.__post_init__
 
     def keep(views):
@@ -181,15 +171,15 @@ def made(monkeypatch):
 
 
 @pytest.mark.slow
-def test_no_command_decides_by_what_judges_and_all_say_the_same_of_the_same_scene(sets, made, tmp_path):
-    """The views by which a sweep decides are tested in test_tradeoff.py."""
+def test_no_command_uses_test_views_for_decisions_and_all_agree_on_scores(sets, made, tmp_path):
+    # test_tradeoff.py tests the validation views of a sweep.
     ply, own = sets["rgba"] / "scene.ply", ("--data", sets["rgba"], "--test-every", "5", "--size", "24x20")
     found = {}
 
     def run(*words):
         """Run a command; return its JSON and check the roles of its views."""
         made.clear()
-        result = json.loads(invoke(*words, *own, "--json").stdout)
+        result = json.loads(call(*words, *own, "--json").stdout)
         assert any(views.images for views in made), words
         for views in made:
             roles = poses(views)
@@ -217,15 +207,15 @@ def test_no_command_decides_by_what_judges_and_all_say_the_same_of_the_same_scen
     assert simplified["photographs"]["psnr"] == pytest.approx(again, abs=0.01)
 
 
-def test_another_origin_judges_alike(sets, scene):
+def test_another_origin_does_not_change_scores(sets, scene):
     moved = replace(scene, means=scene.means - np.float32((10.0, -20.0, 5.0)), origin=(10.0, -20.0, 5.0))
     scorers = [find_view_set(one, data=DataOptions(str(sets["rgb"]))).image_test_scorer() for one in (scene, moved)]
     assert scorers[0].psnr(scene) == pytest.approx(scorers[1].psnr(moved), abs=0.01)
     assert scorers[0].psnr(scene) == pytest.approx(scorers[0].psnr(moved), abs=0.01)
 
 
-def test_a_set_in_coordinates_of_a_map_judges_alike(sets, scene, tmp_path):
-    """The scene has another origin than the set, and the camera file none."""
+def test_map_coordinates_of_a_set_do_not_change_scores(sets, scene, tmp_path):
+    # The scene has another origin than the set, and the camera file has none.
     place = np.array((500123.25, 4649876.5, 214.75))
     shutil.copytree(sets["rgb"], tmp_path / "set")
     document = json.loads((tmp_path / "set" / "transforms.json").read_text())
@@ -249,12 +239,6 @@ def test_a_set_in_coordinates_of_a_map_judges_alike(sets, scene, tmp_path):
 SIZE = (24, 20)
 
 
-def call(*words):
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    assert result.exit_code == 0, (result.stderr, result.exception)
-    return result.stdout
-
-
 def photographs(kind, folder):
     folder.mkdir()
     if kind == "blender":
@@ -272,13 +256,13 @@ def photographs(kind, folder):
     ],
 )
 def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, held_out, commands):
-    """None is called with background, split or size: the PLY names them. `encode` searches, which takes long."""
+    # No command gets a background, split or size: the PLY records them. `encode` runs once because it searches.
     data, ply, log = photographs(kind, tmp_path / "data"), tmp_path / "s.ply", tmp_path / "log.json"
     quick = ("--max-splats", 60, "--sh-degree", 0, "--iterations", 10, "--set", "init=box")
     size = "x".join(map(str, SIZE))
     call("train", data, "-o", ply, *quick, "--size", size, "--test-every", every, "--report", log, "-q")
-    said = TrainingRecord.of(read_ply(ply).metadata)
-    assert ((1.0, 1.0, 1.0) if kind == "blender" else (0.0, 0.0, 0.0), SIZE) == (said.background, said.size)
+    record = TrainingRecord.of(read_ply(ply).metadata)
+    assert ((1.0, 1.0, 1.0) if kind == "blender" else (0.0, 0.0, 0.0), SIZE) == (record.background, record.size)
     trained = json.loads(log.read_text())["metrics"]
     found = {name: SCORES[name](ply, data, tmp_path) for name in commands}
     assert {held_out} == {trained["views"]} | {views for views, _ in found.values() if views is not None}
@@ -286,34 +270,37 @@ def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, 
     assert max(scores.values()) - min(scores.values()) < 0.01, scores
 
 
-def compared(ply, data, _):
-    scores = json.loads(call("compare", ply, ply, "--data", data, "--json"))["photographs"]["a"]
+def score_of_compare(ply, data, _):
+    scores = json.loads(call("compare", ply, ply, "--data", data, "--json").stdout)["photographs"]["a"]
     return scores["views"], scores["psnr"]
 
 
-def tuned(ply, data, folder):
-    report = folder / "tuned.json"
+def score_of_finetune(ply, data, folder):
+    report = folder / "score_of_finetune.json"
     words = ("finetune", ply, "--data", data, "-o", folder / "t.csplat", "--iterations", 1, "--set", "sh-coding=none")
     call(*words, "--report", report, "-q")
     return None, json.loads(report.read_text())["scores"]["source"]["psnr"]
 
 
-def simplified(ply, data, folder):
+def score_of_simplify(ply, data, folder):
     report = folder / "simplified.json"
     words = ("simplify", ply, folder / "less.ply", "--data", data, "--keep", 0.9, "--set", "rounds=1,refit=no")
     call(*words, "--report", report, "-q")
     return None, json.loads(report.read_text())["photographs"]["source"]
 
 
-def swept(ply, data, _):
-    scores = json.loads(call("tradeoff", ply, "--data", data, "--what", "presets", "--json", "-q"))
+def score_of_tradeoff(ply, data, _):
+    scores = json.loads(call("tradeoff", ply, "--data", data, "--what", "presets", "--json", "-q").stdout)
     return scores["source"]["photographs"]["views"], scores["source"]["photographs"]["psnr"]
 
 
-def targeted(ply, data, folder):
+def score_of_encode(ply, data, folder):
     words = ("encode", ply, folder / "e.csplat", "--data", data, "--max-psnr-drop", 3, "--no-prune", "--preset", "fast")
-    report = json.loads(call(*words, "--json"))["target"]
+    report = json.loads(call(*words, "--json").stdout)["target"]
     return report["views"], report["photographs"]["source"]
 
 
-SCORES = {"compare": compared, "finetune": tuned, "simplify": simplified, "tradeoff": swept, "encode": targeted}
+SCORES = {
+    "compare": score_of_compare, "finetune": score_of_finetune, "simplify": score_of_simplify,
+    "tradeoff": score_of_tradeoff, "encode": score_of_encode,
+}  # fmt: skip
