@@ -1,4 +1,4 @@
-"""README and documentation: links lead somewhere, figures are the measured ones, examples run."""
+"""README and documentation: links resolve, figures are the measured ones, examples run."""
 
 import itertools
 import json
@@ -13,7 +13,8 @@ from command_line import InThisProcess
 from typer.testing import CliRunner
 
 import csplat
-from csplat_bench.pages import write_pages
+from csplat_bench.pages import with_tables, write_pages
+from csplat_bench.tables import markdown_table, select_rows
 from csplat_tools.batches import batch_run
 from csplat_tools.cli.app import app
 
@@ -37,7 +38,7 @@ def blocks(text, language):
     return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
-def test_every_link_of_a_page_leads_to_a_file(site):
+def test_links_of_pages_lead_to_files(site):
     for path in site.pages().values():
         text = (ROOT / path).read_text("utf-8")
         for match in site.links(text):
@@ -45,16 +46,40 @@ def test_every_link_of_a_page_leads_to_a_file(site):
                 site.target_of(path, match[3])
 
 
-def test_every_place_that_a_link_names_is_a_heading(site):
+def test_anchors_of_links_are_headings(site):
     for path in site.pages().values():
         for match in site.links((ROOT / path).read_text("utf-8")):
             if "#" in match[3] and "://" not in match[3]:
-                target, place = site.target_of(path, match[3])
+                target, anchor = site.target_of(path, match[3])
                 headings = re.findall(r"^#+ (.+)$", (ROOT / target).read_text("utf-8"), re.MULTILINE)
-                assert place in {re.sub(r"[^\w\- ]", "", one.lower()).replace(" ", "-") for one in headings}
+                assert anchor in {re.sub(r"[^\w\- ]", "", one.lower()).replace(" ", "-") for one in headings}
 
 
-def test_a_link_that_leads_nowhere_is_refused(site):
+def test_tables_show_templates_missing_values_and_labels():
+    rows = [{"name": "a", "bytes": 1_500_000, "count": 3, "psnr": {"file": 38.25, "source": 40.0}}, {"name": "b"}]
+    columns = [["", "{name}"], ["MB", "{bytes / 1e6:.2f}"], ["dB", "{psnr.file - psnr.source:+.1f}"]]
+    expected = "|  | MB | dB |\n| --- | --- | --- |\n| first | 1.50 | -1.8 |\n| b | – | – |"
+    assert expected == markdown_table(rows, columns, {"a": "first"})
+    assert "| 0.50 |" in markdown_table(rows, [{"key": "bytes", "title": "MB", "scale": 1 / 3e6, "format": ".2f"}])
+
+
+def test_rows_of_results_are_filtered_ordered_and_grouped(tmp_path):
+    rows = [{"scene": s, "encoder": e, "size": n} for n, (s, e) in enumerate(itertools.product("ab", "xyz"))]
+    (tmp_path / "r.json").write_text(json.dumps({"rows": rows}))
+    spec = {"source": "r.json", "where": {"scene": ["b", "a"], "encoder": ["x", "y"]}}
+    assert [3, 4, 0, 1] == [row["size"] for row in select_rows(spec, tmp_path)]
+    grouped = select_rows({**spec, "group": "scene", "by": "encoder"}, tmp_path)
+    assert [{"scene": "b", "x.size": 3, "y.size": 4}, {"scene": "a", "x.size": 0, "y.size": 1}] == grouped
+    with pytest.raises(ValueError, match="no row is left"):
+        select_rows({"source": "r.json", "where": {"scene": "c"}}, tmp_path)
+
+
+def test_a_page_with_an_undeclared_table_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="table sizes is not declared"):
+        with_tables("<!-- table: sizes -->\n<!-- end -->", {}, tmp_path)
+
+
+def test_a_broken_link_is_refused(site):
     with pytest.raises(FileNotFoundError, match=r"README\.md: nowhere\.md"):
         site.rewritten("see [this](nowhere.md)", "README.md")
 
@@ -65,17 +90,17 @@ def test_links_between_files_become_links_between_pages(site):
     assert expected == site.rewritten(text, "codec/EMBEDDING.md")
 
 
-def test_what_only_github_takes_is_mended(site):
+def test_markdown_of_github_is_converted_for_the_site(site):
     text = "Words:\n- one\n- two\n<!-- begin -->\n```python spec-test\n- x\n```\n"
     assert "Words:\n\n- one\n- two\n```python\n- x\n```\n" == site.for_python_markdown(text)
 
 
-def test_the_navigation_names_every_page(site):
+def test_the_navigation_contains_every_page(site):
     named = re.findall(r": ([\w-]+\.md)$", (DOCS / "mkdocs.yml").read_text("utf-8"), re.MULTILINE)
     assert sorted({*site.pages(), "commands.md", "python.md"}) == sorted(named)
 
 
-def test_the_readme_is_short_and_its_pictures_are_small():
+def test_the_readme_is_short_and_its_images_are_small():
     assert len(README.splitlines()) <= 130
     assert sum(path.stat().st_size for path in (DOCS / "pictures").iterdir()) < 300_000
 
@@ -99,7 +124,7 @@ def test_encoded_sizes_match_the_readme():
         assert recorded[f"sample {name}"]["size_bytes"] == pytest.approx(one["size_bytes"], rel=0.02)
 
 
-def test_a_package_index_shows_nothing_that_only_a_checkout_has():
+def test_the_readme_of_the_package_has_no_relative_links():
     hook = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"]["metadata"]["hooks"]
     text = README
     for one in hook["fancy-pypi-readme"]["substitutions"]:
@@ -109,8 +134,8 @@ def test_a_package_index_shows_nothing_that_only_a_checkout_has():
     assert len(text) > 0.7 * len(README)
 
 
-def test_the_commands_of_readme_and_guides_are_ones_that_csplat_knows():
-    """Their words are parsed, nothing is run: options that are gone are found."""
+def test_commands_in_readme_and_guides_are_valid():
+    """Commands are parsed, not run, which finds removed options."""
     from typer.main import get_command
 
     group = get_command(app)
@@ -125,7 +150,7 @@ def test_the_commands_of_readme_and_guides_are_ones_that_csplat_knows():
 
 
 @pytest.mark.slow
-def test_the_python_of_readme_and_batch_runs(sample_path, tmp_path, monkeypatch, capsys):
+def test_python_examples_run(sample_path, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(batch_run, "Worker", InThisProcess)
     (tmp_path / "scenes").mkdir()
@@ -146,9 +171,9 @@ def test_the_python_of_readme_and_batch_runs(sample_path, tmp_path, monkeypatch,
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("small_views")
-def test_the_commands_of_the_tutorial_run_one_after_the_other(tmp_path, monkeypatch):
-    """As they stand there, but for fewer, smaller pictures of a square and fewer steps."""
-    pytest.importorskip("numba", reason="it trains: pip install 'csplat[render]'")
+def test_the_tutorial_runs(tmp_path, monkeypatch):
+    """Its commands run in order, with fewer and smaller images of a square, and fewer steps."""
+    pytest.importorskip("numba", reason="training needs numba: pip install 'csplat[render]'")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(ROOT / "tools" / "sample")
     text = (DOCS / "guide" / "tutorial.md").read_text("utf-8")
@@ -169,7 +194,7 @@ def test_the_commands_of_the_tutorial_run_one_after_the_other(tmp_path, monkeypa
 
 
 def square(_garden, camera):
-    """A square in the middle of a picture, and places on it: nothing has to be compiled for that."""
+    """Return an image of a square and 3D points on it, without compiling the renderer."""
     pixels = np.zeros((camera.H, camera.W, 4), np.uint8)
     pixels[camera.H // 3 : -camera.H // 3, camera.W // 3 : -camera.W // 3] = (200, 120, 40, 255)
     return pixels, np.random.default_rng(0).uniform(-0.5, 0.5, (camera.H, camera.W, 3))
