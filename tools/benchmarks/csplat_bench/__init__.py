@@ -1,11 +1,10 @@
-"""Benchmarks, in packages by topic: `python -m csplat_bench.TOPIC`, with `--help`.
+"""Benchmarks: suites in TOML, one runner, results as JSON.
 
-codec             throughput, memory and size compared with other programs; quality, decoders
-rendering         time of a render and of its gradients
-training          a step of training, stage by stage; lego
-viewer            culling, sorting, drawing; arrival, engines, owners
-targets           targets compared with presets and another build
-datasets          the scenes that papers report
+    python -m csplat_bench list                          # all suites
+    python -m csplat_bench run codec --scenes lego60k    # measures what is missing in results/codec.json
+    python -m csplat_bench table results/codec.json
+    python -m csplat_bench pages                         # tables and plots of the result pages
 
-A second word names a module: `python -m csplat_bench.codec.quality`. `common` is what several of them share.
+A suite (`suites/NAME.toml`) names scenes, cases, and the subject that measures a case on a scene: a function that is
+registered in `subjects.py`. Every subject is one module.
 """

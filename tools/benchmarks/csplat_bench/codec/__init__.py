@@ -1,1 +1,0 @@
-"""Benchmarks of the codec: throughput, memory, size, quality; how fast decoders are, and whether ours agree."""

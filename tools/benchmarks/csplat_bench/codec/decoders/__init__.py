@@ -1,1 +1,0 @@
-"""Decoders of ours and of others: how fast they are, and whether ours agree bit by bit (`agree`)."""

@@ -1,1 +1,0 @@
-"""The benchmark sets that papers report: trained, scored, encoded, scored again."""

@@ -1,1 +1,0 @@
-"""From photographs to files of several sizes: one training, and what `csplat train` makes of it."""

@@ -1,1 +1,0 @@
-"""Benchmarks of targets, compared with presets, fixed shares of the splats, and another build."""

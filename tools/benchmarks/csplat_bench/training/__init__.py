@@ -1,1 +1,0 @@
-"""Benchmarks of training: a step, stage by stage; Lego by number of splats."""
