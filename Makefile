@@ -78,18 +78,11 @@ test-dist: ## install out/dist/*.whl in an environment of its own, and run the c
 	out/fresh/$(notdir $(BIN))/python -m pip install --quiet --disable-pip-version-check out/dist/csplat-*.whl
 	$(MAKE) --no-print-directory demo BIN=out/fresh/$(notdir $(BIN)) CORE=
 
-bench: $(VENV)/.dev ## throughput, memory and size, beside other formats
+bench: $(VENV)/.dev ## measure what is missing in out/bench, suite by suite; a day or more
 	$(BIN)/pytest -m "area(name='benchmarks')"
-	$(BENCH).codec
-	$(BENCH).codec.quality --no-peers --seeds 0,1,2,3,4
-	$(BENCH).codec.formats
-	$(BIN)/csplat encode $(SAMPLE) out/parts.csplat --force --quiet --set tile-splats=1024
-	$(BENCH).codec.parts out/parts.csplat --share 0.2
-	$(BENCH).rendering
-	$(BIN)/pytest -rP tests/test_rasteriser.py tests/test_removal.py
-	$(BENCH).training
-	$(BENCH).viewer
-	$(BENCH).targets --sizes 4,8
+	for suite in codec formats file_parts decoder_agreement decoders targets rendering training viewer; do \
+		$(BENCH) run $$suite || exit 1; \
+	done
 
 wasm: ## compile the decoder in C for the JavaScript one; needs Debian 12's clang-14 lld-14 wasi-libc libclang-rt-14-dev-wasm32
 	codec/js/wasm/build.sh codec/js/wasm_binary.mjs

@@ -1,21 +1,15 @@
-"""The command line in the process of the tests, a batch worker without a process, and processes that tests start."""
+"""The command line in the process of the tests, a batch worker without a process, and SIGINT in child processes."""
 
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
-import sys
 import threading
-from pathlib import Path
 
 from typer.testing import CliRunner
 
 from csplat_tools.cli.app import app
 from csplat_tools.cli.batch_protocol import answer
-
-BENCHMARKS = Path(__file__).resolve().parent.parent / "tools" / "benchmarks"
 
 
 def invoke(*words):
@@ -44,13 +38,6 @@ class InThisProcess:
 
     def close(self):
         pass
-
-
-def bench(topic, *words, check=True):
-    """Run `python -m csplat_bench.TOPIC WORDS` in a process of its own."""
-    path = os.pathsep.join(filter(None, (str(BENCHMARKS), os.environ.get("PYTHONPATH"))))
-    command = [sys.executable, "-m", f"csplat_bench.{topic}", *map(str, words)]
-    return subprocess.run(command, check=check, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path})
 
 
 def heed_interrupts():

@@ -451,7 +451,7 @@ def test_another_quality_moves_what_is_wanted_of_all_pictures():
 
 
 def test_figures_beside_ones_own_are_those_of_the_inputs():
-    # Written by `python -m csplat_bench.codec.inputs --write`
+    # Written by `python -m csplat_bench figures`
     figures = json.loads((files(encoders) / "figures.json").read_text("utf-8"))
 
     assert set(ENCODABLE) - {DEGREE_4} == set(figures)

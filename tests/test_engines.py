@@ -16,11 +16,10 @@ from csplat import EncodeOptions, decode, encode, read_ply
 from csplat.editing.transform import convert_axes
 from csplat.formats import write
 from csplat.scene_source import source_from_model
-from csplat_bench.common.browser import serve
-from csplat_bench.viewer.loaders import Trial
-from csplat_bench.viewer.owners import stands, still
-from csplat_bench.viewer.rules import ENGINES
-from csplat_bench.viewer.stage import pinhole, served
+from csplat_bench.browser import serve
+from csplat_bench.engine_stage import ENGINES, pinhole, served
+from csplat_bench.subjects.engine_images import settled_image, up_in_world
+from csplat_bench.subjects.engine_loaders import Trial
 from csplat_render.camera_paths import orbit_cameras
 from csplat_render.metrics import psnr
 
@@ -86,15 +85,15 @@ def picture(trial):
 
 def settled(trial):
     """Return the engine's final picture; it redraws continuously, which makes up most of these tests' time."""
-    return still(trial.page, 0.2)
+    return settled_image(trial.page, 0.2)
 
 
 def test_a_scene_stands_upright_and_is_ours(trial, picture, files):
     shown, said = picture
     _, _, model, camera = files
     assert said["count"] - len(model) in range(16)  # Babylon.js fills up
-    assert "upright" == stands(model, said["world"])
-    ours = ENGINES[trial.engine].drawn(model, camera, 3)
+    assert "upright" == up_in_world(model, said["world"])
+    ours = ENGINES[trial.engine].render(model, camera, 3)
     assert psnr(shown, ours) > max(30.0, psnr(shown, ours[:, ::-1]) + 3.0)
 
 
@@ -130,9 +129,9 @@ def test_disposal_leaves_nothing_on_the_gpu(trial):
     if trial.engine == "three":
         pytest.skip("GaussianSplat of three 0.187 keeps its textures until the renderer is disposed of, of a PLY, too")
     trial.repeat("scene.csplat", 1)
-    before = trial.taken()[1]
+    before = trial.memory()[1]
     trial.repeat("scene.csplat", 2)
-    assert trial.taken()[1] <= before + 100_000
+    assert trial.memory()[1] <= before + 100_000
 
 
 @pytest.mark.usefixtures("packages")
@@ -146,7 +145,7 @@ def test_the_examples_show_the_sample(browser, sample_path):
     with serve(EXAMPLES / "dist") as address:
         for name in ENGINES:
             page.goto(f"{address}{name}.html")
-            shown = still(page)
+            shown = settled_image(page)
             assert "" == page.inner_text("#words"), name
             assert 0.1 < (shown.max(axis=2) > 0.15).mean() < 0.9, name
             page.goto(f"{address}{name}.html?scene=cut.csplat")

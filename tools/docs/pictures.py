@@ -27,9 +27,9 @@ from PIL import Image
 import csplat
 from csplat.encoder import PresetName
 from csplat.types import U8
-from csplat_bench.common.measuring import timed
-from csplat_bench.common.peers import find_splat_transform
-from csplat_bench.common.report import describe
+from csplat_bench.measuring import timed
+from csplat_bench.peers import find_splat_transform, splat_transform_version
+from csplat_bench.results import describe
 from csplat_render import Camera, render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.scorer import Scorer
@@ -89,18 +89,16 @@ def measure(peers: Path) -> dict[str, Any]:
         rows.append(
             {"name": name, "preset": name, "series": "preset", **_scored(scorer, runs[0][0]), "seconds": seconds}
         )
-    command, version = find_splat_transform(peers)
-    if command is None:
-        raise SystemExit(f"no splat-transform: {version}")
+    command = find_splat_transform(peers)
     with tempfile.TemporaryDirectory() as folder:
         rows += [_target(scorer, Path(folder), psnr, "--no-prune") for psnr in _TARGETS]
         rows += [_target(scorer, Path(folder), psnr) for psnr in _PRUNED_TARGETS]
         rows += [_peer(scorer, command, Path(folder) / f"sample.{ending}") for ending in ("spz", "sog")]
-    machine = describe()
+    machine, versions = describe()
     return {
         "command": "python tools/docs/pictures.py --measure",
-        "machine": machine.pop("machine"),
-        "versions": {**machine, "splat_transform": version},
+        "machine": machine,
+        "versions": {**versions, "splat_transform": splat_transform_version(peers).removeprefix("splat-transform ")},
         "source": {"size_bytes": SAMPLE.stat().st_size, "splats": len(source), "sh_degree": source.sh_degree},
         "rows": rows,
     }

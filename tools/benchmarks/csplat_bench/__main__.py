@@ -12,12 +12,11 @@ from typing import Annotated
 import typer
 
 from csplat.errors import CsplatError
-from csplat_bench import results as result_files
 from csplat_bench.pages import write_pages
 from csplat_bench.protocol import Setup
 from csplat_bench.results import Results, read_results
 from csplat_bench.rules import mark_beaten, mean_rows, size_ratios
-from csplat_bench.runner import run_suite
+from csplat_bench.runner import run_suite, scene_name
 from csplat_bench.scenes import DATA, OUT
 from csplat_bench.subjects import SCENE_FINDERS, SUBJECTS
 from csplat_bench.subjects.encoder_inputs import write_figures
@@ -45,7 +44,7 @@ def run(
     scenes: Annotated[str, typer.Option(help="Scenes or PLY files, separated by commas. Default: the suite's.")] = "",
     only: Annotated[str, typer.Option(help="Patterns of case names, separated by commas. Default: all.")] = "",
     again: Annotated[bool, typer.Option("--again", help="Measure these scenes and cases again.")] = False,
-    out: Annotated[Path | None, typer.Option(help="Results. Default: results/SUITE.json.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Results. Default: out/bench/SUITE.json.")] = None,
     work: Annotated[Path, typer.Option(help="Folder for made scenes, trainings and files.")] = OUT / "bench",
     peers: Annotated[Path, typer.Option(help="Folder for npm packages and programs of others.")] = OUT / "peers",
     data: Annotated[Path, typer.Option(help="Folder of scenes and data sets.")] = DATA,
@@ -57,7 +56,7 @@ def run(
     chosen = load_suite(suite, list(SUBJECTS))
     program = shlex.split(csplat) or [sys.executable, "-m", "csplat_tools"]
     setup = Setup(work, peers, data, program, chromium, lpips, chosen.options)
-    path = out or result_files.FOLDER / f"{chosen.name}.json"
+    path = out or work / f"{chosen.name}.json"
     results = Results(path, chosen, f"python -m csplat_bench run {suite}")
     note(f"{results.machine}, {results.document['versions']}")
     names, patterns = _listed(scenes) or list(chosen.scenes), _listed(only)
@@ -65,7 +64,7 @@ def run(
         names = SCENE_FINDERS[chosen.subject](setup, names)
     if again:
         for name in names:
-            results.forget(name, chosen.cases_on(name, patterns))
+            results.forget(scene_name(name), chosen.cases_on(scene_name(name), patterns))
     fine = run_suite(chosen, SUBJECTS[chosen.subject], setup, results, names, patterns)
     print(markdown_table(mark_beaten(results.rows), chosen.columns))
     raise typer.Exit(0 if fine else 1)

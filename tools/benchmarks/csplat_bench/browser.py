@@ -13,7 +13,7 @@ from typing import Any
 
 from csplat_bench.protocol import AbsentError
 
-_TIMEOUT_MS = 600_000  # of anything that a page does
+_TIMEOUT_MS = 600_000  # milliseconds; limit for every action of a page
 
 _SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 # SwiftShader through Vulkan, which gives WebGPU a device that can draw on a page.

@@ -36,7 +36,7 @@ class Protocol:
     Attributes:
         slug: name in results.
         kind: layout on disk.
-        factors: by how much the papers scale the images of a scene down: 4 stands for the folder `images_4`.
+        factors: by how much the papers scale the images of a scene down; 4 means the folder `images_4`.
     """
 
     slug: str

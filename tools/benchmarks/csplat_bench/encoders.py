@@ -2,7 +2,7 @@
 
 command = "encode --preset fast"    # csplat's command line, in a process of its own
 bytes_per_splat = 4                 # with command: --target-size, by the number of splats
-suffix = ".spz"                     # of the file that the command writes. Default: .csplat
+suffix = ".spz"                     # the file that the command writes ends in this. Default: .csplat
 peer = "spz"                        # splat-transform; see `peers.PEERS`
 format = "spz4"                     # `csplat.formats.write`, in a process of its own
 """

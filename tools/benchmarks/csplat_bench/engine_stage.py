@@ -62,7 +62,7 @@ class Engine:
         title: its name.
         reads: formats, as `csplat formats` names them.
         clips: it clips the colour of a splat to 0..1, that of degree 0 as well before adding the other bands.
-        thin: it dilates splats by half as much as we do.
+        thin: it dilates splats half as far as we do.
         antialiased: it compensates opacity for the dilation, whatever a file declares.
     """
 

@@ -39,7 +39,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Usage:
-    """What a program took.
+    """Time and memory of a program.
 
     Attributes:
         wall, cpu: seconds; CPU seconds include the program's children.

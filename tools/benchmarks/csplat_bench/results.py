@@ -13,10 +13,10 @@ from typing import Any
 from csplat.disk_files import atomic_writer
 from csplat.errors import InputError
 from csplat_bench.suites import Case, Suite
-from csplat_tools.tradeoffs.machine import describe_machine
+from csplat_tools.optional_packages import describe_machine
 
-FOLDER = Path(__file__).resolve().parent.parent / "results"
-PUBLISHED = FOLDER.with_name("published")
+#: Folder of published figures.
+PUBLISHED = Path(__file__).resolve().parent.parent / "published"
 
 _DIGITS = 6  # significant digits of numbers in results
 

@@ -90,7 +90,7 @@ def mark_beaten(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
     A file that holds every splat (`all_splats`) is only beaten by others that do; `None` if no file beats it.
     """
-    made = [row for row in rows if "error" not in row and row.get("psnr") is not None]
+    made = [row for row in rows if None not in (row.get("psnr"), row.get("size_bytes"))]
 
     def beats(other: Row, row: Row) -> bool:
         return bool(

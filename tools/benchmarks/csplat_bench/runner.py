@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from subprocess import CalledProcessError
 from typing import Any
 
@@ -23,14 +24,15 @@ def run_suite(
         suite, subject: what is measured.
         setup: where.
         results: the file, to which rows are added.
-        scenes: scenes to measure.
+        scenes: names or paths of scenes to measure.
         only: patterns of names of cases; empty: all.
 
     Returns:
         True if every case gave a row without an error, or was left out because something is not installed.
     """
     fine = True
-    for scene in scenes:
+    for place in scenes:
+        scene = scene_name(place)
         cases = suite.cases_on(scene, only)
         missing = [case for case in cases if not results.is_known(scene, case)]
         if not missing:
@@ -39,7 +41,7 @@ def run_suite(
         cases = cases if suite.ratio else missing
         note(f"{suite.name} {scene}: {len(cases)} cases")
         try:
-            with subject(setup, scene, cases) as measure:
+            with subject(setup, place, cases) as measure:
                 for case, row in _take_turns(suite, cases, measure, scene):
                     fine &= "error" not in row
                     results.add(scene, case, row)
@@ -48,6 +50,12 @@ def run_suite(
     if "published" in suite.options:
         results.set_published(suite.options["published"])
     return fine
+
+
+def scene_name(place: str) -> str:
+    """Return the name of a scene in results: the last part of its path, without .ply or .csplat."""
+    name = Path(place).name if "/" in place and Path(place).exists() else place
+    return name.removesuffix(".ply").removesuffix(".csplat")
 
 
 def _take_turns(

@@ -40,7 +40,7 @@ SAMPLE = ROOT / "tools" / "csplat_tools" / "data" / "sample.ply"
 
 _MADE = re.compile(r"(?P<base>.+?)(?P<kind>[-@])(?P<count>\d+)(?P<unit>[kM])(-sh(?P<degree>[0-3]))?")
 _UNITS = {"k": 1_000, "M": 1_000_000}
-_UNSEEN_SEEDS = (1, 2)  # of virtual cameras that no search uses: searches and `csplat compare` use seed 0
+_UNSEEN_SEEDS = (1, 2)  # seeds of virtual cameras; searches and `csplat compare` use seed 0
 
 
 @dataclass(frozen=True)

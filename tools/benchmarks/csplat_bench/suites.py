@@ -6,7 +6,7 @@ scenes = ["sample", "lego60k"]
 repeats = 3                             # turns; results are medians. Default: 1
 warmups = 1                             # turns before them that do not count. Default: 0
 warmup_splats = 1000000                 # more such turns for small scenes: one per scene size in this number
-ratio = "decode_seconds"                # of a case's `reference` over its own, turn by turn: `times_as_fast`
+ratio = "decode_seconds"                # times_as_fast: the `reference` case's value over a case's own
 
 [options]                               # for the subject
 metrics = ["psnr"]
@@ -20,7 +20,7 @@ command = "encode --preset {preset}"    # this and all other keys are the subjec
 [table]
 columns = [["scene", "{scene}"], ["MB", "{size_bytes / 1e6:.2f}"]]
 
-[plot]                                  # as in `tables.draw_plot`
+[plot]                                  # see `tables.draw_plot`
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How soon a scene that comes over a slow line can be seen, in several viewers: milliseconds and bytes.
+"""Scenes that arrive over a slow line: milliseconds and bytes until they can be seen, in several viewers.
 
 A case has a `viewer` (a page of subjects/pages) and a `form` of the file, all forms made from the same PLY. Options:
 `mbits`, million bits per second over all connections together; `latency_ms` before each answer. Page, modules and

@@ -40,7 +40,7 @@ from csplat_tools.console import note
 DRIVERS = Path(__file__).with_name("drivers")
 
 _C = ROOT / "codec" / "c"
-_THREADS_MAX = 64  # of the driver in C
+_THREADS_MAX = 64  # the driver in C has an array of this size
 _SPZ = "https://github.com/nianticlabs/spz"
 _SPZ_COMMIT = "21715c3b7a609ea6fb7c69b8ae42181a12b59f22"
 _PACKAGES = {
