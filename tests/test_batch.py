@@ -128,9 +128,9 @@ def test_a_manifest_names_scenes_outputs_and_options(scenes, name, text, encodin
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "line 1: wanted an object"),
-        ('{"output": "a"}', "line 1: wanted a path"),
-        ('{"path": "a", "output": "../a"}', "leads out"),
+        ("{", "line 1: expected a JSON object"),
+        ('{"output": "a"}', "line 1: expected a path"),
+        ('{"path": "a", "output": "../a"}', "outside the folder"),
         ('{"path": "a", "options": "\\"--x"}', "options"),
         ('{"path": "a.ply", "output": "c"}\n{"path": "b.ply", "output": "c"}', "the output of 2 scenes"),
         ("", "no scene"),

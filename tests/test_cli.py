@@ -512,7 +512,7 @@ def test_of_two_writers_of_a_new_name_one_loses(tmp_path, monkeypatch):
         writer.join()
     assert 1 == len(lost)
     data, message = lost[0]
-    assert "and it was kept; --force replaces it" in message
+    assert "and it was not replaced; --force replaces it" in message
     assert {b"one": b"two", b"two": b"one"}[data] == (tmp_path / "new").read_bytes()
     assert ["new"] == [path.name for path in tmp_path.iterdir()]
 

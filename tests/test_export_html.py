@@ -160,7 +160,7 @@ def test_modules_become_functions_behind_those_that_they_import():
             {"a.mjs": "import './b.mjs';", "b.mjs": "import './a.mjs';"},
             r"import each other: a\.mjs -> b\.mjs -> a\.mjs",
         ),
-        ({"a.mjs": "import './gone.mjs';"}, r"a\.mjs imports gone\.mjs, which is not there"),
+        ({"a.mjs": "import './gone.mjs';"}, r"a\.mjs imports gone\.mjs, which does not exist"),
         ({"a.mjs": "export default 1;"}, r"a\.mjs has a statement that cannot be linked: export default 1;"),
         ({"a.mjs": "export let n = 1;"}, r"a\.mjs has a statement that cannot be linked: export let n = 1;"),
         ({"a.mjs": "export * from './b.mjs';"}, r"a\.mjs has a statement that cannot be linked: export \* from"),
@@ -207,5 +207,5 @@ def test_an_incomplete_installation_is_an_error_of_its_own(monkeypatch, tmp_path
     import csplat_tools.present.viewer_page
 
     monkeypatch.setattr(csplat_tools.present.viewer_page, "__file__", str(tmp_path / "a" / "b" / "viewer_page.py"))
-    with pytest.raises(CsplatError, match="install csplat again"):
+    with pytest.raises(CsplatError, match="reinstall csplat"):
         export_page(b"", "scene.csplat")

@@ -757,7 +757,7 @@ def test_weights_are_for_the_splats_of_the_source(capture, tmp_path):
     np.save(tmp_path / "w.npy", np.ones(300))
     result = invoke(*words, "--importance", tmp_path / "w.npy")
     assert 1 == result.exit_code
-    assert "wanted (301,)" in result.stderr
+    assert "expected (301,)" in result.stderr
     np.save(tmp_path / "w.npy", np.arange(301.0))
     call(*words, "--importance", tmp_path / "w.npy")
 

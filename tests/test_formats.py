@@ -332,7 +332,7 @@ def test_of_a_large_scene_what_covers_most_is_shown_and_that_is_said(make_model)
     model.opacities[::3] = 0.0
     shown = scene_html(model, most_splats=1000)
     assert 1000 == len(scene_in(shown))
-    assert "1,000 of 3,000 splats, those that cover most" in shown
+    assert "1,000 of 3,000 splats, the most visible ones" in shown
     kept = most_visible(model, 1000)
     assert kept.opacities.min() > 0.0
     areas = np.exp(np.sort(kept.scales, axis=1)[:, 1:].sum(axis=1))

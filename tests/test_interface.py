@@ -223,10 +223,10 @@ def test_a_target_takes_a_model_or_a_file_and_gives_the_same_bytes(files):
     [
         ({}, "no target"),
         ({"psnr": 40.0, "size": 1000}, "one of them"),
-        ({"size": "5 parsecs"}, "wanted bytes"),
+        ({"size": "5 parsecs"}, "expected bytes"),
         ({"errors": {"colour": 1.0}}, "no measure"),
-        ({"errors": {"means": "2mm"}}, "means is '2mm', wanted a number"),
-        ({"psnr": "40"}, "psnr is '40', wanted a number"),
+        ({"errors": {"means": "2mm"}}, "means is '2mm', expected a number"),
+        ({"psnr": "40"}, "psnr is '40', expected a number"),
     ],
 )
 def test_a_target_that_is_none_is_refused_before_the_scene_is_read(asked, message):

@@ -154,7 +154,7 @@ def test_cameras_and_data_exclude_each_other(files, tmp_path):
     assert 2 == invoke("render", files[0], "--cameras", "x.json", "--data", tmp_path, "-o", tmp_path / "o").exit_code
     assert 2 == invoke("compare", *files, "--size", "32x24").exit_code
     assert 2 == invoke("compare", *files, "--data", tmp_path, "--split", "val").exit_code
-    with pytest.raises(InputError, match="not both"):
+    with pytest.raises(InputError, match="exclude each other"):
         find_view_set(read_ply(files[0]), cameras="x.json", data=DataOptions(str(tmp_path)))
 
 

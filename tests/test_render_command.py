@@ -396,7 +396,7 @@ def test_what_a_film_cannot_be_is_refused(film_scene, tmp_path, words, status, m
 
 
 def test_pictures_of_two_sizes_make_no_film():
-    with pytest.raises(InputError, match="one size, the cameras have 2"):
+    with pytest.raises(InputError, match="the cameras have 2 sizes"):
         check_film("a.gif", [(4, 4), (5, 4)], 25.0)
 
 

@@ -409,7 +409,7 @@ def test_pruning_says_how_much_of_it_other_views_would_have_seen(tmp_path, seen_
     missed = read_sensitivity(npz, read_ply(seen_in_part)).missed_share
     assert missed > 0.0
     done = invoke("encode", seen_in_part, out, "--importance", npz, "--prune-unseen", "-q")
-    assert f"{100 * missed:.1f} % of the splats are left out although" in done.stderr
+    assert f"{100 * missed:.1f} % of the splats were pruned although" in done.stderr
     assert "left out" not in invoke("encode", seen_in_part, out, "--importance", npz, "--force", "-q").stderr
 
 

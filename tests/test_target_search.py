@@ -90,14 +90,14 @@ def test_a_search_ends_after_few_tries_and_makes_no_file_twice(goal):
 @pytest.mark.parametrize("ceiling", [36.0, 97.0])
 def test_a_psnr_that_no_precision_reaches_is_refused_after_few_tries(ceiling, no_prune):
     tried = []
-    with pytest.raises(InputError, match=r"no file reaches 98.00 dB; the best of those tried has"):
+    with pytest.raises(InputError, match=r"no file reaches 98.00 dB; the best found has"):
         search(replace(PLAIN, ceiling=ceiling), psnr=98.0, no_prune=no_prune, tried=tried)
     assert 0 < len(tried) <= MOST_TRIES
 
 
 def test_a_psnr_just_above_what_precision_reaches_is_refused_after_few_tries():
     tried = []
-    with pytest.raises(InputError, match=r"no file reaches 38.00 dB; the best of those tried has 36"):
+    with pytest.raises(InputError, match=r"no file reaches 38.00 dB; the best found has 36"):
         search(replace(PLAIN, ceiling=36.0), psnr=38.0, no_prune=True, tried=tried)
     assert 0 < len(tried) <= MOST_TRIES
 
@@ -187,7 +187,7 @@ def test_more_bytes_are_better_pictures():
 @pytest.mark.parametrize(("no_prune", "said"), [(True, "no file with all splats has"), (False, "no file has")])
 def test_a_size_below_all_files_is_refused_after_few_tries(no_prune, said):
     tried = []
-    with pytest.raises(InputError, match=f"{said} 300 bytes or fewer: of those tried one has"):
+    with pytest.raises(InputError, match=f"{said} at most 300 bytes; the smallest found has"):
         search(PLAIN, size_bytes=300, no_prune=no_prune, tried=tried)
     assert 0 < len(tried) <= MOST_TRIES
 
@@ -220,7 +220,7 @@ def test_a_loss_is_kept_to_and_its_file_hardly_larger_than_the_smallest(loss):
 
 def test_a_loss_that_no_file_keeps_to_is_refused():
     """Files err by as much as photographs do, at any precision."""
-    with pytest.raises(InputError, match=r"no file reaches 49.50 dB by the validation photographs; the best has"):
+    with pytest.raises(InputError, match=r"no file reaches 49.50 dB on the validation images; the best has"):
         search(replace(PLAIN, ceiling=50.0), max_psnr_drop=0.5, photo_psnr=50.0)
 
 

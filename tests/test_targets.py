@@ -60,13 +60,13 @@ def test_a_length_with_a_unit_wants_a_scene_that_has_one():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("means", "bounds no error"),
-        ("means=", "bounds no error"),
-        ("weight=1", "no measure"),
+        ("means", "is not an error bound"),
+        ("means=", "is not an error bound"),
+        ("weight=1", "not a measure"),
         ("means=0", "above 0"),
         ("means=1,means=2", "twice"),
-        ("sh0=1mm", "no length"),
-        ("means=1parsec", "wanted one of"),
+        ("sh0=1mm", "not a length"),
+        ("means=1parsec", "expected one of"),
     ],
 )
 def test_other_bounds_are_refused(text, message):
@@ -82,7 +82,7 @@ def test_other_bounds_are_refused(text, message):
         ({"keep": 0.5, "max_psnr_drop": 1.0}, "one of them"),
         ({"keep": 0.5, "max_error": {"means": 1.0}}, "no bounds"),
         ({"max_psnr_drop": 0.5, "max_error": {"means": 1.0}}, "no bounds"),
-        ({"size_bytes": 0}, "wanted 1 or more"),
+        ({"size_bytes": 0}, "expected at least 1"),
         ({"psnr": 99.5}, "at most 99"),
         ({"psnr": float("nan")}, "above 0"),
         ({"max_psnr_drop": 0.0}, "0.001 to 60"),
@@ -130,12 +130,12 @@ def test_a_bound_that_no_lattice_keeps_is_refused(scene):
 
 
 def test_a_knob_and_its_bound_contradict_each_other(scene):
-    with pytest.raises(InputError, match="position_step is given"):
+    with pytest.raises(InputError, match="position_step is determined"):
         meet_bounds(scene, EncodeOptions(position_step=0.1), {"means": 0.1})
     for fixed in (EncodeOptions(sh_coding="none"), EncodeOptions(adaptive=0.5)):
         with pytest.raises(InputError, match="error"):
             meet_bounds(scene, fixed, {"sh1": 0.1})
-    with pytest.raises(InputError, match="codebook bounds no error"):
+    with pytest.raises(InputError, match="codebook excludes a bound"):
         meet_bounds(scene, EncodeOptions(sh_coding="codebook"), {"sh1": 0.1})
 
 
@@ -217,7 +217,7 @@ def test_the_command_foretells_a_search_before_it_begins(tmp_path, ply, monkeypa
     words = ("encode", ply, tmp_path / "s.csplat", "--target-psnr", "30", "--cameras", tmp_path / "away.json")
     done = run(*words, "--no-prune", "--views", 8)
     assert "this takes about 2 to 5 minutes here" in done.stderr
-    assert "cameras of this scene?" in done.stderr
+    assert "cameras belong to the scene" in done.stderr
 
 
 REFUSED = [

@@ -402,7 +402,7 @@ def test_too_little_disk_space_is_an_error_before_drawing(files_of_both, monkeyp
 
 def test_a_memory_limit_below_the_minimum_is_refused(files_of_both, monkeypatch):
     monkeypatch.setattr(SlicedScene, "least_bytes", 450_000_000)
-    with pytest.raises(InputError, match=r"^0 MB of memory are too little to draw these scenes, which take 482$"):
+    with pytest.raises(InputError, match=r"^the memory is 0 MB, expected at least 482 MB to draw these scenes$"):
         csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
 
 

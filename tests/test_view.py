@@ -295,7 +295,7 @@ def test_a_taken_port_is_refused(scene_path):
 def test_an_address_of_another_machine_is_refused(scene_path):
     with (
         open_viewer_scene(str(scene_path), preset="fast") as scene,
-        pytest.raises(InputError, match=r"203\.0\.113\.1 is no address of this machine"),
+        pytest.raises(InputError, match=r"203\.0\.113\.1 is not an address of this machine"),
         open_server(scene, host="203.0.113.1"),
     ):
         pass

@@ -8,18 +8,18 @@ from contextlib import suppress
 
 from csplat_tools import VERSIONS
 
-_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+_INTERRUPTED = 130  # exit status: 128 + SIGINT, the convention of shells
 
 
 def main() -> None:
     """Run the program.
 
-    The commands are imported here, not above: an interrupt while they load ends as quietly as a later one. Printing
-    the versions requires none of them.
+    The commands are imported here, so that an interrupt while they load is handled, too. Printing the versions does
+    not load them.
     """
     if sys.argv[1:] == ["--version"]:
-        with suppress(OSError):  # a full disk is reported below
-            os.write(sys.stdout.fileno(), f"{VERSIONS}\n".encode())  # data, before there is a console
+        with suppress(OSError):  # the code below reports a full disk
+            os.write(sys.stdout.fileno(), f"{VERSIONS}\n".encode())
             return
     try:
         from csplat_tools.cli.app import app

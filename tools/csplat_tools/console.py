@@ -1,6 +1,6 @@
-"""Print data on standard output, messages and progress on standard error; format and parse what people read.
+"""Print data on standard output, messages and progress on standard error; format and parse sizes and durations.
 
-Progress is a bar on a terminal, otherwise a line now and then. There is one standard error, so one display at a time.
+Progress is a bar on a terminal, otherwise a line every ten seconds. There is at most one display at a time.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 
 
 _BAR_DELAY = 2.0  # seconds before a terminal shows bars
-_LINE_EVERY = 10.0  # seconds from one line to the next if standard error is not a terminal
-_TICK = 0.2  # seconds from one update of the display to the next
+_LINE_EVERY = 10.0  # seconds between lines if standard error is not a terminal
+_TICK = 0.2  # seconds between updates of the display
 _ESTIMATE_FROM = (0.03, 1.0)  # fraction done and seconds of a stage from which its remaining time is estimated
-_TIMED_REPORTS = 2  # reports of a long run from which its time is estimated
-_RUN_RANGE = (0.8, 2.0)  # range of that estimate, as factors: a scene that grows takes longer
+_TIMED_REPORTS = 2  # number of reports of a long run after which its time is estimated
+_RUN_RANGE = (0.8, 2.0)  # range of that estimate, as factors: steps get slower as a scene grows
 _RENDER_RANGE = (0.6, 1.7)  # the same for estimates from the time of renders
-_STAGES = 2  # stages shown at a time: those that were reported last
+_STAGES = 2  # stages shown at a time: those reported last
 _WORKING = "working"  # shown if no stage is known
-_MINUTES_FROM = 100.0  # seconds from which durations are given in minutes
+_MINUTES_FROM = 100.0  # seconds; longer durations are given in minutes
 
 #: Regular expression of a number, with one group.
 NUMBER = r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
@@ -40,7 +40,7 @@ NUMBER = r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
 _UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
 _FILE_BYTES_MIN = 64  # size of a file's header: no file is smaller
 
-#: Seconds from which the time of work is announced.
+#: Seconds; the expected time of longer work is announced.
 LONG_WORK_SECONDS = 10.0
 
 
@@ -76,7 +76,7 @@ S = TypeVar("S", bound=RunProgress)
 
 @contextmanager
 def progress_bar(*, quiet: bool = False) -> Iterator[Progress | None]:
-    """Show progress; within another progress bar, that one is used.
+    """Show progress; if a display is shown already, use it.
 
     Yields:
         The progress callback; `None` if nothing is shown.
@@ -89,11 +89,11 @@ def progress_bar(*, quiet: bool = False) -> Iterator[Progress | None]:
 def step_progress(
     name: str, describe: Callable[[S], str], *, quiet: bool = False, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[Callable[[S], None] | None]:
-    """Show the progress of a long run with a text of its own, and announce its time.
+    """Show the progress of a long run with its own text, and announce its expected time.
 
     Args:
         name: name of the run.
-        describe: returns a line on the state of a run, and the time left.
+        describe: returns a line on the state of the run and the time left.
         quiet: show nothing.
         clock: returns seconds.
 
@@ -104,7 +104,7 @@ def step_progress(
 
     def show(now: S) -> None:
         reports.append((clock(), now.iteration))
-        if len(reports) == _TIMED_REPORTS:  # the first steps load and compile: their time is not that of the others
+        if len(reports) == _TIMED_REPORTS:  # the first steps are slower, since they load and compile
             (begun, first), (seconds, last) = reports[0], reports[-1]
             left = (seconds - begun) / max(1, last - first) * (now.iterations - last)
             if left > LONG_WORK_SECONDS:
@@ -118,7 +118,7 @@ def step_progress(
 
 @dataclass
 class _Stage:
-    """A stage of the work: when it began, and its last report."""
+    """A stage of the work: its start, and its last report."""
 
     begun: float
     done: float = 0.0
@@ -126,10 +126,10 @@ class _Stage:
 
 
 class Display:
-    """A display of progress. Owns the times at which work and its stages began, and the bars.
+    """A display of progress. Owns the stages and the bars.
 
     A terminal shows nothing for two seconds, then a bar for each unfinished stage. Otherwise a line is printed every
-    ten seconds. `tick` is called often, with or without reports: silent work is shown as well.
+    ten seconds. `tick` is called often, even without reports, so that silent work is shown as well.
 
     Args:
         terminal: True if standard error is a terminal.
@@ -148,7 +148,7 @@ class Display:
 
         Args:
             stage: its name.
-            done: fraction done, 0 to 1; less than before: the stage has begun anew.
+            done: fraction done, 0 to 1; a smaller fraction than before restarts the stage.
             text: text to show instead of percentage and time left.
         """
         with self._lock:
@@ -156,7 +156,7 @@ class Display:
             if known is None or done < known.done:
                 known = _Stage(self._clock())
             known.done, known.text = done, text
-            self._stages[stage] = known  # last in the order: reported last
+            self._stages[stage] = known  # moved to the end of the order
 
     def tick(self) -> None:
         """Update the bars, or print a line if one is due."""
@@ -189,16 +189,13 @@ class Display:
         for name, stage in unfinished:
             if name not in self._tasks:
                 self._tasks[name] = self._bars.add_task(name, words="")
-            total = 1.0 if stage.done > 0.0 else None  # None: a bar that only shows that work goes on
+            total = 1.0 if stage.done > 0.0 else None  # None: an indeterminate bar
             self._bars.update(self._tasks[name], completed=stage.done, total=total, words=_stage_text(stage, now))
         self._bars.refresh()
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[object]], *, left: int = 1) -> str:
-    """Format a table: the first `left` columns flush left, the others flush right.
-
-    The text is the same on a terminal and in a pipe, so that it can be searched, cut and compared.
-    """
+    """Format a table: the first `left` columns flush left, the others flush right; the same in a pipe."""
     cells = [list(header), *([str(cell) for cell in row] for row in rows)]
     widths = [max(len(row[column]) for row in cells) for column in range(len(header))]
     lines = []
@@ -212,7 +209,7 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[object]], *, lef
 
 
 def format_bytes(size_bytes: int) -> str:
-    """Format a size for people: `12.3 MB`, MB = 10^6 bytes."""
+    """Format a size: `12.3 MB`, MB = 10^6 bytes."""
     for unit, divisor in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
         if size_bytes >= divisor:
             return f"{size_bytes / divisor:.1f} {unit}"
@@ -229,14 +226,14 @@ def parse_size_bytes(text: str) -> int:
     unit = None if found is None else _UNITS.get(found[2].lower())
     size = None if found is None or unit is None else float(found[1]) * unit
     if size is None or not 1.0 <= size < 2.0**63:
-        raise InputError(f"a size is {text!r}, wanted bytes, or a number with kB, MB, GB, KiB, MiB or GiB")
+        raise InputError(f"a size is {text!r}, expected bytes, or a number with kB, MB, GB, KiB, MiB or GiB")
     if size < _FILE_BYTES_MIN:
         raise InputError(f"no file has {size:.0f} bytes or fewer; did you mean {text.strip()}MB?")
     return int(size)
 
 
 def format_seconds(seconds: float) -> str:
-    """Format a duration for people, rounded: `12 s`, `3 minutes`."""
+    """Format a duration, rounded: `12 s`, `3 minutes`."""
     return f"{seconds:.0f} s" if seconds < _MINUTES_FROM else f"{seconds / 60.0:.0f} minutes"
 
 
@@ -252,12 +249,12 @@ def format_range(least: float, most: float) -> str:
     return f"{max(1.0, least / 60.0):.0f} to {most / 60.0:.0f} minutes"
 
 
-_displays: list[Display] = []  # the display that is shown, at most one: there is one standard error
+_displays: list[Display] = []  # the display that is shown; at most one
 
 
 @contextmanager
 def displayed(display: Display) -> Iterator[Display]:
-    """Show progress on a display until the end; `print_data` and `note` remove its bars first."""
+    """Show progress on a display within the context; `print_data` and `note` remove its bars first."""
     _displays.append(display)
     try:
         yield display
@@ -304,8 +301,8 @@ def _stage_text(stage: _Stage, now: float) -> str:
 
 
 def _new_bars() -> Bars:
-    """Return bars on standard error that vanish in the end. They redirect nothing: data stays on standard output."""
-    from rich.console import Console  # takes longer to import than most commands to run
+    """Return bars on standard error that vanish when stopped, and do not redirect standard output."""
+    from rich.console import Console  # slow to import compared with most commands
     from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as Bars
 
@@ -319,5 +316,5 @@ def _new_bars() -> Bars:
 def _echo(text: str, stream: TextIO) -> None:
     for display in _displays:
         display.close()  # bars and lines on one terminal do not mix
-    encoding = stream.encoding or "utf-8"  # file names and metadata may hold characters that it cannot represent
+    encoding = stream.encoding or "utf-8"  # may lack characters of file names and metadata
     stream.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")

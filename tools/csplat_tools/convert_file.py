@@ -1,4 +1,4 @@
-"""Convert scene files between formats, and filter their splats on the way."""
+"""Convert scene files between formats, and filter their splats."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from csplat.types import F64, Mask, Progress
 from csplat_tools.file_streams import is_one_way, local_path, mapped_csplat, write_model
 from csplat_tools.scene_files import MetadataOverrides, findings_as_json, size_on_disk, with_progress
 
-_CELL = 0.01  # fraction of the scene's extent: distance of neighbours of any splat
-_SPREAD = 4.0  # standard deviations of a splat: distance of its neighbours, if that is farther
-_NEIGHBOURS_MIN = 8  # splats in the neighbourhood, itself included: with fewer a splat is a floater
+_CELL = 0.01  # radius of a splat's neighbourhood, as a fraction of the scene's extent
+_SPREAD = 4.0  # the same in standard deviations of the splat, used if it is larger
+_NEIGHBOURS_MIN = 8  # splats in the neighbourhood, including itself; a splat with fewer is a floater
 
 
 @dataclass(frozen=True)
@@ -32,15 +32,15 @@ class Filters:
     """Changes of a scene, applied in the order of the fields; `None` and False change nothing.
 
     Attributes:
-        to_axes: turn the scene to these axes, as in `SplatModel`; a scene without axes is taken to have x right,
+        to_axes: convert the scene to these axes, as in `SplatModel`; a scene without axes is assumed to have x right,
             y down, z forward.
         rotate: rotate about x, y, z in this order, degrees, counter-clockwise as seen from the tip of the axis.
-        scale: factor by which the scene is enlarged about the origin of its coordinates.
+        scale: scale the scene about the origin of its coordinates by this factor.
         translate: offset added to all positions, scene units.
         crop_box: keep splats whose centres lie between two corners, x y z each.
         crop_sphere: keep splats whose centres lie within a sphere, x y z and radius.
         drop_floaters: drop splats with almost no others around them.
-        sh_degree: leave out the SH bands above.
+        sh_degree: drop the SH bands above.
     """
 
     to_axes: str | None = None
@@ -137,7 +137,7 @@ def _select(scene: SceneSource, keep: Callable[[SplatModel], Mask]) -> SceneSour
 
 
 def _without_floaters(scene: SceneSource) -> SceneSource:
-    """Drop isolated splats; holds centres and sizes of all splats in memory, 16 bytes each."""
+    """Drop isolated splats; keeps centres and sizes of all splats in memory, 16 bytes each."""
     points, sizes = np.empty((scene.count, 3), np.float32), np.empty(scene.count, np.float32)
     at = 0
     for model in scene.blocks():
@@ -186,13 +186,12 @@ class Conversion:
 
     Attributes:
         source_format, target_format: names of the formats.
-        count, sh_degree: number of splats and SH degree of the scene that was written, or would be.
-        source_bytes, size_bytes: sizes of the files; the latter is an estimate if nothing was written, `None` if it
-            cannot be estimated.
-        lost: contents that the target cannot hold.
+        count, sh_degree: number of splats and SH degree of the target.
+        source_bytes, size_bytes: sizes of the files; in a dry run the latter is an estimate, or `None` if unknown.
+        lost: contents that the target format does not support.
         rounded: names of the arrays that the target rounds.
         axes: axes before and after.
-        findings: findings in the source.
+        findings: lint findings in the source.
     """
 
     source_format: str
@@ -240,28 +239,27 @@ def convert_file(
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> Conversion:
-    """Read a scene in one format and write it in another, some splats at a time.
+    """Read a scene in one format and write it in another, block by block.
 
     Args:
         source: a file, or a folder, or `-`.
-        target: the file or folder to write; its name determines the format unless `write_as` does. The caller has
-            checked that it may be replaced.
+        target: the file or folder to write; it is replaced without a check.
         read_as: name of the source's format, if its content does not identify it.
-        write_as: the name of the target's format.
+        write_as: name of the target's format; `None`: by the file name ending.
         level: level of detail to read if the source has several; 0 is the finest.
         overrides: overrides of the source's metadata.
-        filters: changes of the scene on the way.
+        filters: changes of the scene.
         no_loss: refuse if anything would be lost.
         dry_run: write nothing.
         progress: progress callback; some formats read splats twice.
 
     Raises:
-        CsplatError: the source is not whole, the target cannot hold it, or `no_loss` is set and something is lost.
+        CsplatError: the source is damaged, the target cannot hold it, or `no_loss` is set and something is lost.
         OSError: a file cannot be read or written.
     """
     writes = format_by_suffix(Path(target)) if write_as is None else format_by_name(write_as)
     if writes.write is None:
-        raise InputError(f"{target} would be {writes.title}, which csplat does not write")
+        raise InputError(f"{target} has the name of {writes.title}, which csplat does not write")
     sh_degree = None if filters is None else filters.sh_degree
     with local_path(source) as local, open_scene(local, read_as, level=level, sh_degree=sh_degree) as reader:
         scene = (overrides or MetadataOverrides()).apply_to_scene(reader)
@@ -294,12 +292,12 @@ def decode_file(
     overrides: MetadataOverrides | None = None,
     progress: Progress | None = None,
 ) -> tuple[int, int]:
-    """Decode a .csplat file to a PLY, some splats at a time.
+    """Decode a .csplat file to a PLY, block by block.
 
     Args:
         source: the file, or `-`.
-        target: the PLY to write, or `-`. The caller has checked that it may be replaced.
-        sh_degree: leave out the SH bands above.
+        target: the PLY to write, or `-`; it is replaced without a check.
+        sh_degree: drop the SH bands above.
         absolute: add the origin and write doubles.
         max_splats: refuse a scene of more splats; `None`: no limit.
         overrides: overrides of the file's metadata for the PLY.
@@ -309,13 +307,13 @@ def decode_file(
         The number of splats written, and their SH degree.
 
     Raises:
-        CsplatError: the file is not valid, or too large; then there is no PLY.
+        CsplatError: the file is not valid, or too large; no PLY is written then.
         OSError: a file cannot be read or written.
     """
     with mapped_csplat(source) as data:
         opened = open_tiles(data, limits=None if max_splats is None else Limits(splats=max_splats))
         decoded = SceneSource(opened.header.splat_count, opened.metadata_model, opened.models)
-        # All bands are decoded, even if some are left out: damage anywhere gives no PLY.
+        # All bands are decoded, even if some are dropped, so that damage anywhere is found.
         scene = Filters(sh_degree=sh_degree).apply((overrides or MetadataOverrides()).apply_to_scene(decoded))
         if is_one_way(target):
             for _ in with_progress(decoded, "checking", progress).blocks():
@@ -325,7 +323,7 @@ def decode_file(
 
 
 def format_rows() -> list[tuple[str, ...]]:
-    """Return a row for each format: name, endings, if it is read, if it is written, SH degree, axes, exact, carried."""
+    """Return a row for each format: name, endings, readable, writable, SH degree, axes, exact and carried contents."""
     return [
         (
             one.name,

@@ -18,12 +18,7 @@ from csplat.ply.column_names import dropped_columns
 from csplat.system import default_memory_bytes
 from csplat.types import Progress
 from csplat_tools.console import note
-from csplat_tools.file_streams import (
-    STANDARD_STREAM,
-    source_path,
-    write_array,
-    write_bytes,
-)
+from csplat_tools.file_streams import STANDARD_STREAM, source_path, write_array, write_bytes
 from csplat_tools.scene_files import (
     CHEAP_TO_REOPEN,
     LoadedModel,
@@ -33,14 +28,14 @@ from csplat_tools.scene_files import (
     size_on_disk,
 )
 
-_MEMORY_FACTOR = 4  # memory of a scene over the size of its PLY; other formats have to be opened to tell
-#: By SH degree: seconds per million splats for one reading pass and for coding; seconds for a codebook. Within a tenth
-#: of the times measured with copies of fox120k at `balanced`: 10 M and 100 M splats of degree 0, 3 M of degrees 1, 2
-#: and 3, 30 M of degree 3.
+_MEMORY_FACTOR = 4  # memory of a scene divided by the size of its PLY; unknown for other formats
+#: By SH degree: seconds per million splats for one reading pass and for coding; seconds for a codebook. Within 10 % of
+#: times measured with copies of fox120k at `balanced`: 10 M and 100 M splats of degree 0, 3 M of degrees 1, 2 and 3,
+#: 30 M of degree 3.
 _SECONDS = ((0.2, 3.1, 0.0), (0.35, 7.0, 8.0), (0.45, 7.3, 12.0), (0.55, 8.0, 20.0))
 #: Bytes per splat of a file, by preset and SH degree 0 to 3.
 _FILE_BYTES = {"fast": (9.0, 9.5, 10.0, 11.0), "balanced": (6.5, 8.0, 8.5, 9.0), "small": (5.0, 6.5, 7.0, 7.5)}
-_SMALL = 4 << 20  # bytes: a file up to this size, in any format, fits in any memory
+_SMALL = 4 << 20  # bytes; smaller files of any format always fit in memory
 
 
 @dataclass(frozen=True)
@@ -48,11 +43,11 @@ class OutOfCoreOptions:
     """Options for encoding scenes that may be larger than memory.
 
     Attributes:
-        memory_bytes: bound on the memory; `None`: half of the free memory.
+        memory_bytes: limit of the memory; `None`: half of the free memory.
         folder: working folder; `None`: next to the file.
         resume: continue from the content of the working folder.
         cluster: address of a Dask scheduler.
-        out_of_core: a scene of several buckets is encoded out of core, even if it fits in memory.
+        out_of_core: encode scenes of several buckets out of core, even if they fit in memory.
     """
 
     memory_bytes: int | None = None
@@ -62,7 +57,7 @@ class OutOfCoreOptions:
     out_of_core: bool = False
 
     def may_exceed_memory(self, path: Path) -> bool:
-        """Return True if a scene may not fit in memory, and has to be opened to tell."""
+        """Return True if a scene may not fit in memory, which can only be decided after opening it."""
         if self.cluster is not None or self.resume or self.out_of_core:
             return True
         bound = default_memory_bytes() if self.memory_bytes is None else self.memory_bytes
@@ -82,8 +77,8 @@ class OutOfCoreResult:
 def read_degree(options: EncodeOptions) -> int | None:
     """Return the SH degree at which to read a scene to be encoded; `None` keeps all bands.
 
-    Bands that the encoder drops are read as well: they are part of the declared errors. A file of a higher degree than
-    models have is readable only if bands are to be left out.
+    Bands that the encoder drops are read as well, since declared errors include them. A file of a higher degree than
+    models support can be read only if bands are dropped.
     """
     return None if options.sh_degree is None else MAX_SH_DEGREE
 
@@ -103,18 +98,14 @@ def encode_out_of_core(
     Args:
         local: the scene, in any format.
         target: the file to write.
-        options: options of the encoder.
-        overrides: overrides of the scene's metadata.
-        scale: memory, disk, workers.
-        strict: refuse defects that would be repaired.
-        progress: progress callback.
+        options, overrides, scale, strict, progress: as for `encode_file`.
 
     Returns:
-        The outcome of the encoding; or the scene in memory, as `read_source` returns it; `None` if it fits in memory,
-        and is read faster by `read_source`.
+        The outcome of the encoding. If the scene fits in memory: the loaded scene, or `None` if `read_source` reads it
+        faster.
 
     Raises:
-        CsplatError: as for `encode_scene`; or the scene is too large to go to standard output.
+        CsplatError: as for `encode_scene`; or a scene larger than memory is to be written to standard output.
         OSError: as for `encode_scene`.
     """
     if progress is not None:
@@ -131,7 +122,7 @@ def encode_out_of_core(
             model = (overrides or MetadataOverrides()).apply(model)
             return LoadedModel(model, size_on_disk(local), name=local.name, findings=tuple(findings))
         if target == STANDARD_STREAM:
-            raise InputError("the scene does not fit in memory, and is written by way of the disk: name a file")
+            raise InputError("the scene does not fit in memory, and cannot be written to standard output: name a file")
         findings = [*reader.findings]
         if reader.metadata_model.extra and not options.keep_extra:
             findings.append(dropped_columns(list(reader.metadata_model.extra)))
@@ -146,7 +137,7 @@ def encode_out_of_core(
         except (KeyboardInterrupt, OSError):
             folder = Path(scale.folder or f"{target}.work")
             if folder.exists():
-                note(f"{folder} keeps what is done: --resume continues with it")
+                note(f"{folder} holds the finished part: --resume continues from it")
             raise
         return OutOfCoreResult(scene.metadata_model, report, tuple(findings))
 
@@ -158,7 +149,7 @@ class CostEstimate:
     Attributes:
         count, sh_degree: number of splats and SH degree that will be encoded.
         needs: memory, disk, workers.
-        seconds: approximate time, from measurements on one core (`_SECONDS`) and the number of workers.
+        seconds: approximate time (`_SECONDS`).
         file_bytes: approximate size of the file at the preset's precision.
     """
 
@@ -186,7 +177,7 @@ def estimate_cost(local: Path, options: EncodeOptions, scale: OutOfCoreOptions) 
     """Estimate the cost of encoding a scene, without reading its splats.
 
     Raises:
-        CsplatError: the scene is not valid, or the memory is too little.
+        CsplatError: the scene is not valid, or there is too little memory.
         OSError: the scene cannot be read.
     """
     with open_scene(local, sh_degree=read_degree(options)) as reader:
@@ -209,7 +200,7 @@ class EncoderOutcome:
 
     Attributes:
         result: the encoder's result.
-        key: name of the entry of a JSON report that holds `report`; "": none.
+        key: key of `report` in the JSON of the command; "": none.
         report: the target, the candidates and the choice, JSON-compatible.
         lines: remarks for the user, a sentence each.
     """
@@ -220,7 +211,6 @@ class EncoderOutcome:
     lines: tuple[str, ...] = ()
 
 
-#: A function that encodes a scene, with a progress callback.
 EncodeFunction = Callable[[SplatModel, EncodeOptions, Progress | None], EncoderOutcome]
 
 
@@ -229,11 +219,11 @@ class EncodedFile:
     """The outcome of an encoding.
 
     Attributes:
-        source: the scene as it was encoded; without its splats if it was not in memory.
+        source: the encoded scene; only its metadata if it was encoded out of core.
         report: choices and errors.
-        outcome: the encoded file; `None` if the scene was not in memory.
-        findings: findings of lint in the PLY.
-        source_bytes: size of the PLY.
+        outcome: the encoded file; `None` if it was encoded out of core.
+        findings: lint findings in the source.
+        source_bytes: size of the source.
         seconds: time of reading, encoding and writing.
     """
 
@@ -281,20 +271,20 @@ def encode_file(
     """Read a scene file, encode it, and write the .csplat file.
 
     Args:
-        source: a PLY, or `-`.
-        target: the file to write, or `-`. The caller has checked that it may be replaced.
+        source: a scene in any format, or `-`.
+        target: the file to write, or `-`; it is replaced without a check.
         options: options of the encoder; `keep_extra` applies to reading, too.
-        overrides: overrides of the PLY's metadata.
+        overrides: overrides of the scene's metadata.
         strict: refuse defects that would be repaired.
-        importance: a .npy file with one weight per splat of the PLY as read, or a file of `csplat sensitivity`.
-        prune_unseen: leave out the splats that no view of the sensitivities saw.
-        source_index: a .npy file to write: for each splat of the file, its index in the PLY as read.
-        encoder: a function to call instead of the encoder, such as a target search; it does not get `importance`.
-        scale: memory, disk and workers. An `encoder`, an importance or a source index requires the scene in memory.
+        importance: a .npy file with one weight per splat of the source, or a file of `csplat sensitivity`.
+        prune_unseen: prune the splats that no view of the sensitivities saw.
+        source_index: a .npy file to write: the index in the source of each splat of the file.
+        encoder: called instead of the encoder, such as a target search; `importance` is ignored then.
+        scale: memory, disk and workers. `encoder`, `importance` and `source_index` require the scene in memory.
         progress: progress callback.
 
     Raises:
-        CsplatError: the PLY or the options cannot be used.
+        CsplatError: the scene or the options are not valid.
         OSError: a file cannot be read or written.
     """
     start, scale = time.perf_counter(), scale or OutOfCoreOptions()
@@ -317,10 +307,10 @@ def encode_file(
         outcome = encoder(model, options, progress)
     elif importance is None:
         if prune_unseen:
-            raise InputError("splats that no view saw are known only from a file of `csplat sensitivity`")
+            raise InputError("pruning unseen splats requires a file of `csplat sensitivity` as importance")
         outcome = EncoderOutcome(encode_with_report(model, options, progress=progress))
     else:
-        from csplat_tools.importance_file import encode_by_importance  # imports names of trainer and renderer
+        from csplat_tools.importance_file import encode_by_importance  # imports trainer and renderer
 
         outcome = EncoderOutcome(
             encode_by_importance(model, options, importance, prune_unseen=prune_unseen, progress=progress)

@@ -34,7 +34,7 @@ from csplat.scene_source import SceneSource
 
 STANDARD_STREAM = "-"
 
-_OWN_FORMATS = ("ply", "csplat")  # names of the formats that commands other than `convert` write
+_OWN_FORMATS = ("ply", "csplat")  # formats that commands other than `convert` write
 _PLY_MAGICS = (b"ply\n", b"ply\r")
 
 #: Commands by the file name endings of their input and output; `*`: any.
@@ -45,7 +45,7 @@ _MAKERS = {
     ("*", ".npz"): "sensitivity",
 }
 
-#: File name endings of files that are no scenes.
+#: File name endings of other files than scenes.
 _NO_SCENES = {".csv", ".gif", ".jpg", ".json", ".mp4", ".npy", ".pdf", ".png", ".svg", ".txt", ".webp", ".xml"}
 
 
@@ -53,7 +53,7 @@ class _StandardInput(io.BytesIO):
     name = "standard input"
 
 
-_free: set[Path] = set()  # names that were free when checked: a file that has appeared since is not replaced
+_free: set[Path] = set()  # paths without a file when checked; a file that appeared since is not replaced
 
 
 def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> None:
@@ -62,7 +62,7 @@ def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> Non
     Args:
         path: the file to be written, or `-`.
         force: an existing file may be replaced.
-        inputs: files that the command reads; none of them may be the output, force or not.
+        inputs: files that the command reads; the output may not be one of them, even with `force`.
 
     Raises:
         InputError: the file exists, is an input, or is a terminal.
@@ -70,14 +70,14 @@ def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> Non
     """
     if path == STANDARD_STREAM:
         if sys.stdout.isatty():
-            raise InputError("will not write binary data to a terminal: name a file, or use a pipe")
+            raise InputError("binary data are not written to a terminal: name a file, or use a pipe")
         return
     target = Path(path)
     if target.is_dir():
-        raise InputError(f"{path} is a folder, wanted the name of a file")
+        raise InputError(f"{path} is a folder, expected the name of a file")
     _free.discard(target.resolve())
     if not target.exists():
-        target.parent.stat()  # an OSError that names the folder
+        target.parent.stat()  # raises an OSError that names the folder
         if not force:
             _free.add(target.resolve())
         return
@@ -92,9 +92,9 @@ def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[
     """Refuse unusable outputs before any work is done for them; see `check_output`.
 
     Args:
-        paths: the files to be written, or `-`; `None` for those that are not requested.
+        paths: the files to be written, or `-`; `None` is ignored.
         force: existing files may be replaced.
-        inputs: files that the command reads, folders or URLs; `None` for those that are not given.
+        inputs: files, folders and URLs that the command reads; `None` is ignored.
 
     Raises:
         InputError: as for `check_output`; or two paths name the same file.
@@ -108,7 +108,7 @@ def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[
     read = tuple(path for path in inputs if path is not None and not is_url(path))
     for path in read:
         if path != STANDARD_STREAM:
-            Path(path).stat()  # an OSError that names it, before any work is done
+            Path(path).stat()  # raises an OSError that names it
     for path in outputs:
         check_output(path, force=force, inputs=read)
 
@@ -119,11 +119,11 @@ def check_name(path: str, wanted: str, writer: str, source: str = "") -> None:
     Args:
         path: the output, or `-`.
         wanted: file name ending of the output.
-        writer: name of the command whose argument it is, or the option whose value it is.
-        source: the input of that command, to suggest a command that makes such a file.
+        writer: the command whose argument it is, or the option whose value it is.
+        source: the input of that command, for suggesting a command that makes such a file.
 
     Raises:
-        InputError: the name has the ending of another kind of file; the message suggests what was meant.
+        InputError: the name has the ending of another kind of file; the message suggests a remedy.
     """
     target, suffix = Path(path), Path(path).suffix.lower()
     if suffix == wanted:
@@ -135,7 +135,7 @@ def check_name(path: str, wanted: str, writer: str, source: str = "") -> None:
     maker = _MAKERS.get((Path(source).suffix.lower(), suffix)) or _MAKERS.get(("*", suffix)) or converts * "convert"
     if known is None and not maker and suffix not in {kind for pair in _MAKERS for kind in pair} | _NO_SCENES:
         return
-    what = f"csplat does not write {known} yet, and" if known else f"it has the name of a {suffix} file, and"
+    what = f"csplat does not write {known} yet, and" if known else f"the name is that of a {suffix} file, and"
     line = writer if writer.startswith("-") else f"csplat {writer}"
     meant = " ".join(filter(None, [line, source * (line != writer), str(target.with_suffix(wanted))]))
     if maker and source:
@@ -156,7 +156,7 @@ def local_path(file: File) -> Iterator[Path]:
 
 
 def kept_path(file: File) -> AbstractContextManager[Path]:
-    """Like `local_path`, but errors raised while it is open are not attributed to this file."""
+    """Return a context like `local_path` that does not attribute errors to this file."""
     if isinstance(file, str) and file == STANDARD_STREAM:
         return local_file(sys.stdin.buffer, "standard input")
     return local_file(file)
@@ -164,7 +164,7 @@ def kept_path(file: File) -> AbstractContextManager[Path]:
 
 @contextmanager
 def naming(file: object) -> Iterator[None]:
-    """Set the path of errors that name no file, if this file has a name."""
+    """Set the path of errors that name no file to this file's."""
     try:
         yield
     except CsplatError as error:
@@ -175,7 +175,7 @@ def naming(file: object) -> Iterator[None]:
 
 @contextmanager
 def source_path(file: File) -> Iterator[Path]:
-    """Yield the path of a scene to be encoded; anything but a path is copied to a temporary file first.
+    """Yield the path of a scene to be encoded; streams and bytes are copied to a temporary file first.
 
     Raises:
         InputError: the scene is a .csplat file.
@@ -185,7 +185,7 @@ def source_path(file: File) -> Iterator[Path]:
         if is_csplat(local):
             _refuse_others(local.name, read_head(local))
             raise InputError(
-                f"{local.name} is a .csplat file already: `csplat decode` turns it into a PLY,"
+                f"{local.name} is a .csplat file already: `csplat decode` converts it to a PLY,"
                 " `csplat info` describes it"
             )
         yield local
@@ -194,7 +194,7 @@ def source_path(file: File) -> Iterator[Path]:
 def is_csplat(path: Path) -> bool:
     """Return True for a .csplat file, by its first bytes, or by its name if they are damaged.
 
-    A PLY is none, whatever its name; nor is a folder (an unbundled SOG).
+    A PLY with such a name is not one, nor is a folder (an unbundled SOG).
 
     Raises:
         OSError: the file cannot be read.
@@ -208,9 +208,7 @@ def is_csplat(path: Path) -> bool:
 
 @contextmanager
 def mapped_csplat(path: str) -> Iterator[bytes | mmap]:
-    """Yield the bytes of a .csplat file, memory-mapped if possible.
-
-    The decoder checks if they are valid; only files of other known formats are refused here.
+    """Yield the bytes of a .csplat file, memory-mapped if possible; they are not validated.
 
     Raises:
         InputError: the file is in another format.
@@ -270,7 +268,7 @@ def _output_stream(path: str) -> Iterator[BinaryIO]:
 
 @contextmanager
 def whole_output(path: str) -> Iterator[BinaryIO]:
-    """Like `_output_stream`, but data reaches standard output only when it is complete."""
+    """Yield a stream like `_output_stream`; data reaches standard output only when it is complete."""
     if path != STANDARD_STREAM:
         with open_output(path) as stream:
             yield stream
@@ -283,10 +281,10 @@ def whole_output(path: str) -> Iterator[BinaryIO]:
 
 @contextmanager
 def open_output(path: str) -> Iterator[BinaryIO]:
-    """Open a file that gets its name when it is complete; a name that `check_output` found free must still be free.
+    """Open a file that gets its name when it is complete.
 
     Raises:
-        InputError: another program has written a file of that name meanwhile.
+        InputError: another program has written a file of that name since `check_output`.
         OSError: the file cannot be written.
     """
     target = Path(path).resolve()
@@ -295,7 +293,7 @@ def open_output(path: str) -> Iterator[BinaryIO]:
             yield stream
     except FileExistsError:
         raise InputError(
-            f"{path} exists: another program wrote it meanwhile, and it was kept; --force replaces it"
+            f"{path} exists: another program wrote it meanwhile, and it was not replaced; --force replaces it"
         ) from None
     _free.discard(target)
 
@@ -328,4 +326,4 @@ def _close(data: mmap) -> None:
     try:
         data.close()
     except BufferError:
-        return  # an error that is raised still holds a view; the garbage collector closes it
+        return  # an error in flight holds a view of the data; the garbage collector will close it

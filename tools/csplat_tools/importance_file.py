@@ -1,4 +1,4 @@
-"""Encode by the importance in a file: weights (.npy), or the output of `csplat sensitivity` (.npz)."""
+"""Encode with the importance in a file: weights (.npy), or the output of `csplat sensitivity` (.npz)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from csplat_trainer.sensitivity_file import StoredSensitivity, read_sensitivity
 
 _ZIP = b"PK"  # first bytes of a .npz file
 _ONE_CLASS = (
-    "all splats are in one quantisation class: their precision does not follow from weights, nor from virtual views"
-    " inside surroundings; `csplat sensitivity` from cameras gives it"
+    "all splats are in one quantisation class, since this importance does not determine their precision:"
+    " use `csplat sensitivity` with real cameras"
 )
 
 
@@ -39,14 +39,10 @@ def read_importance(path: str, model: SplatModel) -> NDArray[Any] | Importance |
 def encoder_importance(
     found: NDArray[Any] | Importance | StoredSensitivity, model: SplatModel
 ) -> NDArray[Any] | Importance:
-    """Return the importance that the encoder takes, from the content of a file.
+    """Return the importance for the encoder from the result of `read_importance`.
 
-    Virtual views do not look from where the cameras of a surrounding scene were: they show too little of it to tell
-    how coarsely it may be quantised. So such sensitivities do not sort splats into quantisation classes.
-
-    Args:
-        found: the result of `read_importance`.
-        model: the scene.
+    In surrounding scenes, virtual views show too little to determine how coarsely splats may be quantised. So
+    sensitivities measured in such views do not sort splats into quantisation classes.
     """
     if not isinstance(found, StoredSensitivity):
         return found
@@ -57,7 +53,7 @@ def encoder_importance(
 
 
 def read_encoder_importance(path: str, model: SplatModel) -> NDArray[Any] | Importance:
-    """Read the importance that the encoder takes from a file, see `read_importance`."""
+    """Read the importance for the encoder from a file, see `read_importance`."""
     return encoder_importance(read_importance(path, model), model)
 
 
@@ -69,47 +65,42 @@ def encode_by_importance(
     Args:
         model: the scene.
         options: options of the encoder.
-        path: a file as `read_importance` takes it.
-        prune_unseen: leave out the splats that no view of the sensitivities saw.
+        path: a file as for `read_importance`.
+        prune_unseen: prune the splats that no view of the sensitivities saw.
         progress: progress callback.
 
     Raises:
-        InputError: the file is invalid, belongs to another scene, or `prune_unseen` is set and it does not tell which
-            splats were seen, or none was.
+        InputError: the file is invalid or belongs to another scene; or `prune_unseen` is set and no view saw any
+            splat, or the file has weights only.
         OSError: the file cannot be read.
     """
     found = read_importance(path, model)
     stored = found if isinstance(found, StoredSensitivity) else None
     if prune_unseen and stored is None:
-        raise InputError("splats that no view saw are known only from a file of `csplat sensitivity`")
+        raise InputError("pruning unseen splats requires a file of `csplat sensitivity` as importance")
     weights = encoder_importance(found, model)
     notes = _class_notes(options, weights)
     if not prune_unseen or stored is None or stored.seen.all():
         return _with_notes(encode_with_report(model, options, importance=weights, progress=progress), *notes)
     rows = np.flatnonzero(stored.seen)
     if not len(rows):
-        raise InputError(f"{path}: no view saw any splat; none would be kept")
+        raise InputError(f"{path}: no view saw any splat, so all would be pruned")
     pruned = {"unseen": len(model) - len(rows), "views": stored.view_count, "source": stored.source}
     result = encode_with_report(
         model.select(rows), options, importance=weights.select(rows) if isinstance(weights, Importance) else None,
         origin=Origin(len(model), rows), metadata={"pruned": pruned}, progress=progress,
     )  # fmt: skip
-    if stored.missed_share > 0.0:  # False for NaN: no view was held out
-        missed = (
-            f"{100 * stored.missed_share:.1f} % of the splats are left out although held-out views saw"
-            " them: `csplat sensitivity` with more views misses fewer"
-        )
-        notes = (*notes, missed)
+    if stored.missed_share > 0.0:  # NaN if no view was held out
+        missed = f"{100 * stored.missed_share:.1f} % of the splats were pruned although held-out views saw them:"
+        notes = (*notes, f"{missed} `csplat sensitivity` with more views misses fewer")
     return _with_notes(result, *notes)
 
 
 def _class_notes(options: EncodeOptions, weights: NDArray[Any] | Importance) -> tuple[str, ...]:
-    """Return a note if quantisation classes were requested and the importance cannot provide them."""
     if (options.max_classes or 1) == 1 or (isinstance(weights, Importance) and weights.blocks is not None):
         return ()
     return (_ONE_CLASS,)
 
 
 def _with_notes(result: EncodeResult, *notes: str) -> EncodeResult:
-    """Return the result with notes for the user added."""
     return replace(result, report=replace(result.report, notes=(*result.report.notes, *notes)))

@@ -1,4 +1,4 @@
-"""Import optional packages, or raise an error that tells how to install them; compile the renderer."""
+"""Import optional packages, or raise an error that names the extra; compile the renderer; describe the machine."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _DATA_SETS = (
     ("numba", None),
     ("scipy", None),
     ("PIL", "pillow"),
-)  # modules needed to read and render photographs, with the package's name if it is another
+)  # modules for reading and rendering images, with the name of the package if it differs
 
 
 def require_renderer() -> None:
-    """Import the package for rendering, to fail before the minutes that reading may take.
+    """Import the package for rendering, to fail early.
 
     Raises:
         InputError: numba is not installed.
@@ -39,8 +39,8 @@ def prepare_renderer(
 
     Args:
         quiet: print nothing.
-        gradients: compile the gradients that training runs, too.
-        simplify: compile the functions that simplification runs, too, gradients among them.
+        gradients: compile the gradients for training, too.
+        simplify: compile the functions for simplification, too, including gradients.
         ssim: compile SSIM, too.
         lpips: compile LPIPS, too.
 
@@ -63,7 +63,7 @@ def prepare_renderer(
 
 
 def require_trainer(*, plots: bool = False) -> None:
-    """Import the packages for training on the CPU (not torch), after setting how OpenMP threads wait.
+    """Import the packages for training on the CPU (not torch), and limit how long OpenMP threads spin.
 
     Args:
         plots: import the package for plots, too.
@@ -131,11 +131,10 @@ def _need(module: str, package: str | None = None, *, extra: str = "render") -> 
 
 
 def _limit_spinning() -> None:
-    """Let the threads of GNU OpenMP sleep soon while they wait for each other.
+    """Let waiting threads of GNU OpenMP sleep soon, unless the user has set the variable.
 
-    They spin for milliseconds otherwise, and if another program uses the same cores, a training step waits for a
-    thread that waits for a core; measured 57 instead of 470 ms per step. The library reads the variable when it is
-    loaded, so it is set before; a value that the user has set is kept.
+    By default they spin for milliseconds, which blocks cores if another program uses them, too: 57 instead of 470 ms
+    per training step, measured. The variable must be set before the library is loaded.
     """
     os.environ.setdefault("GOMP_SPINCOUNT", _SPIN_COUNT)
 
@@ -144,11 +143,7 @@ _PACKAGES = ("numpy", "numba", "scipy", "deflate", "zstandard", "matplotlib", "p
 
 
 def describe_machine(threads: int | None) -> dict[str, Any]:
-    """Describe processor, cores, threads in use, system, and versions, JSON-compatible.
-
-    Args:
-        threads: number of threads in use; `None` for all.
-    """
+    """Return processor, cores, threads in use (`None` for all), system and versions as JSON-compatible values."""
     cores = core_count()
     return {
         "processor": processor_name(),

@@ -18,7 +18,7 @@ from csplat_tools.file_streams import write_bytes
 from csplat_tools.optional_packages import require_film, require_images
 
 _DIGITS = 4
-_NAME_LENGTH_MAX = 200  # file systems take 255 bytes
+_NAME_LENGTH_MAX = 200  # characters; file systems allow 255 bytes
 
 
 def image_names(images: Sequence[str | None]) -> list[str]:
@@ -28,7 +28,7 @@ def image_names(images: Sequence[str | None]) -> list[str]:
         images: names of the cameras' images, such as `images/0007.jpg`, or `None`.
 
     Returns:
-        The names of the images; a number for a camera without one; both if the names are not unique.
+        The stems of the image names; a number for a camera without an image; both if the names are not unique.
     """
     stems = [_stem(image) for image in images]
     numbers = [f"{number:0{_DIGITS}d}" for number in range(len(stems))]
@@ -47,14 +47,14 @@ def make_output_folder(folder: str, names: Sequence[str], *, force: bool) -> Pat
         force: existing files may be replaced.
 
     Raises:
-        InputError: `folder` is not a folder; two names are the same; or one of the files exists, or is not a file.
+        InputError: `folder` is not a folder; two names are equal; or one of the files exists, or is not a file.
         OSError: the folder cannot be made.
     """
     path = Path(folder)
     if path.exists() and not path.is_dir():
         raise InputError(f"{folder} is not a folder")
     if len(set(names)) < len(names):
-        raise InputError("two renders would get the same name: rename the cameras' images")
+        raise InputError("two renders have the same name: rename the cameras' images")
     for name in names:
         target = path / name
         if target.exists() and not (force and target.is_file()):
@@ -71,12 +71,12 @@ def to_uint8(values: F32) -> U8:
 
 
 def side_by_side(a: F32, b: F32, amplification: float, image: F32 | None = None) -> U8:
-    """Lay side by side two images and the amplified magnitude of their difference.
+    """Concatenate two images and the amplified magnitude of their difference.
 
     Args:
         a, b: [H, W, 3], 0..1.
-        amplification: factor by which the difference is multiplied.
-        image: [H, W, 3], placed before the others, if there is one.
+        amplification: factor of the difference.
+        image: [H, W, 3], placed first, if given.
 
     Returns:
         [H, 3 W, 3], or [H, 4 W, 3] with an image.
@@ -102,7 +102,7 @@ def write_png(path: Path, pixels: NDArray[Any]) -> None:
 
 
 def _stem(image: str | None) -> str:
-    """Return the last part of a path of any system, without its ending and characters that file names may not hold."""
+    """Return the last part of a path of any system, without its ending and characters that file names cannot have."""
     if image is None:
         return ""
     name = PureWindowsPath(PurePosixPath(image).name).name  # never leads out of the folder
@@ -112,7 +112,7 @@ def _stem(image: str | None) -> str:
 
 _MP4 = "MP4"
 
-#: File name endings of films, with pillow's names of the formats (it does not write MP4); other names are folders.
+#: File name endings of films, with pillow's names of the formats; pillow does not write MP4.
 FILM_ENDINGS = {".webp": "WEBP", ".gif": "GIF", ".png": "PNG", ".apng": "PNG", ".mp4": _MP4}
 
 #: Frames per second.
@@ -120,16 +120,16 @@ DEFAULT_FPS, MAX_FPS = 25.0, 100.0
 
 _TICKS = {"WEBP": 1000, "GIF": 100, "PNG": 1000, _MP4: 1000}  # ticks per second of the format's clock
 _MAX_SIDE = {"WEBP": 16383, "GIF": 65535, "PNG": 1 << 15, _MP4: 16384}  # largest width or height, pixels
-_MAX_BYTES = 1 << 31  # largest size of all frames, which are in memory together
+_MAX_BYTES = 1 << 31  # largest size of all frames, which are kept in memory
 _WEBP = {"quality": 90, "method": 4}
 _X264 = {
     "crf": "18",
     "preset": "medium",
-    "threads": "1",  # with several, the bytes differ between machines
-    "x264-params": "mbtree=0",  # with mbtree two runs in four gave other bytes, even on one thread
+    "threads": "1",  # with several threads, the bytes differ between machines
+    "x264-params": "mbtree=0",  # with mbtree two of four runs gave different bytes, even on one thread
 }
-_BT709 = 1  # matrix, primaries and transfer function, as H.264 numbers them
-_LIMITED_RANGE = 1  # as players expect: black is 16
+_BT709 = 1  # H.264's number for matrix, primaries and transfer function
+_LIMITED_RANGE = 1  # black is 16, which players expect
 
 
 def is_film(path: str) -> bool:
@@ -141,13 +141,13 @@ def check_film(path: str, sizes: Sequence[tuple[int, int]], fps: float) -> None:
     """Refuse a film that cannot be written, before it is rendered.
 
     Args:
-        path: a name for which `is_film` holds.
+        path: a path for which `is_film` is true.
         sizes: width and height of its frames, at least one.
         fps: frames per second, above 0.
 
     Raises:
-        InputError: the frames differ in size, are too large or too many, or `fps` is too high; or the package that
-            writes such films is not installed.
+        InputError: the frames differ in size, are too large or too many; `fps` is too high; or the package for this
+            format is not installed.
     """
     kind = FILM_ENDINGS[Path(path).suffix.lower()]
     if kind == _MP4:
@@ -155,16 +155,16 @@ def check_film(path: str, sizes: Sequence[tuple[int, int]], fps: float) -> None:
     else:
         require_images()
     if len(set(sizes)) > 1:
-        raise InputError(f"a film has frames of one size, the cameras have {len(set(sizes))}: give --size")
+        raise InputError(f"the cameras have {len(set(sizes))} sizes, expected one for a film: set --size")
     width, height = sizes[0]
     if kind == _MP4 and min(width, height) < 2:
-        raise InputError(f"MP4 frames have at least 2 pixels a side, wanted {width}x{height}")
+        raise InputError(f"frames have {width}x{height} pixels, expected at least 2 per side for MP4")
     if max(width, height) > _MAX_SIDE[kind]:
-        raise InputError(f"{kind} frames have at most {_MAX_SIDE[kind]} pixels a side, wanted {width}x{height}")
+        raise InputError(f"frames have {width}x{height} pixels, expected at most {_MAX_SIDE[kind]} per side for {kind}")
     if len(sizes) * width * height * 3 > _MAX_BYTES:
         raise InputError(
-            f"{len(sizes)} frames of {width}x{height} are more than {_MAX_BYTES >> 30} GiB: render into a folder, "
-            "and let ffmpeg make a film of it"
+            f"{len(sizes)} frames of {width}x{height} need more than {_MAX_BYTES >> 30} GiB: render into a folder, "
+            "and make the film with ffmpeg"
         )
     if fps > min(MAX_FPS, _TICKS[kind]):
         raise InputError(f"{fps:g} frames per second, wanted {MAX_FPS:g} at most")
@@ -210,10 +210,10 @@ def _mp4(frames: Sequence[U8], fps: float) -> bytes:
     require_film()
     import av
 
-    height, width = (side - side % 2 for side in frames[0].shape[:2])  # colours have half the resolution
+    height, width = (side - side % 2 for side in frames[0].shape[:2])  # even, since chroma has half the resolution
     rate = Fraction(fps).limit_denominator(1001)
     with tempfile.TemporaryDirectory(prefix="csplat-") as folder:
-        film = Path(folder) / "film.mp4"  # PyAV rewrites the file: the index for players has to come first
+        film = Path(folder) / "film.mp4"  # a file, since PyAV rewrites it to put the index first
         options = {"movflags": "+faststart", "fflags": "+bitexact"}
         with av.open(film, "w", format="mp4", options=options) as container:
             try:
@@ -232,7 +232,7 @@ def _mp4(frames: Sequence[U8], fps: float) -> bytes:
 
 
 def _durations(count: int, fps: float, ticks: int) -> list[int]:
-    """Return the milliseconds of each frame, in whole ticks of the format, without drift."""
+    """Return the milliseconds of each frame, rounded to ticks of the format without drift."""
     ends = np.rint(np.arange(count + 1) * (ticks / fps)).astype(np.int64)
     lasting = np.maximum(np.diff(ends), 1) * (1000 // ticks)
     return [int(value) for value in lasting]

@@ -27,10 +27,10 @@ from csplat_tools.file_streams import is_csplat, kept_path, local_path, mapped_c
 #: Names of files that represent the whole folder they are in: SOG as a folder, and with levels.
 FOLDER_NAMES = ("meta.json", "lod-meta.json")
 
-#: Formats that unpack nothing when they are opened, and are read as a whole in fewer passes.
+#: Formats that are opened without unpacking, and are read as a whole in fewer passes.
 CHEAP_TO_REOPEN = ("ply", "csplat")
-_SMALL = 1 << 20  # bytes: a file up to this size, in any format, fits in any memory
-#: Bytes of a comparison in addition to the scenes' arrays: for the program, and per splat drawn and searched.
+_SMALL = 1 << 20  # bytes; smaller files of any format always fit in memory
+#: Bytes of memory of a comparison in addition to the scenes' arrays: for the program, and per splat.
 _BASE_BYTES, _SPLAT_BYTES = 200_000_000, 320
 
 
@@ -42,9 +42,9 @@ class LoadedModel:
         model: the splats.
         size_bytes: size of the file; for a model without a file, of its plain PLY.
         header: header of a .csplat file; `None` for other formats.
-        declared_bounds: declared errors of a .csplat file; `None` if it has none.
+        declared_bounds: declared error bounds of a .csplat file, if any.
         name: name of the file.
-        findings: findings while it was read.
+        findings: lint findings.
     """
 
     model: SplatModel
@@ -56,10 +56,10 @@ class LoadedModel:
 
     def _repr_html_(self) -> str | None:
         """Return the HTML that a notebook shows, see `SplatModel`."""
-        return self.model._repr_html_()  # notebooks' protocol, and public there
+        return self.model._repr_html_()  # the protocol of notebooks
 
     def sample(self, progress: Progress | None = None) -> tuple[SplatModel, int]:  # noqa: ARG002  # as in `OpenedScene`
-        """Return all splats, and 1: each stands for itself."""
+        """Return all splats, and 1, as `OpenedScene.sample` does."""
         return self.model, 1
 
     @property
@@ -69,7 +69,7 @@ class LoadedModel:
 
     @property
     def metadata_model(self) -> SplatModel:
-        """The scene's metadata, as fields of the model itself."""
+        """The model itself, for its metadata."""
         return self.model
 
     def as_json(self) -> dict[str, Any]:
@@ -82,10 +82,10 @@ class OpenedScene:
     """A scene that is open, but not in memory.
 
     Attributes:
-        scene: the splats, some at a time.
+        scene: the splats, in blocks.
         size_bytes: size of the file.
         path: path of the file.
-        memory_bytes: approximate bound on the memory for working with the scene.
+        memory_bytes: approximate limit of the memory for working with the scene.
         sample_splats: largest number of splats in the sample.
     """
 
@@ -100,7 +100,7 @@ class OpenedScene:
         """Return every Nth splat, without SH bands, and N. The sample is read once and cached.
 
         Raises:
-            CsplatError: the scene is not whole.
+            CsplatError: the scene is truncated or damaged.
         """
         every = max(1, -(-self.count // self.sample_splats))
         if not self._sample:
@@ -119,13 +119,13 @@ class OpenedScene:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings while it was read."""
+        """Lint findings."""
         extra = list(self.metadata_model.extra)
         return (*self.scene.findings, *([dropped_columns(extra)] if extra and self.scene.format == "ply" else []))
 
     @property
     def metadata_model(self) -> SplatModel:
-        """The scene's metadata, as a model without splats."""
+        """A model without splats that has the scene's metadata."""
         return self.scene.metadata_model
 
     def as_json(self) -> dict[str, Any]:
@@ -154,10 +154,9 @@ def load_model(scene: SceneLike, *, sh_degree: int | None = None) -> LoadedModel
     """Read a scene in any format (`csplat formats`), detected by its content.
 
     Args:
-        scene: the file: a path, an open binary file, or bytes; the path `-` is standard input. A model, or a
-            scene that is loaded already, is returned as it is.
-        sh_degree: leave out the SH bands above when reading a file, even one of a higher degree than 3; `None`: keep
-            all.
+        scene: a path, an open binary file, or bytes; the path `-` is standard input. A model or a `LoadedModel` is
+            not read again.
+        sh_degree: drop the SH bands above; required to read files of a higher degree than 3. `None`: keep all.
 
     Examples:
         >>> import csplat_tools
@@ -206,12 +205,12 @@ def read_source(
         file: a path, or `-`; an open binary file; or bytes.
         overrides: overrides of the scene's metadata.
         strict: refuse defects that would be repaired.
-        keep_extra: carry columns that splats do not have.
-        sh_degree: leave out the SH bands above, even of a file of a higher degree than 3; `None`: keep all.
+        keep_extra: keep additional columns.
+        sh_degree: as for `load_model`.
         progress: progress callback.
 
     Raises:
-        CsplatError: the scene is not usable.
+        CsplatError: the scene is not valid.
         OSError: the scene cannot be read.
     """
     findings: list[Finding] = []
@@ -228,23 +227,23 @@ def read_source(
 def open_scenes(
     given: Sequence[SceneLike | OpenedScene], memory_bytes: int | None = None
 ) -> Iterator[Sequence[LoadedModel] | Sequence[OpenedScene]]:
-    """Read scenes for a comparison: all into memory, or none if they do not fit together.
+    """Read scenes for a comparison into memory, or open all of them if they do not fit together.
 
     Args:
-        given: scenes as for `load_model`. If one is a model or loaded already, all are read into memory; if all are
-            open already, they remain so.
-        memory_bytes: approximate bound on the memory; `None`: half of the free memory.
+        given: scenes as for `load_model`. If one is in memory already, all are read into memory; if all are open
+            already, they remain so.
+        memory_bytes: approximate limit of the memory; `None`: half of the free memory.
 
     Yields:
-        The scenes; they can be read as long as the context lasts.
+        The scenes, which can be read within the context.
 
     Raises:
-        CsplatError: as for `load_model`; files that do not fit in memory are opened instead.
+        CsplatError: as for `load_model`.
         OSError: a file cannot be read.
     """
     opened = [one for one in given if isinstance(one, OpenedScene)]
     if opened:
-        assert len(opened) == len(given), "all are in memory, or none"
+        assert len(opened) == len(given), "either all scenes are in memory, or none"
         yield opened
         return
     bound = default_memory_bytes() if memory_bytes is None else memory_bytes
@@ -317,11 +316,8 @@ def findings_as_json(findings: tuple[Finding, ...] | list[Finding]) -> list[dict
 
 
 def ply_splat_bytes(sh_degree: int) -> int:
-    """Return the bytes of a splat in a PLY of the INRIA trainer, whose columns are floats: 248 at SH degree 3.
-
-    Position, normal, opacity, scale and rotation have 14 columns; the others are colours.
-    """
-    return 4 * (14 + 3 * (sh_degree + 1) ** 2)
+    """Return the bytes of a splat in a PLY of the INRIA trainer, which has float columns: 248 at SH degree 3."""
+    return 4 * (14 + 3 * (sh_degree + 1) ** 2)  # 14: position, normal, opacity, scale, rotation; the others: colours
 
 
 def with_progress(scene: SceneSource, stage: str, progress: Progress | None) -> SceneSource:
@@ -332,13 +328,13 @@ def with_progress(scene: SceneSource, stage: str, progress: Progress | None) -> 
 
     def blocks() -> Iterator[SplatModel]:
         yield from reporting.blocks()
-        progress("writing", 0.0)  # or another pass over the scene, which begins anew
+        progress("writing", 0.0)  # the blocks have been read; another pass restarts the stage
 
     return replace(scene, blocks=blocks)
 
 
 def without_extra_columns(scene: SceneSource) -> SceneSource:
-    """Return the scene without the columns that splats do not have."""
+    """Return the scene without additional columns."""
     if not scene.metadata_model.extra:
         return scene
     return replace(

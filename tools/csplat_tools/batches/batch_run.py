@@ -32,12 +32,12 @@ from csplat_tools.batches.scene_job import (
 )
 from csplat_tools.scene_files import size_on_disk
 
-_SET_BY_BATCH = ("threads", "memory", "resume")  # options that the batch passes to a command that has them
+_SET_BY_BATCH = ("threads", "memory", "resume")  # options that the batch passes to commands that have them
 _FREE_SHARE = 0.9  # fraction of the free memory that a batch uses if `memory_bytes` is not given
 
 
 class CommandLineError(InputError):
-    """The command of a batch does not exist, or its options are wrong."""
+    """The command of a batch does not exist, or its options are invalid."""
 
     code = "E_USAGE"
 
@@ -47,11 +47,10 @@ class BatchStep:
     """The progress of a batch.
 
     Attributes:
-        iteration, iterations: number of scenes that ended, and of all.
+        iteration, iterations: number of finished scenes, and of all scenes.
         failed: number of scenes that failed so far.
-        share: fraction of the work that is done, by the sizes of the sources, 0 to 1; scenes that were done before
-            do not count.
-        record: record of the scene that has just ended.
+        share: fraction done, 0 to 1, by the sizes of the sources, without those done by an earlier run.
+        record: record of the scene that finished last.
     """
 
     iteration: int
@@ -68,7 +67,7 @@ class Batch:
     Attributes:
         folder: the folder of outputs.
         records: records of all scenes, in their order.
-        done_before: outputs that an earlier run had made from the same files with the same command.
+        done_before: outputs that an earlier run made from the same files with the same command.
     """
 
     folder: Path
@@ -107,27 +106,27 @@ def batch(
 ) -> Batch:
     """Run one command on many scenes, as `csplat batch` does.
 
-    A scene is not done again if its content, the command with its options and the version of the program are those in
-    `batch.jsonl`, and the output is unchanged. Scenes that failed are tried again.
+    A scene is skipped if its content, the command with its options and the version of the program equal those in
+    `batch.jsonl`, and the output is unchanged. Failed scenes are tried again.
 
     Args:
         scenes: a folder, with its subfolders; or a manifest, see `find_tasks`.
-        folder: the folder of outputs; made if need be. `batch.jsonl` and `index.html` are written there, too.
+        folder: the folder for outputs, `batch.jsonl` and `index.html`; it is made if need be.
         command: a command that takes a scene and an output, with its options.
         ending: file name ending of the outputs; `None`: that of the command.
-        match: shell pattern of the names that are taken from a folder, such as `*.ply`.
+        match: shell pattern of names within a folder, such as `*.ply`.
         workers: number of processes at a time; `None`: one per core.
-        memory_bytes: memory that the processes may hold together, by the expected need of each scene; a scene that
-            needs more by itself fails, or gets this limit by `--memory` if the command has that option. `None`: most
-            of the free memory, and a scene that needs more is tried alone.
-        dask: a cluster: the address of its scheduler, or a `dask.distributed.Client`. Its machines see the same
-            files; `workers` and `memory_bytes` are left to the cluster.
-        force: outputs that no batch has written may be replaced.
+        memory_bytes: memory of all processes together, by the expected need of each scene. A scene that needs more
+            fails, or gets this limit by `--memory` if the command has that option. `None`: most of the free memory; a
+            scene that needs more runs alone.
+        dask: a cluster: the address of its scheduler, or a `dask.distributed.Client`. Its machines must see the same
+            files; `workers` and `memory_bytes` are ignored.
+        force: outputs that were not written by a batch may be replaced.
         thumbnails: draw a small render of each scene if the extra `render` is installed.
-        progress: called with a `BatchStep` for each scene that ended.
+        progress: called with a `BatchStep` for each finished scene.
 
     Returns:
-        A record for each scene; those that failed are among them.
+        A record for each scene, including failed ones.
 
     Examples:
         >>> import csplat_tools
@@ -135,7 +134,7 @@ def batch(
         >>> [(one.path, one.error) for one in found.failures]  # doctest: +SKIP
 
     Raises:
-        InputError: there is no scene, or a manifest is invalid, or another batch is at work in the folder.
+        InputError: there are no scenes, a manifest is invalid, or another batch uses the folder.
         OSError: the folder cannot be written.
     """
     target = Path(folder)
@@ -175,7 +174,7 @@ def plan_batch(
     match: str = "*",
     workers: int | None = None,
 ) -> list[PlannedJob]:
-    """Return what `batch` would do with each scene, with expected time and memory; nothing is written.
+    """Return the work that `batch` would do for each scene, with expected time and memory; nothing is written.
 
     Raises:
         InputError, OSError: as for `batch`.
@@ -198,30 +197,26 @@ def _prepared(
     ending: str | None,
     match: str,
 ) -> tuple[list[Task], frozenset[str]]:
-    """Find the scenes, check their command lines, and return them with the command's options that the batch sets.
-
-    Raises:
-        CommandLineError: a command line is wrong.
-    """
+    """Find the scenes and check their command lines; return them with the command's options that the batch sets."""
     answer = _checked(worker, command)
-    wanted = answer["ending"] if ending is None else ending
-    if ending is None and not wanted:
-        raise CommandLineError(f"csplat {command[0]} writes files of several kinds: --ending .spz names one")
-    tasks = find_tasks(os.fspath(scenes), command[0], wanted, match=match, without=folder)
+    own_ending = answer["ending"] if ending is None else ending
+    if not own_ending and ending is None:
+        raise CommandLineError(f"csplat {command[0]} writes several formats: choose one with --ending, such as .spz")
+    tasks = find_tasks(os.fspath(scenes), command[0], own_ending, match=match, without=folder)
     taken = {JOURNAL, PAGE} & {one.output for one in tasks}
     if taken:
-        raise InputError(f"{taken.pop()} is written by the batch itself: name that output in a manifest")
+        raise InputError(f"{taken.pop()} is written by the batch itself: give the scene another output in a manifest")
     for options in {one.options for one in tasks if one.options}:
         _checked(worker, (*command, *options))
     has = set(answer["options"]) & set(_SET_BY_BATCH)
     if "memory" in has and worker.ask("check", words=[*command, "--memory", "1GB"])["wrong"]:
-        has -= {"memory", "resume"}  # not with these options
+        has -= {"memory", "resume"}  # these options exclude them
     return tasks, frozenset(has)
 
 
 def _checked(worker: Worker, words: Sequence[str]) -> Mapping[str, Any]:
     if not words:
-        raise CommandLineError("wanted a command behind --, as encode")
+        raise CommandLineError("expected a command after --, such as encode")
     try:
         answer = worker.ask("check", words=list(words))
     except WorkerLostError as error:
@@ -239,7 +234,7 @@ def _jobs(
 
 
 def _may_begin(job: SceneJob) -> bool:
-    """Return True if a file found in the output's place from now on belongs to this batch."""
+    """Return True if a file that appears as the output from now on belongs to this batch."""
     output = job.task.output
     known = job.pending or (job.earlier is not None and job.earlier.output_sha256)
     return not is_url(output) and bool(known or not (Path(job.folder) / output).exists())
@@ -251,7 +246,7 @@ def _record_all(
     journal: Journal,
     progress: Callable[[BatchStep], object] | None,
 ) -> frozenset[str]:
-    """Write a line for each scene as it ends; return the outputs of scenes that were done before."""
+    """Write a line for each finished scene; return the outputs that were done before."""
     before = set()
     with closing(ended):
         for step, worked in _steps(ended, jobs):
@@ -266,7 +261,7 @@ def _record_all(
 
 
 def _steps(ended: Iterable[tuple[Record, bool]], jobs: Sequence[SceneJob]) -> Iterator[tuple[BatchStep, bool]]:
-    """Yield the progress of the batch with each scene that ends, and whether anything was done for it."""
+    """Yield the progress after each scene, and True unless it was done before."""
     sizes = {one.task.output: 1.0 + job_bytes(one) for one in jobs}
     whole, done, failed = sum(sizes.values()), 0.0, 0
     for number, (record, worked) in enumerate(ended, 1):
@@ -287,12 +282,12 @@ def run_jobs(
     do: Callable[[SceneJob, Worker], T],
     stop: Callable[[], object] = lambda: None,
 ) -> Generator[T, None, None]:
-    """Process jobs, the largest first, and yield each result; the processes end with the generator, or its closing.
+    """Process jobs, the largest first, and yield the results; closing the generator ends the processes.
 
     Args:
         jobs: the scenes.
-        workers: the processes, each with a thread; as many scenes are processed at a time.
-        do: called by a thread with a scene and the thread's process.
+        workers: the processes; each has a thread of this process.
+        do: called in a thread with a scene and the thread's process.
         stop: called when the generator ends.
     """
     todo: queue.SimpleQueue[SceneJob | None] = queue.SimpleQueue()
@@ -305,7 +300,7 @@ def run_jobs(
         while (job := todo.get()) is not None and not stopped.is_set():
             try:
                 ended.put(do(job, worker))
-            except Exception as error:  # noqa: BLE001  # a defect of csplat, raised in the thread that waits
+            except Exception as error:  # noqa: BLE001  # a defect of csplat; raised again by the generator
                 ended.put(error)
 
     with ThreadPoolExecutor(len(workers)) as pool:
@@ -335,12 +330,12 @@ def job_bytes(job: SceneJob) -> int:
 
 
 class MemoryBudget:
-    """A gate that lets a scene begin when there is memory for it. Owns the number of bytes left.
+    """Lets a scene begin when there is memory for it. Owns the number of bytes left.
 
     Args:
-        allowed: bytes that the user allowed; `None`: not specified.
-        free: bytes to use if `allowed` is not specified; `None`: no limit.
-        has_option: the command has `--memory`, and can keep to less than it would need.
+        allowed: the user's limit in bytes; `None`: not specified.
+        free: limit if `allowed` is `None`; `None`: no limit.
+        has_option: the command has `--memory`, and so can work with less than it would need.
     """
 
     def __init__(self, allowed: int | None, free: int | None = None, *, has_option: bool = False) -> None:
@@ -361,7 +356,7 @@ class MemoryBudget:
             Options for the command.
 
         Raises:
-            LimitError: more is needed than the user allowed for all scenes together.
+            LimitError: the scene needs more than the user's limit.
         """
         if self._total is None:
             yield ()
@@ -381,22 +376,22 @@ class MemoryBudget:
                 self._changed.notify_all()
 
     def stop(self) -> None:
-        """Release all threads that wait: no scene is to begin any more."""
+        """Release all waiting threads, so that they can end."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()
 
 
-_thread_state = threading.local()  # holds the process of each thread of a Dask worker; it ends with the worker
+_thread_state = threading.local()  # the process of each thread of a Dask worker
 
 
 def run_on_cluster(jobs: Sequence[SceneJob], dask: Any) -> Generator[tuple[Record, bool], None, None]:
-    """Process scenes on a cluster; yield the record of each when it ends, and whether anything was done.
+    """Process scenes on a cluster, and yield the results of `run_job`.
 
     Dask moves the scenes of a lost machine to others, a limited number of times.
 
     Args:
-        jobs: scenes, under paths that all machines have.
+        jobs: scenes, with paths that are valid on all machines.
         dask: the address of a scheduler, or a client.
 
     Raises:
@@ -409,7 +404,7 @@ def run_on_cluster(jobs: Sequence[SceneJob], dask: Any) -> Generator[tuple[Recor
         raise missing_package(error, "dask[distributed]", extra="scale") from None
     dasks: Any = distributed  # the package has no types
     with dasks.Client(dask, set_as_default=False) if isinstance(dask, str) else nullcontext(dask) as client:
-        run = uuid4().hex  # Dask identifies tasks by name; those of an earlier batch must not be taken for these
+        run = uuid4().hex  # Dask identifies tasks by key, which must differ from those of an earlier batch
         tasks = {client.submit(_run_on_dask, job, key=f"{job.task.output}-{run}"): job for job in jobs}
         try:
             for future in dasks.as_completed(list(tasks), loop=client.loop):

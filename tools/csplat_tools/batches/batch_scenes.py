@@ -23,21 +23,21 @@ _MANIFESTS = (".jsonl", ".csv", ".txt")
 _COLUMNS = ("path", "output", "options")
 _ONE_LEVEL, _LEVELS = FOLDER_NAMES
 _CSPLAT = ".csplat"
-#: The file that INRIA's trainer writes next to its scenes, with the points that it began with.
+#: The file that INRIA's trainer writes next to its scenes, with its initial points; and the folder of its scenes.
 _POINTS, _SCENES = "input.ply", "point_cloud"
-_OTHER_GPU = re.compile(r"_rank[1-9]\d*\.pt$")  # gsplat's checkpoints, which are read with that of the first GPU
-#: Commands that do not take every scene of a folder: True takes only .csplat files, False leaves them out.
+_OTHER_GPU = re.compile(r"_rank[1-9]\d*\.pt$")  # gsplat's checkpoints, which are read with that of rank 0
+#: Commands that take some scenes of a folder: True: only .csplat files; False: all others.
 _TAKES_CSPLAT = {"encode": False, "decode": True, "extract": True}
 
 
 @dataclass(frozen=True)
 class Task:
-    """A scene, and the output that is made from it.
+    """A scene and its output.
 
     Attributes:
-        source: its path, or a URL.
-        output: a path within the folder of outputs, with slashes; or a URL.
-        options: options of this scene alone; they follow those of all scenes.
+        source: path or URL of the scene.
+        output: path within the folder of outputs, with slashes; or a URL.
+        options: options for this scene only, which follow those for all scenes.
     """
 
     source: str
@@ -47,7 +47,7 @@ class Task:
 
 @dataclass(frozen=True)
 class _ListedScene:
-    """A scene whose output may have no name yet; `within` is the path that names it within the folder of outputs."""
+    """A scene whose output may have no name yet; it is then derived from `within`, a relative path."""
 
     task: Task
     within: str
@@ -57,16 +57,16 @@ def find_tasks(scenes: str, command: str, ending: str, *, match: str = "*", with
     """Return the scenes of a folder, sorted, or those of a manifest in its order.
 
     Args:
-        scenes: a folder, searched with its subfolders for names that `csplat formats` lists, without the input.ply
-            of INRIA's trainer; or a manifest: lines of JSON (.jsonl), or of path, output and options, separated by
-            commas or, as spreadsheets write them, by semicolons or tabs (.csv, .txt).
-        command: the command that is run on the scenes: `encode` leaves .csplat files out, `decode` takes no others.
-        ending: file name ending of outputs that have no name.
-        match: shell pattern of the names that are taken from a folder.
+        scenes: a folder, searched with its subfolders for the endings that `csplat formats` lists, without the
+            input.ply of INRIA's trainer; or a manifest: lines of JSON (.jsonl), or of path, output and options (.csv,
+            .txt), separated by commas or, as some spreadsheets write them, by semicolons or tabs.
+        command: the command for the scenes: `encode` skips .csplat files, `decode` skips all others.
+        ending: file name ending of outputs without a name.
+        match: shell pattern of names within a folder.
         without: a folder that is not searched, such as that of the outputs.
 
     Raises:
-        InputError: `scenes` is neither; a line has no path; there is no scene, or two have the same output.
+        InputError: `scenes` is neither, or a line is invalid; there are no scenes, or two have the same output.
         OSError: `scenes` cannot be read.
     """
     path = Path(scenes)
@@ -76,18 +76,18 @@ def find_tasks(scenes: str, command: str, ending: str, *, match: str = "*", with
     elif path.suffix.lower() in _MANIFESTS:
         found = list(_listed(path))
     else:
-        raise InputError(f"{scenes} is no folder, wanted one, or a manifest: {', '.join(_MANIFESTS)}")
+        raise InputError(f"{scenes} is not a folder, expected a folder or a manifest: {', '.join(_MANIFESTS)}")
     if not found:
-        raise InputError(f"{scenes} has no scene for `csplat {command}`")
+        raise InputError(f"{scenes} has no scenes for `csplat {command}`")
     named = _named(found, path.resolve().name if path.is_dir() else path.stem, ending)
     output, count = Counter(one.output for one in named).most_common(1)[0]
     if count > 1:
-        raise InputError(f"{output} is the output of {count} scenes: give them names in a manifest")
+        raise InputError(f"{output} is the output of {count} scenes: name their outputs in a manifest")
     return named
 
 
 def _names(folder: Path, command: str, match: str, without: Path | None) -> list[str]:
-    """Return the names of the scenes within a folder, with slashes."""
+    """Return the relative paths of the scenes within a folder, with slashes."""
     endings = tuple(suffix for one in formats() if one.open is not None for suffix in one.suffixes)
     names = []
     for one in sorted(folder.rglob("*")):
@@ -106,11 +106,11 @@ def _names(folder: Path, command: str, match: str, without: Path | None) -> list
 
 
 def starting_points(folder: Path, names: Sequence[str] | None = None) -> list[str]:
-    """List the files of a folder that are no scenes, but points that INRIA's trainer began with.
+    """Return the files of a folder that hold the initial points of INRIA's trainer, not a scene.
 
     Args:
-        folder: the folder that is searched.
-        names: names of files in it, with slashes; `None`: all files.
+        folder: the folder to search.
+        names: relative paths of its files, with slashes; `None`: all files.
     """
     found = [one.relative_to(folder).as_posix() for one in folder.rglob(_POINTS)] if names is None else names
     return [
@@ -136,13 +136,13 @@ def _listed(manifest: Path) -> Iterator[_ListedScene]:
         where = f"{manifest.name}, line {number}"
         source, output, options = (fields.get(name) or "" for name in _COLUMNS)
         if not isinstance(source, str) or not source or not isinstance(output, str):
-            raise InputError(f"{where}: wanted a path, and perhaps an output and options")
+            raise InputError(f"{where}: expected a path, optionally an output and options")
         if not is_url(output) and leads_out(output):
-            raise InputError(f"{where}: the output {output} leads out of the folder of outputs")
+            raise InputError(f"{where}: the output {output} is outside the folder of outputs")
         try:
             words = split_words(options) if isinstance(options, str) else [str(word) for word in options]
         except (ValueError, TypeError):
-            raise InputError(f"{where}: the options are {options!r}, wanted words as of a command line") from None
+            raise InputError(f"{where}: the options are {options!r}, expected words of a command line") from None
         if "\\" in source and not is_url(source) and not (manifest.parent / source).exists():
             source, output = source.replace("\\", "/"), output.replace("\\", "/")  # written on Windows
         placed = source if is_url(source) else str(manifest.parent / source)
@@ -158,12 +158,12 @@ def _json_lines(manifest: Path, text: str) -> Iterator[tuple[int, dict[str, Any]
         except ValueError:
             fields = None
         if not isinstance(fields, dict):
-            raise InputError(f"{manifest.name}, line {number}: wanted an object of JSON with a path")
+            raise InputError(f"{manifest.name}, line {number}: expected a JSON object with a path")
         yield number, fields
 
 
 def _table_lines(text: str) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield each row's line number and its cells by column; a heading may name the columns in another order."""
+    """Yield each row's line number, and its cells by column; a header row may reorder the columns."""
     rows = csv.reader(text.splitlines(), skipinitialspace=True, delimiter=_separator(text))
     columns: Sequence[str] = _COLUMNS
     for row in _rows(rows):
@@ -181,13 +181,13 @@ def _rows(rows: Iterator[list[str]]) -> Iterator[list[str]]:
     try:
         yield from rows
     except csv.Error as error:
-        raise InputError(f"the manifest is no table: {error}") from None
+        raise InputError(f"the manifest is not a table: {error}") from None
 
 
 def _separator(text: str) -> str:
-    """Tell what separates the cells of a table: a comma, or what spreadsheets write instead in many countries.
+    """Return the separator of a table's cells: a comma, or what spreadsheets write instead in many countries.
 
-    The first line decides, if it has one of them: the names of the columns, Excel's `sep=;`, or a scene.
+    It is that of the first line: the names of the columns, Excel's `sep=;`, or a scene.
     """
     lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
     first = next(lines, "").casefold().removeprefix("sep=")
@@ -195,23 +195,23 @@ def _separator(text: str) -> str:
 
 
 def _within(source: str) -> str:
-    """Return a manifest's path as one within the folder of outputs; its last part if it leads elsewhere."""
+    """Return a manifest's path as one within the folder of outputs; its last part if it leads out."""
     path = PurePosixPath(source.partition("?")[0])
     return path.name if is_url(source) or leads_out(str(path)) else str(path)
 
 
 def leads_out(name: str, flavour: type[PurePath] = PurePath) -> bool:
-    """Return True if a relative path leads out of its folder, read as POSIX or as this system reads paths.
+    """Return True if a relative path leads out of its folder, read as a POSIX path or as one of this system.
 
     Args:
-        name: parts separated by `/`, or as the system does.
-        flavour: the kind of path.
+        name: the path.
+        flavour: the path class of this system.
     """
     return any(path.anchor or ".." in path.parts for path in (PurePosixPath(name), flavour(name)))
 
 
 def _named(found: Sequence[_ListedScene], root: str, ending: str) -> list[Task]:
-    """Name the outputs: the source's name with another ending, or with one appended if two names would be the same."""
+    """Name the outputs: the source's name with another ending, or with one appended if names would clash."""
     short = [one.task.output or _output(one.within, root, ending, whole=False) for one in found]
     counts = Counter(short)
     return [

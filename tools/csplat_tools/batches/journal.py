@@ -1,7 +1,7 @@
-"""`batch.jsonl`: a line for each scene that ended, and for each run that began.
+"""`batch.jsonl`: a line for each finished scene, and for each run that began.
 
-A line is written at once, so that a program that is killed leaves whole lines behind, except perhaps the last. When a
-run ends by itself, one line remains for each scene.
+Lines are written one by one, so that a killed program leaves whole lines, except perhaps the last. A run that ends
+normally leaves one line per scene.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Record:
         code: code of the error, such as `E_INPUT` or `ENOENT`; "" if there is none.
         error: the error in one line.
         source_bytes, output_bytes: sizes of the files.
-        output_sha256: hash of the output's content; if the scene failed, of the output that an earlier run left.
+        output_sha256: hash of the output's content; if the scene failed, of an earlier run's output.
         splats: number of splats of the result if the command reports it, else of the source.
         seconds: time that the command took.
         memory_bytes: peak memory of its process.
@@ -62,7 +62,7 @@ class Record:
 
     @property
     def key(self) -> tuple[str, tuple[str, ...], str]:
-        """The inputs of the output: if they are the same again, it is not made again."""
+        """The inputs that determine the output."""
         return self.sha256, self.command, self.version
 
     def as_json(self) -> dict[str, Any]:
@@ -71,14 +71,11 @@ class Record:
 
 
 class Journal:
-    """The records of a folder. Owns them, and the open file that lines are appended to.
-
-    Args:
-        folder: the folder of outputs.
+    """The records of a folder of outputs. Owns them, and the open file that lines are appended to.
 
     Attributes:
         records: the last record of each output.
-        pending: outputs that a run which did not end by itself was to write; files there belong to the batch.
+        pending: outputs of an interrupted run without a record; files under these names belong to the batch.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -87,20 +84,20 @@ class Journal:
         self._file = self._path.open("ab", buffering=0)
         with self._path.open("rb") as stream:
             if stream.seek(0, os.SEEK_END) and (stream.seek(-1, os.SEEK_END), stream.read())[1] != b"\n":
-                self._write_line(b"")  # half a line stays by itself
+                self._write_line(b"")  # ends an incomplete line
 
     def begin(self, outputs: Sequence[str]) -> None:
-        """Note what a run is to write."""
+        """Record the outputs that a run is going to write."""
         self._write_line(json.dumps({"state": _BEGUN, "outputs": list(outputs)}).encode())
 
     def add(self, record: Record) -> None:
-        """Append the line of a scene that ended."""
+        """Append the line of a finished scene."""
         self.records[record.output] = record
         self._write_line(json.dumps(record.as_json()).encode())
 
     def end(self) -> None:
-        """Leave one line for each scene; nothing can be added any more."""
-        self.close()  # Windows replaces no file that is open
+        """Rewrite the file with one line per scene, and close it."""
+        self.close()  # Windows cannot replace an open file
         lines = [json.dumps(one.as_json()) + "\n" for one in self.records.values()]
         write_bytes(str(self._path), "".join(lines).encode())
 
@@ -109,10 +106,10 @@ class Journal:
         self._file.close()
 
     def _write_line(self, line: bytes) -> None:
-        left = memoryview(line + b"\n")
-        while left:  # a full disk writes a part, and then raises
-            left = left[self._file.write(left) :]
-        os.fsync(self._file.fileno())  # an output that is there after a power cut has to be known
+        rest = memoryview(line + b"\n")
+        while rest:  # on a full disk, a write may be partial before one raises
+            rest = rest[self._file.write(rest) :]
+        os.fsync(self._file.fileno())  # so that after a power cut no output exists without its line
 
 
 @contextmanager
@@ -120,12 +117,12 @@ def open_journal(folder: Path) -> Iterator[Journal]:
     """Open the records of a folder; only one program at a time may do so.
 
     Raises:
-        InputError: another batch is at work there.
-        OSError: it cannot be written.
+        InputError: another batch uses the folder.
+        OSError: the file cannot be written.
     """
     with locked_folder(folder, _LOCK) as is_ours:
         if not is_ours:
-            raise InputError(f"another batch writes to {folder}: wait for it, or name another folder")
+            raise InputError(f"another batch writes to {folder}: wait until it ends, or use another folder")
         journal = Journal(folder)
         try:
             yield journal
@@ -136,10 +133,7 @@ def open_journal(folder: Path) -> Iterator[Journal]:
 def read_journal(folder: Path) -> tuple[dict[str, Record], set[str]]:
     """Read the records and the pending outputs as in `Journal`; both are empty if there is no journal.
 
-    Lines that cannot be parsed are left out: an incomplete one, or one of another version.
-
-    Raises:
-        OSError: it cannot be read.
+    Lines that cannot be parsed are skipped: incomplete ones, or those of another version.
     """
     records: dict[str, Record] = {}
     pending: set[str] = set()

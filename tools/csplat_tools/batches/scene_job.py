@@ -1,4 +1,7 @@
-"""Process one scene, here or on a machine of a cluster: inspect it, run the command unless done before, record it."""
+"""Process one scene of a batch, on this machine or a cluster: inspect it, run the command in a worker, record it.
+
+A worker is a process, so that a crash of a command leaves the rest of the batch running.
+"""
 
 from __future__ import annotations
 
@@ -40,11 +43,11 @@ class SceneJob:
         task: the scene.
         command: the command with the options of all scenes, as words.
         folder: the folder of outputs, absolute.
-        earlier: the record of an earlier run; `None`: there is none.
-        pending: the output may have been left by a run that did not end by itself.
-        force: an existing output may be replaced, whoever wrote it.
+        earlier: the record of an earlier run, if any.
+        pending: an interrupted run may have written the output.
+        force: any existing output may be replaced.
         threads: number of threads for the command; `None`: it has no such option.
-        resumes: the command has `--resume`, with which it goes on from a folder OUT.work that was left.
+        resumes: the command has `--resume`, which continues from a folder OUT.work.
         thumbnail: draw a small render, too.
     """
 
@@ -65,7 +68,7 @@ class SceneJob:
 
     @property
     def record(self) -> Record:
-        """The record of a failed scene; results are filled in when they are known."""
+        """A record of failure, to be completed with results."""
         before = "" if self.earlier is None else self.earlier.output_sha256
         return Record(self.task.source, self.task.output, self.words, __version__, "failed", output_sha256=before)
 
@@ -77,8 +80,8 @@ class PlannedJob:
     Attributes:
         job: the scene.
         file: the scene's file; `None`: it cannot be read.
-        is_done: the output is there already, and nothing would be done.
-        seconds: expected time; `None`: nothing is known of the command.
+        is_done: an earlier run made the output, and nothing would be done.
+        seconds: expected time; `None` if unknown for this command.
         memory_bytes: expected peak memory.
     """
 
@@ -94,7 +97,7 @@ Gate = Callable[[int], AbstractContextManager[tuple[str, ...]]]
 
 
 def plan_job(job: SceneJob, worker: Worker) -> PlannedJob:
-    """Inspect a scene and return what would be done, without doing it."""
+    """Inspect a scene, and return the work that `run_job` would do."""
     try:
         with _local_source(job.task.source) as source:
             found = _inspected(worker, source)
@@ -106,15 +109,15 @@ def plan_job(job: SceneJob, worker: Worker) -> PlannedJob:
 
 
 def run_job(job: SceneJob, worker: Worker, gate: Gate | None = None) -> tuple[Record, bool]:
-    """Process a scene, unless its output is there already.
+    """Process a scene unless an earlier run made its output.
 
     Args:
         job: the scene.
         worker: the process that runs the command.
-        gate: waits for memory; `None`: there is enough.
+        gate: waits for memory; `None`: no limit.
 
     Returns:
-        The record of the scene, and whether anything was done.
+        The record of the scene, and False if an earlier run made the output.
     """
     record = job.record
     try:
@@ -138,7 +141,7 @@ def run_job(job: SceneJob, worker: Worker, gate: Gate | None = None) -> tuple[Re
 
 
 class SceneError(CsplatError):
-    """Nothing can be done with a scene: a file cannot be fetched, read or replaced."""
+    """A file of a scene cannot be fetched, read or replaced."""
 
     def __init__(self, message: str, code: str) -> None:
         super().__init__(message)
@@ -149,7 +152,7 @@ def _ran(job: SceneJob, record: Record, worker: Worker, source: Path, output: Pa
     """Run the command, and return the record with its results."""
     output.parent.mkdir(parents=True, exist_ok=True)
     if output.exists() and not is_url(job.task.output) and not job.force and not _is_ours(job, output):
-        raise SceneError(f"{job.task.output} is there already, and not by this batch: --force replaces it", "E_INPUT")
+        raise SceneError(f"{job.task.output} exists, and is not from this batch: --force replaces it", "E_INPUT")
     threads = () if job.threads is None or "--threads" in job.words else ("--threads", str(job.threads))
     resume = ("--resume",) if job.resumes and output.with_name(f"{output.name}.work").is_dir() else ()
     words = (job.command[0], str(source), str(output), *job.words[1:], *threads, *options, *resume)
@@ -162,7 +165,7 @@ def _ran(job: SceneJob, record: Record, worker: Worker, source: Path, output: Pa
         )  # fmt: skip
     except WorkerLostError:
         if worker.pid is not None:
-            remove_left(output, worker.pid)
+            remove_unfinished(output, worker.pid)
         raise
     record = replace(
         record,
@@ -193,17 +196,17 @@ def _inspected(worker: Worker, source: Path) -> SceneFile:
 
 
 def _is_done(job: SceneJob, found: SceneFile) -> bool:
-    """Return True if the command's output is there already, unchanged."""
+    """Return True if an earlier run made the output from the same inputs, and it is unchanged."""
     earlier = job.earlier
     if earlier is None or earlier.state != "done" or earlier.key != (found.sha256, job.words, __version__):
         return False
     if is_url(job.task.output):
-        return True  # checking the file there would mean to download it
+        return True  # to check the file it would have to be downloaded
     return _is_ours(replace(job, pending=False), Path(job.folder) / job.task.output)
 
 
 def _is_ours(job: SceneJob, output: Path) -> bool:
-    """Return True if a batch wrote the output that is there, or may have written it."""
+    """Return True if a batch wrote the existing output, or may have."""
     if job.pending:
         return True
     known = job.earlier.output_sha256 if job.earlier is not None else ""
@@ -216,11 +219,7 @@ def _is_ours(job: SceneJob, output: Path) -> bool:
 
 @contextmanager
 def _local_source(source: str) -> Iterator[Path]:
-    """Yield the path of a scene on this machine; a URL is downloaded for that time.
-
-    Raises:
-        CsplatError, OSError: the scene cannot be downloaded.
-    """
+    """Yield the path of a scene on this machine; a URL is downloaded to a temporary file."""
     if not is_url(source):
         yield Path(source)
         return
@@ -234,7 +233,7 @@ def _local_source(source: str) -> Iterator[Path]:
 
 @contextmanager
 def _local_output(job: SceneJob) -> Iterator[Path]:
-    """Yield the path that the command is to write; if the output is a URL, the file is sent there at the end."""
+    """Yield the path for the command's output; if the output is a URL, the file is uploaded at the end."""
     if not is_url(job.task.output):
         yield Path(job.folder) / job.task.output
         return
@@ -242,10 +241,10 @@ def _local_output(job: SceneJob) -> Iterator[Path]:
         local = Path(folder) / PurePosixPath(job.task.output).name
         yield local
         if local.exists():
-            _send(local, job.task.output)
+            _upload(local, job.task.output)
 
 
-def _send(local: Path, url: str) -> None:
+def _upload(local: Path, url: str) -> None:
     try:
         from fsspec.core import url_to_fs
     except ModuleNotFoundError as error:
@@ -254,27 +253,27 @@ def _send(local: Path, url: str) -> None:
         files, place = url_to_fs(url)
         files.put(str(local), place)
     except Exception as error:  # noqa: BLE001  # each kind of store raises its own
-        name = PurePosixPath(url.partition("?")[0]).name  # the rest may hold what is secret
-        raise StoreError(f"{name} could not be sent: {type(error).__name__}") from None
+        name = PurePosixPath(url.partition("?")[0]).name  # the rest may contain secrets
+        raise StoreError(f"{name} could not be uploaded: {type(error).__name__}") from None
 
 
-def _no_gate(memory_bytes: int) -> AbstractContextManager[tuple[str, ...]]:  # noqa: ARG001  # as gates have it
+def _no_gate(memory_bytes: int) -> AbstractContextManager[tuple[str, ...]]:  # noqa: ARG001  # signature of `Gate`
     return nullcontext(())
 
 
-_FILE_SPLAT_BYTES = 16.0  # bytes per splat if a file does not state its count; .splat, SPZ and SOG have about as many
+_FILE_SPLAT_BYTES = 16.0  # assumed bytes per splat if a file does not state its count; about those of .splat and SPZ
 _UNBOUNDED = 1 << 62
-#: Bytes that a process holds in addition to its command: the renderer draws the thumbnail.
+#: Bytes of memory of a process in addition to its command, for the renderer that draws the thumbnail.
 RENDERER_BYTES = 160_000_000
-#: By command: seconds per scene, seconds per splat, bytes per scene, bytes per splat; `encode` predicts its own if it
-#: can. Measured at SH degree 3 on two cores with 120,000 to 1.1 million splats; bytes include a margin of a fifth.
+#: By command: seconds per scene, seconds per splat, bytes per scene, bytes per splat. Measured at SH degree 3 on two
+#: cores with 120,000 to 1.1 million splats; bytes include a margin of 20 %. `encode` has better estimates if possible.
 _COSTS = {
     "encode": (0.1, 40e-6, 120e6, 750.0),
     "decode": (0.05, 2.5e-6, 60e6, 300.0),
     "convert": (0.05, 9e-6, 140e6, 150.0),
     "extract": (0.02, 0.1e-6, 40e6, 30.0),
 }
-_OTHER_BYTES = (340e6, 3000.0)  # bytes per scene and per splat of commands that render: a guess on the safe side
+_OTHER_BYTES = (340e6, 3000.0)  # bytes per scene and per splat of other commands, which render: a cautious guess
 
 
 @dataclass(frozen=True)
@@ -297,7 +296,7 @@ class SceneFile:
     encode_bytes: int | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as JSON-compatible values, which `SceneFile(**...)` takes."""
+        """Return the fields as JSON-compatible values, for `SceneFile(**...)`."""
         return asdict(self)
 
 
@@ -306,7 +305,7 @@ class JobEstimate:
     """The time and memory that a command is expected to take for a scene.
 
     Attributes:
-        seconds: expected time on two cores with SH degree 3; `None` if nothing is known of the command.
+        seconds: expected time on two cores with SH degree 3; `None` if unknown for this command.
         memory_bytes: expected peak memory of the process.
     """
 
@@ -315,7 +314,7 @@ class JobEstimate:
 
 
 def inspect_scene(path: Path) -> SceneFile:
-    """Read a scene's header and hash its content; defects of the scene are left for the command to report.
+    """Read a scene's header and hash its content; the command will report defects.
 
     Raises:
         OSError: the file cannot be read.
@@ -330,7 +329,7 @@ def inspect_scene(path: Path) -> SceneFile:
 
 
 def estimate_job(command: str, known: SceneFile) -> JobEstimate:
-    """Return the time and memory that a command with default options is expected to take."""
+    """Estimate the time and memory of a command with default options."""
     splats = known.splats if known.splats is not None else known.size_bytes / _FILE_SPLAT_BYTES
     if command == "encode" and known.encode_bytes is not None:
         return JobEstimate(known.encode_seconds, RENDERER_BYTES + known.encode_bytes)
@@ -342,7 +341,7 @@ def estimate_job(command: str, known: SceneFile) -> JobEstimate:
 
 
 def content_hash(path: Path) -> str:
-    """Return the SHA-256 of a file; for a scene of several files or a folder, that of their names and contents.
+    """Return the SHA-256 of a file; for a folder or a scene of several files, that of their names and contents.
 
     Raises:
         OSError: a file cannot be read.
@@ -360,11 +359,11 @@ def _files(path: Path) -> list[Path]:
     folder = path.parent if path.name.lower() in FOLDER_NAMES else path
     if folder.is_dir():
         return sorted(one for one in folder.rglob("*") if one.is_file())
-    return [path, *_beside(path)] if path.suffix.lower() == ".gltf" else [path]
+    return [path, *_buffer_files(path)] if path.suffix.lower() == ".gltf" else [path]
 
 
-def _beside(path: Path) -> Iterator[Path]:
-    """Yield the buffer files that a glTF names and that exist in its folder; none if the JSON cannot be parsed."""
+def _buffer_files(path: Path) -> Iterator[Path]:
+    """Yield the buffer files that a glTF names and that exist in its folder; none if the JSON is invalid."""
     try:
         buffers = json.loads(path.read_bytes()).get("buffers", [])
         names = [unquote(one["uri"]) for one in buffers if not one.get("uri", "data:").startswith("data:")]
@@ -382,26 +381,26 @@ def _hashed(path: Path) -> str:
 
 #: The program of a process, started by its name: `cli` is above this package and may not be imported here.
 _PROGRAM = "csplat_tools.cli.batch_protocol"
-_PATIENCE = 10.0  # seconds that an interrupted process has to tidy up before it is killed
+_CLEANUP_SECONDS = 10.0  # time for an interrupted process to remove unfinished files before it is killed
 
 Process = subprocess.Popen[str]
 
 
 class WorkerLostError(CsplatError):
-    """A process ended before it answered. Its text tells how, in a few words."""
+    """A process ended before it answered."""
 
     code = "E_WORKER"
 
 
 class Worker:
-    """A process that is started with the first request, and again after it was lost. Owns the process.
+    """A process that runs commands. It starts with the first request, and again after a loss.
 
-    Requests come from one thread; `close` may be called by another.
+    Requests must come from one thread; `close` may be called by another.
     """
 
     def __init__(self) -> None:
         self._process: Process | None = None
-        self._said = TemporaryFile()  # noqa: SIM115  # as long as this object
+        self._stderr = TemporaryFile()  # noqa: SIM115  # lives as long as this object
         self._lock = threading.Lock()
         self._closed = False
 
@@ -409,7 +408,7 @@ class Worker:
         """Send a request, and return the answer of `csplat_tools.cli.batch_protocol.answer`.
 
         Raises:
-            WorkerLostError: the process ended, or was closed. Files that it had begun to write remain, see `pid`.
+            WorkerLostError: the process ended, or was closed. Its unfinished files remain, see `remove_unfinished`.
         """
         process = self._started()
         assert process.stdin is not None
@@ -427,15 +426,15 @@ class Worker:
 
     @property
     def pid(self) -> int | None:
-        """Number of the process, or of the one that was lost last; names of its temporary files contain it."""
+        """Id of the current process, or the last one; it is part of the names of temporary files."""
         return None if self._process is None else self._process.pid
 
     def close(self) -> None:
-        """End the process, which has some seconds to remove unfinished files. No request is possible any more."""
+        """End the process; it has some seconds to remove unfinished files."""
         with self._lock:
             self._closed = True
             _end(self._process)
-            self._said.close()
+            self._stderr.close()
 
     def _started(self) -> Process:
         with self._lock:
@@ -444,8 +443,9 @@ class Worker:
             if self._process is None or self._process.poll() is not None:
                 _end(self._process)
                 self._process = subprocess.Popen(  # noqa: S603  # this interpreter
-                    [sys.executable, "-m", _PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._said,
-                    encoding="utf-8", start_new_session=True,  # an interrupt at the terminal is for the parent alone
+                    [sys.executable, "-m", _PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                    stderr=self._stderr, encoding="utf-8",
+                    start_new_session=True,  # so that Ctrl-C reaches only the parent
                     creationflags=NEW_GROUP_FLAGS,
                 )  # fmt: skip
             return self._process
@@ -456,12 +456,12 @@ class Worker:
         with self._lock:
             if self._closed:
                 return "closed"
-            self._said.seek(0)
-            said = self._said.read().decode(errors="replace").strip().splitlines()[-1:]
+            self._stderr.seek(0)
+            last_line = self._stderr.read().decode(errors="replace").strip().splitlines()[-1:]
         if status >= 0:
-            return ": ".join([f"its process ended with status {status}", *said])
+            return ": ".join([f"its process ended with status {status}", *last_line])
         name = signal.Signals(-status).name if -status in set(signal.Signals) else str(-status)
-        return f"its process was ended by {name}" + ("; was memory short?" if name == "SIGKILL" else "")
+        return f"its process was ended by {name}" + ("; it may have run out of memory" if name == "SIGKILL" else "")
 
 
 def _end(process: Process | None) -> None:
@@ -470,18 +470,18 @@ def _end(process: Process | None) -> None:
         return
     interrupt_process(process)
     try:
-        process.wait(_PATIENCE)
+        process.wait(_CLEANUP_SECONDS)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:
-            with suppress(OSError):  # data that could not be sent to it
+            with suppress(OSError):  # unsent data
                 pipe.close()
 
 
-def remove_left(output: Path, pid: int) -> None:
-    """Remove temporary files that a lost process had begun to write for an output; see `atomic_writer`."""
-    for left in output.parent.glob(f".*.{pid}.*.tmp"):
-        if left.name.startswith(f".{output.name}."):
-            left.unlink(missing_ok=True)
+def remove_unfinished(output: Path, pid: int) -> None:
+    """Remove the temporary files of a lost process for an output; see `atomic_writer`."""
+    for file in output.parent.glob(f".*.{pid}.*.tmp"):
+        if file.name.startswith(f".{output.name}."):
+            file.unlink(missing_ok=True)

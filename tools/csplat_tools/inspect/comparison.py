@@ -1,4 +1,4 @@
-"""Compare a scene with its source: sizes, errors of splats whose pairs are known or found, and scores of renders."""
+"""Compare a scene with its source: sizes, errors of splats, and scores of renders."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from csplat_tools.views import Colour, ViewSet, comparison_cameras, find_view_se
 from csplat_tools.views.sliced_renderer import SlicedScene
 
 Pairing = Literal["index", "order", "search"]
-_NEAR = 0.01  # fraction of the scene's spread: splats in the same order are nearer than this
-#: Value that searches the LPIPS weights in the usual places, instead of the name of a file.
+_NEAR = 0.01  # fraction of the scene's spread; largest median distance of splats in the same order
+#: Name that searches LPIPS weights in the usual places, instead of a file.
 AUTO_WEIGHTS = "auto"
-_PIXEL_BYTES = 13  # bytes per pixel of the renders of the source, which are kept
-#: Width and height of the renders, pixels. Smaller ones average errors away: half of 640×480 gives 0.4 dB too much,
-#: this size 0.2 dB at most.
+_PIXEL_BYTES = 13  # bytes per pixel of the renders of the source, which are kept in memory
+#: Width and height of renders for an estimate, pixels. Small renders average errors away: 320×240 gives 0.4 dB too
+#: much, this size at most 0.2 dB.
 ESTIMATE_SIZE = (480, 360)
 #: Largest number of splats to render for an estimate; more take too long.
 ESTIMATE_SPLATS_MAX = 1_000_000
@@ -47,12 +47,11 @@ ESTIMATE_SPLATS_MAX = 1_000_000
 
 @dataclass(frozen=True)
 class AttributeErrors:
-    """Errors of pairs of splats.
+    """Errors of splats against their source.
 
     Attributes:
-        pairing: origin of the pairs. `index`: a source index. `order`: both scenes have the same number of splats,
-            in the same order by their centres. `search`: a source splat was found within the errors that the file
-            declares; it need not be the original one.
+        pairing: origin of the pairs. `index`: a source index. `order`: both scenes have the same number of splats, in
+            the same order by their centres. `search`: some source splat is within the declared error bounds.
         matched: number of splats with a partner; only these are measured.
         unmatched: number of splats without one.
         errors: largest and rms error by measure, in the order of the registry.
@@ -81,18 +80,17 @@ class Comparison:
     """The outcome of comparing two scenes.
 
     Attributes:
-        a: the source; open, but not in memory, if both do not fit together.
-        b: the scene compared with it; likewise.
-        attributes: errors of B's splats; `None` if the pairs of splats cannot be found, which is the usual case
-            without a source index if the scenes are not in memory.
+        a, b: the source, and the scene compared with it; `OpenedScene` if they do not fit in memory together.
+        attributes: errors of B's splats; `None` if pairs of splats cannot be found, which is usual out of core without
+            a source index.
         quality: scores of B's renders against A's.
         ignored: number of splats of A that were not drawn because they hold NaN or infinities.
         cameras: source of the views: the name of a camera file or of a data set, or `virtual`.
         image_scores: scores of A's and B's renders against the images of a data set, as JSON of `Scores`, by the
-            keys `split`, `a` and `b`; `None` if there is no data set.
+            keys `split`, `a` and `b`; `None` without a data set.
         background, mode: background colour and renderer mode.
         notes: remarks about the views.
-        seconds: time of reading scenes that were not in memory, matching, rendering and writing.
+        seconds: time of reading, matching, rendering and writing.
     """
 
     a: LoadedModel | OpenedScene
@@ -155,21 +153,20 @@ def compare(
     """Compare a scene with its source, as `csplat compare` does. Requires the packages of the render extra.
 
     Args:
-        a: the source: a model, or a file in any format.
-        b: the scene compared with it, likewise.
-        views: its test views are rendered; if they have images, A and B are scored against these, too. `None`:
-            the eight virtual views of `psnr`, 640×480, in front of black (`find_view_set`).
-        source_index: [N] the splat of A that each splat of B is.
-        lpips: a file of LPIPS weights, or `auto` for the usual places; LPIPS is not computed if left out.
-        pictures: a folder for one PNG per view: the image if there is one, A, B, and their amplified difference.
-        amplification: factor by which the difference is amplified.
-        background: red, green, blue, 0..1; that of the views if left out.
+        a, b: the source, and the scene compared with it: models, or files in any format.
+        views: the views; A and B are scored on the test views, against their images, too, if there are any. `None`:
+            the eight virtual views of `psnr`, 640×480, on black (`find_view_set`).
+        source_index: [N] the index in A of each splat of B.
+        lpips: a file of LPIPS weights, or `auto` for the usual places; `None`: LPIPS is not computed.
+        pictures: a folder for one PNG per view: the image, if any, A, B, and their amplified difference.
+        amplification: factor of the difference.
+        background: red, green, blue, 0..1; `None`: that of the views.
         mode: mode of the renderer.
-        force: existing files of `pictures` may be replaced.
-        memory_bytes: approximate memory that may be taken; the disk is used if that is too little for both files.
-            `None`: half of the free memory. Images of the data set are not included.
-        prepare: called when all inputs have been read and checked, before the first render.
-        progress: called with the stage and the fraction of it that is done, 0 to 1.
+        force: existing files in `pictures` may be replaced.
+        memory_bytes: approximate limit of the memory, without images of a data set; scenes that do not fit together
+            are compared out of core. `None`: half of the free memory.
+        prepare: called when all inputs have been checked, before the first render.
+        progress: progress callback.
 
     Examples:
         >>> import csplat_tools
@@ -178,8 +175,8 @@ def compare(
         (12.3, 41.2, (0.00021, 0.00009))
 
     Raises:
-        CsplatError: a file is not valid, or exists; or there are no test views; or the renderer is not installed; or
-            the disk has no room for the splats of a scene that does not fit in memory, or the bound is too low even so.
+        CsplatError: a file is not valid, or an output exists; there are no test views; the renderer is not installed;
+            the disk is full, or `memory_bytes` is too low.
         OSError: a file cannot be read or written.
     """
     start = time.perf_counter()
@@ -201,10 +198,10 @@ def compare(
             prepare()
         image_scores = None if image_scorer is None else _ImageScores(image_scorer, distance)
         viewers += [] if image_scores is None else [image_scores]
-        judge = views.test_scorer(first, mode=mode, background=background, progress=progress)
-        quality = judge.scores(second, lpips=distance, on_view=_all_of(viewers), progress=progress)
+        scorer = views.test_scorer(first, mode=mode, background=background, progress=progress)
+        quality = scorer.scores(second, lpips=distance, on_view=_all_of(viewers), progress=progress)
         return Comparison(
-            source, other, errors, quality, judge.reference(0).ignored, views.name,
+            source, other, errors, quality, scorer.reference(0).ignored, views.name,
             None if image_scores is None else {"split": views.split, **image_scores.as_json()},
             views.background, mode, views.notes, time.perf_counter() - start,
         )  # fmt: skip
@@ -220,13 +217,13 @@ def attribute_errors(
     """Measure the errors of a scene's splats against those of its source.
 
     Args:
-        source: the scene that `other` was made from.
+        source: the source.
         other: the scene whose errors are measured.
-        source_index: [N] integers, the source splat of each splat of `other`; `None`: unknown.
+        source_index: [N] integers, the index in the source of each splat of `other`; `None`: unknown.
         progress: progress callback of a search.
 
     Returns:
-        The errors; `None` if the pairs of splats cannot be found.
+        The errors; `None` if pairs of splats cannot be found.
 
     Raises:
         InputError: `source_index` is not one index of a source splat for each splat of `other`.
@@ -236,10 +233,10 @@ def attribute_errors(
         return AttributeErrors("index", len(theirs), 0, _errors(ours, theirs, source_index))
     if _same_order(source.model, theirs):
         return AttributeErrors("order", len(theirs), 0, _errors(ours, theirs, np.arange(len(theirs))))
-    stated, header = other.declared_bounds, other.header
-    if header is None or stated is None or not len(theirs):
+    declared, header = other.declared_bounds, other.header
+    if header is None or declared is None or not len(theirs):
         return None
-    bounds = {record.measure: record.max for record in stated.records}
+    bounds = {record.measure: record.max for record in declared.records}
     if not bounds.keys() >= {"means", "opacities", "sh0"}:
         return None
     found = find_partners(ours, theirs, bounds, lattice_radii(theirs, header), progress=progress)
@@ -257,11 +254,11 @@ def attribute_errors_out_of_core(
     *,
     progress: Progress | None = None,
 ) -> AttributeErrors | None:
-    """Measure errors as `attribute_errors` does, out of core: without search; an index only for .csplat files."""
+    """Measure errors as `attribute_errors` does, out of core, without search; an index requires a .csplat file."""
     if source_index is not None:
         if not is_csplat(other.path):
             return None
-        # For a file that declares no errors and was refitted, all errors are measured.
+        # All errors are measured for a file that was refitted and declares no bounds.
         nothing = DeclaredBounds(source.count, 0, source.metadata_model.sh_degree, refitted=True, records=())
         opened = replace(open_tiles(other.path), declared_bounds=nothing)
         proof = verify_out_of_core(
@@ -285,14 +282,14 @@ def estimate_psnr(
     """Estimate the PSNR of `csplat compare` in a second, from smaller renders.
 
     Args:
-        source: the scene that was encoded.
+        source: the source.
         data: the file.
         threads: number of threads; `None` for all.
         splats_max: scenes of more splats are not rendered.
 
     Returns:
-        PSNR in dB; `None` if there are no splats or too many, if the renderer is not compiled yet, which takes longer
-        than the encoding, or if it cannot draw them.
+        PSNR in dB; `None` if there are no splats or too many, if rendering fails, or if the renderer is not compiled
+        yet, which takes longer than encoding.
     """
     from csplat_render.warmup import is_compiled  # requires numba
 
@@ -301,14 +298,14 @@ def estimate_psnr(
     try:
         cameras = [resized(camera, *ESTIMATE_SIZE) for camera in comparison_cameras(source)]
         return Scorer.of_source(source, cameras, threads=threads).psnr(decode(data, threads=threads))
-    except (CsplatError, MemoryError):  # the file is written: this is a remark on it
+    except (CsplatError, MemoryError):  # the estimate is optional
         return None
 
 
 def _paired_blocks(
     a: SceneSource, b: SceneSource, progress: Progress | None
 ) -> Iterator[tuple[int, SplatModel, SplatModel]]:
-    """Yield blocks of the splats of two scenes of the same order, with the number of the first splat."""
+    """Yield paired blocks of two scenes in the same order, with the index of the first splat."""
     first = scenes.with_progress(a, "measuring splats", progress or null_progress).blocks()
     second = scenes.with_progress(b, "", null_progress).blocks()
     start, ours, theirs = 0, a.metadata_model, b.metadata_model
@@ -325,7 +322,7 @@ def _errors(source: Source, other: SplatModel, index: NDArray[Any]) -> dict[str,
 
 
 def _same_order(source: SplatModel, other: SplatModel) -> bool:
-    """Return True if splat i of one scene is splat i of the other; in a shuffled scene half of them are far apart."""
+    """Return True if both scenes have the same order; in a shuffled scene half of the pairs are far apart."""
     if len(source) != len(other) or not len(source):
         return False
     means = source.means.astype(np.float64)
@@ -350,8 +347,8 @@ def _measured(
     """Return both scenes in a form to render, and the errors of B's splats."""
     if isinstance(source, LoadedModel) and isinstance(other, LoadedModel):
         return source.model, other.model, attribute_errors(source, other, source_index, progress=progress)
-    assert isinstance(source, OpenedScene), "both are in memory, or none"
-    assert isinstance(other, OpenedScene), "likewise"
+    assert isinstance(source, OpenedScene)
+    assert isinstance(other, OpenedScene)
     kept = sum(_PIXEL_BYTES * camera.W * camera.H for camera in cameras)
     first, second = (
         SlicedScene(one.scene, *one.sample(progress), one.memory_bytes - kept, progress) for one in (source, other)
@@ -359,11 +356,11 @@ def _measured(
     for one in (first, second):
         if one.memory_bytes < one.least_bytes:
             bound, least = (one.memory_bytes + kept) / 1e6, (one.least_bytes + kept) / 1e6
-            raise InputError(f"{bound:,.0f} MB of memory are too little to draw these scenes, which take {least:,.0f}")
+            raise InputError(f"the memory is {bound:,.0f} MB, expected at least {least:,.0f} MB to draw these scenes")
     check_free_space(
         tempfile.gettempdir(),
         max(first.disk_bytes, second.disk_bytes),
-        "scenes are rendered: TMPDIR names another folder",
+        "scenes are rendered: TMPDIR sets another folder",
     )
     return first, second, attribute_errors_out_of_core(source, other, source_index, progress=progress)
 
@@ -371,13 +368,13 @@ def _measured(
 class _ImageScores:
     """The scores of A's and B's renders against the images."""
 
-    def __init__(self, judge: Scorer, distance: Distance | None) -> None:
-        self._judge, self._distance = judge, distance
+    def __init__(self, scorer: Scorer, distance: Distance | None) -> None:
+        self._scorer, self._distance = scorer, distance
         self._each: dict[str, list[ViewScore]] = {"a": [], "b": []}
 
     def __call__(self, number: int, a: F32, b: F32) -> None:
-        for each, seen in zip(self._each.values(), (a, b), strict=True):
-            each.append(self._judge.score(number, seen, lpips=self._distance))
+        for each, render in zip(self._each.values(), (a, b), strict=True):
+            each.append(self._scorer.score(number, render, lpips=self._distance))
 
     def as_json(self) -> dict[str, Any]:
         return {name: Scores.of(each).as_json() for name, each in self._each.items()}

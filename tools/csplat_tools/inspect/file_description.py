@@ -1,7 +1,7 @@
 """Describe a file without decoding it, for `csplat info`.
 
-The blocks of a .csplat file are walked by their heads: nothing is inflated and no CRC is computed, so that a
-memory-mapped file of any size is described at once. Every length is checked against the bytes that remain.
+Of a .csplat file only the heads of blocks are read. Nothing is inflated and no CRC is computed, so that a memory-mapped
+file of any size is described at once. Every length is checked against the remaining bytes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import local_path
 from csplat_tools.scene_files import findings_as_json, size_on_disk
 
-_ALWAYS = ("bits_per_splat",)
+_NULLABLE = ("bits_per_splat",)  # values that the JSON contains even if they are `None`
 _STREAM_CLAUSE = "STR-6"
 
 
@@ -53,7 +53,7 @@ class AttributeUsage:
         block_bytes: size of the blocks in tiles: heads, parameters and streams.
         codebook_bytes: size of the codebook chunks with the attribute's columns.
         codings, coders: number of blocks or streams that use each, by name.
-        escaped_count: number of splats whose values are coded as escapes instead of codebook entries.
+        escaped_count: number of splats coded as escapes instead of codebook entries.
     """
 
     block_bytes: int = 0
@@ -74,11 +74,11 @@ class AttributeSummary:
 
     Attributes:
         size_bytes: all bytes of the attribute.
-        codebook_bytes: those of its codebook columns, included in `size_bytes`.
+        codebook_bytes: bytes of its codebook columns, included in `size_bytes`.
         bits_per_splat: average over all splats; `None` without splats.
         codings, coders: number of blocks or streams that use each, by name.
-        escaped_splats: number of splats whose values are coded as escapes instead of codebook entries.
-        mapping, step, chroma_shift, levels: fields of the attribute's record; `None` if it has none.
+        escaped_splats: number of splats coded as escapes instead of codebook entries.
+        mapping, step, chroma_shift, levels: fields of the attribute's record, if any.
     """
 
     size_bytes: int
@@ -95,7 +95,7 @@ class AttributeSummary:
 
 @dataclass(frozen=True)
 class LayerSummary:
-    """The size of a layer: its tiles, and the codebook chunks that it requires."""
+    """The size of a layer, including its codebook chunks."""
 
     size_bytes: int
     codebook_bytes: int
@@ -124,9 +124,9 @@ class FileDescription:
         codebooks: codebooks in the order of the index.
         overhead: bytes outside attributes, by name: header, index, chunks of the whole file, frames of the tiles'
             chunks.
-        cameras: number of cameras; `None` without the chunk, as for the following ones.
+        cameras: number of cameras; `None` without the chunk, as for the following fields.
         options, metadata: the file's JSON.
-        declared_bounds: the source of the file, and the declared error bounds.
+        declared_bounds: the declared error bounds, and counts of the source.
     """
 
     header: SceneHeader
@@ -175,7 +175,7 @@ class FileDescription:
             "antialiased": header.antialiased,
             "flat": header.flat,
             "attributes": {
-                name: {key: value for key, value in asdict(one).items() if value is not None or key in _ALWAYS}
+                name: {key: value for key, value in asdict(one).items() if value is not None or key in _NULLABLE}
                 for name, one in self.attributes.items()
             },
             "layers": {name: asdict(one) for name, one in self.layers.items()},
@@ -190,7 +190,7 @@ class FileDescription:
             "cameras": self.cameras,
             "options": self.options,
             "metadata": self.metadata,
-            "stated_errors": None if self.declared_bounds is None else _stated(self.declared_bounds),
+            "stated_errors": None if self.declared_bounds is None else _bounds_as_json(self.declared_bounds),
         }
 
 
@@ -198,7 +198,7 @@ def describe_file(data: bytes | mmap) -> FileDescription:
     """Describe a .csplat file by its header, its index, the heads of its blocks, and its small chunks.
 
     Args:
-        data: the whole file; little of a memory-mapped one is touched.
+        data: the whole file; only a small part is read.
 
     Raises:
         FormatError: header, index, block heads or one of the small chunks are not valid.
@@ -222,16 +222,13 @@ def describe_file(data: bytes | mmap) -> FileDescription:
 
 
 def describe_other_format(source: str) -> tuple[dict[str, Any], str]:
-    """Describe a file in any format by what is known before its splats are read.
-
-    Args:
-        source: a scene in any format, or `-`.
+    """Describe a scene in any format, or `-`, without reading its splats.
 
     Returns:
         JSON-compatible values, and the same as text.
 
     Raises:
-        InputError: the file is in no format that is read, or not whole.
+        InputError: the file is in no readable format, or truncated.
         OSError: the file cannot be read.
     """
     with local_path(source) as path, open_scene(path) as scene:
@@ -268,7 +265,7 @@ def describe_other_format(source: str) -> tuple[dict[str, Any], str]:
 
 
 def bytes_by_attribute(data: bytes | mmap, header: SceneHeader) -> dict[str, int]:
-    """Return the bytes of each attribute, and as `overhead` those of everything else.
+    """Return the bytes of each attribute, and of everything else as `overhead`.
 
     Raises:
         FormatError: heads contradict each other.
@@ -280,16 +277,12 @@ def bytes_by_attribute(data: bytes | mmap, header: SceneHeader) -> dict[str, int
 def attribute_usage(data: bytes | mmap, header: SceneHeader) -> dict[str, AttributeUsage]:
     """Add up the bytes and codings of each attribute.
 
-    Args:
-        data: the file.
-        header: its header and index.
-
     Returns:
-        By attribute name, in the order of the registry. A codebook of several attributes other than SH bands counts
-        with its first.
+        Usage by attribute name, in the order of the registry. A codebook of several attributes other than SH bands
+        counts with the first.
 
     Raises:
-        FormatError: the heads contradict each other, or the data is not one whole file.
+        FormatError: heads contradict each other, or the file is truncated or has trailing bytes.
     """
     if len(data) < header.file_size:
         raise FormatError(
@@ -324,7 +317,7 @@ def describe_scene(file: FileDescription) -> dict[str, str]:
     header = file.header
     words = describe_placement(header, header.splat_count, file.metadata or {})
     words["tiles"] = _tiles(file)
-    extras = ", ".join(f"{one.name} ({one.dtype or 'of a type not known here'})" for one in header.extras)
+    extras = ", ".join(f"{one.name} ({one.dtype or 'unknown type'})" for one in header.extras)
     if extras:
         words["extra"] = extras
     if file.cameras is not None:
@@ -448,13 +441,13 @@ def _codebook(header: SceneHeader, record: _spec.CodebookRecord) -> CodebookSumm
     )
 
 
-def _stated(stated: DeclaredBounds) -> dict[str, Any]:
+def _bounds_as_json(bounds: DeclaredBounds) -> dict[str, Any]:
     return {
-        "source_splats": stated.source_count,
-        "pruned_splats": stated.pruned_count,
-        "source_sh_degree": stated.source_sh_degree,
-        "refitted": stated.refitted,
-        "errors": {record.measure: {"max": record.max, "rms": record.rms} for record in stated.records},
+        "source_splats": bounds.source_count,
+        "pruned_splats": bounds.pruned_count,
+        "source_sh_degree": bounds.source_sh_degree,
+        "refitted": bounds.refitted,
+        "errors": {record.measure: {"max": record.max, "rms": record.rms} for record in bounds.records},
     }
 
 
@@ -528,7 +521,7 @@ def _walk_codebook(
     use.escaped_count += params.escape_count
     if params.escape_count:
         escape = _spec.unpack_block_head(cursor.take(_spec.BLOCK_HEAD_SIZE))
-        if escape.coding == _spec.CODING_CODEBOOK:  # otherwise the recursion would not be bounded
+        if escape.coding == _spec.CODING_CODEBOOK:  # bounds the recursion
             raise FormatError(_spec.ERROR_STREAM, cursor.at, "CBK-5", found="coding codebook")
         _walk_coding(cursor, attribute, escape.coding, codebooks, use)
 
@@ -541,7 +534,7 @@ def _walk_stream(cursor: _Cursor, use: AttributeUsage) -> None:
 
 
 def _first_attribute(record: _spec.CodebookRecord, band: int) -> int:
-    """Return the id of the attribute whose columns a codebook chunk holds; for SH that of the band."""
+    """Return the id of the first attribute of a codebook chunk; for SH that of the band."""
     if record.kind == _spec.CODEBOOK_KIND_SH:
         name = f"sh{band}"
     else:

@@ -1,4 +1,4 @@
-"""Check a file and verify its declared errors: `csplat verify` without the command line."""
+"""Validate a file and verify its declared error bounds, as `csplat verify` does."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Verification:
     """The outcome of verifying a file.
 
     Attributes:
-        validation: violations of the spec, and the checks that were made.
-        proof: verification of the declared bounds; `None` without a source, or if the file violates a clause.
+        validation: violations of the spec, and the checks made.
+        proof: verification of the declared bounds; `None` without a source, or if the file violates the spec.
     """
 
     validation: Validation
@@ -41,7 +41,7 @@ class Verification:
 
     @property
     def holds(self) -> bool:
-        """True if the file conforms, and its declared errors were not disproved."""
+        """True if the file conforms to the spec, and no declared bound was exceeded."""
         return self.validation.conforms and (self.proof is None or self.proof.holds)
 
     def as_json(self) -> dict[str, Any]:
@@ -76,14 +76,14 @@ def verify_file(
 
     Args:
         path: the file, or `-`.
-        source: the PLY that it was made from.
+        source: its source.
         source_index: the .npy file that the encoder wrote.
         max_splats: refuse a scene of more splats (LIM-1); `None`: no limit.
-        memory_bytes: bound on the memory; the disk is used if it is too little. `None`: half of the free memory.
+        memory_bytes: limit of the memory; larger scenes are verified out of core. `None`: half of the free memory.
         progress: progress callback for validating and matching.
 
     Raises:
-        CsplatError: source or index are not valid; or the disk has no room for the verification.
+        CsplatError: source or index are not valid; or the disk is full.
         OSError: a file cannot be read.
     """
     rows = None if source_index is None else read_array(source_index, most_bytes=_INDEX_BYTES)
@@ -98,11 +98,11 @@ def _verify_bounds(
     data: bytes | mmap, source: str, rows: NDArray[Any] | None, memory_bytes: int | None, progress: Progress | None
 ) -> BoundsVerification:
     opened = open_tiles(data)
-    header, stated = opened.header, opened.declared_bounds
-    degree = MAX_SH_DEGREE  # bands above cannot be encoded, and declared errors do not include them
+    header, bounds = opened.header, opened.declared_bounds
+    degree = MAX_SH_DEGREE  # bands above cannot be encoded, and declared bounds do not include them
     with source_path(source) as local:
-        if fits_memory(opened, stated.source_count if stated else 0, size_on_disk(local), memory_bytes):
+        if fits_memory(opened, bounds.source_count if bounds else 0, size_on_disk(local), memory_bytes):
             model = formats.read(local, keep_extra=bool(header.extras), sh_degree=degree)
-            return verify_bounds(Source.of(model), decode(data), header, stated, rows, progress=progress)
+            return verify_bounds(Source.of(model), decode(data), header, bounds, rows, progress=progress)
         with formats.open_scene(local, sh_degree=degree) as scene:
             return verify_out_of_core(scene, opened, rows, memory_bytes=memory_bytes, progress=progress)

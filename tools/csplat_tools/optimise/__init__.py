@@ -1,4 +1,1 @@
-"""Search for the file of a scene that meets a target, over precision, coding of SH and number of splats.
-
-`target` and `bounds` do not need the renderer.
-"""
+"""Search for the file of a scene that meets a target, over precision, coding of SH and number of splats."""

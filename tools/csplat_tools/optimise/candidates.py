@@ -1,4 +1,4 @@
-"""Candidate files of a search, given by splats, coding of their colours and precision; each is made once."""
+"""Candidates of a search, given by subset, coding of colours and precision; each is made once."""
 
 from __future__ import annotations
 
@@ -21,21 +21,20 @@ from csplat_render.scorer import Scorer
 #: Importance of the splats, as for the encoder.
 Weights = NDArray[Any] | Importance
 
-_ENTRIES = (16, 8192)  # least and largest number of entries of a codebook that is chosen here
-_QUICK_LEVEL = 10  # DEFLATE level of drafts: the highest spends half of its time on the last per cent
+_ENTRIES = (16, 8192)  # least and largest number of codebook entries chosen here
+_QUICK_LEVEL = 10  # DEFLATE level of drafts; the highest level spends half of its time on the last 1 %
 
 
 @dataclass(frozen=True)
 class CodingChoice:
-    """The SH bands that are kept, their coding, and the use of quantisation classes.
+    """The SH bands to keep, their coding, and the use of quantisation classes.
 
     Attributes:
-        sh: "codebook", "scalar" or "none"; `None`: as in the options, like the plain encoder.
-        entries_per_splat: entries of a codebook per splat; `None`: as in the options.
-        degree: bands up to this one are kept; `None`: as in the options.
+        sh: "codebook", "scalar" or "none"; `None`: as in the options.
+        entries_per_splat: codebook entries per splat; `None`: as in the options.
+        degree: SH degree to keep; `None`: as in the options.
         adaptive: how much coarser unimportant splats are coded; `None`: as in the options.
-        use_classes: splats are sorted into quantisation classes by measurements, if there are any; False: measurements
-            are not used.
+        use_classes: sort splats into quantisation classes by measured importance, if there is any.
     """
 
     sh: ShCoding | None
@@ -45,11 +44,11 @@ class CodingChoice:
     use_classes: bool = True
 
     def options(self, encoding: EncodeOptions, splats: int) -> EncodeOptions:
-        """Return the encoder's options with this coding, for a file of `splats` splats."""
+        """Return the encoder's options with this coding, for a file with this number of splats."""
         return _options_of(self, encoding, splats)
 
 
-@lru_cache(maxsize=256)  # a search compares the options of its files a thousand times, and each is checked when made
+@lru_cache(maxsize=256)  # a search compares options a thousand times, and they are validated when made
 def _options_of(coding: CodingChoice, encoding: EncodeOptions, splats: int) -> EncodeOptions:
     size = encoding.codebook_size
     if coding.sh == "codebook" and coding.entries_per_splat is not None and size is None:
@@ -65,16 +64,16 @@ def _options_of(coding: CodingChoice, encoding: EncodeOptions, splats: int) -> E
 
 
 class Subset(Protocol):
-    """Splats that a file is to hold."""
+    """Splats for a candidate."""
 
     @property
     def model(self) -> SplatModel:
-        """The splats before they are quantised."""
+        """The splats before SH bands are dropped."""
         ...
 
     @property
     def unquantised(self) -> SplatModel:
-        """The splats that are quantised: SH bands may be left out."""
+        """The splats to quantise; SH bands may have been dropped."""
         ...
 
     @property
@@ -84,7 +83,7 @@ class Subset(Protocol):
 
     @property
     def refits(self) -> bool:
-        """True if encoding refits the splats through the quantisers of a file, which needs rendering."""
+        """True if encoding refits the splats through the quantisers, which requires rendering."""
         ...
 
     @property
@@ -93,11 +92,11 @@ class Subset(Protocol):
         ...
 
     def coded(self, options: EncodeOptions, *, use_classes: bool, quick: bool) -> EncodedTiles:
-        """Quantise and code the splats; `quick` leaves out the refit through the quantisers."""
+        """Quantise and code the splats; `quick` skips the refit through the quantisers."""
         ...
 
     def options_entry(self, candidate: Candidate | None) -> Mapping[str, Any] | None:
-        """Return the entry for a file's options: the splats and, with a file, its quality; `None`: no entry."""
+        """Return the entry for the file's options: the splats and, with a candidate, its quality; `None`: no entry."""
         ...
 
 
@@ -108,7 +107,7 @@ class WholeScene:
     Attributes:
         model: the scene.
         importance: the caller's importance of the splats.
-        measured: importance measured from views, by which splats are sorted into quantisation classes.
+        measured: importance measured in views, for quantisation classes.
         progress: progress callback.
     """
 
@@ -132,22 +131,22 @@ class WholeScene:
         return encode_tiles(plan, progress=self.progress)
 
     def options_entry(self, candidate: Candidate | None) -> None:  # the protocol's
-        """Return no entry: the file holds the scene as it is."""
+        """Return no entry."""
 
 
 @dataclass(eq=False)
 class Candidate:
-    """A candidate file. Owns its score on the test views, which is measured when first asked for.
+    """A candidate file. Owns its score on the test views, which is measured on first use.
 
     Attributes:
         subset, coding: its splats, and the coding of their colours.
-        quality: the PSNR of each attribute for which it was made, dB; `None`: that of the options.
+        quality: its attribute PSNR, dB; `None`: that of the options.
         options: options of the encoder.
-        is_final: it is packed as tightly as the caller requires, and no refit was left out.
+        is_final: it is fully compressed, and no refit was skipped.
         result: the encoder's result.
-        test_scorer: scorer by the source's renders in the test views.
-        validation_psnr: PSNR on the validation views, dB, by which files are compared.
-        photo_psnr: PSNR against the validation images, dB; NaN if there are none.
+        test_scorer: scorer on the test views, against the source's renders.
+        validation_psnr: PSNR on the validation views, dB, by which candidates are compared.
+        photo_psnr: PSNR on the validation images, dB; NaN without images.
         decode: decodes its bytes.
     """
 
@@ -172,7 +171,7 @@ class Candidate:
 
     @property
     def psnr(self) -> float:
-        """PSNR of these errors, pooled, dB: targets refer to it, and files are not compared by it."""
+        """PSNR on the test views, pooled, dB. Targets refer to it; candidates are not compared by it."""
         return psnr_of_mse(self.test_scorer.pooled(self.errors))
 
     @property
@@ -181,16 +180,16 @@ class Candidate:
         return self._errors is not None
 
     def score_on_test_views(self) -> None:
-        """Score the file on the test views: only then may it be written for a PSNR target."""
+        """Score the file on the test views, as required for a PSNR target."""
         _ = self.errors
 
     @property
     def is_packed(self) -> bool:
-        """True if the file is packed as tightly as the caller requires."""
+        """True if the file is fully compressed."""
         return self.is_final or self.subset.refits
 
     def with_result(self, result: EncodeResult) -> Candidate:
-        """Return the file with another result, whose options have more entries; its score is kept."""
+        """Return the candidate with another result of the same splats; the score is kept."""
         return replace(self, result=result)
 
     @property
@@ -228,17 +227,16 @@ class Candidate:
 
 @dataclass(eq=False)
 class CandidatePool:
-    """Makes candidate files and scores them, each once. Owns all that were made.
+    """Makes candidates and scores them, each once. Owns all of them.
 
     Attributes:
-        encoding: the caller's options, which no choice overrides.
-        test_scorer: scorer by the source's renders in the test views: a PSNR target refers to them, and they choose
-            nothing.
-        validation_scorer: scorer by the source's renders in the validation views, by which files are compared.
-        image_scorer: scorer by validation images, if the target is a loss against images.
-        made: all files, in order.
-        progress: progress callback, called with each file that is made.
-        decode: decodes the bytes of a file; an encoder other than csplat's, such as a formula in tests, brings its own.
+        encoding: the caller's options, which are never overridden.
+        test_scorer: scorer on the test views, to which a PSNR target refers.
+        validation_scorer: scorer on the validation views, by which candidates are compared.
+        image_scorer: scorer on validation images, if the target is a drop of PSNR.
+        made: all candidates, in order.
+        progress: progress callback, called for each candidate.
+        decode: decodes the bytes of a file; tests replace it.
     """
 
     encoding: EncodeOptions
@@ -252,13 +250,13 @@ class CandidatePool:
 
     @property
     def render_count(self) -> int:
-        """Number of renders made of the files."""
+        """Number of renders of the candidates."""
         return sum(
             len(self.validation_scorer.cameras) + one.is_scored * len(self.test_scorer.cameras) for one in self.made
         )
 
     def test_psnr(self, subset: Subset) -> float:
-        """Return the PSNR of a subset before quantisation on the test views, dB: the error that pruning takes."""
+        """Return the PSNR of a subset before quantisation on the test views, dB."""
         if subset not in self._test_psnr:
             self._test_psnr[subset] = self.test_scorer.psnr(subset.unquantised)
         return self._test_psnr[subset]
@@ -272,15 +270,15 @@ class CandidatePool:
         quick: bool,
         encoding: EncodeOptions | None = None,
     ) -> Candidate:
-        """Make a file, or return the one that was made with the same arguments.
+        """Make a candidate, or return the one that was made with the same arguments.
 
         Args:
             subset: its splats.
             coding: the coding of their colours.
-            quality: PSNR of each attribute, dB; `None`: that of the options.
-            quick: pack it less tightly if that is most of the work (the decoded splats are the same), and leave out
-                the refit through the quantisers.
-            encoding: options of the encoder, instead of those that all files share.
+            quality: attribute PSNR, dB; `None`: that of the options.
+            quick: make a draft: lower compression if that saves time (the decoded splats are the same), and no refit
+                through the quantisers.
+            encoding: options of the encoder, instead of the shared ones.
         """
         options = coding.options(encoding or self.encoding, len(subset.model))
         options = options if quality is None else replace(options, attribute_psnr=quality)
@@ -292,8 +290,8 @@ class CandidatePool:
             is_same_kind = candidate.subset is subset and candidate.coding.use_classes == coding.use_classes
             if is_same_kind and candidate.options == options and candidate.is_final == final:
                 return candidate
-        tell, stage = self.progress or null_progress, f"file {len(self.made) + 1}"
-        tell(stage, 0.0)
+        report, stage = self.progress or null_progress, f"file {len(self.made) + 1}"
+        report(stage, 0.0)
         coded = subset.coded(options, use_classes=coding.use_classes, quick=quick)
         result = coded.write(subset.options_entry(None))
         model = self.decode(result.data)
@@ -304,11 +302,11 @@ class CandidatePool:
         )
         entry = subset.options_entry(candidate)
         self.made.append(candidate if entry is None else candidate.with_result(coded.write(entry)))
-        tell(stage, 1.0)
+        report(stage, 1.0)
         return self.made[-1]
 
     def of(self, subset: Subset, coding: CodingChoice, *, final: bool = False) -> list[Candidate]:
-        """Return files of given splats and coding, at any quality; with `final`, only those that might be written."""
+        """Return candidates of a subset and coding, at any precision; with `final`, without drafts."""
         options = coding.options(self.encoding, len(subset.model))
         made = [one for one in self.made if one.subset is subset and one.quality is not None]
         made = [one for one in made if one.coding.options(self.encoding, len(subset.model)) == options]

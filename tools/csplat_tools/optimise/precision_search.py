@@ -1,4 +1,4 @@
-"""Find the precision at which a kind of file is near the goal, to compare kinds, or exactly on it, to be written."""
+"""Find the precision at which candidates are near the goal, to compare kinds, or exactly on it, to be written."""
 
 from __future__ import annotations
 
@@ -14,46 +14,41 @@ from csplat_tools.optimise.rate_distortion import BYTES_PER_DB, LEAST_QUANTISED,
 
 @dataclass(frozen=True)
 class SearchWindow:
-    """The range in which a value is to lie.
-
-    Attributes:
-        low, high: values between these are good enough.
-        aim: the value that a trial aims at.
-    """
+    """The accepted range of a value, from `low` to `high`; trials aim at `aim`."""
 
     low: float
     high: float
     aim: float
 
 
-#: Least slope that is taken from two tries, as a fraction of the expected one: a smaller one may be noise.
+#: Least slope measured between two tries, as a fraction of the expected one; a smaller one may be noise.
 FLATTEST = 0.15
 
-_STEEPEST = 4.0  # largest slope that is taken from two tries, as a multiple of the expected one
-_LONG_STEP = 0.03  # fraction of the range: over a shorter distance, values that do not grow may be noise
-_BRACKET_MARGIN = 0.08  # fraction of a bracket: a trial is never nearer to its ends
+_STEEPEST = 4.0  # largest slope measured between two tries, as a multiple of the expected one
+_LONG_STEP = 0.03  # fraction of the range; a lack of growth over a shorter distance may be noise
+_BRACKET_MARGIN = 0.08  # fraction of a bracket; least distance of a trial from its ends
 
-#: dB that a refit through the quantisers of a file gains, about: quick files count as better by this.
+#: Typical gain of a refit through the quantisers, dB; drafts count as better by this.
 REFIT_GAIN = 1.1
 
-_QUALITIES = (24.0, 110.0)  # range in which the PSNR of each attribute is searched, dB
+_QUALITIES = (24.0, 110.0)  # range of the attribute PSNR, dB
 
-_NEAR = SearchWindow(-0.8, 1.0, 0.1)  # dB above the goal: near enough to predict the cost of a file on it
+_NEAR = SearchWindow(-0.8, 1.0, 0.1)  # dB above the goal: near enough to predict the cost on it
 _CLOSE = SearchWindow(-0.35, 0.4, 0.05)  # dB above the goal: near enough to choose the best coding
-_ON = SearchWindow(0.0, 0.15, 0.06)  # dB above the goal; PSNR jumps by about as much from one precision to the next
-_ON_REFITTED = SearchWindow(0.0, 0.25, 0.1)  # the same for the error of quantisation of refitted splats
+_ON = SearchWindow(0.0, 0.15, 0.06)  # dB above the goal; PSNR jumps by about this from one precision to the next
+_ON_REFITTED = SearchWindow(0.0, 0.25, 0.1)  # the same for the quantisation error of refitted splats
 _WITHIN = SearchWindow(-0.35, 0.0, -0.12)  # range of a size target, in the dB that the bytes are worth
 _FEW, _SOME, _MANY = 3, 4, 6  # largest numbers of tries
 _JUMP = 0.25  # dB by which a file may be worse than one of less precision by chance
-_ROUGH = 16  # levels of opacity: with fewer, the PSNR of files jumps from one precision to the next
-_NEIGHBOURS = (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)  # dB of precision from the one found, tried if the PSNR jumps
-_APART = 0.5  # least difference of two files from which the cost of a decibel is taken, dB
+_ROUGH = 16  # levels of opacity; with fewer, the PSNR jumps from one precision to the next
+_NEIGHBOURS = (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)  # differences of attribute PSNR to try if the PSNR jumps, dB
+_APART = 0.5  # least difference in dB of two candidates between which the cost of a decibel is measured
 _SLOPES = (0.02, 0.1)  # range of the fraction of the bytes that a decibel costs
-_PLATEAU = 1.5  # dB below the goal: files that are lower are predicted with the steepest slope
-_FORESEEN = 2.0  # dB: quantisation that is better than it has to be by more counts only as the whole file is better
-_EVEN = 0.5  # least slope from two refitted files, as a fraction of the expected: quantisation is hardly less steep
-_STALLED = (2.0, 0.25)  # dB of precision, and the gain per dB that they must bring, or no precision reaches the goal
-_GROWS = {"codebook": 0.6}  # dB of a file's PSNR per dB of its attributes' PSNR, about; 1 for other codings
+_PLATEAU = 1.5  # dB below the goal; lower candidates are predicted with the steepest slope
+_FORESEEN = 2.0  # dB; an excess of quantisation quality above this counts only as far as the whole file is better
+_EVEN = 0.5  # least slope between two refitted candidates, as a fraction of the expected one
+_STALLED = (2.0, 0.25)  # dB of precision, and the least gain per dB below which no precision reaches the goal
+_GROWS = {"codebook": 0.6}  # typical dB of a file's PSNR per dB of its attribute PSNR; 1 for other codings
 
 
 @dataclass(frozen=True)
@@ -63,9 +58,9 @@ class SearchGoal:
     Attributes:
         psnr: least PSNR of renders against the source's, dB; with `photo_psnr`, the value that is likely to meet it.
         size_bytes: largest size of the file.
-        photo_psnr: least PSNR against photographs, dB.
-        photo_slope: growth of that with every dB of `psnr`, about: little if a file's own error is little.
-        max_error: largest errors of splats by measure; a file that exceeds one is no result.
+        photo_psnr: least PSNR against validation images, dB.
+        photo_slope: approximate growth of that per dB of `psnr`.
+        max_error: largest errors of splats by measure; files that exceed one are rejected.
     """
 
     psnr: float | None = None
@@ -75,7 +70,7 @@ class SearchGoal:
     max_error: Mapping[str, float] = field(default_factory=dict)
 
     def above(self, candidate: Candidate, slope: float = BYTES_PER_DB) -> float:
-        """Return by how many dB a file is above the goal; for a size, the dB that its excess bytes are worth.
+        """Return by how many dB a candidate is above the goal; for a size, the dB that its excess bytes are worth.
 
         Args:
             candidate: the file.
@@ -89,11 +84,11 @@ class SearchGoal:
 
     @property
     def uses_test_views(self) -> bool:
-        """True if files are measured on the test views: the goal is a PSNR."""
+        """True if candidates are measured on the test views, since the goal is a PSNR."""
         return self.size_bytes is None and self.photo_psnr is None
 
     def is_met(self, candidate: Candidate) -> bool:
-        """Return True if a file meets the goal."""
+        """Return True if a candidate meets the goal."""
         errors = candidate.result.report.errors
         if any(errors[name][0] > most for name, most in self.max_error.items() if name in errors):
             return False
@@ -101,7 +96,7 @@ class SearchGoal:
         return above <= 0.0 if self.size_bytes is not None else above >= 0.0
 
     def best(self, candidates: list[Candidate]) -> Candidate | None:
-        """Return the smallest file that meets the goal; for a size, the one with the best validation PSNR."""
+        """Return the smallest candidate that meets the goal; for a size, the one with the best validation PSNR."""
         good = [candidate for candidate in candidates if self.is_met(candidate)]
         if self.size_bytes is not None:
             return max(good, key=lambda candidate: candidate.validation_psnr, default=None)
@@ -110,10 +105,10 @@ class SearchGoal:
 
 @dataclass(eq=False)
 class PrecisionSearch:
-    """The search for the precision at which files of given splats and coding meet the goal.
+    """The search for the precision at which candidates of a subset and coding meet the goal.
 
     Attributes:
-        candidates: makes the files.
+        candidates: makes the candidates.
         goal: the goal.
     """
 
@@ -121,19 +116,19 @@ class PrecisionSearch:
     goal: SearchGoal
 
     def find_near(self, subset: Subset, coding: CodingChoice, start: float, tries: int = _FEW) -> Candidate:
-        """Return a file near the goal, or the nearest of a few.
+        """Return a candidate near the goal, or the nearest of a few.
 
         Args:
             subset: its splats.
             coding: the coding of their colours.
-            start: PSNR of each attribute for the first file, dB.
-            tries: largest number of files.
+            start: attribute PSNR of the first candidate, dB.
+            tries: largest number of candidates.
         """
         self._approach(subset, coding, start, _NEAR, tries, self.margin)
         return self._nearest(subset, coding)
 
     def find_closer(self, candidate: Candidate) -> Candidate:
-        """Return a file if it is close to the goal; else make one more of its kind, and return the nearest of all."""
+        """Return a candidate that is close to the goal; else make another one, and return the nearest of its kind."""
         if _CLOSE.low <= self.margin(candidate) <= _CLOSE.high:
             return candidate
         assert candidate.quality is not None
@@ -142,7 +137,7 @@ class PrecisionSearch:
         return self._nearest(candidate.subset, candidate.coding)
 
     def find_on(self, subset: Subset, coding: CodingChoice) -> Candidate | None:
-        """Return the best file that meets the goal, for splats and a coding with files near it; `None` if none does."""
+        """Return the best candidate on the goal, for a subset and coding with candidates near it; `None` if none is."""
         known = self._nearest(subset, coding)
         assert known.quality is not None
         if self.goal.size_bytes is not None:
@@ -161,7 +156,7 @@ class PrecisionSearch:
         return packed if self.goal.is_met(packed) else None
 
     def try_neighbours(self, best: Candidate) -> None:
-        """Try precisions next to that of a file on the goal if the PSNR jumps, and pack the smallest that meets it."""
+        """Try neighbouring precisions of a candidate on the goal if the PSNR jumps, and finish the smallest on it."""
         made, levels = self.candidates.of(best.subset, best.coding), best.result.report.options["opacity_levels"]
         if self.goal.size_bytes is not None or best.subset.refits or not (levels < _ROUGH or _jumps(made)):
             return
@@ -176,36 +171,33 @@ class PrecisionSearch:
             self.candidates.make(found.subset, found.coding, found.quality, quick=False).score_on_test_views()
 
     def cost(self, candidate: Candidate) -> float:
-        """Return the expected cost, see `expected_cost`, of a file like this one on the goal; infinite if not near."""
+        """Return `expected_cost`; infinite if the candidate is not near the goal."""
         above = self.margin(candidate)
         far = above < _NEAR.low if self.goal.size_bytes is None else above > _NEAR.high
         return math.inf if far else self.expected_cost(candidate)
 
     def expected_cost(self, candidate: Candidate) -> float:
-        """Return the expected cost of a file like this one on the goal: a logarithm of bytes.
-
-        The cost is infinite if no precision of its kind reaches the goal.
-        """
+        """Return the expected log bytes of this kind of candidate on the goal; infinite if none reaches it."""
         if self.is_stalled(candidate):
             return math.inf
         by_psnr = self.goal.size_bytes is None
         goal = self.validation_goal(candidate.subset) if by_psnr else self._validation_goal_of_size()
         above = candidate.validation_psnr + self._refit_gain(candidate) - goal
-        far = min(above + _PLATEAU, 0.0)  # finer steps alone bring nothing so far up
+        far = min(above + _PLATEAU, 0.0)  # finer steps alone do not gain this much
         above = min(_quantisation_margin(candidate, above), max(above, _FORESEEN))
         return math.log(candidate.size_bytes) - self.slope(candidate) * (above - far) - _SLOPES[1] * far
 
     def margin(self, candidate: Candidate) -> float:
-        """Return by how many dB a file is above the goal, as far as validation views tell.
+        """Return by how many dB a candidate is above the goal, estimated from validation views.
 
-        A quick file of refitted splats counts as better by the expected gain of the refit through its quantisers.
+        Drafts of refitted splats count as better by the expected gain of the refit through the quantisers.
         """
         if not self.goal.uses_test_views:
             return self.goal.above(candidate)
         return candidate.validation_psnr + self._refit_gain(candidate) - self.validation_goal(candidate.subset)
 
     def is_stalled(self, candidate: Candidate) -> bool:
-        """Return True if its kind of file is below a PSNR and more precision hardly helps: a codebook is too small."""
+        """Return True if more precision hardly helps a candidate below a PSNR, since its codebook is too small."""
         made = self.candidates.of(candidate.subset, candidate.coding)
         made = [one for one in made if one.is_final == candidate.is_final]
         if self.goal.size_bytes is not None or len(made) < 2:
@@ -221,7 +213,7 @@ class PrecisionSearch:
         return 0.0 if candidate.is_final or not candidate.subset.refits else REFIT_GAIN
 
     def slope(self, candidate: Candidate) -> float:
-        """Return the fraction of the bytes that a decibel of quantisation error costs for files of this kind."""
+        """Return the fraction of the bytes that a decibel of quantisation error costs for this kind of candidate."""
         for other in self.candidates.of(candidate.subset, candidate.coding):
             apart = _quantisation_margin(other, other.validation_psnr - candidate.validation_psnr)
             is_alike = other.is_final == candidate.is_final
@@ -230,9 +222,9 @@ class PrecisionSearch:
         return BYTES_PER_DB
 
     def validation_goal(self, subset: Subset) -> float:
-        """Return the goal as a PSNR on the validation views, dB; their errors differ from those of the test views.
+        """Return the goal as a PSNR on the validation views, dB.
 
-        They differ most for errors of pruning, so this goal depends on the splats.
+        Errors on validation and test views differ, most of all those of pruning, so the goal depends on the subset.
         """
         goal = self.goal.psnr or 0.0
         if not self.goal.uses_test_views:
@@ -245,10 +237,10 @@ class PrecisionSearch:
         return goal + nearest.validation_psnr - nearest.psnr
 
     def _validation_goal_of_fit(self, subset: Subset, allowed: float) -> float:
-        """Return the goal for refitted splats without a file yet: the pruning error plus the rest for quantisation.
+        """Return the goal for refitted splats without a candidate yet: the pruning error, the rest for quantisation.
 
-        Errors of quantisation are alike in all views, and errors of pruning are not: these are measured on both kinds
-        of views, reduced by the expected gain of the refit through the quantisers.
+        Quantisation errors are similar in all views. Pruning errors are not: they are measured on both kinds of views,
+        reduced by the expected gain of the refit through the quantisers.
         """
         validation, test = (
             error_of_psnr(psnr + REFIT_GAIN) for psnr in (subset.psnr, self.candidates.test_psnr(subset))
@@ -256,7 +248,7 @@ class PrecisionSearch:
         return psnr_of_mse(validation + max(allowed - test, LEAST_QUANTISED * allowed))
 
     def is_hopeless(self, subset: Subset) -> bool:
-        """Return True if pruning takes nearly all of the error that a PSNR allows, measured on the test views."""
+        """Return True if pruning takes nearly all of the allowed error on the test views."""
         if not (self.goal.uses_test_views and subset.refits):
             return False
         pruning = error_of_psnr(self.candidates.test_psnr(subset) + REFIT_GAIN)
@@ -282,7 +274,7 @@ class PrecisionSearch:
             value = above(candidate)
             if not fewer:
                 return value
-            # If pruning takes most of the error, a file whose total error is near enough is near enough.
+            # If pruning takes most of the error, a total error near the goal suffices.
             quantised = _quantisation_margin(candidate, value)
             return min(quantised, window.high) if 0.0 <= value <= _ON.high else quantised
 
@@ -304,9 +296,9 @@ class PrecisionSearch:
 
 
 def _quantisation_margin(candidate: Candidate, above: float) -> float:
-    """Return by how many dB the quantisation of a file is better than needed, if the whole file is `above` the goal.
+    """Return by how many dB the quantisation of a candidate is better than needed, if it is `above` the goal.
 
-    The error of pruning is the same at any precision; only the rest falls evenly with it, and the bytes follow that.
+    Precision does not change the error of pruning; bytes depend on the error of quantisation only.
     """
     total, goal = error_of_psnr(candidate.validation_psnr), error_of_psnr(candidate.validation_psnr - above)
     pruning = min(error_of_psnr(candidate.subset.psnr), (1.0 - LEAST_QUANTISED) * min(total, goal))
@@ -314,7 +306,7 @@ def _quantisation_margin(candidate: Candidate, above: float) -> float:
 
 
 def _jumps(candidates: Sequence[Candidate]) -> bool:
-    """Return True if a file is worse than another of less precision, by more than chance."""
+    """Return True if a candidate is worse than another of less precision, by more than chance."""
     ordered = [one.validation_psnr for one in sorted(candidates, key=lambda candidate: candidate.quality or 0.0)]
     return any(after < before - _JUMP for before, after in pairwise(ordered))
 
@@ -336,24 +328,24 @@ def find_in_window(
     flattest: float = FLATTEST,
     patience: int = 2,
 ) -> list[tuple[float, float]]:
-    """Try places until the value of an increasing function lies in a window.
+    """Try arguments until the value of an increasing function is in a window.
 
     Args:
-        measure: returns the value at a place; expensive.
-        window: the range in which the value is to lie.
-        start: the first place to try.
-        slope: approximate slope of the value, above 0.
-        bounds: the least and the largest place.
+        measure: the function; expensive.
+        window: the accepted range of the value.
+        start: the first argument to try.
+        slope: approximate slope of the function, above 0.
+        bounds: the least and the largest argument.
         tries: largest number of trials.
-        known: places and values from before; if there are any, `start` is not used.
-        flattest: least slope that is taken from two trials, as a fraction of `slope`.
-        patience: number of consecutive long steps without a gain after which the search ends.
+        known: known arguments and values; if there are any, `start` is ignored.
+        flattest: least slope measured between two trials, as a fraction of `slope`.
+        patience: number of consecutive long steps without a gain that end the search.
 
     Returns:
-        Places and values in the order in which they were tried, those known first; the last one lies in the window if
-        any does. Fewer than `tries` if a bound is the best possible place, or the values do not grow any more.
+        Arguments and values, known ones first, then in the order of trials; the last one is in the window if any is.
+        The search ends early if a bound is the best possible argument, or the values stop growing.
     """
-    points = sorted(known, key=lambda point: -abs(point[1] - window.aim))  # the nearest to the aim comes last
+    points = sorted(known, key=lambda point: -abs(point[1] - window.aim))  # the nearest to the aim last
     if points and window.low <= points[-1][1] <= window.high:
         return points
     for _ in range(tries):
@@ -377,7 +369,7 @@ def _next_place(
     bounds: tuple[float, float],
     patience: int,
 ) -> float | None:
-    """Return the next place to try; None if a bound was tried already, or the values do not grow any more."""
+    """Return the next argument to try; `None` if a bound was tried already, or the values stopped growing."""
     below = max((point for point in points if point[1] < window.low), default=None)
     above = min((point for point in points if point[1] > window.high), default=None)
     if below is not None and above is not None and above[0] > below[0]:
@@ -390,14 +382,14 @@ def _next_place(
         if value < window.low and all(
             _has_stalled(points[: len(points) - back], slope, bounds) for back in range(patience)
         ):
-            return None  # the values do not grow any more
+            return None  # the values stopped growing
         slope = min(max(seen, least), _STEEPEST * slope)
     wanted = min(max(place + (window.aim - value) / slope, bounds[0]), bounds[1])
     return None if any(wanted == tried for tried, _ in points) else wanted
 
 
 def _has_stalled(points: list[tuple[float, float]], slope: float, bounds: tuple[float, float]) -> bool:
-    """Return True if the last step was long and gained next to nothing; a single one may have crossed a plateau."""
+    """Return True if the last step was long and hardly gained anything; a single one may have crossed a plateau."""
     if len(points) < 2:
         return False
     (before, low), (place, high) = points[-2:]

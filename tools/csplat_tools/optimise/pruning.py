@@ -1,4 +1,4 @@
-"""`simplify`: prune splats that renders do not need, round after round, and refit the others."""
+"""Prune splats of low importance in rounds, and refit the others: `simplify`."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ from csplat_tools.scene_files import SceneLike, load_model
 from csplat_tools.views import ViewSet, camera_sequence, find_view_set
 from csplat_tools.views.sufficient_views import SufficientViews, find_sufficient_views
 
-_TRIES = 3  # largest number of fits on the way to a target PSNR
-_AGREE_ON = 0.5  # least fraction of the splats on whose pruning views have to agree: fits need the views in any case
-_NEAR = 0.05  # dB: a result this near to the target PSNR is not improved
-_BANDS_WORTH = 1.0  # dB that leaving out SH bands may cost; a fit that loses more has failed
+_TRIES = 3  # largest number of refits in the search for a target PSNR
+_AGREE_ON = 0.5  # least fraction of the splats on whose pruning views must agree, since refits need views in any case
+_NEAR = 0.05  # dB; a result this close to the target PSNR is not improved
+_BANDS_WORTH = 1.0  # dB that dropping SH bands may cost; a refit that loses more has failed
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +45,9 @@ class Simplified:
 
     Attributes:
         model: the scene.
-        source_index: [N] int64, the source splat that each splat was.
-        threshold: the largest error of a pruned splat: what a splat's bits are worth.
-        kept_bands: [N, d], mask of the SH bands that are kept; None if bands were not chosen.
+        source_index: [N] int64, the index of each splat in the source.
+        threshold: the largest error of a pruned splat.
+        kept_bands: [N, d], mask of the kept SH bands; `None` if bands were not chosen.
         report: pruned splats by reason, predicted and measured errors, views, seconds; JSON-compatible.
     """
 
@@ -60,7 +60,7 @@ class Simplified:
 
 @dataclass(frozen=True, eq=False)
 class PruningSession:
-    """A source, its views, and its pruning order, which several simplifications of one scene share.
+    """A source with its views and pruning order, shared by several simplifications.
 
     Attributes:
         source: the scene.
@@ -68,11 +68,11 @@ class PruningSession:
         view_set: all views of the scene.
         views: the training views whose pruning errors agree with those of held-out views, and the held-out views.
         training_cameras: views that splats are fitted to: the training views and, if they are virtual, at least the
-            same number of others, because a fit follows its views.
+            same number of others, against overfitting.
         view_groups: the same views with the source's pruning errors: two groups if they are virtual, else one.
         references: [H, W, 3], the source's render of each view of `training_cameras`.
         order: the pruning order.
-        check_scorer: scorer by held-out views.
+        check_scorer: scorer on held-out views.
         seconds: time by stage.
     """
 
@@ -89,11 +89,11 @@ class PruningSession:
 
     @property
     def value_count(self) -> int:
-        """Pixels times channels of all views of `training_cameras`."""
+        """Number of pixels times channels of all `training_cameras`."""
         return sum(group.pruning_error.value_count for group in self.view_groups)
 
     def kept_rows(self, pruned_count: int) -> I64:
-        """Return the source splats that are kept if the first `pruned_count` of the order are pruned."""
+        """Return the indices of the kept splats if the first `pruned_count` of the order are pruned."""
         return self.order.kept(len(self.source), pruned_count)
 
     def threshold(self, pruned_count: int) -> float:
@@ -125,8 +125,8 @@ def prepare_pruning(
 
     Args:
         source: the scene.
-        views: views of the scene; None for virtual views.
-        kept_count: number of splats to keep; None if it is not known yet.
+        views: views of the scene; `None` for virtual views.
+        kept_count: number of splats to keep; `None` if not known yet.
         options: options of the simplification.
         progress: progress callback.
         allowed: approximate mean squared error of pruning at which the order may end.
@@ -162,7 +162,6 @@ def prepare_pruning(
 
 
 def _render_all(source: SplatModel, cameras: Sequence[Camera], options: SimplifyOptions) -> list[F32]:
-    """Render the source from all cameras; the renderer's memory is released at the end."""
     draw = renderer(source, options.background, threads=options.threads)
     return [draw(camera).rgb for camera in cameras]
 
@@ -177,19 +176,19 @@ def simplify(
     options: SimplifyOptions | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Simplified:
-    """Prune splats to a target, refit the others, and leave out SH bands, as `csplat simplify` does.
+    """Prune splats to a target, refit the others, and drop SH bands, as `csplat simplify` does.
 
     Give one of `keep`, `psnr` and `max_psnr_drop`. Requires the packages of the render extra.
 
     Args:
         scene: a model, or a file in any format.
         keep: fraction of the splats to keep, above 0, at most 1.
-        psnr: least PSNR against the source's renders on the validation views, dB; as few splats as possible are kept.
-        max_psnr_drop: dB that the PSNR against the photographs of `views` may fall.
-        views: the kept splats are fitted to training views, and validation views determine how many may be pruned.
-            `None`: virtual views, as many as it takes.
+        psnr: least PSNR against the source's renders on the validation views, dB; the fewest splats are kept.
+        max_psnr_drop: largest drop of the PSNR on the validation images of `views`, dB.
+        views: the kept splats are fitted to training views; validation views determine how many may be pruned. `None`:
+            virtual views.
         options: options of the simplification.
-        progress: called with the stage and the fraction of it that is done, 0 to 1.
+        progress: progress callback.
 
     Returns:
         The simplified scene; its splats are in the source's order.
@@ -213,7 +212,7 @@ def simplify(
     if not len(source):
         raise InputError("a scene without splats cannot be simplified")
     if target.max_psnr_drop is not None and (views is None or not views.images):
-        raise InputError("a loss against photographs wants photographs: name a data set")
+        raise InputError("a largest drop of PSNR requires images: name a data set")
     kept_count = None if target.keep is None else target.count(len(source))
     session = prepare_pruning(source, views, kept_count, options, progress)
     start = time.perf_counter()
@@ -232,7 +231,7 @@ class _PrunedScene:
     """A pruned and refitted scene with its scores; names that end in `pruned_psnr` are scores before the refit.
 
     Attributes:
-        model, rows, kept_bands: as in `Simplified`; `rows` are the source splats.
+        model, rows, kept_bands: as in `Simplified`; `rows` is its source index.
         pruned_count: number of pruned splats.
         check_pruned_psnr, check_psnr: PSNR on held-out views, dB.
         is_refused: the refit made held-out views worse, and was discarded.
@@ -262,7 +261,7 @@ class _PrunedScene:
 
 
 def _find_scorer(session: PruningSession, target: Target) -> tuple[Scorer, float]:
-    """Return the scorer by validation views, and the PSNR to reach, dB; the largest possible if there is no target."""
+    """Return the scorer on validation views, and the PSNR to reach, dB; `PSNR_CAP` without a target."""
     views, threads = session.view_set, session.options.threads
     if target.max_psnr_drop is not None:
         scorer = views.image_validation_scorer(threads=threads)
@@ -271,7 +270,7 @@ def _find_scorer(session: PruningSession, target: Target) -> tuple[Scorer, float
 
 
 def _test_scores(session: PruningSession, model: SplatModel) -> dict[str, Any]:
-    """Return the scores of the result on the test views, for the report; empty if there are none."""
+    """Return the scores on the test views, for the report; empty without test views."""
     views, threads = session.view_set, session.options.threads
     if not views.test:
         return {}
@@ -288,7 +287,6 @@ def _test_scores(session: PruningSession, model: SplatModel) -> dict[str, Any]:
 def _prune_and_refit(
     session: PruningSession, pruned_count: int, scorer: Scorer | None, progress: Progress | None
 ) -> _PrunedScene:
-    """Prune and refit, and measure the result."""
     rows = session.kept_rows(pruned_count)
     pruned, refit = session.source.select(rows), session.refit(rows, progress)
     check_pruned, check = session.check_scorer.psnr(pruned), session.check_scorer.psnr(refit.model)
@@ -302,9 +300,9 @@ def _prune_and_refit(
 
 
 def _search_fewest(session: PruningSession, scorer: Scorer, goal: float, progress: Progress | None) -> _PrunedScene:
-    """Find the fewest splats that reach a PSNR: bisect along the order without a fit, then allow for the fit's gain."""
+    """Find the fewest splats that reach a PSNR, by bisection without refits, corrected by the gain of a refit."""
     if scorer.psnr(session.source) < goal:
-        raise InputError(f"even the source is below the target of {goal:.2f} dB: its renders are not its pictures")
+        raise InputError(f"the unpruned source is below the target of {goal:.2f} dB: lower the target")
     best, gain = None, 0.0
     lowest = 0
     for _ in range(_TRIES):
@@ -327,13 +325,13 @@ def _search_fewest(session: PruningSession, scorer: Scorer, goal: float, progres
 
 
 def _most_prunable(session: PruningSession, scorer: Scorer, goal: float, lowest: int) -> int:
-    """Return the number of splats that may be pruned before the PSNR, without a fit, falls below a goal.
+    """Return the number of splats that may be pruned before the PSNR, without a refit, falls below a goal.
 
     Args:
         session: the scene and its pruning order.
-        scorer: scorer by validation views.
+        scorer: scorer on validation views.
         goal: least PSNR, dB.
-        lowest: a number of splats that is known to be possible.
+        lowest: a number that is known to be possible.
     """
     low, high = lowest, len(session.order.rows)
     while high - low > max(1, len(session.source) // 200):
@@ -346,7 +344,6 @@ def _most_prunable(session: PruningSession, scorer: Scorer, goal: float, lowest:
 
 
 def _report(session: PruningSession, result: _PrunedScene, target: Target) -> dict[str, Any]:
-    """Return the report: pruned splats by reason, views, rounds, predicted and measured errors."""
     source, views = session.source, session.views
     pruned = np.ones(len(source), bool)
     pruned[result.rows] = False

@@ -1,4 +1,4 @@
-"""Find the pruning order of splats, by the exact error of removing each, measured anew in every round."""
+"""Find the pruning order of splats, by the exact error of removing each, measured again in every round."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from csplat_tools.views import VIEW_SIZE, default_views
 from csplat_tools.views.sufficient_views import pruning_keys
 
 _DEFAULT_EFFORT = 3
-_LEAST_FRACTION = 0.01  # fraction of the splats that is kept at the end of an order without a given target
-_ROUND_FRACTION = 0.72  # fraction kept after each round of such an order: splats that hid another may have been pruned
+_LEAST_FRACTION = 0.01  # fraction of the splats kept at the end of an order without a splat count
+_ROUND_FRACTION = 0.72  # fraction kept by each round of such an order; pruned splats may have hidden others
 
 
 @dataclass(frozen=True)
@@ -30,17 +30,17 @@ class SimplifyOptions:
     """Options of a simplification.
 
     Attributes:
-        rounds: number of times that errors are measured anew while splats are pruned, at least 1.
+        rounds: number of rounds of measuring errors and pruning, at least 1.
         refit: fit colours, opacities, scales and rotations of the kept splats to the source's renders.
-        effort: amount of work, 1 to 9: each one less than 3 halves the steps of descent, every two more double them;
+        effort: amount of work, 1 to 9. Steps of descent halve with each level below 3, and double with every two above;
             below 3 a target tries fewer candidates.
-        bands: set SH bands to zero that are worth less than their bits.
+        bands: set SH bands to zero that are not worth their bits.
         keep_unseen: keep splats that no view shows.
         view_size: width and height of training renders, pixels; `None`: chosen by the number of splats.
         views: largest number of virtual views if no views are given; `None`: chosen by the number of splats.
         background: red, green, blue behind virtual views; given views have their own.
         seed: seed of the virtual views, and of the order in which views are used.
-        threads: number of threads; None for all. The result does not depend on it.
+        threads: number of threads; `None` for all. The result does not depend on it.
 
     Raises:
         InputError: a value is out of range.
@@ -59,13 +59,13 @@ class SimplifyOptions:
 
     def __post_init__(self) -> None:
         if not 1 <= self.effort <= 9:
-            raise InputError(f"effort is {self.effort}, wanted 1 to 9")
+            raise InputError(f"effort is {self.effort}, expected 1 to 9")
         for name in ("rounds", "views"):
             value = getattr(self, name)
             if value is not None and value < 1:
-                raise InputError(f"{name} is {value}, wanted 1 or more")
+                raise InputError(f"{name} is {value}, expected at least 1")
         if self.view_size is not None and min(self.view_size) < 1:
-            raise InputError(f"view_size is {self.view_size}, wanted pixels")
+            raise InputError(f"view_size is {self.view_size}, expected at least 1 pixel")
 
     def views_and_size(self, splats: int) -> tuple[int, tuple[int, int]]:
         """Return the largest number of training views, and the width and height of their renders, for N splats."""
@@ -73,13 +73,13 @@ class SimplifyOptions:
         return self.views or views, self.view_size or size
 
     def steps(self, usual: int) -> int:
-        """Return the number of steps in place of the usual one, by effort; fewer if renders are larger than usual."""
+        """Return the number of steps scaled by effort, and reduced for large renders."""
         larger = math.sqrt(math.prod(self.view_size or VIEW_SIZE) / math.prod(VIEW_SIZE))
         return max(1, round(usual * self.work / max(1.0, larger)))
 
     @property
     def work(self) -> float:
-        """The amount of work as a multiple of that with the default effort."""
+        """The amount of work relative to the default effort."""
         octaves = self.effort - _DEFAULT_EFFORT
         return 2.0 ** (octaves / 2 if octaves > 0 else octaves)
 
@@ -95,7 +95,7 @@ class PruningRound:
 
     Attributes:
         removed: number of pruned splats.
-        largest: the largest error of one of them, as a sum over pixels, channels and views.
+        largest: largest error of a pruned splat, summed over pixels, channels and views.
         predicted: sum of their errors.
     """
 
@@ -109,8 +109,8 @@ class PruningOrder:
     """A pruning order.
 
     Attributes:
-        rows: [G] int64, source splats in the order of pruning, without those that are never pruned.
-        errors: [G], error of removing each, as measured in its round.
+        rows: [G] int64, indices of splats in the order of pruning, without those that are never pruned.
+        errors: [G], error of removing each, measured in its round.
         rounds: the rounds.
     """
 
@@ -119,7 +119,7 @@ class PruningOrder:
     rounds: tuple[PruningRound, ...]
 
     def kept(self, splat_count: int, pruned_count: int) -> I64:
-        """Return the source splats that are kept if `pruned_count` are pruned, ascending."""
+        """Return the indices of the kept splats if `pruned_count` are pruned, ascending."""
         is_kept = np.ones(splat_count, bool)
         is_kept[self.rows[:pruned_count]] = False
         return np.flatnonzero(is_kept)
@@ -127,18 +127,18 @@ class PruningOrder:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredViews:
-    """Views from which splats are measured together.
+    """Views in which pruning errors are measured together.
 
     Attributes:
         cameras: the views.
-        pruning_error: errors of removing each of the kept splats, as last measured in these views.
+        pruning_error: errors of removing each kept splat, as last measured in these views.
     """
 
     cameras: Sequence[Camera]
     pruning_error: PruningError
 
     def of_rows(self, rows: NDArray[Any]) -> MeasuredViews:
-        """Return the views with the errors of some of the splats."""
+        """Return the views with the errors of a subset."""
         return replace(self, pruning_error=self.pruning_error.of_rows(rows))
 
 
@@ -156,12 +156,12 @@ def find_pruning_order(
 
     Args:
         model: the source.
-        view_groups: views with the pruning errors of the source. Rounds measure one group after the other, and the last
-            measurements of the others still count: with two groups, twice the views at the cost of one.
+        view_groups: views with the pruning errors of the source. Each round measures the next group, and adds the last
+            measurements of the others: two groups give twice the views at the cost of one.
         options: rounds, background, threads, `keep_unseen`.
-        kept_count: number of splats to keep; None for an order that may be cut anywhere.
+        kept_count: number of splats to keep; `None` for an order that may be cut anywhere.
         progress: progress callback.
-        enough: an order without `kept_count` ends with the round in which the sum of all errors exceeds this.
+        enough: sum of all errors at which an order without `kept_count` ends.
         start: an order to continue.
     """
     count = len(model)

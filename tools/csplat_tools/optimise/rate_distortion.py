@@ -1,9 +1,9 @@
 """The rate-distortion model of the search, in the number of splats and the error of quantisation.
 
-A decibel costs the fraction s of a file's bytes, so that quantisation with the error Q takes bytes in proportion to
-n · Q^-k for n splats, k = 10 / ln(10) · s. With P(n) the error of pruning, a file whose error may be D is smallest for
-the n that minimises n · (D - P(n))^-k; a file of a given size is best for the n that minimises
-P(n) + Q · (n / N)^(1 / k), where Q is the error of quantisation with N splats.
+A decibel costs the fraction s of a file's bytes, so the bytes for n splats with quantisation error Q are proportional
+to n · Q^-k, k = 10 / ln(10) · s. With P(n) the error of pruning, the smallest file of error D has the n that minimises
+n · (D - P(n))^-k. The best file of a given size has the n that minimises P(n) + Q · (n / N)^(1 / k), where Q is the
+quantisation error with N splats.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from csplat.types import F64
 
-#: Fraction of the bytes that a decibel costs, about; measured 0.035 without SH, 0.05 with it.
+#: Typical fraction of the bytes that a decibel costs; measured 0.035 without SH, 0.05 with it.
 BYTES_PER_DB = 0.045
 
 #: Least fraction of a file's error that is attributed to quantisation.
@@ -45,8 +45,8 @@ def log_bytes_at_error(kept_count: F64, removed: F64, allowed: float, most: floa
         kept_count: number of kept splats, in any unit.
         removed: mean squared error of pruning the others.
         allowed: mean squared error of the files.
-        most: largest fraction of it that pruning may take: beyond, the rest for quantisation would be a small
-            difference of numbers that are not known well.
+        most: largest fraction of it that pruning may take; beyond, the rest for quantisation would be a small
+            difference of uncertain numbers.
         slope: fraction of the bytes that a decibel costs.
     """
     fits = removed <= most * allowed
@@ -55,9 +55,5 @@ def log_bytes_at_error(kept_count: F64, removed: F64, allowed: float, most: floa
 
 
 def rate_exponent(slope: float) -> float:
-    """Return k: bytes are proportional to the error to the power of -k.
-
-    Args:
-        slope: fraction of the bytes that a decibel costs.
-    """
+    """Return k of bytes ∝ error^-k for the fraction of the bytes that a decibel costs."""
     return slope * 10.0 / math.log(10.0)

@@ -22,12 +22,10 @@ from csplat_trainer.sensitivity import Sensitivity, measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, write_sensitivity
 
 _NOTHING = "a scene without splats has no sensitivities"
-_PRUNED_FRACTION = (
-    0.4  # fraction of the splats on whose pruning virtual views have to agree before there are enough views
-)
-_GIVEN = 40  # number of cameras that suffice if cameras are given
+_PRUNED_FRACTION = 0.4  # fraction of the splats on whose pruning virtual views must agree before they are enough
+_GIVEN = 40  # number of training views that suffice if cameras are given
 _VIRTUAL = {False: (120, 120), True: (80, 60)}  # by `has SH`: number of small virtual views, for small and large scenes
-_LARGE = 40_000  # splats of a large scene: for fewer, half of the views would change the size of files by a per cent
+_LARGE = 40_000  # splats of a large scene; for smaller ones, half of the views would change file sizes by 1 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +75,7 @@ def measure_scene(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> SceneSensitivity:
-    """Measure the sensitivities of a scene from training views: all of them, or as many virtual ones as it takes.
+    """Measure the sensitivities of a scene in all training views, or in sufficiently many virtual ones.
 
     Args:
         model: the scene.
@@ -116,14 +114,14 @@ def measure_views(
     threads: int | None,
     progress: Progress | None = None,
 ) -> Sensitivity:
-    """Measure the sensitivities of a scene from given views.
+    """Measure the sensitivities of a scene in given views.
 
     Args:
         model: the scene.
         cameras: the views, relative to the scene's origin.
         background: background colour.
         matrices: measure the matrices of SH coefficients, too.
-        magnitudes: measure gradient magnitudes in addition to the squares from which weights are made.
+        magnitudes: measure gradient magnitudes, too; weights are made from squares.
         threads: number of threads; `None` for all.
         progress: progress callback.
 
@@ -133,7 +131,7 @@ def measure_views(
     if not len(model):
         raise InputError(_NOTHING)
     if progress is not None:
-        progress("compiling", 0.0)  # the first time takes some seconds
+        progress("compiling", 0.0)  # takes some seconds unless cached
         measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=matrices, magnitudes=magnitudes)
         progress("compiling", 1.0)
     found = measure_sensitivity(
@@ -141,7 +139,7 @@ def measure_views(
         progress=progress,
     )  # fmt: skip
     if not found.seen.any():
-        raise InputError("no view shows any splat: scene and cameras do not belong together")
+        raise InputError("no view shows any splat: check that the cameras belong to the scene")
     return found
 
 
@@ -169,11 +167,10 @@ def measure_importance(
 
 
 def importance_views(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
-    """Select the training views from which the precision that splats need is measured.
+    """Return the training views in which the importance of splats is measured.
 
-    Virtual training views look from nearer and farther, from below and from the side, too. Cameras like the test views
-    would show less of what others see: plane3 with quantisation classes from 40 of them has 42 dB on them and 39 on
-    others; from these views, 41 and 40.
+    Virtual training views have various distances and directions. Cameras like the test views generalise less: plane3
+    with quantisation classes from 40 of them has 42 dB on them and 39 on others; from these views, 41 and 40.
     """
     return evenly_spaced(
         views.training, _VIRTUAL[source.sh_degree > 0][len(source) >= _LARGE] if views.virtual else _GIVEN
@@ -193,15 +190,14 @@ def complete_importance(
 
     Args:
         source: the scene.
-        views: the views, of which training views are used.
-        encoding: the caller's options; some leave nothing to sort into quantisation classes.
-        importance: the caller's importance. If it has curvatures, nothing is measured; else it is kept for SH.
-        inside: the views are virtual ones in a surrounding scene, from which nothing is measured.
+        views: the views; importance is measured in training views.
+        encoding: the caller's options; some exclude quantisation classes.
+        importance: the caller's importance. If it has Gauss–Newton blocks, nothing is measured; else it is kept for SH.
+        inside: the views are virtual ones in a surrounding scene, in which nothing is measured.
         progress: progress callback.
 
     Returns:
-        Weights and curvatures, `None` if they are not known or would change nothing; and the number of views in which
-        they were measured here.
+        The importance, `None` if it is unknown or would change nothing; and the number of views used here.
     """
     several = max_class_count(len(source), encoding) > 1
     if isinstance(importance, Importance) and importance.blocks is not None:
@@ -220,5 +216,5 @@ def complete_importance(
     elif importance is not None:
         found = replace(found, sh=np.asarray(importance))
     if not encoding.shape_codebook_size:
-        found = replace(found, shape_metric=None)  # half of the memory of `found`
+        found = replace(found, shape_metric=None)  # frees half of the memory
     return found, len(seen_from)

@@ -1,4 +1,4 @@
-"""Describe a search and the file that it found."""
+"""The report of a search for a target, and its result."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from csplat_tools.optimise.candidates import Candidate, CandidatePool
 from csplat_tools.optimise.targets import Target
 from csplat_tools.views import describe_views
 
-_FAR = 0.3  # dB: a PSNR that exceeds the target by more is explained
-_LESS = 1.0  # dB: a PSNR from elsewhere that is lower by more is pointed out
+_FAR = 0.3  # dB; a PSNR that exceeds the target by more is explained
+_LESS = 1.0  # dB; a PSNR on other views that is lower by more is pointed out
 
 
 @dataclass(frozen=True)
@@ -32,19 +32,18 @@ class SearchReport:
         splats_before: number of splats of the scene.
         encodes: number of files that were made.
         seconds: time of the whole search.
-        reached: largest errors of the file by measure, for those that are bounded.
-        psnr: PSNR of the file against the source, dB; `None` if nothing was rendered, as for all that follows.
-        photographs: PSNR of `file` and `source` against the test photographs, if there are any.
+        reached: largest errors of the file by measure, for bounded measures.
+        psnr: PSNR of the file against the source, dB; `None`, like the following fields, if nothing was rendered.
+        photographs: PSNR of `file` and `source` against the test images, if any.
         worst_psnr: PSNR of the worst view, dB.
         spread: standard deviation of the PSNR over other choices of such views, dB.
-        elsewhere: PSNR from virtual views that had no part in the search, dB: `beside` those of `psnr`, and the same
-            `nearer` and `farther`.
+        elsewhere: PSNR on virtual views that were not used in the search, dB, by kind (`extra_test_cameras`).
         views: number of test views.
         views_of: source of the views: `virtual`, or a name.
-        renders: number of renders that were scored.
-        removal_views, sensitivity_views: number of small renders to measure pruning errors, and sensitivities.
-        chosen, tried: the chosen file and all files, see `Candidate.as_json`.
-        why, sure: explanations of the choice, and of the reliability of the PSNR.
+        renders: number of scored renders.
+        removal_views, sensitivity_views: number of small renders for measuring pruning errors, and sensitivities.
+        chosen, tried: the chosen file and all candidates, see `Candidate.as_json`.
+        why, sure: explanations of the choice, and of the accuracy of the PSNR.
     """
 
     goal: dict[str, Any]
@@ -79,28 +78,28 @@ class SearchReport:
         asked = [f"{name} within {bound:g}" for name, bound in goal.get("max_error", {}).items()]
         if "size_bytes" in goal:
             percentage = 100.0 * self.size_bytes / goal["size_bytes"]
-            asked.append(f"{format_bytes(goal['size_bytes'])}, of which the file takes {percentage:.1f} %")
+            asked.append(f"{format_bytes(goal['size_bytes'])}; the file uses {percentage:.1f} %")
         if "psnr" in goal:
-            asked.append(f"{goal['psnr']:g} dB, of which it reaches {self.psnr:.2f}")
+            asked.append(f"{goal['psnr']:g} dB; the file has {self.psnr:.2f} dB")
         if "keep" in goal:
             asked.append(f"{100.0 * goal['keep']:g} % of {counted(self.splats_before, 'splat')}")
         if "max_psnr_drop" in goal:
-            asked.append(f"a drop of {goal['max_psnr_drop']:g} dB against the validation photographs")
+            asked.append(f"a drop of {goal['max_psnr_drop']:g} dB on the validation images")
         lines = [f"target: {'; '.join(asked)}"]
         if self.photographs:
             file, source = self.photographs["file"], self.photographs["source"]
-            lines.append(f"test photographs: {file:.2f} dB, the source {source:.2f}")
+            lines.append(f"test images: {file:.2f} dB, the source {source:.2f} dB")
         lines += [f"chosen: {line}" for line in self.why]
         if self.psnr is not None:
             lines.append(f"PSNR {self.psnr:.2f} dB, {self.sure}")
             lines += self._elsewhere(self.psnr)
         cost = f"{counted(self.encodes, 'file')} tried"
         if self.renders:
-            cost += f", {counted(self.renders, 'picture')} judged"
+            cost += f", {counted(self.renders, 'render')} scored"
         if self.sensitivity_views:
-            cost += f", sensitivity measured in {self.sensitivity_views}"
+            cost += f", sensitivity measured in {counted(self.sensitivity_views, 'render')}"
         if self.removal_views:
-            cost += f", removal measured in {self.removal_views} small ones"
+            cost += f", pruning error measured in {counted(self.removal_views, 'small render')}"
         return (*lines, cost)
 
     def _elsewhere(self, psnr: float) -> list[str]:
@@ -108,8 +107,8 @@ class SearchReport:
             return []
         scores = ", ".join(f"{found:.2f} {kind}" for kind, found in self.elsewhere.items())
         less = psnr - min(self.elsewhere.values())
-        worse = f": up to {less:.1f} dB less than where it was judged" if less > _LESS else ""
-        return [f"from virtual views that nothing was chosen by, PSNR {scores}{worse}"]
+        worse = f": up to {less:.1f} dB less than on the test views" if less > _LESS else ""
+        return [f"PSNR on virtual views that were not used in the search: {scores}{worse}"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -150,10 +149,10 @@ def make_report(
     Args:
         target: the target.
         found: the chosen file.
-        candidates: all files that were tried.
+        candidates: all candidates.
         splats_before: number of splats of the scene.
         views_of: source of the test views: `virtual`, or a name.
-        remarks: further sentences for `why`.
+        remarks: additional sentences for `why`.
         numbers: the other fields of `SearchReport`.
     """
     errors, spread = found.errors, psnr_spread(found.errors)
@@ -222,7 +221,7 @@ def _coding(candidate: Candidate) -> str:
 
 
 def psnr_spread(errors: F64) -> float:
-    """Return one standard deviation of a PSNR over other choices of views, in dB, by jackknife.
+    """Return the standard deviation of a PSNR over other choices of views, in dB, by jackknife.
 
     Args:
         errors: [V] mean squared error by view.

@@ -1,4 +1,4 @@
-"""Choose SH bands, their coding and quantisation classes from files near the goal, by their expected cost."""
+"""Choose SH bands, their coding and quantisation classes, by the expected cost of candidates near the goal."""
 
 from __future__ import annotations
 
@@ -13,33 +13,31 @@ from csplat.scene_source import drop_bands
 from csplat_tools.optimise.candidates import Candidate, CodingChoice, Subset
 from csplat_tools.optimise.precision_search import PrecisionSearch
 
-_LARGEST_SH = 1e4  # scenes with larger SH values get no codebook: at some qualities its escapes cannot code them
-_USUAL_ENTRIES = (38.0, 1 / 64, 0.4)  # PSNR of a file in dB, usual codebook entries per splat there, octaves per dB
-_ENTRIES_STEP = 4.0  # factor from one codebook size to the next that is tried
-_FITTED = 2.0  # factor of the entries per splat after pruning: the splats that are kept differ more
+_LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes cannot code them at some qualities
+_USUAL_ENTRIES = (38.0, 1 / 64, 0.4)  # PSNR in dB, usual codebook entries per splat at this PSNR, octaves per dB
+_ENTRIES_STEP = 4.0  # factor between codebook sizes to try
+_FITTED = 2.0  # factor of the entries per splat after pruning, since kept splats are more diverse
 _ENTRIES_PER_SPLAT = (1 / 4096, 1 / 4)  # least and most codebook entries per splat
-_ADAPTIVE = 1.0  # `adaptive` that is tried instead of the preset's for SH coded one by one, if importance was measured
-_BANDS_DROPPED = (
-    5.0  # dB above the goal that a scene without the upper bands has to reach: they take a third of the error
-)
-_NONE_DROPPED = 1.0  # dB above the goal below which fewer bands are not tried; without SH at all, enough for a try
-_FIRST_TRIES, _TRIES = 4, 2  # largest number of files to bring the first coding, and others, near the goal
-_CLOSER = 3  # files that may bring the best coding nearer to the goal
-_CLASSES_GAIN = 1.0  # dB that quantisation classes gain, about
-_CODEBOOK_GAIN = 0.7  # dB by which a codebook is better than values coded one by one, at the same precision
-_UNSURE = (0.02, 0.04)  # uncertainty of an expected cost, as a fraction of the bytes: on the goal, and per dB off it
-_FAR_OFF = 1.5  # dB: a codebook whose file is below the goal by more is too small, one above it by more too large
-_CLOSE = 0.1  # fraction of the bytes: a codebook whose cost exceeds the best by less may win with another size
+_ADAPTIVE = 1.0  # `adaptive` to try instead of the preset's for scalar coding of SH, if importance was measured
+_BANDS_DROPPED = 5.0  # dB above the goal that a scene without its upper bands must reach: a third of the error
+_NONE_DROPPED = 1.0  # dB above the goal that fewer bands must reach to be tried; enough for no SH at all
+_FIRST_TRIES, _TRIES = 4, 2  # most candidates for the first coding, and for others, to get near the goal
+_CLOSER = 3  # additional candidates for the best coding, to get nearer to the goal
+_CLASSES_GAIN = 1.0  # typical gain of quantisation classes, dB
+_CODEBOOK_GAIN = 0.7  # typical gain of a codebook over scalar coding at the same precision, dB
+_UNSURE = (0.02, 0.04)  # uncertainty of an expected cost, as a fraction of file size: on the goal, and per dB off it
+_FAR_OFF = 1.5  # dB; a codebook is too small or too large if its file is off the goal by more
+_CLOSE = 0.1  # fraction of file size; a codebook whose cost exceeds the best by less may win with another size
 
 
 @dataclass(eq=False)
 class CodingSearch:
-    """Codings for the splats of one scene, to be compared. Owns the PSNR of the scene without its upper bands.
+    """A comparison of codings for subsets of one scene. Owns the PSNR of the scene without its upper bands.
 
     Attributes:
         source: the scene.
-        encoding: the caller's options; those that are set are not chosen here.
-        classifiable: measurements exist by which splats can be sorted into quantisation classes.
+        encoding: the caller's options, which are never overridden.
+        classifiable: importance was measured, so that quantisation classes are possible.
     """
 
     source: SplatModel
@@ -48,11 +46,11 @@ class CodingSearch:
     _truncated: dict[int, float] = field(default_factory=dict, init=False)
 
     def usual_codings(self, subset: Subset, psnr: float = _USUAL_ENTRIES[0]) -> list[CodingChoice]:
-        """Return one coding of each kind that is possible: values one by one, a codebook, or none.
+        """Return one coding of each possible kind: scalar, codebook, or none.
 
         Args:
             subset: the splats.
-            psnr: approximate PSNR of files near the goal, dB.
+            psnr: approximate PSNR of candidates near the goal, dB.
         """
         if not self._degree or self.encoding.sh_coding == "none":
             return [CodingChoice("none")]
@@ -67,7 +65,7 @@ class CodingSearch:
         if self.encoding.sh_coding != "auto":
             return kinds[self.encoding.sh_coding]
         is_extreme = float(np.abs(self.source.shN).max(initial=0.0)) > _LARGEST_SH
-        if is_extreme or self.encoding.preset == "fast":  # making a codebook for each precision takes too long
+        if is_extreme or self.encoding.preset == "fast":  # a codebook for each precision takes too long
             return [scalar]
         return [scalar, *kinds["codebook"]]
 
@@ -75,13 +73,13 @@ class CodingSearch:
         """Try the codings that may be best.
 
         Args:
-            search: brings files near the goal.
+            search: finds the precision of candidates.
             subset: the splats.
-            start: PSNR of each attribute for the first file, dB.
+            start: attribute PSNR of the first candidate, dB.
             brief: try only one coding of each kind.
 
         Returns:
-            One file of each coding that was tried, the least costly first.
+            One candidate of each coding, the least costly first.
         """
         tried = _TriedCodings(search, subset, start)
         first, *others = self.usual_codings(subset, search.goal.psnr or _USUAL_ENTRIES[0])
@@ -115,7 +113,7 @@ class CodingSearch:
         return self.source.sh_degree if fixed is None else min(fixed, self.source.sh_degree)
 
     def _degrees(self, search: PrecisionSearch) -> list[int]:
-        """Return the SH degrees worth a try below the full one, by the PSNR of the unquantised scene at each."""
+        """Return the lower SH degrees worth a try, by the PSNR of the unquantised scene at each."""
         goal = search.goal.psnr
         if goal is None:
             goal = max((candidate.validation_psnr for candidate in search.candidates.made), default=0.0)
@@ -135,13 +133,13 @@ class CodingSearch:
 
 @dataclass(eq=False)
 class _TriedCodings:
-    """One file of each coding that was tried for some splats: near the goal, or as near as was worth it.
+    """One candidate of each coding that was tried for a subset, near the goal or promising.
 
     Attributes:
-        search: brings files near the goal.
+        search: finds the precision of candidates.
         subset: the splats.
-        start: PSNR of each attribute for the first file, dB.
-        found: the files.
+        start: attribute PSNR of the first candidate, dB.
+        found: the candidates.
     """
 
     search: PrecisionSearch
@@ -151,21 +149,21 @@ class _TriedCodings:
 
     @property
     def best(self) -> CodingChoice:
-        """The coding with the least expected cost; for a PSNR, codings too far from the goal to tell come last."""
+        """The coding with the least expected cost; for a PSNR, codings too far from the goal come last."""
         unknown = {coding: self.search.goal.size_bytes is None and self.is_far_off(coding) for coding in self.found}
         return min(self.found, key=lambda coding: (unknown[coding], self.search.expected_cost(self.found[coding])))
 
     def ordered(self) -> list[Candidate]:
-        """Return the files, the least costly first."""
+        """Return the candidates, the least costly first."""
         return sorted(self.found.values(), key=self.search.cost)
 
     def add(self, coding: CodingChoice, *, finer: float = 0.0, sized: bool = True) -> float:
-        """Try a coding, with a second file if the first one is promising, and return its expected cost.
+        """Try a coding, with a second candidate if the first is promising, and return its expected cost.
 
         Args:
             coding: the coding; nothing is made if it was tried before.
-            finer: approximate precision that it needs in addition to that of the best one so far, dB.
-            sized: a codebook of another size may be tried later instead of other steps.
+            finer: approximate precision that it needs in addition to that of the best so far, dB.
+            sized: other codebook sizes may be tried later, instead of another precision.
         """
         search, found = self.search, self.found
         if not found:
@@ -181,14 +179,13 @@ class _TriedCodings:
         return search.expected_cost(found[coding])
 
     def resize(self, book: CodingChoice) -> None:
-        """Try smaller or larger codebooks, step by step as long as it pays; only one way if one is far off the goal."""
+        """Try smaller or larger codebooks, step by step while it pays; in one direction if it is far off the goal."""
         above, stalled = self.search.margin(self.found[book]), self.search.is_stalled(self.found[book])
         ways = ((1 / _ENTRIES_STEP, above < -_FAR_OFF or stalled), (_ENTRIES_STEP, above > _FAR_OFF))
         for factor in [factor for factor, is_wrong in ways if not is_wrong]:
             coding, gained = book, False
             while (after := _resized(coding, factor)) is not None:
-                # If a codebook is too small for any precision, so are smaller ones, even if their files do not show
-                # it yet: go on to larger ones.
+                # If a codebook is too small for any precision, larger ones are tried even if this one did not pay.
                 pays = self.add(after) < self.add(coding)
                 if not pays and not (factor > 1.0 and self.search.is_stalled(self.found[after])):
                     break
@@ -197,13 +194,13 @@ class _TriedCodings:
                 break
 
     def bring_closer(self) -> None:
-        """Make more files of the best coding, until one is near enough to the goal for its cost to be trusted."""
+        """Make more candidates of the best coding until one is near enough to the goal for a reliable cost."""
         for _ in range(_CLOSER):
             best = self.best
             self.found[best] = self.search.find_closer(self.found[best])
 
     def is_far_off(self, coding: CodingChoice) -> bool:
-        """Return True if another codebook size is likelier to bring a coding near the goal than other steps."""
+        """Return True if another codebook size is likelier to get near the goal than another precision."""
         if coding.entries_per_splat is None:
             return False
         above = self.search.margin(self.found[coding])
@@ -212,14 +209,14 @@ class _TriedCodings:
         return is_far and _ENTRIES_PER_SPLAT[0] <= entries_per_splat <= _ENTRIES_PER_SPLAT[1]
 
     def _quality(self) -> float:
-        """Return the PSNR of each attribute at which the best coding so far would meet the goal, dB."""
+        """Return the attribute PSNR at which the best coding so far would meet the goal, dB."""
         known = min(self.found.values(), key=self.search.cost)
         assert known.quality is not None
         return known.quality - self.search.margin(known)
 
 
 def _resized(book: CodingChoice, factor: float) -> CodingChoice | None:
-    """Return the coding with `factor` times the codebook entries, within limits; `None` if that changes too little."""
+    """Return the coding with `factor` times the codebook entries, within limits; `None` if they change too little."""
     before = book.entries_per_splat or 0.0
     entries_per_splat = min(max(before * factor, _ENTRIES_PER_SPLAT[0]), _ENTRIES_PER_SPLAT[1])
     return (

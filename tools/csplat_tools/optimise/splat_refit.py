@@ -1,10 +1,10 @@
 """Refit kept splats to renders of the source by gradient descent, and choose the SH bands that they need.
 
-Neighbours of pruned splats have to cover more, and errors of quantised values can be made up for by other values:
-colours, opacities, scales and rotations are fitted together, one small view after the other. The step length is
-proportional to the error. Least squares over all views at once (linear for colours alone) overfit the training views;
-descent does not: after three passes over the views it gains as much on held-out views. Centres are fixed: if they move,
-too, scenes with few views get worse.
+Colours, opacities, scales and rotations are fitted together, one small view per step, so that neighbours of pruned
+splats cover for them, and other values compensate for quantisation. The step length is proportional to the error. Least
+squares over all views at once (linear for colours alone) overfit the training views; descent does not, and after three
+passes over the views gains the same on held-out views. Centres are fixed, since otherwise scenes with few views get
+worse.
 """
 
 from __future__ import annotations
@@ -30,12 +30,11 @@ from csplat_tools.optimise.rate_distortion import LEAST_QUANTISED, rate_exponent
 from csplat_trainer.parameters import Parameters, adam_step, from_model
 from csplat_trainer.tuning.tuned_scene import RateTerm, TunedScene
 
-#: Steps of a fit, and of the one after bands were left out.
+#: Steps of a refit, and of the one after bands were dropped.
 FIT_STEPS, BAND_STEPS = 960, 160
 #: Largest errors of bands 1, 2, 3 that are not worth their bits, as fractions of the scene's error per splat. At the
-#: optimum, a bit reduces the error by the same amount wherever it is spent: a splat has some 30 quantised values, whose
-#: error is half of the whole, and each bit takes 2 ln 2 of its value's error; bands of 9, 15 and 21 values take one and
-#: a half bits for each value.
+#: optimum, every bit reduces the error by the same amount. A splat has some 30 quantised values, whose error is half of
+#: the total, and a bit reduces its value's error by 2 ln 2; bands of 9, 15 and 21 values take 1.5 bits per value.
 BAND_COST = (0.25, 0.4, 0.55)
 
 
@@ -46,7 +45,7 @@ def choose_bands(pruning_error: PruningError, error: float) -> Mask:
         pruning_error: errors of removing each band from the scene.
         error: squared error of the scene per splat, summed over the views of `pruning_error`.
 
-    All bands of a splat that no view saw are kept.
+    Splats that no view saw keep all bands.
     """
     costs = np.array(BAND_COST[: pruning_error.bands.shape[1]])
     kept_bands: Mask = (pruning_error.bands > error * costs) | ~pruning_error.seen[:, None]
@@ -67,15 +66,15 @@ def drop_bands(model: SplatModel, kept_bands: Mask) -> SplatModel:
     return replace(model, shN=model.shN * coefficient_mask(kept_bands)[:, :, None].astype(np.float32))
 
 
-#: Learning rates of the first steps per unit of the root mean square error, which counts up to `_LARGEST_ERROR`.
+#: Learning rates of the first steps per unit of the root mean square error, which is limited to `_LARGEST_ERROR`.
 _RATES = {"logits": 1.95, "scales": 0.39, "quats": 0.023, "sh0": 0.1, "shN": 0.04}
 _SH_FACTOR = 2.0  # factor of the step length for scenes without SH; not used through quantisers
-_LARGEST_ERROR = 0.04  # root mean square error, 0 to 1, above which steps do not become longer
-_BETA2 = 0.98  # Adam's decay rate of squared gradients: errors fall too fast for a longer memory
-_LAST_RATE = 0.02  # fraction of the rates that is left in the last steps
-_SLOPE = 0.07  # fraction of the bytes that a decibel costs after a refit, about
+_LARGEST_ERROR = 0.04  # root mean square error, 0 to 1, above which steps do not get longer
+_BETA2 = 0.98  # Adam's decay rate of squared gradients; errors fall too fast for a longer memory
+_LAST_RATE = 0.02  # fraction of the learning rates in the last steps
+_SLOPE = 0.07  # typical fraction of the bytes that a decibel costs after a refit
 _COUNT_EVERY = 50  # steps between counts of a file's integers
-_CENTRE_BITS = 24.0  # bits of a splat's centre, about, which is fixed
+_CENTRE_BITS = 24.0  # typical bits of a splat's centre, which is fixed
 _SAMPLE = 8  # every Nth view is rendered to measure the error
 
 
@@ -97,7 +96,7 @@ def refit_splats(
         references: [H, W, 3], the reference image of each view.
         options: background, seed of the order of views, threads.
         steps: number of steps, one view each.
-        free: [N, K], mask of the SH coefficients beyond the first that may change; None for all.
+        free: [N, K], mask of the SH coefficients beyond the first that may change; `None` for all.
         progress: progress callback.
 
     Returns:
@@ -118,14 +117,14 @@ def quantisation_aware_refit(
     steps: int,
     progress: Progress | None = None,
 ) -> FreeValues:
-    """Refit splats through the quantisers of a file, so that renders are those of the decoded file; its bytes count.
+    """Refit splats through the quantisers of a file, so that renders are those of the decoded file; weigh its bytes.
 
     Args:
         fixed: the encoder's quantisation.
         cameras, references, options, steps, progress: as for `refit_splats`.
 
     Returns:
-        Values that `FixedQuantisation.coded` takes.
+        Values for `FixedQuantisation.encode`.
     """
     model, values = fixed.encode_plan.model, _QuantisedValues(TunedScene(fixed))
     values.tuned.parameters.beta2 = _BETA2
@@ -134,7 +133,7 @@ def quantisation_aware_refit(
     quantised = max(rms**2 - pruning_rms**2, LEAST_QUANTISED * rms**2)
     if math.isfinite(quantised):
         value_count = sum(image.size for image in references) / len(references)
-        # Growth of the error per saved fraction of the bytes; half of it, because views give half of its gradient.
+        # Growth of the error per saved fraction of the bytes; halved, since views give half of the gradient.
         values.lambda_ = 0.5 * quantised * value_count / rate_exponent(_SLOPE)
     _descend(values, views, steps, _step_length(rms), progress)
     return values.tuned.free_values.copy()
@@ -146,7 +145,7 @@ class RefitResult:
 
     Attributes:
         model: the scene.
-        kept_bands: [N, d], mask of the SH bands that are kept; None if bands were not chosen.
+        kept_bands: [N, d], mask of the kept SH bands; `None` if bands were not chosen.
     """
 
     model: SplatModel
@@ -162,14 +161,14 @@ def refit_with_bands(
     band_views: int | None = None,
     progress: Progress | None = None,
 ) -> RefitResult:
-    """Refit the splats; set bands to zero that are not worth their bits, and refit the others once more.
+    """Refit the splats, set bands to zero that are not worth their bits, and refit the others again.
 
     Args:
         model: the scene, with the source's values.
         cameras: the views.
         references: [H, W, 3], the source's render of each view.
         options: `refit` and `bands`, effort, background.
-        band_views: number of views, from the first on, by which bands are chosen; `None`: all.
+        band_views: choose bands by the first views, of this number; `None`: all.
         progress: progress callback.
     """
     if options.refit:
@@ -202,7 +201,7 @@ def refit_with_bands(
 
 
 class _FittedValues(Protocol):
-    """The values that are fitted, and the splats that are rendered from them."""
+    """The fitted values, and the splats to render."""
 
     def splats(self) -> UncheckedSplats: ...
 
@@ -220,11 +219,11 @@ class _TrainingViews:
         self._background, self._antialiased = options.background, antialiased
 
     def error_image(self, splats: HasSplats, view: int) -> F32:
-        """Return the error of a view's render, [H, W, 3]: positive if it is too bright."""
+        """Return the error of a view's render, [H, W, 3]; positive if it is too bright."""
         render = self.rasteriser.forward(
             splats, self.cameras[view], background=self._background, antialiased=self._antialiased
         )
-        # Straight-through gradient of the clipping: a colour above 1 is pulled back only if the reference is darker.
+        # Straight-through gradient of the clipping: a colour above 1 is reduced only if the reference is darker.
         return np.clip(render.rgb, 0.0, 1.0) - np.clip(self.references[view], 0.0, 1.0)
 
     def rms(self, splats: HasSplats) -> float:
@@ -235,7 +234,7 @@ class _TrainingViews:
 
 
 def _step_length(rms: float) -> float:
-    """Return the length of the first steps for a root mean square error; 0 if it is not finite."""
+    """Return the length of the first steps for a root mean square error, 0 if that is not finite."""
     return min(rms, _LARGEST_ERROR) if math.isfinite(rms) else 0.0
 
 
@@ -277,15 +276,15 @@ class _FloatValues:
         slopes: dict[str, Any] = {name: getattr(gradients, name) for name in ("quats", "scales", "sh0", "shN")}
         slopes["logits"] = gradients.opacities * alphas * (np.float32(1.0) - alphas)
         if self.free is not None:
-            gradients.shN[:] *= self.free[:, :, None]  # in place: the rasteriser's buffer, valid until its next pass
+            gradients.shN[:] *= self.free[:, :, None]  # the rasteriser's buffer, valid until its next pass
         adam_step(self.parameters, slopes, rates)
 
     def applied_to(self, before: SplatModel) -> SplatModel:
-        """Return the scene with the splats that changed; the others, and any that overflowed, are kept bit for bit.
+        """Return the scene with the changed values; unchanged and overflowed splats are kept bit for bit.
 
-        No step may follow: the optimiser's state is released.
+        This releases the optimiser's state, so no step may follow.
         """
-        self.parameters.first, self.parameters.second = {}, {}  # as large as the scene, each
+        self.parameters.first, self.parameters.second = {}, {}  # each as large as the scene
         values, alphas, start = self.parameters.values, self.parameters.alphas, _values_to_fit(before)
         moved = np.zeros(len(before), bool)
         for name in ("logits", "scales", "sh0", "shN"):
@@ -304,7 +303,6 @@ class _FloatValues:
 
 
 def _values_to_fit(model: SplatModel) -> dict[str, F32]:
-    """Return the values of a scene that are fitted."""
     values = from_model(model, model.sh_degree)
     del values["means"]
     return values
@@ -312,7 +310,7 @@ def _values_to_fit(model: SplatModel) -> dict[str, F32]:
 
 @dataclass(eq=False)
 class _QuantisedValues:
-    """Values that pass through quantisers; `lambda_`: squared error of a render that all bits together are worth."""
+    """Values that pass through quantisers; `lambda_` is the squared error of a render that all bits are worth."""
 
     tuned: TunedScene
     lambda_: float = 0.0

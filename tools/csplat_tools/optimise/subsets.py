@@ -1,4 +1,4 @@
-"""Prune a scene and refit the kept splats: how many to keep, and the content of a file of fewer splats."""
+"""Prune a scene and refit the kept splats: how many to keep, and subsets for candidates."""
 
 from __future__ import annotations
 
@@ -52,28 +52,28 @@ PsnrOf = Callable[[SplatModel], float]
 
 _USUAL_BYTES = (8.0, 11.0)  # bytes per splat of files of useful quality, without and with SH
 _FRAME_BYTES = 1_000  # bytes of a file without splats: header, index, options, declared errors
-_MOST_PRUNED = 0.7  # largest fraction of the error allowed by a PSNR that pruning may take
+_MOST_PRUNED = 0.7  # largest fraction of the allowed error that pruning may take
 _LEAST_PRUNED = 0.01  # least fraction of the error that is attributed to pruning
-_REFIT_GAIN = (8.0, 1.0)  # dB by which a refit reduces the pruning error, about, and more with twice the work
-_FAR = 2.0  # multiple of the error allowed by a PSNR at which an order ends: splats together err by more than the sum
-_FARTHER = 4.0  # multiple of its error to which an order that was too short is continued
-_CALIBRATIONS = 3  # largest number of times that a first number of splats is corrected by validation views
-_AGREED = 0.05  # fraction of the splats: a correction below this ends them
-_ERROR_POWER = 0.85  # power of the pruning error with which the error after a refit grows, about
-_ERROR_POWERS = (0.5, 1.1)  # range of that power if it is taken from two fits
+_REFIT_GAIN = (8.0, 1.0)  # typical gain of a refit over the pruning error, dB; increase for twice the work
+_FAR = 2.0  # multiple of the allowed error at which an order ends; errors of several splats exceed their sum
+_FARTHER = 4.0  # factor of its error to which an order that was too short is continued
+_CALIBRATIONS = 3  # largest number of corrections of the first splat count by validation views
+_AGREED = 0.05  # fraction of the splats; a smaller correction ends them
+_ERROR_POWER = 0.85  # typical power of the pruning error with which the error after a refit grows
+_ERROR_POWERS = (0.5, 1.1)  # range of that power if it is measured on two refits
 _NOTHING = 1e-12  # least mean squared error, to divide by
-_LEAST_FOR_CLASSES = 4_000  # least number of splats for quantisation classes: fewer are too similar
-_LEAST_REST = 0.2  # fraction of the fit's error that is at least left to bands and quantisation
-_MOST_BANDS = 0.7  # fraction of the error left by the fit that leaving out bands may take at most
-_BAND_TRIES, _FEWER_BANDS = 2, 4.0  # if they take more: number of tries, each with the bound divided by this factor
-_CARRIED_STEPS = 480  # steps of a fit that starts from the result of another
-_FILE_STEPS = 480  # steps of a fit through the quantisers of a file
+_LEAST_FOR_CLASSES = 4_000  # least number of splats for quantisation classes; fewer are too similar
+_LEAST_REST = 0.2  # least fraction of the refit's error that is left to bands and quantisation
+_MOST_BANDS = 0.7  # largest fraction of the error left by the refit that dropping bands may take
+_BAND_TRIES, _FEWER_BANDS = 2, 4.0  # number of further tries if they take more, and the divisor of the bound
+_CARRIED_STEPS = 480  # steps of a refit that starts from the result of another
+_FILE_STEPS = 480  # steps of a refit through the quantisers of a file
 _SENSITIVITY_VIEWS = (120, 40)  # number of views to measure the sensitivity of splats, without and with SH
 
 
 @dataclass(eq=False)
 class Pruner:
-    """Prunes a scene and refits the kept splats. Owns views, renders of the source and pruning order, made when needed.
+    """Prunes a scene and refits the kept splats. Owns views, renders of the source and pruning order, made lazily.
 
     Attributes:
         source: the scene.
@@ -81,8 +81,8 @@ class Pruner:
         options: options of pruning and fitting.
         use_classes: kept splats may be sorted into quantisation classes.
         progress: progress callback.
-        psnr: target PSNR, dB: the order ends far below it; `None`: another kind of target.
-        kept_count: number of splats to keep, if the target specifies it: the order is made for that number.
+        psnr: target PSNR, dB, which limits the length of the order; `None` for another kind of target.
+        kept_count: number of splats to keep if the target specifies it.
     """
 
     source: SplatModel
@@ -98,7 +98,7 @@ class Pruner:
 
     @property
     def session(self) -> PruningSession:
-        """The views, renders and pruning order that are shared by all numbers of splats."""
+        """The views, renders and pruning order, shared by all splat counts."""
         if self._session is None:
             allowed = math.inf if self.psnr is None else _FAR * error_of_psnr(self.psnr)
             self._session = prepare_pruning(
@@ -108,14 +108,14 @@ class Pruner:
 
     @property
     def view_count(self) -> int:
-        """Number of small renders in which pruning errors were measured, over all passes; 0 if they were not."""
+        """Number of small renders in which pruning errors were measured, over all passes."""
         if self._session is None:
             return 0
         views, later = self._session.views, max(0, len(self._session.order.rounds) - 1)
         return len(self._session.training_cameras) + len(views.used) * later + len(views.check)
 
     def refit(self, kept_count: int, allowed: float | None, psnr_of: PsnrOf) -> RefittedSubset:
-        """Return `kept_count` splats, refitted, but at least those that are never pruned, such as unseen ones.
+        """Return `kept_count` refitted splats; more if some can never be pruned, such as unseen ones.
 
         Args:
             kept_count: number of splats to keep.
@@ -131,23 +131,23 @@ class Pruner:
         return self._fitted
 
     def first_at_psnr(self, psnr: float, slope: float, psnr_of: PsnrOf) -> int:
-        """Return the number of splats to begin with for the smallest file of a PSNR.
+        """Return the first splat count to try for the smallest file of a PSNR.
 
-        Validation views show more or less of the pruning error than training views; this is measured and corrected.
+        Pruning errors on validation views differ from those on training views; this is measured and corrected.
 
         Args:
             psnr: target PSNR, dB.
             slope: fraction of the bytes that a decibel costs.
-            psnr_of: measures the PSNR of some of the source's splats on the validation views, dB.
+            psnr_of: measures the PSNR of a subset of the source on the validation views, dB.
         """
         return self._calibrated(_at_psnr(psnr, slope), psnr_of)
 
     def first_at_size(self, size_bytes: int, near: tuple[int, float] | None, slope: float, psnr_of: PsnrOf) -> int:
-        """Return the number of splats to begin with for the best file of a size.
+        """Return the first splat count to try for the best file of a size.
 
         Args:
             size_bytes: size of the file.
-            near: number of splats and PSNR in dB of a file of about that size; `None`: there is none.
+            near: number of splats and PSNR in dB of a file of about that size, if any.
             slope, psnr_of: as for `first_at_psnr`.
         """
         if near is None:
@@ -156,7 +156,7 @@ class Pruner:
         return self._calibrated(_at_size(near[0], error_of_psnr(near[1]), slope), psnr_of)
 
     def next_at_psnr(self, kept_count: int, fitted_psnr: float, psnr: float, slope: float) -> tuple[int, float]:
-        """Predict the number of splats for the smallest file of a PSNR, and the saving as a logarithm of bytes.
+        """Predict the splat count for the smallest file of a PSNR, and the saving in log bytes.
 
         Args:
             kept_count: number of splats of the last fit.
@@ -170,7 +170,7 @@ class Pruner:
         )
 
     def next_at_size(self, kept_count: int, fitted_psnr: float, psnr: float, slope: float) -> tuple[int, float]:
-        """Predict the number of splats for the best file of a size, and the gain as a logarithm of bytes.
+        """Predict the splat count for the best file of a size, and the gain in log bytes.
 
         Args:
             kept_count: number of splats of a file of that size.
@@ -184,7 +184,7 @@ class Pruner:
         return self._next(_at_size(kept_count, quantised, slope), (kept_count, removed), _ERROR_POWER)
 
     def _next(self, cost: Cost, known: tuple[int, float], power: float) -> tuple[int, float]:
-        """Return the number of kept splats with the least cost, and by how much it is below the known one."""
+        """Return the splat count with the least cost, and by how much it is below that of a known one."""
         kept_count, least = self._least(cost, known, power)
         return kept_count, float(cost(*map(np.atleast_1d, known))[0]) - least
 
@@ -202,10 +202,10 @@ class Pruner:
         return kept_count
 
     def _error_growth(self, before: tuple[int, float] | None, known: tuple[int, float]) -> float:
-        """Return the power with which the error after a refit grows with the pruning error, from two fits.
+        """Return the power with which the error after a refit grows with the pruning error, from two refits.
 
         Args:
-            before, known: number of splats and mean squared error of two fits; `None`: there was only one.
+            before, known: number of splats and mean squared error of each; `before` is `None` for the first refit.
         """
         if before is None or before[0] == known[0]:
             return _ERROR_POWER
@@ -215,11 +215,11 @@ class Pruner:
         return min(max(math.log(known[1] / before[1]) / removed, _ERROR_POWERS[0]), _ERROR_POWERS[1])
 
     def _least(self, cost: Cost, known: tuple[int, float] | None, power: float = _ERROR_POWER) -> tuple[int, float]:
-        """Return the number of kept splats with the least cost, and that cost.
+        """Return the splat count with the least cost, and that cost.
 
         Args:
-            cost: takes the numbers of kept splats and their errors after a refit.
-            known: number of splats and mean squared error of a fit; `None`: the usual gain of a refit is assumed.
+            cost: called with splat counts and their errors after a refit.
+            known: number of splats and mean squared error of a refit; `None`: the usual gain is assumed.
             power: power of the pruning error with which the error after a refit grows.
         """
         while True:
@@ -238,7 +238,7 @@ class Pruner:
         return _REFIT_GAIN[0] + _REFIT_GAIN[1] * math.log2(self.options.work)
 
     def _try_extending(self) -> bool:
-        """Continue the pruning order until its error is several times as large; return False if it cannot be."""
+        """Continue the pruning order to several times its error; return False if it has ended."""
         before = self.session.order
         self._extend(None, _FARTHER * float(before.errors.sum()))
         return len(self.session.order.rows) > len(before.rows)
@@ -268,7 +268,7 @@ def _at_psnr(psnr: float, slope: float) -> Cost:
 
 
 def _at_size(splats: int, quantised: float, slope: float) -> Cost:
-    # As a logarithm of bytes, as for a PSNR.
+    # In log bytes, like the cost for a PSNR.
     power = rate_exponent(slope)
     return lambda kept_count, removed: power * np.log(error_at_size(kept_count / splats, removed, quantised, slope))
 
@@ -280,12 +280,12 @@ class RefittedSubset:
     Attributes:
         session: the scene, its views, and the pruning order of its splats.
         pruned_count: number of pruned splats.
-        allowed: PSNR that files are to have on the validation views, dB: the error that the fit leaves below it
-            determines which SH bands are worth their bits; `None`: the fit's own error does.
-        psnr_of: measures the PSNR of some splats on the validation views, dB.
+        allowed: PSNR goal of files on the validation views, dB. The error that the refit leaves below it determines
+            which SH bands are worth their bits; `None`: the refit's own error does.
+        psnr_of: measures the PSNR of splats on the validation views, dB.
         use_classes: the splats may be sorted into quantisation classes, if there are enough.
         progress: progress callback.
-        before: a fit with another number of splats, from which this one starts.
+        before: a refit with another splat count, from which this one starts.
     """
 
     session: PruningSession
@@ -302,7 +302,7 @@ class RefittedSubset:
 
     @cached_property
     def rows(self) -> I64:
-        """[N] int64, the source splats that are kept."""
+        """[N] int64, the indices in the source of the kept splats."""
         return self.session.kept_rows(self.pruned_count)
 
     @property
@@ -322,12 +322,12 @@ class RefittedSubset:
 
     @cached_property
     def banded(self) -> tuple[SplatModel, Mask | None]:
-        """The splats without the SH bands that are not worth their bits, and a mask of kept bands; `None`: all."""
+        """The splats without SH bands that are not worth their bits, and the mask of kept bands; `None`: all."""
         session, model = self.session, self.model
         if not session.options.bands or not model.sh_degree:
             return model, None
         error, most = error_of_psnr(session.check_scorer.psnr(model)), math.inf
-        if self.allowed is not None:  # training and validation views see errors of different size
+        if self.allowed is not None:  # errors differ between training and validation views
             fitted, allowed = error_of_psnr(self.fitted_psnr), error_of_psnr(self.allowed)
             error *= max(allowed / fitted - 1.0, _LEAST_REST)
             most = max(fitted + _MOST_BANDS * (allowed - fitted), (1.0 + _LEAST_REST) * fitted)
@@ -342,16 +342,16 @@ class RefittedSubset:
 
     @property
     def unquantised(self) -> SplatModel:
-        """The splats that are quantised: refitted, without the bands that are left out."""
+        """The refitted splats without the dropped bands."""
         return self.banded[0]
 
     @property
     def psnr(self) -> float:
         """PSNR of `unquantised` on the validation views, dB."""
-        return self._banded_psnr  # pyright does not take a cached property for the protocol's
+        return self._banded_psnr  # pyright does not accept a cached property for the protocol's
 
     def coded(self, options: EncodeOptions, *, use_classes: bool, quick: bool) -> EncodedTiles:
-        """Quantise and code the splats; unless `quick`, refit them through the quantisers before."""
+        """Quantise and code the splats, after a quantisation-aware refit unless `quick`."""
         session, refit = self.session, self.session.options.refit
         start = self.banded[0]
         plan = EncodePlan.of(
@@ -367,13 +367,13 @@ class RefittedSubset:
             steps=session.options.steps(_FILE_STEPS), progress=self.progress,
         )  # fmt: skip
         models = [replace(start, **vars(fixed.dequantise(one)), means_double=None) for one in (fixed.start(), values)]
-        if self.psnr_of(models[1]) < self.psnr_of(models[0]):  # steps may be too long for a handful of splats
+        if self.psnr_of(models[1]) < self.psnr_of(models[0]):  # steps may be too long for very few splats
             values, models = fixed.start(), models[:1]
         self._check_psnr = session.check_scorer.psnr(models[-1])
         return fixed.encode(values, self.progress)
 
     def options_entry(self, candidate: Candidate | None) -> Mapping[str, Any]:
-        """Return the entry for a file's options: splats of the source, number of views, and PSNRs of the file."""
+        """Return the entry for the file's options: splats of the source, number of views, PSNRs of the file."""
         session = self.session
         entry = {"splats": len(session.source), "views": len(session.training_cameras)}
         figures = {} if candidate is None else {"validation_psnr": round(candidate.validation_psnr, 3)}
@@ -393,11 +393,11 @@ class RefittedSubset:
             return start
         if self.before is not None:
             start, steps = _with_values_of(self.before.model, self.before.rows, start, self.rows), _CARRIED_STEPS
-        self.before = None  # as large as the scene, and perhaps not used elsewhere
+        self.before = None  # frees memory: as large as the scene
         return self._refitted(start, steps)
 
     def _without_bands(self, error: float) -> tuple[SplatModel, Mask]:
-        """Return the splats without the bands that are not worth their bits at a squared error, and the kept bands."""
+        """Return the splats without bands that are not worth their bits at a squared error, and the kept bands."""
         session, model = self.session, self.model
         kept_bands = choose_bands(self._pruning_error, error * self._pruning_error.value_count / max(1, len(model)))
         banded = drop_bands(model, kept_bands)
@@ -422,7 +422,7 @@ class RefittedSubset:
 
     @cached_property
     def _pruning_error(self) -> PruningError:
-        """The error of removing each splat and each of its SH bands, and the weights of their colours."""
+        """The error of removing each splat and each of its SH bands, and the weights of colours."""
         session = self.session
         return measure_pruning_error(
             self.model, session.views.used, background=session.options.background, threads=session.options.threads,
@@ -441,7 +441,7 @@ class RefittedSubset:
 
 
 def _with_values_of(before: SplatModel, its_rows: I64, start: SplatModel, rows: I64) -> SplatModel:
-    """Return splats of the source with the values of another fit for those that it had; `rows` ascend."""
+    """Return splats of the source with the values of another refit if it has them; `rows` ascend."""
     _, there, here = np.intersect1d(its_rows, rows, assume_unique=True, return_indices=True)
 
     def carried(own: NDArray[np.float32], its: NDArray[np.float32]) -> NDArray[np.float32]:

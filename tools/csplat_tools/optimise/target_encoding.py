@@ -1,4 +1,4 @@
-"""Encode to a target: `encode_to`, and the search for steps within error bounds, which needs no renderer."""
+"""Encode to a target: `encode_to`, and the search for steps within error bounds, which does not render."""
 
 from __future__ import annotations
 
@@ -46,20 +46,20 @@ def encode_to(
 
     Args:
         scene: a model, or a file in any format.
-        psnr: least PSNR of the file's renders against the source's, dB, pooled over the test views; the smallest such
-            file is searched.
-        size: largest size in bytes, or as text such as "5MB"; the file with the best PSNR within it is searched.
-        max_psnr_drop: dB that the PSNR against the photographs of `views` may be below the source's; the smallest such
-            file is searched.
+        psnr: least PSNR of renders against the source's, dB, pooled over the test views; finds the smallest such file.
+        size: largest size in bytes, or as text such as "5MB"; finds the file with the best PSNR.
+        max_psnr_drop: largest drop of the PSNR against the images of `views` below the source's, dB; finds the
+            smallest such file.
         keep: fraction of the splats to keep, above 0, at most 1, at the precision of the preset.
         errors: the largest error of any splat, by measure: `means` in scene units, `covariance` relative,
             `opacities`, `sh0`, `sh1`, `sh2`, `sh3`.
         views: training, validation and test views; `None`: virtual ones around the scene (`find_view_set`).
-        options: options that are set here are not chosen. The preset "fast" tries no codebooks and keeps all splats.
-        no_prune: keep every splat as it is, which takes a sixth of the time.
+        options: options of the encoder; those that are set are not changed by the search. The preset "fast" tries no
+            codebooks and keeps all splats.
+        no_prune: keep all splats unchanged, which takes a sixth of the time.
         importance: importance of the splats, as for the encoder.
-        simplifying: options of pruning and fitting; the background is that of the views.
-        progress: called with the stage and the fraction of it that is done, 0 to 1; `print` will do.
+        simplifying: options of pruning and refitting; the background is that of the views.
+        progress: progress callback; `print` works.
 
     Returns:
         The file's bytes (`data`), the encoder's result (`result`), and the report of the search (`report`).
@@ -75,7 +75,7 @@ def encode_to(
         SplatModel(1000 splats, sh_degree=3)
 
     Raises:
-        InputError: there are no splats, an option is set that the target has to choose, or the target is out of reach.
+        InputError: there are no splats, an option is set that the target determines, or the target is out of reach.
         CsplatError: the scene is not valid.
         OSError: the file cannot be read.
     """
@@ -104,7 +104,7 @@ def encode_to(
 
 
 def _bounded_result(source: SplatModel, target: Target, bounded: BoundedFile, start: float) -> Optimised:
-    """Return the file for a target of largest errors alone, for which nothing was rendered."""
+    """Return the result for a target of largest errors alone, without scores."""
     result = bounded.result
     report = SearchReport(
         goal=target.as_json(),
@@ -119,8 +119,8 @@ def _bounded_result(source: SplatModel, target: Target, bounded: BoundedFile, st
 
 
 _TRIES = 12  # largest number of files
-_NEAR = 0.9  # fraction of a bound that is good enough; below it a coarser step is tried
-_AIM = 0.97  # fraction of a bound at which a new step aims
+_NEAR = 0.9  # fraction of a bound; a coarser step is tried if the error is below
+_AIM = 0.97  # fraction of a bound that a new step aims at
 _FASTEST = 8.0  # largest factor from one step to the next
 _KNOBS = {
     "means": ("position_error", "position_step", "position_bits"),
@@ -133,11 +133,11 @@ _KNOBS = {
 
 @dataclass(frozen=True, eq=False)
 class BoundedFile:
-    """A file whose errors keep within bounds.
+    """A file whose errors are within bounds.
 
     Attributes:
         encoding: options of the encoder.
-        result: the file that they give.
+        result: the file.
         encodes: number of files that were made.
     """
 
@@ -158,17 +158,17 @@ def meet_bounds(
 
     Args:
         source: the scene.
-        encoding: the other options; steps of measures that are not bounded are kept.
+        encoding: the other options; steps of unbounded measures are kept.
         bounds: largest error by measure.
         importance: importance of the splats, as for the encoder.
         progress: progress callback.
 
     Returns:
-        The file. The largest errors that it declares are within the bounds, and near them if float32 and the lattices
-        allow it.
+        The file. The largest errors that it declares are within the bounds, and close to them if float32 and the
+        lattices allow it.
 
     Raises:
-        InputError: the caller fixed a step that a bound would have to choose, or no step keeps to a bound.
+        InputError: `encoding` sets a step that a bound determines, or no step is fine enough.
     """
     options = _first_options(source, encoding, bounds)
     best: tuple[EncodeOptions, EncodeResult] | None = None
@@ -186,7 +186,7 @@ def meet_bounds(
         else:
             wrong = {name: ratio for name, ratio in ratios.items() if ratio > 1.0}
             if best is not None:
-                break  # the last coarser step was too coarse
+                break  # the last step was too coarse
             changed = _scaled_options(options, wrong)
             if changed == options or files == _TRIES:
                 break
@@ -194,7 +194,7 @@ def meet_bounds(
     if best is None:
         worst = max(ratios, key=lambda name: ratios[name])
         raise InputError(
-            f"no lattice keeps the error of {worst} within {bounds[worst]:g}: the best that was found is"
+            f"no lattice keeps the error of {worst} within {bounds[worst]:g}: the best found is"
             f" {result.report.errors[worst][0]:.3g}"
         )
     return BoundedFile(*best, files)
@@ -207,7 +207,7 @@ def _first_options(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[
         knobs = _KNOBS[_family(name)]
         fixed = [knob for knob in knobs if getattr(encoding, knob) is not None]
         if fixed:
-            raise InputError(f"{fixed[0]} is given, and the largest error of {name} is to choose it: leave one out")
+            raise InputError(f"{fixed[0]} is determined by the largest error of {name}: give only one of them")
         if name == "means":
             chosen["position_error"] = bound
         elif name == "opacities":
@@ -220,20 +220,20 @@ def _first_options(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[
             chosen[_KNOBS[_family(name)][0]] = min(step, chosen.get(_KNOBS[_family(name)][0], step))
     if any(_family(name) == "sh" for name in bounds) and source.sh_degree:
         if encoding.sh_coding == "none":
-            raise InputError("SH coding none leaves out the SH bands whose error is bounded")
+            raise InputError("sh_coding none drops the SH bands whose error is bounded")
         if encoding.adaptive:
-            raise InputError("adaptive steps bound no error of a splat: leave them out")
+            raise InputError("adaptive steps exclude a bound on the error of SH")
         if encoding.sh_coding == "codebook":
-            raise InputError("an SH codebook bounds no error of a splat: leave sh_coding to the bound")
+            raise InputError("an SH codebook excludes a bound on the error of SH: leave sh_coding unset")
         bounded = max(int(name[2:]) for name in bounds if _family(name) == "sh")
         if encoding.sh_degree is not None and encoding.sh_degree < min(bounded, source.sh_degree):
-            raise InputError(f"SH degree {encoding.sh_degree} leaves out sh{bounded}, whose error is bounded")
+            raise InputError(f"SH degree {encoding.sh_degree} drops sh{bounded}, whose error is bounded")
         chosen.update(sh_coding="scalar", adaptive=0.0, sh_degree=encoding.sh_degree or source.sh_degree)
     return replace(encoding, **chosen)
 
 
 def _scaled_options(options: EncodeOptions, ratios: Mapping[str, float]) -> EncodeOptions:
-    """Return the options with steps finer by the ratios of errors to bounds; coarser for ratios below 1."""
+    """Return the options with steps divided by the ratios of errors to bounds."""
     chosen: dict[str, Any] = {}
     for name, ratio in ratios.items():
         factor = min(max(_AIM / max(ratio, 1e-9), 1.0 / _FASTEST), _FASTEST)
@@ -259,7 +259,7 @@ def _clip_step(wanted: float) -> float:
 
 
 def _scaled_levels(levels: int | None, factor: float) -> int:
-    """Return the number of levels for steps that are `factor` times as coarse."""
+    """Return the number of levels for steps that are coarser by `factor`."""
     count = levels or 1
     scaled = math.ceil(count / factor) if factor < 1.0 else math.floor(count / factor)
     return scaled if scaled != count else count + (1 if factor < 1.0 else 0)
@@ -270,5 +270,5 @@ def _family(name: str) -> str:
 
 
 def _clip_levels(value: float, low: int, high: int) -> int:
-    """Clip a value, which may be infinite for bounds near 0, to a range, and round it up."""
+    """Clip a value to a range, and round it up; it may be infinite for bounds near 0."""
     return math.ceil(min(max(value, low), high))

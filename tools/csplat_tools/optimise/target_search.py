@@ -1,9 +1,9 @@
 """Search for the smallest file at a PSNR or a loss, or the best one within a size.
 
-The search chooses the precision, from which all steps follow; the SH bands and their coding; quantisation classes; and
-the number of splats, which are refitted to renders of the source after pruning. Every kind of file is brought near the
-goal by a few tries, and compared by its expected cost there; the best are brought onto the goal, and compared with the
-presets' own files. Nothing is tried that is not expected to pay.
+The search chooses the precision, which determines all steps; the SH bands and their coding; quantisation classes; and
+the number of splats, which are refitted to renders of the source after pruning. A few candidates of each kind are made
+near the goal, and kinds are compared by their expected cost there. For the best kinds candidates exactly on the goal
+are made, and compared with the presets' own files. Candidates that are not expected to pay are not made.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ from csplat_tools.optimise.targets import Target
 from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_validation_views
 from csplat_tools.views.view_sets import render_seconds
 
-#: Cost of a target in renders of 640x480: without pruning (measured 380 to 690 with plane3, donut, lego60k, fox120k),
-#: and with it, a fixed part and one that grows with the effort (plane3 at 40 dB, effort 1, 3 and 7: as 0.6 to 1 to 4).
+#: Cost of a target in renders of 640x480. Without pruning, measured 380 to 690 with plane3, donut, lego60k, fox120k.
+#: With pruning, a fixed part, and one that grows with the effort (plane3 at 40 dB, effort 1, 3 and 7: 0.6 to 1 to 4).
 _RENDERS = 520.0
 _RENDERS_WITH_PRUNING = (600.0, 2400.0)
-_ATTRIBUTE_GAIN = (5.0, 8.5)  # dB from the PSNR of all attributes to that of each alone, at 30 dB, without and with SH
-_ATTRIBUTE_GAIN_GROWS = (0.0, 0.22)  # dB that this grows with every dB above 30, without and with SH
-_USUAL = (7.0, 42.0)  # usual bytes per splat, and the PSNR of each attribute in such files
-_COUNTS = 3  # numbers of splats for which a fit is made; up to twice as many until there is a file
-_WORTH = 0.02  # fraction of the bytes: a number of splats that is predicted to save less is not worth a fit
-_CLOSE = 0.04  # fraction of the splats: a number that differs less from one that was tried is not worth a fit
-_SPARE = 0.7  # dB above the goal: a fit whose PSNR is lower leaves too little of the error to quantisation
-_FEWER = 0.7  # factor from one number of splats to a smaller one if none of its files fits the size
-_ALL_BUT = 0.02  # fraction of the splats: pruning fewer is not worth a fit
-_LEAST_REST = 0.15  # fraction of the allowed error that is at least left to quantisation
-_WITHIN_REACH = 0.1  # fraction of the bytes that another coding may save
-_PAYS = 0.01  # fraction of the bytes: a file that is expected to take this much more may turn out smaller
-_PAYS_FOR_REFIT = 0.03  # fraction of the bytes that pruned splats have to promise: their files take a fit each
-_COMMON = 0.1  # fraction of the bytes: largest excess of one refitted file that is expected of the others, too
-_FAR = 0.03  # fraction of the bytes: presets are not tried if files of all splats cost this much more than the best
-_BANDS_GROW = (34.0, 0.055)  # dB above which splats with SH are cheaper to keep, and by which fraction per dB
-_PRESETS = (-1.0, 2.5)  # dB above the goal: presets whose own files are expected in this range are tried
+_ATTRIBUTE_GAIN = (5.0, 8.5)  # dB from the PSNR of all attributes to that of one alone, at 30 dB, without and with SH
+_ATTRIBUTE_GAIN_GROWS = (0.0, 0.22)  # increase of this gain per dB above 30, without and with SH
+_USUAL = (7.0, 42.0)  # usual bytes per splat, and the attribute PSNR of such files, dB
+_COUNTS = 3  # splat counts to refit; twice this number if none has a file yet
+_WORTH = 0.02  # fraction of file size; a splat count predicted to save less is not refitted
+_CLOSE = 0.04  # fraction of the splats; a splat count closer to one that was tried is not refitted
+_SPARE = 0.7  # dB above the goal; a refit of lower PSNR leaves too little of the error to quantisation
+_FEWER = 0.7  # factor from one splat count to the next if none of its files fits the size
+_ALL_BUT = 0.02  # fraction of the splats; pruning fewer does not pay
+_LEAST_REST = 0.15  # least fraction of the allowed error that is left to quantisation
+_WITHIN_REACH = 0.1  # fraction of file size that another coding may save
+_PAYS = 0.01  # fraction of file size; a candidate expected to be larger by less may turn out smaller
+_PAYS_FOR_REFIT = 0.03  # fraction of file size that pruned candidates must promise, since each takes a refit
+_COMMON = 0.1  # fraction of file size; largest excess of one refitted file that is assumed for others
+_FAR = 0.03  # fraction of file size; presets are not tried if candidates of all splats exceed the best by more
+_BANDS_GROW = (34.0, 0.055)  # dB above which splats with SH become cheaper to keep, and the fraction per dB
+_PRESETS = (-1.0, 2.5)  # dB above the goal; presets whose own files are expected in this range are tried
 _INSIDE_REMARK = (
-    "virtual views decided which splats go: cameras inside of surroundings may see more of those than these do;"
-    " --data, or --cameras with 40 of them, would decide by yours, --no-prune leaves all"
+    "splats were pruned by virtual views, which may show less than cameras inside of the surroundings do:"
+    " use --data, or --cameras with at least 40 cameras, or keep all splats with --no-prune"
 )
 
 
@@ -72,21 +72,24 @@ def search_target(
     simplifying: SimplifyOptions | None,
     progress: Progress | None,
 ) -> tuple[Candidate, SearchReport]:
-    """Search for the file that meets a target, by rendering candidates. The report has no seconds yet.
+    """Search for the file that meets a target, by rendering candidates.
 
     Args:
         source: the scene.
-        target: the target, which must not be largest errors alone.
-        views: training, validation and test views; they do not overlap.
+        target: the target, other than largest errors alone.
+        views: training, validation and test views.
         encoding, no_prune, importance, simplifying, progress: as for `encode_to`.
 
+    Returns:
+        The file, and the report with 0 seconds.
+
     Raises:
-        InputError: the target is out of reach, no splat shows, or a loss is requested without images.
+        InputError: the target is out of reach, no splat is visible, or a drop of PSNR is requested without images.
     """
     views = with_validation_views(views)
     test_scorer = views.test_scorer(source, threads=encoding.threads)
     if views.name != VIRTUAL and _is_empty(test_scorer):
-        raise InputError("no splat shows in the views given: are these cameras of this scene?")
+        raise InputError("no splat is visible in the given views: check that the cameras belong to the scene")
     inside = views.virtual and scene_frame(source).kind == "surrounding"
     pruner = None
     if not _keeps_all(target, encoding, no_prune=no_prune):
@@ -98,7 +101,7 @@ def search_target(
     image_scorer = None
     if target.max_psnr_drop is not None:
         if not views.images:
-            raise InputError("a largest loss wants photographs (--data): it is lost against them")
+            raise InputError("a largest drop of PSNR requires images (--data), against which it is measured")
         image_scorer = views.image_validation_scorer(threads=encoding.threads)
     validation_scorer = views.validation_scorer(source, threads=encoding.threads)
     candidates = CandidatePool(encoding, test_scorer, validation_scorer, image_scorer, progress=progress)
@@ -136,10 +139,7 @@ def expected_seconds(
     no_prune: bool,
     simplifying: SimplifyOptions | None = None,
 ) -> float:
-    """Estimate the seconds that a target takes on this machine.
-
-    Renders some test views to measure their time: the search costs about a fixed number of such renders on any machine.
-    """
+    """Estimate the seconds for a target on this machine, from the time of some renders of test views."""
     renders = expected_renders(encoding, target, no_prune=no_prune, simplifying=simplifying)
     return renders * render_seconds(source, views.test, threads=encoding.threads)
 
@@ -147,14 +147,14 @@ def expected_seconds(
 def expected_renders(
     encoding: EncodeOptions, target: Target, *, no_prune: bool, simplifying: SimplifyOptions | None = None
 ) -> float:
-    """Return the approximate cost of a target as a number of renders of the test views."""
+    """Return the approximate cost of a target in renders of the test views."""
     if _keeps_all(target, encoding, no_prune=no_prune):
         return _RENDERS
     return _RENDERS_WITH_PRUNING[0] + _RENDERS_WITH_PRUNING[1] * (simplifying or SimplifyOptions()).work
 
 
 def _keeps_all(target: Target, encoding: EncodeOptions, *, no_prune: bool) -> bool:
-    """Return True if no splat may be pruned: by `no_prune`, bounded errors, extra columns, or the preset `fast`."""
+    """Return True if no splat may be pruned, due to `no_prune`, error bounds, extra columns or the preset `fast`."""
     blocked = no_prune or bool(target.max_error) or encoding.preset == "fast" or encoding.keep_extra
     return target.keep is None and blocked
 
@@ -166,11 +166,11 @@ def check_target(source: SplatModel, target: Target, encoding: EncodeOptions, *,
         InputError: there are no splats, or the target contradicts an option.
     """
     if not len(source):
-        raise InputError("a scene without splats has no size or quality to choose")
+        raise InputError("a scene without splats cannot be encoded to a target")
     if encoding.attribute_psnr is not None and target.is_rendered and target.keep is None:
-        raise InputError("attribute_psnr is what a target chooses: give one of them")
+        raise InputError("attribute_psnr is chosen by the target: give only one of them")
     if target.keep is not None and no_prune:
-        raise InputError("a share of the splats is to stay, and all of them: give one of the two")
+        raise InputError("a kept fraction and no_prune exclude each other")
 
 
 def _is_empty(scorer: Scorer) -> bool:
@@ -180,7 +180,7 @@ def _is_empty(scorer: Scorer) -> bool:
 
 
 def _psnr_elsewhere(source: SplatModel, found: Candidate, views: ViewSet, threads: int | None) -> dict[str, float]:
-    """Return the PSNR from views that had no part in the search, by kind."""
+    """Return the PSNR on views that were not used in the search, by kind."""
     model, groups = decode(found.result.data), extra_test_cameras(source).items()
     return {
         kind: round(Scorer.of_source(source, cameras, views.background, threads=threads).psnr(model), 3)
@@ -198,14 +198,14 @@ def find_goal(target: Target, source: SplatModel, image_scorer: Scorer | None) -
     """Return the goal of the search for a target.
 
     Args:
-        target: a PSNR, a size or a loss.
+        target: a PSNR, a size or a drop of PSNR.
         source: the scene.
-        image_scorer: the scorer by validation images, against which a loss is measured.
+        image_scorer: the scorer on validation images, against which a drop is measured.
     """
     if target.max_psnr_drop is None or image_scorer is None:
         return SearchGoal(target.psnr, target.size_bytes, max_error=target.max_error)
     reached = image_scorer.psnr(source)
-    # The source's error against images is far larger than the loss: a file's own error is a small part of the sum.
+    # The source's error against images is far larger than the drop, so a file's own error is a small part of the sum.
     slope = 1.0 - 10.0 ** (-target.max_psnr_drop / 10.0)
     return SearchGoal(
         min(loss_as_psnr(target.max_psnr_drop, reached), PSNR_CAP), None, reached - target.max_psnr_drop, slope
@@ -213,10 +213,9 @@ def find_goal(target: Target, source: SplatModel, image_scorer: Scorer | None) -
 
 
 def loss_as_psnr(loss: float, photo_psnr: float) -> float:
-    """Return the PSNR against the source's renders at which the PSNR against images falls by a loss.
+    """Return the PSNR against the source's renders at which the PSNR against images drops by `loss` dB.
 
-    The source has an error of its own against images; the error that a file adds is taken as independent of it,
-    so that the two squared errors add up.
+    The errors of the source and of the file are assumed to be independent, so that squared errors add up.
 
     Args:
         loss: dB, above 0.
@@ -230,7 +229,7 @@ class TargetSearch:
     """The search for the coding, the splats and the precision.
 
     Attributes:
-        search: brings files near the goal, and onto it.
+        search: finds the precision of candidates near the goal, and on it.
         codings: the possible codings of SH.
         whole: all splats.
         pruner: prunes splats; `None`: all are kept.
@@ -242,7 +241,7 @@ class TargetSearch:
     pruner: Pruner | None
 
     def best(self) -> Candidate:
-        """Return the smallest file that meets a PSNR or a loss, or the best one of a size.
+        """Return the smallest file that meets a PSNR or a drop of PSNR, or the best one of a size.
 
         Raises:
             InputError: no file meets the goal.
@@ -265,12 +264,12 @@ class TargetSearch:
         return best
 
     def _on_goal(self, tried: Sequence[Candidate]) -> list[Candidate]:
-        """Return files that meet the goal, made from the most promising; with more splats if all tried were too few."""
+        """Return candidates on the goal, of the most promising kinds; with more splats if all tried were too few."""
         found, failed, excess = list[Candidate](), list[Candidate](), 0.0
         for candidate in sorted(tried, key=self.search.cost):
             others = [one for one in tried if one.subset.refits and one.splats > candidate.splats]
             if any(one.subset is candidate.subset for one in failed) and others:
-                continue  # files of more splats come first
+                continue  # candidates of more splats come first
             if self._pays(candidate, found, excess):
                 expected, on = self.search.cost(candidate), self.search.find_on(candidate.subset, candidate.coding)
                 if on is not None and candidate.subset.refits:
@@ -282,11 +281,11 @@ class TargetSearch:
         return found
 
     def _may_be_written(self, candidate: Candidate) -> bool:
-        """Return True if a file is no draft and, if the goal is measured on the test views, has been scored on them."""
+        """Return True for a final file; if the goal refers to test views, it must have been scored on them."""
         return candidate.is_packed and (candidate.is_scored or not self.search.goal.uses_test_views)
 
     def _start(self) -> float:
-        """Return the PSNR of each attribute for the first file, dB."""
+        """Return the attribute PSNR of the first file, dB."""
         goal, has_sh = self.search.goal, self.codings.usual_codings(self.whole) != [CodingChoice("none")]
         if goal.size_bytes is None:
             psnr = goal.psnr or 0.0
@@ -295,7 +294,7 @@ class TargetSearch:
         return clip_quality(_USUAL[1] + math.log(per_splat / _USUAL[0]) / BYTES_PER_DB)
 
     def _pruned_candidates(self, pruner: Pruner, whole: Candidate) -> list[Candidate]:
-        """Return files near the goal for several numbers of splats, each predicted from the files before."""
+        """Return candidates near the goal for several splat counts, each predicted from earlier ones."""
         search, goal, splats = self.search, self.search.goal, len(self.whole.model)
         slope, found = self._slope_of_counts(whole), list[Candidate]()
         psnr_of = search.candidates.validation_scorer.psnr
@@ -308,7 +307,7 @@ class TargetSearch:
             if kept_count > (1.0 - _ALL_BUT) * splats:
                 if found or pruner.options.is_brief:
                     break
-                kept_count = splats  # all splats: they are still refitted through the quantisers of their files
+                kept_count = splats  # all splats, which are still refitted through the quantisers
             subset = pruner.refit(kept_count, allowed, psnr_of)
             if allowed is not None and subset.fitted_psnr < allowed + _SPARE:
                 if found:
@@ -325,16 +324,16 @@ class TargetSearch:
             if kept_count == splats or pruner.options.is_brief:
                 break
             if math.isinf(search.cost(candidate)):
-                # None of them is small enough for a size, or good enough for a PSNR.
+                # No candidate is small enough for a size, or good enough for a PSNR.
                 if goal.size_bytes is None:
                     kept_count = _next_larger(kept_count)
                 elif len(subset.rows) > kept_count or kept_count == 1:
-                    break  # no more splats can be pruned: no view saw the others
+                    break  # no more splats can be pruned, since no view saw the others
                 else:
                     kept_count = int(kept_count * _FEWER)
                 continue
             if goal.psnr is not None:
-                # The error of bands that are left out does not depend on the number of splats.
+                # The error of dropped bands does not depend on the number of splats.
                 allowed = search.validation_goal(subset)
                 goal_psnr = _subtracted(allowed, error_of_psnr(subset.psnr) - error_of_psnr(subset.fitted_psnr))
                 kept_count, saved = pruner.next_at_psnr(len(subset.rows), subset.fitted_psnr, goal_psnr, slope)
@@ -350,15 +349,14 @@ class TargetSearch:
     def _slope_of_counts(self, whole: Candidate) -> float:
         """Return the fraction of the bytes that a decibel costs, for the choice of the number of splats.
 
-        The more SH a file needs, the fewer bytes the next splat takes compared with more important ones: it has fewer
-        bands.
+        The more SH a file needs, the cheaper are less important splats, since they have fewer bands.
         """
         above = (self.search.goal.psnr or whole.validation_psnr) - _BANDS_GROW[0]
         has_sh = whole.coding.sh != "none"
         return self.search.slope(whole) * (1.0 + _BANDS_GROW[1] * max(above, 0.0) * has_sh)
 
     def _of_more(self, candidate: Candidate) -> Candidate | None:
-        """Return a file that meets the goal with more splats than a candidate that cannot; `None` if there is none."""
+        """Return a file on the goal with more splats than a candidate that cannot meet it; `None` if there is none."""
         kept_count = _next_larger(candidate.splats)
         keeps_all = candidate.subset is self.whole or kept_count > (1.0 - _ALL_BUT) * len(self.whole.model)
         if self.pruner is None or self.search.goal.psnr is None or keeps_all:
@@ -377,30 +375,30 @@ class TargetSearch:
         return pruner.first_at_size(goal.size_bytes or 0, near, slope, psnr_of)
 
     def _pays(self, candidate: Candidate, found: list[Candidate], excess: float) -> bool:
-        """Return True if a file near the goal is worth bringing onto it.
+        """Return True if a candidate near the goal is worth the search for its precision on the goal.
 
         Args:
-            candidate: the file.
+            candidate: the candidate.
             found: files that meet the goal already.
-            excess: logarithm by which a refitted file among them exceeded its expected cost.
+            excess: log bytes by which a refitted file among them exceeded its expected cost.
         """
         best = self.search.goal.best(found)
         if best is None:
             return True
         again = any(one.subset is candidate.subset for one in found)
-        # A file that meets a PSNR costs its bytes, even if fewer were predicted.
+        # The cost of a file that meets a PSNR is its actual size, even if less was predicted.
         known = math.log(best.size_bytes) if self.search.goal.size_bytes is None else self.search.cost(best)
         saved = known - self.search.cost(candidate) - excess * candidate.subset.refits
         return saved > (_PAYS_FOR_REFIT if candidate.subset.refits else _PAYS if again else -_PAYS)
 
     def _try_presets(self, tried: Sequence[Candidate]) -> None:
-        """Make the presets' own files if they are expected near the goal: a search must not be worse than a preset."""
+        """Make the presets' own files if they are expected near the goal, so that a search is not worse than these."""
         goal, plain = self.search.goal, [candidate for candidate in tried if candidate.subset is self.whole]
         if not goal.uses_test_views:
             return
         near = min(plain, key=lambda candidate: (candidate.coding.use_classes, self.search.cost(candidate)))
         if self.search.cost(near) > min(map(self.search.cost, tried)) + _FAR:
-            return  # presets keep all splats in one class, too
+            return  # presets keep all splats, in one class
         lost = (near.quality or 0.0) - self.search.margin(near)
         for name, preset in PRESETS.items():
             expected = preset.quality[near.coding.sh == "none"] - lost
@@ -415,16 +413,16 @@ class TargetSearch:
         if goal.size_bytes is not None:
             kept = " with all splats" if self.pruner is None else ""
             smallest = min(candidate.size_bytes for candidate in made)
-            return f"no file{kept} has {goal.size_bytes} bytes or fewer: of those tried one has {smallest}"
+            return f"no file{kept} has at most {goal.size_bytes} bytes; the smallest found has {smallest}"
         if goal.photo_psnr is not None:
             nearest = max(candidate.photo_psnr for candidate in made)
-            return f"no file reaches {goal.photo_psnr:.2f} dB by the validation photographs; the best has {nearest:.2f}"
+            return f"no file reaches {goal.photo_psnr:.2f} dB on the validation images; the best has {nearest:.2f} dB"
         highest = max(candidate.psnr for candidate in made if candidate.is_scored)
-        return f"no file reaches {goal.psnr or 0.0:.2f} dB; the best of those tried has {highest:.2f} dB"
+        return f"no file reaches {goal.psnr or 0.0:.2f} dB; the best found has {highest:.2f} dB"
 
 
 def _may_try_preset(name: str, preset: str) -> bool:
-    """Return True if a search with a preset may use another preset's file: `fast` only if it is the one requested."""
+    """Return True if a search with a preset may use another preset's file; `fast` only for itself."""
     return name == preset if "fast" in (name, preset) else True
 
 
@@ -434,12 +432,12 @@ def _next_larger(splats: int) -> int:
 
 
 def _subtracted(psnr: float, error: float) -> float:
-    """Return the PSNR of the error that remains of a PSNR's allowance after another error is subtracted."""
+    """Return the PSNR of the error that remains after another error is subtracted from that of a PSNR."""
     allowed = error_of_psnr(psnr)
     return psnr_of_mse(max(allowed - max(error, 0.0), _LEAST_REST * allowed))
 
 
 def _raised_quality(quality: float, psnr: float, fitted_psnr: float) -> float:
-    """Return the PSNR of each attribute, raised because pruning has taken its part of the error already."""
+    """Return the attribute PSNR, raised to compensate for the error of pruning."""
     rest = max(_LEAST_REST, 1.0 - error_of_psnr(fitted_psnr) / error_of_psnr(psnr))
     return clip_quality(quality + psnr_of_mse(rest))

@@ -1,1 +1,1 @@
-"""Output for people to look at: renders, films, the viewer and its page."""
+"""Renders, films, the viewer and its page."""

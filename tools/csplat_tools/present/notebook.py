@@ -1,7 +1,7 @@
-"""Show a scene as the result of a notebook's cell: the viewer's page in a frame, with the scene inside.
+"""Show a scene in a notebook: the page of `csplat export-html` in a frame.
 
-The page of `csplat export-html` is the text of the frame (`srcdoc`): it is saved with the notebook, and no server is
-needed. The frame is a sandbox: its scripts cannot reach the notebook.
+The page is the text of the frame (`srcdoc`), so that it is saved with the notebook and needs no server. The frame is a
+sandbox: its scripts cannot access the notebook. This is a module of its own because an entry point names it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from csplat_render.up_estimate import estimate_up
 from csplat_tools.present.viewer_page import export_page
 from csplat_tools.present.viewer_server import estimated_up_parameters
 
-#: Largest number of splats in a frame: some 9 bytes each, a third more as text, are saved with the notebook.
+#: Largest number of splats in a frame; each adds about 12 bytes to the notebook.
 MOST_SPLATS = 250_000
 
 _HEIGHT = 480  # height of the frame, pixels
@@ -28,14 +28,13 @@ def scene_html(model: SplatModel, *, most_splats: int = MOST_SPLATS) -> str:
 
     Args:
         model: the scene, of at least one splat.
-        most_splats: of a larger scene only this many splats are shown, those that cover most, and a line says so.
+        most_splats: of a larger scene, only this many splats that cover most are shown, with a note.
 
     Returns:
-        A frame of the full width, with the scene encoded by the preset `fast`. It is self-contained: nothing is loaded
-        from elsewhere.
+        A frame of the full width with the scene, encoded by the preset `fast`. It loads nothing else.
 
     Raises:
-        InputError: values that no lattice can hold, or the installation is not complete.
+        InputError: the scene cannot be encoded, or the installation is incomplete.
     """
     shown = most_visible(model, most_splats)
     wishes = estimated_up_parameters(estimate_up(shown))
@@ -46,11 +45,11 @@ def scene_html(model: SplatModel, *, most_splats: int = MOST_SPLATS) -> str:
     )
     if len(shown) == len(model):
         return frame
-    return f"{frame}\n<div><small>{len(shown):,} of {len(model):,} splats, those that cover most</small></div>"
+    return f"{frame}\n<div><small>{len(shown):,} of {len(model):,} splats, the most visible ones</small></div>"
 
 
 def most_visible(model: SplatModel, count: int) -> SplatModel:
-    """Return the `count` splats that cover most, by opacity × area, in their order; all if there are no more."""
+    """Return the `count` splats with the largest opacity × area, in their order; all if there are fewer."""
     if len(model) <= count:
         return model
     covered = visible_opacity(model) * surface_areas(model)

@@ -1,4 +1,4 @@
-"""Render a scene to PNG files in a folder, or to a film: `csplat render` without the command line."""
+"""Render a scene to PNG files in a folder, or to a film, as `csplat render` does."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _DEFAULT_SIZE = (640, 480)
 
 @dataclass(frozen=True)
 class Rendered:
-    """The files that were written.
+    """The written files.
 
     Attributes:
         files: paths in the order of the cameras.
@@ -52,25 +52,25 @@ def find_cameras(
     """Return the cameras of a file, of a data set, or of an orbit.
 
     Args:
-        model: the scene to orbit around; a data set's cameras are made relative to its origin.
+        model: the scene; cameras are relative to its origin.
         path: path of a camera file.
-        orbit_count: number of cameras on a closed path, which follows those of a file or a data set if one is given.
+        orbit_count: number of cameras on a closed path, along those of a file or a data set if one is given.
         data: a data set; its own size is used instead of `size`, unless there is an orbit.
-        size: width and height of the renders; the file's own, or 640 by 480, if left out.
-        split: the part of a data set whose cameras are used.
-        report: receives remarks on the camera file of another program.
+        size: width and height of the renders; `None`: those of the file, or 640×480.
+        split: the part of the data set.
+        report: receives remarks on camera files of other programs.
 
     Raises:
-        InputError: none of the three is given, or both a file and a set; the file or the set is invalid; a render of
-            that size would be distorted.
+        InputError: none of the three is given, or both a file and a set; the file or the set is invalid; `size` has
+            another aspect ratio.
     """
     if (path, orbit_count, data) == (None, None, None) or None not in (path, data):
-        raise InputError("wanted cameras: a file, a data set, or a number for an orbit")
+        raise InputError("expected cameras: a file, a data set, or a number for an orbit")
     cameras: list[Camera] = []
     if path is not None:
         cameras = load_cameras(path, report, model.origin)
     elif data is not None:
-        # An orbit requires the cameras' positions, not the size of their photographs.
+        # An orbit uses the positions of the cameras, but not the size of their images.
         full_size = data if orbit_count is None else replace(data, size=None)
         found = find_view_set(model, data=full_size, count=0, split=split)
         cameras = [*found.test, *(() if orbit_count is None else (*found.training, *found.validation))]
@@ -98,13 +98,13 @@ def render_folder(
 
     Args:
         model: the scene.
-        cameras: the views. Renders are named after their photographs, or by numbers.
+        cameras: the views. Renders are named after their images, or by numbers.
         folder: the folder for the files; it is made if need be.
         background: red, green, blue, 0..1; `None`: that of the scene's training if known, else black.
         mode: `exact`, `standard` or `fast`.
-        depth: write NAME.depth.npy, too, [H, W] float32: mean depth along the camera's axis, scene units; 0 where
-            there are no splats.
-        alpha: write NAME.alpha.png, too, 255 where the background is hidden completely.
+        depth: write NAME.depth.npy, too, [H, W] float32: mean depth along the camera's axis, scene units; 0 in pixels
+            without splats.
+        alpha: write NAME.alpha.png, too; 255 is opaque.
         force: existing files may be replaced.
         prepare: called when the folder has been checked, before the first render.
         progress: progress callback.
@@ -152,7 +152,7 @@ def render_film(
     Args:
         model: the scene.
         cameras: the views, at least one, of one size.
-        path: path of the file; its ending determines the format, see `check_film`.
+        path: path of the file; its ending determines the format, see `write_film`.
         fps: frames per second.
         background, mode, prepare, progress: see `render_folder`.
         force: an existing file may be replaced.
@@ -180,7 +180,6 @@ def _renders(
     prepare: Callable[[], object] | None,
     progress: Progress | None,
 ) -> Iterator[RenderResult]:
-    """Render camera after camera; see `render_folder`."""
     if prepare is not None:
         prepare()
     record = TrainingRecord.of(model.metadata)
@@ -195,7 +194,7 @@ def _renders(
 
 @contextmanager
 def _removed_if_empty(folder: Path | None) -> Iterator[None]:
-    """Remove a new folder that is still empty if an error occurs."""
+    """Remove a new folder if an error occurs while it is empty."""
     try:
         yield
     except BaseException:
@@ -206,6 +205,6 @@ def _removed_if_empty(folder: Path | None) -> Iterator[None]:
 
 
 def _mean_depth(depth: F32, alpha: F32) -> F32:
-    """Return the mean depth: the renderer's depth is a sum over weights, whose own sum is alpha."""
+    """Return the mean depth; the renderer's depth is a weighted sum, and alpha is the sum of the weights."""
     mean = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0.0)
     return mean.astype(np.float32)

@@ -1,11 +1,10 @@
 """Export the viewer, the JavaScript decoder and a scene as one HTML page; or the viewer as one script.
 
-A page that was opened as `file:` may not import modules from neighbouring files, and its worker may not import at all:
-the origin of such a page equals no other, not even that of its own blobs, which WebKit refuses to a worker's `import`,
-and Chromium to a worker that is a module. So the modules become functions of one classic script. The page runs it, and
-so does the worker, which is made from a blob of the same text; a function can read its own source. A policy in the page
-forbids the network. The page is ASCII: if a server declared another charset, the text would no longer match the digests
-in the policy.
+A page opened as `file:` cannot import modules from neighbouring files, and its worker cannot import at all: the origin
+of such a page equals no other, not even that of its own blobs. So the modules become functions of one classic script.
+The page runs it, and so does the worker, which is made from a blob of the same text: a function can read its own
+source. A policy in the page forbids the network. The page is ASCII, so that the text matches the digests in the policy
+even if a server declares another charset.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from pathlib import Path
 
 from csplat.errors import InputError
 
-#: Paths below the root: the page, the element for other pages, and the module that both start as a worker.
+#: Paths below the root: the page, the element for other pages, and the module of their worker.
 PAGE = "tools/viewer/index.html"
 ELEMENT = "tools/viewer/element.mjs"
 WORKER = "tools/viewer/worker.mjs"
@@ -31,13 +30,10 @@ _FOLDERS = {"tools/viewer": (".html", ".css", ".mjs"), "codec/js": (".mjs",)}
 
 
 def web_files() -> dict[str, Path]:
-    """Find every file that the page may load.
-
-    Returns:
-        Local files by their paths below the root, with slashes: `tools/viewer/index.html`, `codec/js/decoder.mjs`, ...
+    """Return the files that the page may load, by their paths below the root, such as `tools/viewer/index.html`.
 
     Raises:
-        InputError: the installation is not complete.
+        InputError: the installation is incomplete.
     """
     package = Path(__file__).resolve().parent.parent  # csplat_tools
     for root in (package / "web", package.parent.parent):  # an installed wheel, a checkout
@@ -48,7 +44,7 @@ def web_files() -> dict[str, Path]:
                 for path in sorted((root / folder).iterdir())
                 if path.suffix in endings
             }
-    raise InputError("the page of the viewer is not installed: install csplat again")
+    raise InputError("the viewer is not installed: reinstall csplat")
 
 
 # Import statements: `import { a, b as c } from '…'`, `import * as a from '…'`, `import '…'`.
@@ -60,7 +56,7 @@ _IMPORT = re.compile(
 _DECLARED = re.compile(r"^export\s+(?=(?:const|class|(?:async\s+)?function\s*\*?)\s+(?P<name>[\w$]+))", re.MULTILINE)
 _LISTED = re.compile(r"^export\s+\{(?P<names>[^}]*?),?\s*\};", re.MULTILINE)
 _STATEMENT = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
-# Lines with nothing but comments. Inside template strings these are GLSL comments, which are removed, too.
+# Lines of comments. Those in template strings are GLSL comments, and are removed, too.
 _COMMENT = re.compile(r"^ *(?://.*|/\*\*(?:(?!\*/)[\s\S])*\*/)\n", re.MULTILINE)
 _STYLE = '<link rel="stylesheet" href="viewer.css">'
 _SCRIPT = '<script type="module" src="main.mjs"></script>'
@@ -112,8 +108,8 @@ class ExportedPage:
 
     Attributes:
         page: the HTML file.
-        code_bytes: bytes of viewer and decoder in it.
-        scene_bytes: bytes of the scene in it, as base64; a third more than its file.
+        code_bytes: its bytes without the scene.
+        scene_bytes: bytes of the scene in it, as base64: 4/3 of its file.
     """
 
     page: bytes
@@ -130,14 +126,14 @@ def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None
         wishes: parameters of the page.
 
     Raises:
-        InputError: the installation is not complete.
+        InputError: the installation is incomplete.
     """
     texts = _texts()
     folder = posixpath.dirname(PAGE)
     script = f"\n{_program(texts, f'{folder}/main.mjs', _SCENE)}"
     style = f"\n{texts[f'{folder}/viewer.css']}"
-    assert not re.search(r"</script|<!--", script, re.IGNORECASE), "the script can stand in an element"
-    assert style.isascii(), "characters of a style have no other spelling that a page may use"
+    assert not re.search(r"</script|<!--", script, re.IGNORECASE), "the script fits into an element"
+    assert style.isascii(), "a style cannot be escaped as the script is"
     coded = base64.b64encode(scene).decode()
     described = _json({"name": name, "wishes": dict(wishes or {})})
     body = (
@@ -157,25 +153,25 @@ def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None
 
 
 def export_element() -> bytes:
-    """Make one script of viewer and decoder: pages that run it have the element `<csplat-view>`.
+    """Return a script of viewer and decoder that defines the element `<csplat-view>`.
 
     Raises:
-        InputError: the installation is not complete.
+        InputError: the installation is incomplete.
     """
     return _program(_texts(), ELEMENT).encode()
 
 
 def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]:
-    """Turn the entry modules, and all that they import in turn, into functions.
+    """Turn the entry modules and their imports into functions.
 
     Args:
         texts: source texts of modules by their paths.
         entries: paths of the modules to begin with.
 
     Returns:
-        By path, each module after those that it imports: an element of a list of functions, with its comma. Each
-        takes a function that returns the exports of another module, by its number in this order, and returns its own
-        exports. (Imports are not live bindings then; no module exports a value that changes.)
+        Functions by path, each after those of its imports, with a trailing comma. A function is called with one that
+        returns the exports of another module by its number in this order, and returns its own exports. (Imports are
+        not live bindings then; no module exports a value that changes.)
     """
     found: dict[str, str] = {}
     numbers: dict[str, int] = {}
@@ -184,7 +180,7 @@ def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]
     def visit(path: str) -> int:
         assert path not in open_paths, f"modules import each other: {' -> '.join([*open_paths, path])}"
         if path not in numbers:
-            assert path in texts, f"{open_paths[-1] if open_paths else 'the page'} imports {path}, which is not there"
+            assert path in texts, f"{open_paths[-1] if open_paths else 'the page'} imports {path}, which does not exist"
             open_paths.append(path)
             text = _IMPORT.sub(lambda match: taken(path, match), texts[path])
             open_paths.pop()
@@ -203,18 +199,18 @@ def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]
 
 
 def _texts() -> dict[str, str]:
-    """Return the text files of viewer and decoder by path; modules without comments, which are a fifth of them."""
+    """Return the text files of viewer and decoder by path; modules without comments, which are 20 % of them."""
     texts = {path: file.read_text("utf-8") for path, file in web_files().items()}
     return {path: _COMMENT.sub("", text) if path.endswith(".mjs") else text for path, text in texts.items()}
 
 
 def _program(texts: Mapping[str, str], entry: str, before: str = "") -> str:
-    """Return a classic script in ASCII that runs a module, and its worker, with all that they import.
+    """Return a classic script in ASCII that runs a module and its worker.
 
     Args:
         texts: source texts by their paths.
         entry: path of the module.
-        before: statements to run before it in the page.
+        before: statements to run before the module in the page.
     """
     modules = link_modules(texts, [entry, WORKER])
     order = list(modules)
@@ -226,12 +222,12 @@ def _program(texts: Mapping[str, str], entry: str, before: str = "") -> str:
     }
     script = re.sub("MODULES|WORKER|BEFORE|ENTRY", lambda match: parts[match[0]], _PROGRAM)
     script = script.encode("ascii", "backslashreplace").decode()  # JavaScript has the same \x… and \u… escapes
-    assert "\\U000" not in script, "JavaScript spells characters beyond U+FFFF otherwise"
+    assert "\\U000" not in script, "JavaScript has another escape for characters beyond U+FFFF"
     return script
 
 
 def _as_function(path: str, text: str) -> str:
-    """Return a module, whose imports are replaced already, as a function that returns its exports."""
+    """Return a module with replaced imports as a function that returns its exports."""
     names = [match["name"] for match in _DECLARED.finditer(text)]
     names += [re.sub(r"([\w$]+)\s+as\s+([\w$]+)", r"\2: \1", match["names"]) for match in _LISTED.finditer(text)]
     text = _LISTED.sub("", _DECLARED.sub("", text))
@@ -243,7 +239,7 @@ def _as_function(path: str, text: str) -> str:
 
 
 def _json(value: object) -> str:
-    """Return JSON that is safe in a script element: nothing in it looks like markup."""
+    """Return JSON that is safe in a script element."""
     return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
 
 

@@ -1,6 +1,6 @@
-"""Prepare a scene for the viewer, and serve it: the page, the decoder and the scene with HTTP Range.
+"""Prepare a scene for the viewer, and serve the page, the decoder and the scene with HTTP Range.
 
-Every path that is served is in a table, so that no other file can be reached.
+A table lists all paths that are served, so that no other file can be reached.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from csplat_tools.present.viewer_page import PAGE, web_files
 from csplat_tools.scene_files import MetadataOverrides, read_source
 
 _NONE = MetadataOverrides()
-_UP_SPLATS_MAX = 2_000_000  # larger files are not decoded only to estimate the up direction
+_UP_SPLATS_MAX = 2_000_000  # splats; the up direction of larger files is not estimated, since that decodes them
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -62,9 +62,9 @@ class _Resource:
     """The content of a path.
 
     Attributes:
-        open: opens the content; returns a stream and its number of bytes.
+        open: returns a stream of the content, and its size in bytes.
         media_type: value of `Content-Type`.
-        tag: returns the entity tag of a stream that `open` returned.
+        tag: returns the entity tag of a stream from `open`.
     """
 
     open: Callable[[], tuple[BinaryIO, int]]
@@ -82,8 +82,8 @@ class ViewerScene:
         size_bytes: size of the file.
         header: header of the file.
         seems_up: estimated up direction, if the scene does not specify one.
-        findings: findings of lint in the PLY.
-        encoded_from: size of the PLY in bytes; 0 if the scene was a .csplat file already.
+        findings: lint findings in the source.
+        encoded_from: size of the source in bytes; 0 if it is a .csplat file.
     """
 
     name: str
@@ -102,7 +102,7 @@ class ViewerScene:
 class SceneServer(ThreadingHTTPServer):
     """A server of one scene; `url` is the address of its page."""
 
-    daemon_threads = True  # a browser keeps connections open; they do not keep the command alive
+    daemon_threads = True  # connections that a browser keeps open must not keep the command alive
 
     def __init__(self, host: str, port: int, resources: Mapping[str, _Resource], start: str) -> None:
         self.resources = resources
@@ -111,11 +111,11 @@ class SceneServer(ThreadingHTTPServer):
         super().__init__((host, port), _Handler)
         shown = f"[{host}]" if ":" in host else host
         self.url = f"http://{shown}:{self.server_address[1]}/"
-        # a web page whose own name is made to resolve to this machine must not read the scene (DNS rebinding)
+        # Protects from DNS rebinding: a web page whose host name resolves to this machine must not read the scene.
         self.local_only = shown in _LOOPBACK
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Ignore a browser that closes the connection in the middle of an answer."""
+        """Ignore connections that the browser closes early."""
 
 
 @contextmanager
@@ -128,7 +128,7 @@ def open_viewer_scene(path: str, *, preset: PresetName, progress: Progress | Non
         progress: progress callback of reading and encoding.
 
     Yields:
-        The scene; a copy of standard input exists as long as the context.
+        The scene; its content can be read within the context.
 
     Raises:
         CsplatError: the file is not valid.
@@ -148,14 +148,14 @@ def open_server(
     Args:
         scene: the scene to show.
         host: the address of a network interface, or `localhost`.
-        port: port number; 0 for one that is free.
+        port: port number; 0 for any free port.
         wishes: parameters of the page.
 
     Yields:
         The server, already listening.
 
     Raises:
-        InputError: the port is taken, or the host is no address of this machine.
+        InputError: the port is in use, or the host is not an address of this machine.
     """
     place = f"scene/{scene.name}"
     resources = {path: _file(file) for path, file in web_files().items()}
@@ -169,7 +169,7 @@ def open_server(
     try:
         server = SceneServer(host, port, resources, start)
     except OverflowError:
-        raise InputError(f"port {port} is none, wanted 1 to 65535, or 0 for one that is free") from None
+        raise InputError(f"the port is {port}, expected 1 to 65535, or 0 for any free port") from None
     except OSError as error:
         raise InputError(_refusal(error, host, port)) from None
     with server:
@@ -182,19 +182,16 @@ def page_parameters(
     report: list[str] | None = None,
     origin: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> dict[str, str]:
-    """Translate options into parameters of the page.
+    """Return the parameters of the page for given options.
 
     Args:
-        camera: a camera file, see `load_cameras`. The page begins with the first camera and steps through all of them.
+        camera: a camera file, see `load_cameras`. The page starts at the first camera and steps through all of them.
         overrides: overrides of the scene's axes and up direction.
-        report: receives remarks on the camera file of another program.
+        report: receives remarks on camera files of other programs.
         origin: the scene's origin.
 
-    Returns:
-        Parameters of the page.
-
     Raises:
-        InputError: the camera file holds no cameras.
+        InputError: the camera file has no cameras.
     """
     wishes = {}
     if camera is not None:
@@ -208,20 +205,19 @@ def page_parameters(
 
 
 def estimated_up_parameters(up: Direction | None) -> dict[str, str]:
-    """Return the page's parameters for an estimated up direction, which have the lowest priority."""
+    """Return the parameters of the page for an estimated up direction, which has the lowest priority."""
     return {} if up is None else {"seems": _join(up)}
 
 
 def byte_range(header: str | None, size: int) -> tuple[int, int] | None:
-    """Read a Range header (RFC 9110, 14.2).
+    """Parse a Range header (RFC 9110, 14.2).
 
     Args:
         header: its value.
         size: number of bytes of the resource.
 
     Returns:
-        First byte and number of bytes; `None` if everything is to be sent: there is no range, it is not understood, or
-        there are several.
+        First byte and number of bytes; `None` to send everything: there is no range, an unsupported one, or several.
 
     Raises:
         ValueError: no byte of the range exists (status 416).
@@ -239,7 +235,7 @@ def byte_range(header: str | None, size: int) -> tuple[int, int] | None:
     if match[2] != "" and last < first:
         return None
     if first >= size:
-        raise ValueError("a range behind the end")
+        raise ValueError("a range after the end")
     return first, min(last, size - 1) - first + 1
 
 
@@ -289,7 +285,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(send=False)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Stay quiet: standard error is for the person who runs the command."""
+        """Log nothing: standard error is for messages to the user."""
 
     def _answer(self, *, send: bool) -> None:
         server = self.server
@@ -339,7 +335,7 @@ class _Handler(BaseHTTPRequestHandler):
         stream.seek(first)
         while length > 0:
             block = stream.read(min(length, _BLOCK_BYTES))
-            if not block:  # the file was shortened: the browser notices that bytes are missing
+            if not block:  # the file was truncated; the browser notices missing bytes
                 self.close_connection = True
                 return
             self.wfile.write(block)
@@ -377,9 +373,9 @@ def _bytes(data: bytes, ending: str) -> _Resource:
 
 def _refusal(error: OSError, host: str, port: int) -> str:
     if error.errno == errno.EADDRINUSE:
-        return f"port {port} is taken: --port 0 finds one that is free"
+        return f"port {port} is in use: --port 0 finds a free port"
     if error.errno == errno.EACCES:
-        return f"port {port} needs more rights: --port 0 finds one that is free"
+        return f"port {port} requires more rights: --port 0 finds a free port"
     if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
-        return f"{host} is no address of this machine: 127.0.0.1 is reached from here alone, 0.0.0.0 from everywhere"
+        return f"{host} is not an address of this machine: use 127.0.0.1 for local access, 0.0.0.0 for all interfaces"
     return f"{host}:{port}: {error.strerror or error}"

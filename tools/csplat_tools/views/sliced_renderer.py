@@ -1,8 +1,7 @@
-"""Render a scene that does not fit in memory, in slices of depth, by way of a file on the disk.
+"""Render a scene that does not fit in memory, in slices of depth, using a file on the disk.
 
-For each render all splats are read once, and the visible ones are sorted into slices. These are drawn one after the
-other, the nearest first, each with the transmittance that the one before it left: the render is that of the whole
-scene, bit for bit, however it was cut.
+For each render all splats are read once, and the visible ones are sorted into slices. Slices are drawn from front to
+back, each with the transmittance left by the previous one. So the render is that of the whole scene, bit for bit.
 """
 
 from __future__ import annotations
@@ -26,13 +25,13 @@ from csplat_render import Camera, Mode
 from csplat_render.conventions import HasSplats, RenderResult
 
 STAGE = "drawing one picture by way of the disk"
-_LOOKED_AT = 1 << 19  # approximate number of splats that are sampled to cut a slice again
-_BASE_BYTES = 320_000_000  # bytes of the program, samples, and splats that wait to be written
+_SAMPLED = 1 << 19  # approximate number of splats to sample when a slice is cut again
+_BASE_BYTES = 320_000_000  # bytes of the program, samples, and buffered splats
 _BLOCKS = 16  # blocks of splats in memory: being decoded, or freed and not yet returned to the system
-_FOLDS = 2.2  # memory of a drawn splat as a multiple of its arrays: it exists as a record, and in arrays
-_SPLAT_BYTES = 300  # bytes of the rasteriser per splat, in addition to these
+_FOLDS = 2.2  # memory of a drawn splat divided by its arrays; it exists as a record and in arrays
+_SPLAT_BYTES = 300  # additional bytes of the rasteriser per splat
 _PAIR_BYTES = 5  # bytes per pair of a splat and a tile that it touches
-_FULL = 0.75  # fraction of a slice's memory that is planned for, since its limits come from a sample
+_FULL = 0.75  # planned fraction of a slice's memory, since its limits come from a sample
 _READING = 0.6  # fraction of the time of a render that reading takes, for progress
 
 
@@ -40,15 +39,15 @@ _READING = 0.6  # fraction of the time of a render that reading takes, for progr
 class SlicedScene:
     """A scene that is drawn without being in memory.
 
-    A render takes as much disk space as the arrays of its visible splats, in an unnamed file in the folder for
-    temporary files (TMPDIR), which disappears when the program ends in any way.
+    A render takes disk space for the arrays of its visible splats, in an unnamed file in the folder for temporary files
+    (TMPDIR), which disappears when the program ends in any way.
 
     Attributes:
         scene: its splats.
         sample, every: as returned by `OpenedScene.sample`.
-        memory_bytes: approximate bound on the memory.
+        memory_bytes: approximate limit of the memory.
         progress: progress callback of a render.
-        slice_bytes: least bytes of memory for a slice.
+        slice_bytes: least memory for a slice, bytes.
     """
 
     scene: SceneSource
@@ -80,16 +79,16 @@ class SlicedScene:
 
     @property
     def least_bytes(self) -> int:
-        """Bytes of memory without which nothing can be drawn."""
-        return self._beside + self.slice_bytes
+        """Least memory for a render, bytes."""
+        return self._fixed_bytes + self.slice_bytes
 
     @property
     def room_bytes(self) -> int:
-        """Bytes of memory for a slice."""
-        return max(self.slice_bytes, self.memory_bytes - self._beside)
+        """Memory for a slice, bytes."""
+        return max(self.slice_bytes, self.memory_bytes - self._fixed_bytes)
 
     @property
-    def _beside(self) -> int:
+    def _fixed_bytes(self) -> int:
         return _BASE_BYTES + _BLOCKS * BLOCK_SPLATS * self.layout.dtype.itemsize
 
     def renderer(
@@ -98,10 +97,10 @@ class SlicedScene:
         """Return a function that draws the scene from a camera, like `csplat_render.scorer.renderer`, without `radii`.
 
         Raises:
-            InputError: the mode is `exact`; while drawing: the disk has no room, or the scene is not whole.
+            InputError: the mode is `exact`; while drawing: the disk is full, or the scene is damaged.
         """
         if mode == "exact":
-            raise InputError("mode exact wants the scene in memory, and it does not fit: take standard")
+            raise InputError("mode exact requires a scene that fits in memory: use standard")
         return lambda camera: _SlicedRender(self, camera, background, mode, threads).drawn()
 
 
@@ -123,22 +122,22 @@ class _SlicedRender:
     def drawn(self) -> RenderResult:
         """Draw all slices, and return the render."""
         limits = self._limits(map(_source, source_from_model(self._scene.sample).blocks()), 1, self._scene.every)
-        self._draw(_source(self._scene.scene.metadata_model))  # so that there is a render even if no splat is visible
+        self._draw(_source(self._scene.scene.metadata_model))  # the background, in case no splat is visible
         self._sort_and_draw(self._blocks, self._scene.scene.count, limits, first=True)
-        self._tell(1.0)
-        assert self._last is not None, "something was drawn"
+        self._report(1.0)
+        assert self._last is not None
         return replace(self._last, drawn=self._done, intersections=self._pairs, ignored=self._ignored)
 
     @property
     def _full(self) -> float:
         return _FULL * self._scene.room_bytes
 
-    def _tell(self, share: float) -> None:
+    def _report(self, share: float) -> None:
         if self._scene.progress is not None:
             self._scene.progress(STAGE, share)
 
-    def _looked(self, splats: HasSplats) -> tuple[F32, F64, int]:
-        """Return depths and bytes of memory for drawing, both 0 for invisible splats; and the number of ignored."""
+    def _visible_splats(self, splats: HasSplats) -> tuple[F32, F64, int]:
+        """Return depths and memory for drawing in bytes, both 0 if invisible; and the number of ignored splats."""
         seen = self._rasteriser.find_visible(
             splats, self._camera, antialiased=self._scene.scene.metadata_model.antialiased
         )
@@ -147,25 +146,25 @@ class _SlicedRender:
     def _blocks(self) -> Iterator[Source]:
         """Yield all splats of the scene."""
         for rows, block in self._scene.scene.numbered():
-            self._tell(_READING * rows.start / max(1, self._scene.scene.count))
+            self._report(_READING * rows.start / max(1, self._scene.scene.count))
             yield _source(block)
 
     def _sort_and_draw(
         self, blocks: Callable[[], Iterator[Source]], count: int, limits: F32, *, first: bool = False
     ) -> None:
-        """Sort splats into slices, and draw these; slices that are too large are cut again.
+        """Sort splats into slices, and draw them; slices that are too large are cut again.
 
         Args:
             blocks: the splats, in order.
-            count: largest number of them.
-            limits: limits of the slices, as from `slice_limits`.
-            first: True for the first pass over the scene, in which splats are counted.
+            count: upper bound of their number.
+            limits: limits of the slices, see `slice_limits`.
+            first: count splats, as in the first pass over the scene.
         """
         spool = open_spool(self._layout, count)
         with closing(spool.stream):
             sizes = np.zeros(len(limits) + 1)
             for block in blocks():
-                near, taken, ignored = self._looked(block)
+                near, taken, ignored = self._visible_splats(block)
                 rows = np.flatnonzero(near)
                 keys = np.searchsorted(limits, near[rows], "right")
                 sizes += np.bincount(keys, taken[rows], len(sizes))
@@ -180,10 +179,10 @@ class _SlicedRender:
                 if sizes[key] <= self._scene.room_bytes or number == 1:
                     self._draw(next(read(number)))
                 elif 0 < key < len(limits) and np.nextafter(limits[key - 1], np.float32(np.inf)) == limits[key]:
-                    for part in read(max(1, int(number * self._full / sizes[key]))):  # one depth: by order
+                    for part in read(max(1, int(number * self._full / sizes[key]))):  # equal depths: in order
                         self._draw(part)
                 else:
-                    every = -(-number // _LOOKED_AT)
+                    every = -(-number // _SAMPLED)
                     self._sort_and_draw(
                         partial(read, BLOCK_SPLATS), number, self._limits(read(BLOCK_SPLATS), every, every, least=2)
                     )
@@ -192,11 +191,11 @@ class _SlicedRender:
         return (source for source, _ in spool.sources(key, most))
 
     def _limits(self, blocks: Iterator[Source], every: int, share: int, *, least: int = 1) -> F32:
-        """Return limits as `slice_limits` does, from one in `every` of some splats; each stands for `share`."""
-        looked = [[column[::every].copy() for column in self._looked(block)[:2]] for block in blocks]
-        if not looked:
+        """Return limits as `slice_limits` does, from every Nth splat of blocks, each of which represents `share`."""
+        found = [[column[::every].copy() for column in self._visible_splats(block)[:2]] for block in blocks]
+        if not found:
             return np.empty(0, np.float32)
-        near, taken = (np.concatenate(columns) for columns in zip(*looked, strict=True))
+        near, taken = (np.concatenate(columns) for columns in zip(*found, strict=True))
         return slice_limits(near, taken, max(least, math.ceil(taken.sum() * share / self._full)))
 
     def _draw(self, splats: HasSplats) -> None:
@@ -206,7 +205,7 @@ class _SlicedRender:
         )  # fmt: skip
         self._last = replace(found, radii=np.empty(0, np.float32))
         self._done, self._pairs = self._done + found.drawn, self._pairs + found.intersections
-        self._tell(_READING + (1.0 - _READING) * self._done / max(1, self._visible))
+        self._report(_READING + (1.0 - _READING) * self._done / max(1, self._visible))
 
 
 def slice_limits(near: F32, taken: F64, pieces: int) -> F32:
@@ -218,8 +217,8 @@ def slice_limits(near: F32, taken: F64, pieces: int) -> F32:
         pieces: least number of slices.
 
     Returns:
-        Limits in ascending order: a slice includes its lower limit, but not its upper one. A depth with more splats
-        than fit into a slice is a slice of its own: its upper limit is the next float.
+        Limits in ascending order; a slice includes its lower limit, but not its upper one. A depth with more splats
+        than fit into a slice is a slice of its own, up to the next float.
     """
     rows = np.flatnonzero(near)
     if pieces < 2 or not len(rows):
@@ -234,5 +233,5 @@ def slice_limits(near: F32, taken: F64, pieces: int) -> F32:
 
 
 def _source(model: SplatModel) -> Source:
-    """Return the splats as they are drawn, with centres in float32."""
+    """Return the splats to draw, with centres in float32."""
     return Source(model.means, model.quats, model.scales, model.opacities, model.sh0, model.shN)

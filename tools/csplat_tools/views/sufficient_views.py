@@ -1,8 +1,7 @@
-"""Find how many views a choice of splats needs: views are added until they agree with held-out ones.
+"""Find how many views are needed to choose splats: views are added until they agree with held-out ones.
 
-A choice of splats to prune suits the views that it was made with better than others. By how much is known without
-rendering the result: the predicted error of the pruned splats has to be about the same on the views that chose them
-and on held-out views.
+A choice of splats to prune overfits its views. This can be measured without rendering the result: the predicted error
+of the pruned splats should be about the same in the views that chose them and in held-out views.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from csplat_render.conventions import ALPHA_MIN
 from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_tools.views import HELD_OUT_COUNT, VIEW_SIZE, ViewSet, shrink_cameras
 
-_BATCH = 40  # virtual views that are added at a time
-# dB between the errors predicted for used and for held-out views, below which there are enough views. Fits overfit
-# their views more than choices do: at 1 dB lego60k stops at 40 views, and is 3 dB better on others with 160.
+_BATCH = 40  # virtual views added at a time
+# Views suffice if the errors predicted for used and held-out views differ by less, dB. Refits overfit more than choices
+# do: with 1 dB lego60k stops at 40 views, and is 3 dB better on other views with 160.
 _GAP_MAX = 0.1
-_MISSED_MAX = 0.005  # fraction of the splats that only the held-out views show, below which there are enough views
+_MISSED_MAX = 0.005  # fraction of the splats; views suffice if only held-out views show fewer
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +35,8 @@ class SufficientViews:
     Attributes:
         used: the training views.
         check: the held-out views.
-        pruning_error: pruning errors of the source, measured from `used`.
-        gap: dB by which the error predicted for the splats to be pruned is larger in `check` than in `used`.
+        pruning_error: pruning errors of the source, measured in `used`.
+        gap: dB by which the predicted error of the splats to prune is larger in `check` than in `used`.
     """
 
     used: list[Camera]
@@ -55,16 +54,16 @@ def find_sufficient_views(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> SufficientViews:
-    """Add training views until there are enough, and measure the pruning errors of the source from them.
+    """Add training views until they suffice, and measure the pruning errors of the source in them.
 
     Args:
         model: the source.
-        views: virtual training views are taken batch by batch until no new splats appear and they agree with some that
-            are held out; of other views all are taken, and validation views are the held-out ones.
-        pruned: fraction of the splats to be pruned, whose predicted errors have to agree.
+        views: the views. Virtual training views are added batch by batch until they show all splats and agree with some
+            that are held out. Other training views are all used, with validation views as the held-out ones.
+        pruned: fraction of the splats to prune, whose predicted errors must agree.
         size: width and height of the renders, pixels; the user's cameras keep their aspect ratio and are never
             enlarged.
-        threads: number of threads; None for all.
+        threads: number of threads; `None` for all.
         progress: progress callback.
 
     Raises:
@@ -78,11 +77,10 @@ def find_sufficient_views(
 
     if not views.training or not views.validation:
         found = len(views.training) + len(views.validation)
-        raise InputError(f"{found} cameras, wanted 2 at least: one for training, one for validation")
+        raise InputError(f"{found} cameras, expected at least 2: one for training, one for validation")
     every, check = shrink_cameras(views.training, size), shrink_cameras(views.validation, size)
     if views.virtual:
-        # A choice has to be good on other views, too; this is checked on views of the same kind.
-        every, check = _hold_out(every)
+        every, check = _hold_out(every)  # views of the same kind
     check_errors = measure(check)
     count = min(_BATCH, len(every)) if views.virtual else len(every)
     pruning_error = measure(every[:count])
@@ -101,11 +99,11 @@ def pruning_keys(opacities: NDArray[np.float32], pruning_error: PruningError, *,
     Args:
         opacities: [N], opacities of a scene.
         pruning_error: its pruning errors.
-        keep_unseen: prune splats that no view saw last, instead of first.
+        keep_unseen: prune splats that no view saw last, not first.
 
     Returns:
         [N] float64: −1 for a splat whose alpha is too small to be drawn; infinity, or −0.5 without `keep_unseen`, for
-        one that no view saw; else the error of pruning it.
+        a splat that no view saw; else the pruning error.
     """
     keys = np.where(pruning_error.seen, pruning_error.error, np.inf if keep_unseen else -0.5)
     keys[opacities < ALPHA_MIN] = -1.0
@@ -113,20 +111,17 @@ def pruning_keys(opacities: NDArray[np.float32], pruning_error: PruningError, *,
 
 
 def _hold_out(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
-    """Split cameras into those to use, and some to hold out.
-
-    The latter are taken evenly from the whole sequence: its beginning is not spread as evenly as all of it.
-    """
+    """Split cameras into used and held-out ones, which are evenly spaced: only the whole sequence is even."""
     count = min(HELD_OUT_COUNT, len(cameras) - 1)
     held_out = set(np.linspace(0, len(cameras) - 1, count + 2).astype(int)[1:-1].tolist())
     return [one for i, one in enumerate(cameras) if i not in held_out], [cameras[i] for i in sorted(held_out)]
 
 
 def _gap(model: SplatModel, used: PruningError, check: PruningError, pruned: float) -> float:
-    """Return by how many dB the predicted error of the splats to be pruned is larger in held-out views."""
+    """Return by how many dB the predicted error of the splats to prune is larger in held-out views."""
     keys = pruning_keys(model.opacities, used)
     order = np.argsort(keys, kind="stable")[: int(pruned * len(model))]
     order = order[np.isfinite(keys[order])]
-    there = float(np.sum(used.error[order])) / used.value_count
-    elsewhere = float(np.sum(check.error[order])) / check.value_count
-    return 10.0 * math.log10(elsewhere / there) if there > 0.0 and elsewhere > 0.0 else 0.0
+    in_used = float(np.sum(used.error[order])) / used.value_count
+    in_check = float(np.sum(check.error[order])) / check.value_count
+    return 10.0 * math.log10(in_check / in_used) if in_used > 0.0 and in_check > 0.0 else 0.0

@@ -1,11 +1,11 @@
 """Assign the views of a scene their roles: training, validation and test.
 
-Values are fitted to training views; validation views decide how many splats are kept, which step is best and when a
-search ends; scores in reports are those of test views. No view has two roles.
+Values are fitted to training views. Validation views decide how many splats are kept, which step is best and when a
+search ends. Reports contain scores on test views. No view has two roles.
 
 | views | training | validation | test |
 |---|---|---|---|
-| virtual | `count` small ones and 16 more, all around | twelve like those of `psnr` | the eight of `psnr` |
+| virtual | `count` + 16 small ones, all around | twelve like those of `psnr` | the eight of `psnr` |
 | camera file, 40 or more | the others | every 8th of the others | every 4th, 24 at most |
 | camera file, fewer | virtual ones | virtual ones | all |
 | data set | training images | 16 for validation at most, else every 8th training one | held-out ones |
@@ -47,19 +47,19 @@ WHITE: Colour = (1.0, 1.0, 1.0)
 #: Name of a set whose test views are virtual: those of `psnr`.
 VIRTUAL = "virtual"
 
-#: Parts of a data set: the images that were held out of training, and the others.
+#: Parts of a data set: its test images, and the others.
 Split = Literal["test", "train"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 
-_SPLIT_FROM = 40  # cameras in a file from which they are split into all three roles
+_SPLIT_FROM = 40  # cameras; a file with at least this number is split into all three roles
 _TEST_EVERY, _TEST_MAX = 4, 24  # every Nth camera of a file is a test view, up to this number
 _VALIDATION_EVERY = 8  # every Nth view that is not a test view is a validation view
-_VALIDATION_MAX = 16  # validation images of a data set that are used, at most
+_VALIDATION_MAX = 16  # validation images of a data set, at most
 _VALIDATION_SEED = 1000  # seed of virtual validation views, added to the user's
-_HOLD_OUT_EVERY = 8  # every Nth image is held out if nothing else is specified
+_HOLD_OUT_EVERY = 8  # every Nth image is a test image by default
 
-_TIMED_MAX = 2  # renders that are timed, at most
-_TIMED_DIVISOR = 8  # of width and height in mode `exact`, whose renders take a minute: time grows with pixels
+_TIMED_MAX = 2  # timed renders, at most
+_TIMED_DIVISOR = 8  # divisor of width and height for timing mode `exact`, whose time is proportional to pixels
 
 _DISPLAY_MAX, _DISPLAY_SIZE = 6, (640, 480)  # views to display, at most; width and height, pixels
 _DISPLAY_CANDIDATES, _DISPLAY_POINTS, _DISPLAY_SEED = 64, 40_000, 0  # candidate views; points of the scene; seed
@@ -68,20 +68,20 @@ _DISPLAY_DETAIL = 0.8  # least detail of a view to display, as a fraction of the
 
 @dataclass(frozen=True, eq=False)
 class ViewSet:
-    """The views of a scene by role. No view has two roles: what a view has chosen scores better there than elsewhere.
+    """The views of a scene by role. No view has two roles, since scores on views that were fitted to are too good.
 
     Attributes:
         name: source of the test views: `virtual`, or the name of a camera file or of a data set.
-        background: red, green, blue behind training and validation views; behind test views, too, unless they are
-            virtual: `psnr` is on black.
-        training: training views, to which values are fitted, and from which importance is measured.
-        validation: validation views, by which the number of splats, the best step and the end of a search are chosen.
+        background: background colour of training and validation views, and of test views unless they are virtual:
+            `psnr` is on black.
+        training: training views, to which values are fitted, and in which importance is measured.
+        validation: validation views, which choose the number of splats, the best step and the end of a search.
         test: test views, to which the scores in reports refer.
         images: images of a data set, in its order; each has its camera, one of those above.
-        virtual: training and validation views were placed around the scene by csplat.
+        virtual: csplat placed training and validation views around the scene.
         origin: the scene's origin, to which all cameras are relative.
         notes: remarks for the user on the choice of views, a line each.
-        split: the images of a data set that are test views: the held-out ones, or those of the training.
+        split: part of the data set that the test views are.
 
     Raises:
         InputError: a view has two roles.
@@ -120,11 +120,11 @@ class ViewSet:
         threads: int | None = None,
         progress: Callable[[str, float], None] | None = None,
     ) -> Scorer:
-        """Return the scorer by the source's renders in the test views.
+        """Return the scorer on the test views, against the source's renders.
 
         Args:
             source: the scene.
-            background: a background colour instead of `test_background`.
+            background: background colour; `None`: `test_background`.
             mode, threads: mode of the renderer, and its number of threads.
             progress: progress callback of rendering the source.
 
@@ -135,7 +135,7 @@ class ViewSet:
         return Scorer.of_source(source, self.test, colour, mode=mode, threads=threads, progress=progress)
 
     def validation_scorer(self, source: SplatModel, *, threads: int | None = None) -> Scorer:
-        """Return the scorer by the source's renders in the validation views.
+        """Return the scorer on the validation views, against the source's renders.
 
         Raises:
             InputError: there are no validation views.
@@ -143,7 +143,7 @@ class ViewSet:
         return Scorer.of_source(source, self.validation, self.background, threads=threads)
 
     def image_test_scorer(self, *, mode: Mode = "standard", threads: int | None = None) -> Scorer:
-        """Return the scorer by the images of the test views.
+        """Return the scorer on the test views, against their images.
 
         Raises:
             InputError: there are no images, or no test views.
@@ -151,7 +151,7 @@ class ViewSet:
         return self._image_scorer(self.test, mode, threads)
 
     def image_validation_scorer(self, *, threads: int | None = None) -> Scorer:
-        """Return the scorer by the images of the validation views.
+        """Return the scorer on the validation views, against their images.
 
         Raises:
             InputError: there are no images, or no validation views.
@@ -164,7 +164,7 @@ class ViewSet:
         return [taken[id(camera)] for camera in cameras]
 
     def read_images(self) -> None:
-        """Read all images, so that a damaged one is found before minutes are spent on the others.
+        """Read all images, to find damaged ones early.
 
         Raises:
             InputError: a file is not an image, or is truncated.
@@ -176,18 +176,13 @@ class ViewSet:
         from csplat_trainer.posed_images import image_scorer
 
         if not self.images:
-            raise InputError("there are no photographs: name a data set")
+            raise InputError("the views have no images: name a data set")
         shown = self.images_of(cameras)
         return image_scorer(shown, self.background, mode=mode, threads=threads, origin=self.origin)
 
 
 def describe_views(count: int, name: str) -> str:
-    """Describe the number of views and their source: `8 virtual views`, `8 views of lego`.
-
-    Args:
-        count: number of views.
-        name: name of the set.
-    """
+    """Describe the number of views and their source: `8 virtual views`, `8 views of lego`."""
     return counted(count, "virtual view") if name == VIRTUAL else f"{counted(count, 'view')} of {name}"
 
 
@@ -199,14 +194,14 @@ def pose_key(camera: Camera) -> bytes:
 
 @dataclass(frozen=True)
 class DataOptions:
-    """A data set of images. For `None` the scene's own metadata is used, else the default.
+    """A data set of images. `None` means the value in the scene's metadata, else the default.
 
     Attributes:
         path: the set's folder, or its transforms.json.
         size: width and height to which images are scaled; default: no scaling.
         images: folder of images of a COLMAP set; default: chosen by the reader.
-        test_every: every Nth image is held out if the set does not specify test images; default: 8.
-        near: near plane of the cameras, scene units; default: one that suits the set.
+        test_every: every Nth image is a test image if the set does not specify any; default: 8.
+        near: near plane of the cameras, scene units; default: chosen by the reader.
     """
 
     path: str
@@ -217,7 +212,7 @@ class DataOptions:
 
 
 def comparison_cameras(source: SplatModel, every: int = 1) -> list[Camera]:
-    """Return the cameras of `psnr`: virtual ones, chosen by the source alone, or by every Nth of its splats."""
+    """Return the virtual cameras of `psnr`, which depend only on the source, or on every Nth of its splats."""
     return virtual_cameras(source, *virtual_views.VIRTUAL_SIZES.test, seed=0, every=every)
 
 
@@ -241,33 +236,33 @@ def find_view_set(
         cameras: a camera file, see `csplat_render.camera_files.load_cameras`.
         data: a data set, instead of a camera file.
         background: background colour; `None`: that of the scene's training if known, else black.
-        count: number of virtual training views, to which 16 are added that pruning holds out to check its choice; 0: no
-            virtual training or validation views. `None`: by the number of splats (`default_views`).
+        count: number of virtual training views, in addition to 16 that pruning holds out; 0: no virtual training or
+            validation views. `None`: by the number of splats (`default_views`).
         size: width and height of virtual training views, pixels; `None`: by the number of splats.
         seed: seed of virtual training and validation views.
-        validation_count: number of validation views; `None`: as in the table; 0: none that could be training views.
-        split: the images of a data set that are test views. With `train`, no view has another role.
-        every: the source is every Nth splat of the scene, by which virtual test views are placed; 1: all splats.
+        validation_count: number of validation views; `None`: as in the table; 0: keep all others as training views.
+        split: the part of a data set that becomes test views. With `train`, there are no other views.
+        every: the source is every Nth splat of the scene; used to place virtual test views.
 
     Raises:
-        InputError: both are given, or one is not valid, or has too few views.
+        InputError: both `cameras` and `data` are given, or one is not valid, or has too few views.
         OSError: a file cannot be read.
     """
     if cameras is not None and data is not None:
-        raise InputError("wanted cameras of a file or of a data set, not both")
+        raise InputError("cameras and data exclude each other")
     if split not in SPLITS:
-        raise InputError(f"the split is {split!r}, wanted one of {', '.join(SPLITS)}")
+        raise InputError(f"the split is {split!r}, expected one of {', '.join(SPLITS)}")
     usual = default_views(every * len(source))
     count, size = usual[0] if count is None else count, size or usual[1]
     if data is not None:
         return _views_of_data(source, data, background, validation_count, split)
     if cameras is None:
         test = comparison_cameras(source, every)
-        test_poses = {pose_key(camera) for camera in test}  # in a scene without splats all views are the same
+        test_poses = {pose_key(camera) for camera in test}  # in an empty scene all views are equal
         training, validation = (
             _without(test_poses, part) for part in _place_virtual(source, count, size, seed, validation_count)
         )
-        notes = () if every < 2 else (f"the scene is not in memory: views are placed by one in {every} of its splats",)
+        notes = () if every < 2 else (f"the scene is not in memory: views are placed by 1 in {every} of its splats",)
         colour = background or BLACK
         return ViewSet(VIRTUAL, colour, training, validation, test, virtual=True, origin=source.origin, notes=notes)
     return _views_of_file(source, cameras, background, (count, size, seed), validation_count)
@@ -282,18 +277,18 @@ def with_validation_views(views: ViewSet) -> ViewSet:
 
 
 def display_cameras(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
-    """Choose views whose renders are worth showing to people.
+    """Choose views for showing renders to users.
 
-    The views of `psnr` are spread all around a scene: some see the back of objects, or a wall from nearby; a scene
-    without a known up direction may lie on its side. That is fair to files, but of no use to a reader.
+    The views of `psnr` are spread all around a scene. Some see the back of objects, or a wall from nearby, and a scene
+    without a known up direction may lie on its side. This is fair for scores, but not instructive.
 
     Args:
         source: the scene.
         views: its test views are shown; if they are virtual, other views are searched.
 
     Returns:
-        Cameras relative to the scene's origin: the test views, or virtual ones far apart from each other that show fine
-        splats with nothing in front of them.
+        Cameras relative to the scene's origin: the test views, or virtual ones far from each other that show much
+        detail with nothing in front of it.
     """
     if views.name != VIRTUAL or not len(source):
         return views.test
@@ -310,7 +305,7 @@ def display_cameras(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
 
 
 def total_render_seconds(source: SplatModel, cameras: Sequence[Camera], *, mode: Mode = "standard") -> float:
-    """Estimate the seconds for renders from all cameras, from some of them; 0 without splats or cameras."""
+    """Estimate the seconds for renders from all cameras, by timing some; 0 without splats or cameras."""
     return len(cameras) * render_seconds(source, cameras, mode=mode) if len(source) and cameras else 0.0
 
 
@@ -322,7 +317,7 @@ def render_seconds(
     threads: int | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> float:
-    """Measure the seconds for a render, from some that are discarded.
+    """Measure the seconds for a render.
 
     Args:
         source: the scene.
@@ -390,7 +385,7 @@ def _views_of_data(
     test_poses = {pose_key(one.camera) for one in test}
     training = _without(test_poses, [one.camera for one in train])
     if len(training) < len(train):
-        more.append(f"{len(train) - len(training)} training photographs have the pose of a test view, and are left out")
+        more.append(f"{len(train) - len(training)} training images are dropped: they have the pose of a test view")
     taken = test_poses | {pose_key(camera) for camera in training}
     validation = _without(taken, [one.camera for one in val])
     if validation_count or not validation:
@@ -416,7 +411,7 @@ def _complete_options(data: DataOptions, record: TrainingRecord | None) -> tuple
 def _choose_background(
     background: Colour | None, record: TrainingRecord | None, *, images: bool = False
 ) -> tuple[Colour, list[str]]:
-    """Return the background colour, with remarks on it, which matter most if images are compared."""
+    """Return the background colour, and remarks; with `images`, also if it is unknown."""
     if background is not None:
         if record is None or record.background == background:
             return background, []
@@ -424,12 +419,11 @@ def _choose_background(
         return background, [f"background is {names[0]}, but the scene was trained on {names[1]}"]
     if record is not None:
         return record.background, []
-    note = "the background of the training is not known: black is used, --background changes that"
-    return BLACK, [note] if images else []
+    return BLACK, ["the training background is unknown: black is used, set --background to change it"] if images else []
 
 
 def _set_name(path: str) -> str:
-    """Return the name of a file or a folder, changed if it is that of virtual views."""
+    """Return the name of a file or folder, changed if it equals that of virtual views."""
     name = Path(path).resolve().name
     return f"./{name}" if name == VIRTUAL else name
 
@@ -445,7 +439,7 @@ def _shifted(images: Sequence[PosedImage], shift: NDArray[np.float64]) -> list[P
 def _place_virtual(
     source: SplatModel, count: int, size: tuple[int, int], seed: int, validation_count: int | None
 ) -> tuple[list[Camera], list[Camera]]:
-    """Return virtual training and validation views; the latter are like the test views of `psnr`, at other places."""
+    """Return virtual training views, and validation views like those of `psnr` at other positions."""
     if count < 1:
         return [], []
     usual, width, height = virtual_views.VIRTUAL_SIZES.validation
@@ -461,7 +455,7 @@ def _split_validation(cameras: Sequence[Camera], validation_count: int | None) -
         every = min(_VALIDATION_EVERY, count)
         places: Collection[int] = range(every // 2, count, every) if count > 1 else ()
     elif validation_count and validation_count >= count:
-        raise InputError(f"{validation_count} of {count} validation views leave no training views")
+        raise InputError(f"validation_count is {validation_count}, which leaves none of {count} views for training")
     else:
         places = [(2 * number + 1) * count // (2 * validation_count) for number in range(validation_count)]
     validation, others = _split(cameras, places)

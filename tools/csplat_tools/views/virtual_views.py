@@ -1,7 +1,7 @@
-"""Place virtual cameras around a scene: for training, and for a test of other places.
+"""Place virtual cameras around a scene, for training and for extra tests.
 
-Training cameras are many and small, evenly spread at any count: many small renders overfit less than few large ones
-with the same number of pixels.
+Training views are many and small, since many small renders overfit less than a few large ones with the same number of
+pixels.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from csplat_render.virtual_cameras import FIELD_OF_VIEW, HIDING, is_clear, virtu
 
 T = TypeVar("T")
 
-#: Default number of virtual training views, and width and height of their renders, pixels, for small scenes; for larger
-#: ones see `default_views`.
+#: Default number of virtual training views of small scenes, and width and height of their renders, pixels; for larger
+#: scenes see `default_views`.
 VIEW_COUNT = 160
 VIEW_SIZE = (240, 180)
 
-#: Virtual views in addition to those requested, held out to check choices that are made on the others.
+#: Additional virtual views, held out to check choices made on the training views.
 HELD_OUT_COUNT = 16
 
 
 @dataclass(frozen=True)
 class VirtualViewSizes:
-    """Counts of virtual views to which nothing is fitted, and their widths and heights in pixels.
+    """Counts, widths and heights in pixels of virtual views to which nothing is fitted.
 
     Attributes:
         test: test views, those of `psnr`.
@@ -47,29 +47,30 @@ class VirtualViewSizes:
     extra: tuple[int, int, int] = (12, 320, 240)
 
 
-#: The default, with which all published figures were measured.
+#: The default, used for all published figures.
 VIRTUAL_SIZES = VirtualViewSizes()
 
 _PIXELS = 50  # pixels of all views together per splat
-_LARGEST = 2.0  # largest factor of width and height: all renders are in memory, and larger ones would be too few
-_POINTS = 20_000  # points that are sampled from the scene
+_LARGEST = 2.0  # largest factor of width and height; all renders are in memory, and larger ones would be too few
+_POINTS = 20_000  # points to sample from the scene
 _OBJECT_DISTANCE = (0.95, 1.6)  # distance from the centre of an object, extents
-_OBJECT_HEIGHT = (-0.95, 0.98)  # sines of elevations: objects are seen from below, too
+_OBJECT_HEIGHT = (-0.95, 0.98)  # sines of elevations; objects are seen from below, too
 _OBJECT_OFFSET = 0.2  # largest offset of a camera's target from the centre, per axis, extents
 _AROUND_DISTANCE = (0.35, 1.45)  # the same for surrounding scenes
 _AROUND_HEIGHT = (-0.12, 0.7)
 _AROUND_OFFSET = 0.35
-_OUTWARDS = 5  # one view in this many looks away from the middle of a surrounding scene
-_GOOD_DETAIL = 0.4  # least detail as a fraction of the best view's: views of walls from behind are useless
-_CANDIDATES = 3  # candidates for each view
+_OUTWARDS = 5  # every Nth view looks away from the middle of a surrounding scene
+_GOOD_DETAIL = 0.4  # least detail as a fraction of the best view's; views of walls from behind are useless
+_CANDIDATES = 3  # candidates per view
 _STEPS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)  # powers of 1 / the root of x⁴ = x + 1
 
 
 def default_views(splats: int) -> tuple[int, tuple[int, int]]:
     """Return the default count of virtual training views, and their width and height, by the number of splats.
 
-    The cost of a render grows with splats, not with pixels: for many splats, fewer and larger views are more efficient.
-    At the same PSNR a file of 290,000 splats is 16 % smaller with 110 views of 348x261 than with 160 of 240x180.
+    The cost of a render depends on splats more than on pixels, so for many splats fewer and larger views are more
+    efficient. At the same PSNR a file of 290,000 splats is 16 % smaller with 110 views of 348x261 than with 160 of
+    240x180.
     """
     larger = min(max(math.sqrt(_PIXELS * splats / (VIEW_COUNT * math.prod(VIEW_SIZE))), 1.0), _LARGEST)
     width, height = (round(larger * side) for side in VIEW_SIZE)
@@ -77,7 +78,7 @@ def default_views(splats: int) -> tuple[int, tuple[int, int]]:
 
 
 def camera_sequence(model: SplatModel, count: int, size: tuple[int, int] = VIEW_SIZE, *, seed: int = 0) -> list[Camera]:
-    """Place virtual cameras around a scene, evenly spread at any count: a longer list begins with the same cameras.
+    """Place virtual cameras around a scene, evenly spread at any count.
 
     Args:
         model: the scene; its own cameras are not used.
@@ -86,9 +87,9 @@ def camera_sequence(model: SplatModel, count: int, size: tuple[int, int] = VIEW_
         seed: start of the sequence.
 
     Returns:
-        `count` cameras, by a low-discrepancy sequence over directions, distances and targets. Cameras whose view is
-        hidden from nearby come last around an object, as do those that show little detail in a surrounding scene; of
-        more candidates than needed, the last are left out.
+        `count` cameras, by a low-discrepancy sequence over directions, distances and targets. There are more
+        candidates than needed: last come, and are dropped, cameras around an object whose view is hidden from nearby,
+        and cameras in a surrounding scene that show little detail.
     """
     frame = scene_frame(model)
     K = intrinsics(*size, FIELD_OF_VIEW)
@@ -109,7 +110,7 @@ def camera_sequence(model: SplatModel, count: int, size: tuple[int, int] = VIEW_
 
 
 def shrink_cameras(cameras: Sequence[Camera], size: tuple[int, int] = VIEW_SIZE) -> list[Camera]:
-    """Reduce views to about as many pixels as `size` has, if they have more."""
+    """Reduce views to about the number of pixels of `size`, if they have more."""
     smaller = []
     for camera in cameras:
         factor = (size[0] * size[1] / (camera.W * camera.H)) ** 0.5
@@ -160,29 +161,28 @@ def evenly_spaced(items: Sequence[T], most: int) -> list[T]:
     return [items[i] for i in places]
 
 
-_SEED = 2000  # seed of extra test views; validation views use 1000 and more
+_SEED = 2000  # seed of extra test views; validation views use 1000 and above
 _NEARER, _FARTHER = (0.6, 0.7, 0.8, 0.9), 2.0  # factors of the distance from the middle of the scene
-# points that are sampled from the scene
 
 
 def extra_test_cameras(source: SplatModel) -> dict[str, list[Camera]]:
-    """Place virtual cameras like those of `psnr` at other places, and nearer to and farther from the middle.
+    """Place virtual cameras like those of `psnr` at other positions, and nearer to and farther from the middle.
 
-    They have no part in fits and choices. Nearer ones stay outside of the objects that they look at.
+    They are used for reports only. Nearer ones stay outside of the objects that they look at.
 
     Args:
         source: the scene; its own cameras are not used.
 
     Returns:
-        12 cameras of each kind: `beside`, `nearer`, `farther`.
+        12 cameras of each kind, by its name in reports.
     """
     frame = scene_frame(source)
-    beside = virtual_cameras(source, *VIRTUAL_SIZES.extra, seed=_SEED)
-    found = {"beside": beside, "farther": [_at(camera, frame.centre, _FARTHER) for camera in beside]}
+    others = virtual_cameras(source, *VIRTUAL_SIZES.extra, seed=_SEED)
+    found = {"beside": others, "farther": [_at(camera, frame.centre, _FARTHER) for camera in others]}
     if not len(source):
-        return {**found, "nearer": beside}
+        return {**found, "nearer": others}
     cloud = sample_cloud(source, _POINTS, np.random.default_rng(_SEED))
-    candidates = [[_at(camera, frame.centre, times) for times in _NEARER] + [camera] for camera in beside]
+    candidates = [[_at(camera, frame.centre, times) for times in _NEARER] + [camera] for camera in others]
     nearer = [next((one for one in each if is_clear(frame, cloud, one)), each[-1]) for each in candidates]
     return {**found, "nearer": nearer}
 
