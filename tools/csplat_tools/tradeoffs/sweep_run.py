@@ -25,7 +25,7 @@ from csplat_tools.console import format_bytes, format_estimate
 from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.optimise.target_encoding import encode_to
 from csplat_tools.optional_packages import describe_machine, require_renderer
-from csplat_tools.study import Reduction, encode_reduced, parse_kmeans
+from csplat_tools.study import Reduction, encode_reduced
 from csplat_tools.tradeoffs.sweep_options import SweepOptions, SweepSetting, read_setting
 from csplat_tools.tradeoffs.sweep_points import (
     DECODE_RUNS,
@@ -269,7 +269,7 @@ def _strategies(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedP
         tau = sweep.opacities[-1]
         yield strategy(f"SH 0, opacity > {tau:g}", Reduction(prune_opacity=tau, sh_degree=0))
     for entries in sweep.kmeans:
-        yield strategy(f"k-means {entries:g}", Reduction(kmeans=parse_kmeans(f"{entries:g}")), "k-means")
+        yield strategy(f"k-means {entries:g}", Reduction(kmeans=round(entries)), "k-means")
     for kept in reversed(range(min(degree, _MOST_DISTILLED))):
         yield strategy(f"SH {kept}, distilled", Reduction(sh_degree=kept, distil=True), "distilled")
 
@@ -357,7 +357,10 @@ def _tuning_views(setting: SweepSetting) -> ViewSet:
     )  # fmt: skip
 
 
-_IMPORTS = "from pathlib import Path; from csplat import EncodeOptions, read_ply; from csplat_tools.study import"
+_IMPORTS = (
+    "from pathlib import Path; from csplat import EncodeOptions, read_ply;"
+    " from csplat_tools.study import Reduction, encode_reduced"
+)
 
 
 def file_name(setting: SweepSetting, name: str) -> str:
@@ -385,16 +388,13 @@ def finetune_command(setting: SweepSetting, name: str, sweep: SweepOptions, keep
 
 def reduction_command(setting: SweepSetting, name: str, preset: str, reduction: Reduction) -> str:
     """Return a Python command for a file of `csplat_tools.study`, which has no csplat command."""
-    names, before, others, views = ["Reduction", "encode_reduced"], "", [], ""
+    before, others, views = "", list[str](), ""
     if reduction.prune_opacity is not None:
         others.append(f"prune_opacity={reduction.prune_opacity!r}")
     if reduction.sh_degree is not None:
         others.append(f"sh_degree={reduction.sh_degree}")
     if reduction.kmeans is not None:
-        names.append("parse_kmeans")
-        sizes = ",".join(f"{attribute}={size:g}" for attribute, size in reduction.kmeans.sizes.items())
-        one = set(reduction.kmeans.sizes.values())
-        others.append(f"kmeans=parse_kmeans({_literal(f'{one.pop():g}' if len(one) == 1 else sizes)})")
+        others.append(f"kmeans={reduction.kmeans}")
     if reduction.distil:
         others.append("distil=True")
         before = "from csplat_tools.views import DataOptions, find_view_set; "
@@ -402,7 +402,7 @@ def reduction_command(setting: SweepSetting, name: str, preset: str, reduction: 
     source = "/dev/stdin" if setting.path == STANDARD_STREAM else setting.path
     arguments = f"scene, Reduction({', '.join(others)}), EncodeOptions(preset={_literal(preset)}){views}"
     program = (
-        f"{_IMPORTS} {', '.join(names)}; {before}scene = read_ply({_literal(source)}); "
+        f"{_IMPORTS}; {before}scene = read_ply({_literal(source)}); "
         f"made = encode_reduced({arguments}); "
         f"Path({_literal(file_name(setting, name))}).write_bytes(made.data)"
     )
