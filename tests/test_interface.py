@@ -224,7 +224,7 @@ def test_a_target_takes_a_model_or_a_file_and_gives_the_same_bytes(files):
         ({}, "no target"),
         ({"psnr": 40.0, "size": 1000}, "one of them"),
         ({"size": "5 parsecs"}, "expected bytes"),
-        ({"errors": {"colour": 1.0}}, "no measure"),
+        ({"errors": {"colour": 1.0}}, "not a measure"),
         ({"errors": {"means": "2mm"}}, "means is '2mm', expected a number"),
         ({"psnr": "40"}, "psnr is '40', expected a number"),
     ],

@@ -386,7 +386,7 @@ def test_a_film_of_one_picture_is_a_picture(tmp_path):
         (("--depth",), 2, "want a folder"),
         (("--fps", "0"), 2, "fps"),
         (("--fps", "101"), 2, "fps"),
-        (("--size", "20000x10"), 1, "at most 16383 pixels a side"),
+        (("--size", "20000x10"), 1, "at most 16383 per side"),
     ],
 )
 def test_what_a_film_cannot_be_is_refused(film_scene, tmp_path, words, status, message):

@@ -286,7 +286,7 @@ def test_a_taken_port_is_refused(scene_path):
         port = other.getsockname()[1]
         with (
             open_viewer_scene(str(scene_path), preset="fast") as scene,
-            pytest.raises(InputError, match=f"port {port} is taken"),
+            pytest.raises(InputError, match=f"port {port} is in use"),
             open_server(scene, port=port),
         ):
             pass

@@ -22,7 +22,6 @@ from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats
 from csplat.scene_source import drop_bands
 from csplat.types import F32, F64, I64, Progress
 from csplat_render import Camera
-from csplat_render.scene_frame import surface_areas
 from csplat_render.scorer import Scorer, renderer
 from csplat_tools.views import ViewSet, find_view_set, shrink_cameras
 
@@ -162,25 +161,6 @@ def prune_opacity(model: SplatModel, tau: float) -> tuple[SplatModel, I64]:
 def _check_threshold(tau: float) -> None:
     if not 0.0 <= tau < 1.0:
         raise InputError(f"the opacity to prune by is {tau:g}, expected at least 0 and less than 1")
-
-
-def prune_share(model: SplatModel, keep: float, *, by_area: bool = False) -> tuple[SplatModel, I64]:
-    """Keep a fraction of the splats: the most opaque ones, or those with the largest opacity × surface area.
-
-    Args:
-        model: the scene.
-        keep: the fraction, above 0, at most 1; at least one splat is kept.
-        by_area: multiply the opacity by the surface area.
-
-    Returns:
-        The kept splats, in their order, and the index of each in the scene, [N] int64.
-    """
-    keys = model.opacities.astype(np.float64)
-    if by_area:
-        keys *= surface_areas(model)
-    pruned_count = len(model) - max(1, round(keep * len(model)))
-    rows = np.sort(np.argsort(keys, kind="stable")[pruned_count:])
-    return model.select(rows), rows
 
 
 @dataclass(frozen=True, eq=False)
