@@ -1,4 +1,4 @@
-"""Rendering of Gaussian splats on the CPU: numba rasteriser with gradients, exact reference, cameras, image metrics."""
+"""Render Gaussian splats on the CPU: numba rasteriser with gradients, exact reference, cameras, image metrics."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ def render(
     sh_degree: int | None = None,
     threads: int | None = None,
 ) -> RenderResult:
-    """Render one image. For many images of one scene, or gradients, keep a `csplat_render.rasteriser.Rasteriser`.
+    """Render one image.
+
+    For many images of one scene, or for gradients, use a `csplat_render.rasteriser.Rasteriser`.
 
     Args:
-        model: a `SplatModel`, or anything with its six arrays. Its origin is not added: cameras
-            are relative to it, as `means` are.
+        model: a `SplatModel`, or an object with its six arrays. Cameras, like `means`, are relative to its origin.
         camera: the camera to render from.
-        background: red, green, blue behind everything.
-        mode: `standard`; `fast`, which leaves out what hardly shows; or `exact`, the slow reference,
-            in float64.
-        antialiased: apply the mip-splatting filter; None for the model's own setting.
-        sh_degree: highest degree of the spherical harmonics; None for the model's.
-        threads: number of threads; None for all.
+        background: red, green, blue of the background.
+        mode: `standard`; `fast`, which omits faint contributions; or `exact`, the slow reference in float64.
+        antialiased: apply the mip-splatting filter; `None`: the model's own setting.
+        sh_degree: highest SH degree; `None`: the model's.
+        threads: number of threads; `None`: all.
 
     Returns:
         `rgb` [H, W, 3] float32, not clipped; `alpha` [H, W]; `depth` [H, W], scene units; and more.
@@ -53,10 +53,10 @@ def render(
         (48, 64, 3)
 
     Raises:
-        InputError: shapes do not fit together, an option has another value, or numba is not installed.
-        LimitError: too many splats are too large: `rasteriser.MAX_INTERSECTIONS`.
+        InputError: array shapes do not match, an option is invalid, or numba is not installed.
+        LimitError: too many large splats: more than `rasteriser.MAX_INTERSECTIONS`.
     """
-    # numba takes a second to import: code that needs only cameras does not wait for it.
+    # Imported lazily: numba takes a second to import, and code that uses only cameras does not need it.
     try:
         from csplat_render.rasteriser import Rasteriser
         from csplat_render.reference_rasteriser import render_exact

@@ -1,7 +1,7 @@
-"""Binning: one sort of all visible splats by depth, then a counting sort into tiles, which is the order of blending.
+"""Binning: a radix sort of all visible splats by depth, then a stable counting sort into tiles, the order of blending.
 
-No result depends on the number of threads: the chunks are fixed, and each writes to a range that a prefix sum over all
-of them has reserved.
+No result depends on the number of threads: chunks of the depth order are fixed, and each writes to a range that a
+prefix sum over all chunks has reserved.
 """
 
 from __future__ import annotations
@@ -19,26 +19,25 @@ TILE = 16
 #: Bits of a pixel position within a tile.
 TILE_BITS = 4
 
-#: Runs of the depth order that are sorted into tiles independently.
+#: Number of runs of the depth order that are sorted into tiles independently.
 CHUNKS = 8
 
-_SMALL_BOX = 6  # tiles; smaller boxes are used as they are, without the ellipse inside
+_SMALL_BOX = 6  # tiles; in boxes up to this size all tiles are used, without intersecting the ellipse
 _DIGIT = 11  # bits per pass of the radix sort; three passes cover a float32
 
 
 @kernel
 def depth_order(depth: Any, keys: Any, order: Any, keys2: Any, order2: Any) -> int:
-    """Sort the splats that are drawn by float32 depth, then by index (radix sort, stable).
+    """Sort the drawn splats by float32 depth, then by index (stable radix sort).
 
     Args:
         depth: [N] float32, above 0 for splats that are drawn.
-        keys: [N] uint32, scratch.
+        keys, keys2: [N] uint32, scratch.
         order: [N] int32, scratch.
-        keys2: [N] uint32, scratch.
-        order2: [N] int32, written: indices of the splats that are drawn, nearest first.
+        order2: [N] int32, written: indices of the drawn splats, nearest first.
 
     Returns:
-        Number of splats that are drawn.
+        Number of drawn splats.
     """
     bits = depth.view(np.uint32)  # positive floats sort like their bits
     buckets = 1 << _DIGIT
@@ -79,7 +78,7 @@ def _scatter(n: int, shift: Any, mask: Any, counts: Any, keys: Any, order: Any, 
 
 @device_function
 def _tile_box(j: int, box: Any) -> tuple[int, int, int, int, bool]:
-    """Return columns and rows of the tiles of a box, and whether it is small: roots would cost more than they save."""
+    """Return the columns and rows of the tiles of a box; and True if it is too small for `_row_span` to pay off."""
     first, last = box[j, 0] >> TILE_BITS, ((box[j, 1] - 1) >> TILE_BITS) + 1
     top, bottom = box[j, 2] >> TILE_BITS, ((box[j, 3] - 1) >> TILE_BITS) + 1
     width, height = last - first, bottom - top
@@ -88,13 +87,16 @@ def _tile_box(j: int, box: Any) -> tuple[int, int, int, int, bool]:
 
 @device_function
 def _row_span(tile_y: int, j: int, extent: Any, box: Any, first: int, last: int) -> tuple[int, int]:
-    """Return first and last + 1 tile of one row of tiles that the ellipse of a splat touches."""
+    """Return the range of tiles in a row of tiles that the ellipse of a splat touches (see "Extent" in `projection`).
+
+    Within the row's heights, the right end of the chord is farthest at the height of the ellipse's rightmost point,
+    clamped to the row, and the left end at the height of its leftmost point.
+    """
     py = extent[j, 5]
     low = max(tile_y * TILE, box[j, 2]) + 0.5 - py
     high = min(tile_y * TILE + TILE, box[j, 3]) - 0.5 - py
     widest = extent[j, 3]
     slope, half, flat = extent[j, 0], extent[j, 1], extent[j, 2]
-    # The heights within this row of tiles where the ellipse extends farthest: to the right, to the left.
     dy = low if widest < low else (high if widest > high else widest)
     t = 1.0 - (dy * flat) * (dy * flat)
     right = dy * slope + half * math.sqrt(t if t > 0.0 else 0.0)
@@ -102,8 +104,8 @@ def _row_span(tile_y: int, j: int, extent: Any, box: Any, first: int, last: int)
     t = 1.0 - (dy * flat) * (dy * flat)
     left = dy * slope - half * math.sqrt(t if t > 0.0 else 0.0)
     if not (left <= right):
-        return first, last  # rounding at the extremes: the box is always correct
-    # A tile's first and last pixel centres lie half a pixel inside it; the other half allows for rounding.
+        return first, last  # NaN by overflow: use the box
+    # Pixel centres are at least half a pixel inside a tile, which leaves a margin for rounding.
     x0, x1 = (extent[j, 4] + left) * (1.0 / TILE), (extent[j, 4] + right) * (1.0 / TILE)
     begin = first if x0 < first else (last if x0 > last else int(x0))
     end = last if x1 > last - 1 else (first if x1 < first else int(x1)) + 1
@@ -114,14 +116,12 @@ def _row_span(tile_y: int, j: int, extent: Any, box: Any, first: int, last: int)
 def gather_by_depth(
     lane: int, lanes: int, order: Any, extent: Any, box: Any, sorted_extent: Any, sorted_box: Any
 ) -> None:
-    """Copy extents and boxes into depth order, so that the sort into tiles reads memory sequentially.
+    """Copy extents and boxes into depth order so that the sort into tiles reads memory sequentially.
 
     Args:
-        order: [V] int32, splats that are drawn, nearest first.
-        extent: [N, 6], see `project`.
-        box: [N, 4], see `project`.
-        sorted_extent: [V, 6], written.
-        sorted_box: [V, 4], written.
+        order: [V] int32, drawn splats, nearest first.
+        extent, box: [N, 6] and [N, 4], see `project`.
+        sorted_extent, sorted_box: [V, 6] and [V, 4], written.
     """
     for j in range(*lane_range(lane, lanes, len(order))):
         i = order[j]
@@ -138,12 +138,11 @@ def count_tiles(
     """Count the splats of each tile; parallel over chunks of the depth order.
 
     Args:
-        order: [V] int32, splats that are drawn, nearest first.
-        extent: [V, 6], see `gather_by_depth`.
-        box: [V, 4], see `gather_by_depth`.
-        tiles_x: tiles side by side.
-        counts: [CHUNKS, tiles] int32, written: splats of each chunk in each tile.
-        touched: [N] int32, written for splats that are drawn: tiles of each; empty without gradients.
+        order: [V] int32, drawn splats, nearest first.
+        extent, box: [V, 6] and [V, 4], see `gather_by_depth`.
+        tiles_x: number of tiles per row.
+        counts: [CHUNKS, tiles] int32, written: number of splats per chunk and tile.
+        touched: [N] int32, written for drawn splats: number of tiles; empty without gradients.
     """
     chunks = counts.shape[0]
     n = len(order)
@@ -169,10 +168,10 @@ def count_tiles(
 
 @kernel
 def tile_starts(counts: Any, starts: Any) -> int:
-    """Turn counts into offsets: the start of each tile, and the start of each chunk within it.
+    """Convert counts to offsets: the start of each tile, and the start of each chunk within it.
 
     Args:
-        counts: [CHUNKS, tiles] int32, replaced by the offsets relative to the tile's start.
+        counts: [CHUNKS, tiles] int32, replaced by offsets relative to the tile's start.
         starts: [tiles + 1] int64, written.
 
     Returns:
@@ -209,15 +208,12 @@ def fill_tiles(
     """Write the splats of each tile, nearest first; parallel over chunks of the depth order.
 
     Args:
-        order: see `count_tiles`, as the next three.
-        extent: [V, 6], see `gather_by_depth`.
-        box: [V, 4], see `gather_by_depth`.
-        tiles_x: tiles side by side.
-        counts: [CHUNKS, tiles] int32, from `tile_starts`; used up.
-        starts: [tiles + 1] int64.
+        order, extent, box, tiles_x: as in `count_tiles`.
+        counts: [CHUNKS, tiles] int32, from `tile_starts`; modified.
+        starts: [tiles + 1] int64, from `tile_starts`.
         ids: [intersections] int32, written: splats, tile by tile.
         offsets: [N + 1] int64, index of each splat's first gradient record; empty without gradients.
-        slots: [intersections] int32, written: the gradient record of each of `ids`.
+        slots: [intersections] int32, written: the gradient record of each entry of `ids`.
         slot_tiles: [intersections] int32, written: the tile of each gradient record.
     """
     chunks = counts.shape[0]
@@ -245,7 +241,7 @@ def fill_tiles(
 
 @kernel
 def record_offsets(depth: Any, touched: Any, offsets: Any) -> None:
-    """Write the index of each splat's first gradient record: the prefix sum of the tiles that each touches."""
+    """Write the index of each splat's first gradient record: the prefix sum of `touched`."""
     total = 0
     for i in range(len(depth)):
         offsets[i] = total

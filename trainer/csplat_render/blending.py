@@ -1,17 +1,25 @@
 """Blending of the splats of each tile, front to back, 16 pixels of a row at a time; and its gradient.
 
-A splat's exponent is rewritten for each tile, in float64, as one polynomial of x for each row, so that float32 is
-enough for the pixels however far away the centre of the splat lies. This is done for a batch of splats at a time,
-because their numbers lie anywhere in memory: the processor fetches many at once.
+Forward, at a pixel, with exponent E = −½ dᵀ Σ⁻¹ d and transmittance T = 1 before the first splat:
 
-Forward, at a pixel, with transmittance T = 1 before the first splat:
+    alpha = min(opacity · exp(E), ALPHA_CAP), and 0 below ALPHA_MIN
+    w = T · alpha
+    colour += w · c
+    T ← T · (1 − alpha)
 
-    alpha = min(opacity · exp(E), ALPHA_CAP), 0 below ALPHA_MIN;  w = T alpha;  colour += w c;  T ← T (1 − alpha)
+In each tile, E is rewritten in float64 as a polynomial of x for each row of pixels, so float32 suffices for the pixels
+however far away the centre of the splat is. This is done for a batch of splats at a time, so that the processor fetches
+their scattered data in parallel.
 
-Backward, the splats are blended once more, front to back. With L the loss, a pixel keeps the product of its gradient
-with all colour, depth and alpha that lies behind, `behind`; each splat subtracts its share `own` = w (g_colour·c +
-g_alpha + g_depth z). Then slope = ∂L/∂E = own − behind · alpha / (1 − alpha), 0 if alpha is capped. Each splat and
-tile has one record of gradients, so that threads share nothing.
+Backward, the splats are blended once more, front to back. With L the loss and g the gradients of a pixel, the pixel
+keeps `behind`, the contribution of all farther splats to g_colour·colour + g_alpha·alpha + g_depth·depth:
+
+    own = w · (g_colour·c + g_alpha + g_depth z)
+    behind ← behind − own
+    slope = ∂L/∂E = own − behind · alpha / (1 − alpha), and 0 if alpha is capped
+
+Each pair of splat and tile has its own record of gradients, so threads share no memory. The slow twin is
+`reference_rasteriser`.
 """
 
 from __future__ import annotations
@@ -24,29 +32,28 @@ import numpy as np
 from csplat_render.binning import TILE
 from csplat_render.kernels import ParallelKernel, device_function, fast_exp2, inlined, parallel_kernel
 
-#: Splats of a batch, after which rows of a tile are checked for being finished.
+#: Number of splats per batch; between batches, finished rows of the tile are skipped.
 BATCH = 16
 
-# Numbers of a splat in a batch: for each row of the tile the constant and the linear coefficient of
-# the exponent of 2, then the quadratic one, opacity, red, green, blue, depth.
+# Columns of a batch: the constant and the linear coefficient of the exponent of 2 for each row of the tile, then the
+# quadratic coefficient, opacity, red, green, blue, depth.
 ROW0, ROW1, TAIL = 0, TILE, 2 * TILE
 BATCH_COLUMNS = TAIL + 6
 
-#: Distance from the corner of a tile to its middle, pixels.
-HALF_TILE = 0.5 * TILE
+HALF_TILE = 0.5 * TILE  # pixels
 
 _LOG2E = math.log2(math.e)
 _CACHE_LINE = 64  # bytes
 
-# If a splat has alpha >= 1/255, the gradient of its exponent is at most √(2 ln 255 / 0.3) ≈ 6 per
-# pixel, and changes by at most 1/0.3 per pixel: in a tile whose centre exceeds these the splat is invisible.
+# Where alpha >= 1/255, the gradient of the exponent is at most √(2 ln 255 / 0.3) ≈ 6 per pixel; it changes by at most
+# 1 / 0.3 per pixel. Beyond these bounds at the centre of a tile, the splat is invisible in the tile.
 _MAX_SLOPE = 1e3
 _MIN_EXPONENT = -1e4
 
 
 @device_function
 def aligned_zeros(size: int, like: Any) -> Any:
-    """Return zeros aligned to a cache line, so that no 16 float32 cross one; `like` has their dtype."""
+    """Return zeros of the dtype of `like`, aligned to a cache line so that no row of 16 float32 crosses one."""
     store = np.zeros(size + _CACHE_LINE // like.itemsize, like.dtype)
     skip = -store.ctypes.data % _CACHE_LINE // like.itemsize
     return store[skip : skip + size]
@@ -54,7 +61,7 @@ def aligned_zeros(size: int, like: Any) -> Any:
 
 @device_function
 def pixel_centres() -> Any:
-    """Return the positions of the 16 pixels of a row, or of the rows, about the middle of a tile; float64."""
+    """Return the positions of 16 pixel centres relative to the centre of a tile, float64."""
     ys = np.empty(TILE, np.float64)
     for y in range(TILE):
         ys[y] = y + (0.5 - HALF_TILE)
@@ -63,19 +70,19 @@ def pixel_centres() -> Any:
 
 @device_function
 def tile_extent(tile: int, tiles_x: int, width: int, height: int) -> tuple[int, int, int, int]:
-    """Return first column and row of a tile, and the number of columns and rows on the image."""
+    """Return the first column and row of a tile, and the number of its columns and rows on the image."""
     X0, Y0 = tile % tiles_x * TILE, tile // tiles_x * TILE
     return X0, Y0, min(TILE, width - X0), min(TILE, height - Y0)
 
 
 @device_function
 def begin_tile(T: Any, columns: int, one: Any) -> None:
-    """Initialise transmittances; columns that are not on the image are finished from the start.
+    """Initialise transmittances; pixels outside the image are finished from the start.
 
     Args:
-        T: [TILE, TILE or more], transmittances, written; a pixel that is finished has a negative one.
+        T: [TILE, TILE or more], transmittances, written; negative for finished pixels.
         columns: number of columns on the image.
-        one: 1, of the dtype of the pixels.
+        one: 1, in the dtype of the pixels.
     """
     for y in range(TILE):
         for x in range(TILE):
@@ -84,13 +91,13 @@ def begin_tile(T: Any, columns: int, one: Any) -> None:
 
 @device_function
 def load_state(state: Any, X0: int, Y0: int, columns: int, high: int, planes: Any) -> None:
-    """Load the state of a tile after nearer splats.
+    """Load the pixels of a tile as blended by an earlier slice of nearer splats.
 
     Args:
-        state: [H, W, 5]: transmittance, negative if a pixel is finished, red, green, blue, and the fifth plane.
+        state: [H, W, 5]: transmittance, negative for finished pixels, red, green, blue, and the fifth plane.
         X0, Y0: first column and row of the tile.
         columns, high: number of columns and rows on the image.
-        planes: [TILE, 5 * TILE or more], written on the image.
+        planes: [TILE, 5 * TILE or more], written for pixels on the image.
     """
     for y in range(high):
         for x in range(columns):
@@ -100,7 +107,7 @@ def load_state(state: Any, X0: int, Y0: int, columns: int, high: int, planes: An
 
 @device_function
 def store_state(state: Any, X0: int, Y0: int, columns: int, high: int, planes: Any) -> None:
-    """Store the state of a tile for farther splats: the inverse of `load_state`."""
+    """Store the pixels of a tile for a later slice: the inverse of `load_state`."""
     for y in range(high):
         for x in range(columns):
             for k in range(5):
@@ -109,7 +116,7 @@ def store_state(state: Any, X0: int, Y0: int, columns: int, high: int, planes: A
 
 @device_function
 def read_planes(image: Any, X0: int, Y0: int, columns: int, high: int, planes: Any, at: int) -> None:
-    """Copy a tile of an image, [H, W, 3], into three consecutive planes of 16 × 16, from `at` on."""
+    """Copy a tile of an image [H, W, 3] into three consecutive planes of 16 × 16, starting at `at`."""
     for y in range(high):
         row = planes[at + y * TILE :]
         for x in range(columns):
@@ -120,10 +127,10 @@ def read_planes(image: Any, X0: int, Y0: int, columns: int, high: int, planes: A
 
 @device_function
 def tile_polynomial(shape: Any, i: int, x: float, y: float) -> tuple[float, float, float, float, float, float, bool]:
-    """Return the exponent of a splat around the point (x, y): c0 + cx·dx + cy·dy + cxx·dx² + cxy·dx·dy + cyy·dy².
+    """Expand the exponent of a splat around (x, y): E = c0 + cx·dx + cy·dy + cxx·dx² + cxy·dx·dy + cyy·dy².
 
     Returns:
-        c0, cx, cy, cxx, cxy, cyy, and whether the splat can be visible in the tile there.
+        c0, cx, cy, cxx, cxy, cyy; and True if the splat may be visible in the tile around this point.
     """
     dx, dy = x - shape[i, 0], y - shape[i, 1]
     a, b, c = shape[i, 2], shape[i, 3], shape[i, 4]
@@ -135,7 +142,7 @@ def tile_polynomial(shape: Any, i: int, x: float, y: float) -> tuple[float, floa
 
 @device_function
 def unfinished_rows(T: Any, low: int, high: int) -> tuple[int, int]:
-    """Narrow a range of rows to those with a pixel that is not finished."""
+    """Shrink a range of rows at both ends until its first and last row have an unfinished pixel."""
     while low < high:
         best = T[low, 0]
         for x in range(1, TILE):
@@ -168,21 +175,18 @@ def gather_batch(
     batch: Any,
     rows: Any,
 ) -> None:
-    """Write the coefficients of some splats in a tile that the loop over pixels needs.
+    """Compute the coefficients of a batch of splats in a tile.
+
+    In row y, the exponent of 2 is quadratic in x: E · log2(e) = (cxx x + cx + cxy y) x + c0 + (cy + cyy y) y.
 
     Args:
-        ids: see `blend`, as shape and box.
-        begin: first of `ids`.
-        end: last of `ids`, plus 1; at most BATCH of them.
-        shape: see `blend`.
-        box: see `blend`.
-        X0: first column of the tile.
-        Y0: first row of the tile.
-        low: first of the tile's rows that is not finished.
-        high: last of them, plus 1.
+        ids, shape, box: as in `blend`.
+        begin, end: range of `ids`, at most BATCH.
+        X0, Y0: first column and row of the tile.
+        low, high: range of the tile's rows that are not finished.
         ys: [TILE] float64, see `pixel_centres`.
         batch: [BATCH, BATCH_COLUMNS], written.
-        rows: [BATCH, 2] int64, written: first row of the tile that each splat may touch, and last plus 1.
+        rows: [BATCH, 2] int64, written: range of the tile's rows that each splat may touch.
     """
     for k in range(begin, end):
         i = ids[k]
@@ -201,13 +205,15 @@ def gather_batch(
 
 @device_function
 def narrow_rows(count: int, batch: Any, rows: Any) -> None:
-    """Narrow the rows of a tile that each splat may touch: the box of a slanted splat is too large.
+    """Narrow the rows that each splat may touch, because the box of a slanted splat is too large.
+
+    A row is dropped if the maximum of the exponent of 2 within it, at x = −c1 / 2a clamped to the tile, is too small.
 
     Args:
-        count: splats of the batch.
-        batch: [BATCH, BATCH_COLUMNS], see `gather_batch`; the last column is the exponent of 2 below which nothing is
-            drawn.
-        rows: [BATCH, 2] int64, changed.
+        count: number of splats in the batch.
+        batch: [BATCH, BATCH_COLUMNS], see `gather_batch`; the last column is the exponent of 2 below which the splat is
+            not drawn.
+        rows: [BATCH, 2] int64, modified.
     """
     edge = np.float32(HALF_TILE - 0.5)
     for j in range(count):
@@ -227,7 +233,7 @@ def narrow_rows(count: int, batch: Any, rows: Any) -> None:
 
 @inlined
 def batch_entry(batch: Any, j: int, first: int) -> tuple[Any, ...]:
-    """Return a splat's columns of a batch: both coefficients by row, from row `first` on; then the scalars."""
+    """Return a splat's entries of a batch: constant and linear coefficients from row `first` on, then the scalars."""
     splat = batch[j]
     row0, row1 = splat[ROW0 + first :], splat[ROW1 + first :]
     return row0, row1, splat[TAIL], splat[TAIL + 1], splat[TAIL + 2], splat[TAIL + 3], splat[TAIL + 4], splat[TAIL + 5]
@@ -235,17 +241,15 @@ def batch_entry(batch: Any, j: int, first: int) -> tuple[Any, ...]:
 
 @inlined
 def alpha_at(x: Any, c0: Any, c1: Any, a: Any, o: Any, alpha_min: Any, alpha_cap: Any, zero: Any) -> tuple[Any, Any]:
-    """Return alpha of a splat at a pixel, without and with cap and floor.
+    """Return alpha of a splat at a pixel, o · 2**((a x + c1) x + c0), without and with thresholds.
 
     Args:
         x: position in the row.
-        c0: constant coefficient of the exponent of 2 in this row.
-        c1: linear coefficient.
-        a: quadratic coefficient.
+        c0, c1, a: constant, linear and quadratic coefficient of the exponent of 2 in this row.
         o: opacity.
-        alpha_min: floor; smaller values become 0.
-        alpha_cap: cap; larger values become this.
-        zero: 0, of the dtype of the pixels.
+        alpha_min: smaller values become 0.
+        alpha_cap: larger values become this.
+        zero: 0, in the dtype of the pixels.
     """
     full = o * fast_exp2(min((a * x + c1) * x + c0, zero))
     alpha = min(full, alpha_cap)
@@ -254,9 +258,9 @@ def alpha_at(x: Any, c0: Any, c1: Any, a: Any, o: Any, alpha_min: Any, alpha_cap
 
 @inlined
 def transmit(before: Any, alpha: Any, stop: Any, zero: Any, one: Any) -> tuple[Any, Any, Any]:
-    """Return whether a pixel continues behind a splat, the splat's weight in it, and its new transmittance.
+    """Return True if a splat does not finish a pixel; its weight in the pixel; and the new transmittance.
 
-    A pixel whose transmittance would fall below `stop` is finished: its transmittance becomes negative and is kept.
+    A pixel whose transmittance would fall below `stop` is finished: its transmittance stays, with a negative sign.
     """
     after = before * (one - alpha)
     going = after >= stop
@@ -264,7 +268,7 @@ def transmit(before: Any, alpha: Any, stop: Any, zero: Any, one: Any) -> tuple[A
 
 
 def _make_blend(counted: bool) -> ParallelKernel[...]:
-    """Make `blend`, or the kernel that stores how far pixels got instead of depth."""
+    """Make `blend`; if `counted`, a variant that stores the position of each pixel's last splat instead of depth."""
 
     @parallel_kernel(relaxed=True)
     def blend(
@@ -286,27 +290,24 @@ def _make_blend(counted: bool) -> ParallelKernel[...]:
         """Blend the splats of every tile; parallel over tiles, vectorised over the 16 pixels of a row.
 
         Args:
-            lane: which of the threads this is.
-            lanes: how many share the tiles; the result does not depend on it.
-            starts: [tiles + 1] int64, where the splats of each tile begin in `ids`.
+            lane, lanes: see `parallel_kernel`; the result does not depend on the number of lanes.
+            starts: [tiles + 1] int64, start of each tile's splats in `ids`.
             ids: [intersections] int32, splats, tile by tile, nearest first.
-            shape: [N, 10] float64, see `project`; if `counted`, see `narrow_rows`.
+            shape: [N, 10] float64, see `project`; if `counted`, its last column is that of `ProjectedView.shape`.
             box: [N, 4] int32, see `project`.
-            tiles_x: tiles side by side.
-            limits: [3], smallest alpha, largest alpha, smallest transmittance; its dtype, float32 or
-                float64, is that of the pixels.
+            tiles_x: number of tiles per row.
+            limits: [3], minimum alpha, maximum alpha, minimum transmittance; float32 or float64, the dtype of pixels.
             background: [3].
             rgb: [H, W, 3], written.
             transmittance: [H, W], written: weight of the background.
-            fifth: [H, W], written: the sum of weight · depth; if `counted`, the position, from its tile's start, of the
-                last splat before the pixel was finished of those whose rows contain it, −1 if there is none.
-            used: [tiles] int64, written: the end of the splats that were blended, per tile.
-            state: [H, W, 5], changed: the pixels after nearer splats, see `load_state`; empty if there are none, and
-                then nothing is stored for farther ones.
+            fifth: [H, W], written: the sum of weight · depth; if `counted`, the position, relative to its tile's start,
+                of the last splat that covers the pixel's row before the pixel is finished, −1 if there is none.
+            used: [tiles] int64, written: end of the blended splats of each tile.
+            state: [H, W, 5], modified: the pixels after an earlier slice, see `load_state`; empty: there are no slices.
         """
         height, width = transmittance.shape
-        # One row of memory per row of pixels, so that the compiler sees that they do not overlap:
-        # 16 transmittances, then 16 each of red, green, blue, the fifth; and the positions in a row.
+        # One row of memory per row of pixels, so that the compiler knows that they do not overlap: 16 transmittances,
+        # then 16 values each of red, green, blue and the fifth plane, and the positions in a row.
         planes = aligned_zeros(TILE * 6 * TILE, limits).reshape((TILE, 6 * TILE))
         ys = pixel_centres()
         for y in range(TILE):
@@ -374,14 +375,14 @@ blend = _make_blend(counted=False)
 blend_counted = _make_blend(counted=True)
 
 
-#: Numbers per record: moments of the exponent's gradient (1, x, y, xx, xy, yy, about the centre of
-#: the tile), gradients of red, green, blue and depth.
+#: Numbers per record: moments of slope about the centre of the tile (1, x, y, xx, xy, yy), and gradients with respect
+#: to red, green, blue and depth.
 RECORD = 10
 
 _AREA = TILE * TILE
 
-# Offsets of the planes of a tile: transmittance, the gradient's product with all that lies behind,
-# gradients, slope and weight of the current splat, positions about the centre of the tile.
+# Offsets of the planes of a tile: after transmittance, `behind`, the gradients, slope and weight of the current splat,
+# and positions relative to the centre of the tile.
 _BEHIND, _RED, _GREEN, _BLUE, _ALPHA, _DEPTH, _SLOPE, _WEIGHT, _X, _Y = (_AREA * k for k in range(1, 11))
 _PLANES = 11
 
@@ -409,26 +410,16 @@ def blend_backward(
     """Compute one record of gradients per splat and tile; parallel over tiles, vectorised over the pixels of a row.
 
     Args:
-        lane: which of the threads this is.
-        lanes: how many share the tiles; the result does not depend on it.
-        starts: see `blend`.
-        used: [tiles] int64, as `blend` wrote it.
-        ids: see `blend`.
-        slots: [intersections] int32, the record of each of `ids`.
-        shape: see `blend`, as the next three.
-        box: see `blend`.
-        tiles_x: see `blend`.
-        limits: see `blend`.
-        rgb: [H, W, 3], as `blend` wrote it, as the next two.
-        transmittance: [H, W].
-        depth: [H, W].
-        grad_rgb: [H, W, 3], gradient of the loss.
-        grad_alpha: [H, W], the same for alpha = 1 − transmittance.
-        grad_depth: [H, W], the same for depth.
+        lane, lanes, starts, ids, shape, box, tiles_x, limits: as in `blend`.
+        used, rgb, transmittance, depth: results of `blend`.
+        slots: [intersections] int32, the record of each entry of `ids`.
+        grad_rgb: [H, W, 3], gradient of the loss with respect to rgb.
+        grad_alpha: [H, W], gradient with respect to alpha = 1 − transmittance.
+        grad_depth: [H, W], gradient with respect to depth.
         records: [intersections, RECORD], written.
     """
     height, width = transmittance.shape
-    # Planes of 16 × 16, one after the other, in one array: the compiler sees which parts overlap.
+    # Planes of 16 × 16 one after the other in one array, so that the compiler knows which parts overlap.
     planes = aligned_zeros(_PLANES * _AREA, limits)
     T = planes[:_AREA].reshape((TILE, TILE))
     ys = pixel_centres()
@@ -477,7 +468,6 @@ def blend_backward(
                         own = weight * (colour + row[_ALPHA + x] + row[_DEPTH + x] * d)
                         behind = row[_BEHIND + x] - own
                         row[_BEHIND + x] = behind
-                        # Colour of this splat against the colour behind; 0 if alpha is capped.
                         slope = own - behind * alpha / (one - alpha)
                         slope = slope if going else zero
                         row[_SLOPE + x] = slope if full < alpha_cap else zero

@@ -1,4 +1,4 @@
-"""A pinhole camera, cameras that look at a point or orbit it, and sets of cameras."""
+"""A pinhole camera, cameras that look at or orbit a point, and sets of cameras."""
 
 from __future__ import annotations
 
@@ -13,33 +13,31 @@ from numpy.typing import ArrayLike, NDArray
 from csplat.errors import InputError
 from csplat.types import F64, Mask
 
-#: Distance of the near plane in scene units, if a camera does not specify it.
+#: Default distance of the near plane, scene units.
 DEFAULT_NEAR = 0.2
 
-#: Largest width and height of an image, in pixels.
+#: Maximum width and height of an image, pixels.
 MAX_IMAGE_SIZE = 1 << 15
 
-_ROTATION_TOLERANCE = 1e-3  # of the entries of R Rᵀ − 1; camera files hold few digits
+_ROTATION_TOLERANCE = 1e-3  # for the entries of R Rᵀ − 1; camera files have few digits
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A pinhole camera: its pose, its intrinsics, and the size of its image.
 
-    A point p of the world has camera coordinates c = viewmat · p (x to the right, y down, z
-    forward) and falls on the image at K · c / c_z, in pixels; the centre of the first pixel lies
-    at (0.5, 0.5). Skew is not supported: K holds focal lengths and principal point alone.
+    A world point p has the camera coordinates c = viewmat · p (x right, y down, z forward) and the image position
+    K · c / c_z, in pixels. The centre of the first pixel is at (0.5, 0.5). Skew is not supported.
 
     Attributes:
         K: [3, 3] float64, (fx, 0, cx; 0, fy, cy; 0, 0, 1), in pixels, fx and fy above 0.
         viewmat: [4, 4] float64, world to camera, a rotation and a translation.
-        W: width of the image in pixels.
-        H: height of the image in pixels.
-        near: distance of the near plane, scene units; splats whose centre is not beyond it are not drawn.
-        image: name of the view's image file, if there is one.
+        W, H: width and height of the image, pixels.
+        near: distance of the near plane, scene units; splats are drawn only if their centre is beyond it.
+        image: name of the view's image file; `None`: there is none.
 
     Raises:
-        InputError: a field has another shape or value than described above.
+        InputError: a field has an invalid shape or value.
     """
 
     K: F64
@@ -56,17 +54,17 @@ class Camera:
             object.__setattr__(self, name, _checked_size(name, getattr(self, name)))
         object.__setattr__(self, "near", _checked_near(self.near))
         if self.image is not None and not isinstance(self.image, str):
-            raise InputError(f"the camera's image is {self.image!r}, expected a name or nothing")
+            raise InputError(f"the camera's image is {self.image!r}, expected a name or None")
         _check_intrinsics(self.K)
         _check_pose(self.viewmat)
 
     @property
     def position(self) -> F64:
-        """Position of the camera in world coordinates, [3]."""
+        """Position of the camera, [3], world coordinates."""
         return np.asarray(-np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3]), np.float64)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the camera as one entry of a camera file, a JSON object."""
+        """Return the camera as an entry of a camera file, a JSON object."""
         entry: dict[str, Any] = {
             "K": self.K.tolist(),
             "viewmat": self.viewmat.tolist(),
@@ -80,13 +78,13 @@ class Camera:
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Camera:
-        """Make a camera from one entry of a camera file; unknown keys are ignored.
+        """Build a camera from an entry of a camera file; unknown keys are ignored.
 
         Args:
-            entry: K, viewmat, W, H and, if they are not the defaults, near and image.
+            entry: K, viewmat, W, H and, optionally, near and image.
 
         Raises:
-            InputError: a key is missing or a value is not valid for `Camera`.
+            InputError: a key is missing or a value is invalid.
         """
         if not isinstance(entry, Mapping):
             raise InputError(f"a camera is a {type(entry).__name__}, expected an object with K, viewmat, W and H")
@@ -98,7 +96,7 @@ class Camera:
         return cls(entry["K"], entry["viewmat"], entry["W"], entry["H"], near, image)
 
 
-_ROW_TOLERANCE = 1e-5  # difference of a value of the last row; files hold few digits, or products of matrices
+_ROW_TOLERANCE = 1e-5  # for values of the last row; files have few digits, or products of matrices
 
 
 def check_last_row(pose: F64, name: str) -> None:
@@ -106,17 +104,17 @@ def check_last_row(pose: F64, name: str) -> None:
 
     Args:
         pose: [4, 4].
-        name: name of the field and its place in the file.
+        name: name of the field and its place in the file, for messages.
 
     Raises:
-        InputError: its last row is not 0 0 0 1.
+        InputError: the last row is not 0 0 0 1.
     """
-    wanted = (0.0, 0.0, 0.0, 1.0)
-    if np.abs(pose[3] - wanted).max() <= _ROW_TOLERANCE:
+    expected = (0.0, 0.0, 0.0, 1.0)
+    if np.abs(pose[3] - expected).max() <= _ROW_TOLERANCE:
         return
     found = " ".join(f"{value:.9g}" for value in pose[3])
-    by_columns = (pose[:, 3] == wanted).all()
-    hint = ": its last column is that, so it is transposed" if by_columns else ""
+    by_columns = (pose[:, 3] == expected).all()
+    hint = ": the last column is 0 0 0 1, so it is transposed" if by_columns else ""
     raise InputError(f"{name} has the last row {found}, expected 0 0 0 1{hint}")
 
 
@@ -128,7 +126,7 @@ def _checked_matrix(name: str, value: ArrayLike, size: int) -> F64:
     if matrix.shape != (size, size):
         raise InputError(f"the camera's {name} has shape {list(matrix.shape)}, expected [{size}, {size}]")
     if not np.isfinite(matrix).all():
-        raise InputError(f"the camera's {name} holds values that are NaN or infinite")
+        raise InputError(f"the camera's {name} contains NaN or infinity")
     matrix.flags.writeable = False
     return matrix
 
@@ -169,16 +167,16 @@ def _check_pose(viewmat: F64) -> None:
 
 
 _PARALLEL = 1e-6  # sine of the angle below which two directions count as parallel
-_OUTLIER_DISTANCE = 20.0  # times the median distance from the middle, beyond which a camera may be an outlier
-_OUTLIER_GAP = 4.0  # times the largest distance of the other cameras, beyond which it is one
-_CONVERGENT = 0.7  # `convergence` from which cameras look at one subject
-_MOST_OUTLIERS = 1.0 / 3.0  # fraction of the cameras; more of them are part of the set
+_OUTLIER_DISTANCE = 20.0  # minimum distance of an outlier from the middle, in median distances of all cameras
+_OUTLIER_GAP = 4.0  # minimum distance of an outlier, in largest distances of the other cameras
+_CONVERGENT = 0.7  # minimum `convergence` of cameras that look at one subject
+_MOST_OUTLIERS = 1.0 / 3.0  # maximum fraction of outliers
 
 
 def central_camera(cameras: Sequence[Camera]) -> Camera:
-    """Return the most typical camera of a set: the one nearest to the mean position and viewing direction.
+    """Return the most typical camera of a set: the nearest to the mean position and viewing direction.
 
-    Positions are measured in units of the mean distance from their mean.
+    Distances of positions are in units of their mean distance from the mean position.
 
     Args:
         cameras: at least one.
@@ -193,21 +191,21 @@ def central_camera(cameras: Sequence[Camera]) -> Camera:
 
 
 def camera_outliers(viewmats: F64, points: NDArray[np.floating] | None = None) -> Mask:
-    """Find cameras far away from all others, as structure from motion leaves them when it fails.
+    """Find cameras that are far away from all others, for example due to failures of structure from motion.
 
-    The subject of the cameras counts, too: in a set whose cameras are close together, a camera no farther away than
-    the subject is no outlier. Distances that grow gradually (a flight towards a building) belong to the set.
+    The distance of the subject matters, too: if cameras are close together, a camera no farther away than the subject
+    is not an outlier. Nor are distances that grow gradually, as in a flight towards a building.
 
     Args:
         viewmats: [N, 4, 4], world to camera, OpenCV axes.
-        points: [P, 3], points of the scene, if they are known.
+        points: [P, 3], points of the scene; `None`: unknown.
 
     Returns:
         [N], True for outliers: none among fewer than four cameras, at most a third of all.
     """
     positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     middle = np.median(positions, axis=0)
-    with np.errstate(over="ignore"):  # beyond the square root of float64 all are infinitely far away
+    with np.errstate(over="ignore"):  # squares may overflow to infinity
         distances = np.sqrt(np.sum((positions - middle) ** 2, axis=1))
     order = np.argsort(distances, kind="stable")
     away = distances[order]
@@ -219,7 +217,7 @@ def camera_outliers(viewmats: F64, points: NDArray[np.floating] | None = None) -
             subject = np.median(points, axis=0)
         else:
             near, axes = positions[others] - middle, viewmats[others, 2, :3]
-            if convergence(near, axes) < _CONVERGENT:  # a tripod, a street: the size of the scene is unknown
+            if convergence(near, axes) < _CONVERGENT:  # tripod or street: the size of the scene is unknown
                 continue
             subject = nearest_point(near, axes) + middle
         if away[first] > _OUTLIER_DISTANCE * float(np.sqrt(np.sum((subject - middle) ** 2))):
@@ -236,7 +234,7 @@ def convergence(positions: F64, axes: F64) -> float:
         axes: [N, 3], viewing directions, unit length.
 
     Returns:
-        1 for cameras around a subject, -1 for cameras that look away from their middle.
+        1 for cameras around a subject, −1 for cameras that look outwards.
     """
     towards = nearest_point(positions, axes) - positions
     lengths = np.maximum(np.linalg.norm(towards, axis=1), np.finfo(np.float64).tiny)
@@ -244,14 +242,14 @@ def convergence(positions: F64, axes: F64) -> float:
 
 
 def nearest_point(positions: F64, axes: F64) -> F64:
-    """Find the point nearest to all lines of sight, by least squares over the distances from the lines.
+    """Find the point nearest to all lines of sight by least squares: minimise Σ |(I − a aᵀ)(x − p)|² over x.
 
     Args:
-        positions: [N, 3], positions of cameras.
-        axes: [N, 3], viewing directions, unit length.
+        positions: [N, 3], positions p of cameras.
+        axes: [N, 3], viewing directions a, unit length.
 
     Returns:
-        [3]. For parallel lines, the point nearest to the mean position, which has a small weight.
+        [3]. A small additional term favours points near the mean position, which matters for parallel lines.
     """
     weight = 1e-6 * len(positions)
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -261,10 +259,10 @@ def nearest_point(positions: F64, axes: F64) -> F64:
 
 
 def relative_to(origin: Sequence[float] | F64, camera: Camera) -> Camera:
-    """Return the same camera for a scene whose coordinates are relative to an origin.
+    """Return the camera for scene coordinates that are relative to an origin.
 
     Args:
-        origin: [3], in the camera's coordinates.
+        origin: [3], in the world coordinates of the camera.
         camera: the camera to move.
     """
     shift = np.asarray(origin, np.float64)
@@ -276,25 +274,24 @@ def relative_to(origin: Sequence[float] | F64, camera: Camera) -> Camera:
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """Return a camera of the same view with an image of another size.
+    """Return the camera with another image size.
 
     Raises:
-        InputError: the aspect ratio would change by more than the rounding of a pixel.
+        InputError: the aspect ratio changes by more than the rounding of a pixel.
     """
     across, down = width / camera.W, height / camera.H
     if abs(camera.H * across - height) > 1.0 and abs(camera.W * down - width) > 1.0:
         raise InputError(
-            f"a camera takes pictures of {camera.W}x{camera.H} pixels: at {width}x{height} they would be distorted"
+            f"the camera's image has {camera.W}x{camera.H} pixels: at {width}x{height} it would be distorted"
         )
     return replace(camera, K=np.diag([across, down, 1.0]) @ camera.K, W=width, H=height)
 
 
 def intrinsics(width: int, height: int, field_of_view: float) -> F64:
-    """Return K of a camera whose principal point is the middle of its image.
+    """Return K of a camera whose principal point is the centre of its image.
 
     Args:
-        width: pixels.
-        height: pixels.
+        width, height: pixels.
         field_of_view: horizontal, degrees, above 0 and below 180.
 
     Returns:
@@ -316,27 +313,26 @@ def look_at(
     near: float = DEFAULT_NEAR,
     image: str | None = None,
 ) -> Camera:
-    """Return a camera at one point that looks at another.
+    """Return a camera that looks at a point.
 
     Args:
         position: [3], position of the camera.
         target: [3], the point shown at the principal point.
-        up: [3], the direction that points upwards in the image; if it is parallel to the line of sight, any
-            direction across is used.
+        up: [3], the direction that points upwards in the image; if it is parallel to the line of sight, an arbitrary
+            perpendicular direction is used.
         K: [3, 3], intrinsics.
-        width: pixels.
-        height: pixels.
+        width, height: pixels.
         near: near plane, scene units.
         image: name of an image file.
 
     Raises:
-        InputError: position and target are the same point.
+        InputError: position and target are equal.
     """
     eye = np.array(position, np.float64)
     forward = np.array(target, np.float64) - eye
     length = math.sqrt(float(np.sum(forward**2)))
     if not (math.isfinite(length) and length > 0.0):
-        raise InputError("a camera cannot look at the point where it stands")
+        raise InputError("the camera's position and target are the same point")
     forward = forward / length
     right = _cross(forward, np.array(up, np.float64))
     if math.sqrt(float(np.sum(right**2))) <= _PARALLEL:
@@ -346,7 +342,7 @@ def look_at(
     viewmat = np.eye(4)
     for row, axis in enumerate((right, down, forward)):
         viewmat[row, :3] = axis
-        viewmat[row, 3] = -float(np.sum(axis * eye))  # no BLAS: the same for any number of threads
+        viewmat[row, 3] = -float(np.sum(axis * eye))  # without BLAS, so the result does not depend on threads
     return Camera(K, viewmat, width, height, near, image)
 
 
@@ -355,11 +351,11 @@ def direction_at(up: ArrayLike, azimuth: float, elevation: float) -> F64:
 
     Args:
         up: [3], unit length, the up direction.
-        azimuth: degrees around `up`, right-handed.
+        azimuth: degrees around `up`, right-handed; 0 is the scene axis most nearly perpendicular to `up`.
         elevation: degrees above the horizon.
 
     Returns:
-        [3] float64. Azimuth 0 is an axis of the scene that lies most nearly across `up`.
+        [3] float64.
     """
     u = np.array(up, np.float64)
     first = np.eye(3)[int(np.argmin(np.abs(u)))]
@@ -372,7 +368,7 @@ def direction_at(up: ArrayLike, azimuth: float, elevation: float) -> F64:
 
 
 def _cross(a: F64, b: F64) -> F64:
-    """Return `np.cross` of two vectors, to the bit, without its overhead: cameras are tried by the hundred."""
+    """Return `np.cross` of two vectors, bit for bit, without its overhead, which matters for hundreds of cameras."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
@@ -388,16 +384,15 @@ def orbit(
     elevation: float = 20.0,
     near: float = DEFAULT_NEAR,
 ) -> list[Camera]:
-    """Return cameras on a full circle around a point, all looking at it.
+    """Return evenly spaced cameras on a circle around a point, looking at it.
 
     Args:
-        centre: [3], the point they look at.
-        distance: from the centre, scene units, above 0.
+        centre: [3], the point to look at.
+        distance: distance from the centre, scene units, above 0.
         up: [3], unit length, the axis of the circle.
-        count: number of cameras, evenly spaced.
+        count: number of cameras, at least 1.
         K: [3, 3], intrinsics.
-        width: pixels.
-        height: pixels.
+        width, height: pixels.
         elevation: degrees above the horizon, above −90 and below 90.
         near: near plane, scene units.
     """

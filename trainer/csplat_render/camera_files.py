@@ -1,9 +1,9 @@
-"""Camera files: ours, and those of other programs.
+"""Read and write camera files of csplat, and read those of other programs.
 
-* Ours: a JSON list of {K, viewmat, W, H, near, image}: world to camera, OpenCV axes, pixel centres at +0.5; `near` and
-  `image` are optional.
+* csplat: a JSON list of {K, viewmat, W, H, near, image}: world to camera, OpenCV axes, pixel centres at +0.5; `near`
+  and `image` are optional.
 * cameras.json of INRIA: a list of {id, img_name, width, height, position, rotation, fx, fy}; `rotation` is camera to
-  world by rows, OpenCV axes; the principal point is the middle.
+  world by rows, OpenCV axes; the principal point is the centre of the image.
 * Camera paths of nerfstudio: {render_width, render_height, camera_path: [{camera_to_world, fov, aspect}]}; 16 numbers
   by rows, OpenGL axes: x right, y up, z backwards; `fov` is vertical, in degrees.
 * transforms.json of instant-ngp and nerfstudio: {w, h, fl_x or camera_angle_x, frames: [{file_path,
@@ -25,17 +25,17 @@ from csplat.errors import InputError, counted
 from csplat.types import F64
 from csplat_render.camera import DEFAULT_NEAR, Camera, check_last_row, relative_to
 
-#: Models of transforms.json that are a pinhole with OpenCV's distortion, or without; "" where none is named.
+#: Camera models of transforms.json that are a pinhole with or without OpenCV's distortion; "" if none is specified.
 PERSPECTIVES = ("", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
-_ORIGIN_FAR = 100.0  # distance of an origin from 0, in distances of the cameras from it: map coordinates
+_ORIGIN_FAR = 100.0  # minimum distance of an origin in map coordinates from 0, in distances of the cameras from it
 _FOCAL_RANGE = (0.05, 500.0)  # focal length relative to the image's side: 169 to 0.1 degrees of view (satellites)
-_MAX_FOCAL_RATIO = 3.0  # ratio of the focal lengths across and down
-_OFF_CENTRE = 10.0  # largest distance of the principal point, in sides of the image
-_SWAPPED = 0.02  # relative difference of a principal point from half of the other side
+_MAX_FOCAL_RATIO = 3.0  # between the horizontal and vertical focal length
+_OFF_CENTRE = 10.0  # maximum distance of the principal point from 0, relative to the image's side
+_SWAPPED = 0.02  # tolerance for a principal point that fits the swapped image size, relative to half a side
 _NERFSTUDIO_NEAR = 0.01  # near plane of nerfstudio's renderer, scene units
 _SCALE_TOLERANCE = 1e-3
-_ANGLE_TOLERANCE = 0.01  # relative difference of a focal length and an angle of view; files hold few digits
+_ANGLE_TOLERANCE = 0.01  # relative difference between a focal length and an angle of view; files have few digits
 _LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")  # distortion_params
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
@@ -46,16 +46,17 @@ def load_cameras(
     """Read a camera file.
 
     Args:
-        path: a JSON file, see above. Its cameras are relative to the scene's origin, unless that is a hundred times as
-            far from 0 as from the middle of the cameras: then they are in map coordinates, and it is subtracted.
-        report: lines on how the file was understood are appended.
+        path: a JSON file in a format listed above. Its cameras are relative to the scene's origin. But if the origin is
+            more than a hundred times farther from 0 than from the cameras, they are in map coordinates, and the origin
+            is subtracted.
+        report: lines about the interpretation of the file are appended.
         origin: [3], origin of the scene.
 
     Returns:
-        Its cameras, at least one, relative to the origin.
+        The cameras, at least one, relative to the origin.
 
     Raises:
-        InputError: the file is absent, is not JSON, or does not hold cameras.
+        InputError: the file does not exist, is not JSON, or contains no cameras.
     """
     path, report = Path(path), [] if report is None else report
     entries = read_json(path)
@@ -68,13 +69,13 @@ def load_cameras(
         check_intrinsics(focals, middle, (camera.W, camera.H), f"{path}, camera {number}")
     away = np.median([camera.position for camera in cameras], axis=0) - origin
     if _ORIGIN_FAR * float(np.linalg.norm(away)) < float(np.linalg.norm(origin)):
-        report.append(f"{path}: the cameras stand around the scene's origin, which is taken off their coordinates")
+        report.append(f"{path}: the cameras are around the scene's origin, which is subtracted from their coordinates")
         cameras = [relative_to(origin, camera) for camera in cameras]
     return cameras
 
 
 def save_cameras(path: str | Path, cameras: Sequence[Camera]) -> None:
-    """Write a camera file that `load_cameras` reads back without loss."""
+    """Write a camera file that `load_cameras` reads without loss."""
     text = ",\n".join(json.dumps(camera.to_json(), allow_nan=False) for camera in cameras)
     Path(path).write_text(f"[\n{text}\n]\n", "utf-8")
 
@@ -85,18 +86,19 @@ def parse_foreign_cameras(document: object, where: str, report: list[str]) -> li
     Args:
         document: contents of a JSON file.
         where: the file, for messages.
-        report: a line on how the file was understood is appended.
+        report: lines about the interpretation of the file are appended.
 
     Returns:
-        Its cameras; `None` if it has none of the formats above.
+        The cameras; `None` if the file has none of the formats listed above.
 
     Raises:
         InputError: a field is missing or not a number, or a pose is invalid.
     """
     if isinstance(document, list) and document and isinstance(document[0], Mapping) and "rotation" in document[0]:
         cameras = _parse_each(document, where, "camera", _parse_inria)
-        many = counted(len(cameras), "camera")
-        report.append(f"{where} is a cameras.json of INRIA: {many}, principal points in the middle")
+        report.append(
+            f"{where} is a cameras.json of INRIA: {counted(len(cameras), 'camera')}, principal points in the middle"
+        )
         return cameras
     if not isinstance(document, Mapping):
         return None
@@ -111,13 +113,13 @@ def parse_foreign_cameras(document: object, where: str, report: list[str]) -> li
         report.append(f"{where} is a transforms.json: {counted(len(cameras), 'camera')}")
         report += describe_scales([frame["transform_matrix"] for frame in document["frames"]], where)
         if any(one.get(key) for key in _DISTORTION for one in (document, *document["frames"])):
-            report.append(f"{where}: the distortion of its lens is left out, renders are straight")
+            report.append(f"{where}: lens distortion is ignored, renders are rectilinear")
         return cameras
     return None
 
 
 def frame_values(document: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of a frame of a transforms.json: its own, else those for all frames."""
+    """Return the values of a frame of a transforms.json, which override those of all frames."""
     own = {**frame, **_intrinsics_of_matrix(frame)}
     values = {**document, **own}
     listed = values.get("distortion_params")  # nerfstudio
@@ -133,7 +135,7 @@ def frame_values(document: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[
 
 
 def _intrinsics_of_matrix(frame: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of a frame's `intrinsic_matrix` (NeuS2) under the names of instant-ngp."""
+    """Return the entries of a frame's `intrinsic_matrix` (NeuS2) under the names of instant-ngp."""
     if "intrinsic_matrix" not in frame or "fl_x" in frame:
         return {}
     try:
@@ -149,16 +151,16 @@ def _intrinsics_of_matrix(frame: Mapping[str, Any]) -> dict[str, Any]:
 def check_intrinsics(
     focals: tuple[float, float], middle: tuple[float, float], size: tuple[float, float], where: str
 ) -> None:
-    """Check intrinsics for plausibility: focal lengths in other units, swapped numbers.
+    """Check that intrinsics are plausible; detects focal lengths in other units and swapped numbers.
 
     Args:
-        focals: across and down, pixels.
-        middle: the principal point, pixels.
+        focals: horizontal and vertical focal length, pixels.
+        middle: principal point, pixels.
         size: width and height, pixels.
         where: file and place, for messages; "" for none.
 
     Raises:
-        InputError: no camera has such intrinsics.
+        InputError: the intrinsics are implausible.
     """
     where = f"{where}: " if where else ""
     (fx, fy), (cx, cy), (width, height) = focals, middle, size
@@ -167,28 +169,28 @@ def check_intrinsics(
         if not low <= focal / side <= high:
             raise InputError(
                 f"{where}the focal length {name} is {focal:g} for {side:g} pixels, expected {low * side:g} to "
-                f"{high * side:g}: it is in pixels of images of that size, not in millimetres or other units"
+                f"{high * side:g}: specify it in pixels of images of that size, not in millimetres or other units"
             )
     if not 1.0 / _MAX_FOCAL_RATIO <= fx / fy <= _MAX_FOCAL_RATIO:
         raise InputError(
             f"{where}the focal lengths are {fx:g} across and {fy:g} down, expected about the same: one of them is wrong"
         )
     point = f"{where}the principal point is {cx:g} {cy:g} in {width:g}×{height:g} pixels"
-    far = _OFF_CENTRE  # images that are tiles of a larger one have it outside of themselves
+    far = _OFF_CENTRE  # outside the image if that is a tile of a larger one
     if not (-far * width <= cx <= far * width and -far * height <= cy <= far * height):
         raise InputError(f"{point}, expected about the middle")
     away = max(abs(2.0 * cx / width - 1.0), abs(2.0 * cy / height - 1.0))
     away_if_swapped = max(abs(2.0 * cx / height - 1.0), abs(2.0 * cy / width - 1.0))
     if away_if_swapped <= _SWAPPED < away:
-        wanted = f"{0.5 * width:g} {0.5 * height:g}"
-        raise InputError(f"{point}, expected about {wanted}: width and height, or its two numbers, are swapped")
+        middle_text = f"{0.5 * width:g} {0.5 * height:g}"
+        raise InputError(f"{point}, expected about {middle_text}: width and height, or its two numbers, are swapped")
 
 
 def finite_number(values: Mapping[str, Any], key: str, where: str, default: float | None = None) -> float:
     """Look up a finite number.
 
     Raises:
-        InputError: it is missing without a default, or not a finite number.
+        InputError: the value is missing without a default, or not a finite number.
     """
     value = values.get(key)
     if value is None and default is not None:
@@ -205,26 +207,25 @@ def finite_number(values: Mapping[str, Any], key: str, where: str, default: floa
 def focal_lengths(
     values: Mapping[str, Any], width: float, height: float, where: str, *, fisheye: bool = False
 ) -> tuple[float, float]:
-    """Return the focal lengths of a transforms.json, which may give angles of view instead.
+    """Return the focal lengths of a transforms.json, which may specify angles of view instead.
 
     Args:
-        values: fl_x, fl_y, camera_angle_x, camera_angle_y: one at least.
-        width: width of the images, pixels.
-        height: height of the images, pixels.
+        values: at least one of fl_x, fl_y, camera_angle_x, camera_angle_y.
+        width, height: size of the images, pixels.
         where: file and place, for messages.
-        fisheye: angles of view are not those of a pinhole: they are not compared with focal lengths.
+        fisheye: do not compare angles of view with focal lengths, because they are not those of a pinhole.
 
     Returns:
-        Across and down, pixels; equal if one is given.
+        The horizontal and vertical focal length, pixels; equal if only one is specified.
 
     Raises:
-        InputError: none is given, one is out of range, or two contradict each other.
+        InputError: there is none, one is out of range, or two contradict each other.
     """
     fx = _focal(values, "x", width, where, fisheye=fisheye)
     fy = _focal(values, "y", height, where, fisheye=fisheye)
     if fx is None and fy is None:
         raise InputError(f"{where}: no focal length, expected fl_x or camera_angle_x")
-    fx, fy = fx or fy, fy or fx  # square pixels unless both are named
+    fx, fy = fx or fy, fy or fx  # square pixels unless both are specified
     assert fx is not None
     assert fy is not None
     return fx, fy
@@ -239,7 +240,7 @@ def viewmat_of_opengl(matrix: Any, name: str, where: str) -> F64:
         where: file and place, for messages.
 
     Raises:
-        InputError: it is not a rotation with a translation, up to one scale.
+        InputError: the matrix is not a rotation with a translation, up to a common scale.
     """
     try:
         pose = np.array(matrix, np.float64)
@@ -251,7 +252,7 @@ def viewmat_of_opengl(matrix: Any, name: str, where: str) -> F64:
         check_last_row(pose, f"{where}: {name}")
     axes = pose[:3, :3] * np.array([1.0, -1.0, -1.0])
     lengths = np.linalg.norm(axes, axis=0)
-    scale = float(lengths.mean())  # some exporters leave the scale of the world in the axes
+    scale = float(lengths.mean())  # some exporters include the scale of the world in the axes
     determinant = float(np.linalg.det(axes))
     if not (scale > 0.0 and determinant > 0.0 and np.abs(lengths / scale - 1.0).max() <= _SCALE_TOLERANCE):
         found = ", ".join(f"{length:.4g}" for length in lengths)
@@ -259,7 +260,7 @@ def viewmat_of_opengl(matrix: Any, name: str, where: str) -> F64:
             f"{where}: {name} begins with axes of lengths {found} and determinant {determinant:.4g}, expected a "
             "rotation: it is mirrored, sheared or zero"
         )
-    u, _, vt = np.linalg.svd(axes / scale)  # the nearest rotation: files hold few digits
+    u, _, vt = np.linalg.svd(axes / scale)  # u vᵀ is the nearest rotation: files have few digits
     viewmat = np.eye(4)
     viewmat[:3, :3] = (u @ vt).T
     viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:3, 3]
@@ -270,16 +271,14 @@ def describe_scales(matrices: Sequence[Any], where: str) -> list[str]:
     """Report poses with a scale in their axes, which `viewmat_of_opengl` removes.
 
     Args:
-        matrices: the poses, as for `viewmat_of_opengl`.
+        matrices: the poses, valid for `viewmat_of_opengl`.
         where: the file, for messages.
     """
     scales = [float(np.linalg.norm(np.array(matrix, np.float64)[:3, :3], axis=0).mean()) for matrix in matrices]
     scaled = [scale for scale in scales if abs(scale - 1.0) > _SCALE_TOLERANCE]
     if not scaled:
         return []
-    return [
-        f"{where}: {counted(len(scaled), 'pose')} scaled (the first by {scaled[0]:g}), which is taken off: places stay"
-    ]
+    return [f"{where}: {counted(len(scaled), 'pose')} scaled (the first by {scaled[0]:g}): removed, positions stay"]
 
 
 def _own_cameras(entries: object, path: Path) -> list[Camera]:
@@ -300,7 +299,7 @@ def _own_cameras(entries: object, path: Path) -> list[Camera]:
 def _parse_each(
     entries: list[Any], where: str, kind: str, read: Callable[[Mapping[str, Any], str], Camera]
 ) -> list[Camera]:
-    """Parse the entries of a list; errors name the file and the entry."""
+    """Parse the entries of a list; error messages contain the file and the entry."""
     if not entries:
         raise InputError(f"{where} lists no cameras")
     cameras = []
@@ -329,10 +328,6 @@ def _make_camera(
         raise InputError(f"{at}: {error}") from error
 
 
-def _middle(width: float, height: float) -> tuple[float, float]:
-    return width / 2.0, height / 2.0
-
-
 def _parse_inria(entry: Mapping[str, Any], at: str) -> Camera:
     width, height = finite_number(entry, "width", at), finite_number(entry, "height", at)
     focals = finite_number(entry, "fx", at), finite_number(entry, "fy", at)
@@ -341,13 +336,12 @@ def _parse_inria(entry: Mapping[str, Any], at: str) -> Camera:
     except (TypeError, ValueError, OverflowError):
         rotation = position = np.zeros(0)
     if rotation.shape != (3, 3) or position.shape != (3,):
-        raise InputError(f"{at}: rotation and position have other shapes, expected [3, 3] and [3]")
+        raise InputError(f"{at}: rotation or position has another shape, expected [3, 3] and [3]")
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation.T
     viewmat[:3, 3] = -rotation.T @ position
-    return _make_camera(
-        at, focals, _middle(width, height), viewmat, (width, height), DEFAULT_NEAR, entry.get("img_name")
-    )
+    middle = width / 2.0, height / 2.0
+    return _make_camera(at, focals, middle, viewmat, (width, height), DEFAULT_NEAR, entry.get("img_name"))
 
 
 def _parse_nerfstudio(document: Mapping[str, Any], entry: Mapping[str, Any], at: str) -> Camera:
@@ -362,14 +356,14 @@ def _parse_nerfstudio(document: Mapping[str, Any], entry: Mapping[str, Any], at:
     if isinstance(matrix, list) and len(matrix) == 16:
         matrix = [matrix[row : row + 4] for row in range(0, 16, 4)]
     viewmat = viewmat_of_opengl(matrix, "camera_to_world", at)
-    focal = 0.5 * height / math.tan(math.radians(angle) / 2.0)
-    return _make_camera(at, (focal, focal), _middle(width, height), viewmat, (width, height), _NERFSTUDIO_NEAR, None)
+    focal, middle = 0.5 * height / math.tan(math.radians(angle) / 2.0), (width / 2.0, height / 2.0)
+    return _make_camera(at, (focal, focal), middle, viewmat, (width, height), _NERFSTUDIO_NEAR, None)
 
 
 def _parse_frame(document: Mapping[str, Any], frame: Mapping[str, Any], at: str) -> Camera:
     values = frame_values(document, frame)
     if values.get("w") is None or values.get("h") is None:
-        raise InputError(f"{at}: w and h are missing, expected the size of the images: --data reads it from them")
+        raise InputError(f"{at}: w and h are missing, expected the size of the images (--data reads it from them)")
     width, height = finite_number(values, "w", at), finite_number(values, "h", at)
     model = str(values.get("camera_model") or "").upper()
     if values.get("is_fisheye") or model not in PERSPECTIVES:
@@ -381,7 +375,7 @@ def _parse_frame(document: Mapping[str, Any], frame: Mapping[str, Any], at: str)
 
 
 def _focal(values: Mapping[str, Any], axis: str, size: float, where: str, *, fisheye: bool) -> float | None:
-    """Return the focal length along one axis, given in pixels or by the angle of view; `None` if neither is given."""
+    """Return the focal length along an axis, from pixels or an angle of view; `None` if neither is specified."""
     length, angle = values.get(f"fl_{axis}"), values.get(f"camera_angle_{axis}")
     by_angle = None
     if angle is not None and not (fisheye and length is not None):
@@ -397,7 +391,7 @@ def _focal(values: Mapping[str, Any], axis: str, size: float, where: str, *, fis
         raise InputError(f"{where}: fl_{axis} is {focal:g}, expected above 0")
     if by_angle is not None and abs(by_angle / focal - 1.0) > _ANGLE_TOLERANCE:
         raise InputError(
-            f"{where}: fl_{axis} is {focal:g}, expected {by_angle:.6g} as camera_angle_{axis} = {angle:g} says for "
-            f"{size:g} pixels: leave out the one that is wrong"
+            f"{where}: fl_{axis} is {focal:g}, expected {by_angle:.6g} from camera_angle_{axis} = {angle:g} and "
+            f"{size:g} pixels: remove the wrong one"
         )
     return focal

@@ -1,11 +1,11 @@
-"""Closed camera paths for films: a film that repeats does not jump.
+"""Closed camera paths for films that loop without a jump.
 
-An *object* is circled about its up axis, estimated if necessary (`with_estimated_up`), from a distance that shows all
-of it. Inside *surroundings* a circle would lead through walls. If cameras are known, the path follows them and looks
-where they look; if the scene specifies its first view, the path sways around it; else it is the longest arc, of several
-distances and heights, from which fine splats are visible, there and back.
+An *object* is circled about its up axis, estimated if necessary (`with_estimated_up`), at a distance that shows all of
+it. In *surroundings*, a circle would lead through walls. If cameras are known, the path follows their positions and
+directions. If the scene specifies an initial view, the path sways around it. Otherwise the path goes back and forth
+along the longest of several arcs on which fine splats are visible.
 
-These cameras are not used for scoring; those of `psnr` are `virtual_cameras.virtual_cameras`.
+These cameras are not used for scoring; `psnr` uses `virtual_cameras.virtual_cameras`.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from csplat_render.up_estimate import with_estimated_up
 from csplat_render.virtual_cameras import FIELD_OF_VIEW, HIDING
 
 ELEVATION = 20.0  # degrees above the horizon, for objects
-_MARGIN = 0.08  # fraction of half an image that is left free around an object
-_POINTS = 16_000  # points of a cloud for an object
-_SHOWN = 0.999  # fraction of an object's points inside each image; the rest is haze
+_MARGIN = 0.08  # free margin around an object, as a fraction of half the image
+_POINTS = 16_000  # cloud points for an object
+_SHOWN = 0.999  # minimum fraction of an object's points inside each image; the rest is haze
 _CELL = 0.1  # extents; parts are separated by a gap of at least one cell
-_CELLS = 36  # cells each way from the centre
+_CELLS = 36  # number of cells in each direction from the centre
 _PART = 0.02  # fraction of the surface; smaller parts are floaters
-_BODY = 0.5  # fraction of the surface; if the parts hold less, the whole scene is shown
-_TURNS = 24  # azimuths that are tried
-_HEIGHTS = np.linspace(-0.2, 0.2, 5)  # look-at points above an object's middle that are tried, in object heights
+_BODY = 0.5  # fraction of the surface; if all parts together have less, the whole scene is shown
+_TURNS = 24  # number of azimuths to try
+_HEIGHTS = np.linspace(-0.2, 0.2, 5)  # heights of look-at points to try, relative to the object's middle and height
 
-_ARC_POINTS = 12_000  # points of a cloud for surroundings
+_ARC_POINTS = 12_000  # cloud points for surroundings
 _ARC_ELEVATIONS = (5.0, 20.0, 40.0)  # degrees
 _ARC_DISTANCES = (1.7, 1.3, 1.0, 0.7, 0.4)  # extents
-_GOOD = 0.85  # fraction of the best view's detail below which an arc ends
-_ARC_MIN = 10.0  # degrees each way
+_GOOD = 0.85  # detail on an arc, as a fraction of the best view's detail
+_ARC_MIN = 10.0  # degrees in each direction
 
-_SWINGS = (30.0, 24.0, 18.0, 13.0, 9.0, 6.0)  # degrees each way around a known view, the widest tried first
-_FLATTENED = 0.3  # vertical part of a swing, as a fraction of it
-_NEAREST_MIDDLE = 0.3  # extents; least distance of the look-at point from a view
+_SWINGS = (30.0, 24.0, 18.0, 13.0, 9.0, 6.0)  # degrees in each direction from a known view; the widest is tried first
+_FLATTENED = 0.3  # ratio of the vertical to the horizontal swing
+_NEAREST_MIDDLE = 0.3  # extents; minimum distance of the look-at point from a view
 
-_REACH = 0.35  # fraction of the ellipse's longer half-axis over which cameras influence the path
-_EASE = 0.04  # fraction of the path over which directions are smoothed
+_REACH = 0.35  # distance over which cameras influence the path, as a fraction of the ellipse's longer half-axis
+_EASE = 0.04  # width of the smoothing of directions, as a fraction of the path
 
 
 def orbit_cameras(
@@ -59,16 +59,15 @@ def orbit_cameras(
     elevation: float = ELEVATION,
     along: Sequence[Camera] = (),
 ) -> list[Camera]:
-    """Return cameras on a closed path, for a film.
+    """Return cameras on a closed path for a film.
 
     Args:
         model: the scene.
         count: number of cameras.
-        width: pixels.
-        height: pixels.
+        width, height: pixels.
         elevation: degrees above the horizon, for objects.
-        along: cameras that the path follows, relative to the scene's origin. Default: those that the scene carries,
-            for surroundings; none for an object.
+        along: cameras for the path to follow, relative to the scene's origin. Default: the cameras of the scene for
+            surroundings, none for an object.
 
     Raises:
         InputError: `count` is below 1, or a camera of the scene is invalid.
@@ -98,9 +97,9 @@ def orbit_cameras(
 
 
 def _main_parts(cloud: Cloud, frame: SceneFrame) -> F64:
-    """Return the points of an object without floaters, [M, 3]: those of its larger parts.
+    """Return the points of the larger parts of an object, [M, 3], without floaters.
 
-    Parts are sets of grid cells that touch. If splats are scattered, all of them belong to the object.
+    Parts are connected sets of grid cells. If the splats are too scattered, all points are returned.
     """
     side = 2 * _CELLS + 1
     with np.errstate(invalid="ignore", over="ignore"):
@@ -120,12 +119,12 @@ def _main_parts(cloud: Cloud, frame: SceneFrame) -> F64:
 
 
 def _touching(first: int, filled: Mask) -> Mask:
-    """Return the filled cells that are connected with one of them."""
+    """Return the filled cells connected with the cell `first`."""
     found: Mask = np.zeros_like(filled)
     found.flat[first] = True
     while True:
         wider = found
-        for axis in range(3):  # the outermost cells of a grid are empty, or hold distant points
+        for axis in range(3):  # wrapping around is harmless: border cells are empty or contain distant points
             wider = wider | np.roll(wider, 1, axis) | np.roll(wider, -1, axis)
         wider = wider & filled
         if (wider == found).all():
@@ -134,7 +133,7 @@ def _touching(first: int, filled: Mask) -> Mask:
 
 
 def _framing(body: F64, frame: SceneFrame, elevation: float, K: F64, width: int, height: int) -> tuple[F64, float]:
-    """Return a look-at point and a distance from which an object is inside all images around it."""
+    """Return a look-at point and a distance at which an object is inside all images of an orbit."""
     up = frame.up
     first, second = direction_at(up, 0.0, 0.0), direction_at(up, 90.0, 0.0)
     sides = np.stack([_along(body - frame.centre, axis) for axis in (first, second, up)])
@@ -150,8 +149,8 @@ def _framing(body: F64, frame: SceneFrame, elevation: float, K: F64, width: int,
             out = x * math.cos(azimuth) + y * math.sin(azimuth)
             across = y * math.cos(azimuth) - x * math.sin(azimuth)
             nearer, above = out * math.cos(e) + z * math.sin(e), z * math.cos(e) - out * math.sin(e)
-            wanted = nearer + np.maximum(np.abs(across) / slopes[0], np.abs(above) / slopes[1])
-            far = max(far, float(np.quantile(wanted, _SHOWN)))
+            needed = nearer + np.maximum(np.abs(across) / slopes[0], np.abs(above) / slopes[1])
+            far = max(far, float(np.quantile(needed, _SHOWN)))
         if best is None or far < best[0]:
             best = far, middle + np.array([0.0, 0.0, share * tall])
     assert best is not None
@@ -161,7 +160,7 @@ def _framing(body: F64, frame: SceneFrame, elevation: float, K: F64, width: int,
 
 
 def _first_view(model: SplatModel) -> Camera | None:
-    """Return the camera of a scene's first view; `None` if it specifies none, or an invalid one."""
+    """Return the camera of a scene's initial view; `None` if it is absent or invalid."""
     try:
         return Camera.from_json(model.metadata[VIEW]) if VIEW in model.metadata else None
     except InputError:
@@ -169,7 +168,10 @@ def _first_view(model: SplatModel) -> Camera | None:
 
 
 def _sway(cloud: Cloud, first: Camera, frame: SceneFrame, count: int, K: F64, width: int, height: int) -> list[Camera]:
-    """Return cameras on an ellipse around a known one, as wide as they see what it sees; the look-at point is fixed."""
+    """Return cameras on an ellipse around a known one, looking at a fixed point.
+
+    The ellipse is the widest on which the cameras show enough detail.
+    """
     ahead, eye = first.viewmat[2, :3], first.position
     depth = max(float(np.sum((frame.centre - eye) * ahead)), frame.extent * _NEAREST_MIDDLE)
     middle, side, near = eye + depth * ahead, first.viewmat[0, :3], min(frame.near, first.near)
@@ -191,7 +193,7 @@ def _sway(cloud: Cloud, first: Camera, frame: SceneFrame, count: int, K: F64, wi
 
 
 def _arc(cloud: Cloud, frame: SceneFrame, count: int) -> tuple[F64, float, float]:
-    """Return the longest good arc about the middle of surroundings: azimuths, there and back; elevation, distance."""
+    """Return the longest good arc around the middle of surroundings: azimuths back and forth, elevation, distance."""
     K = intrinsics(640, 480, FIELD_OF_VIEW)
     azimuths = np.arange(_TURNS) * 360.0 / _TURNS
     circles = [(elevation, distance) for distance in _ARC_DISTANCES for elevation in _ARC_ELEVATIONS]
@@ -222,19 +224,19 @@ def _arc(cloud: Cloud, frame: SceneFrame, count: int) -> tuple[F64, float, float
 def _camera_towards(
     frame: SceneFrame, azimuth: float, elevation: float, distance: float, K: F64, width: int, height: int
 ) -> Camera:
-    """Return a camera that looks at the middle of a scene: angles in degrees, the distance in extents."""
+    """Return a camera that looks at the middle of a scene; angles in degrees, distance in extents."""
     eye = frame.centre + distance * frame.extent * direction_at(frame.up, azimuth, elevation)
     return look_at(eye, frame.centre, frame.up, K, width, height, frame.near)
 
 
 def _path_along(cameras: Sequence[Camera], count: int, up: Sequence[float] | None) -> tuple[F64, F64, F64]:
-    """Return a path along the given cameras.
+    """Compute a path along the given cameras.
 
-    It begins as the ellipse with the covariance of the cameras' positions. Each of its points moves to the weighted
-    mean position of the cameras around it, and looks in their mean direction.
+    The path starts as the ellipse with the covariance of the cameras' positions. Each of its points then moves to the
+    weighted mean position of the cameras around it, and looks in their weighted mean direction.
 
     Returns:
-        [count, 3] positions; [count, 3] directions of unit length; [3], the up direction.
+        [count, 3] positions; [count, 3] directions of unit length; [3] the up direction.
     """
     outliers = camera_outliers(np.stack([camera.viewmat for camera in cameras]))
     cameras = [camera for camera, outlier in zip(cameras, outliers, strict=True) if not outlier]
@@ -261,7 +263,7 @@ def _path_along(cameras: Sequence[Camera], count: int, up: Sequence[float] | Non
 
 
 def _smooth(rows: F64) -> F64:
-    """Smooth the rows of a closed path, [N, 3]: each becomes the weighted mean of those around it."""
+    """Smooth the rows [N, 3] of a closed path with a Gaussian."""
     count = len(rows)
     steps = np.arange(count)
     gaps = np.minimum(steps, count - steps) / count
@@ -272,6 +274,6 @@ def _smooth(rows: F64) -> F64:
 
 
 def _along(rows: F64, axis: F64) -> F64:
-    """Return the coordinates of rows [N, 3] along an axis, without BLAS: the same for any number of threads."""
+    """Return the coordinates of rows [N, 3] along an axis, without BLAS, whose rounding depends on threads."""
     result: F64 = np.sum(rows * axis, axis=1)
     return result

@@ -1,18 +1,24 @@
 """Contribution of each splat to the renders of a scene: sums over pixels per splat, without building any matrix.
 
-A `ProjectedView` is one view of fixed splats, projected and sorted into tiles, reduced to the splats that it shows.
-It answers two questions: how much pruning each splat would change the image (`Contributions.measure_pruning`), and
-which image other colours give, with the way back from pixels to colours (`Contributions.backproject`).
+A `ProjectedView` is one view of fixed splats, projected, sorted into tiles, and reduced to the visible splats. It is
+used to measure the effect of pruning each splat (`Contributions.measure_pruning`), and to render other colours and
+project an image back to the colours (`Contributions.backproject`).
 
-Pruning. At a pixel a splat of alpha a with transmittance T in front of it has the weight w = T·a. Let C be its colour
-and B the colour that is seen where it ends, background included, not multiplied by any transmittance. Without the
-splat the pixel changes by d = w·(B − C): nothing else in the sum changes but the light that reaches what lies behind.
-So after an ordinary render, in which each pixel stores how far it got, the splats of a tile are processed once more,
-back to front: B follows from B ← B + a·(C − B), T from T ← T / (1 − a). Nothing is subtracted from a finished sum:
-what lies deep behind is as exact as what lies in front.
+Pruning. At a pixel, a splat of alpha a with transmittance T in front of it has the weight w = T·a. Let C be its colour
+and B the colour blended from everything behind it, background included, as seen directly behind the splat. Without the
+splat the pixel changes by
 
-Colours. Taking an image back to the colours is the transpose of rendering them. It needs the weights w alone: front to
-back, as for a render.
+    d = w·(B − C),
+
+because only the light from behind changes. So after an ordinary render, in which each pixel stores its last splat, the
+splats of a tile are processed once more, back to front:
+
+    T ← T / (1 − a);  d = T·a·(B − C);  B ← B + a·(C − B)
+
+Nothing is subtracted from a finished sum, so splats deep in the scene are as accurate as those in front.
+
+Colours. The transpose of rendering colours sums, for each splat, w times the image. It needs only the weights w, which
+are computed front to back as in a render.
 """
 
 from __future__ import annotations
@@ -41,15 +47,15 @@ from csplat_render.blending import (
     transmit,
 )
 from csplat_render.camera import Camera
-from csplat_render.conventions import TRANSMITTANCE_MIN, Array, HasSplats, UncheckedSplats, view_vector
+from csplat_render.conventions import TRANSMITTANCE_MIN, Array, HasSplats
 from csplat_render.kernels import device_function, parallel_kernel, thread_count
-from csplat_render.projection import BLOCK, project, sh_basis, view_direction
-from csplat_render.rasteriser import Rasteriser
+from csplat_render.projection import BLOCK, sh_basis, view_direction
+from csplat_render.rasteriser import Rasteriser, checked_splats
 
-# Limit on colours: squares of their differences, summed over a tile, stay within float32.
+# Colours are limited so that squares of their differences, summed over a tile, stay within float32.
 _MAX_COLOUR = 1e15
 
-# Allowance for rounding of an exponent: far from a splat's centre it is a small difference of large numbers, up to 1e4.
+# Margin for the rounding of exponents, which far from a splat's centre are small differences of numbers up to 1e4.
 _EXPONENT_MARGIN = 0.05
 
 
@@ -58,16 +64,15 @@ class ProjectedView:
     """One view of fixed geometry: the V splats that may be visible in it, in the order of the scene.
 
     Attributes:
-        rows: [V] int32, which splats of the scene they are.
-        shape: [V, 10] float64, see `project`, but for the last column: the exponent of 2 below which nothing is drawn.
-            Columns 6 to 8 are colours and may be replaced.
+        rows: [V] int32, indices of the splats in the scene.
+        shape: [V, 10] float64, see `project`, except for the last column: the exponent of 2 below which the splat is
+            not drawn. Columns 6 to 8 are colours and may be replaced.
         box: [V, 4] int32, see `project`.
-        basis: [V, B] float32, spherical harmonics in the direction of the splat, B = (degree + 1)²; [V, 0] if
-            not requested.
-        starts: [tiles + 1] int64, where the splats of each tile begin in `ids`.
-        ids: [intersections] int32, places in `rows`, tile by tile, nearest first.
-        slots: [intersections] int32, the record of each of `ids`.
-        first: [V + 1] int64, where the records of each splat begin.
+        basis: [V, B] float32, SH basis in the direction of the splat, B = (degree + 1)²; [V, 0] if not requested.
+        starts: [tiles + 1] int64, start of each tile's splats in `ids`.
+        ids: [intersections] int32, indices into `rows`, tile by tile, nearest first.
+        slots: [intersections] int32, the record of each entry of `ids`.
+        first: [V + 1] int64, index of each splat's first record.
         width, height: size of the image, pixels.
     """
 
@@ -84,18 +89,18 @@ class ProjectedView:
 
     @property
     def size_bytes(self) -> int:
-        """Memory of the arrays."""
+        """Memory of the arrays in bytes."""
         arrays = (self.rows, self.shape, self.box, self.basis, self.starts, self.ids, self.slots, self.first)
         return sum(array.nbytes for array in arrays)
 
     def with_records(self, needed: Array) -> tuple[ProjectedView, Array]:
-        """Leave out pairs of splat and tile, and splats that have none.
+        """Drop pairs of splat and tile, and splats without any.
 
         Args:
-            needed: [intersections] bool, which records are kept.
+            needed: [intersections] bool, True for records to keep.
 
         Returns:
-            The view, and which of the V splats are kept.
+            The view; and the indices of the kept splats among the V.
         """
         before = np.zeros(len(needed) + 1, np.int64)
         np.cumsum(needed, out=before[1:])
@@ -122,10 +127,10 @@ class ProjectedView:
 
 
 class Contributions(Rasteriser):
-    """A rasteriser that sums over pixels by splat.
+    """A rasteriser that computes sums over pixels for each splat.
 
-    No result depends on the number of threads: every splat of every tile has a record of its own, and a splat's
-    records are added up in one order.
+    No result depends on the number of threads: each pair of splat and tile has its own record, and the records of a
+    splat are added in a fixed order.
 
     Args:
         dtype: see `Rasteriser`.
@@ -146,46 +151,34 @@ class Contributions(Rasteriser):
     def project_view(
         self, splats: HasSplats, camera: Camera, *, antialiased: bool = False, basis: bool = True
     ) -> ProjectedView:
-        """Project splats, sort them into tiles, and drop those that the view does not show.
+        """Project splats, sort them into tiles, and drop invisible splats.
 
         Args:
             splats: the scene.
             camera: the view.
-            antialiased: scale opacities by what the dilation added.
-            basis: compute the spherical harmonics in the direction of each splat.
+            antialiased: compensate for the dilation by scaling opacities.
+            basis: compute the SH basis in the direction of each splat.
 
         Raises:
             LimitError: there are too many pairs of splat and tile.
         """
-        arrays = UncheckedSplats(
-            *(
-                np.ascontiguousarray(getattr(splats, name), self.dtype)
-                for name in ("means", "quats", "scales", "opacities", "sh0", "shN")
-            )
-        )
-        n, degree = len(arrays.means), sh_degree_of(arrays.shN.shape[1])
-        width, height = camera.W, camera.H
-        tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-        shape, extent = self._buffer("shape", (n, 10), np.float64), self._buffer("extent", (n, 6), np.float64)
-        box, near = self._buffer("box", (n, 4), np.int32), self._buffer("near", (n,), np.float32)
-        view = view_vector(camera)
+        arrays = checked_splats(splats, self.dtype)
+        degree = sh_degree_of(arrays.shN.shape[1])
+        tiles_x, tiles_y = -(-camera.W // TILE), -(-camera.H // TILE)
         with thread_count(self.threads):
-            project(
-                arrays.means, arrays.quats, arrays.scales, arrays.opacities, arrays.sh0, arrays.shN, degree, view,
-                width, height, antialiased, self.thresholds.alpha_min, shape, extent, box, near,
-                self._buffer("radii", (n,), np.float32), self._buffer("ignored", (-(-n // BLOCK),), np.int64),
-            )  # fmt: skip
+            view, _, _ = self._project(arrays, camera, degree, antialiased=antialiased)
+            shape, extent, box, near = (self._buffers[name] for name in ("shape", "extent", "box", "near"))
             order = self._depth_order(near)
             starts, _ = self._sort_into_tiles(order, near, extent, box, tiles_x, tiles_x * tiles_y)
-            # In the order of the scene, not of depth: arrays by splat are then read and written sequentially.
+            # In scene order rather than depth order, so that arrays by splat are read and written sequentially.
             rows = np.flatnonzero(near > 0.0).astype(np.int32)
             harmonics = np.empty((len(rows), (degree + 1) ** 2 if basis else 0), np.float32)
             evaluate_basis(arrays.means, rows, view, degree, harmonics)
-        offsets, place = self._buffers["offsets"], self._buffer("place", (n,), np.int32)
+        offsets, place = self._buffers["offsets"], self._buffer("place", (len(near),), np.int32)
         place[rows] = np.arange(len(rows), dtype=np.int32)
         drawn = np.take(shape, rows, axis=0)
         np.minimum(drawn[:, 6:9], _MAX_COLOUR, out=drawn[:, 6:9])
-        drawn[:, 9] = np.log2(self.thresholds.alpha_min / drawn[:, 5]) - _EXPONENT_MARGIN
+        drawn[:, 9] = np.log2(self._alpha_min / drawn[:, 5]) - _EXPONENT_MARGIN
         return ProjectedView(
             rows=rows,
             shape=drawn,
@@ -195,8 +188,8 @@ class Contributions(Rasteriser):
             ids=np.take(place, self._buffers["ids"]),
             slots=self._buffers["slots"].copy(),
             first=np.append(offsets[rows], offsets[-1]),  # splats that are not drawn have no records
-            width=width,
-            height=height,
+            width=camera.W,
+            height=camera.H,
         )
 
     def measure_pruning(
@@ -209,17 +202,17 @@ class Contributions(Rasteriser):
         background: Array,
         reference: Array | None = None,
     ) -> Array:
-        """Add one view's sums for every splat to the totals of a scene.
+        """Add the sums of one view for every splat to the totals of a scene.
 
         Args:
-            drawn: the view, its shape holding the splats' colours.
-            shN: [N, K, 3] float32, spherical harmonics of all splats beyond the first.
-            totals: [N, 5] float64, added to: squared change of the render if the splat were absent, product of that
-                change with (render − reference), weight, squared weight, and 1 if the splat was seen.
-            bands: [N, d] float64, added to: squared change of the render if its band 1, … d were zero; [N, 0] for
-                views without a basis.
-            background: [3], behind everything.
-            reference: [H, W, 3], the image to compare with; None for this render.
+            drawn: the view, with the splats' own colours.
+            shN: [N, K, 3] float32, SH coefficients of all splats.
+            totals: [N, 5] float64, sums over pixels are added: |d|², d · (render − reference), w and w², with w the
+                weight of the splat and d the change of the render without it; and 1 if the splat is visible.
+            bands: [N, d] float64, squared change of the render with zeros in SH band 1, … d is added; [N, 0] for views
+                without a basis.
+            background: [3].
+            reference: [H, W, 3], the image to compare with; `None`: this render.
 
         Returns:
             [H, W, 3], the render.
@@ -255,22 +248,22 @@ class Contributions(Rasteriser):
         background: Array,
         reference: Array | None = None,
     ) -> Array:
-        """Render with other colours, subtract an image, and take the difference back to the colours.
+        """Render with other colours, subtract an image, and project the difference back to the coefficients.
 
-        A colour is offset + Σ_k Y_k(direction) · coefficient_k if it is active, else 0: linear, not clamped.
+        A colour is offset + Σ_k Y_k(direction) · coefficient_k if it is active, else 0. It is not clamped.
 
         Args:
             drawn: the view; its colours are overwritten.
             coefficients: [N, B, 3] float32.
-            active: [V, 3] bool, which colours take part.
-            gradient: [N, B, 3] float32, added to: sum over pixels of w · Y_k · (render − reference).
-            diagonal: [N, B] float32, added to: sum over pixels of (w · Y_k)²; empty if it is not needed.
+            active: [V, 3] bool, True for active colours.
+            gradient: [N, B, 3] float32, the sum over pixels of w · Y_k · (render − reference) is added.
+            diagonal: [N, B] float32, the sum over pixels of (w · Y_k)² is added; empty: it is not computed.
             offset: ½ for renders of splats, 0 for differences of such renders.
             background: [3].
-            reference: [H, W, 3]; None for black.
+            reference: [H, W, 3]; `None`: black.
 
         Returns:
-            [H, W, 3], the render, before the subtraction.
+            [H, W, 3], the render before the subtraction.
         """
         size, tiles_x = (drawn.height, drawn.width), -(-drawn.width // TILE)
         records = self._buffer("sums", (len(drawn.ids), COLOUR_SUMS), self.dtype)
@@ -292,17 +285,17 @@ class Contributions(Rasteriser):
         return rgb
 
     def trim(self, drawn: ProjectedView) -> tuple[ProjectedView, Array]:
-        """Leave out splats that had no weight in the last `backproject`, of this view: renders keep their bits.
+        """Drop splats of zero weight after a `backproject` of this view; renders do not change.
 
         Returns:
-            The view, and which of the V splats are kept.
+            The view; and the indices of the kept splats among the V.
         """
         return drawn.with_records(self._buffer("sums", (len(drawn.ids), COLOUR_SUMS), self.dtype)[:, 3] > 0.0)
 
 
 @parallel_kernel()
 def evaluate_basis(lane: int, lanes: int, means: Any, rows: Any, view: Any, degree: int, basis: Any) -> None:
-    """Evaluate the spherical harmonics in the direction of each drawn splat; parallel over blocks of splats."""
+    """Evaluate the SH basis in the direction of each drawn splat; parallel over blocks of splats."""
     values = np.empty(16, np.float64)
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
@@ -316,7 +309,7 @@ def evaluate_basis(lane: int, lanes: int, means: Any, rows: Any, view: Any, degr
 def set_colours(
     lane: int, lanes: int, rows: Any, basis: Any, coefficients: Any, active: Any, offset: float, shape: Any
 ) -> None:
-    """Write offset + Y · coefficients into the shapes, 0 where not active; parallel over blocks of splats."""
+    """Write colours, offset + Y · coefficients if active, else 0, into the shapes; parallel over blocks of splats."""
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
             i = rows[j]
@@ -328,7 +321,7 @@ def set_colours(
 
 @device_function
 def _colour_at(basis: Any, coefficients: Any) -> tuple[float, float, float]:
-    """Return red, green, blue of coefficients [B, 3] in the direction of a basis [B]; float64."""
+    """Return basis [B] · coefficients [B, 3], float64."""
     r, g, b = 0.0, 0.0, 0.0
     for k in range(basis.shape[0]):
         y = np.float64(basis[k])
@@ -342,7 +335,10 @@ def _colour_at(basis: Any, coefficients: Any) -> tuple[float, float, float]:
 def add_pruning_sums(
     lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, shN: Any, totals: Any, bands: Any
 ) -> None:
-    """Add the records of one view to the totals, see `Contributions.measure_pruning`; parallel over blocks."""
+    """Add the records of a view to the totals of `Contributions.measure_pruning`; parallel over blocks of splats.
+
+    Without SH band b, a splat's colour changes by Σ_{k in b} Y_k sh_k, and a pixel by w times that.
+    """
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
             i = rows[j]
@@ -369,7 +365,10 @@ def add_pruning_sums(
 def add_gradient(
     lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, active: Any, gradient: Any, diagonal: Any
 ) -> None:
-    """Add the gradient of one view to the coefficients, see `Contributions.backproject`; parallel over blocks."""
+    """Add the records of a view to the results of `Contributions.backproject`; parallel over blocks of splats.
+
+    gradient_k += Y_k Σ w · error and diagonal_k += Y_k² Σ w².
+    """
     with_diagonal = diagonal.shape[0] > 0
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
@@ -398,8 +397,8 @@ PRUNING_SUMS = 4
 
 _AREA = TILE * TILE
 
-# Where the planes of a tile begin, after transmittance: three colours of what lies behind, how far each pixel got,
-# three differences from the reference, the current splat's terms of two sums, its weight, positions.
+# Offsets of the planes of a tile: after transmittance, the colour B behind the current splat, the position of each
+# pixel's last splat, the error, the current splat's terms of two sums, its weight, and positions in a row.
 _RED, _GREEN, _BLUE, _LAST, _ERR_R, _ERR_G, _ERR_B, _CHANGE, _PRODUCT, _WEIGHT, _X = (_AREA * k for k in range(1, 12))
 _PLANES = 12
 
@@ -421,27 +420,17 @@ def sum_pruning(
     last: Any,
     records: Any,
 ) -> None:
-    """Sum over the pixels of every splat in every tile; parallel over tiles, vectorised over the 16 pixels of a row.
+    """Compute the sums of "Pruning" above; parallel over tiles, vectorised over the 16 pixels of a row.
 
     Args:
-        lane: which of the threads this is.
-        lanes: how many share the tiles; the result does not depend on it.
-        starts: see `blend`, as the next.
-        ids: [intersections] int32.
-        slots: [intersections] int32, the record of each of `ids`.
-        shape: [N, 10] float64, as for `blend_counted`, as the next four.
-        box: [N, 4] int32.
-        tiles_x: tiles side by side.
-        limits: [3].
-        background: [3].
+        lane, lanes, starts, ids, shape, box, tiles_x, limits, background: as in `blend_counted`.
+        slots: [intersections] int32, the record of each entry of `ids`.
         error: [H, W, 3], the render minus the reference; [0, 0, 3] if the render is the reference.
-        transmittance: [H, W], as `blend_counted` wrote it, as the next.
-        last: [H, W].
-        records: [intersections, SUMS], written: sums of |d|², d · error, w and w², d being the change of the pixel
-            without the splat.
+        transmittance, last: [H, W], results of `blend_counted`.
+        records: [intersections, PRUNING_SUMS], written: sums over pixels of |d|², d · error, w and w².
     """
     height, width = transmittance.shape
-    # Planes of 16 × 16, one after the other, in one array: the compiler sees which parts overlap.
+    # Planes of 16 × 16 one after the other in one array, so that the compiler knows which parts overlap.
     planes, deepest = aligned_zeros(_PLANES * _AREA, limits), np.zeros(TILE, np.int64)
     ys = pixel_centres()
     for e in range(_AREA):
@@ -520,11 +509,12 @@ def sum_pruning(
 COLOUR_SUMS = 4
 
 
-# Where the planes of a tile begin, after transmittance: the image, the current splat's weight, positions.
+# Offsets of the planes of a tile: after transmittance, the error, the current splat's weight, and positions in a row.
 _COLOUR_RED, _COLOUR_GREEN, _COLOUR_BLUE, _COLOUR_WEIGHT, _COLOUR_X = (_AREA * k for k in range(1, 6))
 _COLOUR_PLANES = 6
 
-# Weight of a splat that finishes a pixel there: nothing compared with the smallest weight, 4e-7, but not 0.
+# Weight of a splat in a pixel that it finishes: negligible compared with the smallest weight, 4e-7, but not 0, so that
+# `trim` keeps the splat.
 _FINISHING_WEIGHT = 1e-12
 
 
@@ -543,22 +533,15 @@ def sum_colours(
     error: Any,
     records: Any,
 ) -> None:
-    """Take an image back to the splats of every tile; parallel over tiles, vectorised over the 16 pixels of a row.
+    """Project an image back to the splats; parallel over tiles, vectorised over the 16 pixels of a row.
 
     Args:
-        lane: which of the threads this is.
-        lanes: how many share the tiles; the result does not depend on it.
-        starts: see `blend`.
-        used: [tiles] int64, as `blend` wrote it.
-        ids: see `blend`.
-        slots: [intersections] int32, the record of each of `ids`.
-        shape: see `blend`, as the next three; colours are not read.
-        box: [N, 4] int32.
-        tiles_x: tiles side by side.
-        limits: [3].
-        error: [H, W, 3], the image that is taken back.
-        records: [intersections, COLOUR_SUMS], written: sums of w · error for red, green, blue, and of w²; the last is
-            0 for a splat that neither shows in a pixel nor finishes one.
+        lane, lanes, starts, ids, shape, box, tiles_x, limits: as in `blend`; colours are not read.
+        used: [tiles] int64, result of `blend`.
+        slots: [intersections] int32, the record of each entry of `ids`.
+        error: [H, W, 3], the image.
+        records: [intersections, COLOUR_SUMS], written: sums over pixels of w · error for red, green, blue, and of w²,
+            which is 0 only for a splat that neither contributes to a pixel nor finishes one.
     """
     height, width = error.shape[:2]
     planes = aligned_zeros(_COLOUR_PLANES * _AREA, limits)
@@ -574,7 +557,7 @@ def sum_colours(
         begin_tile(T, columns, one)
         planes[_COLOUR_RED:_COLOUR_WEIGHT] = zero
         read_planes(error, X0, Y0, columns, high, planes, _COLOUR_RED)
-        # Finished rows are processed too, so that the order of a sum does not depend on what lies in front.
+        # Finished rows are processed, too, so that the order of a sum does not depend on the splats in front.
         for begin in range(starts[tile], used[tile], BATCH):
             count = min(BATCH, used[tile] - begin)
             gather_batch(ids, begin, begin + count, shape, box, X0, Y0, 0, high, ys, batch, rows)

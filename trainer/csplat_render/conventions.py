@@ -1,9 +1,13 @@
-"""Definitions that the rasteriser and its exact reference share: constants, modes, splats, and results.
+"""Shared definitions of the rasteriser and its exact reference: constants, modes, splats and results.
 
-The constants are those of the first published implementation of Gaussian splatting: alpha = opacity ·
-exp(−½ dᵀ Σ⁻¹ d) with Σ the projected covariance plus `DILATION`, capped at `ALPHA_CAP`, left out below `ALPHA_MIN`;
-splats are blended front to back in the order of float32 depth, then of index, until the next one would bring the
-transmittance below `TRANSMITTANCE_MIN`; colour = spherical harmonics + ½, at least 0.
+The conventions are those of INRIA's implementation (Kerbl et al., 3D Gaussian Splatting, 2023):
+
+    alpha = min(opacity · exp(−½ dᵀ Σ⁻¹ d), ALPHA_CAP), and 0 below ALPHA_MIN
+    Σ = projected covariance + DILATION · I
+    colour = max(Σ_k Y_k(direction) · sh_k + ½, 0)
+
+Splats are blended front to back by float32 depth, then by index. A pixel is finished before the splat that would bring
+its transmittance below `TRANSMITTANCE_MIN`.
 """
 
 from __future__ import annotations
@@ -17,51 +21,42 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat_render.camera import Camera
 
-#: Added to both variances of the projected covariance, in square pixels.
+#: Square pixels, added to both variances of the projected covariance.
 DILATION = 0.3
 
-#: A splat covers a pixel with at most this alpha.
+#: Maximum alpha of a splat in a pixel.
 ALPHA_CAP = 0.99
 
-#: A splat does not touch a pixel that it covers with less than this alpha.
+#: Splats with a smaller alpha in a pixel do not contribute to it.
 ALPHA_MIN = 1.0 / 255.0
 
-#: A pixel is finished before the splat that would bring its transmittance below this.
+#: Transmittance below which a pixel never falls.
 TRANSMITTANCE_MIN = 1e-4
 
-#: The perspective is linearised at most this far outside the image, in half-widths of the image.
+#: Distance outside the image up to which the perspective is linearised, as a multiple of half the image's size.
 FOV_MARGIN = 0.3
 
-#: Log-scales are clamped to this distance from 0 (a factor of 5e34), so that all products are finite.
+#: Log scales are clamped to ± this (a factor of 5e34) so that all products are finite.
 LOG_SCALE_LIMIT = 80.0
 
-#: Smallest ratio of determinants from which the antialiased mode computes its compensation.
+#: Minimum ratio of determinants in the compensation of the antialiased mode.
 COMPENSATION_MIN = 0.000025
 
 Mode = Literal["exact", "standard", "fast"]
 MODES: tuple[Mode, ...] = ("exact", "standard", "fast")
 
 
-@dataclass(frozen=True)
-class Thresholds:
-    """Thresholds of a mode: the smallest alpha that is drawn, and the transmittance at which a pixel is finished."""
-
-    alpha_min: float
-    transmittance_min: float
-
-
 _THRESHOLDS = {
-    "standard": Thresholds(ALPHA_MIN, TRANSMITTANCE_MIN),
-    # A larger minimum of alpha shrinks every splat; light that passes with less than 1/255 is left out.
-    "fast": Thresholds(1.5 * ALPHA_MIN, ALPHA_MIN),
+    "standard": (ALPHA_MIN, TRANSMITTANCE_MIN),
+    "fast": (1.5 * ALPHA_MIN, ALPHA_MIN),  # shrinks every splat, and omits light of a transmittance below 1/255
 }
 
 
-def thresholds_of(mode: str) -> Thresholds:
-    """Return the thresholds of a mode of the rasteriser.
+def thresholds_of(mode: str) -> tuple[float, float]:
+    """Return the minimum alpha and the minimum transmittance of a mode of the rasteriser.
 
     Raises:
-        InputError: there is no such mode, or it is that of the exact reference.
+        InputError: the rasteriser has no such mode.
     """
     if mode not in _THRESHOLDS:
         raise InputError(f"the rasteriser's mode is {mode!r}, expected one of {', '.join(_THRESHOLDS)}")
@@ -69,11 +64,11 @@ def thresholds_of(mode: str) -> Thresholds:
 
 
 def view_vector(camera: Camera) -> NDArray[np.float64]:
-    """Return the numbers of a camera that the kernels need, in one row.
+    """Return the parameters of a camera for the kernels.
 
     Returns:
-        [24] float64: rotation (9, row by row), translation, fx, fy, cx, cy, near plane, smallest
-        and largest x/z and y/z at which the perspective is linearised, camera position.
+        [24] float64: rotation (9, row by row), translation, fx, fy, cx, cy, near plane, bounds of x/z and of y/z within
+        which the perspective is linearised, camera position.
     """
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
     margin_x, margin_y = FOV_MARGIN * 0.5 * camera.W / fx, FOV_MARGIN * 0.5 * camera.H / fy
@@ -91,7 +86,7 @@ Array = NDArray[Any]
 
 
 class HasSplats(Protocol):
-    """Anything that can be rendered: a `SplatModel`, `UncheckedSplats`, or any object with these arrays."""
+    """An object with the arrays of splats: a `SplatModel`, `UncheckedSplats`, or another one."""
 
     @property
     def means(self) -> Array: ...  # noqa: D102 - as in Splats
@@ -109,7 +104,7 @@ class HasSplats(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class UncheckedSplats:
-    """The arrays of N splats, of which only the shapes are checked: rows that hold NaN are not drawn.
+    """The arrays of N splats with unchecked values: splats with NaN or infinity are not drawn.
 
     Attributes:
         means: [N, 3], centres.
@@ -136,11 +131,10 @@ class RenderResult:
         rgb: [H, W, 3], not clipped: colours may exceed 1.
         alpha: [H, W], 1 − transmittance.
         depth: [H, W], sum of weight · depth, not divided by alpha.
-        radii: [N] float32, 3 standard deviations of each splat along its longest axis, in pixels;
-            0 for splats that are not drawn.
+        radii: [N] float32, pixels, 3 standard deviations of each splat along its longest axis; 0 if it is not drawn.
         drawn: number of splats in view.
-        intersections: number of pairs of splat and tile, to which the time is proportional.
-        ignored: number of splats that hold NaN or infinity.
+        intersections: number of pairs of splat and tile; the time is proportional to it.
+        ignored: number of splats with NaN or infinity.
     """
 
     rgb: Array
@@ -154,12 +148,12 @@ class RenderResult:
 
 @dataclass(frozen=True, eq=False)
 class VisibleSplats:
-    """Splats that are visible in a render.
+    """The splats that are visible in a render.
 
     Attributes:
-        near: [N] float32, depths, by which splats are sorted; 0 for splats that are not drawn.
-        tiles: [N] integers, number of tiles that each splat may touch; 0 likewise.
-        ignored: number of splats that hold NaN or infinity.
+        near: [N] float32, depths by which splats are sorted; 0 for splats that are not drawn.
+        tiles: [N] integers, number of tiles that each splat may touch; 0 for splats that are not drawn.
+        ignored: number of splats with NaN or infinity.
     """
 
     near: Array
@@ -169,16 +163,16 @@ class VisibleSplats:
 
 @dataclass(frozen=True, eq=False)
 class Gradients:
-    """Gradients of a loss; the arrays are the rasteriser's and hold until its next `backward`.
+    """Gradients of a loss with respect to the splats; the rasteriser's next `backward` overwrites the arrays.
 
     Attributes:
         means: [N, 3].
         quats: [N, 4], through the normalisation.
-        scales: [N, 3], towards the logarithms.
-        opacities: [N], towards alpha.
+        scales: [N, 3], with respect to the logarithms.
+        opacities: [N], with respect to alpha.
         sh0: [N, 3].
-        shN: [N, K, 3]; 0 beyond the degree that was rendered.
-        means2d: [N], length of the gradient towards the centre on the image, per pixel.
+        shN: [N, K, 3], 0 above the rendered degree.
+        means2d: [N], norm of the gradient with respect to the centre on the image, per pixel.
         radii: [N] float32, see `RenderResult`.
     """
 

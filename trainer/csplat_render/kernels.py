@@ -1,4 +1,4 @@
-"""Decorators that compile kernels with numba, with types for a type checker; threads that run them."""
+"""Compile kernels with numba by typed decorators, and run them on threads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from numba.core import event as typed_event
 
 from csplat.errors import InputError
 
-# numba's own types differ from version to version.
+# Typed as Any because numba's own types differ between versions.
 numba: Any = typed_numba
 extending: Any = typed_extending
 compiler: Any = typed_compiler
@@ -27,72 +27,72 @@ event: Any = typed_event
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Held by the one caller whose kernel the threads run.
+#: Held by the caller whose kernel the threads run.
 LOCK = threading.RLock()
 
-# Size of the arrays in bytes below which waking threads (80 µs) takes longer than running on one.
+# Bytes of all arrays; smaller work runs on one thread, because waking threads takes 80 µs.
 _SERIAL_BYTES = 1 << 17
 
-# Without nnan and ninf: the kernels test for NaN and infinity, and may meet them.
+# Without nnan and ninf, because the kernels test for NaN and infinity.
 _LN2 = math.log(2.0)
 _RELAXED = {"reassoc", "nsz", "arcp", "contract", "afn"}
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function of one thread, in strict IEEE arithmetic."""
+    """Compile a single-threaded kernel with strict IEEE arithmetic."""
     compiled: Callable[P, R] = numba.njit(function, cache=True, nogil=True, error_model="numpy")
     return compiled
 
 
 def device_function(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a small function that kernels call; it takes on their arithmetic when LLVM inlines it."""
+    """Compile a small function that kernels call; if LLVM inlines it, it uses the kernel's arithmetic."""
     compiled: Callable[P, R] = numba.njit(function, inline="never", cache=True, nogil=True, error_model="numpy")
     return compiled
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Inline a few lines into the kernels that call them before compilation, so that loops still vectorise."""
+    """Inline a few lines into the calling kernels before compilation so that their loops still vectorise."""
     copied: Callable[P, R] = numba.njit(function, inline="always", nogil=True, error_model="numpy")
     return copied
 
 
 def relaxed_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function of one thread that may reassociate and contract: the body of a loop over pixels."""
+    """Compile a single-threaded kernel with relaxed arithmetic (reassociation, contraction), for loops over pixels."""
     compiled: Callable[P, R] = numba.njit(function, cache=True, nogil=True, error_model="numpy", fastmath=_RELAXED)
     return compiled
 
 
 @dataclass(frozen=True, eq=False)
 class ParallelKernel(Generic[P]):
-    """A function that every thread calls once; callers omit its first two arguments, lane and number of lanes.
+    """A kernel that every thread calls once; callers omit its first two arguments, lane and number of lanes.
 
-    Python threads run it instead of numba's `prange`, which compiles a kernel four times: as the written function, as
-    two wrappers, and as part of its caller. A call costs 10 µs more, and compilation takes half the time.
+    It runs on Python threads instead of numba's `prange`, which compiles a kernel four times: as the written function,
+    as two wrappers, and as part of its caller. A call takes 10 µs longer, compilation takes half the time.
 
     Attributes:
-        compiled: the kernel; lane, number of lanes, arguments.
+        compiled: the compiled function; its arguments are lane, number of lanes, and those of the call.
     """
 
     compiled: Any
 
     @property
     def signatures(self) -> list[Any]:
-        """Signatures that it was compiled for."""
+        """Signatures for which the kernel is compiled."""
         signatures: list[Any] = self.compiled.signatures
         return signatures
 
     def __call__(self, *arguments: P.args, **named: P.kwargs) -> None:
-        """Run it on the threads that `thread_count` sets, on one if arrays are small; return when all are done."""
+        """Run the kernel on the threads set by `thread_count`, by default on one if arrays are small, and wait."""
         assert not named
         with LOCK:
             _threads.run(self.compiled, arguments)
 
 
-class _NoAliasCompiler(compiler.Compiler):  # type: ignore[misc]  # numba's types are those of each version
-    """A compiler of kernels whose arrays do not overlap: otherwise many loops are not vectorised."""
+class _NoAliasCompiler(compiler.Compiler):  # type: ignore[misc]  # numba's types differ between versions
+    """A compiler for kernels whose arrays do not overlap, which allows more loops to be vectorised."""
 
     def define_pipelines(self) -> Any:
-        """Return numba's pipelines for this compilation, with its noalias flag set."""
+        """Return numba's pipelines after setting the noalias flag."""
         self.state.flags.noalias = True
         return super().define_pipelines()
 
@@ -100,12 +100,12 @@ class _NoAliasCompiler(compiler.Compiler):  # type: ignore[misc]  # numba's type
 def parallel_kernel(
     *, relaxed: bool = False
 ) -> Callable[[Callable[Concatenate[int, int, P], None]], ParallelKernel[P]]:
-    """Compile a function that does one lane of the work, (lane, lanes, ...); all lanes run at once.
+    """Compile a function that does one lane of the work; its first arguments are the lane and the number of lanes.
 
-    No two of its arrays may overlap.
+    Its arrays must not overlap.
 
     Args:
-        relaxed: reassociate and contract, for the loops over pixels.
+        relaxed: use relaxed arithmetic, see `relaxed_kernel`.
     """
     options: dict[str, Any] = {"fastmath": _RELAXED} if relaxed else {}
 
@@ -119,7 +119,7 @@ def parallel_kernel(
     return decorate
 
 
-class _FirstCompilation(event.Listener):  # type: ignore[misc]  # numba's types are those of each version
+class _FirstCompilation(event.Listener):  # type: ignore[misc]  # numba's types differ between versions
     """A listener that calls a function when the first kernel is compiled."""
 
     def __init__(self, call: Callable[[], object]) -> None:
@@ -136,7 +136,7 @@ class _FirstCompilation(event.Listener):  # type: ignore[misc]  # numba's types 
 
 @contextmanager
 def on_compiling(call: Callable[[], object]) -> Iterator[None]:
-    """Call a function once if a kernel is compiled meanwhile, not if all of them come from numba's cache."""
+    """Within the context, call a function when a kernel is first compiled rather than loaded from numba's cache."""
     with event.install_listener("numba:compile", _FirstCompilation(call)):
         yield
 
@@ -146,13 +146,13 @@ def is_cached(kernel: Any) -> bool:
     compiled = getattr(kernel, "compiled", kernel)
     if compiled.signatures:
         return True
-    # The index of the cache has no public name; it is empty if the source is newer.
+    # numba has no public interface to the index of its cache; the index is empty if the source is newer.
     load = getattr(getattr(compiled._cache, "_cache_file", None), "_load_index", None)  # noqa: SLF001
     return load is not None and bool(load())
 
 
 def fast_exp2(x: float) -> float:
-    """Return 2**x for x < 128 in kernels: by a polynomial (error 2e-7) that vectorises in float32, exact in float64."""
+    """Return 2**x for x < 128: in float32 by a polynomial (relative error 2e-7) that vectorises, in float64 exactly."""
     return math.exp(x * _LN2)
 
 
@@ -164,7 +164,7 @@ def _fast_exp2(x: Any) -> Callable[[Any], Any]:
         return exact
 
     lowest, half = np.float32(-120.0), np.float32(0.5)
-    # 2**f for |f| <= 1/2, fitted for the smallest relative error.
+    # 2**x = 2**n · 2**f with n an integer and |f| <= 1/2; 2**f = Σ c_k f**k, fitted for minimal relative error.
     c0, c1, c2 = np.float32(1.0000001353333114), np.float32(0.6931468253392489), np.float32(0.24021906575261626)
     c3, c4, c5 = np.float32(0.05550791318132806), np.float32(0.009684186484357147), np.float32(0.0013275470569714626)
 
@@ -173,7 +173,7 @@ def _fast_exp2(x: Any) -> Callable[[Any], Any]:
         whole = np.int32(t - half)
         f = t - np.float32(whole)
         power = np.float32(c0 + f * (c1 + f * (c2 + f * (c3 + f * (c4 + f * c5)))))
-        # The whole part of the exponent goes straight into the bits.
+        # Multiply by 2**n by adding n to the exponent bits.
         return np.int32(power.view(np.int32) + (whole << np.int32(23))).view(np.float32)
 
     return polynomial
@@ -184,33 +184,33 @@ extending.overload(fast_exp2, jit_options={"fastmath": _RELAXED}, inline="always
 
 @device_function
 def lane_range(lane: int, lanes: int, count: int) -> tuple[int, int]:
-    """Return first and last + 1 of a thread's share of `count` items."""
+    """Return the range of a lane's share of `count` items."""
     return count * lane // lanes, count * (lane + 1) // lanes
 
 
 def python_function(compiled: Callable[P, R]) -> Callable[P, R]:
-    """Return the Python function that was compiled; it accepts arrays in place of a kernel's numbers."""
+    """Return the uncompiled function of a kernel, which also accepts arrays in place of numbers."""
     function: Callable[P, R] = getattr(compiled, "py_func", compiled)
     return function
 
 
 def available_threads() -> int:
-    """Return the number of threads for kernels: the processors of this process, or NUMBA_NUM_THREADS."""
+    """Return the maximum number of threads for kernels: the processors of this process, or NUMBA_NUM_THREADS."""
     return int(numba.config.NUMBA_NUM_THREADS)
 
 
 @contextmanager
 def thread_count(threads: int | None) -> Iterator[int]:
-    """Run kernels on this many threads, one caller at a time.
+    """Set the number of threads for kernels within the context, for one caller at a time.
 
-    A thread that waits inside the context for another one that calls a kernel waits for ever.
+    Within the context, waiting for another thread that calls a kernel is a deadlock.
 
     Args:
-        threads: number of threads, at least 1, limited to `available_threads`; None for the number set before,
-            at first all, or one if arrays are small.
+        threads: number of threads, at least 1, limited to `available_threads`; `None`: unchanged. Initially kernels use
+            all threads, or one if arrays are small.
 
     Yields:
-        The largest number of threads in use.
+        The maximum number of threads in use.
 
     Raises:
         InputError: `threads` is below 1.
@@ -228,10 +228,7 @@ def thread_count(threads: int | None) -> Iterator[int]:
 
 
 class _HelperThread:
-    """A thread that sleeps until it has a call to make. Owns two locks that alternate.
-
-    Locks wake a thread in half the time of a queue or a future.
-    """
+    """A thread that sleeps until it gets a call to make. Owns two locks, which wake it twice as fast as a queue."""
 
     def __init__(self) -> None:
         self._begun, self._ended = threading.Lock(), threading.Lock()
@@ -242,12 +239,12 @@ class _HelperThread:
         threading.Thread(target=self._serve, name="csplat kernel", daemon=True).start()
 
     def start(self, function: Any, arguments: tuple[Any, ...]) -> None:
-        """Begin a call."""
+        """Start a call."""
         self._job = function, arguments
         self._begun.release()
 
     def wait(self) -> None:
-        """Wait for the end of the call, and raise what it raised."""
+        """Wait for the end of the call, and re-raise its exception."""
         self._ended.acquire()
         error, self._error = self._error, None
         if error is not None:
@@ -260,14 +257,14 @@ class _HelperThread:
             self._job = (None, ())
             try:
                 function(*arguments)
-            except BaseException as error:  # noqa: BLE001  # the caller raises it again
+            except BaseException as error:  # noqa: BLE001  # `wait` raises it again
                 self._error = error
-            del function, arguments  # buffers must not live until the next call
+            del function, arguments  # frees the buffers before the next call
             self._ended.release()
 
 
 class _ThreadPool:
-    """The threads that run kernels, in addition to the calling one. Owns them and the number of threads to use."""
+    """The threads that run kernels in addition to the calling thread. Owns them and the number of threads to use."""
 
     def __init__(self) -> None:
         self.limit: int | None = None
@@ -291,11 +288,11 @@ class _ThreadPool:
             raise
         except BaseException:
             self._quit(waiting)
-            self.forget()  # an interrupt may have come between a start and its record: use new threads next time
+            self.forget()  # a started helper may be missing in `waiting`: use new threads next time
             raise
 
     def _quit(self, waiting: list[_HelperThread]) -> None:
-        """Wait for lanes that still write into the buffers; their errors are not the first one."""
+        """Wait for lanes that still write into the buffers, ignoring further errors."""
         try:
             while waiting:
                 with suppress(Exception):
@@ -315,13 +312,13 @@ def _bytes_of(arguments: tuple[Any, ...]) -> int:
 
 
 def _after_fork() -> None:
-    """Reset the lock and the threads in a child process, which has neither."""
-    global LOCK  # noqa: PLW0603  # a thread that does not exist here may hold it for ever
+    """Reset the lock and the threads in a child process, which does not inherit threads."""
+    global LOCK  # noqa: PLW0603  # a thread of the parent may hold it, and would never release it here
     LOCK = threading.RLock()
     _threads.limit = None
     _threads.forget()
 
 
 _threads = _ThreadPool()
-if hasattr(os, "register_at_fork"):  # work at import: a child process must learn that it has no threads
+if hasattr(os, "register_at_fork"):  # work at import: forked processes must reset the threads
     os.register_at_fork(after_in_child=_after_fork)

@@ -1,13 +1,17 @@
-"""LPIPS v0.1 with AlexNet (Zhang et al. 2018), a forward pass without PyTorch.
+"""LPIPS v0.1 with AlexNet (Zhang et al. 2018), without PyTorch.
+
+With F_l the features after AlexNet's convolution l, scaled to unit length per pixel, the distance is
+
+    Σ_l mean over pixels of w_l · (F_l(a) − F_l(b))²,  w_l: learned weights of the channels.
 
 The weights are not part of this package. `load_lpips` looks for them
 
-1. in the given file, an .npz with the arrays `AlexNet_0/Conv_{0..4}/kernel` (height, width,
-   in, out), `…/bias`, and `NetLinLayer_{0..4}/Conv_0/kernel`;
+1. in the given file, an .npz with the arrays `AlexNet_0/Conv_{0..4}/kernel` (height, width, in, out), `…/bias`, and
+   `NetLinLayer_{0..4}/Conv_0/kernel`;
 2. in the file named by the environment variable CSPLAT_LPIPS;
 3. in the user's cache, `csplat/lpips_alex.npz` under XDG_CACHE_HOME (else `~/.cache`);
-4. if PyTorch is installed: torchvision's AlexNet in torch's own cache, and the linear heads of an
-   installed `lpips` or `torchmetrics` package. Nothing is downloaded.
+4. if PyTorch is installed, in torchvision's AlexNet in torch's cache, with the linear heads of an installed `lpips` or
+   `torchmetrics` package. Nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -27,19 +31,19 @@ from csplat.archives import read_archive
 from csplat.errors import InputError
 from csplat.types import F32
 
-#: Smallest width and height of an image, pixels: AlexNet's last layer of a smaller one is empty.
+#: Minimum width and height of an image, pixels: AlexNet's last layer would be empty for smaller images.
 MIN_SIZE = 31
 
 #: Environment variable with the path of the weights, used if no file is given.
 ENVIRONMENT = "CSPLAT_LPIPS"
 
-#: Mean and standard deviation of the network's input, red, green, blue, of images in −1 to 1.
+#: Mean and standard deviation of the network's input by channel, for images in −1 to 1.
 SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 SCALE = np.array([0.458, 0.448, 0.450], np.float32)
 
 _EPSILON = 1e-10
 
-# Kernel (height, width, in, out), stride, padding, pooled before it.
+# Kernel (height, width, in, out), stride, padding, max-pooling before the convolution.
 _LAYERS = (
     ((11, 11, 3, 64), 4, 2, False),
     ((5, 5, 64, 192), 1, 2, True),
@@ -52,12 +56,12 @@ _TORCH_INDEX = (0, 3, 6, 8, 10)  # indices of AlexNet's convolutions among torch
 
 @dataclass(frozen=True, eq=False)
 class Lpips:
-    """The weights of the five layers, called with two images for their distance.
+    """The weights of the five layers; calling it with two images returns their distance.
 
     Attributes:
         kernels: [height, width, in, out] each, float32.
         biases: [out] each.
-        heads: [out] each, the weights of the differences of a layer's channels.
+        heads: [out] each, the weights w_l.
         source: origin of the weights, for messages.
     """
 
@@ -68,33 +72,30 @@ class Lpips:
 
     def __post_init__(self) -> None:
         for i, (shape, *_) in enumerate(_LAYERS):
-            for name, array, wanted in (
+            for name, array, expected in (
                 ("kernel", self.kernels[i], shape),
                 ("bias", self.biases[i], shape[-1:]),
                 ("head", self.heads[i], shape[-1:]),
             ):
-                if array.shape != wanted:
-                    raise InputError(
-                        f"{self.source}: {name} {i} has shape {list(array.shape)}, expected {list(wanted)}"
-                    )
+                if array.shape != expected:
+                    raise InputError(f"{self.source}: {name} {i} has shape {[*array.shape]}, expected {[*expected]}")
                 if not np.isfinite(array).all():
-                    raise InputError(f"{self.source}: {name} {i} holds values that are not finite")
+                    raise InputError(f"{self.source}: {name} {i} contains values that are not finite")
 
     def __call__(self, reference: NDArray[Any], image: NDArray[Any]) -> float:
-        """Return the perceptual distance of two images, 0 if they are the same.
+        """Return the perceptual distance of two images, 0 if they are equal.
 
         Args:
-            reference: [H, W, 3] floating, clipped to [0, 1]; H and W at least `MIN_SIZE`.
-            image: the same.
+            reference, image: [H, W, 3] floating, clipped to [0, 1]; H and W at least `MIN_SIZE`.
         """
         if reference.shape != image.shape or reference.ndim != 3 or reference.shape[2] != 3:
             raise InputError(
-                f"LPIPS of pictures of shapes {list(reference.shape)} and {list(image.shape)}, wanted [H, W, 3] twice"
+                f"the images for LPIPS have shapes {[*reference.shape]} and {[*image.shape]}, expected [H, W, 3] twice"
             )
         if reference.dtype.kind != "f" or image.dtype.kind != "f":
             raise InputError(f"LPIPS of {reference.dtype} and {image.dtype}, expected floating values in 0 to 1")
         if min(reference.shape[:2]) < MIN_SIZE:
-            raise InputError(f"LPIPS wants pictures of at least {MIN_SIZE}×{MIN_SIZE} pixels")
+            raise InputError(f"LPIPS requires images of at least {MIN_SIZE}×{MIN_SIZE} pixels")
         distance = 0.0
         for a, b, head in zip(_features(reference, self), _features(image, self), self.heads, strict=True):
             distance += float(np.mean(np.square(_unit(a) - _unit(b)) @ head.astype(np.float64)))
@@ -102,13 +103,13 @@ class Lpips:
 
 
 def load_lpips(path: str | Path | None = None) -> Lpips:
-    """Find and read the weights, see above.
+    """Find and read the weights.
 
     Args:
-        path: an .npz file; `None`: the other places above.
+        path: an .npz file; `None`: search the other places listed above.
 
     Raises:
-        InputError: the file does not hold weights, or none are found.
+        InputError: the file does not contain weights, or none are found.
     """
     if path is not None:
         return _read(Path(path))
@@ -121,7 +122,7 @@ def load_lpips(path: str | Path | None = None) -> Lpips:
     if weights is None:
         raise InputError(
             f"no LPIPS weights: neither {cache} nor a file named by {ENVIRONMENT}, nor (with PyTorch) torchvision's "
-            "AlexNet in torch's cache beside an installed lpips package"
+            "AlexNet in torch's cache and an installed lpips package"
         )
     return weights
 
@@ -145,19 +146,17 @@ def _read(path: Path) -> Lpips:
     names = ("AlexNet_0/Conv_{}/kernel", "AlexNet_0/Conv_{}/bias", "NetLinLayer_{}/Conv_0/kernel")
     parts = [[file[name.format(i)] for i in count] for name in names]
     if any(array.dtype.kind != "f" for part in parts for array in part):
-        file.refuse("its arrays hold no real numbers")
+        file.refuse("its arrays do not contain floating-point numbers")
     with np.errstate(over="ignore"):  # values beyond float32 are refused as not finite
         kernels, biases, heads = (tuple(array.astype(np.float32) for array in part) for part in parts)
     return Lpips(kernels, biases, tuple(head.reshape(-1) for head in heads), str(path))
 
 
 def load_torch_lpips(cache: Path | None = None, heads_path: Path | None = None) -> Lpips | None:
-    """Read the weights from PyTorch's own files; `None` if one of them, or torch, is absent.
-
-    Torch is imported by name so that nothing of this package depends on it.
+    """Read the weights from PyTorch's files; return `None` if one of them, or torch, is not installed.
 
     Args:
-        cache: folder of torch's cache; `None`: torch's own.
+        cache: torch's cache folder; `None`: its default.
         heads_path: file of the linear heads; `None`: that of an installed `lpips` or `torchmetrics` package.
 
     Raises:
@@ -184,7 +183,7 @@ def load_torch_lpips(cache: Path | None = None, heads_path: Path | None = None) 
             source=f"{backbones[-1]} and {heads_path}",
         )
     except KeyError as error:
-        raise InputError(f"{backbones[-1]} and {heads_path} hold no LPIPS weights: {error.args[0]}") from error
+        raise InputError(f"{backbones[-1]} and {heads_path} contain no LPIPS weights: {error.args[0]}") from error
 
 
 def _heads_path() -> Path | None:
@@ -212,13 +211,13 @@ def _features(image: NDArray[Any], weights: Lpips) -> list[F32]:
 
 
 def _unit(x: F32) -> NDArray[np.float64]:
-    """Scale every pixel's channels to length 1."""
+    """Scale the channels of each pixel to length 1."""
     wide = x.astype(np.float64)
     result: NDArray[np.float64] = wide / (np.sqrt(np.sum(wide * wide, axis=2, keepdims=True)) + _EPSILON)
     return result
 
 
 def _pool(x: F32) -> F32:
-    """Return the maximum over 3×3, for every second pixel."""
+    """Return the maximum over 3×3 pixels, with a stride of 2."""
     result: F32 = sliding_window_view(x, (3, 3), axis=(0, 1))[::2, ::2].max(axis=(3, 4))
     return result

@@ -1,9 +1,15 @@
 """Kernels of SSIM and LPIPS.
 
-SSIM's window is separable: along the rows, then across them. It is a Gaussian of 11×11 pixels and σ 1.5, zeros lie
-beyond the border, C1 = 0.01² and C2 = 0.03²: the conventions of `csplat_render.metrics`, which the trainer's loss
-shares. The convolution of LPIPS is numba where NumPy would use BLAS, whose threads spin while they wait: with other
-programs on the same two cores, two images of 640×480 took 5 s.
+SSIM (Wang et al. 2004) of a pixel is
+
+    (2 μx μy + C1) (2 σxy + C2) / ((μx² + μy² + C1) (σx² + σy² + C2)),  σxy = E[x y] − μx μy, likewise σx², σy²,
+
+where μ and E are means weighted by the window, a Gaussian of 11×11 pixels and σ 1.5, with zeros beyond the border, and
+C1 = 0.01², C2 = 0.03². The window is separable, so images are blurred along the rows, then across them. The trainer's
+loss uses the same conventions.
+
+The convolution of LPIPS uses numba because NumPy uses BLAS, whose threads spin while they wait: with other programs on
+the same two cores, two images of 640×480 took 5 s.
 """
 
 from __future__ import annotations
@@ -18,11 +24,9 @@ from csplat_render.kernels import parallel_kernel, relaxed_kernel, thread_count
 
 C1, C2 = 0.01**2, 0.03**2
 
-#: Pixels from the middle of the window to its edge.
-RADIUS = 5
+RADIUS = 5  #: pixels from the centre of the window to its edge
 
-#: Values of a pixel, which are adjacent in a row.
-CHANNELS = 3
+CHANNELS = 3  #: values per pixel, adjacent in a row
 
 _SIGMA = 1.5
 _PAD = CHANNELS * RADIUS
@@ -34,7 +38,7 @@ def _window() -> F64:
     return normalised
 
 
-#: [11] float64, its sum is 1; the window is the outer product with itself.
+#: [11] float64 with sum 1; the window is the outer product with itself.
 WINDOW = _window()
 
 
@@ -42,8 +46,7 @@ def mean_ssim(x: F64, y: F64) -> float:
     """Return the mean SSIM over all pixels and channels.
 
     Args:
-        x: [H, W, 3] float64, C-contiguous.
-        y: the same.
+        x, y: [H, W, 3] float64, C-contiguous.
     """
     height, width = x.shape[0], CHANNELS * x.shape[1]
     across = np.zeros((5, height + 2 * RADIUS, width), np.float64)
@@ -56,11 +59,11 @@ def mean_ssim(x: F64, y: F64) -> float:
 
 @relaxed_kernel
 def blur_across(row: Any, taps: Any, out: Any) -> None:
-    """Blur a row that has `RADIUS` pixels of zeros on either side; vectorises over its values.
+    """Blur a row that has `RADIUS` pixels of zeros on either side; vectorised over its values.
 
     Args:
         row: [3·W + 30].
-        taps: [6], of the window, from its middle outwards; the dtype of the row.
+        taps: [6], the window from its centre outwards, in the dtype of the row.
         out: [3·W], written.
     """
     w0, w1, w2, w3, w4, w5 = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
@@ -77,11 +80,11 @@ def blur_across(row: Any, taps: Any, out: Any) -> None:
 
 @relaxed_kernel
 def blur_down(field: Any, r: int, taps: Any, out: Any) -> None:
-    """Blur across the rows r .. r + 10 of a field; vectorises over the values of a row.
+    """Blur across the rows r to r + 10 of a field; vectorised over the values of a row.
 
     Args:
         field: [rows, 3·W].
-        r: the row above the window's middle by `RADIUS`.
+        r: first row of the window.
         taps: see `blur_across`.
         out: [3·W], written.
     """
@@ -102,10 +105,9 @@ def blur_products(lane: int, lanes: int, x: Any, y: Any, taps: Any, across: Any)
     """Blur x, y, x², y², xy along each row; parallel over rows, vectorised over the values of a row.
 
     Args:
-        x: [H, 3·W].
-        y: [H, 3·W].
+        x, y: [H, 3·W].
         taps: [6], see `blur_across`.
-        across: [5, H + 10, 3·W], rows 5 .. H + 4 written.
+        across: [5, H + 10, 3·W], rows 5 to H + 4 are written.
     """
     height, width = x.shape
     for r in range(lane, height, lanes):
@@ -146,14 +148,14 @@ def _similarities(lane: int, lanes: int, across: Any, taps: Any, sums: Any) -> N
 
 
 def mean_ssim_twin(x: F64, y: F64) -> float:
-    """Compute `mean_ssim` the slow way: NumPy, one formula after the other."""
+    """Compute `mean_ssim` slowly in NumPy."""
     mx, my = blur_twin(x), blur_twin(y)
     xx, yy, xy = blur_twin(x * x) - mx * mx, blur_twin(y * y) - my * my, blur_twin(x * y) - mx * my
     return float(np.mean((2.0 * mx * my + C1) * (2.0 * xy + C2) / ((mx * mx + my * my + C1) * (xx + yy + C2))))
 
 
 def blur_twin(x: F64) -> F64:
-    """Return the window's weighted mean around each pixel of [H, W, 3]."""
+    """Return the weighted mean over the window around each pixel of [H, W, 3]."""
     for axis in (0, 1):
         padded = np.pad(x, [(RADIUS, RADIUS) if i == axis else (0, 0) for i in range(3)])
         x = sum(
@@ -163,27 +165,27 @@ def blur_twin(x: F64) -> F64:
     return x
 
 
-_PIXELS = 4  # pixels of a row whose sums are computed together
-_TAPS = 4  # products that are added to a sum at a time
+_PIXELS = 4  # pixels of a row computed together
+_TAPS = 4  # products added to a sum at a time
 
 
 def convolve(x: F32, kernel: F32, bias: F32, stride: int, padding: int) -> F32:
-    """Convolve an image with zeros around it.
+    """Convolve an image: y[r, c, o] = bias[o] + Σ_ijk kernel[i, j, k, o] · x[r stride + i, c stride + j, k], padded.
 
     Args:
         x: [h, w, in].
         kernel: [height, width, in, out].
         bias: [out].
         stride: pixels from one output to the next, in both directions.
-        padding: width of the zeros on each side.
+        padding: width of the zero border.
 
     Returns:
         [rows, columns, out].
     """
     height, width, inputs, outputs = kernel.shape
     rows, columns = ((size + 2 * padding - k) // stride + 1 for size, k in zip(x.shape, (height, width), strict=False))
-    # A row of the kernel is contiguous in a row of the image. It is padded with zeros to a multiple of
-    # the taps, and the columns of the result to a multiple of the pixels.
+    # A row of the kernel is contiguous in a row of the image. It is padded with zeros to a multiple of `_TAPS`, and the
+    # columns of the result to a multiple of `_PIXELS`.
     taps, places = -(-width * inputs // _TAPS) * _TAPS, -(-columns // _PIXELS) * _PIXELS
     values = max((x.shape[1] + 2 * padding) * inputs, (places - 1) * stride * inputs + taps)
     flat = np.zeros((x.shape[0] + 2 * padding, values), np.float32)
@@ -204,8 +206,8 @@ def _convolve(lane: int, lanes: int, x: Any, weights: Any, bias: Any, down: int,
         x: [h, values] float32, rows of pixels.
         weights: [height, taps, out] float32.
         bias: [out] float32.
-        down: rows of `x` from one row of the result to the next.
-        across: values of a row of `x` from one pixel of the result to the next.
+        down: rows of `x` per row of the result.
+        across: values of a row of `x` per pixel of the result.
         result: [rows, columns, out] float32, written; columns are a multiple of four.
     """
     outputs = len(bias)
@@ -234,7 +236,7 @@ def _convolve(lane: int, lanes: int, x: Any, weights: Any, bias: Any, down: int,
 
 
 def convolve_twin(x: F32, kernel: F32, bias: F32, stride: int, padding: int) -> NDArray[np.float64]:
-    """Compute `convolve` the slow way: float64, one product of the sum after the other."""
+    """Compute `convolve` slowly in float64."""
     height, width = kernel.shape[:2]
     padded = np.pad(x.astype(np.float64), ((padding, padding), (padding, padding), (0, 0)))
     rows, columns = (padded.shape[0] - height) // stride + 1, (padded.shape[1] - width) // stride + 1

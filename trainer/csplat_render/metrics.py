@@ -1,18 +1,16 @@
-"""Similarity of two images: PSNR, SSIM, pooled over views; FLIP if `flip-evaluator` is installed.
+"""Similarity of two images: PSNR and SSIM, pooled over views; FLIP if `flip-evaluator` is installed.
 
-Conventions, without which a number means nothing:
+Conventions:
 
 * Images are clipped to [0, 1] and compared in float64; the peak is 1.
-* `psnr` of several views is one PSNR of the squared error pooled over views, pixels and channels;
-  `psnr_mean` is the mean of the views' PSNRs, which is what papers print. Both end at 99 dB.
-* A pixel is *covered* if the reference's alpha is at least `COVERED_ALPHA`. Some scores are over
-  covered pixels only: a plain background that both images share inflates the PSNR of an object, a
-  white one no less than a black one, by 3 dB if half of the image is empty.
-* SSIM is INRIA's: a Gaussian window of 11×11, σ 1.5, zeros beyond the border, C1 = 0.01²,
-  C2 = 0.03², mean over all pixels and channels. (Wang's original leaves the border out; scikit-image
-  does so too.)
+* `psnr` of several views is the PSNR of the squared error pooled over views, pixels and channels; `psnr_mean` is the
+  mean of the views' PSNRs, which papers report. Both are at most 99 dB.
+* A pixel is *covered* if the reference's alpha is at least `COVERED_ALPHA`. Some scores include covered pixels only,
+  because a plain background of any colour inflates the PSNR of an object, by 3 dB if half of the image is empty.
+* SSIM follows INRIA: a Gaussian window of 11×11, σ 1.5, zeros beyond the border, C1 = 0.01², C2 = 0.03², mean over all
+  pixels and channels. (Wang's original and scikit-image omit the border.)
 
-Published tables of Blender scenes are made on a white background, those of photographs have none.
+Published results for Blender scenes use a white background; photographs have none.
 """
 
 from __future__ import annotations
@@ -29,29 +27,29 @@ from numpy.typing import ArrayLike, NDArray
 from csplat.errors import InputError
 from csplat.types import F32, F64
 
-#: Decibels for images without any difference.
+#: dB, maximum PSNR, also for equal images.
 PSNR_CAP = 99.0
 
-#: A pixel counts as covered from this alpha on.
+#: Minimum alpha of a covered pixel.
 COVERED_ALPHA = 0.5
 
 
-#: A distance between two images, [H, W, 3] in 0..1: the reference and the render.
+#: A function that returns the distance between a reference and a render, [H, W, 3] in 0..1.
 Distance = Callable[[F32, F32], float]
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Similarity of two images of one view.
+    """The similarity of two images of a view.
 
     Attributes:
-        image: name of the view's image file, if it has one.
-        pixels: number of pixels that count.
-        mse: mean squared error over these and channels.
-        psnr: the same in dB.
-        covered_mse: over covered pixels only; `None` if cover is not known or 0.
-        cover: share of the pixels that are covered; `None` if not known.
-        ssim, lpips: `None` if they were not requested.
+        image: name of the view's image file; `None`: there is none.
+        pixels: number of compared pixels.
+        mse: mean squared error over pixels and channels.
+        psnr: PSNR, dB.
+        covered_mse: mean squared error over covered pixels; `None` if cover is unknown or 0.
+        cover: fraction of covered pixels; `None` if unknown.
+        ssim, lpips: `None` if not requested.
     """
 
     image: str | None
@@ -66,18 +64,18 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Scores:
-    """Similarity of two sets of images.
+    """The similarity of two sets of images.
 
     Attributes:
-        each: the views, one by one.
+        each: scores of each view.
         psnr: dB, of the error pooled over all views.
-        psnr_mean: dB, mean of the views'.
-        psnr_worst: dB, the lowest of the views'.
+        psnr_mean: dB, mean over views.
+        psnr_worst: dB, minimum over views.
         worst_view: index of that view, from 0.
-        ssim, lpips: means of the views'; `None` if they were not requested.
-        psnr_covered: dB, pooled over covered pixels only; `None` if cover is not known or 0.
-        cover: share of the pixels that are covered, over all views; `None` if not known.
-        ignored: splats of the scene that were not drawn because they hold NaN or infinities.
+        ssim, lpips: means over views; `None` if not requested.
+        psnr_covered: dB, pooled over covered pixels; `None` if cover is unknown or 0.
+        cover: fraction of covered pixels over all views; `None` if unknown.
+        ignored: number of splats that were not drawn because they contain NaN or infinity.
     """
 
     each: tuple[ViewScore, ...]
@@ -96,10 +94,10 @@ class Scores:
         """Pool the scores of views.
 
         Raises:
-            InputError: there are none.
+            InputError: there are no views.
         """
         if not each:
-            raise InputError("no pictures to compare")
+            raise InputError("found no images to compare")
         pixels = [one.pixels for one in each]
         covers = [one.cover for one in each if one.cover is not None]
         known = len(covers) == len(each)
@@ -120,7 +118,7 @@ class Scores:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Return the scores over all views, and the number of views, JSON-compatible."""
+        """Return the pooled scores and the number of views, JSON-compatible."""
         names = ("psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim", "lpips", "psnr_covered", "cover")
         return {"views": len(self.each), **{name: getattr(self, name) for name in names}}
 
@@ -138,14 +136,13 @@ def score_view(
     """Compare a render with the reference image of its view.
 
     Args:
-        reference: [H, W, 3], floating.
-        render: [H, W, 3], floating.
-        covered: [H, W], True for covered pixels of the reference; `None`: not known.
-        mask: [H, W], True for pixels that count, at least one; for the others, SSIM and LPIPS take the render as the
-            reference. `None`: all pixels count.
+        reference, render: [H, W, 3], floating.
+        covered: [H, W], True for covered pixels of the reference; `None`: unknown.
+        mask: [H, W], True for pixels to compare, at least one; elsewhere, SSIM and LPIPS use the render as reference.
+            `None`: compare all pixels.
         image: name of the view's image file.
-        with_ssim: compute SSIM; it takes about as long as rendering.
-        lpips: the LPIPS distance, if it is needed.
+        with_ssim: compute SSIM, which takes about as long as rendering.
+        lpips: the LPIPS distance; `None`: it is not computed.
 
     Raises:
         InputError: the images cannot be compared.
@@ -172,11 +169,11 @@ def score_view(
 
 
 def pooled(errors: ArrayLike, pixels: Sequence[int]) -> float:
-    """Return the mean squared error over all pixels, given those of the views.
+    """Return the mean squared error over all pixels.
 
     Args:
-        errors: [V] mean squared error by view.
-        pixels: [V] of each view.
+        errors: [V], mean squared errors of the views.
+        pixels: [V], numbers of pixels of the views.
     """
     counts = np.asarray(pixels, np.float64)
     return float(np.sum(np.asarray(errors, np.float64) * counts) / np.sum(counts))
@@ -190,7 +187,7 @@ def squared_error(reference: NDArray[Any], image: NDArray[Any]) -> F64:
 
 
 def psnr_of_mse(mean_squared_error: float) -> float:
-    """Return a mean squared error in decibels, `PSNR_CAP` at most."""
+    """Return the PSNR of a mean squared error, −10 log10(MSE) dB, at most `PSNR_CAP`."""
     if mean_squared_error <= 0.0:
         return PSNR_CAP
     return min(PSNR_CAP, -10.0 * math.log10(mean_squared_error))
@@ -202,7 +199,7 @@ def psnr(reference: NDArray[Any], image: NDArray[Any]) -> float:
 
 
 def ssim(reference: NDArray[Any], image: NDArray[Any]) -> float:
-    """Return the SSIM of two images, [H, W, 3] each; 1 if they are the same."""
+    """Return the SSIM of two images, [H, W, 3] each; 1 if they are equal."""
     from csplat_render.metric_kernels import mean_ssim  # numba takes a second to import
 
     return mean_ssim(*_clipped(reference, image))
@@ -221,35 +218,34 @@ def _clipped(reference: NDArray[Any], image: NDArray[Any]) -> tuple[F64, F64]:
         if array.dtype.kind != "f":
             raise InputError(f"the {name} is {array.dtype}, expected floating values in 0 to 1")
     if reference.shape != image.shape:
-        raise InputError(f"pictures of sizes {list(reference.shape)} and {list(image.shape)} cannot be compared")
+        raise InputError(f"images of shapes {list(reference.shape)} and {list(image.shape)} cannot be compared")
     a = np.clip(np.ascontiguousarray(reference, np.float64), 0.0, 1.0)
     b = np.clip(np.ascontiguousarray(image, np.float64), 0.0, 1.0)
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        raise InputError("a picture holds NaN")
+        raise InputError("an image contains NaN")
     return a, b
 
 
 def flip(reference: NDArray[Any], image: NDArray[Any]) -> float:
-    """Return the mean FLIP error (Andersson et al. 2020), 0 (none) to 1, by NVIDIA's `flip-evaluator`.
+    """Return the mean FLIP error (Andersson et al. 2020) of two sRGB images, 0 to 1, with NVIDIA's `flip-evaluator`.
 
-    The package comes with `pip install csplat[flip]`. LDR-FLIP at its default distance: 0.7 m from a 0.7 m wide
-    screen of 3840 pixels, 67 pixels per degree. The values are taken as sRGB.
+    `pip install csplat[flip]` installs the package. This is LDR-FLIP at its default viewing distance: 0.7 m from a
+    0.7 m wide screen of 3840 pixels, 67 pixels per degree.
 
     Args:
-        reference: [H, W, 3] floating, clipped to [0, 1].
-        image: the same.
+        reference, image: [H, W, 3] floating, clipped to [0, 1].
 
     Raises:
         InputError: the images differ in shape, or the package is not installed.
     """
     if reference.shape != image.shape or reference.ndim != 3 or reference.shape[2] != 3:
         raise InputError(
-            f"FLIP of pictures of shapes {list(reference.shape)} and {list(image.shape)}, wanted [H, W, 3] twice"
+            f"the images for FLIP have shapes {[*reference.shape]} and {[*image.shape]}, expected [H, W, 3] twice"
         )
     try:
         package: Any = importlib.import_module("flip_evaluator")
     except ImportError as error:
-        raise InputError("FLIP needs flip-evaluator: pip install 'csplat[flip]'") from error
+        raise InputError("FLIP requires flip-evaluator: pip install 'csplat[flip]'") from error
     a, b = (np.ascontiguousarray(np.clip(array, 0.0, 1.0), np.float32) for array in (reference, image))
     _, mean, _ = package.evaluate(a, b, "LDR", applyMagma=False)
     return float(mean)

@@ -4,8 +4,15 @@ Forward. Let R and t be the rotation and translation of the camera, c = R·mean 
 and J the Jacobian of the perspective at c, (j0, 0, j02; 0, j1, j12). With p and q the two rows of J·R, r_k the axes
 of the splat and s_k its standard deviations, the projected half-axes are u_k = s_k r_k·p and v_k = s_k r_k·q, and the
 covariance is Σ = (A, B; B, C) = (u·u, u·v; u·v, v·v) + dilation. Its determinant is computed as
-|u×v|² + dilation (u·u + v·v) + dilation², with (u×v)_k = s_i s_j r_k·(p×q): sums of squares, which lose nothing
+|u×v|² + dilation (u·u + v·v) + dilation², with (u×v)_k = s_i s_j r_k·(p×q): sums of squares, which are accurate
 however long and thin the splat is.
+
+Extent. A splat of opacity o is drawn within the ellipse dᵀ Σ⁻¹ d ≤ ρ², ρ² = 2 ln(o / alpha_min), whose half-width is
+ρ √A and whose half-height is ρ √C. At height y above its centre, its chord is
+
+    x = (B / C) y ± ρ √(det Σ / C) · √(1 − (y / (ρ √C))²)
+
+and it reaches farthest to the right, ρ √A, at y = ρ B / √A.
 
 Backward. With d the distance of a pixel from the centre m of the ellipse and e = Σ⁻¹ d, the exponent E = −½ dᵀ Σ⁻¹ d
 has ∂E/∂m = e and ∂E/∂Σ = ½ e eᵀ. Writing g_x for ∂loss/∂x and `slope` for ∂loss/∂E of a pixel:
@@ -20,10 +27,12 @@ has ∂E/∂m = e and ∂E/∂Σ = ½ e eᵀ. Writing g_x for ∂loss/∂x and `
     g_c = Jᵀ g_m + (∂J/∂c) g_J + g_depth (0, 0, 1)
     g_mean = Rᵀ g_c + (I − n nᵀ) / |mean − camera| · ∂(colour)/∂n    for the viewing direction n
 
-In the antialiased mode the opacity is multiplied by √ratio, ratio = bare / dilated being the quotient of the
-determinants without and with the dilation; with g = ½ Σ slope / bare this adds
+In the antialiased mode the opacity is multiplied by √ratio (Yu et al., Mip-Splatting, 2024), where ratio = bare /
+dilated is the quotient of the determinants without and with the dilation. With g = ½ Σ slope / bare this adds
 
-    g_A += g (C_bare − ratio (C_bare + dilation)),  g_C likewise with A,  g_B −= 2 g B (1 − ratio).
+    g_A += g (C_bare − ratio (C_bare + dilation))
+    g_B −= 2 g B (1 − ratio)
+    g_C += g (A_bare − ratio (A_bare + dilation))
 
 The sums over pixels are stored per tile as moments about the centre of the tile; `sum_records` moves them to the
 centre of the splat. `reference_rasteriser` is the slow twin; gradients are compared with its finite differences.
@@ -62,13 +71,11 @@ _C30, _C31, _C32, _C33, _C34, _C35, _C36 = (
 
 @device_function
 def sh_basis(degree: int, x: Any, y: Any, z: Any, basis: Any) -> None:
-    """Evaluate the basis functions, real, in the order and with the signs of the splatting literature.
+    """Evaluate the real SH basis functions in the order and with the signs of INRIA's implementation.
 
     Args:
         degree: 0 to 3.
-        x: direction, of unit length: a number, or an array for many directions at once (the exact reference).
-        y: as x.
-        z: as x.
+        x, y, z: unit direction: numbers, or arrays for several directions (in the exact reference).
         basis: [(degree + 1)**2, ...], written.
     """
     basis[0] = SH_C0
@@ -95,14 +102,12 @@ def sh_basis(degree: int, x: Any, y: Any, z: Any, basis: Any) -> None:
 
 @device_function
 def sh_basis_gradient(degree: int, x: float, y: float, z: float, g: Any) -> tuple[float, float, float]:
-    """Return the gradient of the sum of g[k] · basis[k] towards x, y, z, as if they were independent.
+    """Return the gradient of Σ g[k] · basis[k] with respect to x, y and z as independent variables.
 
     Args:
         degree: 0 to 3.
-        x: direction, of unit length.
-        y: the same.
-        z: the same.
-        g: [(degree + 1)**2], one factor per basis function.
+        x, y, z: unit direction.
+        g: [(degree + 1)**2], factors of the basis functions.
     """
     gx, gy, gz = 0.0, 0.0, 0.0
     if degree >= 1:
@@ -147,7 +152,7 @@ BLOCK = 512
 
 @device_function
 def rotation_matrix(w: float, x: float, y: float, z: float) -> tuple[float, ...]:
-    """Return the rotation matrix of a unit quaternion, row by row; its columns are the splat's axes."""
+    """Return the rotation matrix of a unit quaternion, row by row; its columns are the axes of the splat."""
     return (
         1.0 - 2.0 * (y * y + z * z),
         2.0 * (x * y - w * z),
@@ -163,7 +168,7 @@ def rotation_matrix(w: float, x: float, y: float, z: float) -> tuple[float, ...]
 
 @device_function
 def unit_quaternion(q: Any) -> tuple[float, float, float, float, float]:
-    """Return a quaternion at unit length, and 1 / its length; for zero the identity and 0."""
+    """Return the normalised quaternion and 1 / its length; for zero the identity and 0."""
     w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
     squared = w * w + x * x + y * y + z * z
     if squared == 0.0:
@@ -174,13 +179,13 @@ def unit_quaternion(q: Any) -> tuple[float, float, float, float, float]:
 
 @device_function
 def standard_deviation(log_scale: float) -> float:
-    """Return the standard deviation of a log-scale, which is clamped."""
+    """Return the standard deviation of a log scale, which is clamped to ± `LOG_SCALE_LIMIT`."""
     return math.exp(min(max(np.float64(log_scale), -LOG_SCALE_LIMIT), LOG_SCALE_LIMIT))
 
 
 @device_function
 def perspective_jacobian(view: Any, x: float, y: float, z: float) -> tuple[float, float, float, float, bool, bool]:
-    """Return j0, j02, j1, j12 of the perspective's Jacobian, and whether x/z and y/z were inside the limits."""
+    """Return j0, j02, j1, j12 of the perspective's Jacobian; and True for each of x/z and y/z within its bounds."""
     over = 1.0 / z
     tx, ty = x * over, y * over
     inside_x = view[17] < tx < view[18]
@@ -195,7 +200,7 @@ def perspective_jacobian(view: Any, x: float, y: float, z: float) -> tuple[float
 def jacobian_rows(
     view: Any, j0: float, j02: float, j1: float, j12: float
 ) -> tuple[float, float, float, float, float, float]:
-    """Return the rows p and q: Jacobian times the camera's rotation."""
+    """Return the rows p and q of the Jacobian times the camera's rotation."""
     return (
         j0 * view[0] + j02 * view[6],
         j0 * view[1] + j02 * view[7],
@@ -221,13 +226,13 @@ def determinants(pq: Any, r: Any, s0: float, s1: float, s2: float, trace: float)
 
 @device_function
 def compensation(bare: float, dilated: float) -> float:
-    """Return the factor of the opacity in the antialiased mode, which compensates the dilation."""
+    """Return the factor of the opacity in the antialiased mode, which compensates for the dilation."""
     return math.sqrt(max(bare / dilated, COMPENSATION_MIN))
 
 
 @device_function
 def view_direction(view: Any, mean: Any) -> tuple[float, float, float, float]:
-    """Return the direction from the camera to a point, of unit length, and 1 / the distance."""
+    """Return the unit direction from the camera to a point, and 1 / the distance."""
     x, y, z = mean[0] - view[21], mean[1] - view[22], mean[2] - view[23]
     inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
     return x * inverse, y * inverse, z * inverse, inverse
@@ -236,7 +241,7 @@ def view_direction(view: Any, mean: Any) -> tuple[float, float, float, float]:
 @device_function
 def is_finite_shape(i: int, means: Any, quats: Any, scales: Any, opacities: Any) -> bool:
     """Return True if all values of a splat except its colour are finite."""
-    total = opacities[i] - opacities[i]  # NaN or infinity less itself is NaN
+    total = opacities[i] - opacities[i]  # NaN if the value is NaN or infinite
     total += (means[i, 0] - means[i, 0]) + (means[i, 1] - means[i, 1]) + (means[i, 2] - means[i, 2])
     total += (scales[i, 0] - scales[i, 0]) + (scales[i, 1] - scales[i, 1]) + (scales[i, 2] - scales[i, 2])
     total += (quats[i, 0] - quats[i, 0]) + (quats[i, 1] - quats[i, 1])
@@ -246,7 +251,7 @@ def is_finite_shape(i: int, means: Any, quats: Any, scales: Any, opacities: Any)
 
 @device_function
 def is_finite_colour(i: int, sh0: Any, shN: Any, higher: int) -> bool:
-    """Return True if the coefficients of a splat that are used are finite."""
+    """Return True if the SH coefficients of a splat up to the rendered degree are finite."""
     total = (sh0[i, 0] - sh0[i, 0]) + (sh0[i, 1] - sh0[i, 1]) + (sh0[i, 2] - sh0[i, 2])
     for k in range(higher):
         total += (shN[i, k, 0] - shN[i, k, 0]) + (shN[i, k, 1] - shN[i, k, 1]) + (shN[i, k, 2] - shN[i, k, 2])
@@ -255,7 +260,7 @@ def is_finite_colour(i: int, sh0: Any, shN: Any, higher: int) -> bool:
 
 @device_function
 def is_outside(at: float, size: int, squared_reach: float) -> bool:
-    """Return True if an extent around `at` ends more than half a pixel outside of 0 to `size`."""
+    """Return True if the interval of half-length √squared_reach around `at` is more than 1 pixel outside 0..size."""
     distance = max(-at, at - size) - 1.0
     return bool(distance > 0.0 and distance * distance > squared_reach)
 
@@ -283,30 +288,24 @@ def project(
     radii: Any,
     ignored: Any,
 ) -> None:
-    """Project every splat; parallel over blocks of splats, one splat at a time.
+    """Project every splat; parallel over blocks of splats, not vectorised.
 
     Args:
-        means: [N, 3], float32 or float64, as the next five.
-        quats: [N, 4], of any length.
-        scales: [N, 3], logarithms.
-        opacities: [N], alpha.
-        sh0: [N, 3].
-        shN: [N, K, 3], K at least (degree + 1)**2 - 1.
-        degree: degree of the spherical harmonics that are evaluated.
+        means, quats, scales, opacities, sh0, shN: the splats, float32 or float64; quaternions of any length, scales as
+            logarithms, shN [N, K, 3] with K at least (degree + 1)**2 - 1.
+        degree: SH degree to evaluate.
         view: [24], see `view_vector`.
-        width: width of the image, pixels.
-        height: height of the image, pixels.
-        antialiased: compensate the dilation.
+        width, height: size of the image, pixels.
+        antialiased: compensate for the dilation.
         alpha_min: smallest alpha that is drawn.
-        shape: [N, 10] float64, written for splats in view: centre x and y, inverse covariance a
-            b c, opacity, red, green, blue, depth.
-        extent: [N, 6] float64, written, of the ellipse of `alpha_min`: how far the middle of its
-            chord moves per row, its half-width at the height of the centre, 1 / its half-height,
-            the height at which it reaches farthest to the right; centre x and y.
-        box: [N, 4] int32, written: x0, x1, y0, y1 of the pixels that it may touch, x1 and y1 beyond.
-        depth: [N] float32, written: 0 for splats that are not drawn.
-        radii: [N] float32, written: 3 standard deviations along the longest axis; 0 as above.
-        ignored: [ceil(N / BLOCK)] int64, written: number of splats that hold NaN or infinity.
+        shape: [N, 10] float64, written for splats in view: centre x and y, inverse covariance a b c (Σ⁻¹ = (a, b; b,
+            c)), opacity, red, green, blue, depth.
+        extent: [N, 6] float64, written, see the equations above: B / C, ρ √(det Σ / C), 1 / (ρ √C), ρ B / √A; centre x
+            and y.
+        box: [N, 4] int32, written: pixels that the splat may touch, columns x0 to x1 - 1 and rows y0 to y1 - 1.
+        depth: [N] float32, written: depth; 0 for splats that are not drawn.
+        radii: [N] float32, written: 3 standard deviations along the longest axis; 0 for splats that are not drawn.
+        ignored: [ceil(N / BLOCK)] int64, written: number of splats with NaN or infinity.
     """
     n = means.shape[0]
     higher = (degree + 1) * (degree + 1) - 1
@@ -337,7 +336,7 @@ def project(
             p0, p1, p2, q0, q1, q2 = pq
             opacity = np.float64(opacities[i])
             reach = 2.0 * math.log(opacity / alpha_min)
-            # The projected axes are no longer than the longest standard deviation allows.
+            # Early rejection: |u|² ≤ (max s)² |p|², |v|² ≤ (max s)² |q|².
             longest = max(s0, s1, s2)
             longest *= longest
             most_a, most_c = p0 * p0 + p1 * p1 + p2 * p2, q0 * q0 + q1 * q1 + q2 * q2
@@ -366,7 +365,7 @@ def project(
             if not (opacity >= alpha_min and math.isfinite(dilated) and math.isfinite(px) and math.isfinite(py)):
                 bad += not is_finite_colour(i, sh0, shN, higher)
                 continue
-            # opacity · exp(−½ d²) = alpha_min; slightly more, so that rounding never loses a pixel.
+            # ρ, slightly enlarged so that rounding never loses a pixel.
             reach = math.sqrt(reach) * (1.0 + 1e-6) + 1e-6
             root_a, root_c = math.sqrt(A), math.sqrt(C)
             rx, ry = reach * root_a, reach * root_c
@@ -404,7 +403,7 @@ def project(
         ignored[block] = bad
 
 
-_MAX_GRADIENT = 1e37  # gradients are clamped to this, so that sums of them fit float32
+_MAX_GRADIENT = 1e37  # gradients are clamped to ± this so that sums of them fit in float32
 
 
 @device_function
@@ -418,11 +417,14 @@ def _clamped(value: float) -> float:
 
 @device_function
 def sum_records(begin: int, end: int, records: Any, tiles: Any, tiles_x: int, shape: Any, i: int) -> tuple[float, ...]:
-    """Sum the records of a splat.
+    """Sum the gradient records of a splat over its tiles.
+
+    With D the vector from the splat's centre to the tile's, δ that from the tile's centre to a pixel, and e = Σ⁻¹ (D +
+    δ), the sums of slope·e and slope·e eᵀ follow from the moments Σ slope·(1, δ, δ δᵀ) in the record.
 
     Returns:
-        Sums over the pixels of: slope, slope·e_x, slope·e_y, slope·e_x², slope·e_x·e_y,
-        slope·e_y², and the gradients of red, green, blue and depth.
+        Sums over the pixels of: slope, slope·e_x, slope·e_y, slope·e_x², slope·e_x·e_y, slope·e_y², and the gradients
+        with respect to red, green, blue and depth.
     """
     a, b, c = shape[i, 2], shape[i, 3], shape[i, 4]
     s0, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -432,7 +434,7 @@ def sum_records(begin: int, end: int, records: Any, tiles: Any, tiles_x: int, sh
         tile = tiles[j]
         dx = (tile % tiles_x) * TILE + 0.5 * TILE - shape[i, 0]
         dy = (tile // tiles_x) * TILE + 0.5 * TILE - shape[i, 1]
-        # e at the centre of the tile, first: the difference is small where the splat is seen.
+        # Σ⁻¹ D first: the result is small in tiles in which the splat is visible.
         ex, ey = a * dx + b * dy, b * dx + c * dy
         m0, m1, m2 = np.float64(records[j, 0]), np.float64(records[j, 1]), np.float64(records[j, 2])
         fx, fy = a * m1 + b * m2, b * m1 + c * m2
@@ -481,30 +483,17 @@ def project_backward(
     g_shN: Any,
     g_means2d: Any,
 ) -> None:
-    """Compute the gradients of every splat's parameters; parallel over blocks of splats, one splat at a time.
+    """Compute the gradients of every splat's parameters; parallel over blocks of splats, not vectorised.
 
     Args:
-        means: see `project`, as the next six.
-        quats: see `project`.
-        scales: see `project`.
-        opacities: see `project`.
-        shN: see `project`.
-        degree: see `project`.
-        view: see `project`.
-        antialiased: see `project`.
-        shape: see `project`.
-        depth: [N] float32, above 0 for splats that were drawn.
-        offsets: [N + 1] int64, where the records of each splat begin.
+        means, quats, scales, opacities, shN, degree, view, antialiased, shape: as in `project`.
+        depth: [N] float32, above 0 for splats that are drawn.
+        offsets: [N + 1] int64, index of each splat's first record.
         records: [intersections, RECORD], see `blend_backward`.
         record_tiles: [intersections] int32, the tile of each record.
-        tiles_x: tiles side by side.
-        g_means: [N, 3], written, as the next six.
-        g_quats: [N, 4].
-        g_scales: [N, 3].
-        g_opacities: [N].
-        g_sh0: [N, 3].
-        g_shN: [N, K, 3].
-        g_means2d: [N], length of the gradient towards the centre on the image, per pixel.
+        tiles_x: number of tiles per row.
+        g_means, g_quats, g_scales, g_opacities, g_sh0, g_shN: written, gradients, see `Gradients`.
+        g_means2d: [N], written, norm of the gradient with respect to the centre on the image, per pixel.
     """
     n = means.shape[0]
     higher = (degree + 1) * (degree + 1) - 1
@@ -520,7 +509,7 @@ def project_backward(
             )
             g_means2d[i] = _clamped(math.sqrt(sx * sx + sy * sy))
 
-            # Intermediate values of `project`.
+            # Recompute intermediate values of `project`.
             X, Y, Z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
             x = view[0] * X + view[1] * Y + view[2] * Z + view[9]
             y = view[3] * X + view[4] * Y + view[5] * Z + view[10]
@@ -542,7 +531,7 @@ def project_backward(
             v1 = s1 * (r[1] * q0 + r[4] * q1 + r[7] * q2)
             v2 = s2 * (r[2] * q0 + r[5] * q1 + r[8] * q2)
 
-            # Opacity and its compensation; covariance (A, B; B, C).
+            # g_A, g_B, g_C and g_opacity.
             gA, gB, gC = 0.5 * sxx, sxy, 0.5 * syy
             if antialiased:
                 A, B, C = u0 * u0 + u1 * u1 + u2 * u2, u0 * v0 + u1 * v1 + u2 * v2, v0 * v0 + v1 * v1 + v2 * v2
@@ -555,7 +544,7 @@ def project_backward(
                     gB -= g * 2.0 * B * (1.0 - ratio)
             g_opacities[i] = _clamped(s0_ / np.float64(opacities[i]))
 
-            # Half-axes on the image, then standard deviations, axes, rows of the Jacobian.
+            # g_u and g_v, then g_log(s), g_r and the quaternion, g_p and g_q, g_J.
             du0, dv0 = 2.0 * gA * u0 + gB * v0, 2.0 * gC * v0 + gB * u0
             du1, dv1 = 2.0 * gA * u1 + gB * v1, 2.0 * gC * v1 + gB * u1
             du2, dv2 = 2.0 * gA * u2 + gB * v2, 2.0 * gC * v2 + gB * u2
@@ -589,7 +578,7 @@ def project_backward(
             g_j1 = gq0 * view[3] + gq1 * view[4] + gq2 * view[5]
             g_j12 = gq0 * view[6] + gq1 * view[7] + gq2 * view[8]
 
-            # Camera coordinates: by the Jacobian, by the centre on the image, by the depth.
+            # g_c: through the centre on the image, the depth and the Jacobian.
             cx, cy = sx * j0, sy * j1
             cz = far - (sx * j0 * x + sy * j1 * y) / z
             cz -= (g_j0 * j0 + g_j02 * j02 + g_j1 * j1 + g_j12 * j12) / z
@@ -600,7 +589,7 @@ def project_backward(
                 cy -= g_j12 * j1 / z
                 cz -= g_j12 * j12 / z
 
-            # Colour, and the direction in which it is seen.
+            # g_sh0 and g_shN, and g_mean through the viewing direction.
             dx, dy, dz, inverse = view_direction(view, means[i])
             sh_basis(degree, dx, dy, dz, basis)
             red = red if shape[i, 6] > 0.0 else 0.0

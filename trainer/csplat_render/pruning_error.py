@@ -1,8 +1,8 @@
 """Pruning error: the exact leave-one-out error of every splat, in one pass over views.
 
-It is exact for each splat alone, with everything else in place, except for two comparisons of the rasteriser that are
-held fixed: a finished pixel remains finished, although without a splat in front of it more might show of what is behind
-(at most a transmittance of 1e-4, times 1 / (1 − alpha)); and colours beyond 0 and 1 are not clipped.
+It is exact for pruning a single splat, with two exceptions: a finished pixel stays finished, although it might continue
+without one of its splats (the omitted light has a transmittance of at most 1e-4 / (1 − alpha)); and renders are not
+clipped to 0..1. The equations are in `contributions`.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from csplat_render.reference_rasteriser import render_exact
 
 @dataclass(frozen=True, eq=False)
 class PruningError:
-    """Sums over the pixels, channels and views of a pass; the sums of passes add up.
+    """Sums over pixels, channels and views; objects of different views can be added.
 
     Attributes:
-        error: [N] float64, squared change of the renders if the splat were absent.
-        squared_weight: [N] float64, squared weight of the splat in a pixel.
-        seen: [N] bool, which splats any view saw.
-        bands: [N, d] float64, squared change of the renders if the splat's SH band 1, … d were zero; [N, 0] if
-            not requested.
+        error: [N] float64, squared change of the renders without the splat.
+        squared_weight: [N] float64, squared weight of the splat.
+        seen: [N] bool, True for splats that are visible in a view.
+        bands: [N, d] float64, squared change of the renders with zeros in the splat's SH band 1, … d; [N, 0] if not
+            requested.
         value_count: number of pixels times channels of all views.
-        product: [N] float64, the change times the excess of the renders over the references: pruning adds
-            `error + 2 · product` to the squared error. `None` if the renders themselves are the references.
+        product: [N] float64, change times (render − reference): pruning adds `error + 2 · product` to the squared
+            error. `None` if the renders are their own references.
     """
 
     error: Array
@@ -76,28 +76,28 @@ def measure_pruning_error(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> PruningError:
-    """Measure how much pruning each splat, alone, would change the renders of a scene.
+    """Measure the effect of pruning each splat alone on the renders of a scene.
 
     Args:
         model: the scene.
         cameras: the views, at least one; relative to the scene's origin.
-        background: red, green, blue behind everything.
-        bands: measure the effect of SH bands, too.
-        references: the reference images, [H, W, 3] each; None for renders of the scene itself.
-        on_render: called with the number of each render and the render, [H, W, 3].
-        dtype: dtype of pixels, float32 or float64 (which is for tests).
-        transmittance_min: transmittance at which a pixel is finished; 0 for never.
-        threads: number of threads; None for all. The result does not depend on it.
-        progress: called with the stage and the fraction done.
+        background: red, green, blue of the background.
+        bands: also measure the effect of SH bands.
+        references: the reference images, [H, W, 3] each; `None`: renders of the scene itself.
+        on_render: called with the index of each render and the render, [H, W, 3].
+        dtype: dtype of pixels, float32 or (for tests) float64.
+        transmittance_min: transmittance at which a pixel is finished; 0: never.
+        threads: number of threads; `None`: all. The result does not depend on it.
+        progress: called with the stage and the completed fraction.
 
     Raises:
-        InputError: there is no camera, or not one reference for each.
+        InputError: there is no camera, or the number of references differs.
         LimitError: a render has more than `rasteriser.MAX_INTERSECTIONS`.
     """
     if not cameras:
-        raise InputError("measuring removal wants a camera at least")
+        raise InputError("measuring the pruning error requires at least one camera")
     if references is not None and len(references) != len(cameras):
-        raise InputError(f"{len(references)} reference pictures for {len(cameras)} cameras")
+        raise InputError(f"found {len(references)} reference images, expected one for each of {len(cameras)} cameras")
     contributions = Contributions(dtype, transmittance_min=transmittance_min, threads=threads)
     totals, by_band = np.zeros((len(model), 5)), np.zeros((len(model), model.sh_degree if bands else 0))
     behind = np.asarray(background, np.float64)
@@ -122,17 +122,17 @@ def pruning_error_exact(
     background: ArrayLike = (0.0, 0.0, 0.0),
     transmittance_min: float = TRANSMITTANCE_MIN,
 ) -> Array:
-    """Compute the errors of `measure_pruning_error` the slow way: leave out one splat, render in float64, compare.
+    """Compute the errors of `measure_pruning_error` slowly, by rendering in float64 without each splat.
 
     Args:
         model: the scene.
         cameras: the views.
-        rows: the splats to measure.
-        background: red, green, blue behind everything.
-        transmittance_min: transmittance at which a pixel is finished; 0 for never, for which the fast pass is exact.
+        rows: indices of the splats to measure.
+        background: red, green, blue of the background.
+        transmittance_min: transmittance at which a pixel is finished; 0: never, for which the fast pass is exact.
 
     Returns:
-        Squared change of the renders, one number per row of `rows`, float64.
+        Squared change of the renders for each of `rows`, float64.
     """
     rows = np.asarray(rows, np.int64)
     errors = np.zeros(len(rows))

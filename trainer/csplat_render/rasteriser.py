@@ -1,4 +1,4 @@
-"""`Rasteriser`: splats to images, and gradients of images back to splats, on all threads of a CPU."""
+"""`Rasteriser`: render splats and compute gradients with respect to them on all threads of a CPU."""
 
 from __future__ import annotations
 
@@ -31,7 +31,6 @@ from csplat_render.conventions import (
     HasSplats,
     Mode,
     RenderResult,
-    Thresholds,
     UncheckedSplats,
     VisibleSplats,
     thresholds_of,
@@ -40,7 +39,7 @@ from csplat_render.conventions import (
 from csplat_render.kernels import thread_count
 from csplat_render.projection import BLOCK, project, project_backward
 
-#: Largest number of pairs of splat and tile in one image; each takes 4 bytes, with gradients 52.
+#: Maximum number of pairs of splat and tile in one image; each takes 4 bytes, with gradients 52.
 MAX_INTERSECTIONS = 1 << 28
 
 _CHUNKS_OF_MANY_TILES = 2
@@ -49,7 +48,7 @@ _MANY_TILES = 1 << 16  # tiles
 
 @dataclass(frozen=True, eq=False)
 class _ForwardState:
-    """State of the last `forward` that `backward` needs."""
+    """Arguments and results of the last `forward`, for `backward`."""
 
     splats: UncheckedSplats
     view: Array
@@ -65,15 +64,14 @@ class _ForwardState:
 
 
 class Rasteriser:
-    """A renderer of splats and their gradients, which keeps its memory from one image to the next.
+    """A renderer of splats with gradients, which reuses its memory from one image to the next.
 
     Args:
-        mode: `standard`, or `fast`: leaves out alpha below 1.5/255 and light that passes with less than
-            1/255: a sixth of the time, for errors of 40 to 52 dB on trained scenes.
-        dtype: dtype of pixels and gradients, float32 or float64 (which is for tests). Projection is in
-            float64 in any case.
-        gradients: True if `backward` will be called; without it `forward` is a little faster.
-        threads: number of threads; None for all.
+        mode: `standard`; or `fast`, which omits alpha below 1.5/255 and light of a transmittance below 1/255. It takes
+            a sixth of the time, with PSNRs of 40 to 52 dB on trained scenes.
+        dtype: dtype of pixels and gradients, float32 or (for tests) float64. Projection always uses float64.
+        gradients: enable `backward`; without it, `forward` is slightly faster.
+        threads: number of threads; `None`: all.
 
     Raises:
         InputError: the mode or the dtype does not exist.
@@ -87,13 +85,13 @@ class Rasteriser:
         gradients: bool = True,
         threads: int | None = None,
     ) -> None:
-        self.thresholds: Thresholds = thresholds_of(mode)
+        self._alpha_min, transmittance_min = thresholds_of(mode)
         self.dtype = np.dtype(dtype)
         if self.dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
             raise InputError(f"the rasteriser's dtype is {self.dtype}, expected float32 or float64")
         self.gradients = gradients
         self.threads = threads
-        self._limits = np.array([self.thresholds.alpha_min, ALPHA_CAP, self.thresholds.transmittance_min], self.dtype)
+        self._limits = np.array([self._alpha_min, ALPHA_CAP, transmittance_min], self.dtype)
         self._buffers: dict[str, Array] = {}
         self._last: _ForwardState | None = None
 
@@ -109,32 +107,32 @@ class Rasteriser:
     ) -> RenderResult:
         """Render an image.
 
-        Splats may be given in slices of depth, nearest first, each with the `state` of the one before it: the last
-        image is that of all splats, bit for bit.
+        Splats may be rendered in slices of depth, nearest first, that pass on a `state`. The last image is then the one
+        of all splats, bit for bit.
 
         Args:
             splats: the splats to render; arrays of another dtype are converted.
             camera: the camera to render from.
-            background: red, green, blue behind everything.
-            antialiased: scale opacities by what the dilation of 0.3 pixels added (mip-splatting).
-            sh_degree: highest degree of the spherical harmonics; None for that of the splats.
-            state: [H, W, 5] of the rasteriser's dtype, from `initial_state`; changed: the pixels after the splats so
-                far. `None`: these are all splats.
+            background: red, green, blue of the background.
+            antialiased: compensate for the dilation by scaling opacities (mip-splatting).
+            sh_degree: highest SH degree; `None`: that of the splats.
+            state: [H, W, 5], in the rasteriser's dtype, from `initial_state`, updated: the pixels after all slices so
+                far. `None`: there are no slices.
 
         Returns:
-            The image, in new arrays; for a slice the image so far, and the slice's own counts.
+            The image, in new arrays; for a slice, the image so far and the counts of the slice.
 
         Raises:
-            InputError: shapes do not fit together; or `backward` would need all slices.
+            InputError: array shapes do not match, or a slice is rendered with gradients.
             LimitError: there are more than `MAX_INTERSECTIONS`.
         """
-        arrays = _checked(splats, self.dtype)
+        arrays = checked_splats(splats, self.dtype)
         degree = _checked_degree(sh_degree, arrays.shN.shape[1])
         colour = _checked_background(background, self.dtype)
         width, height = camera.W, camera.H
         pixels = _checked_state(state, (height, width, 5), self.dtype)
         if self.gradients and state is not None:
-            raise InputError("gradients want all splats at once, and these are a slice: use gradients=False")
+            raise InputError("gradients require all splats at once, found a slice: use gradients=False")
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
         tile_count = tiles_x * tiles_y
         rgb = np.empty((height, width, 3), self.dtype)
@@ -157,14 +155,14 @@ class Rasteriser:
         return result
 
     def initial_state(self, camera: Camera) -> Array:
-        """Return the `state` of an image before its first slice: all light passes."""
+        """Return the `state` of an image before its first slice."""
         state = np.zeros((camera.H, camera.W, 5), self.dtype)
         state[..., 0] = 1
         return state
 
     def find_visible(self, splats: HasSplats, camera: Camera, *, antialiased: bool = False) -> VisibleSplats:
         """Find the splats that a render would show, and their depths; the arguments are those of `forward`."""
-        arrays = _checked(splats, self.dtype)
+        arrays = checked_splats(splats, self.dtype)
         degree = _checked_degree(None, arrays.shN.shape[1])
         with thread_count(self.threads):
             *_, ignored = self._project(arrays, camera, degree, antialiased=antialiased)
@@ -175,19 +173,19 @@ class Rasteriser:
     def backward(
         self, grad_rgb: ArrayLike, grad_alpha: ArrayLike | None = None, grad_depth: ArrayLike | None = None
     ) -> Gradients:
-        """Compute the gradients of a loss towards the splats of the last `forward`.
+        """Compute the gradients of a loss with respect to the splats of the last `forward`.
 
         Args:
-            grad_rgb: [H, W, 3], gradient of the loss towards the image.
-            grad_alpha: [H, W], gradient towards alpha; None for 0.
-            grad_depth: [H, W], gradient towards depth; None for 0.
+            grad_rgb: [H, W, 3], gradient with respect to the image.
+            grad_alpha: [H, W], gradient with respect to alpha; `None`: 0.
+            grad_depth: [H, W], gradient with respect to depth; `None`: 0.
 
         Raises:
-            InputError: there was no `forward`, or shapes do not fit its image.
+            InputError: there was no `forward`, or an array does not have the shape of its image.
         """
         last = self._last
         if last is None:
-            raise InputError("backward wants a forward with gradients=True before it")
+            raise InputError("backward requires a forward with gradients=True before it")
         size = last.transmittance.shape
         g_rgb = _checked_gradient("grad_rgb", grad_rgb, (*size, 3), self.dtype)
         g_alpha = _checked_gradient("grad_alpha", grad_alpha, size, self.dtype)
@@ -229,7 +227,7 @@ class Rasteriser:
         ignored, radii = self._buffer("ignored", (-(-n // BLOCK),), np.int64), np.empty(n, np.float32)
         project(
             splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN, degree, view,
-            camera.W, camera.H, antialiased, self.thresholds.alpha_min,
+            camera.W, camera.H, antialiased, self._alpha_min,
             self._buffer("shape", (n, 10), np.float64), self._buffer("extent", (n, 6), np.float64),
             self._buffer("box", (n, 4), np.int32), self._buffer("near", (n,), np.float32), radii, ignored,
         )  # fmt: skip
@@ -274,8 +272,8 @@ class Rasteriser:
         return starts, total
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: Any) -> Array:
-        """Return an array of this shape; its memory is kept, and grows by a quarter at least."""
-        size = math.prod(shape)  # np.prod takes longer than the rest of this function
+        """Return an array in reused memory, which grows by at least a quarter."""
+        size = math.prod(shape)  # faster than np.prod
         store = self._buffers.get(name + "*")
         if store is None or store.size < size or store.dtype != dtype:
             larger = 0 if store is None else store.size * 5 // 4
@@ -286,14 +284,15 @@ class Rasteriser:
         return view
 
 
-def _checked(splats: HasSplats, dtype: Any) -> UncheckedSplats:
+def checked_splats(splats: HasSplats, dtype: Any) -> UncheckedSplats:
+    """Convert the arrays to contiguous ones of a dtype, and check their shapes."""
     means = np.ascontiguousarray(splats.means, dtype)
     n = len(means) if means.ndim else 0
-    wanted: dict[str, tuple[int, ...]] = {
+    shapes: dict[str, tuple[int, ...]] = {
         "means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 3)
     }  # fmt: skip
-    arrays = {name: np.ascontiguousarray(getattr(splats, name), dtype) for name in (*wanted, "shN")}
-    for name, shape in wanted.items():
+    arrays = {name: np.ascontiguousarray(getattr(splats, name), dtype) for name in (*shapes, "shN")}
+    for name, shape in shapes.items():
         if arrays[name].shape != shape:
             raise InputError(f"{name} has shape {list(arrays[name].shape)}, expected {list(shape)}")
     shN = arrays["shN"]

@@ -1,8 +1,8 @@
-"""The exact reference: the same images directly from the equations, in float64 NumPy, slow.
+"""The exact reference: renders directly from the equations of `conventions`, in float64 NumPy, slow.
 
-Every splat is evaluated at every pixel. It shares the conventions of the rasteriser and none of its methods: no tiles,
-no bounds, no fast exponential. Outcomes of comparisons (too faint, capped, finished, clamped, which splat is nearer)
-can be recorded and reused, so that a finite difference sees a smooth function.
+Every splat is evaluated at every pixel. The reference shares the conventions of the rasteriser but none of its methods:
+no tiles, no bounds, no fast exponential. Outcomes of comparisons (too faint, capped, finished, clamped, which splat is
+nearer) can be recorded and reused, so that finite differences are taken of a smooth function.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from csplat_render.projection import sh_basis
 
 Array = NDArray[Any]
 
-_CHUNK = 64  # splats that are evaluated at all pixels at a time
+_CHUNK = 64  # splats evaluated at a time
 
 
 @dataclass
@@ -43,7 +43,7 @@ class Decisions:
     _next: int = -1
 
     def ask(self, mask: Array) -> Array:
-        """Record a comparison's outcome, or return what was recorded for it."""
+        """Record the outcome of a comparison, or return its recorded one."""
         if self._next < 0:
             self.masks.append(mask)
             return mask
@@ -51,7 +51,7 @@ class Decisions:
         return self.masks[self._next - 1]
 
     def replay(self) -> None:
-        """Answer with the recorded outcomes, from the first comparison on."""
+        """Return the recorded outcomes from now on, starting with the first comparison."""
         self._next = 0
 
 
@@ -65,16 +65,16 @@ def render_exact(
     transmittance_min: float = TRANSMITTANCE_MIN,
     decisions: Decisions | None = None,
 ) -> RenderResult:
-    """Render an image as `Rasteriser.forward` does, from the equations.
+    """Render the image of `Rasteriser.forward` from the equations.
 
     Args:
         splats: the splats to render.
         camera: the camera to render from.
-        background: red, green, blue behind everything.
-        antialiased: scale opacities by what the dilation added.
-        sh_degree: highest degree of the spherical harmonics; None for that of the splats.
-        transmittance_min: transmittance at which a pixel is finished; 0 for never.
-        decisions: records the outcomes of all comparisons; if it holds some, they are used.
+        background: red, green, blue of the background.
+        antialiased: compensate for the dilation by scaling opacities.
+        sh_degree: highest SH degree; `None`: that of the splats.
+        transmittance_min: transmittance at which a pixel is finished; 0: never.
+        decisions: records the outcomes of all comparisons, or replays recorded ones.
 
     Returns:
         The image, float64; `intersections` is 0.
@@ -94,14 +94,14 @@ def render_exact(
 def _project(
     splats: HasSplats, camera: Camera, degree: int, antialiased: bool, decisions: Decisions
 ) -> tuple[Array, dict[str, Array], int]:
-    """Return centre, inverse covariance, opacity, colour and depth of the splats in front, nearest first."""
+    """Return the indices of the splats in front of the camera, nearest first; their projections; the ignored count."""
     coefficients = np.concatenate([splats.sh0[:, None], splats.shN[:, : (degree + 1) ** 2 - 1]], 1, dtype=np.float64)
     arrays = [splats.means, splats.quats, splats.scales, splats.opacities[:, None], coefficients]
     finite = np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], axis=0)
     index = np.flatnonzero(finite)
     means, quats, scales, opacities, coefficients = (np.asarray(array[index], np.float64) for array in arrays)
 
-    # Camera coordinates, term by term: a matrix product may round otherwise, and order is decided by it.
+    # Camera coordinates, term by term: a matrix product may round differently, which could change the order.
     R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     X, Y, Z = means.T
     x, y, z = (R[k, 0] * X + R[k, 1] * Y + R[k, 2] * Z + t[k] for k in range(3))
@@ -112,7 +112,7 @@ def _project(
     means, scales, coefficients, x, y, z = (v[order] for v in (means, scales, coefficients, x, y, z))
     opacity = opacities[order, 0]
 
-    # Σ = M Mᵀ with M = rotation · deviations; its image under the linearised perspective is T M Mᵀ Tᵀ.
+    # Σ = M Mᵀ with M = rotation · diag(s); its image under the linearised perspective is (J R M) (J R M)ᵀ.
     w, i, j, k = _unit(quats[order]).T
     rotation = np.array(
         [
@@ -163,7 +163,7 @@ def _unit(quats: Array) -> Array:
 
 
 def _clamp(tangent: Array, focal: float, centre: float, size: int, decisions: Decisions) -> Array:
-    """Clamp x/z or y/z to a little more than the image shows."""
+    """Clamp x/z or y/z to the image with a margin, in which the perspective is linearised."""
     margin = FOV_MARGIN * 0.5 * size / focal
     low, high = -centre / focal - margin, (size - centre) / focal + margin
     return np.where(decisions.ask(tangent > low), np.where(decisions.ask(tangent < high), tangent, high), low)
@@ -190,7 +190,7 @@ def _blend(
         weight = np.where(seen, alpha * through, 0.0)
         rgb += np.einsum("sp,sc->pc", weight, part["colour"][:, 0])
         depth += (weight * part["depth"]).sum(0)
-        count = seen.sum(0)  # a finished pixel remains finished: the last splat seen is the count-th
+        count = seen.sum(0)  # a finished pixel stays finished, so the first `count` splats are the blended ones
         before = np.where(count > 0, np.take_along_axis(after, np.maximum(count - 1, 0)[None], 0)[0], before)
         going = seen[-1]
     return rgb.reshape(camera.H, camera.W, 3), before.reshape(camera.H, camera.W), depth.reshape(camera.H, camera.W)

@@ -1,13 +1,14 @@
 """Refit of colours to images with everything else fixed: ridge least squares in spherical harmonics.
 
-With geometry and opacity fixed a pixel is Σ_i w_i · (½ + Y(view)·c_i), linear in the coefficients c, except for the
+With fixed geometry and opacity, a pixel Σ_i w_i · (½ + Y(view)·c_i) is linear in the coefficients c, except for the
 clamp of each splat's colour at 0. The clamp is linearised: a colour that is 0 in a view with the initial coefficients
-remains 0 there, the others are free. The fit minimises
+stays 0 in this view, the others are free. The fit minimises
 
-    Σ over views, pixels, channels (image − reference)² + Σ_i r · (c_i − c0_i)²,
+    Σ over views, pixels, channels (render − reference)² + Σ_i r · (c_i − c0_i)²,
 
-with a ridge r that holds colours that no view sees. It uses preconditioned conjugate gradients: the matrix is never
-built, its product with a vector is a render of the vector's colours taken back to the splats.
+with a ridge r that determines colours that no view shows. With A the linear map from coefficients to renders, it solves
+the normal equations (Aᵀ A + r I) (c − c0) = −Aᵀ (render_0 − reference) by conjugate gradients with the diagonal as
+preconditioner. The matrix is never built: A renders the colours of a vector, Aᵀ projects the image back to the splats.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ from csplat_render.conventions import Array, HasSplats
 
 Floats = NDArray[Any]
 
-#: Memory in bytes for projected views that are kept; the others are projected again in every step.
+#: Bytes of memory for projected views; further views are projected again in every step.
 CACHE_BYTES = 2 << 30
 
-#: Squared error per square of a coefficient: about ten pixels at 40 dB if a coefficient changes by 0.1.
+#: r, squared error per square of a coefficient: a change of 0.1 costs the error of about ten pixels at 40 dB.
 RIDGE = 0.1
 
 
@@ -39,10 +40,10 @@ class ColourOperator:
     Args:
         splats: the geometry; `sh0` and `shN` determine which colours are clamped.
         cameras: the views.
-        background: red, green, blue behind everything.
+        background: red, green, blue of the background.
         antialiased: see `Rasteriser.forward`.
-        threads: number of threads; None for all. No result depends on it.
-        cache_bytes: memory for views that are kept.
+        threads: number of threads; `None`: all. No result depends on it.
+        cache_bytes: memory for projected views.
     """
 
     def __init__(
@@ -72,8 +73,8 @@ class ColourOperator:
         Args:
             coefficients: [N, B, 3].
             references: the reference images, [H, W, 3] each.
-            gradient: [N, B, 3], added to.
-            diagonal: [N, B], added to: the diagonal of the matrix transposed times itself; None if it is not needed.
+            gradient: [N, B, 3], Aᵀ (render − reference) is added.
+            diagonal: [N, B], the diagonal of Aᵀ A is added; `None`: it is not computed.
         """
         not_needed = np.empty((0, coefficients.shape[1]), np.float32)
         total = 0.0
@@ -88,11 +89,11 @@ class ColourOperator:
         return total
 
     def normal(self, vector: Floats, result: Floats) -> float:
-        """Add Aᵀ A times a vector, A being the matrix of the map; return the squared length of A times the vector.
+        """Add Aᵀ A v to a result, and return |A v|².
 
         Args:
-            vector: [N, B, 3] float32.
-            result: [N, B, 3] float32, added to.
+            vector: [N, B, 3] float32, v.
+            result: [N, B, 3] float32, Aᵀ A v is added.
         """
         not_needed = np.empty((0, vector.shape[1]), np.float32)
         total = 0.0
@@ -113,7 +114,7 @@ class ColourOperator:
         return kept
 
     def _keep(self, number: int, drawn: ProjectedView, active: Array) -> None:
-        """Keep a view whose weights have just been summed, without splats of no weight, if the cache has room."""
+        """Cache a view after its `backproject`, without splats of zero weight, if it fits."""
         if number in self._kept or drawn.size_bytes > self._cache_left:
             return
         trimmed, kept = self._contributions.trim(drawn)
@@ -138,26 +139,27 @@ def fit_colours(
     """Fit the colours of splats to images.
 
     Args:
-        splats: geometry, and the colours to start from.
+        splats: geometry and initial colours.
         cameras: the views, relative to the scene's origin.
-        references: the reference images, [H, W, 3] each, as float; they may exceed 1.
-        steps: largest number of steps of conjugate gradients.
+        references: the reference images, [H, W, 3] each, floats, which may exceed 1.
+        steps: maximum number of steps of conjugate gradients.
         ridge: squared error per square of a coefficient.
         least_gain: stop when a step reduces the error by less than this fraction.
-        background: red, green, blue behind everything.
+        background: red, green, blue of the background.
         antialiased: see `Rasteriser.forward`.
-        threads: number of threads; None for all. The result does not depend on it.
-        cache_bytes: memory for views that are kept.
-        progress: called with the stage and the fraction done.
+        threads: number of threads; `None`: all. The result does not depend on it.
+        cache_bytes: memory for projected views.
+        progress: called with the stage and the completed fraction.
 
     Returns:
-        [N, B, 3] float32, and the minimised sum, by the linearised model, before the first and after every step.
+        [N, B, 3] float32, the coefficients; and the minimised sum according to the linearised model, before the first
+        and after every step.
 
     Raises:
-        InputError: there is no camera, or not one reference for each.
+        InputError: there is no camera, or the number of references differs.
     """
     if not cameras or len(references) != len(cameras):
-        raise InputError(f"a fit wants cameras and as many pictures, found {len(cameras)} and {len(references)}")
+        raise InputError(f"found {len(cameras)} cameras and {len(references)} reference images, expected one for each")
     operator = ColourOperator(
         splats, cameras, background=background, antialiased=antialiased, threads=threads, cache_bytes=cache_bytes
     )
@@ -191,5 +193,5 @@ def fit_colours(
 
 
 def _dot(a: Floats, b: Floats) -> float:
-    """Sum the products in float64, without BLAS, whose sums depend on threads."""
+    """Return the scalar product in float64, without BLAS, whose rounding depends on the number of threads."""
     return float(np.einsum("ijk,ijk->", a, b, dtype=np.float64))

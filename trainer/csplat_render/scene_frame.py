@@ -1,12 +1,11 @@
-"""The frame of a scene (centre, extent, up, kind), and the cloud of points that represents its surface.
+"""The frame of a scene (centre, extent, up, kind), and a point cloud that represents its surface.
 
-Two kinds of scene are distinguished by where their surface lies. An *object* is seen from outside. *Surroundings* reach
-much farther than their dense middle.
+There are two kinds of scene: an *object* is viewed from outside; *surroundings* extend far beyond their dense middle.
 
 Choosing cameras needs hundreds of rough images, not exact ones. A `Cloud` replaces splats by points drawn from their
-Gaussians; each point represents a share of its splat's optical depth times the area that the splat shows on average.
-Binned into the cells of a coarse image the points tell, within a few per cent, how much is covered and what hides what.
-All sums are taken in a fixed order and no matrix product is left to BLAS: the same on any number of threads.
+Gaussians. Each point represents a fraction of the splat's optical depth times its mean projected area. Binned into the
+cells of a coarse image, the points determine coverage and occlusion within a few per cent. Sums have a fixed order and
+do not use BLAS, so no result depends on the number of threads.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from csplat_render.camera import DEFAULT_NEAR, Camera
 #: Splats of lower opacity are never drawn.
 MIN_OPACITY = 1.0 / 255.0
 
-_MAX_LOG_SCALE = 60.0  # beyond, squares of squares overflow
-_NEAR = 0.05  # near plane in extents, DEFAULT_NEAR at most
-_FAR_REACH = 4.0  # times the distance within which half the opacity lies; farther surface belongs to no object
-_FAR_SHARE = 0.02  # fraction of the surface; with more of it beyond, a scene is surroundings
-_FLAT = 0.6  # ratio of the shortest extent to the next, below which the short axis points up
+_MAX_LOG_SCALE = 60.0  # fourth powers of larger scales overflow
+_NEAR = 0.05  # near plane, extents; at most DEFAULT_NEAR
+_FAR_REACH = 4.0  # radius of an object, in radii of the sphere that contains half the opacity
+_FAR_SHARE = 0.02  # fraction of the surface; if more is outside this radius, the scene is surroundings
+_FLAT = 0.6  # ratio of the shortest extent to the next; if it is smaller, the short axis points up
 
 Kind = Literal["object", "surrounding"]
 
@@ -40,9 +39,9 @@ class SceneFrame:
     Attributes:
         kind: `"object"` or `"surrounding"`.
         centre: [3] float64, relative to the model's origin.
-        extent: unit of all distances, in scene units, above 0. Objects: half
-            the diagonal of the box that holds 5 to 95 % of the opacity along each axis.
-            Surroundings: the distance from the centre within which half the opacity lies.
+        extent: unit of all distances, in scene units, above 0. Objects: half the diagonal of the box of the 5 % to 95 %
+            quantiles of opacity along each axis. Surroundings: the radius around the centre that contains half the
+            opacity.
         up: [3] float64, unit length.
     """
 
@@ -53,15 +52,12 @@ class SceneFrame:
 
     @property
     def near(self) -> float:
-        """Near plane for the extent, scene units."""
+        """Near plane for cameras of this scene, scene units."""
         return min(DEFAULT_NEAR, _NEAR * self.extent)
 
 
 def scene_frame(model: SplatModel) -> SceneFrame:
-    """Return the centre of a scene, its extent, its up direction and its kind.
-
-    A scene without splats is an object of extent 1 at the origin.
-    """
+    """Compute the frame of a scene. A scene without splats is an object of extent 1 at the origin."""
     if len(model) == 0:
         return SceneFrame("object", np.zeros(3), 1.0, np.array([0.0, -1.0, 0.0]))
     alpha, areas = visible_opacity(model), surface_areas(model)
@@ -71,23 +67,23 @@ def scene_frame(model: SplatModel) -> SceneFrame:
     up = _up(model, half)
     distances = np.sqrt(np.sum((means - middle) ** 2, axis=1))
     reach = float(weighted_quantiles(distances, alpha, (0.5,))[0])
-    surface = alpha * np.minimum(areas, (0.5 * reach) ** 2)  # so that no floater outweighs a scene
+    surface = alpha * np.minimum(areas, (0.5 * reach) ** 2)  # limited so that no floater outweighs a scene
     if np.sum(surface[distances > _FAR_REACH * reach]) > _FAR_SHARE * np.sum(surface):
         return SceneFrame("surrounding", middle, reach, up)
     extent = float(np.sqrt(np.sum(half**2)))
-    if extent <= 0.0:  # one splat, or several in one place
+    if extent <= 0.0:  # a single position
         extent = 3.0 * float(np.sqrt(np.max(areas[alpha > 0.0]) / (2.0 * np.pi)))
     return SceneFrame("object", (low + high) / 2.0, extent, up)
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points that represent a scene's surface.
+    """Points that represent the surface of a scene.
 
     Attributes:
         points: [P, 3] float64, drawn from the splats' Gaussians, relative to the model's origin.
-        masses: [P] float64, optical depth × area that a point represents, square scene units.
-        sizes: [P] float64, square root of the area of the point's splat, scene units.
+        masses: [P] float64, optical depth × area represented by a point, square scene units.
+        sizes: [P] float64, square root of the projected area of the point's splat, scene units.
     """
 
     points: F64
@@ -96,7 +92,7 @@ class Cloud:
 
 
 def visible_opacity(model: SplatModel) -> F64:
-    """Return opacities in float64, 0 for splats that are never drawn; all 1 if none is drawn."""
+    """Return opacities as float64, 0 for splats that are never drawn; all 1 if no splat is drawn."""
     alpha = model.opacities.astype(np.float64)
     alpha[alpha < MIN_OPACITY] = 0.0
     return alpha if alpha.any() else np.ones_like(alpha)
@@ -105,9 +101,9 @@ def visible_opacity(model: SplatModel) -> F64:
 def surface_areas(model: SplatModel) -> F64:
     """Return the mean projected area of each splat over all directions, [N], square scene units, for a peak of 1.
 
-    The integral of a projected Gaussian is 2π·σa·σb; over all directions the product of the two
-    standard deviations is about ((σ0σ1)^p + (σ0σ2)^p + (σ1σ2)^p) / 3)^(1/p), p = 1.6 (Thomsen's
-    formula for the surface of an ellipsoid, a quarter of which is its mean shadow).
+    The integral of a projected Gaussian is 2π·σa·σb. Averaged over all directions, σa·σb is about
+    (((σ0σ1)^p + (σ0σ2)^p + (σ1σ2)^p) / 3)^(1/p), p = 1.6 (Thomsen's formula for the surface of an ellipsoid, which is
+    four times its mean projected area).
     """
     s = np.exp(_clipped_scales(model))
     p = 1.6
@@ -123,26 +119,26 @@ def sample_cloud(model: SplatModel, count: int, rng: np.random.Generator, every:
         model: the scene, at least one splat.
         count: number of points.
         rng: source of random numbers.
-        every: number of the scene's splats that each of the model's represents.
+        every: number of splats of the full scene that each splat of the model represents.
 
     Returns:
-        `count` points. Splats are drawn in proportion to the square root of their mass, so that a few
-        large ones do not take all points.
+        `count` points. Splats are chosen in proportion to the square root of their mass so that a few large ones do not
+        get all points.
     """
     alpha = visible_opacity(model)
     areas = surface_areas(model)
-    # The integral of −ln(1 − alpha·G) over a Gaussian is the dilogarithm of alpha times its area.
+    # ∫ −ln(1 − alpha·G) over a Gaussian G of area A is Li2(alpha) · A, Li2(x) = Σ x^k / k².
     mass = (alpha + alpha**2 / 4.0 + alpha**3 / 9.0 + alpha**4 / 16.0) * areas
     chance = np.sqrt(mass)
     sums = np.cumsum(chance)
     at = (np.arange(count) + rng.random()) / count * sums[-1]
-    last = int(np.flatnonzero(chance).max(initial=0))  # rounding must not reach past it
+    last = int(np.flatnonzero(chance).max(initial=0))  # rounding must not go beyond it
     index = np.minimum(np.searchsorted(sums, at, side="right"), last)
     s = np.exp(_clipped_scales(model)[index])
     offsets = _rotate(model.quats[index].astype(np.float64), rng.standard_normal((count, 3)) * s)
-    # Mass over the expected number of a splat's points: chance · sums[-1] / count.
+    # The mass of a splat divided by its expected number of points is chance · sums[-1] / count.
     return Cloud(
-        points=np.asfortranarray(model.means[index].astype(np.float64) + offsets),  # `_project_cloud` takes columns
+        points=np.asfortranarray(model.means[index].astype(np.float64) + offsets),  # `_project_cloud` reads columns
         masses=chance[index] * (sums[-1] / count) * every,
         sizes=np.sqrt(areas[index]),
     )
@@ -154,7 +150,7 @@ def covered_fraction(cloud: Cloud, camera: Camera, cell: int = 10) -> float:
     Args:
         cloud: the scene.
         camera: the camera.
-        cell: side of the coarse image's cells, pixels.
+        cell: side of a cell of the coarse image, pixels.
     """
     cells, _, depths, _ = _project_cloud(cloud, camera, cell)
     sums = np.bincount(cells, depths, _cell_count(camera, cell))
@@ -162,16 +158,16 @@ def covered_fraction(cloud: Cloud, camera: Camera, cell: int = 10) -> float:
 
 
 def detail(cloud: Cloud, camera: Camera, nearest: float, cell: int = 20, fine: float = 4.0) -> float:
-    """Return the fraction of an image that shows fine splats with nothing in front, 0 to 1.
+    """Return the fraction of an image that shows fine splats, 0 to 1.
 
     Views far from the training cameras show large, smeared splats, or a wall from behind.
 
     Args:
         cloud: the scene.
         camera: the camera.
-        nearest: distance below which splats hide others without showing detail; scene units.
-        cell: side of the coarse image's cells, pixels.
-        fine: splats up to this size count fully, larger ones less in proportion; pixels.
+        nearest: splats nearer than this occlude others but show no detail; scene units.
+        cell: side of a cell of the coarse image, pixels.
+        fine: splats up to this size count fully, larger ones in inverse proportion to their size; pixels.
     """
     cells, z, depths, sizes = _project_cloud(cloud, camera, cell)
     if len(cells) == 0:
@@ -204,7 +200,7 @@ def weighted_quantiles(values: F64, weights: F64, at: tuple[float, ...]) -> F64:
     Returns:
         One value for each of `at`.
     """
-    values, weights = values[weights > 0.0], weights[weights > 0.0]  # weight 0 must not affect neighbours
+    values, weights = values[weights > 0.0], weights[weights > 0.0]  # weight 0 must not affect the interpolation
     order = np.argsort(values, kind="stable")
     sums = np.cumsum(weights[order])
     result: F64 = np.interp(np.array(at) * sums[-1], sums, values[order])
@@ -212,11 +208,11 @@ def weighted_quantiles(values: F64, weights: F64, at: tuple[float, ...]) -> F64:
 
 
 def _up(model: SplatModel, half: F64) -> F64:
-    """Return the up direction: the scene's own; else the short axis of a flat scene; else −y, as in a PLY."""
+    """Return the scene's own up direction, else the short axis of a flat scene, else −y, the default of PLY."""
     stored = up_of(model.metadata, model.coordinate_system)
     if stored is not None:
         direction: F64 = np.array(stored)
-        direction /= np.sqrt(np.sum(direction**2))  # six digits are not exactly unit length
+        direction /= np.sqrt(np.sum(direction**2))  # stored with six digits
         return direction
     up = np.zeros(3)
     order = np.argsort(half, kind="stable")
@@ -233,8 +229,8 @@ def _project_cloud(cloud: Cloud, camera: Camera, cell: int) -> tuple[I64, F64, F
     """Project the points into the cells of a coarse image.
 
     Returns:
-        For the M points inside it: the cell's number, row by row; the depth along z; the optical
-        depth that the point adds to its cell; the size of its splat in pixels.
+        For the points inside the image: index of the cell, row by row; depth along z; optical depth that the point adds
+        to its cell; size of its splat, pixels.
     """
     V = camera.viewmat
     x, y, z = (
@@ -247,7 +243,7 @@ def _project_cloud(cloud: Cloud, camera: Camera, cell: int) -> tuple[I64, F64, F
         inside = (z > camera.near) & (u >= 0.0) & (u < camera.W) & (v >= 0.0) & (v < camera.H)
     z = z[inside]
     columns = -(-camera.W // cell)
-    # Integers first: the same for values that are not negative, in a tenth of the time of `//` of floats.
+    # Conversion to integers first is ten times faster than `//` of floats, and equal for non-negative values.
     cells = v[inside].astype(np.int64) // cell * columns + u[inside].astype(np.int64) // cell
     scale = camera.K[0, 0] / z
     return cells, z, cloud.masses[inside] * (scale / cell) ** 2, cloud.sizes[inside] * scale

@@ -1,6 +1,6 @@
-"""`Scorer`: scores of scenes against reference images, which are renders of a source or images of a data set.
+"""`Scorer`: compare renders of scenes with reference images, which are renders of a source or images of a data set.
 
-The definition of PSNR is in `metrics`.
+`metrics` defines PSNR.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from csplat_render import metrics
 from csplat_render.camera import Camera, relative_to
 from csplat_render.conventions import Mode, RenderResult
 
-#: Called for each view with its number, the reference image and the render, [H, W, 3] in 0..1.
+#: Called for each view with its index, the reference image and the render, [H, W, 3] in 0..1.
 OnView = Callable[[int, F32, F32], None]
 
 
 class Renderable(Protocol):
-    """A scene that renders itself, because it is not in memory."""
+    """A scene that renders itself because it is not in memory."""
 
     @property
     def origin(self) -> tuple[float, float, float]:
-        """The point that cameras are relative to."""
+        """Origin of the camera coordinates."""
         ...
 
     def renderer(
         self, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
     ) -> Callable[[Camera], RenderResult]:
-        """Return a function that renders, like `renderer` of this module."""
+        """Return a function that renders the scene, like `renderer` of this module."""
         ...
 
 
@@ -45,9 +45,9 @@ class ReferenceImage:
 
     Attributes:
         rgb: [H, W, 3] floats.
-        covered: [H, W], True for pixels that show more than the background; `None`: not known.
-        ignored: number of splats that are not drawn because they hold NaN or infinities.
-        mask: [H, W], True for pixels that count; `None`: all of them.
+        covered: [H, W], True for covered pixels, see `metrics`; `None`: unknown.
+        ignored: number of splats that are not drawn because they contain NaN or infinity.
+        mask: [H, W], True for pixels to compare; `None`: all pixels.
     """
 
     rgb: F32
@@ -62,15 +62,15 @@ class Scorer:
 
     Attributes:
         cameras: the views, at least one.
-        references: the reference image of each view, or a function that makes it on demand.
-        background: red, green, blue behind everything.
+        references: the reference image of each view, or a function that returns it on demand.
+        background: red, green, blue of the background.
         mode: mode of the renderer.
-        threads: number of threads; `None` for all. No score depends on it.
-        origin: point that the cameras are relative to; `None`: the origin of the scene that is scored.
-        pixels: number of pixels that count in each view; `None`: all of them.
+        threads: number of threads; `None`: all. No score depends on it.
+        origin: origin of the camera coordinates; `None`: the origin of the scored scene.
+        pixels: number of pixels to compare in each view; `None`: all pixels.
 
     Raises:
-        InputError: there is no view, or not one reference for each.
+        InputError: there is no view, or the number of references differs.
     """
 
     cameras: Sequence[Camera]
@@ -83,9 +83,11 @@ class Scorer:
 
     def __post_init__(self) -> None:
         if not self.cameras:
-            raise InputError("there is no camera to judge from")
+            raise InputError("a scorer requires at least one camera")
         if len(self.cameras) != len(self.references):
-            raise InputError(f"{len(self.cameras)} cameras and {len(self.references)} pictures do not belong together")
+            raise InputError(
+                f"found {len(self.cameras)} cameras and {len(self.references)} reference images, expected one for each"
+            )
 
     @classmethod
     def of_source(
@@ -99,15 +101,15 @@ class Scorer:
         kept_bytes: int = 1 << 30,
         progress: Progress | None = None,
     ) -> Scorer:
-        """Make a scorer whose references are renders of a source.
+        """Create a scorer whose references are renders of a source.
 
         Args:
-            source: the scene that others are compared with.
+            source: the scene to compare with.
             cameras: cameras of the views, relative to the source's origin.
-            background, mode, threads: see above.
-            kept_bytes: limit on the size of the source's renders; if they are larger, they are rendered again for
-                each scene.
-            progress: called with the fraction that is rendered.
+            background, mode, threads: see `Scorer`.
+            kept_bytes: maximum memory for the source's renders; if it does not suffice, they are rendered again for
+                each scored scene.
+            progress: called with the stage and the completed fraction.
         """
         render = renderer(source, background, mode=mode, threads=threads)
         references: list[ReferenceImage | Callable[[], ReferenceImage]]
@@ -137,7 +139,7 @@ class Scorer:
         return errors
 
     def pooled(self, errors: F64) -> float:
-        """Return the mean squared error over all pixels, given those of the views."""
+        """Return the mean squared error over all pixels from the errors of the views."""
         return metrics.pooled(errors, self.pixels or [camera.W * camera.H for camera in self.cameras])
 
     def psnr(self, model: SplatModel) -> float:
@@ -153,7 +155,7 @@ class Scorer:
     def score(
         self, number: int, render: F32, *, ssim: bool = True, lpips: metrics.Distance | None = None
     ) -> metrics.ViewScore:
-        """Score a render of a view, [H, W, 3], from any renderer."""
+        """Score a render [H, W, 3] of a view by any renderer."""
         reference, image = self.reference(number), self.cameras[number].image
         return metrics.score_view(
             reference.rgb, render, reference.covered, reference.mask, image=image, with_ssim=ssim, lpips=lpips
@@ -172,10 +174,10 @@ class Scorer:
 
         Args:
             model: the scene. Its origin may differ from that of the cameras.
-            ssim: compute SSIM; it takes about as long as rendering.
-            lpips: the LPIPS distance, if it is needed.
+            ssim: compute SSIM, which takes about as long as rendering.
+            lpips: the LPIPS distance; `None`: it is not computed.
             on_view: called with the images of each view.
-            progress: called with the fraction done.
+            progress: called with the stage and the completed fraction.
         """
         render, each, ignored = self._renderer(model), [], 0
         for number, camera in enumerate(self.cameras):
@@ -206,17 +208,17 @@ class Scorer:
 def renderer(
     model: SplatModel | Renderable, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
 ) -> Callable[[Camera], RenderResult]:
-    """Return a function that renders a scene from camera after camera, and keeps its memory in between.
+    """Return a function that renders a scene for a camera and reuses its memory between calls.
 
     Args:
-        model: the scene. The cameras are relative to its origin.
-        background: red, green, blue behind everything.
+        model: the scene. Cameras are relative to its origin.
+        background: red, green, blue of the background.
         mode: `exact`, `standard` or `fast`.
-        threads: number of threads; `None` for all.
+        threads: number of threads; `None`: all.
     """
     if not isinstance(model, SplatModel):
         return model.renderer(background, mode=mode, threads=threads)
-    # numba takes a second to import: code that needs only the classes does not wait for it.
+    # Imported lazily: numba takes a second to import, and code that uses only the classes does not need it.
     from csplat_render.rasteriser import Rasteriser
     from csplat_render.reference_rasteriser import render_exact
 

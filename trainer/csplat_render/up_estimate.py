@@ -1,10 +1,10 @@
-"""Estimate of the up axis of a scene that does not specify it, for viewing only, never for a file.
+"""Estimate the up axis of a scene that does not specify it, for viewing only; estimates are not written to files.
 
-People who photograph an object walk around it and look down on it, seldom up at it. So an object shows fine splats from
-above, and from below large and smeared ones, or the ground under it. The sum of all directions, weighted by the detail
-that is visible from there, points up. Measured on 12 objects: six have a sum of 0.34 to 0.64 within 14 degrees of the
-true up axis (lego, donut, the sample; angel, st-peter, seal); five, photographed from all sides, have 0.05 to 0.09,
-which decides nothing; a kitchen that is open at one side has 0.26 towards that side.
+Objects are usually photographed from all around and from above, seldom from below. So they show fine splats from above,
+and large, smeared splats or the ground from below. The sum of all viewing directions, weighted by the detail visible
+from each, points up. On 12 objects, six have a sum of 0.34 to 0.64 within 14 degrees of the true up axis (lego, donut,
+the sample, angel, st-peter, seal). Five that were photographed from all sides have 0.05 to 0.09, which is inconclusive.
+A kitchen that is open on one side has 0.26 towards that side.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from csplat_render.camera import intrinsics, look_at
 from csplat_render.scene_frame import detail, sample_cloud, scene_frame
 from csplat_render.virtual_cameras import FIELD_OF_VIEW
 
-_UP_CERTAIN = 0.3  # least length of the sum that is not by chance
-_UP_NEAR_AXIS = 0.9  # least cosine with an axis: programs make one of their axes up
+_UP_CERTAIN = 0.3  # minimum length of a conclusive sum
+_UP_NEAR_AXIS = 0.9  # minimum cosine with an axis: programs use one of their axes as up
 _UP_POINTS, _UP_DIRECTIONS, _UP_IMAGE_SIZE = 10_000, 32, 320
 _UP_DISTANCE = 2.0  # extents
 _UP_CELL, _UP_FINE = 20, 2.0  # pixels
 
 
 def estimate_up(model: SplatModel, every: int = 1) -> Direction | None:
-    """Estimate which axis of an object, or its opposite, is up.
+    """Estimate the up axis of an object, one of ± x, y, z.
 
     Args:
         model: the scene.
-        every: number of the scene's splats that each of the model's represents.
+        every: number of splats of the full scene that each splat of the model represents.
 
     Returns:
-        `None` if the scene or its cameras determine the up axis, if the estimate is uncertain, and for surroundings.
+        The axis; `None` if the scene or its cameras determine it, if the estimate is uncertain, and for surroundings.
     """
     if len(model) == 0 or model.cameras or up_of(model.metadata, model.coordinate_system) is not None:
         return None
@@ -41,7 +41,7 @@ def estimate_up(model: SplatModel, every: int = 1) -> Direction | None:
         return None
     cloud = sample_cloud(model, _UP_POINTS, np.random.default_rng(0), every)
     K = intrinsics(_UP_IMAGE_SIZE, _UP_IMAGE_SIZE, FIELD_OF_VIEW)
-    heights = 1.0 - (2.0 * np.arange(_UP_DIRECTIONS) + 1.0) / _UP_DIRECTIONS  # a spiral: evenly over the sphere
+    heights = 1.0 - (2.0 * np.arange(_UP_DIRECTIONS) + 1.0) / _UP_DIRECTIONS  # spiral that covers the sphere evenly
     turns, radii = np.pi * (1.0 + 5.0**0.5) * np.arange(_UP_DIRECTIONS), np.sqrt(1.0 - heights**2)
     ways = np.stack([radii * np.cos(turns), radii * np.sin(turns), heights], axis=1)
     details = np.empty(_UP_DIRECTIONS)
@@ -64,5 +64,5 @@ def estimate_up(model: SplatModel, every: int = 1) -> Direction | None:
 
 
 def with_estimated_up(model: SplatModel) -> SplatModel:
-    """Return the scene for viewing: with the estimated up direction if it does not specify its own."""
+    """Return the scene for viewing, with the estimated up direction if it does not specify its own."""
     return with_up(model, estimate_up(model))

@@ -1,11 +1,11 @@
 """Virtual cameras around a scene that has none: the cameras of `psnr`.
 
-An *object* is seen from all sides and slightly to steeply above, so near that it covers at least half of each image. In
-*surroundings*, cameras are placed around or inside of the dense middle, where nothing close by hides it.
+An *object* is viewed from all sides at low to high elevations, close enough to cover at least half of each image. In
+*surroundings*, cameras are placed around or inside the dense middle, at positions from which it is not occluded.
 
-Distances are part of what a PSNR means (the same error scores 33, 39 and 48 dB from one, two and four times as far
-away), so they are fixed multiples of the scene's extent: `OBJECT_DISTANCES`, `SURROUNDING_DISTANCES`. Everything comes
-from the source alone; the seed decides directions.
+A PSNR depends on distances: the same error gives 33, 39 and 48 dB at distances of one, two and four extents. So they
+are fixed multiples of the scene's extent: `OBJECT_DISTANCES`, `SURROUNDING_DISTANCES`. Cameras depend on nothing but
+the source and the seed, which determines directions.
 """
 
 from __future__ import annotations
@@ -31,32 +31,32 @@ from csplat_render.scene_frame import (
 #: Horizontal field of view, degrees.
 FIELD_OF_VIEW = 60.0
 
-#: Distances from the centre of an object, in extents, in the order in which they are tried.
+#: Extents, distances from the centre of an object, in the order of trial.
 OBJECT_DISTANCES = (1.25, 1.125, 1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)
 
-#: Distances from the centre of surroundings, in extents, in the order in which they are tried.
+#: Extents, distances from the centre of surroundings, in the order of trial.
 SURROUNDING_DISTANCES = (1.3, 0.8, 0.5)
 
-#: Least fraction of each image that an object covers.
+#: Minimum fraction of each image that an object covers.
 MIN_COVER = 0.5
 
-#: Distance in extents below which splats in surroundings hide others without showing detail.
+#: Extents; nearer splats in surroundings occlude others but show no detail.
 HIDING = 0.4
 
 _COVER_MARGIN = 0.015  # error of the estimated cover
-_OBJECT_ELEVATIONS = (5.0, 25.0, 50.0)
-_SURROUNDING_ELEVATIONS = (3.0, 15.0, 35.0)
+_OBJECT_ELEVATIONS = (5.0, 25.0, 50.0)  # degrees
+_SURROUNDING_ELEVATIONS = (3.0, 15.0, 35.0)  # degrees
 _PROMISING = 4  # number of directions in which nearer cameras are tried
-_TARGET_OFFSET = 0.05  # extents; largest distance of the look-at point from an object's centre
-_CLEAR_RADIUS = 0.32  # fraction of a camera's distance from the centre: radius that has to be clear of an object
-_CLEAR_SHARE = 0.01  # fraction of an object's surface that may lie within it
-_GOOD_DETAIL = 0.65  # fraction of the best view's detail
+_TARGET_OFFSET = 0.05  # extents; maximum distance of the look-at point from an object's centre along each axis
+_CLEAR_RADIUS = 0.32  # radius around a camera that must be clear, as a fraction of its distance from the centre
+_CLEAR_SHARE = 0.01  # maximum fraction of an object's surface within this radius
+_GOOD_DETAIL = 0.65  # minimum detail, as a fraction of the best view's
 _AZIMUTH_STEP = 15.0  # degrees
-_POINTS = 60_000  # points of a cloud
+_POINTS = 60_000  # cloud points
 
 
 def is_clear(frame: SceneFrame, cloud: Cloud, camera: Camera) -> bool:
-    """Return True if hardly any surface is so near to a camera that it would show as fog, or from inside."""
+    """Return True if hardly any surface is close to a camera, where it would look like fog or be seen from inside."""
     radius = _CLEAR_RADIUS * float(np.linalg.norm(camera.position - frame.centre))
     return share_within(cloud, camera.position, radius) <= _CLEAR_SHARE
 
@@ -67,19 +67,18 @@ def virtual_cameras(
     """Return cameras around a scene, chosen from the scene alone.
 
     Args:
-        model: the scene. Its training cameras, if it has any, are not used.
+        model: the scene. Its own cameras, if any, are not used.
         count: number of cameras, at least 1.
-        width: pixels.
-        height: pixels.
+        width, height: pixels.
         seed: determines the first azimuth and the exact look-at points.
-        every: number of the scene's splats that each of the model's represents.
+        every: number of splats of the full scene that each splat of the model represents.
 
     Returns:
-        `count` cameras, the same for the same arguments. An object covers at least half of each
-        image, if a nearer camera can achieve it.
+        `count` cameras, the same for the same arguments. An object covers at least half of each image if that is
+        possible.
 
     Raises:
-        InputError: `count` is below 1 or the size is not that of an image.
+        InputError: `count` is below 1 or the image size is invalid.
     """
     if count < 1:
         raise InputError(f"{count} virtual cameras, expected at least 1")
@@ -99,7 +98,7 @@ def virtual_cameras(
 
 @dataclass(frozen=True, eq=False)
 class _CameraPlacement:
-    """A scene frame and intrinsics, for cameras given by angles in degrees and lengths in extents."""
+    """A scene frame and intrinsics, for cameras specified by angles in degrees and lengths in extents."""
 
     frame: SceneFrame
     K: F64
@@ -116,7 +115,7 @@ class _CameraPlacement:
 def _around_object(
     views: _CameraPlacement, cloud: Cloud, count: int, begin: float, rng: np.random.Generator
 ) -> list[Camera]:
-    """Place one camera in each of `count` equal sectors, as far away as the object covers enough of the image."""
+    """Place a camera in each of `count` equal sectors, at the largest distance at which the cover is sufficient."""
     width = 360.0 / count
     cameras = []
     for sector in range(count):
@@ -132,13 +131,13 @@ def _around_object(
 
 
 def _object_view(views: _CameraPlacement, cloud: Cloud, angles: list[tuple[float, float]], offset: F64) -> Camera:
-    """Return the farthest view of which the object covers enough, with nothing close by."""
+    """Return the farthest view with sufficient cover and nothing close to the camera."""
     needed = MIN_COVER + _COVER_MARGIN
     best, best_rank = views.at(*angles[0], OBJECT_DISTANCES[0], offset), (False, -1.0)
     highest, highest_at = 1.0, OBJECT_DISTANCES[0]
     for distance in OBJECT_DISTANCES:
         if highest * (highest_at / distance) ** 2 < 0.8 * needed:
-            continue  # the cover from farther away shows that this distance is not enough either
+            continue  # the cover at the last distance implies that this one is not sufficient either
         covers = []
         for angle in angles:
             camera = views.at(*angle, distance, offset)
@@ -149,13 +148,13 @@ def _object_view(views: _CameraPlacement, cloud: Cloud, angles: list[tuple[float
             if (enough, covers[-1]) > best_rank:
                 best, best_rank = camera, (enough, covers[-1])
         highest, highest_at = max(covers), distance
-        ranked = np.argsort(-np.array(covers), kind="stable")  # only the most promising come nearer
+        ranked = np.argsort(-np.array(covers), kind="stable")  # only the most promising ones are tried nearer
         angles = [angles[i] for i in ranked[:_PROMISING]]
     return best
 
 
 def _in_surroundings(views: _CameraPlacement, cloud: Cloud, count: int, begin: float) -> list[Camera]:
-    """Choose, among the views that show fine detail, those with the largest distances from each other."""
+    """Choose views with fine detail that are farthest from each other."""
     azimuths = begin + np.arange(0.0, 360.0, _AZIMUTH_STEP)
     angles = [(azimuth, elevation) for azimuth in azimuths for elevation in _SURROUNDING_ELEVATIONS]
     cameras = [views.at(*angle, distance) for distance in SURROUNDING_DISTANCES for angle in angles]
@@ -163,7 +162,7 @@ def _in_surroundings(views: _CameraPlacement, cloud: Cloud, count: int, begin: f
     good = details >= _GOOD_DETAIL * details.max()
     enough = len(angles)
     while enough < len(cameras) and np.count_nonzero(good[:enough]) < count:
-        enough += len(angles)  # nearer views only if the farther ones are too few
+        enough += len(angles)  # nearer views are used only if there are too few farther ones
     pool = np.flatnonzero(good[:enough])
     if len(pool) < count:
         pool = np.argsort(-details, kind="stable")[: max(count, len(pool))]
@@ -174,7 +173,7 @@ def _in_surroundings(views: _CameraPlacement, cloud: Cloud, count: int, begin: f
 
 
 def farthest_points(points: F64, first: int, count: int) -> list[int]:
-    """Return the indices of `count` points, each the farthest from those before it."""
+    """Return the indices of `count` points, each the farthest from all points before it."""
     chosen = [first]
     gap = np.sum((points - points[first]) ** 2, axis=1)
     while len(chosen) < count:

@@ -1,4 +1,4 @@
-"""Compilation of kernels ahead of their first call, which would take seconds, and its announcement."""
+"""Compile kernels ahead of their first call, and announce it, because compilation takes seconds to a minute."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def warm_up(
     """Compile kernels, or load them from numba's cache, by running them on a single splat.
 
     Args:
-        announce: called with a line if anything has to be compiled, and with another at the end.
-        gradients: compile the renderer's backward pass too.
+        announce: called with a message if something has to be compiled, and with another one at the end.
+        gradients: also compile the renderer's backward pass.
         simplify: compile the kernels of `measure_pruning_error`.
         ssim: compile the kernels of `metrics.ssim`.
         lpips: compile the kernels of `lpips.Lpips`.
-        others: functions that compile further kernels.
-        dtype: dtype of pixels and gradients, see `Rasteriser`; the other groups have one each.
+        others: functions that call further kernels.
+        dtype: dtype of pixels and gradients, see `Rasteriser`; the other kernels have a fixed dtype.
 
     Returns:
         Duration in seconds.
@@ -48,9 +48,7 @@ def warm_up(
         nonlocal compiles
         compiles = True
         if announce is not None:
-            announce(
-                "compiling a part of the renderer for this machine: a minute at most; it is kept for the next time"
-            )
+            announce("compiling a part of the renderer for this machine, once: this takes up to a minute")
 
     with on_compiling(say):
         viewmat = np.eye(4)
@@ -75,7 +73,7 @@ def warm_up(
 
 
 def is_compiled() -> bool:
-    """Return True if a render can start at once, without compiling the kernels that project and blend splats."""
+    """Return True if the kernels that project and blend splats are compiled, so a render starts at once."""
     return all(map(is_cached, (project, blend)))
 
 
