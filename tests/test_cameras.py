@@ -81,7 +81,7 @@ def test_the_target_is_in_the_middle_and_up_points_up():
 def test_a_camera_may_look_along_up_but_not_at_its_own_position():
     camera = look_at([0.0, 0.0, 5.0], [0.0, 0.0, 0.0], UP, K, 640, 480)
     assert np.allclose(pixel(camera, np.zeros(3)), (320.0, 240.0))
-    with pytest.raises(InputError, match="where it stands"):
+    with pytest.raises(InputError, match="position and target are the same"):
         look_at([1.0, 1.0, 1.0], [1.0, 1.0, 1.0], UP, K, 640, 480)
 
 
@@ -215,7 +215,7 @@ FOREIGN = {
         (32, 24),
         "1 pose scaled",
     ),
-    "distortion": ({**TRANSFORMS, "k1": 0.1}, (32, 24), "the distortion of its lens is left out"),
+    "distortion": ({**TRANSFORMS, "k1": 0.1}, (32, 24), "lens distortion is ignored"),
 }
 
 
@@ -238,7 +238,7 @@ def test_camera_files_of_other_programs_are_read(tmp_path):
 #: Invalid files, and a part of the error.
 WRONG = {
     "INRIA, no focal length": ([inria(), inria(fx=None)], "camera 1: fx is None, expected a number"),
-    "INRIA, no position": ([inria(position=None)], "camera 0: rotation and position have other shapes"),
+    "INRIA, no position": ([inria(position=None)], "camera 0: rotation or position has another shape"),
     "INRIA, another entry": ([inria(), {"K": 1}], "camera 1: width is None"),
     "INRIA, no rotation": ([inria(rotation=[[1, 1, 1]] * 3)], "camera 0: the camera's viewmat does not begin"),
     "INRIA, no object": ([inria(), 3], "camera 1 is int, expected an object"),

@@ -117,7 +117,7 @@ def test_refuses_what_cannot_be_compared():
     for reference, image in ((a, b[1:]), (a[..., 0], b[..., 0]), ((a * 255).astype(np.uint8), b), (a * np.nan, b)):
         with pytest.raises(InputError):
             psnr(reference, image)
-    with pytest.raises(InputError, match="no pictures"):
+    with pytest.raises(InputError, match="found no images"):
         Scores.of([])
     with pytest.raises(InputError, match="cover"):
         score_view(a, b, np.zeros((2, 2), bool))

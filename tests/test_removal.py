@@ -233,7 +233,7 @@ def test_parts_add_up():
 def test_no_camera_and_too_few_references_are_refused():
     with pytest.raises(InputError, match="camera"):
         measure_pruning_error(scene(), [])
-    with pytest.raises(InputError, match="1 reference pictures for 2"):
+    with pytest.raises(InputError, match="1 reference images, expected one for each of 2"):
         measure_pruning_error(scene(), views(2), references=[np.zeros((30, 40, 3))])
 
 
@@ -334,5 +334,5 @@ def test_a_fit_of_colours_beyond_all_measure_ends_without_nan():
 
 
 def test_as_many_pictures_as_cameras_are_wanted():
-    with pytest.raises(InputError, match="as many pictures"):
+    with pytest.raises(InputError, match="2 cameras and 1 reference images"):
         fit_colours(scene(), views(2), [np.zeros((30, 40, 3), np.float32)])

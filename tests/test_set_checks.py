@@ -277,7 +277,7 @@ FIELDS = {
     ),
     "lengths and angles that differ": (
         {"camera_angle_x": 0.5},
-        r"frame 0: fl_x is 51\.\d+, expected 93\.99\d* as camera_angle_x = 0\.5 says for 48 pixels",
+        r"frame 0: fl_x is 51\.\d+, expected 93\.99\d* from camera_angle_x = 0\.5 and 48 pixels",
     ),
     "down, too": ({"camera_angle_y": 0.5}, "fl_y is 51.* as camera_angle_y = 0.5 says for 32 pixels"),
     "no unit of pixels": (
@@ -372,7 +372,7 @@ def test_the_scale_of_poses_is_removed_and_reported(tmp_path):
     scaled = (np.array(frames[1]["transform_matrix"]) @ np.diag([2.0, 2.0, 2.0, 1.0])).tolist()
     change_transforms(tmp_path, frames=[frames[0], {**frames[1], "transform_matrix": scaled}, *frames[2:]])
     data = load(tmp_path)
-    assert "transforms.json: 1 pose scaled (the first by 2), which is taken off: places stay" in data.report
+    assert "transforms.json: 1 pose scaled (the first by 2): removed, positions stay" in data.report
     assert np.allclose(cameras(10)[1].viewmat, data.train[0].camera.viewmat)
 
 
