@@ -13,7 +13,7 @@ from command_line import InThisProcess
 from typer.testing import CliRunner
 
 import csplat
-from csplat_bench.pages import with_tables, write_pages
+from csplat_bench.pages import RESULTS, with_tables, write_pages
 from csplat_bench.tables import markdown_table, select_rows
 from csplat_tools.batches import batch_run
 from csplat_tools.cli.app import app
@@ -72,6 +72,15 @@ def test_rows_of_results_are_filtered_ordered_and_grouped(tmp_path):
     assert [{"scene": "b", "x.size": 3, "y.size": 4}, {"scene": "a", "x.size": 0, "y.size": 1}] == grouped
     with pytest.raises(ValueError, match="no row is left"):
         select_rows({"source": "r.json", "where": {"scene": "c"}}, tmp_path)
+
+
+def test_means_on_the_page_on_quality_are_those_of_the_results():
+    text = (DOCS / "results" / "quality.md").read_text("utf-8")
+    rows = json.loads((RESULTS / "spz_and_sog.json").read_text("utf-8"))["at_spz_psnr"]
+    groups = [[row for row in rows[:10] if row["sh_degree"] == degree] for degree in (3, 0)]
+    for group in (*groups, rows[10:]):
+        mean = np.exp(np.mean([np.log(row["pruned_bytes"] / row["spz_bytes"]) for row in group]))
+        assert f" {mean:.3f}" in text
 
 
 def test_a_page_with_an_undeclared_table_is_refused(tmp_path):
