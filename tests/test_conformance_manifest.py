@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 
 from csplat import _spec
-from csplat_authoring.clauses import UNCOVERED, clause_ids, clause_map, replace_generated
-from csplat_authoring.example import annex, example_scene
+from csplat_authoring.annexes import UNCOVERED, annex, clause_ids, clause_map, example_scene, replace_generated
 from csplat_authoring.recipes import sound_recipes
 from csplat_authoring.reference import expected
 from csplat_conformance.declared_bounds import Source

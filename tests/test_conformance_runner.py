@@ -28,9 +28,18 @@ from csplat_conformance.manifest import VECTORS, load, select_names
 from csplat_conformance.single_precision import GPUS
 from csplat_conformance.tolerance import EXACT, RENDERER
 from csplat_selftest import decoder_processes
-from csplat_selftest.decoder_faults import all_faults, off_by, single_precision
+from csplat_selftest.decoder_faults import (
+    DecoderFault,
+    ModuleEdit,
+    all_faults,
+    edited,
+    edited_module,
+    find,
+    off_by,
+    single_precision,
+    table,
+)
 from csplat_selftest.decoder_processes import missing_javascript
-from csplat_selftest.faults import DecoderFault, ModuleEdit, edited, edited_module, find, table
 from csplat_tools.cli.app import app
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -175,7 +184,7 @@ VALID_FAULTS = {
     "refusal": (Status.REFUSED, ("L1", "L2", "L3"), "refused"),
     "no header": (Status.WRONG_ANSWER, ("L1",), "no header.json"),
     "header": (Status.WRONG_ANSWER, ("L1", "L2", "L3"), "header.json is not a JSON object"),
-    "fact": (Status.FAILED, ("L1",), "header.splat_count: 3 for 5"),
+    "fact": (Status.FAILED, ("L1",), "header.splat_count is 3, expected 5"),
     "missing": (Status.WRONG_ANSWER, ("L2",), "integers.means is missing"),
     "extra": (Status.FAILED, ("L3",), "floats.colours: unexpected array"),
     "unknown file": (Status.WRONG_ANSWER, ("L1", "L2", "L3"), "log.txt is not a file of the protocol"),
@@ -599,4 +608,4 @@ def test_the_table_names_fault_vectors_and_clauses():
     fault = next(fault for fault in PYTHON if fault.clause == "HDR-6")
 
     row = table([find(fault, [named("invalid/trailing")])]).splitlines()[-1]
-    assert "| Python | trailing bytes | bytes behind the file are accepted | 1 | `invalid/trailing` | HDR-6 |" == row
+    assert "| Python | trailing bytes | trailing bytes are accepted | 1 | `invalid/trailing` | HDR-6 |" == row

@@ -290,7 +290,7 @@ def test_a_reader_that_disagrees_with_lint_is_a_finding(monkeypatch, ply_target)
 
     monkeypatch.setattr(file_targets, "read_ply", refuse)
 
-    assert "lint finds nothing wrong" in fuzz.attempt(ply_target, ply_target.seeds([])[0].data)[1]
+    assert "lint reports no error" in fuzz.attempt(ply_target, ply_target.seeds([])[0].data)[1]
 
 
 def test_a_ply_is_made_smaller(monkeypatch, ply_target):

@@ -11,11 +11,9 @@ from csplat_conformance.manifest import load
 from csplat_selftest.decoder_processes import missing_c, missing_javascript
 from csplat_selftest.mutation import __main__ as command
 from csplat_selftest.mutation import mutants
-from csplat_selftest.mutation.javascript import JavaScriptDecoder
+from csplat_selftest.mutation.decoders import JavaScriptDecoder, NativeDecoder, PythonDecoder
 from csplat_selftest.mutation.mutants import Fate, Mutant, MutantResult, sample, score, table
-from csplat_selftest.mutation.native import NativeDecoder
 from csplat_selftest.mutation.operators import c_mutants, python_mutants
-from csplat_selftest.mutation.python import PythonDecoder
 
 pytestmark = pytest.mark.slow  # together: tests of the mutants
 

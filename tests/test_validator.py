@@ -20,8 +20,8 @@ from csplat_authoring.samples import attributes, rich_scene, scene, tile
 from csplat_authoring.scene import Attribute, Chunk, StatedErrors
 from csplat_conformance.manifest import load
 from csplat_conformance.validator import validate
+from csplat_conformance.validator.ancillary_chunks import JsonError, parse_json
 from csplat_conformance.validator.inflate import CodedError, Inflater
-from csplat_conformance.validator.json_text import JsonError, parse_json
 from csplat_conformance.validator.streams import undo_coder
 from csplat_conformance.validator.violation_log import CODES, VIOLATIONS_MAX
 from csplat_selftest.fuzzing.bit_flips import flip, flips, prefixes
@@ -108,7 +108,7 @@ def test_one_defect_causes_few_violations(broken):
 @pytest.mark.parametrize(
     ("name", "part"),
     [
-        ("valid/chunks_reversed", "order that is recommended"),
+        ("valid/chunks_reversed", "recommended order"),
         ("extreme/deflate_unused_bits", "unused bits after the final block"),
     ],
 )

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from csplat import _spec
-from csplat_authoring.clauses import clause_map, replace_generated
-from csplat_authoring.example import annex
+from csplat_authoring.annexes import annex, clause_map, replace_generated
 from csplat_authoring.recipe import Recipe
 from csplat_authoring.recipes import all_recipes
 from csplat_authoring.reference import expected

@@ -1,4 +1,5 @@
-"""Tests of the conformance suite: decoders with planted faults, mutants, fuzzing. In a checkout only, not in the wheel.
+"""Tests of the conformance suite and of our decoders. Only in a checkout, not in the wheel.
 
-`decoder_faults` has mistakes that people make, `mutation` changes operator by operator, `fuzzing` damages files.
+`decoder_faults` plants typical mistakes of implementers in our decoders, `mutation` changes single operators of the
+decoders, and `fuzzing` damages files.
 """

@@ -1,23 +1,29 @@
-"""Decoders that are wrong on purpose, one fault each: the suite has to notice every one of them.
+"""Plant typical mistakes of implementers in our decoders, and check that the suite notices each of them.
 
 Usage:
-    python -m csplat_selftest.decoder_faults             # the table: fault, vectors failed, clauses
+    python -m csplat_selftest.decoder_faults             # table of faults, failed vectors and clauses
     python -m csplat_selftest.decoder_faults --only python --vectors
 
-Faults replace a function of the Python decoder (here), or a piece of the text of a function in Python or a module in
-JavaScript (`decoder_faults.toml`). Some compute in single precision, badly, and are tested by the class *renderer*.
+A fault replaces a function of the Python decoder (in this module), or edits the source of a function in Python or of a
+module in JavaScript (`decoder_faults.toml`). Some faults compute imprecisely in single precision, and are tested with
+the tolerances of the class *renderer*.
 """
 
 from __future__ import annotations
 
 import argparse
+import inspect
 import json
 import math
+import shutil
 import sys
+import tempfile
 import tomllib
 import zlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,32 +32,140 @@ from unittest import mock
 
 import numpy as np
 
-from csplat import _spec
+from csplat import _spec, decoder
 from csplat.decoder import blocks, container, entropy, reconstruct
 from csplat.errors import FormatError, InputError, UnsupportedError
+from csplat_authoring.recipes import exact_floats
+from csplat_conformance.adapter import answer
+from csplat_conformance.answers import PARTS, Answer, check_payload_consistency, compare_answer
+from csplat_conformance.conformance_report import Outcome, Status
+from csplat_conformance.manifest import Vector, load
 from csplat_conformance.single_precision import GPUS, GpuArithmetic, lattice_values, opacities, quats
-from csplat_conformance.tolerance import RENDERER
+from csplat_conformance.tolerance import EXACT, RENDERER
 from csplat_conformance.validator.inflate import CodedError, Inflater
-from csplat_selftest.faults import (
-    DecoderFault,
-    ModuleEdit,
-    Plant,
-    Wrong,
-    constants,
-    edited,
-    find,
-    nothing,
-    replaced,
-    table,
-    together,
-)
+from csplat_selftest.decoder_processes import JsDecoder, js_folder
 
 _EDITS: Final = Path(__file__).with_suffix(".toml")
+#: A faulty function; called with the original function and then the arguments.
+Wrong = Callable[..., Any]
+#: Plants a fault in the Python decoder until the stack is closed.
+Plant = Callable[[ExitStack], None]
+
+_SHOWN_CLAUSES = 4
+
+
+@dataclass(frozen=True)
+class ModuleEdit:
+    """An edit of the JavaScript decoder's source.
+
+    Attributes:
+        file: module.
+        edits: pieces of its text, each of which occurs once, and their replacements.
+    """
+
+    file: str
+    edits: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class DecoderFault:
+    """A fault of a decoder.
+
+    Attributes:
+        name: short name.
+        what: the mistake, such as an implementer might make.
+        clause: the clause of the specification that it violates.
+        plant: plants it in the Python decoder or in the JavaScript decoder.
+        by: class (spec 9.2) for which the decoder is tested.
+    """
+
+    name: str
+    what: str
+    clause: str
+    plant: Plant | ModuleEdit
+    by: str = EXACT
+
+    @property
+    def language(self) -> str:
+        """Language of the decoder."""
+        return "JavaScript" if isinstance(self.plant, ModuleEdit) else "Python"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The suite's findings about a decoder with a fault."""
+
+    fault: DecoderFault
+    failed: Sequence[Outcome]
+
+    @property
+    def vectors(self) -> list[str]:
+        """Names of the vectors that failed."""
+        return list(dict.fromkeys(outcome.name for outcome in self.failed))
+
+    @property
+    def clauses(self) -> list[str]:
+        """Clauses of the failed vectors, the most frequent first."""
+        by_vector = {outcome.name: outcome.clauses for outcome in self.failed}
+        counts = Counter(clause for clauses in by_vector.values() for clause in clauses)
+        return [clause for clause, _ in counts.most_common()]
+
+
+def find(fault: DecoderFault, vectors: Iterable[Vector] | None = None) -> Finding:
+    """Run a decoder with a fault over the vectors, or over some of them.
+
+    Codes of refusals are not compared, as for other decoders.
+
+    Raises:
+        InputError: Node or the JavaScript decoder is missing.
+    """
+    outcomes: list[Outcome] = []
+    with ExitStack() as stack:
+        if isinstance(fault.plant, ModuleEdit):
+            ask = stack.enter_context(_edited_javascript(stack, fault.plant)).ask
+        else:
+            fault.plant(stack)
+            ask = _answer
+        near = exact_floats if fault.by == RENDERER else None
+        for vector in load() if vectors is None else vectors:
+            outcomes += compare_answer(vector, ask(vector.data), tuple(PARTS), near=near)
+    return Finding(fault, [one for one in check_payload_consistency(outcomes)[0] if not one.good])
+
+
+def _answer(data: bytes) -> Answer:
+    try:
+        return answer(data)
+    except Exception as error:  # noqa: BLE001 - a faulty decoder may fail in any way
+        return Answer(Status.CRASHED, f"{type(error).__name__}: {error}")
+
+
+def _edited_javascript(stack: ExitStack, edit: ModuleEdit) -> JsDecoder:
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="csplat-fault-")))
+    for path in js_folder().glob("*.mjs"):
+        shutil.copy(path, folder)
+    (folder / edit.file).write_text(edited_module(edit), encoding="utf-8")
+    return JsDecoder(folder)
+
+
+def table(findings: Sequence[Finding]) -> str:
+    """Return a Markdown table of the faults."""
+    lines = [
+        "| decoder | fault | mistake | vectors failed | for example | clauses |",
+        "|---|---|---|---|---|---|",
+    ]
+    for one in findings:
+        fault, clauses = one.fault, one.clauses
+        named = [fault.clause, *(clause for clause in clauses if clause != fault.clause)]
+        more = f" and {len(named) - _SHOWN_CLAUSES} more" if len(named) > _SHOWN_CLAUSES else ""
+        example = next((o.name for o in one.failed if fault.clause in o.clauses), "none")
+        cells = (fault.language, fault.name, fault.what, str(len(one.vectors)), f"`{example}`")
+        lines.append(f"| {' | '.join(cells)} | {', '.join(named[:_SHOWN_CLAUSES])}{more} |")
+    return "\n".join(lines)
 
 
 @cache
 def all_faults() -> list[DecoderFault]:
-    """Return all planted faults of our decoders."""
+    """Return all faults."""
     result = list(_REPLACEMENTS)
     for language, rows in tomllib.loads(_EDITS.read_text(encoding="utf-8")).items():
         for row in rows:
@@ -62,11 +176,11 @@ def all_faults() -> list[DecoderFault]:
 
 
 def main() -> int:
-    """Print the table; the exit status is 1 if a fault goes unnoticed."""
+    """Print the table; return exit status 1 if a fault is not noticed."""
     parser = argparse.ArgumentParser(
         prog="csplat_selftest.decoder_faults", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--only", choices=("python", "javascript"), help="one of the two decoders")
+    parser.add_argument("--only", choices=("python", "javascript"), help="test only one of the two decoders")
     parser.add_argument("--vectors", action="store_true", help="list the vectors that each fault fails")
     args = parser.parse_args()
     findings = []
@@ -82,15 +196,90 @@ def main() -> int:
             sys.stdout.write(f"\n{one.fault.language}, {one.fault.name}: {', '.join(one.vectors)}\n")
     missed = [one.fault for one in findings if one.fault.clause not in one.clauses]
     for fault in missed:
-        sys.stderr.write(f"unnoticed: {fault.language}, {fault.name} ({fault.clause})\n")
+        sys.stderr.write(f"not noticed: {fault.language}, {fault.name} ({fault.clause})\n")
     return 1 if missed else 0
 
 
-# What is checked -----------------------------------------------------------------------------------
+# Ways to plant a fault -----------------------------------------------------------------------------
+
+
+def replaced(name: str, wrong: Wrong, owner: object = None) -> Plant:
+    """Return a plant that replaces a function of an owner, or wherever the decoder has imported it."""
+
+    def plant(stack: ExitStack) -> None:
+        owners = _owners(name) if owner is None else [owner]
+        assert owners, f"the decoder has no {name}"
+        for one in owners:
+            stack.enter_context(mock.patch.object(one, name, _bound(wrong, getattr(one, name))))
+
+    return plant
+
+
+def edited(name: str, edits: Mapping[str, str]) -> Plant:
+    """Return a plant that replaces pieces of the source of a function, each of which must occur once."""
+
+    def plant(stack: ExitStack) -> None:
+        (right,) = {getattr(module, name) for module in _owners(name)}
+        made: dict[str, Any] = {}
+        exec(_edited_text(name, inspect.getsource(right), edits), right.__globals__, made)  # noqa: S102 - our source
+        replaced(name, lambda _right, *args, **options: made[name](*args, **options))(stack)
+
+    return plant
+
+
+def edited_module(edit: ModuleEdit) -> str:
+    """Return the text of a JavaScript module with its edit."""
+    text = (js_folder() / edit.file).read_text(encoding="utf-8")
+    return _edited_text(edit.file, text, edit.edits)
+
+
+def constants(**values: int) -> Plant:
+    """Return a plant that changes constants of the format."""
+    return together(
+        *(lambda stack, k=k, v=v: stack.enter_context(mock.patch.object(_spec, k, v)) for k, v in values.items())
+    )
+
+
+def together(*plants: Plant) -> Plant:
+    """Return a plant of several faults."""
+
+    def plant(stack: ExitStack) -> None:
+        for one in plants:
+            one(stack)
+
+    return plant
+
+
+def nothing(_right: Wrong, *_args: Any, **_options: Any) -> None:
+    """Do nothing; replaces a function."""
+
+
+def _owners(name: str) -> list[object]:
+    prefix = decoder.__name__ + "."
+    modules = [module for key, module in list(sys.modules.items()) if key.startswith(prefix)]
+    return [module for module in modules if hasattr(module, name)]
+
+
+def _bound(wrong: Wrong, right: Wrong) -> Wrong:
+    def replacement(*args: Any, **options: Any) -> Any:
+        return wrong(right, *args, **options)
+
+    return replacement
+
+
+def _edited_text(name: str, text: str, edits: Mapping[str, str]) -> str:
+    for old, new in edits.items():
+        if text.count(old) != 1:
+            raise ValueError(f"{name} contains {old!r} {text.count(old)} times, expected once: update the fault")
+        text = text.replace(old, new)
+    return text
+
+
+# Checks --------------------------------------------------------------------------------------------
 
 
 def _cut_to_size(right: Wrong, data: Any) -> memoryview:
-    """Read as many bytes as the header announces, and no more."""
+    """Drop the bytes after the file size in the header."""
     view: memoryview = right(data)
     if len(view) < _spec.HEADER_SIZE:
         return view
@@ -98,7 +287,7 @@ def _cut_to_size(right: Wrong, data: Any) -> memoryview:
 
 
 def crc_but(unchecked: str) -> Wrong:
-    """Return a fault that checks all CRCs but those of one clause."""
+    """Return a fault that does not check the CRCs of one clause."""
 
     def wrong(right: Wrong, covered: memoryview, stored: int, at: int, clause: str) -> None:
         if clause != unchecked:
@@ -116,7 +305,7 @@ def _tail_of_inflate(_right: Wrong, coded: memoryview, size: int, at: int) -> by
 
 
 class _CarelessInflater(Inflater):
-    """Inflates without looking at one clause."""
+    """An inflater that ignores one clause."""
 
     def __init__(self, coded: bytes, ignored: str) -> None:
         super().__init__(coded)
@@ -135,7 +324,7 @@ def _inflate_without(clause: str) -> Wrong:
         except CodedError as error:
             raise FormatError(_spec.ERROR_CODER, at, error.clause, str(error)) from None
         if len(packed) != size or inflater.used != len(coded):
-            raise FormatError(_spec.ERROR_CODER, at, "COD-2", "another size")
+            raise FormatError(_spec.ERROR_CODER, at, "COD-2", "wrong size")
         return packed
 
     return inflate
@@ -149,7 +338,7 @@ def _skip_critical(right: Wrong, record: _spec.DirectoryRecord, at: int) -> None
 
 
 def _without_tails(stack: ExitStack) -> None:
-    """Use the structures' own sizes in place of the sizes in the file."""
+    """Use the sizes of the structures instead of the sizes in the file."""
     right = _spec.unpack_index_head
 
     def unpack(data: Any, at: int) -> _spec.IndexHead:
@@ -172,7 +361,7 @@ def _known_extras(right: Wrong, *args: Any) -> Any:
 
 def _zigzag(right: Wrong, elements: Any, width: int) -> Any:
     result = right(elements, width)
-    return entropy._wrap(np.where(elements & 1, result + elements.dtype.type(1), result), width)  # noqa: SLF001 - to break it
+    return entropy._wrap(np.where(elements & 1, result + elements.dtype.type(1), result), width)  # noqa: SLF001 - a fault
 
 
 def _no_wrap(_right: Wrong, elements: Any, _width: int) -> Any:
@@ -221,11 +410,6 @@ def _minus_w(right: Wrong, block: Any, record: _spec.AttributeRecord, out: Any) 
     out[:, 0] *= -1.0
 
 
-def _w_last(right: Wrong, block: Any, record: _spec.AttributeRecord, out: Any) -> None:
-    right(block, record, out)
-    out[:] = np.roll(out, -1, axis=1)
-
-
 def _linear(right: Wrong, record: _spec.AttributeRecord) -> Any:
     return right(record._replace(mapping=_spec.MAPPING_LINEAR))
 
@@ -242,7 +426,7 @@ def _channels_innermost(_right: Wrong, block: Any, record: _spec.AttributeRecord
         columns = np.concatenate(parts)
         for channel in range(3):
             for coefficient, row in enumerate(columns[channel::3]):
-                reconstruct._scale(row, step, out[start:stop, coefficient, channel])  # noqa: SLF001 - as the right one
+                reconstruct._scale(row, step, out[start:stop, coefficient, channel])  # noqa: SLF001 - a fault
 
 
 def _without_corner(right: Wrong, block: Any, record: _spec.AttributeRecord, count: int, **options: Any) -> Any:
@@ -283,7 +467,7 @@ def _sorted_codes(right: Wrong, codes: Any) -> Any:
     return right(np.sort(codes))
 
 
-# Pieces of text -------------------------------------------------------------------------------------
+# Texts ----------------------------------------------------------------------------------------------
 
 
 def _library_json(_right: Wrong, text: bytes, _kind: type, at: int) -> Any:
@@ -297,7 +481,7 @@ def _library_json(_right: Wrong, text: bytes, _kind: type, at: int) -> Any:
 
 
 def single_precision(gpu: GpuArithmetic) -> Plant:
-    """Return what makes the Python decoder compute section 7 as a GPU does, and as CNF-7 allows."""
+    """Return a plant that makes the Python decoder compute section 7 with the arithmetic of a GPU (CNF-7)."""
 
     def lattice(_right: Wrong, integers: Any, step: float, out: Any, **_options: Any) -> None:
         out[...] = lattice_values(integers.astype(np.int64), step, 0, gpu)
@@ -325,7 +509,7 @@ def off_by(ulps: int) -> Plant:
 
 
 def _corner_as_float(right: Wrong, block: Any, record: _spec.AttributeRecord, out: Any) -> int:
-    """Add corner × s, exact but for one rounding, and q × s."""
+    """Add corner × s, rounded once, and q × s."""
     largest: int = right(block, record, out)
     if record.attribute == _spec.ATTRIBUTE_MEANS:
         step = math.ldexp(record.step, block.exponent)
@@ -358,7 +542,7 @@ def _overflowing(_right: Wrong, integers: Any, step: float, out: Any, **_options
 
 
 def _checked_when_rounded(_right: Wrong, parts: Any, step: float, record: Any, at: int) -> None:
-    """Ask whether the values in single precision are finite."""
+    """Check that the values in single precision are finite."""
     with np.errstate(over="ignore"):
         finite = all(np.isfinite(part.astype(np.float32) * np.float32(step)).all() for part in parts)
     if not finite:
@@ -381,91 +565,103 @@ _NO_LIMITS = constants(
 _NOTHING_READ = together(replaced("json_chunk", nothing), replaced("bounds_chunk", nothing))
 
 _REPLACEMENTS: Final = (
-    DecoderFault("CRC ignored", "no CRC-32 is compared", "CHK-1", replaced("_check_crc", nothing)),
-    DecoderFault("CRC of the index", "the chunks have theirs", "IDX-1", replaced("_check_crc", crc_but("IDX-1"))),
-    DecoderFault("CRCs of chunks", "the index has its own", "CHK-1", replaced("_check_crc", crc_but("CHK-1"))),
+    DecoderFault("CRC of the index", "not checked", "IDX-1", replaced("_check_crc", crc_but("IDX-1"))),
+    DecoderFault("CRCs of chunks", "not checked", "CHK-1", replaced("_check_crc", crc_but("CHK-1"))),
+    DecoderFault("unused chunks", "unused chunks are not read", "CHK-2", replaced("read_side_chunks", _no_side_chunks)),
+    DecoderFault("trailing bytes", "trailing bytes are accepted", "HDR-6", replaced("view_of", _cut_to_size)),
     DecoderFault(
-        "chunks unused", "what is not used is not read", "CHK-2", replaced("read_side_chunks", _no_side_chunks)
+        "tails of payloads",
+        "bytes may follow the last structure",
+        "TLE-3",
+        replaced("finish", nothing, container.Cursor),
     ),
-    DecoderFault("trailing bytes", "bytes behind the file are accepted", "HDR-6", replaced("view_of", _cut_to_size)),
-    DecoderFault("tails of payloads", "a payload may go on", "TLE-3", replaced("finish", nothing, container.Cursor)),
-    DecoderFault("lenient inflate", "as most libraries do by default", "COD-2", replaced("_inflate", _tail_of_inflate)),
     DecoderFault(
-        "DEFLATE, counts", "any number of 5 bits is a count", "COD-5", replaced("_inflate", _inflate_without("COD-5"))
+        "lenient inflate",
+        "trailing bytes are ignored, as by most libraries",
+        "COD-2",
+        replaced("_inflate", _tail_of_inflate),
     ),
-    DecoderFault("DEFLATE, codes", "complete or not", "COD-6", replaced("_inflate", _inflate_without("COD-6"))),
     DecoderFault(
-        "DEFLATE, lengths", "repetitions as they come", "COD-7", replaced("_inflate", _inflate_without("COD-7"))
+        "DEFLATE, counts", "any 5-bit number is a count", "COD-5", replaced("_inflate", _inflate_without("COD-5"))
     ),
-    DecoderFault("DEFLATE, symbols", "each means something", "COD-8", replaced("_inflate", _inflate_without("COD-8"))),
-    DecoderFault("reserved bits", "reserved fields are not looked at", "RES-1", replaced("check_reserved", nothing)),
     DecoderFault(
-        "critical chunks", "whatever is unknown is skipped", "DIR-2", replaced("_check_chunk_type", _skip_critical)
+        "DEFLATE, codes", "incomplete codes are accepted", "COD-6", replaced("_inflate", _inflate_without("COD-6"))
     ),
-    DecoderFault("tails of records", "a record is as long as its fields", "IDX-9", _without_tails),
+    DecoderFault(
+        "DEFLATE, lengths", "repetitions are not checked", "COD-7", replaced("_inflate", _inflate_without("COD-7"))
+    ),
+    DecoderFault(
+        "DEFLATE, symbols", "every symbol is accepted", "COD-8", replaced("_inflate", _inflate_without("COD-8"))
+    ),
+    DecoderFault("reserved bits", "reserved fields are not checked", "RES-1", replaced("check_reserved", nothing)),
+    DecoderFault(
+        "critical chunks", "all unknown chunks are skipped", "DIR-2", replaced("_check_chunk_type", _skip_critical)
+    ),
+    DecoderFault("tails of records", "records have the size of their fields", "IDX-9", _without_tails),
     DecoderFault(
         "flags",
-        "what is not listed is refused",
+        "unlisted flags are refused",
         "ANC-1",
         constants(ANCILLARY_SCENE_FLAGS=0, ANCILLARY_CHUNK_FLAGS=0),
     ),
-    DecoderFault("layers", "what is not known is refused", "ANC-2", constants(ANCILLARY_ID_MIN=256)),
-    DecoderFault("extra types", "an unknown one has no block", "ANC-3", replaced("read_extras", _known_extras)),
-    DecoderFault("limits", "levels, shifts, columns, nesting without bound", "LAT-4", _NO_LIMITS),
-    DecoderFault("box", "max_scale is believed", "TIL-11", replaced("check_max_scale", nothing)),
+    DecoderFault("layers", "unknown layers are refused", "ANC-2", constants(ANCILLARY_ID_MIN=256)),
+    DecoderFault("extra types", "unknown types have no block", "ANC-3", replaced("read_extras", _known_extras)),
+    DecoderFault("limits", "levels, shifts, columns and nesting are unlimited", "LAT-4", _NO_LIMITS),
+    DecoderFault("box", "max_scale is not checked", "TIL-11", replaced("check_max_scale", nothing)),
     DecoderFault("zigzag", "odd values are one too large", "STR-3", replaced("_undo_zigzag", _zigzag)),
-    DecoderFault("modulus", "DELTA and ZIGZAG not modulo 2^(8w)", "STR-2", replaced("_wrap", _no_wrap)),
-    DecoderFault("sign", "elements of SIGNED read as unsigned", "LAT-4", replaced("_as_signed", _as_unsigned)),
-    DecoderFault("order", "Morton codes taken for sorted", "ORD-1", replaced("morton_axes", _sorted_codes)),
+    DecoderFault("modulus", "DELTA and ZIGZAG are not modulo 2^(8w)", "STR-2", replaced("_wrap", _no_wrap)),
+    DecoderFault("sign", "elements of SIGNED are read as unsigned", "LAT-4", replaced("_as_signed", _as_unsigned)),
+    DecoderFault("order", "Morton codes are assumed sorted", "ORD-1", replaced("morton_axes", _sorted_codes)),
     DecoderFault(
-        "escapes", "escaped splats take the last entry", "CBK-3", replaced("rows", _no_escapes, blocks.CodebookBlock)
+        "escapes", "escaped splats use the last entry", "CBK-3", replaced("rows", _no_escapes, blocks.CodebookBlock)
     ),
-    DecoderFault("unused entries", "entries of a codebook are believed", "CBK-7", replaced("_check_entries", nothing)),
+    DecoderFault("unused entries", "codebook entries are not checked", "CBK-7", replaced("_check_entries", nothing)),
     DecoderFault(
         "summand",
         "the common summand of SHAPE is dropped",
         "CBK-1",
         replaced("rows", _no_summand, blocks.CodebookBlock),
     ),
-    DecoderFault("mask", "bits from the highest on", "SPA-2", replaced("read_sparse", _mask_from_the_top)),
-    DecoderFault("rounding", "products in binary32", "NUM-1", replaced("_scale", _binary32_product)),
+    DecoderFault("mask", "bits are read from the highest", "SPA-2", replaced("read_sparse", _mask_from_the_top)),
+    DecoderFault("rounding", "products are computed in binary32", "NUM-1", replaced("_scale", _binary32_product)),
     DecoderFault("quats, order of operations", "q / M / √2", "NUM-1", replaced("write_quats", _loose_quats)),
     DecoderFault("quats, sign of w", "w is negative", "QUA-2", replaced("write_quats", _minus_w)),
-    DecoderFault("quats, place of w", "x, y, z, w", "QUA-2", replaced("write_quats", _w_last)),
-    DecoderFault("opacities", "the square is forgotten", "LEV-1", replaced("opacity_table", _linear)),
+    DecoderFault("opacities", "SQUARE is ignored", "LEV-1", replaced("opacity_table", _linear)),
     DecoderFault("layers swapped", "band 2 before band 1", "ATT-1", replaced("write_bands", _bands_swapped)),
     DecoderFault("SH columns", "coefficient by coefficient", "ATT-1", replaced("write_colour", _channels_innermost)),
     DecoderFault("tile offset", "the tile's corner is not added", "TIL-7", replaced("lattice_rows", _without_corner)),
     DecoderFault(
-        "tile offset as float", "corner and rest rounded apart", "TIL-7", replaced("write_lattice", _added_as_floats)
+        "tile offset as float",
+        "corner and rest rounded separately",
+        "TIL-7",
+        replaced("write_lattice", _added_as_floats),
     ),
-    DecoderFault("exponents", "2^exponent is forgotten", "LAT-1", _no_exponents),
+    DecoderFault("exponents", "2^exponent is ignored", "LAT-1", _no_exponents),
     DecoderFault("chroma shift", "Co and Cg are not shifted", "ATT-8", replaced("lift", _no_chroma_shift)),
     DecoderFault("lifting", "halves rounded towards zero", "ATT-2", replaced("lift", _lift_towards_zero)),
-    DecoderFault("CRC of the header", "the index has its own", "HDR-12", replaced("_check_crc", crc_but("HDR-3"))),
-    DecoderFault("steps", "binary64, as the means'", "ATT-10", replaced("_is_single", lambda *_: True)),
-    DecoderFault("lattices", "step × 2^exponent may be anything", "LAT-1", replaced("check_step", nothing)),
-    DecoderFault("columns", "within 2^50, as in 0.1", "LAT-4", constants(COLUMN_MAX=2**50)),
+    DecoderFault("CRC of the header", "not checked", "HDR-12", replaced("_check_crc", crc_but("HDR-3"))),
+    DecoderFault("steps", "all steps may be any binary64", "ATT-10", replaced("_is_single", lambda *_: True)),
+    DecoderFault("lattices", "step × 2^exponent is not checked", "LAT-1", replaced("check_step", nothing)),
     DecoderFault("unnamed codebooks", "are not read", "CHK-2", replaced("check_unnamed_codebooks", nothing)),
-    DecoderFault("unread payloads", "nor are frame and CRC looked at, which CHK-6 demands", "CHK-2", _NOTHING_READ),
-    DecoderFault("JSON", "as the library reads it", "JSN-1", replaced("parse_json", _library_json)),
-    _renderer("3 ulp", "values of lattices", "CNF-7", off_by(3)),
+    DecoderFault("unread payloads", "frame and CRC of unread payloads are not checked", "CHK-2", _NOTHING_READ),
+    DecoderFault("JSON", "everything that json.loads accepts", "JSN-1", replaced("parse_json", _library_json)),
+    _renderer("3 ulp", "lattice values are 3 ulp too large", "CNF-7", off_by(3)),
     _renderer(
-        "corner as float", "corner and rest meet as floats", "CNF-7", replaced("write_lattice", _corner_as_float)
+        "corner as float", "corner and rest are added as floats", "CNF-7", replaced("write_lattice", _corner_as_float)
     ),
-    _renderer("radicand", "R of squares in binary32", "CNF-7", replaced("write_quats", _rounded_radicand)),
+    _renderer("radicand", "R from squares in binary32", "CNF-7", replaced("write_quats", _rounded_radicand)),
     _renderer("rest of a unit", "w as √(1 − x² − y² − z²)", "CNF-7", replaced("write_quats", _rest_of_unit)),
-    _renderer("half precision", "opacities of 16 bits", "CNF-7", replaced("opacity_table", _half_precision)),
-    _renderer("overflow", "a product beyond the largest number is infinite", "CNF-7", replaced("_scale", _overflowing)),
+    _renderer("half precision", "opacities in 16 bits", "CNF-7", replaced("opacity_table", _half_precision)),
+    _renderer("overflow", "products beyond the largest number are infinite", "CNF-7", replaced("_scale", _overflowing)),
     _renderer(
         "range by rounded values",
-        "refuses what overflows in single precision",
+        "values that overflow in single precision are refused",
         "CNF-8",
         together(replaced("_is_finite", _never), replaced("_check_finite", _checked_when_rounded)),
     ),
     _renderer(
-        "range by cut values",
-        "a GPU that cuts products has no infinite ones, and the range is not looked at",
+        "range by truncated values",
+        "truncating arithmetic gives no infinite values, and the range is not checked",
         "CNF-8",
         together(replaced("_check_finite", nothing), single_precision(GPUS["WGSL"][1])),
     ),

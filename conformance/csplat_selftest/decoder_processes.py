@@ -1,4 +1,4 @@
-"""Run decoders in C and JavaScript in long-lived processes, which decode file after file. Only a checkout has them."""
+"""Run the decoders in C and JavaScript, which are only in a checkout, in processes that decode many files."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _READ_BYTES = 1 << 16
 
 
 class DecoderProcess:
-    """A decoder process, which is started for the first file and again after a crash.
+    """A decoder process. It is started for the first file and restarted after a crash.
 
     Args:
         words: command line.
         timeout: time limit for one file, seconds.
-        environment: environment of the process; None for that of this process.
+        environment: environment of the process; None: that of this process.
     """
 
     def __init__(self, words: Sequence[str], timeout: float, environment: Mapping[str, str] | None = None) -> None:
@@ -64,7 +64,7 @@ class DecoderProcess:
         self._process = None
 
     def resident_bytes(self) -> int:
-        """Return the resident memory of the process now, 0 if unknown."""
+        """Return the current resident memory of the process, 0 if unknown."""
         if self._process is None:
             return 0
         try:
@@ -82,7 +82,7 @@ class DecoderProcess:
             process.stdin.write(request)
             process.stdin.flush()
             line = self._line(process, began)
-        except OSError:  # a broken pipe, which Windows calls an invalid argument
+        except OSError:  # a broken pipe; Windows reports an invalid argument
             line = b""
         if line is None:
             self._end(process)
@@ -104,7 +104,7 @@ class DecoderProcess:
         return self._process
 
     def _line(self, process: subprocess.Popen[bytes], began: float) -> bytes | None:
-        """Read a line, the part of it before the process ended, or None after the time limit."""
+        """Read a line. Return only its beginning if the process ended, or None after the time limit."""
         assert process.stdout
         if not hasattr(select, "poll"):
             return _read_line_in_thread(process.stdout, began + self._timeout - time.monotonic())
@@ -132,7 +132,7 @@ class DecoderProcess:
 
 
 def _read_line_in_thread(stream: IO[bytes], seconds: float) -> bytes | None:
-    """Read a line as `DecoderProcess._line` does, where the system cannot wait for pipes (Windows)."""
+    """Read a line like `DecoderProcess._line`, on systems that cannot wait for pipes (Windows)."""
     lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=lambda: lines.put(stream.readline()), daemon=True).start()
     try:
@@ -142,8 +142,8 @@ def _read_line_in_thread(stream: IO[bytes], seconds: float) -> bytes | None:
 
 
 C_ADAPTER = Path("tools", "adapter.c")
-C_SOURCES = ("csplat.c", "inflate.c")  # sources of the decoder, which then needs no library
-_C_MEMORY_KIB = 3_000_000  # kibibytes of address space: an allocation without bound fails at once
+C_SOURCES = ("csplat.c", "inflate.c")  # sources of the decoder without libraries
+_C_MEMORY_KIB = 3_000_000  # limit of the address space, KiB: unbounded allocations fail at once
 
 
 def c_folder() -> Path:
@@ -156,11 +156,11 @@ def c_folder() -> Path:
         folder = root / "codec" / "c"
         if (folder / C_ADAPTER).is_file():
             return folder
-    raise InputError("the C decoder is not here: only a checkout has it and its adapter")
+    raise InputError("the C decoder is missing: only a checkout has it and its adapter")
 
 
 def missing_c() -> str:
-    """Return why the C decoder cannot run here, or an empty string."""
+    """Return the reason why the C decoder cannot run here, or an empty string."""
     if shutil.which("cc") is None:
         return "cc, a C compiler, is not installed"
     try:
@@ -178,7 +178,7 @@ def compile_c(out: Path, *words: str | Path) -> None:
         words: further arguments.
 
     Raises:
-        InputError: the compiler is not here, or does not take them.
+        InputError: the compiler is missing, or reports an error.
     """
     missing = missing_c()
     if missing:
@@ -190,12 +190,12 @@ def compile_c(out: Path, *words: str | Path) -> None:
 
 
 class CDecoder(DecoderProcess):
-    """A process of the adapter of the C decoder.
+    """A process of the C decoder's adapter.
 
     Args:
         program: the compiled adapter; None: compile that of the checkout for the first file.
-        limits: budgets: splats, bytes, bytes of a text; default: those of the registry.
-        timeout: seconds for one file.
+        limits: budgets of splats, bytes, and bytes of a text; default: those of the registry.
+        timeout: time limit for one file, seconds.
     """
 
     def __init__(self, program: Path | None = None, limits: Sequence[int] = (), timeout: float = 20.0) -> None:
@@ -237,7 +237,7 @@ _JS_HEAP_MB = 512
 
 
 def js_folder() -> Path:
-    """Return the folder of the JavaScript decoder, whose tests have the adapter.
+    """Return the folder of the JavaScript decoder.
 
     Raises:
         InputError: neither this package nor the working folder belongs to a checkout.
@@ -246,11 +246,11 @@ def js_folder() -> Path:
         folder = root / "codec" / "js"
         if (folder / _JS_ADAPTER).is_file():
             return folder
-    raise InputError("the JavaScript decoder is not here: only a checkout has it and its adapter")
+    raise InputError("the JavaScript decoder is missing: only a checkout has it and its adapter")
 
 
 def missing_javascript() -> str:
-    """Return why the JavaScript decoder cannot run here, or an empty string."""
+    """Return the reason why the JavaScript decoder cannot run here, or an empty string."""
     if shutil.which("node") is None:
         return "node is not installed"
     try:
@@ -264,10 +264,10 @@ class JsDecoder(DecoderProcess):
     """A Node process of the JavaScript decoder.
 
     Args:
-        folder: folder of the decoder's modules, which may be a changed copy; None for that of the checkout.
+        folder: folder of the decoder's modules, such as a modified copy; None: that of the checkout.
         limits: budgets by their names in JavaScript; default: those of the registry.
-        timeout: seconds for one file.
-        coverage: folder to which Node writes its coverage when it ends.
+        timeout: time limit for one file, seconds.
+        coverage: folder to which Node writes its coverage at exit.
     """
 
     def __init__(

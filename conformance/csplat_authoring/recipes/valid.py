@@ -7,8 +7,8 @@ from functools import partial
 from itertools import combinations
 
 from csplat import _spec
+from csplat_authoring.annexes import example_scene
 from csplat_authoring.builder import SIZED
-from csplat_authoring.example import example_scene
 from csplat_authoring.recipe import Recipe, valid_recipe
 from csplat_authoring.samples import (
     QUATS,

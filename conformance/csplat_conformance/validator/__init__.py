@@ -5,10 +5,10 @@
     ...     print(violation)
     CHK-1 E_CRC at byte 244, TILE.0.0: tile[0].layer[0].crc is 0x00000007, computed 0x15ca0d03
 
-It is written from the spec and shares nothing with the decoder but the numbers of the registry. It continues after a
-violation: a chunk with a wrong CRC is still read, a damaged stream is skipped by the size in its head. It also checks
-what decoders may ignore: texts that were not requested, codebooks that no tile uses, error bounds that are impossible.
-Parts whose place or kind is unknown after a violation are listed as not checked.
+It is written from the spec and shares only the numbers of the registry with the decoder. It continues after a
+violation: it still reads a chunk with a wrong CRC, and skips a damaged stream by the size in its head. It also checks
+parts that decoders may ignore: texts that were not requested, codebooks that no tile uses, impossible error bounds.
+Parts whose position or type is unknown after a violation are listed as not checked.
 """
 
 from __future__ import annotations

@@ -39,14 +39,14 @@ class Index:
 
     Attributes:
         head: the index head.
-        degree: `sh_degree`; `None` if this version does not have that degree.
+        degree: `sh_degree`; `None` if this version does not support it.
         attributes: attribute records by registry value.
         steps: steps that obey ATT-6, by registry value.
         levels: levels that obey ATT-3 or ATT-4, by registry value.
         codebooks: codebook records with valid kind and sizes, by id.
         codebook_ids: ids of all codebook records.
         extras: bytes per value of each extra column, `None` if the type is unknown.
-        complete: whether all records that were read so far fit into the index.
+        complete: whether all records read so far fit into the index.
         end: offset of the end of these records.
     """
 
@@ -67,8 +67,8 @@ class Index:
 
 
 def scaled_step(step: float, exponent: int, *, single: bool = False) -> float | None:
-    """Return step × 2^exponent, `None` if that is infinite or subnormal in binary64 or binary32 (TIL-9, LAT-1)."""
-    if abs(exponent) > 4096:  # beyond any pair of binary64 values; avoids a huge integer
+    """Return step × 2^exponent, `None` if it is infinite or subnormal in binary64 or binary32 (TIL-9, LAT-1)."""
+    if abs(exponent) > 4096:  # beyond binary64 for every step; avoids huge integers
         return None
     product = Fraction(step) * Fraction(2) ** exponent
     low, high = (_SINGLE_MIN, _SINGLE_MAX) if single else (_STEP_MIN, _STEP_MAX)
@@ -80,7 +80,7 @@ def read_records(view: memoryview, end: int, log: ViolationLog) -> Index:
 
     Args:
         view: the file.
-        end: offset of the index's CRC by the header, not beyond the data.
+        end: offset of the index's CRC according to the header, not beyond the data.
         log: receives the violations.
     """
     start = _spec.HEADER_SIZE
@@ -90,7 +90,7 @@ def read_records(view: memoryview, end: int, log: ViolationLog) -> Index:
     kinds = ("attribute", "codebook", "extra", "directory", "tile")
     needed = index.size_of("head") + sum(getattr(record, f"{kind}_count") * index.size_of(kind) for kind in kinds)
     if start + needed > end:
-        log.add("IDX-2", start, "index", f"its counts ask for {needed} bytes at least, it has {end - start}")
+        log.add("IDX-2", start, "index", f"its counts require at least {needed} bytes, it has {end - start}")
     _check_head(log, head)
     at = start + index.size_of("head")
     at = _read_attributes(view, at, end, index, log)
@@ -136,16 +136,17 @@ def _check_head(log: ViolationLog, head: Head) -> None:
 def _read_attributes(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> int:
     count = index.head.record.attribute_count
     bands = 0 if index.degree is None else index.degree
-    wanted = [value for value, layer in _spec.ATTRIBUTE_LAYER.items() if layer <= bands]
-    if index.degree is not None and count != len(wanted):
-        log.add_field("ATT-1", index.head, "attribute_count", f"{count}, expected {len(wanted)} for SH degree {bands}")
+    expected = [value for value, layer in _spec.ATTRIBUTE_LAYER.items() if layer <= bands]
+    if index.degree is not None and count != len(expected):
+        message = f"{count}, expected {len(expected)} for SH degree {bands}"
+        log.add_field("ATT-1", index.head, "attribute_count", message)
     for i in range(_count_fitting(index, at, end, count, index.size_of("attribute"))):
         attribute = view[at]
         name = f"attribute[{_spec.ATTRIBUTE_NAMES.get(attribute, attribute)}]"
         placed = read_record(view, _spec.unpack_attribute_record, _spec.ATTRIBUTE_RECORD_OFFSETS, at, name)
         log.check_reserved(placed)
-        if count == len(wanted) and index.degree is not None and attribute != wanted[i]:
-            log.add_field("ATT-1", placed, "attribute", f"{attribute}, expected {wanted[i]} in place {i}")
+        if count == len(expected) and index.degree is not None and attribute != expected[i]:
+            log.add_field("ATT-1", placed, "attribute", f"{attribute}, expected {expected[i]} in place {i}")
         if attribute in _spec.ATTRIBUTE_NAMES and attribute not in index.attributes:
             index.attributes[attribute] = placed
             _check_attribute(log, placed, index)
@@ -229,13 +230,13 @@ def _is_sound_codebook(log: ViolationLog, placed: CodebookAt, index: Index) -> b
     before = len(log.violations)
     first, last = record.band_first, record.band_last
     if record.kind not in _spec.CODEBOOK_KIND_NAMES:
-        log.add_field("RES-2", placed, "kind", f"{record.kind} is no kind that this version uses")
+        log.add_field("RES-2", placed, "kind", f"{record.kind} is not a kind of this version")
     elif record.kind == _spec.CODEBOOK_KIND_SH:
         highest = _spec.SH_DEGREE_MAX if index.degree is None else index.degree
         if not 1 <= first <= last <= highest:
-            log.add_field("CBR-2", placed, "band_first", f"bands {first} to {last} in a scene of degree {highest}")
+            log.add_field("CBR-2", placed, "band_first", f"bands {first} to {last}, expected 1 to {highest}, ascending")
     elif first or last:
-        log.add_field("CBR-2", placed, "band_first", f"bands {first} to {last} of a kind without bands, expected 0")
+        log.add_field("CBR-2", placed, "band_first", f"bands {first} to {last} for a kind without bands, expected 0")
     if not 1 <= record.size <= _spec.CODEBOOK_ENTRIES_MAX:
         log.add_field("CBR-4", placed, "size", f"{record.size} entries, expected 1 to {_spec.CODEBOOK_ENTRIES_MAX}")
     return len(log.violations) == before
@@ -250,7 +251,7 @@ def _read_extras(view: memoryview, at: int, end: int, index: Index, log: Violati
         placed = read_record(view, _spec.unpack_extra_record, _spec.EXTRA_RECORD_OFFSETS, at, f"extra[{i}]")
         record = placed.record
         if record.dtype < _spec.ANCILLARY_ID_MIN and record.dtype not in _spec.EXTRA_DTYPE_NAMES:
-            log.add_field("RES-2", placed, "dtype", f"{record.dtype} is no type of the registry")
+            log.add_field("RES-2", placed, "dtype", f"{record.dtype} is not in the registry")
         if not 1 <= record.name_size <= _spec.EXTRA_NAME_MAX:
             log.add_field("EXR-1", placed, "name_size", f"{record.name_size}, expected 1 to {_spec.EXTRA_NAME_MAX}")
         else:
@@ -264,7 +265,7 @@ def _check_name(log: ViolationLog, placed: PlacedRecord[_spec.ExtraRecord], name
     raw = placed.record.name[: placed.record.name_size]
     rest = placed.record.name[placed.record.name_size :]
     if any(rest):
-        log.add_field("EXR-3", placed, "name", "bytes behind the name are not 0", within=len(raw))
+        log.add_field("EXR-3", placed, "name", "bytes after the name are not 0", within=len(raw))
     try:
         name = raw.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -273,12 +274,12 @@ def _check_name(log: ViolationLog, placed: PlacedRecord[_spec.ExtraRecord], name
     if any(ord(character) < 0x20 or ord(character) == 0x7F for character in name):
         log.add_field("EXR-2", placed, "name", f"a control character in {name!r}")
     if name in names:
-        log.add_field("EXR-2", placed, "name", f"a second column is called {name!r}")
+        log.add_field("EXR-2", placed, "name", f"a second column is named {name!r}")
     names.add(name)
 
 
 _SINGLE_CHUNKS = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
-#: The first layer that this version does not have; the order of its chunks is not checked (4.3.6).
+#: The first layer after those of this version; the order of later layers is not checked (4.3.6).
 _LAYER_END = max(_spec.LAYER_NAMES) + 1
 
 
@@ -293,7 +294,7 @@ class Chunk:
         record: directory or layer record; both have `size` and `offset`.
         identity: codebook id, or index of the tile.
         layer: layer of the record.
-        whole: whether its bytes exist and belong to no other chunk.
+        whole: whether its bytes exist and do not overlap another chunk.
     """
 
     name: str
@@ -328,10 +329,10 @@ def registered_flags(kind: bytes) -> int:
 
 
 def check_chunk_size(log: ViolationLog, chunk: Chunk) -> Chunk:
-    """Check CHK-3 as far as a record alone shows it: a chunk has a header."""
+    """Check CHK-3 as far as possible with the record alone: a chunk has a header."""
     least = _spec.CHUNK_HEADER_SIZE
     if chunk.size < least:
-        log.add_field("CHK-3", chunk.record, "size", f"{chunk.size} bytes, a chunk has {least} at least")
+        log.add_field("CHK-3", chunk.record, "size", f"{chunk.size}, expected at least {least}")
     return chunk
 
 
@@ -370,7 +371,7 @@ def _check_type(log: ViolationLog, placed: PlacedRecord[_spec.DirectoryRecord]) 
     record = placed.record
     kind = record.type
     if kind == _spec.CHUNK_TILE:
-        log.add_field("DIR-1", placed, "type", "TILE, which layer records name")
+        log.add_field("DIR-1", placed, "type", "TILE, which only layer records list")
         return
     if not all(0x20 <= byte <= 0x7E for byte in kind):
         log.add_field("DIR-1", placed, "type", f"{kind!r}, expected bytes 0x20 to 0x7E")
@@ -386,7 +387,7 @@ def _check_type(log: ViolationLog, placed: PlacedRecord[_spec.DirectoryRecord]) 
     elif flags & _spec.CHUNK_FLAG_CRITICAL:
         if kind[:1].islower():
             log.add_field("DIR-6", placed, "flags", f"{kind!r} is private and critical")
-        log.add_field("DIR-2", placed, "type", f"{kind!r} is critical and not known")
+        log.add_field("DIR-2", placed, "type", f"{kind!r} is critical and unknown")
 
 
 def _check_single(log: ViolationLog, chunks: Sequence[Chunk]) -> None:
@@ -404,8 +405,8 @@ def _check_single(log: ViolationLog, chunks: Sequence[Chunk]) -> None:
 
 def _check_codebook_chunks(log: ViolationLog, chunks: Sequence[Chunk], index: Index, start: int) -> None:
     if len(index.codebooks) != index.head.record.codebook_count:
-        return  # some codebooks are unknown, and their violations were added
-    wanted = {
+        return  # violations of the other records were already added
+    required = {
         (identity, layer)
         for identity, book in index.codebooks.items()
         for layer in range(book.record.band_first, book.record.band_last + 1)
@@ -414,15 +415,15 @@ def _check_codebook_chunks(log: ViolationLog, chunks: Sequence[Chunk], index: In
         if chunk.kind != _spec.CHUNK_CODEBOOK:
             continue
         key = (chunk.identity, chunk.layer)
-        if key not in wanted:
-            log.add_field("DIR-5", chunk.record, "type", "no codebook record asks for this chunk, or it is the second")
-        wanted.discard(key)
-    for identity, layer in sorted(wanted):
+        if key not in required:
+            log.add_field("DIR-5", chunk.record, "type", "not required by a codebook record, or a duplicate")
+        required.discard(key)
+    for identity, layer in sorted(required):
         log.add("DIR-5", start, "directory", f"no CODB chunk for codebook {identity}, layer {layer}")
 
 
 def check_coverage(log: ViolationLog, chunks: Sequence[Chunk], start: int, file_size: int, data_size: int) -> None:
-    """Check COV-1, mark the chunks that can be read, and remark on an order that 4.3.6 does not recommend.
+    """Check COV-1, mark the readable chunks, and add a remark if the order is not that of 4.3.6.
 
     Args:
         log: receives the violations.
@@ -435,12 +436,12 @@ def check_coverage(log: ViolationLog, chunks: Sequence[Chunk], start: int, file_
     expected = covered = start
     for chunk in ordered:
         if chunk.offset != expected:
-            log.add_field("COV-1", chunk.record, "offset", f"{chunk.offset}, the chunk before ends at {expected}")
+            log.add_field("COV-1", chunk.record, "offset", f"{chunk.offset}, expected {expected}")
         end = chunk.offset + chunk.size
-        # A chunk that begins within another is not read: a file could name the same bytes a million times.
+        # Overlapping chunks are not read, because a file could list the same bytes a million times.
         chunk.whole = covered <= chunk.offset <= end - _spec.CHUNK_HEADER_SIZE and end <= min(data_size, file_size)
         if not chunk.whole:
-            log.skip(chunk.name, "its bytes are not there, or another chunk's")
+            log.skip(chunk.name, "its bytes are missing, or belong to another chunk")
         expected = end
         covered = max(covered, end) if chunk.whole else covered
     if expected != file_size:
@@ -452,7 +453,7 @@ def check_coverage(log: ViolationLog, chunks: Sequence[Chunk], start: int, file_
         )
     ranks = [chunk.rank for chunk in ordered if chunk.layer < _LAYER_END]
     if ranks != sorted(ranks):
-        log.remarks.append("the chunks are not in the order that is recommended (4.3.6)")
+        log.remarks.append("the chunks are not in the recommended order (4.3.6)")
 
 
 def check_frame(view: memoryview, chunk: Chunk, clause: str, log: ViolationLog) -> Payload:
@@ -471,11 +472,11 @@ def check_frame(view: memoryview, chunk: Chunk, clause: str, log: ViolationLog) 
     header = read_record(view, _spec.unpack_chunk_header, _spec.CHUNK_HEADER_OFFSETS, at, f"{chunk.name}/header")
     log.check_reserved(header)
     payload_size = chunk.size - _spec.CHUNK_HEADER_SIZE
-    for key, wanted in (("type", chunk.kind), ("flags", chunk.flags), ("payload_size", payload_size)):
+    for key, expected in (("type", chunk.kind), ("flags", chunk.flags), ("payload_size", payload_size)):
         found = getattr(header.record, key)
-        if found != wanted:
-            log.add_field("CHK-3", header, key, f"{found!r}, its record has {wanted!r}")
-    # The payload ends by the size in the record, which COV-1 confirmed.
+        if found != expected:
+            log.add_field("CHK-3", header, key, f"{found!r}, expected {expected!r} by its record")
+    # The end of the payload follows from the size in the record, which passed COV-1.
     return Payload(view, at + _spec.CHUNK_HEADER_SIZE, end, chunk.name, clause, log)
 
 
@@ -507,25 +508,25 @@ class Tile:
 
 
 def read_tiles(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> list[Tile]:
-    """Read the tile records, which fill the index up to its CRC (IDX-2), and compare their sum with N (IDX-7).
+    """Read the tile records; check that they fill the index up to its CRC (IDX-2), and that their sum is N (IDX-7).
 
     Args:
         view: the file.
         at: offset of the first record.
         end: offset of the index's CRC.
-        index: the records before them.
+        index: the preceding records.
         log: receives the violations.
     """
     tiles: list[Tile] = []
     head = index.head.record
-    # A count that the index has no room for was reported by `read_records`.
+    # `read_records` already reported a count that does not fit into the index.
     reported = index.size_of("tile") * head.tile_count > end - at
     while len(tiles) < head.tile_count:
         size = _tile_size(view, at, end, index)
         if size > end - at:
             if not reported:
                 log.add("IDX-2", at, f"tile[{len(tiles)}]", "the index ends within the tile")
-            log.skip(f"tile[{len(tiles)}] and those after it", "the index ends before them")
+            log.skip(f"tile[{len(tiles)}] and later tiles", "the index ends before them")
             return tiles
         tiles.append(_read_tile(view, at, len(tiles), index, log))
         at += size
@@ -533,7 +534,7 @@ def read_tiles(view: memoryview, at: int, end: int, index: Index, log: Violation
         log.add("IDX-2", at, "index.rest", f"{end - at} bytes follow the last tile")
     total = sum(tile.count for tile in tiles)
     if total != head.splat_count:
-        log.add_field("IDX-7", index.head, "splat_count", f"{head.splat_count}, the tiles have {total} splats")
+        log.add_field("IDX-7", index.head, "splat_count", f"{head.splat_count}, expected {total}, the sum of the tiles")
     return tiles
 
 
@@ -564,10 +565,10 @@ def _check_tile_box(log: ViolationLog, tile: Tile, index: Index) -> None:
     record, before = tile.record.record, len(log.violations)
     for axis, (corner, extent) in enumerate(zip(record.corner, record.extent, strict=True)):
         if max(abs(corner), abs(corner + extent)) > _spec.INTEGER_MAX:
-            message = f"axis {axis} reaches from {corner} to {corner + extent}, beyond {_spec.INTEGER_MAX}"
+            message = f"axis {axis} is {corner} to {corner + extent}, expected at most {_spec.INTEGER_MAX} in magnitude"
             log.add_field("TIL-7", tile.record, "corner", message, within=8 * axis)
         if extent >= 1 << _spec.AXIS_BITS_MAX:
-            message = f"axis {axis} has {extent}, expected less than 2^{_spec.AXIS_BITS_MAX}"
+            message = f"axis {axis} is {extent}, expected less than 2^{_spec.AXIS_BITS_MAX}"
             log.add_field("TIL-8", tile.record, "extent", message, within=4 * axis)
     step = index.steps.get(_spec.ATTRIBUTE_MEANS)
     if step is not None and scaled_step(step, record.exponent) is None:
@@ -589,9 +590,9 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: Viola
         elif layer <= last:
             log.add_field("TIL-2", placed, "layer", f"{layer} after {last}, expected ascending layers")
         if layer < _spec.ANCILLARY_ID_MIN and layer not in _spec.LAYER_NAMES:
-            log.add_field("RES-2", placed, "layer", f"{layer} is no layer that this version uses")
+            log.add_field("RES-2", placed, "layer", f"{layer} is not a layer of this version")
         if index.degree is not None and layer in _SH_LAYERS and layer > index.degree:
-            log.add_field("TIL-3", placed, "layer", f"band {layer} in a scene of degree {index.degree}")
+            log.add_field("TIL-3", placed, "layer", f"band {layer}, expected at most sh_degree, {index.degree}")
         chunk = Chunk(f"TILE.{tile.place}.{layer}", _spec.CHUNK_TILE, flags, placed, tile.place, layer)
         tile.chunks.append(check_chunk_size(log, chunk))
         last = max(last, layer)
@@ -602,7 +603,7 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: Viola
     has_extra = any(chunk.layer == _spec.LAYER_EXTRA for chunk in tile.chunks)
     if has_extra != bool(index.head.record.extra_count):
         verb = "has" if has_extra else "lacks"
-        message = f"the tile {verb} the extra layer, the scene has {index.head.record.extra_count} extra columns"
+        message = f"the tile {verb} the extra layer, but the scene has {index.head.record.extra_count} extra columns"
         log.add("TIL-5", start, f"{tile.record.name}.layer", message)
 
 
@@ -614,7 +615,7 @@ def _read_codebook_ids(view: memoryview, at: int, tile: Tile, index: Index, log:
         if identity <= last:
             log.add("TIL-6", at, name, f"{identity} after {last}, expected ascending ids")
         elif identity not in index.codebook_ids:
-            log.add("TIL-6", at, name, f"{identity} is the id of no codebook")
+            log.add("TIL-6", at, name, f"there is no codebook {identity}")
         tile.codebook_ids.add(identity)
         last = max(last, identity)
         at += 2

@@ -1,4 +1,4 @@
-"""Inflate DEFLATE (RFC 1951, spec 6.2) bit by bit: slow, but it finds the clause that a stream breaks."""
+"""Inflate DEFLATE (RFC 1951, spec 6.2) bit by bit: slow, but it identifies the clause that a stream violates."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FIXED_DISTANCES = [5] * 32
 
 
 class CodedError(Exception):
-    """Raised if coded bytes break a clause.
+    """Raised if coded bytes violate a clause.
 
     Args:
         clause: COD-1, COD-2, COD-5 to COD-8.
@@ -45,7 +45,7 @@ class Inflater:
         """Inflate to the end of the final block, or until there are more than `size` bytes.
 
         Raises:
-            CodedError: COD-2 if the stream is cut short or not DEFLATE; COD-5 to COD-8.
+            CodedError: COD-2 if the stream is truncated or not DEFLATE; COD-5 to COD-8.
         """
         final = 0
         while not final:
@@ -64,7 +64,7 @@ class Inflater:
 
     @property
     def used(self) -> int:
-        """Number of bytes that were read, the last one at least in part."""
+        """Number of bytes that were read at least in part."""
         return (self._at + 7) // 8
 
     def refuse(self, clause: str, message: str) -> None:
@@ -94,7 +94,9 @@ class Inflater:
         """Read the header of a dynamic block."""
         literals, distances = self._number(5) + 257, self._number(5) + 1
         if literals > _LITERALS_MAX or distances > _DISTANCES_MAX:
-            self.refuse("COD-5", f"{literals} literal/length and {distances} distance symbols, 286 and 30 are the most")
+            self.refuse(
+                "COD-5", f"{literals} literal/length and {distances} distance codes, expected at most 286 and 30"
+            )
         lengths = [0] * len(_ORDER)
         for symbol in _ORDER[: self._number(4) + 4]:
             lengths[symbol] = self._number(3)
@@ -118,11 +120,11 @@ class Inflater:
                 lengths.append(symbol)
                 continue
             if symbol == 16 and not lengths:
-                self.refuse("COD-7", "the first code length repeats the one before")
+                self.refuse("COD-7", "the first code length repeats a previous one")
             value = lengths[-1] if symbol == 16 and lengths else 0
             repeat = (3, 3, 11)[symbol - 16] + self._number((2, 3, 7)[symbol - 16])
             if len(lengths) + repeat > count:
-                self.refuse("COD-7", f"code lengths repeat beyond the {count} that there are")
+                self.refuse("COD-7", f"code lengths repeat beyond the last of {count}")
             lengths += [value] * repeat
         return lengths[:count]
 
@@ -149,7 +151,7 @@ class Inflater:
             out += (pattern * (length // distance + 1))[:length]
 
     def _value(self, symbol: int, each: int) -> int:
-        """Return length - 3 (four symbols for each number of extra bits) or distance - 1 (two)."""
+        """Return length - 3 (`each` is 4 symbols per number of extra bits) or distance - 1 (`each` is 2)."""
         extra = max(0, symbol // each - 1)
         first = symbol if symbol < each else (each + symbol % each) << extra
         return first + self._number(extra)
@@ -164,12 +166,12 @@ class Inflater:
             index += count
             first = first + count << 1
             word <<= 1
-        self.refuse("COD-8", "a codeword that no symbol has")
+        self.refuse("COD-8", "a codeword without a symbol")
         return code.symbols[0] if code.symbols else 0
 
 
 class _Code:
-    """A canonical code: the number of codewords of each length, and the symbols in the order of their codewords."""
+    """A canonical code: the number of codewords of each length, and the symbols in codeword order."""
 
     def __init__(self, lengths: Sequence[int]) -> None:
         used = [length for length in lengths if length]

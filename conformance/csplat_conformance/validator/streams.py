@@ -14,10 +14,10 @@ from csplat import _spec
 from csplat_conformance.validator.inflate import CodedError, Inflater
 from csplat_conformance.validator.violation_log import Payload, PlacedRecord, UnreadableError, ViolationLog
 
-#: Elements of a stream: int64, or uint64 if they are eight bytes wide, as only RAW may be.
+#: Elements of a stream: int64, or uint64 if they have eight bytes, which only RAW permits.
 Elements = NDArray[Any]
 
-#: Largest number of elements in a sound file: the columns of the highest band for a full tile or codebook.
+#: Largest number of elements in a valid file: the columns of the highest band for a full tile or codebook.
 _ELEMENTS_MAX = max(_spec.ATTRIBUTE_COLUMNS.values()) * max(_spec.TILE_SPLATS_MAX, _spec.CODEBOOK_ENTRIES_MAX)
 
 
@@ -27,7 +27,7 @@ class Stream:
 
     Attributes:
         head: the stream head and its place.
-        elements: [count], `None` if a violation hides them.
+        elements: [count], `None` if a violation prevents decoding.
     """
 
     head: PlacedRecord[_spec.StreamHead]
@@ -48,13 +48,13 @@ def read_stream(
     Args:
         payload: reader at the stream head.
         what: name of the stream within its chunk, `sh0.stream`.
-        count: required number of elements; `None` for texts, whose head has it.
+        count: required number of elements; `None` for texts, whose head specifies it.
         width_max: largest number of bytes per element.
         signed: elements are in two's complement.
         count_max: budget of elements if `count` is `None`.
 
     Raises:
-        UnreadableError: the payload ends before the stream does.
+        UnreadableError: the payload ends within the stream.
     """
     log = payload.log
     head = payload.structure(_spec.unpack_stream_head, _spec.STREAM_HEAD_SIZE, _spec.STREAM_HEAD_OFFSETS, what)
@@ -62,20 +62,20 @@ def read_stream(
     sound &= _check_transforms(log, head)
     sound &= _check_packed(log, head, sound)
     if count is None and head.record.count > count_max:
-        log.add_field("STR-8", head, "count", f"{head.record.count} bytes of text, the budget is {count_max}")
+        log.add_field("STR-8", head, "count", f"{head.record.count}, expected at most {count_max} (budget)")
         sound = False
     coder_known = _check_coder(log, head)
     size = head.record.coded_size
     if size > payload.left:
-        log.add_field("STR-6", head, "coded_size", f"{size} bytes, {payload.left} are left")
+        log.add_field("STR-6", head, "coded_size", f"{size} bytes, expected at most {payload.left}")
         raise UnreadableError
     at = payload.take(size, f"{what}.coded")
     if not coder_known:
         return Stream(head, None)
-    # The coder can be checked even if the head is wrong, as long as the size to fill is plausible.
+    # The coder can be checked even if the head is wrong, provided that the output size is plausible.
     most = count_max if count is None else _ELEMENTS_MAX
     if count is not None and count > most:
-        sound = False  # the field that requires more was reported
+        sound = False  # the field that requires the count was reported
     if not sound and head.record.packed_size > 3 * width_max * most:
         return Stream(head, None)
     try:
@@ -93,11 +93,10 @@ def _check_counts(log: ViolationLog, head: PlacedRecord[_spec.StreamHead], count
     sound = True
     found, width = head.record.count, head.record.width
     if found != (max(1, found) if count is None else count):
-        wanted = "1 or more" if count is None else f"{count}, as its place requires"
-        log.add_field("STR-1", head, "count", f"{found} elements, expected {wanted}")
+        log.add_field("STR-1", head, "count", f"{found}, expected {'1 or more' if count is None else count}")
         sound = False
     if not 1 <= width <= width_max:
-        log.add_field("STR-2", head, "width", f"elements of {width} bytes, expected 1 to {width_max}")
+        log.add_field("STR-2", head, "width", f"{width}, expected 1 to {width_max}")
         sound = False
     return sound
 
@@ -108,7 +107,7 @@ def _check_transforms(log: ViolationLog, head: PlacedRecord[_spec.StreamHead]) -
     used = listed.rstrip(b"\0")
     unknown = [value for value in used if value not in _spec.TRANSFORM_NAMES]
     if unknown:
-        log.add_field("RES-2", head, "transforms", f"{unknown[0]} is no transform of the registry")
+        log.add_field("RES-2", head, "transforms", f"{unknown[0]} is not in the registry")
         return False  # STR-3 assumes known ids
     if any(a >= b for a, b in pairwise(used)) or 0 in used:
         log.add_field("STR-3", head, "transforms", f"{list(listed)}, expected strictly ascending values, then zeros")
@@ -123,12 +122,10 @@ def _check_packed(log: ViolationLog, head: PlacedRecord[_spec.StreamHead], sound
     size, packed = head.record.count * head.record.width, head.record.packed_size
     if _spec.TRANSFORM_RUN_LENGTH not in head.record.transforms:
         if packed != size:
-            log.add_field("STR-4", head, "packed_size", f"{packed} bytes, count x width is {size}")
+            log.add_field("STR-4", head, "packed_size", f"{packed}, expected {size}, count x width")
             return False
     elif packed % 3 or not 3 <= packed <= 3 * size:
-        log.add_field(
-            "STR-5", head, "packed_size", f"{packed} bytes of runs, expected a multiple of 3 from 3 to {3 * size}"
-        )
+        log.add_field("STR-5", head, "packed_size", f"{packed}, expected a multiple of 3 from 3 to {3 * size}")
         return False
     return True
 
@@ -137,7 +134,7 @@ def _check_coder(log: ViolationLog, head: PlacedRecord[_spec.StreamHead]) -> boo
     """Check RES-2."""
     coder = head.record.coder
     if coder not in _spec.CODER_NAMES:
-        log.add_field("RES-2", head, "coder", f"{coder} is no coder that this version uses")
+        log.add_field("RES-2", head, "coder", f"{coder} is not a coder of this version")
         return False
     return True
 
@@ -154,9 +151,9 @@ def _elements(
         runs = data.reshape(3, -1)
         lengths = runs[1].astype(np.int64) + 256 * runs[2].astype(np.int64) + 1
         total = int(lengths.sum())
-        wanted = record.count * record.width
-        if total != wanted:
-            log.add("TRF-1", coded_at, head.path("coded"), f"the runs give {total} bytes, expected {wanted}")
+        expected = record.count * record.width
+        if total != expected:
+            log.add("TRF-1", coded_at, head.path("coded"), f"the runs have {total} bytes, expected {expected}")
             return None
         data = np.repeat(runs[0], lengths)
     width, count = record.width, record.count
@@ -201,13 +198,13 @@ def undo_coder(coded: memoryview, coder: int, size: int) -> tuple[bytes, bool]:
     """
     if coder == _spec.CODER_STORED:
         if len(coded) != size:
-            raise CodedError("COD-1", f"{len(coded)} bytes are stored, packed_size is {size}")
+            raise CodedError("COD-1", f"{len(coded)} bytes are stored, expected packed_size, {size}")
         return bytes(coded), False
     return _inflate(coded, size)
 
 
 def _inflate(coded: memoryview, size: int) -> tuple[bytes, bool]:
-    """Inflate and check COD-2 and COD-5 to COD-8. The last byte comes separately, to find its unused bits."""
+    """Inflate and check COD-2 and COD-5 to COD-8. The last byte is inflated separately to find its unused bits."""
     body, last = coded[:-1], bytes(coded[-1:])
     inflater = zlib.decompressobj(_RAW_DEFLATE)
     try:
@@ -216,7 +213,7 @@ def _inflate(coded: memoryview, size: int) -> tuple[bytes, bool]:
             left = len(inflater.unused_data) + len(last)
             raise CodedError("COD-2", f"{left} bytes follow the final block", len(coded) - left)
         if len(packed) > size:
-            raise CodedError("COD-2", f"more than {size} bytes come out, packed_size is {size}")
+            raise CodedError("COD-2", f"more than {size} bytes were inflated, expected packed_size, {size}")
         before = inflater.copy()
         rest = inflater.decompress(last, size + 1 - len(packed))
     except zlib.error as error:
@@ -225,7 +222,7 @@ def _inflate(coded: memoryview, size: int) -> tuple[bytes, bool]:
     packed += rest
     if len(packed) != size:
         amount = f"more than {size}" if len(packed) > size else len(packed)
-        raise CodedError("COD-2", f"{amount} bytes come out, packed_size is {size}")
+        raise CodedError("COD-2", f"{amount} bytes were inflated, expected packed_size, {size}")
     if not inflater.eof:
         raise CodedError("COD-2", "the DEFLATE stream has no end")
     return packed, _has_spare_bits(before, last[0], rest)
@@ -234,8 +231,8 @@ def _inflate(coded: memoryview, size: int) -> tuple[bytes, bool]:
 def _has_spare_bits(before: zlib._Decompress, last: int, rest: bytes) -> bool:
     """Return True if bits of the last byte are set after the end of the final block.
 
-    A byte whose bits from k on are cleared still gives the same end as soon as k is where the block ends; a smaller k
-    does so only if the bits in between were 0 anyway.
+    If the bits from k on are cleared, the stream ends in the same way once k reaches the end of the block. A smaller k
+    has this effect only if the bits in between were already 0.
     """
     for k in range(8):
         trial = before.copy()

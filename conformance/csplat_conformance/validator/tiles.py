@@ -1,4 +1,4 @@
-"""Check TILE chunks (spec 5.2) and the codings of their blocks (6.4)."""
+"""Check TILE and CODB chunks (spec 5.2, 5.3) and the codings of blocks (6.4)."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ import numpy as np
 
 from csplat import _spec
 from csplat.types import I64
-from csplat_conformance.validator.codebooks import CodebookEntries, attribute_columns, first_attribute
 from csplat_conformance.validator.index import Chunk, CodebookAt, Index, Tile, scaled_step
 from csplat_conformance.validator.streams import Elements, read_stream
-from csplat_conformance.validator.values import check_box, check_integers, check_max_scale
+from csplat_conformance.validator.values import Place, check_box, check_integers, check_max_scale
 from csplat_conformance.validator.violation_log import Payload, PlacedRecord, UnreadableError, ViolationLog
 
 BlockHead = PlacedRecord[_spec.BlockHead]
+
+#: The entries, [size, C], of valid chunks, by codebook id and layer.
+CodebookEntries = dict[tuple[int, int], I64]
 
 _SPARSE_WIDTH_MAX = _spec.CODING_WIDTH_MAX[_spec.CODING_SPARSE]
 _MORTON_AXES = 3
@@ -46,8 +48,8 @@ class TileChecker:
         tile: the tile record.
         books: entries by codebook id and layer.
         log: receives the violations.
-        first: indices by codebook id.
-        lost: layers with blocks that could not be read.
+        first: indices by codebook id, from the tile's first block of each codebook.
+        lost: layers with unreadable blocks.
     """
 
     view: memoryview
@@ -62,18 +64,18 @@ class TileChecker:
         """Read the payload of one of the tile's chunks.
 
         Raises:
-            UnreadableError: the structure of the rest is unknown.
+            UnreadableError: the structure of the remaining bytes is unknown.
         """
         log = self.log
         if chunk.layer >= _spec.ANCILLARY_ID_MIN:
             return  # ANC-2
         head = payload.structure(_spec.unpack_tile_head, _spec.TILE_HEAD_SIZE, _spec.TILE_HEAD_OFFSETS, "head")
         if head.record.layer != chunk.layer:
-            log.add_field("TLE-1", head, "layer", f"{head.record.layer}, its record says {chunk.layer}")
+            log.add_field("TLE-1", head, "layer", f"{head.record.layer}, expected {chunk.layer} by its record")
         if chunk.layer not in _spec.LAYER_NAMES or not 1 <= self.tile.count <= _spec.TILE_SPLATS_MAX:
             log.skip(f"{chunk.name} from byte {payload.at} on", "layer or splat_count of its record is wrong")
             return
-        blocks = self._wanted(chunk.layer)
+        blocks = self._expected_blocks(chunk.layer)
         announced = head.record.block_count
         if announced != len(blocks):
             log.add_field("TLE-2", head, "block_count", f"{announced} blocks, expected {len(blocks)}")
@@ -84,18 +86,18 @@ class TileChecker:
         if announced == len(blocks):
             payload.finish()
 
-    def _wanted(self, layer: int) -> list[int]:
+    def _expected_blocks(self, layer: int) -> list[int]:
         if layer == _spec.LAYER_EXTRA:
             return [_spec.ATTRIBUTE_EXTRA] * self.index.head.record.extra_count
         return [attribute for attribute, place in _spec.ATTRIBUTE_LAYER.items() if place == layer]
 
-    def _read_block(self, payload: Payload, wanted: int, number: int) -> None:
+    def _read_block(self, payload: Payload, expected: int, number: int) -> None:
         at = payload.at
-        attribute = payload.view[at] if payload.left else wanted
+        attribute = payload.view[at] if payload.left else expected
         name = f"extra[{number}]" if attribute == _spec.ATTRIBUTE_EXTRA else _spec.ATTRIBUTE_NAMES.get(attribute, "?")
         head = read_block_head(payload, name)
-        if attribute != wanted:
-            message = f"{attribute}, expected {wanted} ({_spec.ATTRIBUTE_NAMES[wanted]}) in place {number}"
+        if attribute != expected:
+            message = f"{attribute}, expected {expected} ({_spec.ATTRIBUTE_NAMES[expected]}) in place {number}"
             self.log.add_field("TLE-2", head, "attribute", message)
             if attribute not in _spec.ATTRIBUTE_NAMES:
                 raise UnreadableError
@@ -133,7 +135,7 @@ class TileChecker:
                 self.log.add("SPA-3", *where, f"bits of the mask beyond the {count} splats are set")
             found = (bits & (1 << count) - 1).bit_count()
             if found != announced:
-                self.log.add("SPA-2", *where, f"{found} bits are set, present_count is {announced}")
+                self.log.add("SPA-2", *where, f"{found} bits are set, expected {announced} by present_count")
         if not 1 <= announced <= count:
             raise UnreadableError
         columns = _spec.ATTRIBUTE_COLUMNS[attribute]
@@ -215,9 +217,7 @@ class TileChecker:
         stream = read_stream(payload, f"{name}.stream", self.tile.count, width_max)
         size = self.index.extras[number] if number < len(self.index.extras) else None
         if size is not None and stream.head.record.width != size:
-            self.log.add_field(
-                "RAW-2", stream.head, "width", f"{stream.head.record.width}, the column has {size} bytes"
-            )
+            self.log.add_field("RAW-2", stream.head, "width", f"{stream.head.record.width}, expected {size}")
 
 
 def read_block_head(payload: Payload, name: str) -> BlockHead:
@@ -231,7 +231,7 @@ def read_columns(
     """Read and check a block coded LEVELS, OFFSET or SIGNED.
 
     Returns:
-        [C, count] integers, `None` if a violation hides them or they are out of range; and the exponent.
+        [C, count] integers, `None` if a violation prevents decoding or they are out of range; and the exponent.
     """
     columns = _spec.ATTRIBUTE_COLUMNS[attribute]
     exponent, offsets, sound = 0, [0] * columns, True
@@ -302,7 +302,7 @@ def _read_codebook_block(reader: TileChecker, payload: Payload, name: str, attri
         at: offset of the block head.
 
     Raises:
-        UnreadableError: the number of streams that follow is unknown.
+        UnreadableError: the number of remaining streams is unknown.
     """
     params = payload.structure(
         _spec.unpack_codebook_params, _spec.CODEBOOK_PARAMS_SIZE, _spec.CODEBOOK_PARAMS_OFFSETS, f"{name}.params"
@@ -339,9 +339,9 @@ def _find_book(reader: TileChecker, params: _CodebookParams, attribute: int) -> 
     if identity not in reader.tile.codebook_ids:
         reader.log.add_field("CBK-1", params, "codebook_id", f"{identity} is not among the tile's table ids")
     elif identity not in reader.index.codebook_ids:
-        reader.log.add_field("CBK-1", params, "codebook_id", f"{identity} is the id of no codebook")
+        reader.log.add_field("CBK-1", params, "codebook_id", f"there is no codebook {identity}")
     elif book is not None and columns is None:
-        reader.log.add_field("CBK-1", params, "codebook_id", f"codebook {identity} does not serve {name}")
+        reader.log.add_field("CBK-1", params, "codebook_id", f"codebook {identity} does not contain {name}")
     if book is None or columns is None:
         raise UnreadableError
     return book, columns
@@ -361,10 +361,10 @@ def _read_indices(
     escaped = None if indices is None else np.asarray(indices == size)
     count = params.record.escape_count
     if escaped is not None and int(escaped.sum()) != count:
-        log.add_field("CBK-3", params, "escape_count", f"{count}, the indices escape {int(escaped.sum())} splats")
+        log.add_field("CBK-3", params, "escape_count", f"{count}, expected {int(escaped.sum())} by the indices")
         escaped = None
     elif escaped is None and count > reader.tile.count:
-        log.add_field("CBK-3", params, "escape_count", f"{count} of a tile of {reader.tile.count} splats")
+        log.add_field("CBK-3", params, "escape_count", f"{count}, expected at most the tile's {reader.tile.count}")
     return CodebookIndices(indices, escaped, count)
 
 
@@ -376,11 +376,11 @@ def _find_indices(reader: TileChecker, book: CodebookAt, params: _CodebookParams
     name = _spec.ATTRIBUTE_NAMES[opener]
     if first is None:
         if _spec.ATTRIBUTE_LAYER[opener] not in reader.lost:
-            message = f"codebook {identity}, and no block of {name} before it is coded with it"
+            message = f"no preceding block of {name} uses codebook {identity}"
             reader.log.add_field("CBK-4", params, "codebook_id", message)
         return CodebookIndices(None, None, count)
     if first.escape_count != count:
-        message = f"codebook {identity} with {count} escapes, the block of {name} has {first.escape_count}"
+        message = f"{count} escapes of codebook {identity}, expected {first.escape_count} as in the block of {name}"
         reader.log.add_field("CBK-4", params, "codebook_id", message)
         return CodebookIndices(first.indices, None, count)
     return first
@@ -410,7 +410,7 @@ def _read_escapes(
     coding = head.record.coding
     legal = (_spec.CODING_SIGNED,) if attribute == _spec.ATTRIBUTE_QUATS else _ESCAPE_CODINGS
     if coding not in _spec.CODING_NAMES:
-        message = f"{coding} is no coding that this version uses"
+        message = f"{coding} is not a coding of this version"
         reader.log.add_field("BLK-1", head, "coding", message, _spec.ERROR_UNSUPPORTED)
         raise UnreadableError
     if coding not in legal:
@@ -427,3 +427,83 @@ def _selected_entries(first: CodebookIndices, entries: I64) -> I64 | None:
         return None
     rows: I64 = entries[first.indices[~first.escaped].astype(np.intp)].T
     return rows
+
+
+# Codebooks -----------------------------------------------------------------------------------------
+
+_ENTRY_WIDTH_MAX = 4  # STR-2: "4 for codebooks' entries"
+_ATTRIBUTES = {name: value for value, name in _spec.ATTRIBUTE_NAMES.items()}
+
+
+def codebook_attributes(book: CodebookAt) -> list[int]:
+    """Return the attributes of a codebook in the order of its columns."""
+    if book.record.kind == _spec.CODEBOOK_KIND_SH:
+        return [_spec.ATTRIBUTE_SH0 + band for band in range(book.record.band_first, book.record.band_last + 1)]
+    return [_ATTRIBUTES[name] for name in _spec.CODEBOOK_KIND_ATTRIBUTES[book.record.kind]]
+
+
+def first_attribute(book: CodebookAt) -> int:
+    """Return the attribute whose block contains the indices."""
+    return codebook_attributes(book)[0]
+
+
+def attribute_columns(book: CodebookAt, attribute: int) -> slice | None:
+    """Return the columns of an attribute in the entries of its layer, `None` if the codebook does not contain it."""
+    first = 0
+    for one in codebook_attributes(book):
+        columns = _spec.ATTRIBUTE_COLUMNS[one]
+        if book.record.kind == _spec.CODEBOOK_KIND_SH:
+            first = 0  # each band has a separate chunk
+        if one == attribute:
+            return slice(first, first + columns)
+        first += columns
+    return None
+
+
+def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: CodebookEntries) -> None:
+    """Read the payload of a CODB chunk.
+
+    Args:
+        payload: payload of the chunk.
+        chunk: the chunk.
+        index: index of the file.
+        books: receives the entries, if a valid codebook record requires the chunk.
+
+    Raises:
+        UnreadableError: the payload ends too early.
+    """
+    log = payload.log
+    book = index.codebooks.get(chunk.identity)
+    layers = () if book is None else range(book.record.band_first, book.record.band_last + 1)
+    head = payload.structure(_spec.unpack_codebook_head, _spec.CODEBOOK_HEAD_SIZE, _spec.CODEBOOK_HEAD_OFFSETS, "head")
+    for key, expected in (("codebook_id", chunk.identity), ("layer", chunk.layer)):
+        found = getattr(head.record, key)
+        if found != expected:
+            log.add_field("CDB-1", head, key, f"{found}, expected {expected} by its record")
+    if book is None or chunk.layer not in layers:
+        log.skip(f"{chunk.name} from byte {payload.at} on", "no valid codebook record requires it")
+        return
+    of_layer = [a for a in codebook_attributes(book) if _spec.ATTRIBUTE_LAYER[a] == chunk.layer]
+    columns = sum(_spec.ATTRIBUTE_COLUMNS[a] for a in of_layer)
+    size = book.record.size
+    stream = read_stream(payload, "entries", size * columns, _ENTRY_WIDTH_MAX, signed=True)
+    if stream.elements is not None:
+        table = stream.elements.astype(np.int64).reshape(columns, size).T
+        where = (stream.head.offset, f"{payload.name}/entries")
+        # Keep invalid entries out of `books`, so that tiles do not report them again.
+        if _check_entries(log, index, book, of_layer, table, where):
+            books[chunk.identity, chunk.layer] = table
+    payload.finish()
+
+
+def _check_entries(
+    log: ViolationLog, index: Index, book: CodebookAt, attributes: list[int], table: I64, where: Place
+) -> bool:
+    """Check CBK-7 for all entries. Scales are checked in the tile, with their summand."""
+    sound = True
+    for attribute in attributes:
+        columns = attribute_columns(book, attribute)
+        if columns is None or attribute == _spec.ATTRIBUTE_SCALES:
+            continue
+        sound &= check_integers(log, index, attribute, table[:, columns].T, 0, where)
+    return sound

@@ -11,8 +11,7 @@ from mmap import mmap
 from csplat import _spec
 from csplat.file_source import PageReleaser
 from csplat.types import null_progress
-from csplat_conformance.validator.bounds_chunk import check_declared_bounds
-from csplat_conformance.validator.codebooks import CodebookEntries, read_codebook
+from csplat_conformance.validator.ancillary_chunks import check_declared_bounds, check_text
 from csplat_conformance.validator.index import (
     Chunk,
     Index,
@@ -23,8 +22,7 @@ from csplat_conformance.validator.index import (
     read_records,
     read_tiles,
 )
-from csplat_conformance.validator.json_text import check_text
-from csplat_conformance.validator.tiles import TileChecker
+from csplat_conformance.validator.tiles import CodebookEntries, TileChecker, read_codebook
 from csplat_conformance.validator.violation_log import (
     Payload,
     PlacedRecord,
@@ -60,11 +58,11 @@ def validate(
     """Find every violation of the spec in a file.
 
     Args:
-        data: the file, complete or cut short.
+        data: the file, complete or truncated.
         json_bytes_max: budget for one JSON text (STR-8), in bytes.
-        splats_max: budget of splats (LIM-1), above which the tiles are not read. Default: none, since only one tile is
-            in memory at a time.
-        progress: called with the share of the tiles that were checked.
+        splats_max: budget of splats (LIM-1), above which the tiles are not read. Default: none, because only one tile
+            is in memory at a time.
+        progress: called with the fraction of the tiles that were checked.
 
     Returns:
         The violations, remarks and unread parts. No content of a file raises an error.
@@ -101,12 +99,12 @@ def _check(
 ) -> None:
     header = _read_header(view, log)
     if header is None:
-        log.skip("everything behind the magic and the version", "this is no file of this version")
+        log.skip("everything after magic and version", "not a file of this version")
         return
     _check_length(view, header.record.file_size, log)
     end = _index_end(view, header, log)
     if end is None:
-        log.skip("index and chunks", "the index is not whole")
+        log.skip("index and chunks", "the index is incomplete")
         return
     index = read_records(view, end - _CRC_SIZE, log)
     counts.splats = index.head.record.splat_count
@@ -116,18 +114,18 @@ def _check(
         tiles = read_tiles(view, index.end, end - _CRC_SIZE, index, log)
         index.complete = len(tiles) == index.head.record.tile_count
     else:
-        log.skip("directory and tiles", "the records before them leave the index")
+        log.skip("directory and tiles", "the preceding records exceed the index")
     counts.tiles = len(tiles)
     chunks = [*directory, *(chunk for tile in tiles for chunk in tile.chunks)]
     if index.complete:
         check_coverage(log, chunks, end, header.record.file_size, len(view))
     else:
-        log.skip("the chunks", "the index does not name all of them")
+        log.skip("the chunks", "the index does not list all of them")
         return
     books = _read_directory_chunks(view, directory, index, json_bytes_max, log)
     if splats_max is not None and sum(tile.count for tile in tiles) > splats_max:
-        log.add_field("LIM-1", index.head, "splat_count", f"{counts.splats} splats, the budget is {splats_max}")
-        log.skip("the tiles", "there are more splats than the budget allows")
+        log.add_field("LIM-1", index.head, "splat_count", f"{counts.splats}, expected at most {splats_max} (budget)")
+        log.skip("the tiles", "the number of splats exceeds the budget")
         return
     _read_tile_chunks(view, tiles, index, books, log, progress)
 
@@ -142,7 +140,7 @@ def _read_header(view: memoryview, log: ViolationLog) -> Header | None:
         if _spec.MAGIC.startswith(magic):
             log.add("HDR-11", len(view), "header", f"the data ends here, a header has {_spec.HEADER_SIZE} bytes")
         else:
-            log.add("HDR-11", 0, "header.magic", f"{magic.hex(' ')} is no magic", _spec.ERROR_MAGIC)
+            log.add("HDR-11", 0, "header.magic", f"{magic.hex(' ')} is not the magic", _spec.ERROR_MAGIC)
         return None
     header = read_record(view, _spec.unpack_header, _spec.HEADER_OFFSETS, 0, "header")
     record = header.record
@@ -150,9 +148,9 @@ def _read_header(view: memoryview, log: ViolationLog) -> Header | None:
         log.add_field("HDR-1", header, "magic", f"{magic.hex(' ')}, expected {_spec.MAGIC.hex(' ')}")
         return None
     version = (record.version_major, record.version_minor)
-    wanted = (_spec.VERSION_MAJOR, _spec.VERSION_MINOR)
-    if version != wanted:
-        message = f"{version[0]}.{version[1]}, this validator knows {wanted[0]}.{wanted[1]}"
+    expected = (_spec.VERSION_MAJOR, _spec.VERSION_MINOR)
+    if version != expected:
+        message = f"{version[0]}.{version[1]}, expected {expected[0]}.{expected[1]}"
         log.add_field("HDR-2", header, "version_major", message)
         return None
     end = _spec.HEADER_OFFSETS["header_crc"]
@@ -161,7 +159,7 @@ def _read_header(view: memoryview, log: ViolationLog) -> Header | None:
         log.add_field("HDR-3", header, "header_crc", f"{record.header_crc:#010x}, computed {computed:#010x}")
     log.checks.append("header_crc")
     if record.profile not in _spec.PROFILE_NAMES:
-        log.add_field("HDR-4", header, "profile", f"{record.profile} is no profile that this version uses")
+        log.add_field("HDR-4", header, "profile", f"{record.profile} is not a profile of this version")
     log.check_reserved(header)
     return header
 
@@ -175,7 +173,7 @@ def _check_length(view: memoryview, size: int, log: ViolationLog) -> None:
 
 
 def _index_end(view: memoryview, header: Header, log: ViolationLog) -> int | None:
-    """Check HDR-7 and IDX-1; return the end of the index, `None` if its head does not fit or it leaves the data."""
+    """Check HDR-7 and IDX-1; return the end of the index, `None` if its head does not fit or it exceeds the data."""
     size, file_size = header.record.index_size, header.record.file_size
     least = _spec.INDEX_HEAD_SIZE + _CRC_SIZE
     end = _spec.HEADER_SIZE + size
@@ -239,10 +237,10 @@ def _read_tile_chunks(
 
 
 def _read_payload(payload: Payload, log: ViolationLog, read: Callable[[], None]) -> bool:
-    """Read a payload; return False and list the rest as not checked if its structure is lost."""
+    """Read a payload; return False and list the rest as not checked if its structure is unknown."""
     try:
         read()
     except UnreadableError:
-        log.skip(f"{payload.name} from byte {payload.at} on", "what it holds cannot be told")
+        log.skip(f"{payload.name} from byte {payload.at} on", "its structure is unknown")
         return False
     return True

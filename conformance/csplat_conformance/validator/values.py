@@ -1,4 +1,4 @@
-"""Check the ranges of integers and of the values that they stand for (spec 6.4, 7)."""
+"""Check the ranges of integers and of the values that they represent (spec 6.4, 7)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from csplat.types import I64
 from csplat_conformance.validator.index import Index, scaled_step
 from csplat_conformance.validator.violation_log import ViolationLog
 
-#: Offset in the file and name of the field that a message is about.
+#: Offset in the file and name of a field to report.
 Place = tuple[int, str]
 
 
 def check_integers(log: ViolationLog, index: Index, attribute: int, rows: I64, exponent: int, where: Place) -> bool:
-    """Check the integers of a block, or of the part of it that comes from one stream or codebook.
+    """Check the integers of a block, or of its part from one stream or codebook.
 
     Args:
         log: receives the violations.
@@ -28,7 +28,7 @@ def check_integers(log: ViolationLog, index: Index, attribute: int, rows: I64, e
         where: the field to report.
 
     Returns:
-        Whether all clauses hold that could be checked.
+        True if all clauses that could be checked hold.
     """
     before = len(log.violations)
     placed, levels = index.attributes.get(attribute), index.levels.get(attribute)
@@ -53,7 +53,7 @@ def _check_quats(log: ViolationLog, rows: I64, levels: int, where: Place) -> Non
     if largest > levels:
         log.add("QUA-1", *where, f"a component of magnitude {largest}, expected at most {levels}")
         if largest > _spec.QUAT_LEVELS_MAX:
-            return  # squares could leave 64 bits
+            return  # squares could overflow 64 bits
     radicands = 2 * levels * levels - np.square(rows).sum(axis=0)
     lowest = int(radicands.min())
     if lowest < 0 and largest <= levels:
@@ -85,7 +85,7 @@ def _check_lattice(
 
 
 def _lifted(rows: I64, chroma_shift: int) -> I64:
-    """Return R, G, B of Y, Co, Cg (7.1). LAT-4 keeps everything within 2^53."""
+    """Return R, G, B of Y, Co, Cg (7.1). LAT-4 bounds all intermediate values by 2^53."""
     y, co, cg = np.split(rows, 3)
     co, cg = co << chroma_shift, cg << chroma_shift
     t = y - (cg >> 1)
@@ -121,7 +121,7 @@ def check_box(
     lows, highs = rows.min(axis=1).tolist(), rows.max(axis=1).tolist()
     for axis, (low, high, extent) in enumerate(zip(lows, highs, record.extent, strict=True)):
         if low != 0 or high != extent:
-            message = f"axis {axis}: q reaches from {low} to {high}, expected 0 to the extent {extent}"
+            message = f"axis {axis}: q is {low} to {high}, expected 0 to the extent {extent}"
             log.add("TIL-10", *box, message)
     step = index.steps.get(_spec.ATTRIBUTE_MEANS)
     scale = None if step is None or not sound else scaled_step(step, record.exponent)
@@ -140,7 +140,7 @@ def check_max_scale(log: ViolationLog, index: Index, largest: int, exponent: int
     scale = None if step is None else scaled_step(step, exponent)
     if scale is None:
         return
-    wanted = value_bits(largest, scale)
-    if wanted != stored:
-        found, value = (float(np.frombuffer(raw, "<f4")[0]) for raw in (stored, wanted))
-        log.add("TIL-11", *where, f"{found!r}, the largest scale is {value!r} ({largest} x {scale})")
+    expected = value_bits(largest, scale)
+    if expected != stored:
+        found, value = (float(np.frombuffer(raw, "<f4")[0]) for raw in (stored, expected))
+        log.add("TIL-11", *where, f"{found!r}, expected the largest scale, {value!r} ({largest} x {scale})")

@@ -1,4 +1,4 @@
-"""The log of violations, records that it reads from bytes, and the error code of each clause (spec 2 to 8)."""
+"""The log of violations, records with their positions, and the error code of each clause (spec 2 to 8)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from csplat import _spec
 
 T = TypeVar("T")
 
-#: Largest number of violations; a file of garbage with sound sizes breaks a clause every few bytes.
+#: Largest number of violations; garbage with valid sizes can violate a clause every few bytes.
 VIOLATIONS_MAX = 10_000
 
 
@@ -20,7 +20,7 @@ class Violation:
 
     Attributes:
         clause: id of the clause.
-        code: error code of a decoder's refusal; empty for SER-5, which no decoder checks.
+        code: error code with which a decoder refuses the file; empty for SER-5, which decoders do not check.
         offset: offset in the file of the offending field or, if there is none, of its structure.
         field: name of structure and field, `tile[0].layer[1].offset`, `TILE.0.1/sh1.stream.count`.
         message: one line: the value found and the value expected.
@@ -39,7 +39,7 @@ class Violation:
 
 @dataclass(frozen=True)
 class Unread:
-    """A part of the file that could not be checked because of a violation before it.
+    """A part of the file that could not be checked because of an earlier violation.
 
     Attributes:
         field: name of the part.
@@ -50,7 +50,7 @@ class Unread:
     reason: str
 
     def __str__(self) -> str:
-        return f"not looked at: {self.field} ({self.reason})"
+        return f"not checked: {self.field} ({self.reason})"
 
 
 @dataclass(frozen=True)
@@ -75,12 +75,12 @@ class Validation:
 
     @property
     def conforms(self) -> bool:
-        """True if no clause is broken."""
+        """True if no clause is violated."""
         return not self.violations
 
 
 class TooManyViolationsError(Exception):
-    """Raised if there are so many violations that the rest is not worth checking."""
+    """Raised at VIOLATIONS_MAX, to end the validation."""
 
 
 @dataclass(frozen=True)
@@ -125,20 +125,20 @@ class ViolationLog:
             offset: offset in the file.
             name: name of the field.
             message: the value found and the value expected.
-            code: error code, if it is not the usual one of the clause.
+            code: error code, if it differs from the usual one of the clause.
 
         Raises:
             TooManyViolationsError: the list is full.
         """
         self.violations.append(Violation(clause, code or CODES[clause], offset, name, message))
         if len(self.violations) >= VIOLATIONS_MAX:
-            self.remarks.append(f"more than {VIOLATIONS_MAX} violations: the rest of the file was not looked at")
+            self.remarks.append(f"more than {VIOLATIONS_MAX} violations: the rest of the file was not checked")
             raise TooManyViolationsError
 
     def add_field(
         self, clause: str, placed: PlacedRecord[Any], key: str, message: str, code: str = "", within: int = 0
     ) -> None:
-        """Add a violation by a field of a structure."""
+        """Add a violation in a field of a structure."""
         self.add(clause, placed.at(key, within), placed.path(key), message, code)
 
     def check_reserved(self, placed: PlacedRecord[Any]) -> None:
@@ -146,7 +146,7 @@ class ViolationLog:
         for key in placed.places:
             value = getattr(placed.record, key)
             if key.startswith("reserved_") and value != 0:
-                self.add_field("RES-1", placed, key, f"reserved, holds {value}, expected 0")
+                self.add_field("RES-1", placed, key, f"{value} in a reserved field, expected 0")
 
     def skip(self, name: str, reason: str) -> None:
         """Add a part that is not checked."""
@@ -157,7 +157,7 @@ _Unpack = Callable[[memoryview, int], T]
 
 
 class UnreadableError(Exception):
-    """Raised if the place of what follows is unknown because a length or a kind is wrong; the violation was added."""
+    """Raised if a wrong length or type makes the position of the rest unknown; the violation was already added."""
 
 
 def read_record(view: memoryview, unpack: _Unpack[T], places: dict[str, int], at: int, name: str) -> PlacedRecord[T]:
@@ -187,14 +187,14 @@ class Payload:
 
     @property
     def left(self) -> int:
-        """Number of bytes that were not read yet."""
+        """Number of remaining bytes."""
         return self.end - self.at
 
     def take(self, size: int, what: str) -> int:
-        """Step over `size` bytes and return their offset.
+        """Skip `size` bytes and return their offset.
 
         Raises:
-            UnreadableError: there are fewer.
+            UnreadableError: fewer bytes are left.
         """
         at = self.at
         if size > self.left:
@@ -218,8 +218,8 @@ class Payload:
             self.log.add(self.clause, self.at, f"{self.name}/tail", f"{self.left} bytes follow the last structure")
 
 
-#: The error code of each requirement on a stream, the usual one if the text names two. Clauses about decoders, partial
-#: readers and editors are not here. A test compares this table with the text of the spec.
+#: The error code of each requirement on a file, the usual one if the clause has two. Clauses about decoders, partial
+#: readers and editors are omitted. A test compares this table with the text of the spec.
 CODES: Final[dict[str, str]] = {
     "RES-1": _spec.ERROR_RESERVED,
     "RES-2": _spec.ERROR_UNSUPPORTED,

@@ -1,5 +1,5 @@
-"""Fuzzing of the decoders and of readers of other formats: what is fed, what must not happen, which lines were reached.
+"""Fuzzing of the decoders and of readers of other formats.
 
-`tests/fuzz.py` is the program. A target makes damaged files from a corpus and reports the result of each attempt;
-`edges` tells which of them reach what none before did: they join the corpus.
+`tests/fuzz.py` is the program. A target damages files of a corpus and reports the result of each attempt. Files that
+reach new edges of the program (`edges`) join the corpus.
 """

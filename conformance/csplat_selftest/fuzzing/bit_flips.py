@@ -1,12 +1,12 @@
-"""Damage a real file bit by bit and byte by byte, and see that the validator finds every damage.
+"""Flip bits of valid files and truncate them, and check that the validator detects every damage.
 
 Usage:
     python -m csplat_selftest.fuzzing.bit_flips scene.csplat ...            # 250 flipped bits each, and 250 prefixes
     python -m csplat_selftest.fuzzing.bit_flips scene.csplat --flips 1000 --prefixes 0 --seed 7
 
-Two rows for the flipped bits: of the file as it is; with all checksums computed anew, so that only structure and
-values can show it. In the latter a flip may give another valid file: a colour that is one step greener breaks no
-clause. The exit status is 1 if a flip of the first row, or a prefix, is not found.
+Flipped bits have two rows: one for the damaged file, and one with all checksums repaired, so that only structure and
+values can reveal the damage. In the second row, a flip may result in another valid file: a colour that is one step
+greener violates no clause. The exit status is 1 if a flip of the first row, or a prefix, is not detected.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _CLAUSES_SHOWN = 6
 
 @dataclass
 class DamageStatistics:
-    """Statistics of a number of damaged files.
+    """Statistics of damaged files.
 
     Attributes:
         what: kind of damage.
         count: number of files.
         found: number of files in which the validator finds a violation.
-        clauses: number of violations of each clause.
-        missed: the damages that the validator did not find.
+        clauses: number of files by violated clause.
+        missed: bits or lengths of the damages that the validator did not find.
     """
 
     what: str
@@ -54,7 +54,7 @@ class DamageStatistics:
 
 
 def flip(data: bytes, bit: int) -> bytearray:
-    """Return the file with one bit flipped; bit 0 is the lowest of byte 0."""
+    """Return the file with one bit flipped; bit 0 is the lowest bit of byte 0."""
     damaged = bytearray(data)
     damaged[bit // 8] ^= 1 << bit % 8
     return damaged
@@ -69,10 +69,10 @@ def flips(
         data: a valid file.
         count: number of flips, at most the number of bits.
         seed: seed of the choice.
-        progress: called with the stage and the number that are done.
+        progress: called with the stage and the number of completed flips.
 
     Returns:
-        What was found in the file as it is, and with all checksums repaired.
+        Statistics without and with repaired checksums.
     """
     chosen = random.Random(seed).sample(range(8 * len(data)), min(count, 8 * len(data)))  # noqa: S311 - repeatable, no secret
     result = (DamageStatistics("flipped bits"), DamageStatistics("all checksums repaired"))
@@ -87,7 +87,7 @@ def flips(
 
 
 def prefixes(data: bytes, count: int, progress: Callable[[str, int], None] | None = None) -> DamageStatistics:
-    """Cut the file at `count` lengths, evenly spread, 0 and all but one byte among them; all if there are fewer."""
+    """Truncate the file to `count` evenly spread lengths from 0 to all but one byte, or to all lengths if fewer."""
     last = len(data) - 1
     lengths = range(len(data)) if count > last else sorted({i * last // max(1, count - 1) for i in range(count)})
     result = DamageStatistics("prefixes")
@@ -99,11 +99,11 @@ def prefixes(data: bytes, count: int, progress: Callable[[str, int], None] | Non
 
 
 def main() -> int:
-    """Run over the files of the command line."""
+    """Test the files of the command line and print the statistics."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", nargs="+", type=Path, help="valid .csplat files")
-    parser.add_argument("--flips", type=int, default=250, help="bits to flip in each (default 250)")
-    parser.add_argument("--prefixes", type=int, default=250, help="lengths to cut each to (default 250)")
+    parser.add_argument("--flips", type=int, default=250, help="bits to flip per file (default 250)")
+    parser.add_argument("--prefixes", type=int, default=250, help="prefixes to test per file (default 250)")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     good = True

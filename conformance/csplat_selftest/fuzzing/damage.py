@@ -1,7 +1,7 @@
-"""Damage files with an eye for their structure, for fuzzing; the checksums are repaired afterwards.
+"""Damage files according to their structure, for fuzzing, and repair the checksums afterwards.
 
-A file is damaged in two steps: fields and bytes are overwritten in place, then perhaps one chunk changes its length
-or place and the file is laid out anew, so that offsets and sizes fit again.
+A file is damaged in two steps. First, fields and bytes are overwritten in place. Then, in some cases, one chunk changes
+its length or position, and the file is reassembled so that offsets and sizes are consistent.
 """
 
 from __future__ import annotations
@@ -27,19 +27,22 @@ def damaged_file(rng: random.Random, bases: Sequence[Built]) -> tuple[bytes, boo
 
     Args:
         rng: source of all random choices.
-        bases: valid files with the places of their fields.
+        bases: valid files with the positions of their fields.
     """
     data, repaired, _ = damaged_from(rng, rng.choice(bases), bases)
     return data, repaired
 
 
 def damaged_from(rng: random.Random, base: Built, bases: Sequence[Built]) -> tuple[bytes, bool, bool]:
-    """Damage a file: the bytes, whether checksums were repaired, whether the fields still lie where they were.
+    """Damage a file.
 
     Args:
         rng: source of all random choices.
-        base: the file, with the places of its fields.
-        bases: others, whose chunks may be put in.
+        base: the file, with the positions of its fields.
+        bases: other files, whose chunks may be inserted.
+
+    Returns:
+        The bytes, whether checksums were repaired, and whether the fields kept their positions.
     """
     data = bytearray(base.data)
     for _ in range(rng.choice((0, 1, 1, 1, 2, 3))):
@@ -57,7 +60,7 @@ def damaged_from(rng: random.Random, base: Built, bases: Sequence[Built]) -> tup
 
 
 def built_from(data: bytes) -> Built:
-    """Return a valid file of any origin with the fields of header, index records and chunk frames."""
+    """Return any valid file with the fields of header, index records and chunk headers."""
     return Built(data, *read_fields(data))
 
 
@@ -77,7 +80,7 @@ def _set_bytes(rng: random.Random, _: Built, data: bytearray) -> None:
 
 
 def _set_field(rng: random.Random, base: Built, data: bytearray) -> None:
-    """Set one number of a structure to an extreme or to a neighbour of what it was."""
+    """Set one number of a structure to an extreme or to a neighbour of its value."""
     entry = rng.choice([entry for entry in base.fields.values() if not entry.format.endswith("s")])
     codes = struct.unpack_from(entry.format, data, entry.offset)
     k = rng.randrange(len(codes))
@@ -101,7 +104,7 @@ def _float(rng: random.Random, code: str) -> float:
 
 
 def _copy_field(rng: random.Random, base: Built, data: bytearray) -> None:
-    """Write the bytes of one field over another of the same size."""
+    """Copy the bytes of one field to another of the same size."""
     source = rng.choice(list(base.fields.values()))
     targets = [entry for entry in base.fields.values() if entry.size == source.size]
     target = rng.choice(targets)
@@ -119,7 +122,7 @@ def _damage_coded(rng: random.Random, base: Built, data: bytearray) -> None:
 
 
 def _swap_records(rng: random.Random, base: Built, data: bytearray) -> None:
-    """Exchange two records of the index, or two structures of a chunk, of one kind."""
+    """Swap two records of the index, or two structures of a chunk, of the same kind."""
     starts: dict[str, list[Field]] = {}
     for name, entry in base.fields.items():
         if entry.structure and name.rsplit(".", 1)[1] == next(iter(_offsets(entry.structure))):
@@ -133,7 +136,7 @@ def _swap_records(rng: random.Random, base: Built, data: bytearray) -> None:
 
 
 def _set_splats(rng: random.Random, base: Built, data: bytearray) -> None:
-    """Announce another number of splats in a tile, and the sum to match: what budgets are for."""
+    """Change the number of splats of a tile and the sum to match, which budgets have to catch."""
     counts = [
         entry for name, entry in base.fields.items() if name.startswith("tile[") and name.endswith(".splat_count")
     ]
@@ -163,11 +166,11 @@ _IN_PLACE: tuple[Callable[[random.Random, Built, bytearray], None], ...] = (
     _set_splats,
 )
 
-# Laid out anew -------------------------------------------------------------------------------------
+# Reassembled ---------------------------------------------------------------------------------------
 
 
 def _laid_out(rng: random.Random, base: Built, data: bytearray, bases: Sequence[Built]) -> bytes:
-    """Change a chunk's length or the chunks' order, then make offsets and sizes fit."""
+    """Change the length of a chunk or the order of chunks, and adjust offsets and sizes."""
     chunks = {name: bytes(data[offset : offset + size]) for name, (offset, size) in base.spans.items()}
     if not chunks:
         return bytes(data)
@@ -202,7 +205,7 @@ def _with_payload(chunk: bytes, payload: bytes) -> bytes:
 
 
 def _edited(rng: random.Random, payload: bytes) -> bytes:
-    """Remove, double or insert some bytes."""
+    """Remove, duplicate or insert some bytes."""
     at = rng.randrange(len(payload) + 1)
     end = min(len(payload), at + rng.choice((1, 2, 4, 20, 1000)))
     middle = rng.choice((b"", payload[at:end] * 2, rng.randbytes(rng.randrange(20)) + payload[at:end]))
@@ -210,7 +213,7 @@ def _edited(rng: random.Random, payload: bytes) -> bytes:
 
 
 def _recoded(rng: random.Random, base: Built, name: str, chunk: bytes) -> bytes:
-    """Put other coded bytes into a stream of the chunk and set coder and sizes to match."""
+    """Replace the coded bytes of a stream of the chunk, and set coder and sizes to match."""
     heads = [key for key in base.fields if key.startswith(f"{name}/") and key.endswith(".coded_size")]
     if not heads:
         return chunk
@@ -234,7 +237,7 @@ def _recoded(rng: random.Random, base: Built, name: str, chunk: bytes) -> bytes:
 
 
 def _assembled(base: Built, data: bytearray, chunks: dict[str, bytes]) -> bytes:
-    """Join header, index and chunks; the records of the chunks get their new places."""
+    """Join header, index and chunks, and update sizes and offsets in the records."""
     first = min(offset for offset, _ in base.spans.values())
     out = bytearray(data[:first])
     for name, chunk in chunks.items():

@@ -27,12 +27,12 @@ from csplat_selftest.fuzzing.damage import built_from, damaged_from
 
 LIMITS = decoder.Limits(splats=100_000, bytes=32_000_000, json_bytes=1_000_000)
 
-_SMALL = decoder.Limits(splats=10_000, bytes=8_000_000, json_bytes=1_000_000)  # arrays are hashed: fewer of them
-#: The same by their names in JavaScript.
+_SMALL = decoder.Limits(splats=10_000, bytes=8_000_000, json_bytes=1_000_000)  # smaller, because arrays are hashed
+#: The same limits by their names in JavaScript.
 JS_LIMITS = {"splats": _SMALL.splats, "bytes": _SMALL.bytes, "jsonBytes": _SMALL.json_bytes}
 C_LIMITS = (_SMALL.splats, _SMALL.bytes, _SMALL.json_bytes)
-_LARGEST_SEED = 3000  # bytes: small files make many cases a second
-_MEMORY = 700_000_000  # bytes of another process; a heap of 512 MiB, and Node
+_LARGEST_SEED = 3000  # bytes; small files allow many cases per second
+_MEMORY = 700_000_000  # bytes of another process: a heap of 512 MiB, and Node itself
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class FuzzCase:
 
     Attributes:
         data: the file.
-        source: makes what it can be damaged from again, of the target's own type; None if nothing can.
-        notes: names that are counted, such as `(not repaired)`.
+        source: returns an entry for the corpus, of the target's own type, to damage it again; None if impossible.
+        notes: names to count, such as `(not repaired)`.
     """
 
     data: bytes
@@ -51,12 +51,12 @@ class FuzzCase:
 
 
 class DecoderTarget:
-    """The Python decoder: it decodes within small limits, or refuses with a CsplatError.
+    """The Python decoder, which must decode within small limits or refuse with a CsplatError.
 
     Attributes:
-        name: on the command line.
+        name: name on the command line.
         suffix: suffix of its files.
-        watched: Python files, or folders of them, whose coverage guides it.
+        watched: Python files, or folders of them, whose coverage guides the fuzzer.
     """
 
     name = "decoder"
@@ -64,8 +64,8 @@ class DecoderTarget:
     watched: Sequence[Path] = (Path(csplat.__file__).parent / "decoder",)
 
     def seeds(self, paths: Iterable[Path]) -> list[Built]:
-        """Return the valid vectors with all their fields, and the given files."""
-        # Selected by the size of the vector's file: building all scenes to select small ones takes two seconds.
+        """Return the small valid vectors with all their fields, and the given files."""
+        # Select by the size of the vector's file, because building all scenes takes two seconds.
         small = {vector.name for vector in load() if (VECTORS / vector.file).stat().st_size <= _LARGEST_SEED}
         scenes = [recipe.scene for recipe in sound_recipes() if recipe.scene is not None and recipe.name in small]
         return [build(scene) for scene in scenes] + [built_from(p.read_bytes()) for p in paths]
@@ -78,21 +78,21 @@ class DecoderTarget:
         return FuzzCase(data, again, () if repaired else ("(not repaired)",))
 
     def attempt(self, data: bytes) -> tuple[str, str]:
-        """Decode; now and then in the other ways too, which must find the same."""
+        """Decode; occasionally with the other decoding functions, too, which must agree."""
         chance = zlib.crc32(data)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
-                # One thread is three times as fast on small files; now and then all are used.
+                # One thread is three times faster on small files; occasionally use all.
                 model = decoder.decode(data, limits=LIMITS, threads=1 if chance % 16 else None)
                 if len(model) > LIMITS.splats:
-                    return "finding", "more splats than the limits allow"
+                    return "finding", "more splats than the limits permit"
                 return _agreed(data, len(model)) if chance % 8 == 1 else ("decoded", "")
         except CsplatError as error:
             return error.code, ""
 
     def smaller(self, data: bytes, corpus: Sequence[Built]) -> Generator[bytes, bytes | None, None]:
-        """Undo one changed byte after the other, if the length is that of a seed."""
+        """Restore changed bytes one by one, if the length is that of a seed."""
         same = [base for base in corpus if len(base.data) == len(data)]
         if not same:
             return
@@ -102,34 +102,36 @@ class DecoderTarget:
             data = data if kept is None else kept
 
     def memory(self) -> str:
-        """Nothing runs elsewhere."""
+        """Return a line if another process exceeds its memory; there is none here."""
         return ""
 
     def coverage(self) -> str:
-        """Nothing runs elsewhere."""
+        """Return the coverage of other processes; there are none here."""
         return ""
 
     def close(self) -> None:
-        """Nothing was started."""
+        """End other processes; there are none here."""
 
 
 def missing_others() -> dict[str, str]:
-    """Return why other decoders cannot run here, by language."""
+    """Return the reasons why other decoders cannot run here, by language."""
     found = {"JavaScript": decoder_processes.missing_javascript(), "C": missing_c()}
     return {name: why for name, why in found.items() if why}
 
 
 class OthersTarget(DecoderTarget):
-    """The decoders in JavaScript and C against the Python one: same verdict, same arrays; another code is only counted.
+    """The decoders in JavaScript and C, compared with the Python decoder.
+
+    They must accept the same files and return the same arrays. Refusals with different codes are only counted.
 
     Args:
         scratch: folder for the coverage that Node writes.
         languages: languages of the decoders.
-        memory_bytes: see below.
+        memory_bytes: largest resident memory of a process.
 
     Attributes:
         decoders: decoders that can run here, by language.
-        memory_bytes: resident memory that none of them exceeds.
+        memory_bytes: largest resident memory of a process.
     """
 
     name = "others"
@@ -151,8 +153,8 @@ class OthersTarget(DecoderTarget):
             self.decoders["C"] = CDecoder(limits=C_LIMITS)
 
     def attempt(self, data: bytes) -> tuple[str, str]:
-        """Decode with all and compare."""
-        ours = adapter.answer(data, _SMALL, threads=1)  # one thread: so it is traced, and quicker
+        """Decode with all decoders and compare."""
+        ours = adapter.answer(data, _SMALL, threads=1)  # one thread, because others are not traced
         if ours.status not in (Status.PASSED, Status.REFUSED):
             return "finding", f"Python, {ours.status}: {ours.message}"
         became = {ours.code or "decoded"}
@@ -167,22 +169,22 @@ class OthersTarget(DecoderTarget):
         return next(name for name in (_spec.ERROR_LIMIT, "another code", *became) if name in became), ""
 
     def memory(self) -> str:
-        """Look at the resident memory of the others."""
+        """Check the resident memory of the other processes."""
         held = {name: one.resident_bytes() for name, one in self.decoders.items()}
         return next((f"{name} holds {size:,} bytes" for name, size in held.items() if size > self.memory_bytes), "")
 
     def close(self) -> None:
-        """Let them end; Node writes its coverage."""
+        """End the processes; Node then writes its coverage."""
         for one in self.decoders.values():
             one.close()
 
     def coverage(self) -> str:
-        """Return the share of the JavaScript decoder's text that ran."""
+        """Return the fraction of the JavaScript decoder's text that ran."""
         return js_coverage(self._scratch) if self._scratch else ""
 
 
 def _built(data: bytes) -> Built | None:
-    """Return a damaged file that was laid out anew with its fields, if its index still leads to its chunks."""
+    """Return a rearranged file with its fields, if its index still locates its chunks."""
     try:
         found = built_from(data)
     except (ValueError, LookupError, struct.error):
@@ -194,21 +196,21 @@ def _built(data: bytes) -> Built | None:
 
 
 def _agreed(data: bytes, count: int) -> tuple[str, str]:
-    """Decode a sound file in the other ways: they must find it sound too."""
+    """Decode a valid file with the other decoding functions, which must accept it, too."""
     try:
         integers = decoder.decode_integers(data, limits=LIMITS, threads=1)
         tiles = list(decoder.iter_tiles(data, limits=LIMITS))
     except CsplatError as error:
-        if error.code == _spec.ERROR_LIMIT:  # a budget counts the bytes of the arrays, which are others
+        if error.code == _spec.ERROR_LIMIT:  # a budget counts the bytes of the returned arrays, which differ
             return "decoded", ""
-        return "finding", f"decode accepts what another way refuses: {error}"
+        return "finding", f"decode accepts a file that another function refuses: {error}"
     if not len(integers["means"]) == sum(len(tile.means) for tile in tiles) == count:
-        return "finding", "ways of decoding differ in the number of splats"
+        return "finding", "decoding functions differ in the number of splats"
     return "decoded", ""
 
 
 def compared(ours: Answer, theirs: Answer, name: str) -> tuple[str, str]:
-    """Compare the answers of Python and of the decoder of this name."""
+    """Compare the answers of the Python decoder and of another one, with its name."""
     codes = (ours.code, theirs.code)
     if _spec.ERROR_LIMIT in codes:
         return _spec.ERROR_LIMIT, ""
@@ -224,7 +226,7 @@ def compared(ours: Answer, theirs: Answer, name: str) -> tuple[str, str]:
 
 
 def js_coverage(folder: Path) -> str:
-    """Return the share of the decoder's text that ran, from what Node left in a folder."""
+    """Return the fraction of the decoder's text that ran, from the coverage that Node wrote to a folder."""
     ran: dict[str, bytearray] = {}
     home = decoder_processes.js_folder()
     for path in folder.glob("coverage-*.json"):
@@ -245,7 +247,7 @@ def js_coverage(folder: Path) -> str:
 
 
 class ValidatorTarget(DecoderTarget):
-    """A file is decoded if and only if the validator finds nothing; of refusals it names the clause, too."""
+    """The validator, which must report a violation exactly for those files that the decoder refuses."""
 
     name = "validator"
     watched: Sequence[Path] = (Path(validator.__file__).parent,)
@@ -259,18 +261,19 @@ class ValidatorTarget(DecoderTarget):
                 decoder.decode(data, limits=LIMITS, threads=1)
             except CsplatError as caught:
                 error = caught
-            if error is not None and error.code == _spec.ERROR_LIMIT:  # a budget is no rule of the format
+            if error is not None and error.code == _spec.ERROR_LIMIT:  # budgets are not part of the format
                 return error.code, ""
             found = validator.validate(data, json_bytes_max=LIMITS.json_bytes, splats_max=LIMITS.splats)
-        clauses = {one.clause for one in found.violations if one.code}  # SER-5 has none: no decoder can judge it
+        # SER-5, which decoders do not check, has no code.
+        clauses = {one.clause for one in found.violations if one.code}
         if error is None:
             return (
-                ("finding", f"decoded, but the validator names {', '.join(sorted(clauses))}")
+                ("finding", f"decoded, but the validator reports {', '.join(sorted(clauses))}")
                 if clauses
                 else ("decoded", "")
             )
         clause = getattr(error, "clause", "")
         if not clauses:
-            return "finding", f"refused with {error.code} ({clause}), but the validator finds nothing"
-        # If several clauses are broken, the validator may attribute the same damage to another one.
+            return "finding", f"refused with {error.code} ({clause}), but the validator reports nothing"
+        # If several clauses are violated, the validator may attribute the damage to another one.
         return (error.code if clause in clauses else "another clause"), ""

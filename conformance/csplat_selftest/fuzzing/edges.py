@@ -1,4 +1,4 @@
-"""Record which edges between lines of Python files were taken, to guide the fuzzer and for its report."""
+"""Record the executed edges between lines of Python files, to guide the fuzzer and for its report."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _Trace = Callable[[FrameType, str, Any], Any]
 
 
 class Edges:
-    """A collector of edges: pairs of lines of one function, executed one after the other.
+    """A collector of edges: pairs of lines of one function that were executed in succession.
 
-    With `sys.settrace`, which every Python has; a small file takes three times as long under it.
+    It uses `sys.settrace`, which makes decoding a small file three times slower.
 
     Args:
         paths: Python files, or folders of them.
@@ -24,10 +24,10 @@ class Edges:
         self.files = [file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])]
         self.seen: set[tuple[CodeType, int, int]] = set()
         self._names = {str(file) for file in self.files}
-        self._wanted: dict[CodeType, bool] = {}
+        self._traced: dict[CodeType, bool] = {}
 
     def watch(self, run: Callable[[], Any]) -> tuple[Any, int]:
-        """Call a function; return what it returns, and how many edges were new."""
+        """Call a function; return its result and the number of new edges."""
         before = len(self.seen)
         outer = sys.gettrace()
         sys.settrace(self._called)
@@ -38,26 +38,26 @@ class Edges:
         return result, len(self.seen) - before
 
     def lines(self) -> set[tuple[str, int]]:
-        """Return the lines that were executed: file and number."""
+        """Return the executed lines: file and number."""
         return {(code.co_filename, line) for code, _, line in self.seen}
 
     def all_lines(self) -> set[tuple[str, int]]:
-        """Return the lines that functions of the files have."""
+        """Return the lines of all functions of the files."""
         found = set()
         for file in self.files:
             whole = compile(file.read_bytes(), str(file), "exec")
             for code in _functions(whole):
-                # The first is the line of `def`, which runs at import.
+                # The first line is that of `def`, which runs at import.
                 lines = {line for _, _, line in code.co_lines() if line is not None and line != code.co_firstlineno}
                 found |= {(str(file), line) for line in lines}
         return found
 
     def _called(self, frame: FrameType, _event: str, _value: Any) -> _Trace | None:
         code = frame.f_code
-        wanted = self._wanted.get(code)
-        if wanted is None:
-            wanted = self._wanted[code] = code.co_filename in self._names
-        if not wanted:
+        traced = self._traced.get(code)
+        if traced is None:
+            traced = self._traced[code] = code.co_filename in self._names
+        if not traced:
             return None
         seen, last = self.seen, 0
 
@@ -73,10 +73,10 @@ class Edges:
 
 
 def _functions(code: CodeType) -> Iterator[CodeType]:
-    """Yield the code of all functions within, at any depth; the bodies of classes run at import."""
+    """Yield the code of all functions at any depth, without class bodies, which run at import."""
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
-            is_class = not constant.co_flags & 0x2  # CO_NEWLOCALS: functions have it
+            is_class = not constant.co_flags & 0x2  # CO_NEWLOCALS, which is set for functions
             if not is_class:
                 yield constant
             yield from _functions(constant)

@@ -29,18 +29,18 @@ _PACKAGE = Path(csplat.__file__).parent
 
 
 class FileTarget:
-    """A base of targets that read files from a folder of their own, within this process."""
+    """A base of targets that read files from a scratch folder, within this process."""
 
     def __init__(self) -> None:
-        memory = Path("/dev/shm")  # noqa: S108 - a folder of our own is made in it; a disk costs most of the time
+        memory = Path("/dev/shm")  # noqa: S108 - a new folder is created in it; a disk would take most of the time
         self._folder = tempfile.TemporaryDirectory(prefix="csplat-fuzz-", dir=memory if memory.is_dir() else None)
 
     def memory(self) -> str:
-        """No limit that another process could pass."""
+        """Return a line if another process exceeds its memory; there is none here."""
         return ""
 
     def coverage(self) -> str:
-        """None of another process."""
+        """Return the coverage of other processes; there are none here."""
         return ""
 
     def close(self) -> None:
@@ -49,7 +49,7 @@ class FileTarget:
 
 
 class PlyTarget(FileTarget):
-    """`read_ply` and `lint_ply`: a sound model or an InputError, and the two agree."""
+    """The PLY reader and linter, which must agree, and return a valid model or raise InputError."""
 
     name = "ply"
     suffix = ".ply"
@@ -60,7 +60,7 @@ class PlyTarget(FileTarget):
         self._file = Path(self._folder.name) / "case.ply"
 
     def seeds(self, paths: Iterable[Path]) -> list[Ply]:
-        """Return small PLYs of all degrees, encodings and oddities, and the given files."""
+        """Return small PLYs of all degrees, encodings and special cases, and the given files."""
         return ply_damage.seeds() + [Ply.parse(path.read_bytes()) for path in paths]
 
     def case(self, rng: random.Random, corpus: Sequence[Ply]) -> FuzzCase:
@@ -72,7 +72,7 @@ class PlyTarget(FileTarget):
         return FuzzCase(data, lambda: ply)
 
     def attempt(self, data: bytes) -> tuple[str, str]:
-        """Read and lint a file; now and then strictly, with extra columns, and written again."""
+        """Read and lint a file; occasionally with extra columns, or write it and read it again strictly."""
         self._file.write_bytes(data)
         chance = zlib.crc32(data)
         with warnings.catch_warnings():
@@ -82,10 +82,10 @@ class PlyTarget(FileTarget):
                 model = read_ply(self._file, keep_extra=chance % 4 == 0)
             except InputError as error:
                 if errors == [] and "csplat" not in str(error):
-                    return "finding", f"lint finds nothing wrong, read_ply refuses: {error}"
+                    return "finding", f"lint reports no error, but read_ply refuses: {error}"
                 return "refused", ""
             if errors:
-                return "finding", f"read_ply accepts what lint calls {errors[0]}"
+                return "finding", f"read_ply accepts a file with the lint error {errors[0]}"
             wrong = unsound(model)
             if not wrong and chance % 8 == 1:
                 wrong = self._written(model)
@@ -98,8 +98,8 @@ class PlyTarget(FileTarget):
             write_ply(path, model)
             again = read_ply(path, strict=True)
         except InputError as error:
-            # Names of extra columns that no PLY can hold.
-            return "" if model.extra else f"what was read cannot be written and read: {error}"
+            # A PLY cannot represent every name of an extra column.
+            return "" if model.extra else f"the model cannot be written and read again: {error}"
         if model.extra:
             return ""
         for name in ("means", "scales", "sh0", "shN"):
@@ -108,7 +108,7 @@ class PlyTarget(FileTarget):
         return "" if again.origin == model.origin else "the origin differs after writing and reading"
 
     def smaller(self, data: bytes, corpus: Sequence[Ply]) -> Generator[bytes, bytes | None, None]:  # noqa: ARG002 - as all targets
-        """Leave out lines of the header and pieces of the body."""
+        """Drop lines of the header and pieces of the body."""
         ply = Ply.parse(data)
         for k in reversed(range(len(ply.lines))):
             smaller = Ply(ply.lines[:k] + ply.lines[k + 1 :], ply.body, ply.newline)
@@ -120,11 +120,11 @@ class PlyTarget(FileTarget):
                 ply = ply if (yield smaller.data) is None else smaller
 
 
-# What must hold ------------------------------------------------------------------------------------
+# Checks --------------------------------------------------------------------------------------------
 
 
 def _linted(path: Path) -> list[str] | None:
-    """Return ids of the errors that lint finds, None if it refuses to look."""
+    """Return the ids of the errors that lint reports, None if it refuses the file."""
     try:
         return [finding.id for finding in lint_ply(path) if finding.kind == "error"]
     except InputError:
@@ -132,13 +132,13 @@ def _linted(path: Path) -> list[str] | None:
 
 
 def unsound(model: SplatModel) -> str:
-    """Return what is wrong with a model that was read; an empty string if nothing is."""
+    """Return a line about a defect of a model, or an empty string."""
     arrays = {name: getattr(model, name) for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
     for name, array in arrays.items():
         if array.dtype != np.float32 or len(array) != len(model.means):
             return f"{name} is {array.dtype} {array.shape}"
         if not np.isfinite(array).all():
-            return f"{name} holds NaN or infinity"
+            return f"{name} contains NaN or infinity"
     lengths = np.linalg.norm(model.quats.astype(np.float64), axis=1)
     if len(lengths) and np.abs(lengths - 1.0).max() > QUAT_LENGTH_TOLERANCE:
         return "a rotation is not of unit length"
@@ -147,43 +147,38 @@ def unsound(model: SplatModel) -> str:
     return "" if all(map(math.isfinite, model.origin)) else "the origin is not finite"
 
 
-_OWN = ("ply", "csplat")  # formats that have targets of their own
+_OWN = ("ply", "csplat")  # formats with separate targets
 _COUNTS = (b"\x00\x00\x00\x00", b"\x01\x00\x00\x00", b"\xff\xff\xff\x7f", b"\xff\xff\xff\xff", b"\x00\x00\x00\x80")
 
 
 @dataclass(frozen=True)
 class Seed:
-    """A file.
-
-    Attributes:
-        ending: ending of its name.
-        content: content of the file.
-    """
+    """A file with the ending of its name."""
 
     ending: str
     content: bytes
 
     @property
     def data(self) -> bytes:
-        """Both, the ending on a line of its own."""
+        """The ending, a line feed and the content."""
         return self.ending.encode() + b"\n" + self.content
 
     @classmethod
     def of(cls, data: bytes) -> Seed:
-        """The other way round."""
+        """Split the result of `data`."""
         ending, _, content = data.partition(b"\n")
         return cls(ending.decode("ascii", "replace").replace("/", "_").replace("\0", "_"), content)
 
 
 class FormatTarget(FileTarget):
-    """`csplat.read` of formats that are not ours: a sound model or an InputError. Cases begin with their ending."""
+    """The readers of other formats, which must return a valid model or raise InputError."""
 
     name = "formats"
     suffix = ".case"
     watched: Sequence[Path] = (_PACKAGE / "formats",)
 
     def seeds(self, paths: Iterable[Path]) -> list[Seed]:
-        """Return small scenes in every format that is written to one file, and the given files."""
+        """Return small scenes in every format that can be written to one file, and the given files."""
         folder = Path(self._folder.name)
         found = []
         for one in formats():
@@ -196,7 +191,7 @@ class FormatTarget(FileTarget):
         return found + [Seed("".join(path.suffixes), path.read_bytes()) for path in paths]
 
     def case(self, rng: random.Random, corpus: Sequence[Seed]) -> FuzzCase:
-        """Damage a file, or what is packed in it."""
+        """Damage a file or its compressed contents."""
         seed = rng.choice(corpus)
         change = _inside if rng.random() < 0.6 else _damaged
         changed = Seed(seed.ending, change(rng, seed.content))
@@ -217,7 +212,7 @@ class FormatTarget(FileTarget):
         return ("finding", wrong) if wrong else ("read", "")
 
     def smaller(self, data: bytes, corpus: Sequence[Seed]) -> Generator[bytes, bytes | None, None]:  # noqa: ARG002 - as all targets
-        """Leave out pieces."""
+        """Drop pieces of the content."""
         seed = Seed.of(data)
         piece = len(seed.content)
         while piece := piece // 2:
@@ -227,7 +222,7 @@ class FormatTarget(FileTarget):
 
 
 def _inside(rng: random.Random, data: bytes) -> bytes:
-    """Damage what a gzip stream or a member of an archive holds; whatever checks it is right again."""
+    """Damage the contents of a gzip stream or of a member of an archive, with a valid checksum."""
     if data[:2] == b"\x1f\x8b":
         try:
             return gzip.compress(_damaged(rng, gzip.decompress(data)), 1, mtime=0)
@@ -235,7 +230,7 @@ def _inside(rng: random.Random, data: bytes) -> bytes:
             return _damaged(rng, data)
     if data[:4] == b"PK\x03\x04":
         return _archive(rng, data)
-    return _damaged(rng, data, 64)  # heads are where structure is
+    return _damaged(rng, data, 64)  # most structure is in the header
 
 
 def _archive(rng: random.Random, data: bytes) -> bytes:
@@ -253,7 +248,7 @@ def _archive(rng: random.Random, data: bytes) -> bytes:
 
 
 def _damaged(rng: random.Random, data: bytes, reach: int | None = None) -> bytes:
-    """A few bytes changed, left out, put in or said twice, within the first `reach`."""
+    """Change, remove, insert or duplicate a few of the first `reach` bytes."""
     changed = bytearray(data)
     for _ in range(rng.choice((1, 1, 2, 5))):
         at = rng.randrange(min(len(changed), reach or len(changed)) or 1)
@@ -278,7 +273,7 @@ def _twice(rng: random.Random, data: bytearray, at: int) -> None:
 
 
 def _digit(rng: random.Random, data: bytearray, at: int) -> None:
-    """Change a number of a text, if there is one near."""
+    """Change a number of a text within the next 200 bytes."""
     for place in range(at, min(at + 200, len(data))):
         if 48 <= data[place] < 58:
             data[place : place + 1] = rng.choice((b"0", b"-1", b"9999999999", b"1e400", b"null", b"[]", b'"x"'))

@@ -1,4 +1,4 @@
-"""PLYs to damage: seeds of all degrees and encodings, and changes with an eye for header and body."""
+"""Damage PLY files for fuzzing: seeds of all degrees and encodings, and changes of header and body."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ _TOKENS = (b"nan", b"inf", b"-inf", b"1e999", b"-1e-999", b"0x10", b"1_0", b"", 
 
 @dataclass(frozen=True)
 class Ply:
-    """A PLY taken apart.
+    """The parts of a PLY.
 
     Attributes:
-        lines: lines of the header, without `end_header`; none if there is no header.
+        lines: lines of the header, without `end_header`; empty if there is no header.
         body: the bytes after the header.
-        newline: end of a line of the header.
+        newline: line ending of the header.
     """
 
     lines: tuple[bytes, ...]
@@ -74,7 +74,7 @@ class Ply:
 
     @classmethod
     def parse(cls, data: bytes) -> Ply:
-        """Take a file apart, whatever it is."""
+        """Split any file into header and body."""
         head, mark, body = data.partition(b"end_header")
         newline = b"\r\n" if b"\r\n" in head else b"\n"
         if not mark:
@@ -83,7 +83,7 @@ class Ply:
 
 
 def seeds() -> list[Ply]:
-    """Return small PLYs of all degrees, encodings and oddities."""
+    """Return small PLYs of all degrees, encodings and special cases."""
     made = [_seed(degree, kind, rows) for degree in (0, 1) for kind in _KINDS for rows in (0, 1, 3)]
     made += [_seed(degree, _KINDS[0], 1) for degree in (2, 3)]
     made += [_seed(1, kind, 2, types={"x": "double", "y": "double", "z": "double"}) for kind in _KINDS]
@@ -100,7 +100,7 @@ def changed(rng: random.Random, ply: Ply) -> Ply:
 
 
 def _zip(name: str) -> bytes:
-    """Return an archive of one empty file: other formats for splats are zip or gzip, and are recognised."""
+    """Return a zip archive of one empty file, because the reader recognises other formats by it."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         archive.writestr(zipfile.ZipInfo(name), b"")
@@ -136,7 +136,7 @@ def _text(value: float, kind: str) -> str:
 
 
 def _line_changes(rng: random.Random, ply: Ply) -> Ply:
-    """Remove, double, move or insert a line."""
+    """Remove, duplicate, move or insert a line."""
     lines = list(ply.lines)
     at = rng.randrange(len(lines) + 1)
     kind = rng.randrange(5)
@@ -153,7 +153,7 @@ def _line_changes(rng: random.Random, ply: Ply) -> Ply:
 
 
 def _word_changes(rng: random.Random, ply: Ply) -> Ply:
-    """Put another word into a line of the header."""
+    """Replace or insert a word in a line of the header."""
     if not ply.lines:
         return ply
     lines = list(ply.lines)
@@ -166,7 +166,7 @@ def _word_changes(rng: random.Random, ply: Ply) -> Ply:
 
 
 def _header_bytes(rng: random.Random, ply: Ply) -> Ply:
-    """Change bytes of the header, or what ends its lines."""
+    """Change bytes or line endings of the header."""
     if rng.random() < 0.3:
         return Ply(ply.lines, ply.body, rng.choice((b"\n", b"\r\n", b"\r", b"\n\n", b" \n")))
     if not ply.lines:
@@ -182,7 +182,7 @@ def _header_bytes(rng: random.Random, ply: Ply) -> Ply:
 
 
 def _body_values(rng: random.Random, ply: Ply) -> Ply:
-    """Put special numbers in the place of others."""
+    """Replace numbers by special values."""
     if any(b"ascii" in line for line in ply.lines[:3]):
         tokens = ply.body.split(b" ")
         for _ in range(rng.choice((1, 1, 4))):
@@ -200,7 +200,7 @@ def _body_values(rng: random.Random, ply: Ply) -> Ply:
 
 
 def _body_bytes(rng: random.Random, ply: Ply) -> Ply:
-    """Flip bits, cut, lengthen or repeat."""
+    """Flip bits, truncate, extend or repeat."""
     body = bytearray(ply.body)
     kind = rng.randrange(4)
     if kind == 0 and body:
@@ -217,7 +217,7 @@ def _body_bytes(rng: random.Random, ply: Ply) -> Ply:
 
 
 def _count(rng: random.Random, ply: Ply) -> Ply:
-    """Declare another number of rows, and perhaps repeat the rows to match."""
+    """Change the declared number of rows, and in some cases repeat the rows to match."""
     lines = list(ply.lines)
     found = [i for i, line in enumerate(lines) if line.startswith(b"element")]
     if not found:

@@ -1,1 +1,1 @@
-"""Decoders changed operator by operator: which changes do the vectors miss? `python -m csplat_selftest.mutation`."""
+"""Mutation testing of the vectors with our decoders: `python -m csplat_selftest.mutation`."""

@@ -1,4 +1,4 @@
-"""Mutants of a decoder, and the verdicts of vectors and damaged files on them."""
+"""Mutants of a decoder, and their results with vectors and fuzzed files."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _SHOWN = 100  # characters of a piece of text
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change.
+    """One change of a source file.
 
     Attributes:
-        file: name of the module's file.
+        file: file name.
         line: line of the change, from 1.
-        start: character at which the old text begins.
-        old: a piece of the file's text: the smallest expression or statement that changes.
+        start: index of the first character of the old text.
+        old: the old text: the smallest expression or statement that changes.
         new: its replacement.
     """
 
@@ -36,23 +36,23 @@ class Mutant:
     new: str
 
     def apply(self, text: str) -> str:
-        """Return the file's text with the change in it."""
+        """Return the file's text with the change."""
         end = self.start + len(self.old)
-        assert text[self.start : end] == self.old, f"{self.file} is another"
+        assert text[self.start : end] == self.old, f"{self.file} has changed"
         return text[: self.start] + self.new + text[end:]
 
     def lines(self, text: str) -> tuple[str, str]:
-        """Return the lines of the file's text that change, as they were and as they are."""
+        """Return the changed lines of the file's text, before and after the change."""
         start, end = text.rfind("\n", 0, self.start) + 1, text.find("\n", self.start + len(self.old))
         return text[start:end], self.apply(text)[start : end - len(self.old) + len(self.new)]
 
 
 class Fate(StrEnum):
-    """The outcome for a mutant."""
+    """The result of a mutant."""
 
     CAUGHT = "caught"  #: a vector fails
-    MISSED = "missed"  #: all vectors pass, and a fuzzed file shows a difference
-    SAME = "same"  #: no file shows a difference: equivalent, or out of the reach of vectors, or only rarely seen
+    MISSED = "missed"  #: all vectors pass, but a fuzzed file reveals a difference
+    SAME = "same"  #: no file reveals a difference
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class MutantResult:
 
     Attributes:
         mutant: the mutant.
-        fate: the outcome; other runners have fates of their own.
-        by: the vector, or the fuzzed file and how the answers differ.
+        fate: the result; other runners define their own.
+        by: the vector, or the fuzzed file with the difference.
     """
 
     mutant: Mutant
@@ -75,12 +75,12 @@ class Decoder(Protocol):
 
     @property
     def texts(self) -> Mapping[str, str]:
-        """The decoder's modules by the names of their files."""
+        """The decoder's source files by name."""
         ...
 
     @property
     def mutants(self) -> Sequence[Mutant]:
-        """All of them."""
+        """All mutants."""
         ...
 
     def valid(self, mutant: Mutant) -> bool:
@@ -88,12 +88,12 @@ class Decoder(Protocol):
         ...
 
     def attempt(self, mutant: Mutant) -> MutantResult:
-        """Run the vectors, and if all pass the fuzzed files."""
+        """Run the vectors and, if all pass, the fuzzed files."""
         ...
 
 
 def sample(decoder: Decoder, count: int, seed: int) -> list[Mutant]:
-    """Choose mutants by chance, in the order of the files; none that is no program."""
+    """Choose random valid mutants, in the order of the files."""
     mixed = list(decoder.mutants)
     random.Random(seed).shuffle(mixed)  # noqa: S311 - repeatable, no secret
     chosen: list[Mutant] = []
@@ -106,7 +106,7 @@ def sample(decoder: Decoder, count: int, seed: int) -> list[Mutant]:
 
 
 def score(results: Sequence[MutantResult]) -> float:
-    """Return the share, in per cent, of caught mutants among those that show a difference at all."""
+    """Return the percentage of caught mutants among those that show a difference."""
     counts = [sum(result.fate is fate for result in results) for fate in (Fate.CAUGHT, Fate.MISSED)]
     return 100.0 * counts[0] / max(1, sum(counts))
 
@@ -117,13 +117,13 @@ def table(
     fates: Sequence[StrEnum] = (Fate.MISSED, Fate.SAME),
     seen: str = "seen in",
 ) -> str:
-    """Return the survivors in Markdown, those that the vectors miss first.
+    """Return a Markdown table of the surviving mutants.
 
     Args:
-        results: all of a run.
-        texts: the modules by the names of their files.
+        results: all results of a run.
+        texts: source files by name.
         fates: the fates to list, in this order.
-        seen: head of the column that holds `by`.
+        seen: heading of the column `by`.
     """
     lines = [f"| fate | where | was | is | {seen} |", "|---|---|---|---|---|"]
     for fate in fates:
@@ -144,18 +144,18 @@ def _short(text: str) -> str:
 #: Decodes a file.
 Ask = Callable[[bytes], Answer]
 
-_SHOWN_ANSWER = 100  # characters of an answer that are shown
+_SHOWN_ANSWER = 100  # characters of an answer to show
 
 
 @cache
 def vectors() -> Sequence[tuple[Vector, bytes]]:
-    """Return the vectors with their files. These decoders read every chunk: what another one may accept they refuse."""
-    wanted = [replace(one, error=one.error | {"optional": ""}) if one.error else one for one in load()]
-    return [(vector, vector.data) for vector in wanted]
+    """Return the vectors with their files. No refusal is optional, because our decoders read every chunk."""
+    required = [replace(one, error=one.error | {"optional": ""}) if one.error else one for one in load()]
+    return [(vector, vector.data) for vector in required]
 
 
 def failing(ask: Ask) -> str:
-    """Return the name of the first vector that fails, or nothing. Of refusals the code does not count."""
+    """Return the name of the first vector that fails, or an empty string. Codes of refusals are not compared."""
     for vector, data in vectors():
         outcomes = compare_answer(vector, ask(data), tuple(PARTS))
         if not all(one.good for one in outcomes):
@@ -171,15 +171,15 @@ def fuzzed(count: int, seed: int) -> list[bytes]:
 
 
 def verdict(answer: Answer) -> Any:
-    """Return what counts of an answer: why a file is refused does not."""
+    """Return the parts of an answer to compare, without the reason of a refusal."""
     return (answer.status, *((dict(answer.header), dict(answer.arrays)) if answer.status is Status.PASSED else ()))
 
 
-def difference(ask: Ask, files: Sequence[bytes], wanted: Sequence[Any]) -> str:
-    """Return where a decoder first differs from what is wanted, or nothing."""
-    for number, (data, right) in enumerate(zip(files, wanted, strict=True)):
+def difference(ask: Ask, files: Sequence[bytes], expected: Sequence[Any]) -> str:
+    """Return a line about the first file with another verdict than expected, or an empty string."""
+    for number, (data, right) in enumerate(zip(files, expected, strict=True)):
         answer = ask(data)
         if verdict(answer) != right:
             words = f"{answer.status} {answer.code} {answer.message}"[:_SHOWN_ANSWER].strip()
-            return f"file {number}: {words} for {right[0]}"
+            return f"file {number}: {words}, expected {right[0]}"
     return ""

@@ -1,4 +1,4 @@
-"""Mutation operators: one small change at a time in Python, and in C by tokens."""
+"""Mutation operators: small changes of Python by syntax tree, and of C by tokens."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ _ARITHMETIC: Final = {
     ast.BitXor: ("^", "&"),
 }
 _NAMES: Final = {"min": "max", "max": "min", "any": "all", "all": "any"}
-#: Nodes whose text has no influence on what a decoder decodes.
+#: Nodes whose text does not influence decoding.
 _WORDS: Final = (ast.JoinedStr, ast.arg)
 
 
 def python_mutants(file: str, text: str) -> list[Mutant]:
-    """Return every mutant of a module, in the order of the text. Some may be no program.
+    """Return every mutant of a module, in the order of the text. Some may not compile.
 
     Args:
-        file: its name.
-        text: its source.
+        file: file name.
+        text: source text.
     """
     return list(_Module(file, text).mutants())
 
@@ -69,7 +69,7 @@ class _Module:
         yield from self.of(node)
         for name, value in ast.iter_fields(node):
             if name in ("annotation", "returns", "decorator_list") or isinstance(node, ast.Raise):
-                continue  # a raise is dropped, its words are not read
+                continue  # a raise is only dropped as a whole
             for child in value if isinstance(value, list) else [value]:
                 if isinstance(child, ast.AST):
                     yield from self.inside(child)
@@ -114,7 +114,7 @@ class _Module:
             case ast.Expr(value=ast.Call()):
                 yield self.replaced(node, "pass")
             case ast.FunctionDef():
-                # A function's last statement would give no value at all: any caller notices.
+                # Without its last return, a function would return nothing, which any caller notices.
                 last = node.body[-1]
                 early = [one for one in ast.walk(node) if isinstance(one, ast.Return) and one is not last]
                 yield from (self.replaced(one, "pass") for one in early)
@@ -122,7 +122,7 @@ class _Module:
     def operator(
         self, node: ast.AST, left: ast.AST, right: ast.AST, old: str, new: str, *, wrap: bool = True
     ) -> Mutant:
-        """Replace the operator between two operands; the node is put in brackets, so that its parts stay its parts."""
+        """Replace the operator between two operands; brackets around the node preserve precedence."""
         (start, end), gap_start, gap_end = self.span(node), self.span(left)[1], self.span(right)[0]
         gap = re.sub(rf"(?<![\w]){old}(?![\w])", new, self.text[gap_start:gap_end], count=1)
         changed = self.text[start:gap_start] + gap + self.text[gap_end:end]
@@ -137,7 +137,7 @@ class _Module:
         return self.text[start:end]
 
     def span(self, node: ast.AST) -> tuple[int, int]:
-        """Characters, where the tree counts bytes of a line in UTF-8."""
+        """Return the character range of a node; the tree counts bytes of lines in UTF-8."""
         places = (node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset)  # type: ignore[attr-defined]  # has a place
         start, end = (
             self.starts[line - 1] + len(self.lines[line - 1].encode()[:column].decode()) for line, column in places
@@ -159,7 +159,7 @@ _TOKEN: Final = re.compile(
     """,
     re.VERBOSE | re.DOTALL | re.MULTILINE | re.IGNORECASE,
 )
-#: Between spaces, as the layout of the source has them on both sides of what is not a sign or a pointer.
+#: Operators surrounded by spaces, which distinguishes them from signs and pointers in our formatting.
 _BINARY: Final = {
     "<": ("<=", ">="),
     "<=": ("<", ">"),
@@ -187,7 +187,7 @@ _BINARY: Final = {
     "<<=": (">>=",),
     ">>=": ("<<=",),
 }
-_MESSAGE_CALLS: Final = ("fail", "note", "refuse")  # calls whose arguments are for people
+_MESSAGE_CALLS: Final = ("fail", "note", "refuse")  # calls whose arguments are only messages
 _KEPT: Final = ("if", "for", "while", "switch", "return", "sizeof", "release", *_MESSAGE_CALLS)
 
 
@@ -200,11 +200,11 @@ class _Token:
 
 
 def c_mutants(file: str, text: str) -> list[Mutant]:
-    """Return every mutant of a source, in the order of the text. Some may be no program.
+    """Return every mutant of a source file, in the order of the text. Some may not compile.
 
     Args:
-        file: its name.
-        text: the source; what generated parts, comments, strings and lines of the preprocessor hold stays.
+        file: file name.
+        text: source text. Generated parts, comments, strings and preprocessor lines do not change.
     """
     found = [
         _Token(match.lastgroup or "", match[0], match.start(), match.end())
@@ -216,14 +216,14 @@ def c_mutants(file: str, text: str) -> list[Mutant]:
 
 
 def _changes(text: str, tokens: list[_Token]) -> Iterator[tuple[int, int, str]]:
-    """Yield what changes: first character, last, and what comes in between."""
+    """Yield changes: start, end and replacement."""
     at = 0
     while at < len(tokens):
         token, last = tokens[at], tokens[at - 1].text if at else ""
         end = _end_of_call(tokens, at)
         if end and token.text in _MESSAGE_CALLS:
             if token.text == "fail":
-                stays = last == "return" and tokens[end].text == ";"  # the code after it is no longer skipped
+                stays = last == "return" and tokens[end].text == ";"  # then also execute the code after it
                 yield (tokens[at - 1].start, tokens[end].end, ";") if stays else (token.start, tokens[end - 1].end, "1")
             at = end
             continue
@@ -245,7 +245,7 @@ def _change(text: str, token: _Token) -> Iterator[tuple[int, int, str]]:
 
 
 def _end_of_call(tokens: list[_Token], at: int) -> int:
-    """Return the number of the token behind a word and its brackets, or 0 if none follow."""
+    """Return the index of the token after a word and its brackets, or 0 if there are no brackets."""
     if tokens[at].kind != "word" or at + 1 == len(tokens) or tokens[at + 1].text != "(":
         return 0
     depth = 0

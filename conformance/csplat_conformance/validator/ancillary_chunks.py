@@ -1,4 +1,4 @@
-"""Check META, CAMS and OPTS: their JSON text (spec 5.4), by a parser that accepts RFC 8259 and nothing else."""
+"""Check ancillary chunks: the JSON texts META, CAMS and OPTS (spec 5.4), and the declared error bounds SERR (5.5)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from csplat import _spec
+from csplat_conformance.tolerance import bound_tolerance, least_true_error
+from csplat_conformance.validator.index import Index
 from csplat_conformance.validator.streams import read_stream
-from csplat_conformance.validator.violation_log import Payload, ViolationLog
+from csplat_conformance.validator.violation_log import Payload, PlacedRecord, ViolationLog
 
 _WHITESPACE = re.compile(r"[ \t\n\r]*")
 _NUMBER = re.compile(r"-?(?:0|[1-9][0-9]*)(?:\.[0-9]+)?(?:[eE][+-]?[0-9]+)?")
@@ -25,14 +27,14 @@ _TEXT_WIDTH = 1
 
 
 class JsonError(Exception):
-    """Raised if a text breaks JSN-1."""
+    """Raised if a text violates JSN-1."""
 
 
 def parse_json(data: bytes) -> Any:
     """Parse a text by JSN-1 and return its value, with numbers as float.
 
     Raises:
-        JsonError: the text breaks JSN-1.
+        JsonError: the text violates JSN-1.
     """
     if data.startswith(_BYTE_ORDER_MARK):
         raise JsonError("a byte order mark")
@@ -49,7 +51,7 @@ def parse_json(data: bytes) -> Any:
 
 
 def check_text(payload: Payload, kind: bytes, bytes_max: int) -> None:
-    """Check META, CAMS or OPTS: STR, JSN-1, JSN-2. Missing keys that the spec recommends are remarks."""
+    """Check META, CAMS or OPTS: STR, JSN-1, JSN-2. Missing keys of cameras are remarks."""
     stream = read_stream(payload, "stream", None, _TEXT_WIDTH, count_max=bytes_max)
     payload.finish()
     if stream.elements is None:
@@ -78,7 +80,7 @@ def _remark_cameras(log: ViolationLog, cameras: list[dict[str, Any]]) -> None:
 
 
 class _Scanner:
-    """A parser at a place of a text. JSON_DEPTH_MAX bounds the recursion."""
+    """A recursive-descent parser, with a depth limit of JSON_DEPTH_MAX."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -124,7 +126,7 @@ class _Scanner:
             name = self.string()
             if name in result:
                 self.at = start
-                raise self.error("a name that the object has already")
+                raise self.error("a repeated name")
             if not self.taken(":"):
                 raise self.error("no colon")
             result[name] = self.value(depth)
@@ -149,7 +151,7 @@ class _Scanner:
         if match is None:
             raise self.error("no string")
         units = _ESCAPE.sub(_unescape, match[1])
-        # Surrogates written as two escapes join to a pair; a lone surrogate is an error.
+        # Surrogates written as two escapes form a pair; a lone surrogate is an error.
         try:
             value = units.encode("utf-16-le", "surrogatepass").decode("utf-16-le", "strict")
         except UnicodeDecodeError:
@@ -171,3 +173,81 @@ class _Scanner:
 def _unescape(match: re.Match[str]) -> str:
     code = match[1]
     return chr(int(code[1:], 16)) if len(code) == 5 else _SHORT_ESCAPES[code]
+
+
+# Declared error bounds -----------------------------------------------------------------------------
+
+_COMPONENTS = {"means": 1, "covariance": 1, "opacities": 1, "sh0": 3, "sh1": 9, "sh2": 15, "sh3": 21}
+_ROUNDING = 1.0 + 2.0**-20  # SER-2
+
+
+def check_declared_bounds(payload: Payload, index: Index) -> None:
+    """Check SERR: SER-1 to SER-4, and SER-5 as far as possible without the source."""
+    log = payload.log
+    head = payload.structure(
+        _spec.unpack_stated_errors_head, _spec.STATED_ERRORS_HEAD_SIZE, _spec.STATED_ERRORS_HEAD_OFFSETS, "head"
+    )
+    stated = head.record
+    unlisted = stated.error_flags & ~sum(_spec.ERROR_FLAG_NAMES)
+    if unlisted:
+        log.add_field("RES-1", head, "error_flags", f"bits {unlisted:#04x} are reserved")
+    splats = index.head.record.splat_count
+    if stated.source_count - stated.pruned_count != splats:
+        message = f"{stated.source_count} minus {stated.pruned_count} pruned, expected {splats}"
+        log.add_field("SER-4", head, "source_count", message)
+    last = 0
+    for i in range(stated.record_count):
+        name = _spec.MEASURE_NAMES.get(payload.view[payload.at] if payload.left else 0, str(i))
+        record = payload.structure(
+            _spec.unpack_stated_error_record,
+            _spec.STATED_ERROR_RECORD_SIZE,
+            _spec.STATED_ERROR_RECORD_OFFSETS,
+            f"record[{name}]",
+        )
+        measure = record.record.measure
+        if measure not in _spec.MEASURE_NAMES:
+            log.add_field("SER-1", record, "measure", f"{measure} is not in the registry")
+        elif measure <= last:
+            log.add_field("SER-1", record, "measure", f"{measure} after {last}, expected ascending measures")
+        last = max(last, measure)
+        if _check_bound(log, record) and measure in _spec.MEASURE_NAMES:
+            _check_bound_possible(log, record, index, stated.source_sh_degree)
+    payload.finish()
+
+
+def _check_bound(log: ViolationLog, record: PlacedRecord[_spec.StatedErrorRecord]) -> bool:
+    """Check SER-2; return True if maximum and rms can be compared."""
+    largest, rms = record.record.max, record.record.rms
+    wrong = [key for key, value in (("max", largest), ("rms", rms)) if not 0.0 <= value < math.inf]
+    for key in wrong:
+        log.add_field("SER-2", record, key, f"{getattr(record.record, key)}, expected finite and not negative")
+    if wrong:
+        return False
+    components = _COMPONENTS.get(_spec.MEASURE_NAMES.get(record.record.measure, ""))
+    if components is not None and rms > largest * math.sqrt(components) * _ROUNDING:
+        message = f"{largest:.9g}, too small for rms {rms:.9g} of {components} components"
+        log.add_field("SER-2", record, "max", message)
+        return False
+    return True
+
+
+def _check_bound_possible(
+    log: ViolationLog, record: PlacedRecord[_spec.StatedErrorRecord], index: Index, source_degree: int
+) -> None:
+    """Check SER-5 without the source: whether any pair of scenes has errors that permit this bound.
+
+    One splat has the true maximum, which the declared maximum hardly exceeds. The true rms is therefore at least that
+    maximum over √N, and the declared rms is hardly smaller (SER-7).
+    """
+    largest, rms = record.record.max, record.record.rms
+    splats, measure = index.head.record.splat_count, _spec.MEASURE_NAMES[record.record.measure]
+    least = least_true_error(measure, largest)
+    if splats and rms * _ROUNDING + bound_tolerance(measure, rms, 0.0) < least / math.sqrt(splats):
+        message = f"{rms:.9g} is too small for max {largest:.9g} over {splats} splats"
+        log.add_field("SER-5", record, "rms", message)
+    if measure == "opacities" and least > 1.0:
+        log.add_field("SER-5", record, "max", f"alpha differs by at most 1, not by {largest:.9g}")
+    band = record.record.measure - _spec.MEASURE_SH0
+    degree = index.degree if index.degree is not None else _spec.SH_DEGREE_MAX
+    if (band > max(degree, source_degree) or not splats) and least > 0.0:
+        log.add_field("SER-5", record, "max", f"{largest:.9g} for {measure}, expected 0: neither scene has {measure}")
