@@ -279,7 +279,7 @@ FIELDS = {
         {"camera_angle_x": 0.5},
         r"frame 0: fl_x is 51\.\d+, expected 93\.99\d* from camera_angle_x = 0\.5 and 48 pixels",
     ),
-    "down, too": ({"camera_angle_y": 0.5}, "fl_y is 51.* as camera_angle_y = 0.5 says for 32 pixels"),
+    "down, too": ({"camera_angle_y": 0.5}, "fl_y is 51.* from camera_angle_y = 0.5 and 32 pixels"),
     "no unit of pixels": (
         {"fl_x": 1.07, "fl_y": 1.07},
         "frame 1: the focal length across is 1.07 for 48 pixels, expected 2.4",
