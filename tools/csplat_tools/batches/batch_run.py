@@ -23,6 +23,7 @@ from csplat_tools.batches.batch_scenes import Task, find_tasks
 from csplat_tools.batches.journal import JOURNAL, Journal, Record, open_journal, read_journal
 from csplat_tools.batches.scene_job import (
     RENDERER_BYTES,
+    CommandLineError,
     PlannedJob,
     SceneJob,
     Worker,
@@ -34,12 +35,6 @@ from csplat_tools.scene_files import size_on_disk
 
 _SET_BY_BATCH = ("threads", "memory", "resume")  # options that the batch passes to commands that have them
 _FREE_SHARE = 0.9  # fraction of the free memory that a batch uses if `memory_bytes` is not given
-
-
-class CommandLineError(InputError):
-    """The command of a batch does not exist, or its options are invalid."""
-
-    code = "E_USAGE"
 
 
 @dataclass(frozen=True)
@@ -206,11 +201,9 @@ def _prepared(
     taken = {JOURNAL, PAGE} & {one.output for one in tasks}
     if taken:
         raise InputError(f"{taken.pop()} is written by the batch itself: give the scene another output in a manifest")
+    has = set(_SET_BY_BATCH) & set(answer["options"])
     for options in {one.options for one in tasks if one.options}:
-        _checked(worker, (*command, *options))
-    has = set(answer["options"]) & set(_SET_BY_BATCH)
-    if "memory" in has and worker.ask("check", words=[*command, "--memory", "1GB"])["wrong"]:
-        has -= {"memory", "resume"}  # these options exclude them
+        has &= set(_checked(worker, (*command, *options))["options"])
     return tasks, frozenset(has)
 
 

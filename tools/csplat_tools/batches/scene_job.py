@@ -22,7 +22,7 @@ from urllib.parse import unquote
 
 from csplat import __version__
 from csplat.encoder import EncodeOptions
-from csplat.errors import CsplatError, StoreError, missing_package
+from csplat.errors import CsplatError, InputError, StoreError, missing_package
 from csplat.formats import detect_format
 from csplat.remote_store import is_url, open_store
 from csplat.system import NEW_GROUP_FLAGS, interrupt_process
@@ -33,6 +33,7 @@ from csplat_tools.scene_files import FOLDER_NAMES, size_on_disk
 
 THUMBNAILS = "thumbnails"
 _PART_BYTES = 16 << 20
+_STATUS_USAGE = 2  # status of a wrong command line
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,9 @@ def run_job(job: SceneJob, worker: Worker, gate: Gate | None = None) -> tuple[Re
 
     Returns:
         The record of the scene, and False if an earlier run made the output.
+
+    Raises:
+        CommandLineError: the command's options are invalid, for any scene.
     """
     record = job.record
     try:
@@ -132,12 +136,20 @@ def run_job(job: SceneJob, worker: Worker, gate: Gate | None = None) -> tuple[Re
                 _local_output(job) as output,
             ):
                 return _ran(job, record, worker, source, output, options), True
+    except CommandLineError:
+        raise
     except CsplatError as error:
         return replace(record, code=error.code, error=" ".join(str(error).split())), True
     except OSError as error:
         return replace(
             record, code=errno.errorcode.get(error.errno or 0, "E_OS"), error=" ".join(str(error).split())
         ), True
+
+
+class CommandLineError(InputError):
+    """The command of a batch does not exist, or its options are invalid."""
+
+    code = "E_USAGE"
 
 
 class SceneError(CsplatError):
@@ -167,6 +179,8 @@ def _ran(job: SceneJob, record: Record, worker: Worker, source: Path, output: Pa
         if worker.pid is not None:
             remove_unfinished(output, worker.pid)
         raise
+    if answer["status"] == _STATUS_USAGE:
+        raise CommandLineError(answer["error"])
     record = replace(
         record,
         seconds=round(answer["seconds"], 3),

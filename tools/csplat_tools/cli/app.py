@@ -11,75 +11,66 @@ from typer.core import TyperGroup
 from typer.main import get_group
 
 from csplat_tools import VERSIONS
-from csplat_tools.cli.command import UsageError, refuse_command_line, report_errors
+from csplat_tools.cli.error_lines import UsageError, refuse_command_line, report_errors
 from csplat_tools.console import print_data
 
-#: Commands as `--help` lists them, and the modules of `csplat_tools.cli` that define them.
-_MODULES = {
-    "encode": "encode",
-    "decode": "decode",
-    "info": "info",
-    "verify": "verify",
-    "lint": "lint",
-    "extract": "extract",
-    "merge": "merge",
-    "convert": "convert",
-    "formats": "convert",
-    "compare": "compare",
-    "tradeoff": "tradeoff",
-    "render": "render",
-    "simplify": "simplify",
-    "sensitivity": "sensitivity",
-    "train": "train",
-    "finetune": "finetune",
-    "view": "view",
-    "export-html": "view",
-    "export-element": "view",
-    "conformance": "conformance",
-    "batch": "batch",
-}
-
-
-def command_function(name: str) -> Any:
-    """Return what defines a command: a function, or a typer of several; `None` if there is no such command."""
-    if name not in _MODULES:
-        return None
-    return getattr(import_module(f"csplat_tools.cli.{_MODULES[name]}"), name.replace("-", "_"))
+#: Panels of `csplat --help`, with their commands and the modules of `csplat_tools.cli` that define them.
+_PANELS = {
+    "Compress": {"encode": "encode", "decode": "decode", "finetune": "finetune", "batch": "batch"},
+    "Inspect": {
+        "info": "info", "verify": "verify", "lint": "lint", "compare": "compare", "tradeoff": "tradeoff",
+        "sensitivity": "sensitivity",
+    },
+    "Edit and convert": {
+        "convert": "convert", "formats": "convert", "simplify": "simplify", "extract": "extract", "merge": "merge",
+    },
+    "Train": {"train": "train"},
+    "View": {"view": "view", "render": "render", "export-html": "view", "export-element": "view"},
+    "Test an implementation": {"conformance": "conformance"},
+}  # fmt: skip
+_PANEL_OF = {name: panel for panel, commands in _PANELS.items() for name in commands}
 
 
 class _Commands(TyperGroup):
-    """The group of all commands, looked up in `_MODULES`. Owns those that were imported."""
+    """The group of all commands, looked up in `_PANELS`. Owns those that were imported."""
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  # typer's
-        return list(_MODULES)
+        return list(_PANEL_OF)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002  # typer's
         # An unknown name is compared with all commands, so that the error can suggest one.
-        for name in {cmd_name} & _MODULES.keys() or _MODULES:
+        for name in {cmd_name} & _PANEL_OF.keys() or _PANEL_OF:
             if name not in self.commands:
                 self.commands[name] = _imported(name)
         return self.commands.get(cmd_name)
+
+    def invoke(self, ctx: Any) -> Any:
+        with report_errors():
+            return super().invoke(ctx)
 
     def main(self, *args: Any, **how: Any) -> Any:
         """Run a command line, and exit; typer would draw a box around the message of a wrong one."""
         if not how.get("standalone_mode", True):
             return super().main(*args, **how)
         try:
-            sys.exit(report_errors(super().main)(*args, **{**how, "standalone_mode": False}))
+            with report_errors():  # of printing help and versions
+                status = super().main(*args, **{**how, "standalone_mode": False})
         except UsageError as error:
             refuse_command_line(error)
-        except typer.Exit as error:  # help could not be printed
-            sys.exit(error.exit_code)
+        except typer.Exit as error:
+            status = error.exit_code
+        sys.exit(status)
 
 
 def _imported(name: str) -> Any:
     """Import the command of a name, or a group of commands."""
-    found = command_function(name)
+    panel = _PANEL_OF[name]
+    found = getattr(import_module(f"csplat_tools.cli.{_PANELS[panel][name]}"), name.replace("-", "_"))
     alone = typer.Typer(rich_markup_mode="rich")
     if isinstance(found, typer.Typer):
-        alone.add_typer(found, name=name)
+        alone.add_typer(found, name=name, rich_help_panel=panel)
     else:
-        alone.command(name)(found)
+        alone.command(name, rich_help_panel=panel)(found)
     return get_group(alone).commands[name]
 
 
@@ -92,8 +83,8 @@ app = typer.Typer(
 )
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(requested: bool) -> None:
+    if requested:
         print_data(VERSIONS)
         raise typer.Exit
 
@@ -101,14 +92,13 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def root(
     _version: Annotated[
-        bool,
-        typer.Option("--version", callback=_version, is_eager=True, help="Print the versions of program and format."),
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the versions.")
     ] = False,
 ) -> None:
     """csplat: 3D Gaussian splats, compressed.
 
-    Status 0: done. 1: refused or failed, with one line on standard error.
-    2: the command line is wrong.
+    Status 0: success. 1: an error, with one line on standard error.
+    2: a wrong command line.
 
     Examples:
       csplat encode scene.ply scene.csplat

@@ -12,71 +12,79 @@ import typer
 
 from csplat.errors import counted
 from csplat_tools.batches.batch_page import PAGE
-from csplat_tools.batches.batch_run import Batch, BatchStep, CommandLineError, plan_batch
+from csplat_tools.batches.batch_run import Batch, BatchStep, plan_batch
 from csplat_tools.batches.batch_run import batch as run_batch
 from csplat_tools.batches.batch_scenes import starting_points
 from csplat_tools.batches.journal import JOURNAL
-from csplat_tools.batches.scene_job import PlannedJob
-from csplat_tools.cli.command import EXIT_FAILED, OutputOptions, command
-from csplat_tools.cli.shared_options import parse_bytes
+from csplat_tools.batches.scene_job import CommandLineError, PlannedJob
+from csplat_tools.cli.command_output import Output
+from csplat_tools.cli.error_lines import EXIT_FAILED
+from csplat_tools.cli.shared_options import (
+    Dask,
+    DryRun,
+    Force,
+    HelpAll,
+    Json,
+    Memory,
+    Quiet,
+    Report,
+    checked,
+    parse_bytes,
+    refuse_together,
+)
 from csplat_tools.console import format_bytes, format_estimate, format_seconds, format_table, note, step_progress
 
 _SHOWN_MAX = 50  # failures listed on standard error; the page lists all
 
 
-@command(one_of=(("dask", "workers"), ("dask", "memory"), ("dask", "dry_run")))
 def batch(
     scenes: Annotated[
         str, typer.Argument(metavar="SCENES", help="A folder, or a manifest: .jsonl, or .csv of path, output, options.")
     ],
     folder: Annotated[str, typer.Argument(metavar="OUT", help="The folder of outputs.")],
-    out: OutputOptions,
     line: Annotated[
         list[str] | None,
         typer.Argument(metavar="[-- COMMAND OPTIONS]", help="A command that takes IN and OUT. Default: encode."),
     ] = None,
     ending: Annotated[
-        str | None, typer.Option(metavar=".spz", help="File name ending of outputs. Default: that of the command.")
+        str | None, typer.Option(metavar=".spz", help="Ending of outputs. Default: the command's.")
     ] = None,
-    match: Annotated[str, typer.Option(metavar="'*.ply'", help="Files of a folder to take.")] = "*",
+    match: Annotated[
+        str, typer.Option(metavar="PATTERN", show_default=False, help="Names of scenes: '*.ply'. Default: all.")
+    ] = "*",
     workers: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="Scenes at a time. Default: one per core.")
     ] = None,
-    memory: Annotated[
-        str | None, typer.Option(metavar="8GB", help="Memory of all scenes at a time. Default: most of what is free.")
-    ] = None,
-    dask: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Work on a Dask cluster that sees these files: tcp://host:8786."),
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="List the work, its time and memory, and do nothing.")
-    ] = False,
-    thumbnails: Annotated[
-        bool, typer.Option("--thumbnails/--no-thumbnails", help="Small renders on the page (extra render).")
-    ] = True,
+    memory: Memory = None,
+    dask: Dask = None,
+    dry_run: DryRun = False,
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
-    """Do the same with many scenes: encode, decode, convert, ...
+    """Run a command on many scenes.
 
-    Each line of OUT/batch.jsonl reports on a scene; OUT/index.html shows all.
-    Finished work is not repeated, whatever ended the last run: the same content,
-    command and version, and an unchanged output. Scenes that fail are listed,
-    tried again in the next run, and make the status 1; the others are processed
-    all the same.
+    OUT/batch.jsonl has a line for each scene, OUT/index.html a table with
+    thumbnails (render extra). Work that is done is not repeated by the next
+    run: the same content, command and version, and an unchanged output.
+    Scenes that fail are listed, tried again in the next run, and make the
+    status 1; the other scenes are processed all the same.
 
     Examples:
       csplat batch scenes encoded
       csplat batch scenes encoded -- encode --preset small
-      csplat batch encoded plys -- decode --sh-degree 1
       csplat batch scenes web --ending .sog --match '*.ply' -- convert
       csplat batch list.jsonl encoded --workers 4 --memory 16GB
-      csplat batch scenes encoded --dry-run
     """
-    words = tuple(line or ("encode",))
+    out, words = Output(force, report, as_json, quiet), tuple(line or ("encode",))
+    refuse_together({"--dask": dask}, {"--workers": workers, "--memory": memory, "--dry-run": dry_run})
+    memory_bytes = checked(parse_bytes, memory)
     out.check(inputs=(scenes,))
     points = starting_points(Path(scenes)) if Path(scenes).is_dir() else []
     if points:
-        note(f"left out: {', '.join(points[:_SHOWN_MAX])}: the points that training began with, no scenes")
+        note(f"left out: {', '.join(points[:_SHOWN_MAX])}: initial points of a training, no scenes")
     try:
         if dry_run:
             planned = plan_batch(scenes, folder, words, ending=ending, match=match, workers=workers)
@@ -84,13 +92,13 @@ def batch(
             return
         with step_progress("batch", _words(), quiet=out.quiet) as progress:
             done = run_batch(
-                scenes, folder, words, ending=ending, match=match, workers=workers, memory_bytes=parse_bytes(memory),
-                dask=dask, force=out.force, thumbnails=thumbnails, progress=progress,
+                scenes, folder, words, ending=ending, match=match, workers=workers, memory_bytes=memory_bytes,
+                dask=dask, force=out.force, progress=progress,
             )  # fmt: skip
     except CommandLineError as error:
         raise typer.BadParameter(str(error)) from None
     out.publish(done.as_json(), _text(done))
-    _tell_failures(done)
+    _print_failures(done)
     if done.failures:
         sys.exit(EXIT_FAILED)
 
@@ -116,7 +124,7 @@ def _text(done: Batch) -> str:
     return f"{scenes}: {made} done, {before} done before, {failed} failed; {done.folder / PAGE}"
 
 
-def _tell_failures(done: Batch) -> None:
+def _print_failures(done: Batch) -> None:
     for one in done.failures[:_SHOWN_MAX]:
         note(f"failed: {one.path}: {one.error}" + (f" ({one.code})" if one.code not in one.error else ""))
     if len(done.failures) > _SHOWN_MAX:
@@ -151,6 +159,6 @@ def _planned_text(planned: list[PlannedJob]) -> str:
         rows.append((one.job.task.source, one.job.task.output, splats, size, *work))
     left = [one for one in planned if not one.is_done]
     known = [one.seconds for one in left if one.seconds is not None]
-    took = f"{format_estimate(sum(known))}, one after the other" if len(known) == len(left) else "nobody knows how long"
+    took = f"{format_estimate(sum(known))}, one after the other" if len(known) == len(left) else "the time is unknown"
     table = format_table(("scene", "output", "splats", "size", "time", "memory"), rows, left=2)
     return f"{table}\n{counted(len(left), 'scene')} to do of {len(planned)}, {took}"

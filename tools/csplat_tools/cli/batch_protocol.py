@@ -23,25 +23,20 @@ from pathlib import Path
 from typing import Any
 
 import typer
+from typer.main import get_command
 
 from csplat.system import interrupt_main_thread
 from csplat_tools.batches.batch_page import prepare_thumbnails, write_thumbnail
 from csplat_tools.batches.scene_job import inspect_scene
-from csplat_tools.cli.app import app, command_function
-from csplat_tools.cli.command import EXIT_FAILED, UsageError, usage_message
+from csplat_tools.cli.app import app
+from csplat_tools.cli.encode import IN_MEMORY
+from csplat_tools.cli.error_lines import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, UsageError, usage_message
 
 _ERROR = "error: "
 _CODE = re.compile(r"\b(E_[A-Z0-9_]+)\b|\((E[A-Z]+)\)$")
 _REMARKS_MAX = 20
-_OWN = ("force", "report", "as_json", "quiet", "output_option")  # options that the batch gives itself
-_FILES = (
-    "page",
-    "source_index",
-    "checkpoint",
-    "resume",
-    "work",
-    "dry_run",
-)  # options that name a file which all scenes would share, or that do no work
+_OWN = ("force", "report", "as_json", "quiet")  # options that the batch gives itself
+_FILES = ("page", "source_index", "checkpoint", "resume", "dry_run")  # a file for all scenes, or no work
 
 
 def main() -> None:
@@ -56,61 +51,60 @@ def main() -> None:
         for line in sys.stdin:
             requests.put(line)
         requests.put(None)
-        if busy.is_set():  # child_processes a waiting command, too
+        if busy.is_set():  # ends a command that waits for child processes, too
             interrupt_main_thread()
 
     threading.Thread(target=listen, daemon=True).start()
     with suppress(KeyboardInterrupt, BrokenPipeError):
         while (line := requests.get()) is not None:
             busy.set()
-            said = answer(json.loads(line))
+            reply = answer(json.loads(line))
             busy.clear()
-            answers.write(json.dumps(said) + "\n")
+            answers.write(json.dumps(reply) + "\n")
             answers.flush()
 
 
 def answer(request: dict[str, Any]) -> dict[str, Any]:
-    """Answer a request: `check` or `run` a command line, or `inspect_scene` at a scene."""
-    asked: dict[str, Callable[..., dict[str, Any]]] = {
+    """Answer a request: `check` or `run` a command line, or `look` at a scene."""
+    answers: dict[str, Callable[..., dict[str, Any]]] = {
         "check": _check,
         "look": _look,
         "run": _run,
     }
-    return asked[request["ask"]](**{name: value for name, value in request.items() if name != "ask"})
+    return answers[request["ask"]](**{name: value for name, value in request.items() if name != "ask"})
 
 
 def _check(words: Sequence[str]) -> dict[str, Any]:
-    """Parse a command, its options, and files that need not exist.
+    """Parse a command line for all scenes.
 
     Returns:
         `wrong`: the error in one line, or "". Without an error also `ending`: the file name ending of the command's
-        outputs, "" if it may have any; `options`: names of the options that the command has.
+        outputs, "" if it may have any; `options`: names of the options that the batch may add.
     """
     name, *rest = words
-    function = command_function(name)
-    if function is None or not hasattr(function, "parsed"):
-        return {"wrong": f"{name} is no command that makes one file of another; `csplat --help` lists them"}
-    alone = typer.Typer(add_completion=False)
-    alone.command(name)(function.parsed)
-    command = typer.main.get_command(alone)
+    group: Any = get_command(app)
+    command = group.get_command(typer.Context(group), name)
+    if command is None or hasattr(command, "commands"):
+        return {"wrong": f"{name} is no command with an input and an output; `csplat --help` lists the commands"}
     arguments = {one.name: one for one in command.params if one.param_type_name == "argument"}
     if list(arguments) != ["source", "output"]:
         return {"wrong": f"csplat {name} does not take IN and OUT alone"}
     try:
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
             context = command.make_context(f"csplat {name}", ["IN", "OUT", *rest])
-            given = [one for one in context.params if _is_given(context, one)]
-            command.invoke(context)
     except UsageError as error:
         return {"wrong": f"csplat {name}: {usage_message(error)}"}
     except (typer.Exit, SystemExit):
-        return {"wrong": f"csplat {name}: what is no option for work, as --help, says nothing here"}
+        return {"wrong": f"csplat {name}: --help and --help-all do no work"}
+    given = [one for one in context.params if _is_given(context, one)]
     taken = [one for one in given if one in (*_OWN, *_FILES)]
     if taken:
-        option = "--" + {"as_json": "json", "output_option": "output"}.get(taken[0], taken[0]).replace("_", "-")
+        option = "--" + {"as_json": "json"}.get(taken[0], taken[0]).replace("_", "-")
         return {"wrong": f"csplat {name}: {option} is not for all scenes of a batch"}
-    ending = Path(arguments["output"].metavar or "").suffix
-    return {"wrong": "", "ending": ending, "options": [one.name for one in command.params]}
+    options = {one.name for one in command.params}
+    if set(given) & set(IN_MEMORY):
+        options -= {"memory", "resume"}
+    return {"wrong": "", "ending": Path(arguments["output"].metavar or "").suffix, "options": sorted(options)}
 
 
 def _is_given(context: Any, name: str) -> bool:
@@ -144,22 +138,24 @@ def _run(words: Sequence[str], thumbnail: str = "", scenes: Sequence[str] = ()) 
         except Exception as error:  # noqa: BLE001  # a defect of csplat: it is reported for this scene, and the batch goes on
             err.write(traceback.format_exc() + f"{_ERROR}a defect of csplat: {error!r} (E_DEFECT)\n")
     seconds = time.perf_counter() - begun
-    if status == 130:  # interrupted from outside: this process is to end
+    if status == EXIT_INTERRUPTED:
         raise KeyboardInterrupt
     lines = [line for line in err.getvalue().splitlines() if line.strip()]
-    told = [line for line in lines if line.startswith(_ERROR)]
-    error_line = told[-1].removeprefix(_ERROR) if told else ""
+    errors = [line for line in lines if line.startswith(_ERROR)]
+    error_line = errors[-1].removeprefix(_ERROR) if errors else ""
     if status and not error_line:
         error_line = lines[-1] if lines else f"status {status}"
     if status == 0 and thumbnail and prepare_thumbnails():
         write_thumbnail(Path(thumbnail), [Path(one) for one in scenes])
+    if status == EXIT_USAGE:  # the batch reports it as its own error
+        error_line = error_line.partition("; `csplat ")[0]
     found = _CODE.search(error_line)
     code = next(filter(None, found.groups())) if found else "E_FAILED"
     return {
         "status": status,
         "error": error_line.removesuffix(f" ({code})"),
         "code": code if status else "",
-        "remarks": [line for line in lines if line not in told][-_REMARKS_MAX:],
+        "remarks": [line for line in lines if line not in errors][-_REMARKS_MAX:],
         "result": _json(out.getvalue()),
         "seconds": seconds,
         "memory_bytes": _peak(),

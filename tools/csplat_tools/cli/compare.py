@@ -10,14 +10,27 @@ import typer
 
 from csplat.disk_files import read_array
 from csplat.errors import InputError, counted
-from csplat_tools.cli.command import OutputOptions, command
-from csplat_tools.cli.shared_options import LpipsOption, ModeOption, SplitOption, ViewOptions, parse_bytes
+from csplat_tools.cli.command_output import Output
+from csplat_tools.cli.shared_options import (
+    Background,
+    Cameras,
+    Data,
+    Force,
+    HelpAll,
+    Json,
+    ModeOption,
+    Quiet,
+    Report,
+    TestEvery,
+    ViewOptions,
+    require_one,
+)
 from csplat_tools.console import format_bytes, format_table
 from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.inspect.comparison import AttributeErrors
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
 from csplat_tools.scene_files import OpenedScene, open_scenes
-from csplat_tools.views import describe_views
+from csplat_tools.views import Split, describe_views
 
 if TYPE_CHECKING:
     from csplat_tools.inspect.comparison import Comparison
@@ -41,62 +54,63 @@ _SCORE_EXPLANATIONS = {
 }
 
 
-@command(reads=True, needs={"split": ("data",), "amplify": ("pictures",)})
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="The source, in any format.")],
     b: Annotated[str, typer.Argument(metavar="B", help="The scene that was made from it.")],
-    views: ViewOptions,
-    out: OutputOptions,
-    split: SplitOption = "test",
-    source_index: Annotated[
-        str | None, typer.Option(metavar="FILE.npy", help="The file of `encode --source-index`: pairs of splats.")
-    ] = None,
+    cameras: Cameras = None,
+    data: Data = None,
+    background: Background = None,
+    split: Annotated[
+        Split, typer.Option(metavar="PART", show_default=False, help="test or train images. Default: test.")
+    ] = "test",
     pictures: Annotated[
-        str | None, typer.Option(metavar="FOLDER", help="Write A, B and their difference, side by side, for each view.")
+        str | None, typer.Option(metavar="FOLDER", help="Write renders of A, B, and differences.")
     ] = None,
-    amplify: Annotated[
-        float, typer.Option(metavar="FACTOR", min=0.0, help="Factor of the differences shown. Default: 10.")
-    ] = 10.0,
-    lpips: LpipsOption = None,
+    lpips: Annotated[
+        str | None, typer.Option(metavar="FILE.npz", help="Compute LPIPS with these weights, or auto.")
+    ] = None,
     mode: ModeOption = "standard",
-    memory: Annotated[
-        str | None, typer.Option(metavar="2GB", help="Memory to use. Default: half of what is free.")
+    test_every: TestEvery = None,
+    source_index: Annotated[
+        str | None,
+        typer.Option(metavar="FILE.npy", hidden=True, help="File of `encode --source-index`: pairs of splats."),
     ] = None,
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
-    """Compare a scene with its source: sizes, errors of the splats, and renders.
+    """Compare a scene with its source: sizes, errors, and renders.
 
-    `psnr` is that of the squared error pooled over all pixels and channels of
-    eight 640x480 views around A in front of black, or of the views given; 99
-    at most. The same error scores 10 dB more from four times as far away:
-    compare only numbers from the same cameras and background; white flatters
-    all of them. With --data A and B are also scored against the held-out photographs.
-    Requires the packages of the render extra.
-
-    Scenes of any size: those that do not fit the memory together are drawn by
-    way of a file in the folder for temporary ones (TMPDIR), as large as the
-    splats; errors of splats then require --source-index, unless the splats of
-    both have the same order.
+    `psnr` is pooled over all pixels of eight 640x480 views around A in front
+    of black, or of the given views; at most 99 dB. Compare only values for
+    the same cameras and background. With --data, A and B are also scored
+    against the held-out images. Scenes that do not fit in memory are rendered
+    from the disk. Requires the render extra.
 
     Examples:
       csplat compare scene.ply scene.csplat
       csplat compare scene.ply scene.csplat --data capture --lpips auto
       csplat compare scene.ply scene.csplat --pictures differences
-      csplat compare city.ply city.csplat --memory 4GB
       csplat compare scene.ply other.ply --cameras test.json --json | jq .psnr
     """
     import csplat_tools
 
+    out = Output(force, report, as_json, quiet)
+    views = ViewOptions(cameras, data, background, test_every)
+    require_one({"--split": split != "test", "--test-every": test_every}, {"--data": data})
     out.check(inputs=(a, b, *views.inputs, source_index, None if lpips == "auto" else lpips))
     if a == b == STANDARD_STREAM:
         raise typer.BadParameter("A and B cannot both be standard input")
     require_renderer()
     rows = None if source_index is None else read_array(source_index, most_bytes=_INDEX_BYTES)
-    with open_scenes((a, b), parse_bytes(memory)) as (source, other), out.bar() as progress:
+    with open_scenes((a, b)) as (source, other), out.bar() as progress:
         if isinstance(source, OpenedScene):
             if mode == "exact":
-                raise InputError("--mode exact wants both scenes in memory, and they do not fit: take standard")
+                raise InputError("--mode exact requires both scenes in memory, and they do not fit: use standard")
             out.remark(
-                f"A and B do not fit {format_bytes(source.memory_bytes)} of memory: they are drawn by way of the disk"
+                f"A and B do not fit in {format_bytes(source.memory_bytes)} of memory: they are rendered from the disk"
             )
         for name, one in ((a, source), (b, other)):
             out.print_findings(one.findings, Path(name).name)
@@ -109,8 +123,8 @@ def compare(
                 lambda: 2 * total_render_seconds(model, around.test, mode=mode), "--mode standard takes seconds"
             )
         compared = csplat_tools.compare(
-            source, other, views=around, source_index=rows, lpips=lpips, pictures=pictures, amplification=amplify,
-            background=views.colour, mode=mode, force=out.force,
+            source, other, views=around, source_index=rows, lpips=lpips, pictures=pictures, background=views.colour,
+            mode=mode, force=out.force,
             prepare=partial(prepare_renderer, quiet=out.quiet, ssim=True, lpips=lpips is not None), progress=progress,
         )  # fmt: skip
     out.publish(compared.as_json(), _format(compared, Path(a).name, Path(b).name))
@@ -121,7 +135,7 @@ def compare(
 def _format(compared: Comparison, a: str, b: str) -> str:
     parts = [_sizes(compared, a, b)]
     if compared.attributes is None:
-        parts.append("errors of the splats are not known: which is which, `encode --source-index` writes down")
+        parts.append("the errors of splats are unknown: `encode --source-index` writes the pairs of splats")
     else:
         parts.append(_attributes(compared.attributes))
     parts.append(_quality(compared))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated
@@ -27,72 +27,36 @@ from csplat_conformance.encoders import PSNR_MIN, EncoderSuiteOptions, run_encod
 from csplat_conformance.encoders.encoder_suite import TIMEOUT_SECONDS as ENCODER_SECONDS
 from csplat_conformance.encoders.render_checks import RenderScore
 from csplat_conformance.tolerance import EXACT
-from csplat_tools.cli.command import EXIT_FAILED, OptionGroup, OutputOptions, chosen, command
+from csplat_tools.cli.command_output import Output
+from csplat_tools.cli.error_lines import EXIT_FAILED
+from csplat_tools.cli.shared_options import (
+    Force,
+    HelpAll,
+    Json,
+    Quiet,
+    Report,
+    checked,
+    refuse_together,
+)
 from csplat_tools.console import note, print_data
 from csplat_tools.file_streams import STANDARD_STREAM, write_bytes
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
 
 _OURS = "-m csplat_tools encode {ply} {out} --source-index {index} --quiet"
-#: Options of a run, which exclude --write-inputs.
-_OF_A_RUN = ("program", "level", "min_psnr", "keep", "timeout", "jobs", "junit", "verbose")
+#: Clauses of the specification, as opposed to names of checks: `HDR-*`, `LIM-1`.
+_CLAUSE = re.compile(r"[A-Z][A-Z0-9*?-]*")
 
 conformance = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
 
-
-@dataclass(frozen=True)
-class RunOptions(OptionGroup):
-    """Options of a run of the suite, and of its reports in addition to the JSON."""
-
-    filters: Annotated[
-        list[str] | None,
-        typer.Option("--filter", metavar="PATTERN,...", help="Only checks of these names: 'invalid/*'. May repeat."),
-    ] = None
-    timeout: Annotated[float | None, typer.Option(metavar="SECONDS", min=0.1, help="For each file.")] = None
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", "-j", metavar="N", min=1, help="Processes at a time; one per core.")
-    ] = None
-    junit: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Every result as JUnit XML, for CI; - for standard output.")
-    ] = None
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="A line for each check.")] = False
-
-    @property
-    def pattern(self) -> str | None:
-        """Patterns of the checks to run, joined by commas as the library takes them; `None`: all."""
-        return _joined(self.filters)
-
-    def check(self, out: OutputOptions) -> None:
-        """Refuse unusable paths of reports before anything is run; XML may go to a terminal."""
-        to_stdout = self.junit == STANDARD_STREAM
-        if to_stdout and out.as_json:
-            raise typer.BadParameter("--json and --junit - both use standard output")
-        out.check(None if to_stdout else self.junit)
-
-    def publish(self, report: ConformanceReport, out: OutputOptions, nothing: str) -> None:
-        """Publish the report in every form that was requested, and exit with status 1 if it did not pass.
-
-        Args:
-            report: the report of the run.
-            out: the options that tell where results go.
-            nothing: message if nothing was checked.
-
-        Raises:
-            typer.Exit: a check failed, or there was none.
-        """
-        if self.junit == STANDARD_STREAM:
-            print_data(to_junit(report).rstrip("\n"))
-        elif self.junit is not None:
-            write_bytes(self.junit, to_junit(report).encode())
-        out.publish(to_json(report), "" if self.junit == STANDARD_STREAM else to_table(report, verbose=self.verbose))
-        if not report.outcomes:
-            note(f"error: {nothing}")
-        if not report.passed:
-            raise typer.Exit(EXIT_FAILED)
+# Options of both commands
+_Jobs = Annotated[int | None, typer.Option("--jobs", metavar="N", min=1, help="Processes. Default: one per core.")]
+_Timeout = Annotated[float | None, typer.Option(metavar="SECONDS", help="Time limit per file. Default: 60.")]
+_Junit = Annotated[str | None, typer.Option(metavar="FILE", help="Write JUnit XML; - is standard output.")]
 
 
 @conformance.callback()
 def root() -> None:
-    """Run the conformance suite: files for decoders, scenes for encoders, and what must come of them.
+    """Test a decoder or an encoder of the format.
 
     Examples:
       csplat conformance decoder
@@ -103,99 +67,97 @@ def root() -> None:
 
 
 @conformance.command()
-@command()
 def decoder(
-    run: RunOptions,
-    out: OutputOptions,
     program: Annotated[
-        str | None, typer.Option("--cmd", metavar="COMMAND", help="Another decoder, with {input} and {outdir}.")
+        str | None, typer.Option("--cmd", metavar="COMMAND", help="Decoder, with {input} and {outdir}.")
     ] = None,
     render_program: Annotated[
-        str | None,
-        typer.Option(
-            "--render-cmd", metavar="COMMAND", help="A renderer, with {input}, {camera} and {out} or {outdir}."
-        ),
+        str | None, typer.Option("--render-cmd", metavar="COMMAND", help="Renderer: {input} {camera} {out}.")
     ] = None,
-    level: Annotated[
-        str | None,
-        typer.Option(metavar="LEVEL", help="1 to 4: all up to this one; or some, as 1,3. 3, and 4 with --render-cmd."),
-    ] = None,
-    clause: Annotated[
-        list[str] | None,
-        typer.Option(metavar="PATTERN,...", help="Only vectors of such clauses of the spec: 'HDR-*'. May repeat."),
+    level: Annotated[str | None, typer.Option(metavar="LEVEL", help="Up to this, or some: 1,3. Default: 3.")] = None,
+    filters: Annotated[
+        list[str] | None, typer.Option("--filter", metavar="PATTERN", help="Names 'invalid/*', clauses 'HDR-*'.")
     ] = None,
     by: Annotated[
-        str, typer.Option("--class", metavar="CLASS", help="exact, or renderer: floats in single precision (spec 9.2).")
+        str, typer.Option("--class", metavar="CLASS", show_default=False, help="exact or renderer. Default: exact.")
     ] = EXACT,
-    exact: Annotated[
-        bool, typer.Option("--exact", help="Of refusals demand code, clause and offset too: for our decoders.")
-    ] = False,
+    jobs: _Jobs = None,
+    timeout: _Timeout = None,
+    junit: _Junit = None,
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
-    """Run a decoder over the vectors: csplat's own, or the one that --cmd starts.
+    """Test a decoder with the test vectors.
 
-    L1: header and refusals. L2: integers. L3: floats, bit for bit, or near
-    enough for --class renderer. L4: images of a renderer. Another decoder
-    writes what it decodes into {outdir}, or exits with status 1 and the error
-    code in a line of JSON: conformance/IMPLEMENTERS.md says how.
+    L1: header and errors. L2: integers. L3: floats, bit for bit, or within
+    the tolerance of --class renderer (spec 9.2). L4: images of --render-cmd.
+    Without a command, csplat's own decoder is tested. Otherwise a decoder
+    writes its results to {outdir}, or exits with status 1 and a line of JSON
+    with the error code: conformance/IMPLEMENTERS.md explains how.
 
     Examples:
       csplat conformance decoder --filter 'invalid/*'
-      csplat conformance decoder --cmd 'dec {input} {outdir}' --clause 'HDR-*'
-      csplat conformance decoder --filter 'valid/sh*,valid/absent_*' --level 2
+      csplat conformance decoder --cmd 'dec {input} {outdir}' --filter 'HDR-*'
       csplat conformance decoder --cmd 'dec {input} {outdir}' --junit all.xml
       csplat conformance decoder --render-cmd 'draw {input} {camera} {out}'
     """
-    run.check(out)
+    out = Output(force, report, as_json, quiet)
+    _check_reports(out, junit)
+    patterns = [one.strip() for text in filters or () for one in text.split(",")]
+    clauses = [one for one in patterns if _CLAUSE.fullmatch(one)]
+    names = [one for one in patterns if one not in clauses]
+    # A renderer alone is tested at L4 alone.
+    levels = checked(parse_levels, level or ("3" if render_program is None else "4"))
+    options = checked(
+        DecoderSuiteOptions, _joined(names), _joined(clauses), levels, timeout=_seconds(timeout, TIMEOUT_SECONDS), jobs=jobs,
+        by=by,
+    )  # fmt: skip
     with out.bar() as bar:
-        # A renderer alone is tested at L4 alone.
-        levels = chosen(parse_levels, text=level or ("3" if render_program is None else "4"))
-        timeout = run.timeout or TIMEOUT_SECONDS
-        choice = DecoderSuiteOptions(run.pattern, _joined(clause), levels, exact, timeout, run.jobs, by)
         if program is None and render_program is None:
-            report = run_builtin(choice, _moved(bar))
+            result = run_builtin(options, _moved(bar))
         else:
-            report = run_command(program, choice, render=render_program, progress=_moved(bar))
-    run.publish(report, out, "no vector is chosen")
+            result = run_command(program, options, render=render_program, progress=_moved(bar))
+    _publish(result, out, junit, "no vector is chosen")
 
 
 @conformance.command()
-@command(one_of=[("folder", name) for name in _OF_A_RUN])
 def encoder(
-    run: RunOptions,
-    out: OutputOptions,
     program: Annotated[
-        str | None,
-        typer.Option("--cmd", metavar="COMMAND", help="Another encoder, with {ply}, {out}, and perhaps {index}."),
+        str | None, typer.Option("--cmd", metavar="COMMAND", help="Encoder: {ply} {out}, maybe {index}.")
     ] = None,
-    level: Annotated[str, typer.Option(metavar="LEVEL", help="1 to 4: all up to this one; or some, as 1,3.")] = "4",
+    level: Annotated[str | None, typer.Option(metavar="LEVEL", help="Up to this, or some: 1,3. Default: 4.")] = None,
     min_psnr: Annotated[
-        float,
-        typer.Option(
-            metavar="DB",
-            help="Least PSNR of renders at L4, dB; choose it by your preset.",
-        ),
-    ] = PSNR_MIN,
-    keep: Annotated[
-        str | None, typer.Option(metavar="FOLDER", help="Keep the inputs and what was made of them there.")
+        float | None, typer.Option(metavar="DB", help=f"Least PSNR at L4. Default: {PSNR_MIN:g}.")
     ] = None,
+    filters: Annotated[
+        list[str] | None, typer.Option("--filter", metavar="PATTERN", help="Names of inputs: 'ordinary/*'.")
+    ] = None,
+    jobs: _Jobs = None,
+    timeout: _Timeout = None,
+    junit: _Junit = None,
+    keep: Annotated[str | None, typer.Option(metavar="FOLDER", help="Keep inputs and results there.")] = None,
     folder: Annotated[
-        str | None,
-        typer.Option(
-            "--write-inputs", metavar="FOLDER", help="Write the inputs and a list of them there; run nothing."
-        ),
+        str | None, typer.Option("--write-inputs", metavar="FOLDER", help="Write the inputs, run nothing.")
     ] = None,
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
-    """Run an encoder over reference PLYs: csplat's own, or the one that --cmd starts.
+    """Test an encoder with reference scenes.
 
-    L1: it ends as it should, the file breaks no clause, and a second run gives
-    the same bytes. L2: every splat of the source is there once, or counted as
-    left out. L3: the stated errors hold. L4: renders keep --min-psnr; requires
-    the packages of the render extra; also checked if L3 proves nothing.
-    An encoder exits with 0 and a file, or with 1, a line that says why, and
-    no file; ordinary inputs it must take. The line is the last one on standard
-    error or, where nothing is there, on standard output. It starts in an empty
-    folder; words of the command that name files here still do.
-    {index}: a .npy of integers, which splat of the source each splat is.
+    L1: the status is as expected, the file breaks no clause, and a second run
+    gives the same bytes. L2: every splat is there once, or counted as left
+    out. L3: the declared errors hold. L4: renders reach --min-psnr (requires
+    the render extra; also checked if L3 verifies nothing). Without --cmd,
+    csplat's own encoder is tested. Otherwise it starts in an empty folder, and
+    exits with status 0 and a file, or with 1 and a reason as the last line of
+    standard error or output. {index}: a .npy file, the source splat of each
+    splat.
 
     Examples:
       csplat conformance encoder --cmd 'my-encoder {ply} {out}'
@@ -203,21 +165,67 @@ def encoder(
       csplat conformance encoder --cmd 'enc {ply} {out} {index}' --keep tried
       csplat conformance encoder --write-inputs inputs
     """
-    run.check(out)
+    out = Output(force, report, as_json, quiet)
+    refuse_together(
+        {"--write-inputs": folder},
+        {
+            "--cmd": program, "--level": level, "--min-psnr": min_psnr, "--keep": keep, "--timeout": timeout,
+            "--jobs": jobs, "--junit": junit,
+        },
+    )  # fmt: skip
+    _check_reports(out, junit)
     if folder is not None:
-        made = write_inputs(_checked_folder(folder, force=out.force), run.pattern)
+        made = write_inputs(_checked_folder(folder, force=out.force), _joined(filters))
         out.publish(made, f"{counted(len(made['inputs']), 'input')} in {folder}")
         return
-    levels = tuple(f"L{number}" for number in chosen(parse_levels, text=level))
+    levels = tuple(f"L{number}" for number in checked(parse_levels, level or "4"))
     kept = _checked_folder(keep, force=out.force) if keep is not None else None
     render_score, reason = _render_scorer(levels, quiet=out.quiet)
-    choice = EncoderSuiteOptions(run.pattern, levels, run.timeout or ENCODER_SECONDS, min_psnr, run.jobs, kept)
+    least = PSNR_MIN if min_psnr is None else min_psnr
+    options = EncoderSuiteOptions(_joined(filters), levels, _seconds(timeout, ENCODER_SECONDS), least, jobs, kept)
     ours = f"{shlex.quote(sys.executable)} {_OURS}"
     with out.bar() as bar:
-        report = run_encoder(
-            program or ours, choice, render_score=render_score, no_render_reason=reason, progress=_moved(bar)
+        result = run_encoder(
+            program or ours, options, render_score=render_score, no_render_reason=reason, progress=_moved(bar)
         )
-    run.publish(report, out, "no input is chosen")
+    _publish(result, out, junit, "no input is chosen")
+
+
+def _check_reports(out: Output, junit: str | None) -> None:
+    """Refuse unusable paths of reports before anything is run; XML may go to a terminal."""
+    to_stdout = junit == STANDARD_STREAM
+    if to_stdout and out.as_json:
+        raise typer.BadParameter("--json and --junit - both use standard output")
+    out.check(None if to_stdout else junit)
+
+
+def _publish(report: ConformanceReport, out: Output, junit: str | None, nothing: str) -> None:
+    """Publish the report, and exit with status 1 if it did not pass.
+
+    Args:
+        report: the report of the run.
+        out: the options that tell where results go.
+        junit: file for JUnit XML, or `-`; `None`: none.
+        nothing: message if nothing was checked.
+
+    Raises:
+        typer.Exit: a check failed, or there was none.
+    """
+    if junit == STANDARD_STREAM:
+        print_data(to_junit(report).rstrip("\n"))
+    elif junit is not None:
+        write_bytes(junit, to_junit(report).encode())
+    out.publish(to_json(report), "" if junit == STANDARD_STREAM else to_table(report))
+    if not report.outcomes:
+        note(f"error: {nothing}")
+    if not report.passed:
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _seconds(timeout: float | None, default: float) -> float:
+    if timeout is not None and not timeout > 0.0:
+        raise typer.BadParameter(f"--timeout is {timeout:g}, expected seconds, above 0")
+    return default if timeout is None else timeout
 
 
 def _joined(patterns: Sequence[str] | None) -> str | None:
@@ -231,7 +239,7 @@ def _moved(bar: Progress | None) -> Callable[[int, int], None] | None:
 def _checked_folder(name: str, *, force: bool) -> Path:
     folder = Path(name)
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"{name} is a file, wanted a folder")
+        raise InputError(f"{name} is a file, expected a folder")
     if folder.is_dir() and any(folder.iterdir()) and not force:
         raise InputError(f"{name} is not empty: --force replaces what is in the way")
     return folder

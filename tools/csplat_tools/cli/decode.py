@@ -6,39 +6,55 @@ from typing import Annotated
 
 import typer
 
-from csplat_tools.cli.command import OutputOptions, command
-from csplat_tools.cli.shared_options import OrientationOptions, ShDegree
+from csplat_tools.cli.command_output import Output, default_output
+from csplat_tools.cli.shared_options import (
+    Force,
+    HelpAll,
+    Json,
+    MaxSplats,
+    Quiet,
+    Report,
+    ShDegree,
+    Up,
+    parse_overrides,
+    parse_sh_degree,
+)
 from csplat_tools.convert_file import decode_file
 from csplat_tools.file_streams import check_name
 
 
-@command(beside=".ply")
 def decode(
     source: Annotated[str, typer.Argument(metavar="IN.csplat", help="A .csplat file, or - for standard input.")],
-    output: Annotated[str, typer.Argument(metavar="OUT.ply", help="The file to write, or -; IN.ply by default.")],
-    upright: OrientationOptions,
-    out: OutputOptions,
+    output: Annotated[
+        str | None, typer.Argument(metavar="OUT.ply", help="The file to write, or -. Default: IN.ply.")
+    ] = None,
+    up: Up = None,
     sh_degree: ShDegree = None,
-    absolute: Annotated[
-        bool, typer.Option("--absolute", help="Add the origin to the positions and write them as doubles.")
-    ] = False,
-    max_splats: Annotated[int | None, typer.Option(metavar="N", min=1, help="Refuse a scene of more splats.")] = None,
+    absolute: Annotated[bool, typer.Option("--absolute", help="Add the origin to positions, as doubles.")] = False,
+    max_splats: MaxSplats = None,
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
-    """Turn a .csplat file into a PLY that every 3DGS viewer opens.
+    """Turn a .csplat file into a PLY for any 3DGS viewer.
 
-    All checks of the format are made: a damaged file gives no PLY. Goes
-    tile by tile: a scene need not fit the memory.
+    A damaged file gives no PLY. Tiles are decoded one after another: a
+    scene need not fit in memory.
 
     Examples:
       csplat decode scene.csplat scene.ply
       csplat decode scene.csplat small.ply --sh-degree 0
       csplat decode scene.csplat - | gzip > scene.ply.gz
     """
+    out, output = Output(force, report, as_json, quiet), default_output(output, source, ".ply")
+    overrides, sh_degree = parse_overrides(up), parse_sh_degree(sh_degree)
     out.check(output, inputs=(source,))
     check_name(output, ".ply", "decode", source)
     with out.bar() as progress:
         count, degree = decode_file(
-            source, output, sh_degree=sh_degree, absolute=absolute, max_splats=max_splats,
-            overrides=upright.overrides(), progress=progress,
+            source, output, sh_degree=sh_degree, absolute=absolute, max_splats=max_splats, overrides=overrides,
+            progress=progress,
         )  # fmt: skip
     out.publish({"splats": count, "sh_degree": degree})

@@ -2,32 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from csplat._spec import MEASURE_NAMES
 from csplat.encoder import EncodeOptions
-from csplat.errors import InputError, counted
+from csplat.errors import counted
+from csplat.formats import assume_format
 from csplat.model import SplatModel
 from csplat.types import Progress
 from csplat_render.up_estimate import estimate_up
-from csplat_tools.cli.command import LibrarySettings, OptionGroup, OutputOptions, command
+from csplat_tools.cli.command_output import Output, default_output
 from csplat_tools.cli.shared_options import (
-    EFFORT,
-    ENCODER_SETTINGS,
-    EncodingOptions,
-    Importance,
-    SourceIndex,
-    SourceOptions,
+    Data,
+    Force,
+    HelpAll,
+    HiddenBackground,
+    HiddenCameras,
+    HiddenDask,
+    HiddenDryRun,
+    HiddenEffort,
+    HiddenKeep,
+    HiddenKeepExtra,
+    HiddenMemory,
+    Json,
+    MaxPsnrDrop,
+    Preset,
+    Quiet,
+    ReadAs,
+    Report,
+    ShDegree,
+    SourceIndexOutput,
+    TargetPsnr,
+    TargetSize,
+    Up,
     ViewOptions,
-    VirtualViewOptions,
+    check_range,
+    checked,
     parse_bytes,
     parse_decibels,
+    parse_overrides,
+    refuse_together,
+    require_one,
+    take_estimated_up,
 )
 from csplat_tools.console import format_bytes, format_estimate, format_table, note
 from csplat_tools.encode_file import (
@@ -45,58 +66,38 @@ from csplat_tools.optional_packages import prepare_renderer, require_renderer
 if TYPE_CHECKING:
     from csplat_tools.optimise.targets import Target
 
-
-_TARGET = "Targets (one of the first four, which require the render extra)"
-_ROOM = "Large scenes"
-_RENDERED = ("target_psnr", "target_size", "max_psnr_drop", "keep")
-_WHOLE = (*_RENDERED, "max_error", "importance", "source_index")  # options that need the scene in memory
+#: Parameters that require the whole scene in memory.
+IN_MEMORY = ("target_psnr", "target_size", "max_psnr_drop", "keep", "max_error", "importance", "source_index")
 
 
 @dataclass(frozen=True)
-class TargetOptions(OptionGroup):
-    """Options of the target that the file is to meet."""
+class _TargetSearch:
+    """The target of the file, and how it is searched.
 
-    one_of: ClassVar[Sequence[tuple[str, ...]]] = (_RENDERED, ("keep", "no_prune"), ("effort", "no_prune"))
-    needs: ClassVar[Mapping[str, tuple[str, ...]]] = {
-        "max_psnr_drop": ("data",),
-        "no_prune": ("target_psnr", "target_size", "max_psnr_drop", "max_error"),
-    }
+    Attributes:
+        psnr, size, max_psnr_drop, keep, max_error: values of the options.
+        no_prune: keep all splats unchanged.
+        effort: amount of work; `None`: the default.
+        views: training, validation and test views.
+        importance: importance of each splat, a file.
+    """
 
-    target_psnr: Annotated[
-        str | None,
-        typer.Option(metavar="DB", rich_help_panel=_TARGET, help="Least PSNR against source renders."),
-    ] = None
-    target_size: Annotated[
-        str | None,
-        typer.Option(metavar="5MB", rich_help_panel=_TARGET, help="Largest size of the file."),
-    ] = None
-    max_psnr_drop: Annotated[
-        str | None,
-        typer.Option(metavar="DB", rich_help_panel=_TARGET, help="Largest PSNR drop, against --data."),
-    ] = None
-    keep: Annotated[
-        float | None,
-        typer.Option(metavar="SHARE", rich_help_panel=_TARGET, help="Share of splats to keep, refitted."),
-    ] = None
-    max_error: Annotated[
-        str | None,
-        typer.Option(
-            metavar="means=0.001,...",
-            rich_help_panel=_TARGET,
-            help="Largest error, by measure.",
-        ),
-    ] = None
-    no_prune: Annotated[
-        bool, typer.Option("--no-prune", rich_help_panel=_TARGET, help="Prune and refit no splat: faster.")
-    ] = False
-    effort: Annotated[int, typer.Option(rich_help_panel=_TARGET, **EFFORT)] = 3
+    psnr: float | None
+    size: str | None
+    max_psnr_drop: float | None
+    keep: float | None
+    max_error: str | None
+    no_prune: bool
+    effort: int | None
+    views: ViewOptions
+    importance: str | None
 
     @property
     def is_rendered(self) -> bool:
         """True if meeting the target requires rendering."""
-        return any(getattr(self, name) is not None for name in _RENDERED)
+        return (self.psnr, self.size, self.max_psnr_drop, self.keep) != (None, None, None, None)
 
-    def read(self, unit_metres: float | None) -> Target | None:
+    def target(self, unit_metres: float | None) -> Target | None:
         """Return the target; `None` if no option specifies one.
 
         Args:
@@ -109,186 +110,148 @@ class TargetOptions(OptionGroup):
             return None
         from csplat_tools.optimise.targets import Target, parse_max_error  # imports names of the renderer
 
-        size = parse_bytes(self.target_size)
-        loss = None if self.max_psnr_drop is None else parse_decibels(self.max_psnr_drop)
         bounds = {} if self.max_error is None else parse_max_error(self.max_error, unit_metres)
-        psnr = None if self.target_psnr is None else parse_decibels(self.target_psnr)
-        return Target(psnr, size, loss, self.keep, bounds)
+        return Target(self.psnr, parse_bytes(self.size), self.max_psnr_drop, self.keep, bounds)
 
 
-@dataclass(frozen=True)
-class LargeSceneOptions(OptionGroup):
-    """Options for encoding scenes larger than memory."""
-
-    memory: Annotated[
-        str | None,
-        typer.Option(
-            metavar="2GB",
-            rich_help_panel=_ROOM,
-            hidden=True,
-            help="Memory of all processes. Default: half of what is free.",
-        ),
-    ] = None
-    work: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FOLDER", rich_help_panel=_ROOM, hidden=True, help="Working folder on the disk. Default: OUT.work."
-        ),
-    ] = None
-    resume: Annotated[
-        bool, typer.Option("--resume", rich_help_panel=_ROOM, hidden=True, help="Continue an interrupted encoding.")
-    ] = False
-    dask: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            rich_help_panel=_ROOM,
-            hidden=True,
-            help="Use the workers of a Dask cluster, which have the --work folder under the same name.",
-        ),
-    ] = None
-    dry_run: Annotated[
-        bool,
-        typer.Option(
-            "--dry-run", rich_help_panel=_ROOM, hidden=True, help="Estimate memory, disk and time, and encode nothing."
-        ),
-    ] = False
-
-    def read(self) -> OutOfCoreOptions:
-        """Return the options as the library takes them.
-
-        Raises:
-            InputError: --memory is not a size.
-        """
-        return OutOfCoreOptions(parse_bytes(self.memory), self.work, self.resume, self.dask)
-
-
-@command(
-    beside=".csplat",
-    reads=True,
-    one_of=(
-        ("prune_unseen", *_RENDERED),
-        ("prune_unseen", "max_error"),
-        ("attribute_psnr", "target_psnr", "target_size", "max_psnr_drop"),
-        ("keep", "importance"),
-        *((name, other) for name in ("memory", "work", "resume", "dask", "dry_run") for other in _WHOLE),
-    ),
-    needs={
-        "prune_unseen": ("importance",),
-        "effort": _RENDERED,
-        "cameras": _RENDERED,
-        "data": _RENDERED,
-        "views": _RENDERED,
-        "view_size": _RENDERED,
-        "background": ("cameras", "data"),
-    },
-    settings=(ENCODER_SETTINGS,),
-)
 def encode(
-    source: Annotated[str, typer.Argument(metavar="IN.ply", help="A PLY, other `csplat formats`, or -.")],
-    output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="The file to write, or -; else IN.csplat.")],
-    encoding: EncodingOptions,
-    goal: TargetOptions,
-    source_options: SourceOptions,
-    views: ViewOptions,
-    virtual: VirtualViewOptions,
-    room: LargeSceneOptions,
-    out: OutputOptions,
-    settings: LibrarySettings,
-    importance: Importance = None,
-    prune_unseen: Annotated[
-        bool, typer.Option("--prune-unseen", hidden=True, help="Prune splats that no view of --importance saw.")
-    ] = False,
-    source_index: SourceIndex = None,
+    source: Annotated[str, typer.Argument(metavar="IN.ply", help="A PLY, another of `csplat formats`, or -.")],
+    output: Annotated[
+        str | None, typer.Argument(metavar="OUT.csplat", help="The file to write, or -. Default: IN.csplat.")
+    ] = None,
+    preset: Preset = "balanced",
+    sh_degree: ShDegree = None,
+    target_psnr: TargetPsnr = None,
+    target_size: TargetSize = None,
+    max_psnr_drop: MaxPsnrDrop = None,
+    max_error: Annotated[str | None, typer.Option(metavar="NAME=MAX", help="Largest errors. Default: none.")] = None,
+    no_prune: Annotated[bool, typer.Option("--no-prune", help="Targets keep all splats unchanged.")] = False,
+    data: Data = None,
+    up: Up = None,
+    attribute_psnr: Annotated[
+        float | None, typer.Option(metavar="DB", hidden=True, help="PSNR of each attribute. Default: by preset.")
+    ] = None,
+    keep: HiddenKeep = None,
+    effort: HiddenEffort = None,
+    cameras: HiddenCameras = None,
+    background: HiddenBackground = None,
+    importance: Annotated[
+        str | None, typer.Option(metavar="FILE", hidden=True, help="File of `csplat sensitivity`, or .npy weights.")
+    ] = None,
+    source_index: SourceIndexOutput = None,
+    memory: HiddenMemory = None,
+    resume: Annotated[bool, typer.Option("--resume", hidden=True, help="Go on from OUT.csplat.work.")] = False,
+    dask: HiddenDask = None,
+    dry_run: HiddenDryRun = False,
+    keep_extra: HiddenKeepExtra = False,
+    unit_metres: Annotated[
+        float | None, typer.Option(metavar="METRES", hidden=True, help="Length of a scene unit. Default: unknown.")
+    ] = None,
+    antialiased: Annotated[
+        bool | None,
+        typer.Option("--antialiased/--no-antialiased", hidden=True, help="Trained with mip-splatting."),
+    ] = None,
+    licence: Annotated[
+        str | None, typer.Option(metavar="TEXT", hidden=True, help="Licence of the scene. Default: none.")
+    ] = None,
+    threads: Annotated[
+        int | None, typer.Option(metavar="N", min=1, hidden=True, help="Threads. Default: one per core.")
+    ] = None,
+    read_as: ReadAs = None,
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
     """Compress a trained 3DGS scene.
 
-    Repairs what is safe to repair, and declares how far the file's splats are
-    from the source. A target chooses all options, and the splats to prune.
-
-    --preset, of 60,000 splats of SH degree 3, 14.9 MB, on one core:
-      fast      719 kB, 42.9 dB, 0.4 s: for previews and experiments
-      balanced  645 kB, 42.7 dB, 4 s: for archives and publication
-      small     529 kB, 38.6 dB, 4 s: if bytes matter more than precision
+    The file declares its largest errors. Targets (--target-psnr,
+    --target-size, --max-psnr-drop, --keep) choose precision and prune
+    splats; all but --max-error require the render extra. --data and
+    --cameras are the views by which a target is measured.
 
     Examples:
       csplat encode scene.ply scene.csplat
       csplat encode scene.ply scene.csplat --preset small --sh-degree 2
       csplat encode scene.ply scene.csplat --target-psnr 40
       csplat encode scene.ply scene.csplat --target-size 5MB --no-prune
-    ---
-    Splats are fitted to training views, files are compared by validation views,
-    and the result is scored by test views, which also decide if it reaches
-    --target-psnr. --preset fast and --max-error keep all splats as they are, as
-    --no-prune does. --max-error bounds means, covariance (relative), opacities,
-    sh0, sh1, sh2, sh3; a length may have a unit, such as mm, if the scene's is
-    known.
-
-    A scene that does not fit the memory is sorted into buckets on the disk, in
-    OUT.csplat.work, and coded by --threads processes. The bytes are the same.
-    --resume continues after an interrupt.
-
-    More examples:
-      csplat encode scene.ply scene.csplat --keep 0.5
-      csplat encode scene.ply scene.csplat --max-psnr-drop 0.3dB --data photographs
-      csplat encode scene.ply scene.csplat --max-error means=0.001,sh0=0.02
-      csplat encode scene.ply scene.csplat --set position-bits=12,sh-coding=scalar
-      csplat sensitivity scene.ply scene.npz --data photographs
-      csplat encode scene.ply scene.csplat --importance scene.npz
-      csplat encode scene.ply scene.csplat --source-index scene.npy
-      csplat verify scene.csplat --source scene.ply --source-index scene.npy
-      csplat encode city.ply city.csplat --memory 4GB
-      csplat encode city.ply city.csplat --memory 4GB --dry-run
-      gunzip -c scene.ply.gz | csplat encode - - | wc -c
     """
-    options = encoding.options(source_options, settings)
-    if (options.max_classes or 1) > 1:
-        if options.shape_codebook_size:
-            raise typer.BadParameter("--max-classes with a codebook of shapes: its entries have one precision")
-        if not goal.is_rendered and importance is None:
-            raise typer.BadParameter("--max-classes requires a target or --importance: views sort the splats")
-    try:  # errors of the target that do not depend on the scene
-        goal.read(1.0)
-    except InputError as error:
-        raise typer.BadParameter(str(error)) from None
-    scale = room.read()
-    if room.dry_run:
-        _say_expected(source, options, scale, out)
-        return
-    out.check(output, inputs=(source, importance, *views.inputs), named={"--source-index": source_index})
-    check_name(output, ".csplat", "encode", source)
-    if goal.is_rendered:
-        require_renderer()
-    reaching: EncodeFunction = partial(_reach, goal, views, virtual, importance, out)
-    with out.bar() as progress:
+    out, output = Output(force, report, as_json, quiet), default_output(output, source, ".csplat")
+    views = ViewOptions(cameras, data, background)
+    precision = {"--target-psnr": target_psnr, "--target-size": target_size, "--max-psnr-drop": max_psnr_drop}
+    rendered = {**precision, "--keep": keep}
+    targets = {**rendered, "--max-error": max_error}
+    whole = {**targets, "--importance": importance, "--source-index": source_index}
+    out_of_core = {"--memory": memory, "--resume": resume, "--dask": dask, "--dry-run": dry_run}
+    refuse_together(rendered)
+    refuse_together({"--attribute-psnr": attribute_psnr}, precision)
+    refuse_together({"--keep": keep}, {"--no-prune": no_prune, "--importance": importance})
+    refuse_together({"--effort": effort}, {"--no-prune": no_prune})
+    refuse_together(out_of_core, whole)
+    require_one({"--max-psnr-drop": max_psnr_drop}, {"--data": data})
+    require_one({"--no-prune": no_prune}, {**precision, "--max-error": max_error})
+    require_one({"--effort": effort, "--cameras": cameras, "--data": data}, rendered)
+    require_one({"--background": background}, {"--cameras": cameras, "--data": data})
+    check_range("--effort", effort, 1, 9)
+    options = checked(
+        EncodeOptions, preset=preset, sh_degree=sh_degree, attribute_psnr=attribute_psnr, keep_extra=keep_extra,
+        threads=threads,
+    )  # fmt: skip
+    search = _TargetSearch(
+        parse_decibels(target_psnr, "--target-psnr"), target_size, parse_decibels(max_psnr_drop, "--max-psnr-drop"),
+        keep, max_error, no_prune, effort, views, importance,
+    )  # fmt: skip
+    checked(search.target, 1.0)  # errors of the target that do not depend on the scene
+    overrides = parse_overrides(up, unit_metres=unit_metres, antialiased=antialiased, licence=licence)
+    scale = OutOfCoreOptions(checked(parse_bytes, memory), resume=resume, cluster=dask)
+    with out.bar() as progress, assume_format(read_as):
+        if dry_run:
+            _publish_estimate(source, options, scale, out)
+            return
+        out.check(output, inputs=(source, importance, *views.inputs), named={"--source-index": source_index})
+        check_name(output, ".csplat", "encode", source)
+        if search.is_rendered:
+            require_renderer()
+        reaching: EncodeFunction = partial(_encode_to_target, search, out)
         encoded = encode_file(
-            source, output, options, overrides=source_options.read(), strict=source_options.strict,
-            importance=importance, prune_unseen=prune_unseen, source_index=source_index, scale=scale,
-            encoder=reaching if goal.is_rendered or goal.max_error is not None else None, progress=progress,
+            source, output, options, overrides=overrides, importance=importance, source_index=source_index,
+            encoder=reaching if search.is_rendered or max_error is not None else None, scale=scale, progress=progress,
         )  # fmt: skip
+        _publish(encoded, source, output, threads, out, up=up, progress=progress)
+
+
+def _publish(
+    encoded: EncodedFile,
+    source: str,
+    output: str,
+    threads: int | None,
+    out: Output,
+    *,
+    up: str | None,
+    progress: Progress | None,
+) -> None:
+    """Publish the result, with an estimate of its PSNR if that is quick."""
     out.print_findings(encoded.findings)
     for line in encoded.report.notes:
         note(line)
-    out.remark(*(() if encoded.outcome is None else encoded.outcome.lines), *_stated(encoded))
-    with out.bar() as progress:
-        if progress is not None:
-            progress("eight small renders", 0.0)
-        psnr = None if out.quiet else _psnr(encoded, encoding.threads)
+    out.remark(*(() if encoded.outcome is None else encoded.outcome.lines), *_declared_errors(encoded))
+    if progress is not None:
+        progress("eight small renders", 0.0)
+    psnr = None if out.quiet else _psnr(encoded, threads)
     about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(ESTIMATE_SIZE)}
     if not out.quiet and encoded.outcome is not None and len(encoded.source) <= ESTIMATE_SPLATS_MAX:
-        source_options.take_estimated_up(estimate_up(encoded.source), out, shown=False)
+        take_estimated_up(estimate_up(encoded.source), out, given=up, shown=False)
     out.remark(_summary(encoded, psnr, source, output))
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
 
 
-def _say_expected(source: str, options: EncodeOptions, scale: OutOfCoreOptions, out: OutputOptions) -> None:
+def _publish_estimate(source: str, options: EncodeOptions, scale: OutOfCoreOptions, out: Output) -> None:
     """Report memory, disk space and time that an encoding would take."""
-    with source_path(source) as local, out.bar() as progress:
-        if progress is not None:
-            progress("opening", 0.0)
+    with source_path(source) as local:
         found = estimate_cost(local, options, scale)
     needs = found.needs
-    where = "in memory" if needs.in_memory else f"by way of the disk, {counted(needs.workers, 'process', 'processes')}"
+    where = "in memory" if needs.in_memory else f"on the disk, {counted(needs.workers, 'process', 'processes')}"
     text = (
         f"{counted(found.count, 'splat')} of SH degree {found.sh_degree}, {where}: about"
         f" {format_estimate(found.seconds)}, {format_bytes(needs.memory_bytes)} of memory,"
@@ -297,49 +260,41 @@ def _say_expected(source: str, options: EncodeOptions, scale: OutOfCoreOptions, 
     out.publish(found.as_json(), text)
 
 
-def _reach(
-    goal: TargetOptions,
-    views: ViewOptions,
-    virtual: VirtualViewOptions,
-    importance: str | None,
-    out: OutputOptions,
-    model: SplatModel,
-    encoding: EncodeOptions,
-    progress: Progress | None,
+def _encode_to_target(
+    search: _TargetSearch, out: Output, model: SplatModel, encoding: EncodeOptions, progress: Progress | None
 ) -> EncoderOutcome:
     """Encode a scene to the target; called by `encode_file` with the last three arguments."""
     import csplat_tools
     from csplat_tools.importance_file import read_encoder_importance
 
-    target, around = goal.read(model.unit_metres), None
+    target, around, simplifying = search.target(model.unit_metres), None, None
     assert target is not None
-    weights = None if importance is None else read_encoder_importance(importance, model)
-    simplifying = None
+    weights = None if search.importance is None else read_encoder_importance(search.importance, model)
     if target.is_rendered:
         prepare_renderer(quiet=out.quiet, simplify=True)
         from csplat_tools.optimise.pruning_order import SimplifyOptions
         from csplat_tools.optimise.target_search import expected_seconds
 
-        given = virtual.given()
-        simplifying = SimplifyOptions(effort=goal.effort, view_size=given.get("size"))
-        around = views.find(model, out, **given)
+        simplifying = SimplifyOptions() if search.effort is None else SimplifyOptions(effort=search.effort)
+        around = search.views.find(model, out)
         if len(model) and around.test:
-            may_prune = not goal.no_prune and goal.keep is None
+            may_prune = not search.no_prune and search.keep is None
             out.announce_time(
                 partial(
-                    expected_seconds, model, encoding, target, around, no_prune=goal.no_prune, simplifying=simplifying
+                    expected_seconds, model, encoding, target, around, no_prune=search.no_prune,
+                    simplifying=simplifying,
                 ),
                 "--no-prune takes a sixth of that, a preset seconds" if may_prune else "a preset takes seconds",
-            )
+            )  # fmt: skip
     made = csplat_tools.encode_to(
         model, psnr=target.psnr, size=target.size_bytes, max_psnr_drop=target.max_psnr_drop, keep=target.keep,
-        errors=target.max_error, views=around, options=encoding, no_prune=goal.no_prune, importance=weights,
+        errors=target.max_error, views=around, options=encoding, no_prune=search.no_prune, importance=weights,
         simplifying=simplifying, progress=progress,
     )  # fmt: skip
     return EncoderOutcome(made.result, "target", made.report.as_json(), made.report.lines())
 
 
-def _stated(encoded: EncodedFile) -> list[str]:
+def _declared_errors(encoded: EncodedFile) -> list[str]:
     errors = encoded.report.errors
     names = sorted(errors, key=list(MEASURE_NAMES.values()).index)
     rows = [(name, *(f"{value:.4g}" for value in errors[name])) for name in names]
@@ -367,5 +322,5 @@ def _summary(encoded: EncodedFile, psnr: float | None, source: str, output: str)
     elif found is not None:
         quality = f", PSNR {found:.2f} dB"
     elif encoded.outcome is not None and len(encoded.source) and "-" not in (source, output):
-        quality = f"; `csplat compare {source} {output}` says how it looks"
+        quality = f"; `csplat compare {source} {output}` shows how it looks"
     return f"{splats}: {sizes}, {ratio:.1f} times smaller{quality}"

@@ -11,7 +11,8 @@ import typer
 
 from csplat.decoder import DeclaredBounds
 from csplat.errors import InputError, counted
-from csplat_tools.cli.command import OutputOptions, command
+from csplat_tools.cli.command_output import Output
+from csplat_tools.cli.shared_options import Force, HelpAll, Json, Quiet, Report, require_one
 from csplat_tools.console import format_table
 from csplat_tools.file_streams import STANDARD_STREAM, is_csplat, mapped_csplat
 from csplat_tools.inspect.file_description import (
@@ -29,48 +30,47 @@ from csplat_tools.inspect.file_description import (
 from csplat_tools.optional_packages import prepare_renderer, require_images
 
 
-@command(reads=True, needs={"beside": ("page",)})
 def info(
-    source: Annotated[str, typer.Argument(metavar="SCENE", help="A .csplat file; or any other of `csplat formats`.")],
-    out: OutputOptions,
+    source: Annotated[str, typer.Argument(metavar="SCENE", help="A .csplat file, or another of `csplat formats`.")],
     page: Annotated[str | None, typer.Option(metavar="FILE.html", help="Write an HTML report.")] = None,
-    beside: Annotated[
-        str | None,
-        typer.Option(
-            "--source",
-            metavar="SCENE",
-            help="The source: the report shows where they differ. Requires the render extra.",
-        ),
+    original: Annotated[
+        str | None, typer.Option("--source", metavar="SCENE", help="Scene to compare with, in the report.")
     ] = None,
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
     """Describe a file: scene, sizes, options, declared errors.
 
-    Reads the header, the index and the heads of the blocks: a large file
-    takes hardly longer than a small one. Nothing is decoded: `csplat verify`
-    checks if the file is intact. --page writes the same as one HTML page with
-    explanations, which opens from a disk.
+    Nothing is decoded: a large file takes hardly longer than a small one,
+    and `csplat verify` checks if the file is intact. --source requires the
+    render extra.
 
     Examples:
       csplat info scene.csplat
       csplat info scene.csplat --json | jq .attributes.means.bits_per_splat
       csplat info scene.csplat --page scene.html --source scene.ply
     """
-    out.check(inputs=(source, beside), named={"--page": page})
-    if beside is not None:
-        prepare_renderer(quiet=out.quiet, ssim=True)
-        require_images()
-    if source != STANDARD_STREAM and not is_csplat(Path(source)):
-        if page is not None:
-            raise InputError(f"{source} is no .csplat file, of which --page tells: `csplat encode` makes one")
-        out.publish(*describe_other_format(source))
-        return
-    with mapped_csplat(source) as data:
-        description = describe_file(data)
-        if page is not None:
-            from csplat_tools.inspect.file_report import write_page
+    out = Output(force, report, as_json, quiet)
+    require_one({"--source": original}, {"--page": page})
+    out.check(inputs=(source, original), named={"--page": page})
+    with out.bar() as progress:
+        if original is not None:
+            prepare_renderer(quiet=out.quiet, ssim=True)
+            require_images()
+        if source != STANDARD_STREAM and not is_csplat(Path(source)):
+            if page is not None:
+                raise InputError(f"{source} is no .csplat file, which --page describes: `csplat encode` makes one")
+            out.publish(*describe_other_format(source))
+            return
+        with mapped_csplat(source) as data:
+            description = describe_file(data)
+            if page is not None:
+                from csplat_tools.inspect.file_report import write_page
 
-            with out.bar() as progress:
-                write_page(page, source, data, description, beside, progress=progress)
+                write_page(page, source, data, description, original, progress=progress)
     out.publish(description.as_json(), _format(description))
 
 
@@ -126,7 +126,7 @@ def _codebook(codebook: CodebookSummary) -> str:
 
 def _stated_errors(stated: DeclaredBounds) -> str:
     source = f"{counted(stated.source_count, 'splat')}, SH degree {stated.source_sh_degree}"
-    lines = [f"stands for a source of {source}; {stated.pruned_count} pruned"]
+    lines = [f"source: {source}; {stated.pruned_count} pruned"]
     if stated.refitted:
         lines.append("attributes were refitted: those without an error here are checked by renders only")
     if stated.records:

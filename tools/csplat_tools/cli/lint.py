@@ -9,37 +9,38 @@ import typer
 from csplat import formats
 from csplat.errors import InputError
 from csplat.lint import Finding
-from csplat_tools.cli.command import EXIT_FAILED, OutputOptions, command
-from csplat_tools.cli.shared_options import ShDegree
+from csplat_tools.cli.command_output import Output
+from csplat_tools.cli.error_lines import EXIT_FAILED
+from csplat_tools.cli.shared_options import Force, HelpAll, Json, KeepExtra, Quiet, Report, ShDegree, parse_sh_degree
 from csplat_tools.console import format_table
 from csplat_tools.file_streams import STANDARD_STREAM, check_name, source_path, write_model
 from csplat_tools.scene_files import findings_as_json, without_extra_columns
 
 
-@command(reads=True)
 def lint(
-    source: Annotated[str, typer.Argument(metavar="SCENE", help="A PLY, a file of `csplat formats`, or -.")],
-    out: OutputOptions,
-    fix: Annotated[
-        str | None, typer.Option(metavar="OUT.ply", help="Write a repaired PLY, where that is safe.")
-    ] = None,
-    keep_extra: Annotated[
-        bool, typer.Option("--keep-extra", help="Extra columns are no defect; --fix keeps them.")
-    ] = False,
+    source: Annotated[str, typer.Argument(metavar="SCENE", help="A PLY, another of `csplat formats`, or -.")],
+    fix: Annotated[str | None, typer.Option(metavar="OUT.ply", help="Write a repaired PLY if that is safe.")] = None,
+    keep_extra: KeepExtra = False,
     sh_degree: ShDegree = None,
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
-    """Say what is wrong with a PLY: each defect with its count.
+    """List the defects of a PLY, each with its count.
 
-    Notes are ordinary variation. Repairs are what encoding repairs by
-    itself and `encode --strict` refuses; errors cannot be repaired without
-    guessing. The status is 1 where there are repairs or errors; with --fix,
-    where there are errors. A file of SH degree 4 wants --sh-degree.
+    Notes are ordinary variation. Repairs are made by `csplat encode`, too.
+    Errors cannot be repaired without guessing. The status is 1 if there are
+    repairs or errors; with --fix, if there are errors. A file of SH degree 4
+    requires --sh-degree.
 
     Examples:
       csplat lint scene.ply
       csplat lint scene.ply --fix clean.ply
       csplat lint scene.ply --json | jq '.findings[].id'
     """
+    out, sh_degree = Output(force, report, as_json, quiet), parse_sh_degree(sh_degree)
     out.check(fix, inputs=(source,))
     if fix is not None:
         check_name(fix, ".ply", "--fix", source)

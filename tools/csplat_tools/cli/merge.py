@@ -9,38 +9,42 @@ import typer
 from csplat.editing.merge import merge as merged
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError, counted
-from csplat_tools.cli.command import OutputOptions, command
-from csplat_tools.cli.shared_options import Preset
+from csplat_tools.cli.command_output import Output
+from csplat_tools.cli.shared_options import Force, HelpAll, Json, Preset, Quiet, Report
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import STANDARD_STREAM, check_name, csplat_file, whole_output
 
 
-@command()
 def merge(
     sources: Annotated[
         list[str],
         typer.Argument(metavar="A.csplat B.csplat ...", help="Files in the order of their splats; URLs, or one -."),
     ],
-    out: OutputOptions,
     target: Annotated[str, typer.Option("--output", "-o", metavar="OUT.csplat", help="The file to write, or -.")],
     preset: Preset = "balanced",
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
     """Join files into one.
 
-    Tiles are copied bit for bit where the files agree on steps, SH degree,
-    origin and extra columns, as parts of one scene do. Else the scenes are
-    decoded and coded again together, with --preset; a line says so, and why.
-    Files whose axes or units contradict each other are refused. What the files
-    say alike of the scene is kept; errors that they state are left out.
+    Tiles are copied unchanged if all files have the same steps, SH degree,
+    origin and extra columns, as parts of one scene do. Otherwise the scenes
+    are decoded and encoded together with --preset, and a line gives the
+    reason. Files with different axes or units are refused. Metadata that all
+    files share is kept; declared errors are left out.
 
     Examples:
       csplat merge north.csplat south.csplat -o city.csplat
     """
+    out = Output(force, report, as_json, quiet)
     if sources.count(STANDARD_STREAM) > 1:
         raise InputError("two files cannot both come from standard input")
     out.check(target, inputs=sources)
     check_name(target, ".csplat", "-o", sources[0])
-    with whole_output(target) as stream:
+    with out.bar(), whole_output(target) as stream:
         done = merged(
             [csplat_file(source) for source in sources],
             stream,

@@ -1,190 +1,220 @@
-"""Options that several commands share."""
+"""Arguments and options that several commands share, and parsers of their values.
+
+Help texts are one line at 80 columns: what the option does, its unit, its default.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any, ClassVar
+from collections.abc import Callable, Mapping
+from copy import copy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
 
 import typer
 
 from csplat.editing.up_axis import Direction, unit_up
-from csplat.encoder import PRESETS, EncodeOptions, PresetName
+from csplat.encoder import PresetName
 from csplat.errors import InputError
-from csplat.model import SplatModel, check_axes
+from csplat.model import MAX_SH_DEGREE, SplatModel, check_axes
 from csplat_render import Mode
 from csplat_render.up_estimate import estimate_up
-from csplat_tools.cli.command import LibrarySettings, OptionGroup, OutputOptions, chosen
-from csplat_tools.console import parse_size_bytes
+from csplat_tools.cli.command_output import Output
+from csplat_tools.console import parse_size_bytes, print_data
 from csplat_tools.scene_files import MetadataOverrides
 from csplat_tools.views import VIRTUAL, DataOptions, Split, ViewSet, find_view_set
 
-_NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-_SCENE = "Metadata that a PLY may lack"
-_DATA = "Photographs of --data (default: as in training)"
-_VIEWS = "Views (default: virtual ones)"
+T = TypeVar("T")
+N = TypeVar("N", int, float, int | None, float | None)
 
-#: The dataclass whose fields `--set` takes for the encoder, as `module:name`.
-ENCODER_SETTINGS = "csplat.encoder.encode_options:EncodeOptions"
+CHECKPOINT_EVERY = 1_000  # steps from one checkpoint to the next
+_NAMED_COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
+
+def _print_full_help(context: typer.Context, requested: bool) -> None:
+    if requested and not context.resilient_parsing:
+        for option in context.command.params:
+            option.hidden = False  # type: ignore[attr-defined]  # arguments have it, too
+        print_data(context.get_help())  # empty if rich has printed it already
+        raise typer.Exit
+
+
+def hidden(option: Any) -> Any:
+    """Return an option that only --help-all shows."""
+    other = copy(option)
+    other.hidden = True
+    return other
+
+
+# The options of every command
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+Report = Annotated[str | None, typer.Option(metavar="FILE", help="Write the result as JSON.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no remarks.")]
+HelpAll = Annotated[
+    bool,
+    typer.Option("--help-all", is_eager=True, callback=_print_full_help, help="Show all options, and exit."),
+]
+
+# Scenes
 SceneArgument = Annotated[
     str, typer.Argument(metavar="SCENE", help="A PLY, a .csplat file, another of `csplat formats`, or -.")
 ]
-
-
-Seed = Annotated[int, typer.Option(min=0, hidden=True, help="Seed of all random choices. Default: 0.")]
-#: Arguments of `typer.Option` for --effort; commands add a panel.
-EFFORT: dict[str, Any] = {
-    "metavar": "1..9", "min": 1, "max": 9, "show_default": False, "help": "Work for fewer bytes. Default: 3."
-}  # fmt: skip
-Threads = Annotated[
-    int | None, typer.Option(min=1, hidden=True, help="Threads, which do not change the result. Default: one per core.")
+ReadAs = Annotated[
+    str | None, typer.Option("--from", metavar="FORMAT", hidden=True, help="Format of IN. Default: by its content.")
 ]
+_up = typer.Option("--up", metavar="-y|X,Y,Z", help="Up direction. Default: the scene's own.")
+Up = Annotated[str | None, _up]
+HiddenUp = Annotated[str | None, hidden(_up)]
+_sh_degree = typer.Option("--sh-degree", metavar="0..3", help="Drop higher SH bands. Default: keep all.")
+ShDegree = Annotated[int | None, _sh_degree]
+HiddenShDegree = Annotated[int | None, hidden(_sh_degree)]
+MaxSplats = Annotated[int | None, typer.Option(metavar="N", min=1, help="Refuse larger scenes. Default: no limit.")]
+SourceIndexOutput = Annotated[
+    str | None,
+    typer.Option("--source-index", metavar="FILE.npy", hidden=True, help="Write the source index of each splat."),
+]
+SourceIndexInput = Annotated[
+    str | None, typer.Option("--source-index", metavar="FILE.npy", help="File of `encode --source-index`.")
+]
+
+# Views; the hidden ones are for commands that rarely need them
+_cameras = typer.Option("--cameras", metavar="FILE.json", help="Test views. Default: virtual ones.")
+_background = typer.Option("--background", metavar="R,G,B", help="Background colour. Default: the training's.")
+Cameras = Annotated[str | None, _cameras]
+HiddenCameras = Annotated[str | None, hidden(_cameras)]
+Data = Annotated[str | None, typer.Option(metavar="DATA", help="Images of the training. Default: none.")]
+Background = Annotated[str | None, _background]
+HiddenBackground = Annotated[str | None, hidden(_background)]
+TestEvery = Annotated[int | None, typer.Option(metavar="N", hidden=True, help="Hold out every Nth image. Default: 8.")]
 ModeOption = Annotated[
-    Mode, typer.Option(metavar="exact|standard|fast", help="Accuracy of the renderer against its speed.")
+    Mode, typer.Option(metavar="MODE", show_default=False, help="exact, standard or fast. Default: standard.")
 ]
-LpipsOption = Annotated[
-    str | None, typer.Option(metavar="WEIGHTS.npz", help="Compute LPIPS (Alex) with these weights, or with `auto`.")
+
+# Encoding, training, tuning
+Preset = Annotated[
+    PresetName, typer.Option(metavar="PRESET", show_default=False, help="fast, balanced, small. Default: balanced.")
 ]
-ShDegree = Annotated[int | None, typer.Option(metavar="0..3", min=0, max=3, help="Leave out SH bands above this one.")]
-SourceIndex = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FILE.npy", hidden=True, help="Write the index of the source splat of each splat of the result."
-    ),
+SmallPreset = Annotated[
+    PresetName | None, typer.Option("--preset", metavar="PRESET", help="fast, balanced, small. Default: small.")
 ]
-Importance = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FILE",
-        hidden=True,
-        help="Importance of each splat: a file of `csplat sensitivity`, or weights (.npy) of the splats as read.",
-    ),
-]
+TargetPsnr = Annotated[str | None, typer.Option(metavar="DB", help="Least PSNR, e.g. 40dB. Default: none.")]
+TargetSize = Annotated[str | None, typer.Option(metavar="BYTES", help="Largest file, e.g. 5MB. Default: none.")]
+MaxPsnrDrop = Annotated[str | None, typer.Option(metavar="DB", help="Largest drop in --data. Default: none.")]
+_effort = typer.Option("--effort", metavar="1..9", help="Work for fewer bytes. Default: 3.")
+Effort = Annotated[int | None, _effort]
+HiddenEffort = Annotated[int | None, hidden(_effort)]
+_keep = typer.Option("--keep", metavar="SHARE", help="Share of splats to keep. Default: all.")
+Keep = Annotated[float | None, _keep]
+HiddenKeep = Annotated[float | None, hidden(_keep)]
+Page = Annotated[str | None, typer.Option(metavar="FILE.html", help="Write an HTML report.")]
 Checkpoint = Annotated[
-    str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Write checkpoints to this file.")
+    str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Write checkpoints. Default: none.")
 ]
-CheckpointEvery = Annotated[
-    int,
-    typer.Option(
-        metavar="N", min=0, hidden=True, help="Steps from one checkpoint to the next; 0: only at the end. Default: 0."
-    ),
+Resume = Annotated[
+    str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Go on from a checkpoint. Default: none.")
 ]
-Resume = Annotated[str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Continue from this checkpoint.")]
-ByteCost = Annotated[
-    float | None,
-    typer.Option(
-        "--lambda",
-        metavar="COST",
-        help="Weight of a bit per splat in the loss. Default: 1e-4; a target finds its own.",
-    ),
-]
+_memory = typer.Option("--memory", metavar="BYTES", help="Memory limit, 8GB. Default: what is free.")
+Memory = Annotated[str | None, _memory]
+HiddenMemory = Annotated[str | None, hidden(_memory)]
+_dask = typer.Option("--dask", metavar="ADDRESS", help="Dask cluster, tcp://host:8786. Default: none.")
+Dask = Annotated[str | None, _dask]
+HiddenDask = Annotated[str | None, hidden(_dask)]
+_dry_run = typer.Option("--dry-run", help="Estimate size, time and memory only.")
+DryRun = Annotated[bool, _dry_run]
+HiddenDryRun = Annotated[bool, hidden(_dry_run)]
+_keep_extra = typer.Option("--keep-extra", help="Keep columns that splats do not have.")
+KeepExtra = Annotated[bool, _keep_extra]
+HiddenKeepExtra = Annotated[bool, hidden(_keep_extra)]
 
 
-Preset = Annotated[PresetName, typer.Option(metavar="|".join(PRESETS), help="Speed against size.")]
-SplitOption = Annotated[
-    Split,
-    typer.Option(metavar="test|train", rich_help_panel=_DATA, help="Photographs to use as test views. Default: test."),
-]
-Near = Annotated[
-    float | None,
-    typer.Option(metavar="UNITS", rich_help_panel=_DATA, hidden=True, help="Near plane of the cameras, scene units."),
-]
+def refuse_together(*groups: Mapping[str, object]) -> None:
+    """Refuse options that exclude each other: several of one group, or of two groups one each.
+
+    Args:
+        groups: option values by spelling; `None` and False: not given.
+
+    Raises:
+        typer.BadParameter: such options are given.
+    """
+    given = [_given(group) for group in groups]
+    both = given[0] if len(groups) == 1 else [names[0] for names in given if names]
+    if len(both) > 1:
+        raise typer.BadParameter(f"{' and '.join(both)}: give one of them")
+
+
+def require_one(options: Mapping[str, object], required: Mapping[str, object]) -> None:
+    """Refuse options that have no effect unless one of the required ones is given.
+
+    Raises:
+        typer.BadParameter: such an option is given, and none of the required ones.
+    """
+    given = _given(options)
+    if given and not _given(required):
+        raise typer.BadParameter(f"{given[0]} requires {' or '.join(required)}")
+
+
+def _given(options: Mapping[str, object]) -> list[str]:
+    return [name for name, value in options.items() if value is not None and value is not False]
+
+
+def checked(kind: Callable[..., T], *args: Any, **values: Any) -> T:
+    """Call a function of the library with values of options.
+
+    Raises:
+        typer.BadParameter: the library refuses them.
+    """
+    try:
+        return kind(*args, **values)
+    except InputError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
+def take_estimated_up(
+    axis: Direction | None, output: Output, *, given: object = None, shown: bool = True
+) -> Direction | None:
+    """Return the estimated up direction, with a remark, if neither the user nor the scene specifies one.
+
+    Args:
+        axis: the estimate of `estimate_up`; `None`: there is none.
+        output: prints remarks.
+        given: the user's direction; `None`: not given.
+        shown: True if the command's result shows the scene with this direction up.
+    """
+    if axis is None or given is not None:
+        return None
+    word = up_word(axis)
+    output.remark(
+        f"the scene does not specify its up direction; {word} is estimated"
+        + (", and used (encode --up writes it into a file)" if shown else f": --up {word} writes it")
+    )
+    return axis
 
 
 @dataclass(frozen=True)
-class OrientationOptions(OptionGroup):
-    """Options of the scene's orientation, which override its own."""
+class ViewOptions:
+    """Views of a camera file or a data set; without either, virtual ones.
 
-    up: Annotated[str | None, typer.Option(metavar="-y|X,Y,Z", help="Direction that is up.")] = None
-    axes: Annotated[
-        str | None, typer.Option(metavar="RDF", hidden=True, help="Directions of +x, +y, +z: R/L, U/D, F/B.")
-    ] = None
+    Attributes:
+        cameras: a camera file.
+        data: a data set, or the folder of images in one.
+        background: background colour, see `parse_colour`; `None`: that of training.
+        test_every: every Nth image was held out; `None`: as in training.
 
-    def parse(self) -> None:
-        """Refuse an invalid direction or axes."""
-        self.overrides()
+    Raises:
+        typer.BadParameter: both are given, or the colour is invalid.
+    """
 
-    def overrides(self) -> MetadataOverrides:
-        """Return the given up direction and axes, as overrides of the scene's own."""
-        up = None if self.up is None else parse_up(self.up)
-        return MetadataOverrides(None if self.axes is None else parse_axes(self.axes), up=up)
+    cameras: str | None = None
+    data: str | None = None
+    background: str | None = None
+    test_every: int | None = None
 
-    def take_estimated_up(
-        self, axis: Direction | None, output: OutputOptions, *, shown: bool = True
-    ) -> Direction | None:
-        """Return the estimated up direction, with a remark, if neither the user nor the scene specifies one.
-
-        Args:
-            axis: the estimate of `estimate_up`; `None`: there is none.
-            output: prints remarks.
-            shown: True if the command's result shows the scene with this direction up.
-        """
-        if axis is None or (self.up, self.axes) != (None, None):
-            return None
-        word = up_word(axis)
-        output.remark(
-            f"the scene does not specify its up direction; {word} is estimated"
-            + (", and used (encode --up writes it into a file)" if shown else f": --up {word} writes it")
-        )
-        return axis
-
-
-@dataclass(frozen=True)
-class ViewOptions(OptionGroup):
-    """Views of a camera file or a data set."""
-
-    one_of: ClassVar[Sequence[tuple[str, ...]]] = (("cameras", "data"),)
-    needs: ClassVar[Mapping[str, tuple[str, ...]]] = dict.fromkeys(("size", "images", "test_every"), ("data",))
-
-    cameras: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FILE.json",
-            rich_help_panel=_VIEWS,
-            help="Test views; of 40 or more most are for training.",
-        ),
-    ] = None
-    data: Annotated[
-        str | None,
-        typer.Option(
-            metavar="DATA",
-            rich_help_panel=_VIEWS,
-            help="Photographs for training, held-out ones for test.",
-        ),
-    ] = None
-    background: Annotated[
-        str | None,
-        typer.Option(
-            metavar="R,G,B",
-            rich_help_panel=_VIEWS,
-            hidden=True,
-            help="Background colour. Default: black; with --data or --cameras, that of training.",
-        ),
-    ] = None
-    size: Annotated[
-        str | None,
-        typer.Option(metavar="WxH", rich_help_panel=_DATA, hidden=True, help="Scale photographs to this size, pixels."),
-    ] = None
-    images: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", rich_help_panel=_DATA, hidden=True, help="Folder of images, such as images_4."),
-    ] = None
-    test_every: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            rich_help_panel=_DATA,
-            hidden=True,
-            help="Every Nth photograph was held out. Default: as in training, or 8.",
-        ),
-    ] = None
-
-    def parse(self) -> None:
-        """Refuse an invalid colour or size."""
-        _ = self.colour, None if self.size is None else parse_size(self.size)
+    def __post_init__(self) -> None:
+        refuse_together({"--cameras": self.cameras, "--data": self.data})
+        _ = self.colour
 
     @property
     def inputs(self) -> tuple[str | None, str | None]:
@@ -196,29 +226,33 @@ class ViewOptions(OptionGroup):
         """Background colour, red, green, blue, 0 to 1; `None`: the default."""
         return None if self.background is None else parse_colour(self.background)
 
-    def data_options(self, near: float | None = None) -> DataOptions | None:
-        """Return the options of the data set; `None` without one.
-
-        Args:
-            near: near plane of the photographs; `None`: one that suits.
-        """
-        size = None if self.size is None else parse_size(self.size)
-        return None if self.data is None else DataOptions(self.data, size, self.images, self.test_every, near)
+    @property
+    def data_options(self) -> DataOptions | None:
+        """The options of the data set; `None` without one."""
+        return None if self.data is None else DataOptions(self.data, test_every=self.test_every)
 
     def find(
-        self, model: SplatModel, output: OutputOptions, *, near: float | None = None, every: int = 1, **how: Any
+        self,
+        model: SplatModel,
+        output: Output,
+        *,
+        count: int | None = None,
+        size: tuple[int, int] | None = None,
+        validation_count: int | None = None,
+        split: Split = "test",
+        every: int = 1,
     ) -> ViewSet:
         """Find views of a scene, and print remarks about them.
 
         Args:
             model: the scene.
             output: prints remarks.
-            near: near plane of the photographs; `None`: one that suits.
-            every: as for `find_view_set`.
-            how: other arguments of `find_view_set`, which defines their defaults.
+            count, size, validation_count, split, every: as for `find_view_set`.
         """
-        data = self.data_options(near)
-        found = find_view_set(model, cameras=self.cameras, data=data, background=self.colour, every=every, **how)
+        found = find_view_set(
+            model, cameras=self.cameras, data=self.data_options, background=self.colour, count=count, size=size,
+            validation_count=validation_count, split=split, every=every,
+        )  # fmt: skip
         output.remark(*found.notes)
         axis = None if output.quiet or found.name != VIRTUAL else estimate_up(model, every)
         if axis is not None:
@@ -230,101 +264,20 @@ class ViewOptions(OptionGroup):
         return found
 
 
-@dataclass(frozen=True)
-class VirtualViewOptions(OptionGroup):
-    """Options of the virtual training views."""
+def parse_overrides(up: str | None, axes: str | None = None, **others: Any) -> MetadataOverrides:
+    """Return overrides of a scene's metadata.
 
-    views: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=1, hidden=True, rich_help_panel=_VIEWS, help="Virtual training views, at most."),
-    ] = None
-    view_size: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WxH", hidden=True, rich_help_panel=_VIEWS, help="Approximate size of training renders, pixels."
-        ),
-    ] = None
+    Args:
+        up: the up direction, see `parse_up`.
+        axes: the axes, see `parse_axes`.
+        others: other fields of `MetadataOverrides`.
 
-    def parse(self) -> None:
-        """Refuse an invalid size."""
-        self.given()
-
-    def given(self) -> dict[str, Any]:
-        """Return the options that are given, as arguments of `find_view_set`."""
-        size = None if self.view_size is None else parse_size(self.view_size)
-        return {name: value for name, value in (("count", self.views), ("size", size)) if value is not None}
-
-
-@dataclass(frozen=True)
-class SourceOptions(OrientationOptions):
-    """Options of reading a scene, and metadata that it may lack."""
-
-    strict: Annotated[
-        bool, typer.Option("--strict", hidden=True, help="Refuse a PLY with defects instead of repairing it.")
-    ] = False
-    keep_extra: Annotated[
-        bool, typer.Option("--keep-extra", hidden=True, help="Carry columns that splats do not have, bit for bit.")
-    ] = False
-    unit_metres: Annotated[
-        float | None,
-        typer.Option(metavar="METRES", rich_help_panel=_SCENE, hidden=True, help="Length of one scene unit."),
-    ] = None
-    antialiased: Annotated[
-        bool | None,
-        typer.Option(
-            "--antialiased/--no-antialiased", rich_help_panel=_SCENE, hidden=True, help="Trained with mip-splatting."
-        ),
-    ] = None
-    licence: Annotated[
-        str | None, typer.Option(metavar="TEXT", rich_help_panel=_SCENE, hidden=True, help="Licence, for the metadata.")
-    ] = None
-
-    def read(self) -> MetadataOverrides:
-        """Return the metadata that the options specify."""
-        return replace(
-            self.overrides(), unit_metres=self.unit_metres, antialiased=self.antialiased, licence=self.licence
-        )
-
-
-@dataclass(frozen=True)
-class EncodingOptions(OptionGroup):
-    """Options of the encoder."""
-
-    preset: Preset = "balanced"
-    attribute_psnr: Annotated[
-        float | None,
-        typer.Option(metavar="DB", help="PSNR of each attribute; renders have 5 to 12 dB less."),
-    ] = None
-    sh_degree: Annotated[int | None, typer.Option(metavar="0..3", help="Leave out SH bands above this one.")] = None
-    max_classes: Annotated[
-        int | None,
-        typer.Option(
-            metavar="1..5",
-            hidden=True,
-            help="Quantisation classes at most, into which a target or --importance sorts splats; 1: one precision.",
-        ),
-    ] = None
-    deflate_level: Annotated[
-        int | None, typer.Option(metavar="1..12", hidden=True, help="Level of DEFLATE; zlib has 9 at most.")
-    ] = None
-    seed: Annotated[int, typer.Option(min=0, hidden=True, help="Seed of the clustering. Default: 0.")] = 0
-    threads: Annotated[
-        int | None,
-        typer.Option(min=1, hidden=True, help="Threads, which do not change the bytes. Default: one per core."),
-    ] = None
-
-    def options(self, source_options: SourceOptions, settings: LibrarySettings) -> EncodeOptions:
-        """Return the options of the encoder.
-
-        Args:
-            source_options: specifies whether extra columns are carried.
-            settings: values of `--set`.
-
-        Raises:
-            typer.BadParameter: an option is out of its range.
-        """
-        own = {one.name: getattr(self, one.name) for one in fields(self)}
-        return chosen(EncodeOptions, **own, **settings.of(EncodeOptions), keep_extra=source_options.keep_extra)
+    Raises:
+        typer.BadParameter: the direction or the axes are invalid.
+    """
+    return MetadataOverrides(
+        None if axes is None else parse_axes(axes), up=None if up is None else parse_up(up), **others
+    )
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -335,7 +288,7 @@ def parse_size(text: str) -> tuple[int, int]:
     """
     found = re.fullmatch(r"([1-9][0-9]{0,4})[xX]([1-9][0-9]{0,4})", text.strip())
     if found is None:
-        raise typer.BadParameter(f"a size is {text!r}, wanted width and height in pixels, as 640x480")
+        raise typer.BadParameter(f"a size is {text!r}, expected width and height in pixels, as 640x480")
     return int(found[1]), int(found[2])
 
 
@@ -348,11 +301,16 @@ def parse_bytes(text: str | None) -> int | None:
     return None if text is None else parse_size_bytes(text)
 
 
-def parse_numbers(option: str, text: str | None, count: int) -> tuple[float, ...] | None:
-    """Parse `count` finite numbers from text such as `1,0.5,-2`; return `None` for `None`.
+def parse_numbers(option: str, text: str | None, *counts: int) -> tuple[float, ...] | None:
+    """Parse finite numbers from text such as `1,0.5,-2`; return `None` for `None`.
+
+    Args:
+        option: the option, for the message.
+        text: its value.
+        counts: valid numbers of numbers.
 
     Raises:
-        typer.BadParameter: the text is not that many finite numbers.
+        typer.BadParameter: the text is something else.
     """
     if text is None:
         return None
@@ -360,8 +318,9 @@ def parse_numbers(option: str, text: str | None, count: int) -> tuple[float, ...
         numbers = tuple(float(part) for part in text.split(","))
     except ValueError:
         numbers = ()
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise typer.BadParameter(f"{option} is {text!r}, wanted {count} numbers with commas between them")
+    if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
+        count = " or ".join(map(str, counts))
+        raise typer.BadParameter(f"{option} is {text!r}, expected {count} numbers with commas between them")
     return numbers
 
 
@@ -371,14 +330,14 @@ def parse_colour(text: str) -> tuple[float, float, float]:
     Raises:
         typer.BadParameter: the text is not a colour.
     """
-    if text.lower() in _NAMED:
-        return _NAMED[text.lower()]
+    if text.lower() in _NAMED_COLOURS:
+        return _NAMED_COLOURS[text.lower()]
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         values = []
     if len(values) != 3 or not all(math.isfinite(value) and 0.0 <= value <= 1.0 for value in values):
-        raise typer.BadParameter(f"a colour is {text!r}, wanted red,green,blue from 0 to 1, or black, or white")
+        raise typer.BadParameter(f"a colour is {text!r}, expected red,green,blue from 0 to 1, or black, or white")
     red, green, blue = values
     return red, green, blue
 
@@ -396,11 +355,13 @@ def parse_up(text: str) -> Direction:
     try:
         return unit_up([float(part) for part in text.split(",")])
     except (ValueError, InputError):
-        raise typer.BadParameter(f"up is {text!r}, wanted x, -x, y, -y, z, -z, or three numbers as 0,-1,0.1") from None
+        raise typer.BadParameter(
+            f"up is {text!r}, expected x, -x, y, -y, z, -z, or three numbers as 0,-1,0.1"
+        ) from None
 
 
 def up_word(axis: Direction) -> str:
-    """Return an axis, or its opposite, as `parse_up` takes it."""
+    """Return an axis, or its opposite, in the form that `parse_up` accepts."""
     at = next(k for k, value in enumerate(axis) if value)
     return ("-" if axis[at] < 0.0 else "") + "xyz"[at]
 
@@ -411,23 +372,61 @@ def parse_axes(text: str) -> str:
     Raises:
         typer.BadParameter: the text is not such axes.
     """
-    try:
-        check_axes(text)
-    except InputError as error:
-        raise typer.BadParameter(str(error)) from None
+    checked(check_axes, text)
     return text
 
 
-def parse_decibels(text: str) -> float:
-    """Parse a number of decibels: `0.3`, `0.3dB`, `0.3 dB`.
+def parse_sh_degree(degree: int | None) -> int | None:
+    """Check an SH degree: 0 to 3.
+
+    Raises:
+        typer.BadParameter: it is out of this range.
+    """
+    return check_range("--sh-degree", degree, 0, MAX_SH_DEGREE)
+
+
+def check_range(option: str, value: N, low: float, high: float) -> N:
+    """Return the value of an option.
+
+    Raises:
+        typer.BadParameter: it is out of its range.
+    """
+    if value is not None and not low <= value <= high:
+        raise typer.BadParameter(f"{option} is {value:g}, expected {low:g} to {high:g}")
+    return value
+
+
+def parse_share(keep: float | None) -> float | None:
+    """Check the share of splats to keep: above 0, at most 1.
+
+    Raises:
+        typer.BadParameter: it is out of this range.
+    """
+    if keep is not None and not 0.0 < keep <= 1.0:
+        raise typer.BadParameter(f"--keep is {keep:g}, expected a share above 0, at most 1")
+    return keep
+
+
+def is_same_file(a: str | None, b: str | None) -> bool:
+    """Return True if two paths are given and lead to the same place."""
+    return a is not None and b is not None and Path(a).resolve() == Path(b).resolve()
+
+
+def parse_decibels(text: str | None, option: str) -> float | None:
+    """Parse a finite number of decibels: `0.3`, `0.3dB`, `0.3 dB`; return `None` for `None`.
 
     Raises:
         typer.BadParameter: the text is not a number of decibels.
     """
+    if text is None:
+        return None
     number = text.strip()
     if number.lower().endswith("db"):
         number = number[:-2]
     try:
-        return float(number)
+        value = float(number)
     except ValueError:
-        raise typer.BadParameter(f"{text!r} is no number of decibels, wanted 0.3 or 0.3dB") from None
+        raise typer.BadParameter(f"{option} is {text!r}, expected decibels, as 0.3 or 0.3dB") from None
+    if not math.isfinite(value):
+        raise typer.BadParameter(f"{option} is {text!r}, expected a finite number of decibels")
+    return value

@@ -3,85 +3,77 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Annotated, Any
 
 import typer
 
 from csplat.errors import counted
-from csplat_tools.cli.command import LibrarySettings, OutputOptions, chosen, command
+from csplat_tools.cli.command_output import Output
 from csplat_tools.cli.shared_options import (
-    EFFORT,
-    OrientationOptions,
+    Cameras,
+    Data,
+    Effort,
+    Force,
+    HelpAll,
+    Json,
+    Keep,
+    MaxPsnrDrop,
+    Quiet,
+    Report,
     SceneArgument,
-    Seed,
-    SourceIndex,
-    Threads,
+    TargetPsnr,
+    Up,
     ViewOptions,
-    VirtualViewOptions,
+    check_range,
+    checked,
     parse_decibels,
+    parse_overrides,
+    refuse_together,
+    require_one,
 )
 from csplat_tools.console import format_table
-from csplat_tools.file_streams import check_name, write_array, write_model
+from csplat_tools.file_streams import check_name, write_model
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
 from csplat_tools.scene_files import load_model
 
-_TARGET = "Target (one of them)"
 #: Cost in renders of all training views: for --keep (measured: donut 9, plane3 19), and for a target, which searches
 #: for the share to keep (20 and 45); half of the cost is fitting.
 _PASSES = (20.0, 45.0)
-_OPTIONS = "csplat_tools.optimise.pruning_order:SimplifyOptions"
 
 
-@command(
-    reads=True,
-    one_of=(("keep", "target_psnr", "max_psnr_drop"),),
-    needs={"max_psnr_drop": ("data",)},
-    settings=(_OPTIONS,),
-)
 def simplify(
     source: SceneArgument,
     output: Annotated[str, typer.Argument(metavar="OUT.ply", help="The PLY to write, or -.")],
-    views: ViewOptions,
-    virtual: VirtualViewOptions,
-    upright: OrientationOptions,
-    out: OutputOptions,
-    settings: LibrarySettings,
-    keep: Annotated[
-        float | None, typer.Option(metavar="SHARE", rich_help_panel=_TARGET, help="Share of the splats to keep.")
-    ] = None,
-    target_psnr: Annotated[
-        str | None,
-        typer.Option(
-            metavar="DB", rich_help_panel=_TARGET, help="Least PSNR of the validation views against source renders."
-        ),
-    ] = None,
-    max_psnr_drop: Annotated[
-        str | None,
-        typer.Option(
-            metavar="DB", rich_help_panel=_TARGET, help="Largest drop of the PSNR against the photographs of --data."
-        ),
-    ] = None,
-    effort: Annotated[int, typer.Option(**EFFORT)] = 3,
-    seed: Seed = 0,
-    threads: Threads = None,
-    source_index: SourceIndex = None,
+    keep: Keep = None,
+    target_psnr: TargetPsnr = None,
+    max_psnr_drop: MaxPsnrDrop = None,
+    effort: Effort = None,
+    cameras: Cameras = None,
+    data: Data = None,
+    up: Up = None,
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
     """Prune splats that no render needs, and refit the others.
 
-    The error that pruning each splat causes is measured exactly, in many small
-    views from all around, and again as splats are pruned. Then colours, opacities,
-    scales and rotations of the others are fitted to the source's renders in the
-    training views. Validation views decide how many splats are kept, and test
-    views score the result. Only --max-psnr-drop requires photographs. `csplat
-    encode` with a target does all this for the file that it writes. Requires the
-    packages of the render extra.
+    One of --keep, --target-psnr and --max-psnr-drop is required. Splats are
+    fitted to training views, validation views decide how many are kept, and
+    test views score the result. `csplat encode` with a target does the same
+    for the file that it writes. Requires the render extra.
 
     Examples:
       csplat simplify scene.ply half.ply --keep 0.5
-      csplat simplify scene.ply small.ply --target-psnr 40 --report small.json
+      csplat simplify scene.ply small.ply --target-psnr 40
       csplat simplify scene.ply small.ply --max-psnr-drop 0.3dB --data capture
     """
+    out = Output(force, report, as_json, quiet)
+    views, overrides = ViewOptions(cameras, data), parse_overrides(up)
+    refuse_together({"--keep": keep, "--target-psnr": target_psnr, "--max-psnr-drop": max_psnr_drop})
+    require_one({"--max-psnr-drop": max_psnr_drop}, {"--data": data})
+    check_range("--effort", effort, 1, 9)
     require_renderer()
     import csplat_tools
     from csplat_tools.optimise.pruning_order import SimplifyOptions
@@ -89,33 +81,27 @@ def simplify(
     from csplat_tools.views import shrink_cameras
     from csplat_tools.views.view_sets import total_render_seconds
 
-    drop = None if max_psnr_drop is None else parse_decibels(max_psnr_drop)
-    psnr = None if target_psnr is None else parse_decibels(target_psnr)
-    chosen(Target, psnr=psnr, max_psnr_drop=drop, keep=keep)  # before anything is read
-    options = chosen(SimplifyOptions, **settings.of(SimplifyOptions), effort=effort, seed=seed, threads=threads)
-    out.check(output, inputs=(source, *views.inputs), named={"--source-index": source_index})
+    psnr, drop = parse_decibels(target_psnr, "--target-psnr"), parse_decibels(max_psnr_drop, "--max-psnr-drop")
+    checked(Target, psnr=psnr, max_psnr_drop=drop, keep=keep)  # before anything is read
+    options = SimplifyOptions() if effort is None else SimplifyOptions(effort=effort)
+    out.check(output, inputs=(source, *views.inputs))
     check_name(output, ".ply", "simplify", source)
-    read = load_model(source)
-    out.print_findings(read.findings)
-    model = upright.overrides().apply(read.model)
-    prepare_renderer(quiet=out.quiet, simplify=True)
-    given = virtual.given()
-    around = views.find(model, out, seed=seed, **given)
-    options = replace(options, view_size=given.get("size"))
-    passes = _PASSES[keep is None] * (0.5 + 0.5 * options.work)
-    out.announce_time(
-        lambda: (
-            passes * total_render_seconds(model, shrink_cameras(around.training, options.views_and_size(len(model))[1]))
-        ),
-        "fewer or smaller views take less: --help-all",
-    )
     with out.bar() as progress:
+        read = load_model(source)
+        out.print_findings(read.findings)
+        model = overrides.apply(read.model)
+        prepare_renderer(quiet=out.quiet, simplify=True)
+        around = views.find(model, out)
+        passes = _PASSES[keep is None] * (0.5 + 0.5 * options.work)
+        size = options.views_and_size(len(model))[1]
+        out.announce_time(
+            lambda: passes * total_render_seconds(model, shrink_cameras(around.training, size)),
+            "--effort 1 takes less",
+        )
         result = csplat_tools.simplify(
             model, keep=keep, psnr=psnr, max_psnr_drop=drop, views=around, options=options, progress=progress
         )
     write_model(output, result.model, absolute=False)
-    if source_index is not None:
-        write_array(source_index, result.source_index)
     out.remark(*_lines(result.report))
     out.publish(result.report)
 

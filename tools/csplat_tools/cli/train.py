@@ -2,160 +2,119 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from csplat.encoder import PRESETS, EncodeOptions, PresetName
-from csplat_tools.cli.command import LibrarySettings, OutputOptions, chosen, command
+from csplat.encoder import EncodeOptions
+from csplat_tools.cli.command_output import Output
 from csplat_tools.cli.shared_options import (
-    ByteCost,
+    CHECKPOINT_EVERY,
     Checkpoint,
-    CheckpointEvery,
-    OrientationOptions,
+    Force,
+    HelpAll,
+    HiddenUp,
+    Json,
+    Page,
+    Quiet,
+    Report,
     Resume,
-    Seed,
-    Threads,
+    SmallPreset,
+    TargetPsnr,
+    TargetSize,
+    TestEvery,
+    checked,
+    is_same_file,
     parse_bytes,
     parse_decibels,
+    parse_overrides,
+    parse_share,
     parse_size,
+    refuse_together,
 )
 from csplat_tools.file_streams import check_name
 from csplat_tools.optional_packages import require_trainer
 from csplat_tools.views import DataOptions
-from csplat_trainer.training_options import BACKGROUNDS, DEVICES, Outputs, TrainOptions
+from csplat_trainer.training_options import BACKGROUNDS, Outputs, TrainOptions
 
 _DEFAULT = TrainOptions()
+_BACKGROUNDS = ", ".join(BACKGROUNDS)
 _KEEP = 0.8  # default fraction of the trained splats that OUT.csplat keeps: some of them are hardly seen
 
 
-@command(
-    needs={"preview_every": ("previews",), "checkpoint_every": ("checkpoint",)},
-    one_of=(("keep", "target_size", "target_psnr"), ("byte_cost", "target_size", "target_psnr")),
-    settings=("csplat_trainer.training_options:TrainOptions",),
-)
 def train(
     source: Annotated[str, typer.Argument(metavar="DATA", help="A folder or transforms.json of posed images.")],
-    output: Annotated[
-        str, typer.Argument(metavar="OUT.ply|OUT.csplat", help="The scene to write, or a file that is tuned as well.")
-    ],
-    upright: OrientationOptions,
-    out: OutputOptions,
-    settings: LibrarySettings,
+    output: Annotated[str, typer.Argument(metavar="OUT", help="OUT.ply; or OUT.csplat, which is tuned as well.")],
     max_splats: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Splats at most. Default: 20,000; with a target, as many as it allows."),
+        int | None, typer.Option(metavar="N", help="Largest number of splats. Default: 20,000.")
     ] = None,
-    sh_degree: Annotated[int, typer.Option(metavar="0..3", help="SH degree of the colours.")] = _DEFAULT.sh_degree,
-    iterations: Annotated[int, typer.Option(metavar="N", help="Training steps.")] = _DEFAULT.iterations,
-    preset: Annotated[
-        PresetName | None,
-        typer.Option(metavar="|".join(PRESETS), help="Preset of OUT.csplat: speed against size. Default: small."),
-    ] = None,
-    keep: Annotated[
-        float | None,
-        typer.Option(metavar="SHARE", help="Share of the trained splats that OUT.csplat keeps. Default: 0.8."),
-    ] = None,
-    target_size: Annotated[
-        str | None, typer.Option(metavar="1.4MB", help="Largest size of OUT.csplat; not with --keep.")
-    ] = None,
-    target_psnr: Annotated[
-        str | None,
-        typer.Option(metavar="dB", help="Least PSNR of OUT.csplat against validation photographs."),
-    ] = None,
-    byte_cost: ByteCost = None,
-    size: Annotated[str | None, typer.Option(metavar="WxH", help="Scale the images to this size.")] = None,
-    images: Annotated[str | None, typer.Option(metavar="NAME", help="Folder of images, such as images_4.")] = None,
-    test_every: Annotated[int, typer.Option(metavar="N", help="Hold out every Nth image; 0: none. Default: 8.")] = 8,
-    background: Annotated[
-        str, typer.Option(metavar="|".join(BACKGROUNDS), help="auto: white behind RGBA, else black.")
-    ] = _DEFAULT.background,
+    sh_degree: Annotated[
+        int, typer.Option(metavar="0..3", show_default=False, help="SH degree of colours. Default: 3.")
+    ] = _DEFAULT.sh_degree,
+    iterations: Annotated[
+        int, typer.Option(metavar="N", show_default=False, help="Training steps. Default: 7,000.")
+    ] = _DEFAULT.iterations,
+    preset: SmallPreset = None,
+    keep: Annotated[float | None, typer.Option(metavar="SHARE", help="Share in OUT.csplat. Default: 0.8.")] = None,
+    target_size: TargetSize = None,
+    target_psnr: TargetPsnr = None,
     device: Annotated[
-        str, typer.Option(metavar="|".join(DEVICES), help="cuda requires a GPU, torch and gsplat.")
+        str, typer.Option(metavar="DEVICE", show_default=False, help="cpu, or cuda: a GPU. Default: cpu.")
     ] = "cpu",
-    near: Annotated[
-        float | None,
-        typer.Option(metavar="UNITS", hidden=True, help="Near plane, scene units. Default: one that suits the set."),
+    page: Page = None,
+    up: HiddenUp = None,
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", hidden=True, help="Scale images, pixels. Default: unscaled.")
     ] = None,
-    seed: Seed = _DEFAULT.seed,
-    threads: Threads = None,
+    test_every: TestEvery = None,
+    background: Annotated[
+        str,
+        typer.Option(metavar="COLOUR", hidden=True, show_default=False, help=f"{_BACKGROUNDS}. Default: auto."),
+    ] = _DEFAULT.background,
+    seed: Annotated[
+        int, typer.Option(metavar="N", min=0, hidden=True, show_default=False, help="Random seed. Default: 0.")
+    ] = _DEFAULT.seed,
     antialiased: Annotated[
         bool, typer.Option("--antialiased", hidden=True, help="Train with the mip-splatting filter.")
     ] = False,
-    lpips_weights: Annotated[
-        str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Weights of LPIPS-Alex.")
-    ] = None,
-    plot: Annotated[
-        str | None, typer.Option(metavar="FILE.png", hidden=True, help="Plot the loss over the steps.")
-    ] = None,
-    page: Annotated[
-        str | None, typer.Option(metavar="FILE.html", help="Write an HTML report: scores, curves, renders.")
-    ] = None,
-    previews: Annotated[
-        str | None, typer.Option(metavar="FOLDER", hidden=True, help="Write early renders next to the photograph.")
-    ] = None,
-    preview_every: Annotated[
-        int,
-        typer.Option(
-            metavar="N", min=0, hidden=True, help="Steps from one preview to the next; 0: after 100, 200, 400, ..."
-        ),
-    ] = 0,
     checkpoint: Checkpoint = None,
-    checkpoint_every: CheckpointEvery = 0,
     resume: Resume = None,
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
-    """Train a scene from posed images, on a CPU.
+    """Train a scene from posed images.
 
-    DATA is a NeRF-synthetic folder, an instant-ngp transforms.json or its
-    folder, or a COLMAP folder with its images. Test images are held out: those
-    that the data set names, or every eighth. Black areas of masks (`mask_path`,
-    or a folder `masks` next to COLMAP's images) are neither learnt nor scored.
-
-    The background is white if images have an alpha channel, else black. OUT.ply
-    records it in a comment, with the held-out images, their size and the near
-    plane: other commands read it and score the scene alike; encode and decode
-    keep it. Another comment records the up direction, from the kind of set or
-    from how its cameras were held.
-
-    For OUT.csplat, splats that renders hardly need are pruned while others can
-    still learn to replace them. Then `csplat finetune --data DATA` follows: the
-    values are tuned through the encoder's quantisers. Validation photographs of
-    the set, or some training photographs, choose the best step. --target-size
-    weighs bytes in the loss so that the file keeps to it. --target-psnr tunes
-    files of several sizes, until the smallest reaches it. --checkpoint and
-    --resume cover training and tuning: one training can make files of several
-    sizes.
+    DATA is a NeRF-synthetic folder, a transforms.json or its folder, a COLMAP
+    folder, or the folder of images in one of them (garden/images_4). The test
+    images of the set, or every 8th image, are held out. OUT.csplat is tuned as
+    by `csplat finetune`, with --preset, --keep or a target.
 
     Examples:
-      csplat train lego -o lego.ply --max-splats 10000
-      csplat train lego -o lego.ply --size 200x200 --report lego.json
-      csplat train lego -o lego.csplat --target-size 800KB --page lego.html
-    ---
-    More examples:
-      csplat train lego -o lego.ply --plot loss.png --previews pictures
-      csplat train lego -o lego.ply --set strategy=gradient,loss=l1
-      csplat train capture -o scene.ply --set lr_exposure=0.01  # photographs differ in brightness
-      csplat train lego -o lego.csplat --max-splats 120000 --keep 0.8 --iterations 7000
-      csplat train lego -o smaller.csplat --max-splats 120000 --resume run.npz --target-size 500KB
-      csplat train capture -o scene.ply --checkpoint run.npz --checkpoint-every 1000
-      csplat train capture -o scene.ply --resume run.npz --max-splats 60000
+      csplat train lego lego.ply --max-splats 10000
+      csplat train garden/images_4 garden.ply --report garden.json
+      csplat train lego lego.csplat --target-size 800KB --page lego.html
+      csplat train lego lego.ply --checkpoint run.npz --resume run.npz
     """
-    require_trainer(plots=plot is not None or page is not None)
+    out = Output(force, report, as_json, quiet)
+    to_file, psnr = Path(output).suffix == ".csplat", parse_decibels(target_psnr, "--target-psnr")
+    targets = {"--keep": keep, "--target-size": target_size, "--target-psnr": target_psnr}
+    refuse_together(targets)
+    for name, value in {"--preset": preset, **targets}.items():
+        if value is not None and not to_file:
+            raise typer.BadParameter(f"{name} is for files, expected OUT.csplat")
+    parse_share(keep)
+    size_bytes, overrides = checked(parse_bytes, target_size), parse_overrides(up)
+    data = DataOptions(source, None if size is None else parse_size(size), test_every=test_every)
+    require_trainer(plots=page is not None)
     from csplat_tools.training.training_run import run_training, run_training_to_file, tuning_after, tuning_checkpoint
     from csplat_tools.training.tuning_report import format_tuning_report
     from csplat_tools.training.tuning_run import SHAPE_ENTRIES, SPLAT_BYTES
     from csplat_trainer.training_checkpoint import load_checkpoint
 
-    to_file, size_bytes = Path(output).suffix == ".csplat", parse_bytes(target_size)
-    psnr = None if target_psnr is None else parse_decibels(target_psnr)
-    if psnr is not None and not math.isfinite(psnr):
-        raise typer.BadParameter(f"--target-psnr is {target_psnr}, wanted a finite number of dB")
-    if not to_file and (preset, keep, size_bytes, psnr, byte_cost) != (None, None, None, None, None):
-        raise typer.BadParameter("--preset, --keep, --lambda and targets are about a file: wanted OUT.csplat")
-    if keep is not None and not 0.0 < keep <= 1.0:
-        raise typer.BadParameter(f"--keep is {keep:g}, wanted a share above 0, at most 1")
     share = 1.0 if not to_file or psnr is not None else _KEEP if keep is None else keep
     if (size_bytes, psnr) != (None, None) and max_splats is None and resume is not None:
         max_splats = load_checkpoint(resume).options.get("max_splats")
@@ -163,44 +122,24 @@ def train(
         left = max(1, size_bytes // SPLAT_BYTES)
         max_splats = max_splats or round(left / _KEEP)
         share = min(1.0, left / max_splats)
-    options = chosen(
+    options = checked(
         TrainOptions, max_splats=max_splats or TrainOptions.max_splats, sh_degree=sh_degree, iterations=iterations,
-        seed=seed, device=device, background=background, antialiased=antialiased,
-        **{"final_share": share, **settings.of(TrainOptions)},
+        seed=seed, device=device, background=background, antialiased=antialiased, final_share=share,
     )  # fmt: skip
-    again = None not in (checkpoint, resume) and Path(str(checkpoint)).resolve() == Path(str(resume)).resolve()
-    later = str(tuning_checkpoint(checkpoint)) if to_file and checkpoint is not None and psnr is None else None
-    out.check(
-        output, inputs=(source, resume, lpips_weights),
-        named={
-            "--plot": plot, "--page": page, "--checkpoint": None if again else checkpoint,
-            "the checkpoint of the tuning": None if again else later,
-        },
-    )  # fmt: skip
+    replaces = is_same_file(checkpoint, resume)
+    tuned = str(tuning_checkpoint(checkpoint)) if to_file and checkpoint is not None and psnr is None else None
+    written = {} if replaces else {"--checkpoint": checkpoint, "the checkpoint of the tuning": tuned}
+    out.check(output, inputs=(source, resume), named={"--page": page, **written})
     if not to_file:
         check_name(output, ".ply", "train", source)
-    data = DataOptions(source, None if size is None else parse_size(size), images, test_every, near)
-    files = Outputs(checkpoint, checkpoint_every, previews, preview_every, resume, lpips_weights)
-    overrides = upright.overrides()
+    files = Outputs(checkpoint, CHECKPOINT_EVERY, resume=resume)
     if not to_file:
-        out.publish(
-            run_training(
-                data,
-                output,
-                options,
-                files,
-                overrides=overrides,
-                plot=plot,
-                page=page,
-                threads=threads,
-                quiet=out.quiet,
-            )
-        )
+        out.publish(run_training(data, output, options, files, overrides=overrides, page=page, quiet=out.quiet))
         return
-    encoding = EncodeOptions(preset or "small", seed=seed, threads=threads, shape_codebook_size=SHAPE_ENTRIES)
-    report = run_training_to_file(
-        data, output, options, files, encoding, chosen(tuning_after, training=options, byte_cost=byte_cost),
-        size_bytes=size_bytes, psnr=psnr, overrides=overrides, plot=plot, page=page, quiet=out.quiet,
+    encoding = EncodeOptions(preset or "small", seed=seed, shape_codebook_size=SHAPE_ENTRIES)
+    result = run_training_to_file(
+        data, output, options, files, encoding, tuning_after(options), size_bytes=size_bytes, psnr=psnr,
+        overrides=overrides, page=page, quiet=out.quiet,
     )  # fmt: skip
-    out.remark(format_tuning_report(report["file"]))
-    out.publish(report)
+    out.remark(format_tuning_report(result["file"]))
+    out.publish(result)

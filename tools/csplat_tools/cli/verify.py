@@ -8,62 +8,64 @@ import typer
 
 from csplat.errors import CsplatError, counted
 from csplat_conformance.declared_bounds import BoundsVerification, MeasureVerification
-from csplat_tools.cli.command import EXIT_FAILED, OutputOptions, command
-from csplat_tools.cli.shared_options import parse_bytes
+from csplat_tools.cli.command_output import Output
+from csplat_tools.cli.error_lines import EXIT_FAILED
+from csplat_tools.cli.shared_options import (
+    Force,
+    HelpAll,
+    Json,
+    MaxSplats,
+    Quiet,
+    Report,
+    SourceIndexInput,
+    require_one,
+)
 from csplat_tools.console import format_table, note
 from csplat_tools.inspect.verification import Verification, verify_file
 
 
-@command(reads=True, needs={"source_index": ("source",), "memory": ("source",)})
 def verify(
     path: Annotated[str, typer.Argument(metavar="F.csplat", help="A .csplat file, or - for standard input.")],
-    out: OutputOptions,
     source: Annotated[
-        str | None, typer.Option(metavar="IN.ply", help="The PLY it was made from: prove the stated errors.")
+        str | None, typer.Option(metavar="IN.ply", help="Source: verify the declared errors, too.")
     ] = None,
-    source_index: Annotated[
-        str | None, typer.Option(metavar="FILE.npy", help="What `encode --source-index` wrote: prove all.")
-    ] = None,
-    max_splats: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=1, help="Refuse a scene of more splats."),
-    ] = None,
-    memory: Annotated[
-        str | None, typer.Option(metavar="2GB", help="What the proof may take; else half of what is free.")
-    ] = None,
+    source_index: SourceIndexInput = None,
+    max_splats: MaxSplats = None,
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
-    """Check a file against every clause of the format, and its stated errors.
+    """Check a file against the format, and its declared errors.
 
-    Lists all violations, not only the first: clause, error code, byte,
-    field. The validator shares no code with the decoder. With --source, each
-    splat of the file must have a splat of the PLY within the stated maxima.
-    With --source-index it is known which one, and rms and counts are proved
-    as well. Scenes of any size: those that do not fit the memory are proved
-    by way of a file in the folder for temporary ones (TMPDIR), as large as
-    the PLY.
+    Lists all violations: clause, error code, byte, field. With --source,
+    each splat of the file must have a splat of the PLY within the declared
+    maxima. With --source-index the pairs are known, and RMS errors and
+    counts are verified as well. Large scenes are verified on the disk, in a
+    temporary file of the size of the PLY (TMPDIR).
 
     Examples:
       csplat verify scene.csplat
       csplat verify scene.csplat --source scene.ply
-      csplat verify scene.csplat --source scene.ply --source-index scene.npy --json
+      csplat verify scene.csplat --source scene.ply --source-index scene.npy
     """
+    out = Output(force, report, as_json, quiet)
+    require_one({"--source-index": source_index}, {"--source": source})
     out.check(inputs=(path, source, source_index))
-    memory_bytes = parse_bytes(memory)
     try:
         with out.bar() as progress:
-            verified = verify_file(
-                path, source, source_index, max_splats=max_splats, memory_bytes=memory_bytes, progress=progress
-            )
+            verified = verify_file(path, source, source_index, max_splats=max_splats, progress=progress)
     except CsplatError as error:
         out.publish({"holds": False, "error": {"code": error.code, "message": str(error)}})
         raise
     out.publish(verified.as_json(), "" if out.quiet else _report(verified))
     if not verified.holds:
-        _say_why(verified, path, unverified=source is not None and verified.proof is None)
+        _print_reasons(verified, path, unverified=source is not None and verified.proof is None)
         raise typer.Exit(EXIT_FAILED)
 
 
-def _say_why(verified: Verification, path: str, *, unverified: bool) -> None:
+def _print_reasons(verified: Verification, path: str, *, unverified: bool) -> None:
     violations = verified.validation.violations
     if violations:
         clauses, codes = (", ".join(sorted({getattr(one, name) for one in violations})) for name in ("clause", "code"))
@@ -82,11 +84,11 @@ def _report(verified: Verification) -> str:
     if proof is not None:
         lines += [_table(proof)] * bool(proof.measures) + list(proof.notes)
         if proof.holds:
-            lines.append(_said(proof))
+            lines.append(_summary(proof))
     return "\n".join(lines)
 
 
-def _said(proof: BoundsVerification) -> str:
+def _summary(proof: BoundsVerification) -> str:
     if not any(one.holds for one in proof.measures):
         return "nothing is stated that could be proved"
     return "the stated errors hold" if proof.rms_verified else "the stated maxima hold"

@@ -11,9 +11,21 @@ from typing import Annotated
 import typer
 
 from csplat.decoder import decode_scene
+from csplat.encoder import PresetName
 from csplat.errors import counted
-from csplat_tools.cli.command import OutputOptions, command
-from csplat_tools.cli.shared_options import OrientationOptions, Preset, SceneArgument
+from csplat_tools.cli.command_output import Output, default_output
+from csplat_tools.cli.shared_options import (
+    Force,
+    HelpAll,
+    Json,
+    Quiet,
+    Report,
+    SceneArgument,
+    Up,
+    check_range,
+    parse_overrides,
+    take_estimated_up,
+)
 from csplat_tools.console import format_bytes, note
 from csplat_tools.file_streams import check_name, write_bytes
 from csplat_tools.present import viewer_page
@@ -25,45 +37,53 @@ from csplat_tools.present.viewer_server import (
     page_parameters,
 )
 
+_PORT_MAX = 65_535
 _Cameras = Annotated[
-    str | None, typer.Option(metavar="FILE.json", help="Look from these cameras, see `csplat render`.")
+    str | None, typer.Option("--cameras", metavar="FILE.json", help="First views. Default: around the scene.")
 ]
+_PRESETS: tuple[PresetName, PresetName] = ("fast", "balanced")  # for `view`, for `export-html`
 
 
-@command(serves=True, reads=True)
 def view(
     source: SceneArgument,
-    upright: OrientationOptions,
-    out: OutputOptions,
-    preset: Preset = "fast",
+    up: Up = None,
     cameras: _Cameras = None,
-    port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="0 finds one that is free.")] = 0,
+    port: Annotated[
+        int, typer.Option(metavar="PORT", show_default=False, help="Port of the server. Default: any free one.")
+    ] = 0,
     host: Annotated[
-        str, typer.Option(metavar="ADDRESS", help="Who can see the scene: this machine; 0.0.0.0: the network.")
+        str, typer.Option(metavar="ADDRESS", show_default=False, help="0.0.0.0: any machine. Default: this one.")
     ] = "127.0.0.1",
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, open nothing.")] = False,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address only.")] = False,
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
     """Show a scene in the browser.
 
     Serves the viewer and the scene, and nothing else of this machine, until
-    Ctrl-C. A PLY is encoded first, in memory. The address of the page goes
-    to standard output.
+    Ctrl-C. A PLY is encoded first, in memory. The address of the page is
+    printed on standard output.
 
     Examples:
       csplat view scene.csplat
-      csplat view scene.ply --preset small --up z
+      csplat view scene.ply --up z
       csplat view scene.csplat --no-browser --port 8000
     """
+    out = Output(force, report, as_json, quiet)
+    check_range("--port", port, 0, _PORT_MAX)
     out.check(inputs=(source, cameras))
-    wishes = page_parameters(cameras, upright.overrides())
+    wishes = page_parameters(cameras, parse_overrides(up))
     with ExitStack() as stack:
         with out.bar() as progress:
-            scene = stack.enter_context(open_viewer_scene(source, preset=preset, progress=progress))
-        wishes |= _scene_wishes(scene, cameras, upright, out)
+            scene = stack.enter_context(open_viewer_scene(source, preset=_PRESETS[0], progress=progress))
+        wishes |= _scene_parameters(scene, cameras, up, out)
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
             out.print_findings(scene.findings)
-            out.remark(*_encoded(scene, preset))
+            out.remark(*_encoded(scene, _PRESETS[0]))
             out.publish({"url": opened.url, "splats": scene.header.splat_count}, opened.url)
             sys.stdout.flush()
             out.remark("Ctrl-C ends this.")
@@ -75,38 +95,41 @@ def view(
                 out.remark("")  # ends the line with the terminal's ^C
 
 
-@command(beside=".html", reads=True)
 def export_html(
     source: SceneArgument,
-    output: Annotated[str, typer.Argument(metavar="PAGE.html", help="The file to write, or -; SCENE.html by default.")],
-    upright: OrientationOptions,
-    out: OutputOptions,
-    preset: Preset = "balanced",
+    output: Annotated[
+        str | None, typer.Argument(metavar="PAGE.html", help="The file to write, or -. Default: SCENE.html.")
+    ] = None,
+    up: Up = None,
     cameras: _Cameras = None,
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
-    """Write one page that shows a scene, with everything inside.
+    """Write an HTML page that contains a scene and its viewer.
 
-    It opens from a disk, without a network, in any browser with WebGL 2,
-    and can be sent to anybody. A PLY is encoded first; a .csplat file is
-    checked to the last byte. `csplat export-element` is for scenes in a
-    page of your own.
+    The page needs no network, and opens in any browser with WebGL 2. A PLY is
+    encoded first; a .csplat file is checked completely. For scenes in pages
+    of your own, use `csplat export-element`.
 
     Examples:
       csplat export-html scene.csplat scene.html
-      csplat export-html scene.ply scene.html --preset small --force
       csplat export-html scene.csplat scene.html --cameras views.json
     """
-    wishes = page_parameters(cameras, upright.overrides())
+    out, output = Output(force, report, as_json, quiet), default_output(output, source, ".html")
+    wishes = page_parameters(cameras, parse_overrides(up))
     out.check(output, inputs=(source, cameras))
     check_name(output, ".html", "export-html", source)
-    with out.bar() as progress, open_viewer_scene(source, preset=preset, progress=progress) as scene:
+    with out.bar() as progress, open_viewer_scene(source, preset=_PRESETS[1], progress=progress) as scene:
         data = scene.read()
         decode_scene(data)
-        wishes |= _scene_wishes(scene, cameras, upright, out)
+        wishes |= _scene_parameters(scene, cameras, up, out)
         exported = viewer_page.export_page(data, scene.name, wishes)
         write_bytes(output, exported.page)
         out.print_findings(scene.findings)
-        out.remark(*_encoded(scene, preset))
+        out.remark(*_encoded(scene, _PRESETS[1]))
     out.remark(
         f"{output}: {format_bytes(len(exported.page))}, of which the scene {format_bytes(exported.scene_bytes)}"
         f" (its file and a third), page and decoder {format_bytes(exported.code_bytes)}"
@@ -115,25 +138,28 @@ def export_html(
     out.publish({"splats": scene.header.splat_count, "size_bytes": len(exported.page), **sizes})
 
 
-@command()
 def export_element(
-    output: Annotated[str, typer.Argument(metavar="OUT.js", help="The file to write, or -.")], out: OutputOptions
+    output: Annotated[str, typer.Argument(metavar="OUT.js", help="The file to write, or -.")],
+    force: Force = False,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    _all: HelpAll = False,
 ) -> None:
-    """Write the viewer as one script, for scenes in pages of your own.
+    """Write the viewer as a script, for scenes in your own pages.
 
-    A page that loads it has the element <csplat-view>, which is to a
-    .csplat file what <img> is to a picture:
+    A page that loads it has the element <csplat-view>:
 
       <script src="csplat-view.js" defer></script>
       <csplat-view src="scene.csplat" alt="A garden"></csplat-view>
 
-    The script needs nothing beside it. "Only show it" in the guide to
-    embedding lists attributes and events, and what a policy of the page
-    (Content-Security-Policy) has to allow.
+    The script has no dependencies. The guide to embedding lists attributes
+    and events, and what a page's Content-Security-Policy has to allow.
 
     Examples:
       csplat export-element csplat-view.js
     """
+    out = Output(force, report, as_json, quiet)
     out.check(output)
     check_name(output, ".js", "export-element")
     script = viewer_page.export_element()
@@ -142,16 +168,14 @@ def export_element(
     out.publish({"size_bytes": len(script)})
 
 
-def _scene_wishes(
-    scene: ViewerScene, cameras: str | None, upright: OrientationOptions, out: OutputOptions
-) -> dict[str, str]:
+def _scene_parameters(scene: ViewerScene, cameras: str | None, up: str | None, out: Output) -> dict[str, str]:
     """Return the page's parameters of a scene: cameras relative to its origin, and the estimated up direction."""
     wishes = {}
     if cameras is not None:
-        report: list[str] = []
-        wishes = page_parameters(cameras, report=report, origin=scene.header.origin)
-        out.remark(*report)
-    return wishes | estimated_up_parameters(upright.take_estimated_up(scene.seems_up, out))
+        notes: list[str] = []
+        wishes = page_parameters(cameras, report=notes, origin=scene.header.origin)
+        out.remark(*notes)
+    return wishes | estimated_up_parameters(take_estimated_up(scene.seems_up, out, given=up))
 
 
 def _encoded(scene: ViewerScene, preset: str) -> list[str]:

@@ -1,0 +1,201 @@
+"""Errors of the command line: one line on standard error, and a status."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NoReturn
+
+import typer
+
+from csplat.errors import CsplatError, InputError
+from csplat_tools.console import note
+
+EXIT_FAILED = 1
+EXIT_USAGE = 2
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
+
+#: Base class of the errors that typer raises for a command line; typer exports only one of its subclasses.
+UsageError: type[Exception] = typer.BadParameter.__bases__[0]
+
+_AGAIN = "copy or download it again"
+_NEWER = "a newer csplat may know it"
+_INVALID = ("the file contradicts itself", f"{_AGAIN}; `csplat verify` lists all that is wrong")
+_DAMAGED = ("the file is damaged", _AGAIN)
+#: By error code of the format: the defect, and the remedy. The viewer has the same in `tools/viewer/messages.mjs`.
+_DEFECTS = {
+    "E_MAGIC": ("not a .csplat file", "`csplat encode` makes one of a PLY"),
+    "E_VERSION": ("written in another version of the format", _NEWER),
+    "E_TRUNCATED": ("the file ends too early", _AGAIN),
+    "E_TRAILING": ("something follows the end of the file", _AGAIN),
+    "E_CRC": _DAMAGED,
+    "E_CODER": _DAMAGED,
+    "E_UNSUPPORTED": ("", _NEWER),
+    "E_STORE": ("", "nothing was kept; try again"),
+    "E_LIMIT": (
+        "the scene is larger than is allowed here",
+        "`csplat decode` and `csplat verify` take scenes of any size",
+    ),
+}
+_LOST_URL = re.compile(r"([a-z][a-z0-9+]+):/+(.+)")  # a URL read as a path, which loses a slash
+_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
+_OS_ADVICE = {
+    errno.ENOENT: "is the name right?",
+    errno.EACCES: "you are not allowed to",
+    errno.EISDIR: "name a file",
+    errno.ENOSPC: "no half of a file was left; make room, or name another place",
+    errno.EFBIG: "no half of a file was left; name another place",
+    errno.EDQUOT: "no half of a file was left; make room, or name another place",
+}
+_EMPTY_PHRASES = re.compile(r"^Invalid value: |(?<=: )Value error, |\.$")  # in typer's messages
+
+_CROP = "is part of --crop now: six numbers are a box, four are a sphere"
+_OUTPUT = "is gone: the output is the last argument, as in `csplat encode IN OUT`"
+_ENCODER = "is an argument of csplat.EncodeOptions in Python now"
+_DATA_SET = "is an argument of csplat_tools.DataOptions in Python now"
+_VIEWS = "is an argument of csplat_tools.find_view_set in Python now"
+_TRAINING = "is an argument of csplat_tools.training.training_run.run_training in Python now"
+_UNSEEN = "is an argument of encode_file and run_finetuning in Python now"
+#: Options of earlier versions, and where to find what they did. They are refused in this way for one version.
+RENAMED_OPTIONS = {
+    "--aside": "is validation_count of csplat_tools.find_view_set in Python now",
+    "--grades": "is max_classes of csplat.EncodeOptions in Python now",
+    "--keep-all": "is called --no-prune now",
+    "--max-loss": "is called --max-psnr-drop now",
+    "-o": _OUTPUT,
+    "--output": _OUTPUT,
+    "--set": "is gone: EncodeOptions, FinetuneOptions, SimplifyOptions and TrainOptions take such settings in Python",
+    "--images": "is part of the data set's path now, as in SET/images_4",
+    "--crop-box": _CROP,
+    "--crop-sphere": _CROP,
+    "--clause": "is part of --filter now, as in --filter 'HDR-*'",
+    "--exact": "is exact of csplat_conformance.decoder_suite.DecoderSuiteOptions in Python now",
+    "--verbose": "is gone: --json and --junit have a result for each check",
+    "-v": "is gone: --json and --junit have a result for each check",
+    "-j": "is called --jobs now",
+    "--checkpoint-every": "is gone: checkpoints are written every 1,000 steps",
+    "--max-classes": _ENCODER,
+    "--deflate-level": _ENCODER,
+    "--attribute-psnr": _ENCODER,
+    "--seed": "is an argument of EncodeOptions, FinetuneOptions and SimplifyOptions in Python now",
+    "--threads": "is an argument of EncodeOptions and SimplifyOptions in Python now",
+    "--size": _DATA_SET,
+    "--test-every": _DATA_SET,
+    "--near": _DATA_SET,
+    "--views": _VIEWS,
+    "--view-size": _VIEWS,
+    "--validation-count": _VIEWS,
+    "--split": _VIEWS,
+    "--background": _VIEWS,
+    "--axes": "is an option of `csplat convert`, and coordinate_system of scenes in Python",
+    "--strict": "is an argument of csplat.read in Python now; `csplat lint` lists defects",
+    "--prune-unseen": _UNSEEN,
+    "--keep-unseen": _UNSEEN,
+    "--importance": "is an option of `csplat encode`, and an argument of run_finetuning in Python",
+    "--source-index": "is an option of encode, finetune, verify and compare; in Python also of csplat_tools.simplify",
+    "--work": "is gone: the working folder is OUT.work; encode_file takes another one in Python",
+    "--memory": "is an argument of csplat_tools.compare and verify_file in Python now",
+    "--amplify": "is amplification of csplat_tools.compare in Python now",
+    "--lpips": "is an option of `csplat compare`, and an argument of csplat_tools.tradeoff's settings in Python",
+    "--plots": "is write_plots of csplat_tools.tradeoffs in Python now; -o PAGE.html has the plots",
+    "--modes": "is an argument of csplat_tools.SweepOptions in Python now",
+    "--iterations": "is an argument of csplat_tools.SweepOptions in Python now",
+    "--matrices": "is an argument of csplat_tools.measure_sensitivity in Python now",
+    "--no-matrices": "is an argument of csplat_tools.measure_sensitivity in Python now",
+    "--lambda": "is byte_cost of FinetuneOptions in Python, and an option of `csplat finetune`",
+    "--lr-factor": "is FinetuneOptions.scaled in Python now",
+    "--lpips-weights": _TRAINING,
+    "--plot": _TRAINING,
+    "--previews": _TRAINING,
+    "--preview-every": _TRAINING,
+    "--preset": "is an option of `csplat encode`: encode the scene first",
+    "--sh-degree": "is gone here: `csplat convert --sh-degree` writes a scene with fewer bands",
+    "--from": "is an option of encode and convert: convert the scene first",
+    "--thumbnails": "is gone: the page has thumbnails if the render extra is installed",
+    "--no-thumbnails": "is thumbnails of csplat_tools.batch in Python now",
+}
+
+
+@contextmanager
+def report_errors() -> Iterator[None]:
+    """Turn expected errors into one line on standard error and status 1.
+
+    Defects of csplat itself still end in a traceback: a bug report needs it.
+
+    Raises:
+        typer.Exit: with the status.
+    """
+    try:
+        yield
+        sys.stdout.flush()  # a closed pipe shows here, not when the interpreter ends
+    except CsplatError as error:
+        _fail(_csplat_error(error))
+    except BrokenPipeError:
+        _drop_stdout()
+        raise typer.Exit(EXIT_FAILED) from None
+    except OSError as error:
+        if error.filename is None and error.errno in _FULL:
+            _drop_stdout()  # all other writers name their file
+        _fail(_os_error(error))
+    except MemoryError:
+        _fail("out of memory")
+    except KeyboardInterrupt:
+        note("interrupted")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def usage_message(error: Any) -> str:
+    """Return the message of an error in a command line, in one line; for an option that is gone, its replacement."""
+    option = getattr(error, "option_name", None) or ""
+    if option in RENAMED_OPTIONS and "No such option" in error.format_message():
+        return f"{option} {RENAMED_OPTIONS[option]}"
+    return " ".join(_EMPTY_PHRASES.sub("", error.format_message()).split())
+
+
+def refuse_command_line(error: Any) -> NoReturn:
+    """Print an error in a command line, in the form of other errors, and exit with status 2."""
+    message = usage_message(error)
+    if message:  # empty for a command line without arguments: help is printed already
+        command = error.ctx.command_path if error.ctx is not None else "csplat"
+        helps = f"`{command} --help`" if error.ctx is not None else "`csplat COMMAND --help`"
+        note(f"error: {command}: {message}; {helps} lists the options (E_USAGE)")
+    sys.exit(EXIT_USAGE)
+
+
+def _fail(message: str) -> NoReturn:
+    note("error: " + " ".join(message.split()))
+    raise typer.Exit(EXIT_FAILED) from None
+
+
+def _csplat_error(error: CsplatError) -> str:
+    """Return the message of an error: the file, the defect in plain words, the details, the remedy, and the code."""
+    what, advice = _DEFECTS.get(error.code, ("", "") if isinstance(error, InputError) else _INVALID)
+    message = str(error)
+    parts = [error.path] if error.path is not None and Path(error.path).name not in message else []
+    parts += [part for part in (what, message) if part]
+    code = "" if error.code in message else f" ({error.code})"
+    return ": ".join(parts) + (f"; {advice}" if advice else "") + code
+
+
+def _os_error(error: OSError) -> str:
+    reason = error.strerror or str(error) or type(error).__name__
+    number = error.errno or 0
+    code = f" ({errno.errorcode[number]})" if number in errno.errorcode else ""
+    if error.filename is None:
+        return (f"standard output: {reason}; what it holds is not whole" if number in _FULL else reason) + code
+    if number == errno.ENOENT and (url := _LOST_URL.match(str(error.filename))):
+        return f"{url[1]}://{url[2]} is a URL, expected a file: download it first; extract and batch read URLs" + code
+    return f"{error.filename}: {reason}" + (f"; {_OS_ADVICE[number]}" if number in _OS_ADVICE else "") + code
+
+
+def _drop_stdout() -> None:
+    """Redirect standard output to the null device, so that the interpreter's flush at exit cannot fail."""
+    try:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (OSError, ValueError):
+        return  # standard output is not a file here
