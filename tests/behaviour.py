@@ -289,14 +289,23 @@ def _presets(name: str, model: csplat.SplatModel, folder: Path) -> Iterator[tupl
 
 def fit_group(folder: Path) -> Iterator[tuple[str, Json]]:
     """Yield goldens of a short training, a short tuning of its result, and searches for a PSNR and for a size."""
+    import pytest
+    from command_line import change_options  # imports the renderer
+
     data, ply = write_images(folder / "images"), folder / "trained.ply"
     tuned, found = folder / "tuned.csplat", folder / "found.csplat"
-    seed = ("--seed", "5")
-    report = run("train", data, "-o", ply, "--max-splats", "300", "--sh-degree", "1", "--iterations", "120", *seed)
+    words = ("--max-splats", "300", "--sh-degree", "1", "--iterations", "120", "--seed", "5")
+    report = run("train", data, ply, *words)
     golden = {"PLY": hashlib.sha256(ply.read_bytes()).hexdigest()[:24]}
     yield "trained", {"parts": golden, "size_bytes": ply.stat().st_size}
     yield "report of train", plain(report, folder)
-    report = run("finetune", ply, tuned, "--data", data, "--iterations", "20", *seed)
+    with pytest.MonkeyPatch.context() as patch:
+        for place in (
+            "csplat_tools.cli.finetune.EncodeOptions",
+            "csplat_trainer.tuning.tuning_options.FinetuneOptions",
+        ):
+            change_options(patch, place, seed=5)
+        report = run("finetune", ply, tuned, "--data", data, "--iterations", "20")
     yield "tuned", file_golden(tuned.read_bytes())
     yield "report of finetune", plain(report, folder)
     for name, target in {"PSNR": ("--target-psnr", "36"), "size": ("--target-size", "3000")}.items():

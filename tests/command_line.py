@@ -5,11 +5,17 @@ from __future__ import annotations
 import json
 import signal
 import threading
+from dataclasses import replace
+from functools import partial
+from importlib import import_module
+from typing import Any
 
+import pytest
 from typer.testing import CliRunner
 
 from csplat_tools.cli.app import app
 from csplat_tools.cli.batch_protocol import answer
+from csplat_tools.views import find_view_set
 
 
 def invoke(*words):
@@ -22,6 +28,40 @@ def call(*words, status=0):
     result = invoke(*words)
     assert status == result.exit_code, (result.output, result.exception)
     return result
+
+
+class _ChangedOptions:
+    """A dataclass of options whose instances have other values of some fields."""
+
+    def __init__(self, kind: type, values: dict[str, Any]) -> None:
+        self._kind, self._values = kind, values
+
+    def __call__(self, *args: Any, **given: Any) -> Any:
+        return replace(self._kind(*args, **given), **self._values)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._kind, name)
+
+
+def change_options(patch: pytest.MonkeyPatch, place: str, **values: object) -> None:
+    """Let commands use other options of the library, which the command line does not have.
+
+    Args:
+        patch: undoes it.
+        place: name of a class of options where a command finds it, such as `csplat_tools.cli.train.TrainOptions`.
+        values: values by field.
+    """
+    module, _, name = place.rpartition(".")
+    patch.setattr(place, _ChangedOptions(getattr(import_module(module), name), values))
+
+
+def change_views(patch: pytest.MonkeyPatch, count: int, size: tuple[int, int]) -> None:
+    """Let commands place few, small virtual views, unless they want none."""
+
+    def find(source, *, count: int | None, size: tuple[int, int] | None, few, small, **how):  # noqa: ARG001
+        return find_view_set(source, count=count if count == 0 else few, size=small, **how)
+
+    patch.setattr("csplat_tools.cli.shared_options.find_view_set", partial(find, few=count, small=size))
 
 
 class InThisProcess:

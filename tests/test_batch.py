@@ -205,13 +205,15 @@ def test_options_are_refused_before_any_work(scenes, tmp_path):
         return result.stderr
 
     assert "not one of" in refused("encode", "--preset", "tiny")
-    assert "give one of them" in refused("encode", "--target-psnr", "40", "--target-size", "1MB")
     assert "--report is not for all" in refused("encode", "--report", "a.json")
     assert "--ending" in refused("convert")
     assert "IN and OUT" in refused("info")
     assert "no command" in refused("nonsense")
     assert "--help" in refused("encode", "--help")
     assert not (tmp_path / "out").exists()
+    line = refused("encode", "--target-psnr", "40", "--target-size", "1MB")  # the first scene finds it out
+    assert "error: csplat batch: csplat encode: --target-psnr and --target-size: give one of them; `csplat b" in line
+    assert [] == list((tmp_path / "out").rglob("*.csplat"))
 
 
 def test_a_dry_run_writes_nothing(scenes, tmp_path, here):
@@ -356,7 +358,7 @@ def test_a_batch_that_is_interrupted_goes_on_where_it_ended(scenes, tmp_path, ma
     os.mkfifo(stuck)  # without a size: it comes last
     command = [sys.executable, "-m", "csplat_tools", "batch", str(scenes), str(out), "--workers", "1"]
     batch = subprocess.Popen(
-        [*command, "--no-thumbnails", "--", *FAST],
+        [*command, "--", *FAST],
         stderr=subprocess.PIPE,
         text=True,
         preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal

@@ -1,6 +1,5 @@
 """`csplat convert` and `csplat formats`: conversion between all formats, filters, reports of losses."""
 
-import inspect
 import json
 from dataclasses import replace
 
@@ -18,7 +17,6 @@ from csplat.formats import spz
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply import read_ply, write_ply
 from csplat.scene_source import source_from_model
-from csplat_tools.cli.app import command_function
 from csplat_tools.convert_file import Filters, convert_file, find_floaters
 from csplat_tools.encode_file import OutOfCoreOptions, encode_file
 from csplat_tools.scene_files import open_scenes
@@ -99,7 +97,7 @@ def test_invalid_arguments_are_refused(tmp_path, ply, monkeypatch, words, messag
 def test_filters_are_applied_in_the_documented_order(tmp_path, ply):
     call(
         "convert", ply, tmp_path / "out.ply", "--rotate", "0,0,90", "--scale", "2", "--translate", "1,0,0",
-        "--crop-box", "-1,-1,-1,3,1,1", "--sh-degree", "1",
+        "--crop", "-1,-1,-1,3,1,1", "--sh-degree", "1",
     )  # fmt: skip
     source, found = read_ply(ply), read_ply(tmp_path / "out.ply")
     turned = np.stack([-source.means[:, 1], source.means[:, 0], source.means[:, 2]], axis=1)
@@ -230,19 +228,14 @@ def assert_exact_arrays_are_kept(tmp_path, first, second, model):
 
 
 @pytest.mark.slow
-def test_every_command_that_reads_scenes_has_the_option_from(tmp_path, ply):
+def test_encode_and_convert_take_the_format_of_a_file(tmp_path, ply):
     call("convert", ply, tmp_path / "a.splat")
     bare = tmp_path / "bare"
     (tmp_path / "a.splat").rename(bare)
     assert "--from splat" in call("info", bare, status=1).stderr
-    assert json.loads(call("info", bare, "--from", "splat", "--json").stdout)["splats"] == 200
-    call("lint", bare, "--from", "splat")
     call("convert", bare, tmp_path / "b.ply", "--from", "splat")
     call("encode", bare, tmp_path / "b.csplat", "--from", "splat")
-    call("verify", tmp_path / "b.csplat", "--source", bare, "--from", "splat")
     assert "the format is 'x', expected one of" in call("encode", bare, "-", "--from", "x", status=1).stderr
-    for name in ("compare", "export-html", "finetune", "render", "sensitivity", "simplify", "tradeoff", "view"):
-        assert "read_as" in inspect.signature(command_function(name)).parameters, name
 
 
 def test_a_packed_scene_is_unpacked_once(tmp_path, make_model, monkeypatch):

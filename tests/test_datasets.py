@@ -484,6 +484,26 @@ def test_the_smallest_sufficient_folder_of_images_is_read(tmp_path):
         load(tmp_path, images="images_8")
 
 
+def test_a_folder_of_images_stands_for_its_set(tmp_path, monkeypatch):
+    shots = cameras(9)
+    for folder in ("images", "small/images_2"):
+        for i, camera in enumerate(shots):
+            write_picture(tmp_path / "garden" / folder / f"im {i:03}.png", camera)
+    write_colmap(tmp_path / "garden" / "sparse" / "0", shots)
+    monkeypatch.chdir(tmp_path)
+    for path, images in (("garden/images", "images"), ("garden/small/images_2", "small/images_2"), ("garden", None)):
+        data = load(path)
+        assert (images, "COLMAP set garden") == (data.images, data.name)
+        assert f"images from {images or 'images'}" in data.report
+    with pytest.raises(InputError, match=r"garden/images_4 is neither a folder .*; garden has images, small"):
+        load("garden/images_4")
+    with pytest.raises(InputError, match=r"garden/sparse is no data set: .* or a folder of images in such a set"):
+        load("garden/sparse")
+    (tmp_path / "garden" / "images" / "transforms.json").write_text("{}")  # a set of its own
+    with pytest.raises(InputError, match="lists no frames"):
+        load("garden/images")
+
+
 def test_a_smaller_size_scales_each_axis_by_itself(blender):
     data = load(blender, (24, 8))
     picture = data.train[0]

@@ -124,7 +124,7 @@ def test_the_command_extracts_and_reports(data, tmp_path):
     assert 1 == CliRunner().invoke(app, [*words, box]).exit_code  # it is there
     refused = CliRunner().invoke(app, [*words, "--force", "--box=1,2,3"])
     assert 2 == refused.exit_code
-    assert "wanted 6 numbers" in refused.stderr
+    assert "expected 6 numbers" in refused.stderr
 
 
 STEPS = {

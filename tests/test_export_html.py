@@ -96,11 +96,11 @@ def test_a_page_has_its_cameras_axes_and_any_name_and_is_forbidden_the_network(t
 def test_the_command_puts_cameras_and_axes_into_the_page(make_model, cameras, tmp_path):
     data = encode(make_model(20, 0))
     (tmp_path / "scene.csplat").write_bytes(data)
-    words = [tmp_path / "scene.csplat", tmp_path / "page.html", "--cameras", cameras, "--axes", "RFU"]
+    words = [tmp_path / "scene.csplat", tmp_path / "page.html", "--cameras", cameras, "--up", "z"]
     done = invoke(*words)
     assert 0 == done.exit_code, done.output
-    wishes = page_parameters(str(cameras), MetadataOverrides(coordinate_system="RFU"))
-    assert {"camera", "axes"} == set(wishes)
+    wishes = page_parameters(str(cameras), MetadataOverrides(up=(0.0, 0.0, 1.0)))
+    assert {"camera", "up"} == set(wishes)
     assert export_page(data, "scene.csplat", wishes).page == (tmp_path / "page.html").read_bytes()
 
 
@@ -174,9 +174,9 @@ def test_modules_that_cannot_be_linked_are_noticed(texts, expected):
 
 def test_a_ply_is_encoded(make_model, tmp_path):
     write_ply(tmp_path / "scene.ply", make_model(50, 1))
-    done = invoke(tmp_path / "scene.ply", tmp_path / "page.html", "--preset", "fast")
+    done = invoke(tmp_path / "scene.ply", tmp_path / "page.html")
     assert 0 == done.exit_code, done.output
-    assert "encoded with the preset fast" in done.stderr
+    assert "encoded with the preset balanced" in done.stderr
     assert re.search(r"page\.html: [\d.]+ kB, of which the scene [\d.]+ kB", done.stderr.replace("\n", " "))
     assert (tmp_path / "page.html").read_bytes().startswith(b"<!doctype html>")
 
@@ -190,7 +190,7 @@ def test_it_refuses_what_it_should(sample, sample_path, tmp_path):
     broken.write_bytes(sample[:middle] + bytes([sample[middle] ^ 1]) + sample[middle + 1 :])
     done = invoke(broken, target, "--force")
     assert (1, True) == (done.exit_code, "E_CRC" in done.stderr)
-    assert 2 == invoke(sample_path, target, "--force", "--preset", "tiny").exit_code
+    assert 2 == invoke(sample_path, target, "--force", "--up", "w").exit_code
     assert "mine" == target.read_text()
     assert ["broken.csplat", "page.html"] == sorted(path.name for path in tmp_path.iterdir())
 

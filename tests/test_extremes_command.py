@@ -11,13 +11,15 @@ from typer.testing import CliRunner
 pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
 pytest.importorskip("PIL.Image", reason="rendering needs pillow: pip install 'csplat[render]'")
 
+from command_line import change_views
+
 from csplat import read_ply
+from csplat.errors import CsplatError
 from csplat_tools.cli.app import app
 
 pytestmark = [pytest.mark.extremes, pytest.mark.slow, pytest.mark.usefixtures("small_views")]
 
 LONG = pytest.mark.area(name="extremes")
-FEW = ("--views", 3, "--view-size", "40x30", "--effort", 1)
 QUICK = ("half the rows NaN",)  # conditions that are tested outside the area, too
 
 
@@ -68,20 +70,22 @@ def test_the_whole_chain(name, tmp_path):
     done = run("info", file, "--json")
     assert (0, json.loads(done.stdout)["size_bytes"]) == (done.exit_code, file.stat().st_size)
 
-    assert 0 == run("render", file, "--orbit", 2, "--size", "64x48", "-o", tmp_path / "pictures", "--depth").exit_code
+    assert 0 == run("render", file, "--orbit", 2, "--size", "64x48", tmp_path / "pictures", "--depth").exit_code
     assert ["0000.depth.npy", "0000.png", "0001.depth.npy", "0001.png"] == names_in(tmp_path / "pictures")
     assert np.isfinite(np.load(tmp_path / "pictures" / "0000.depth.npy")).all()
 
-    done = run("simplify", ply, tmp_path / "half.ply", "--keep", 0.5, *FEW, "--json")
+    with pytest.MonkeyPatch.context() as patch:
+        change_views(patch, 3, (40, 30))
+        done = run("simplify", ply, tmp_path / "half.ply", "--keep", 0.5, "--effort", 1, "--json")
     assert 0 == done.exit_code
     assert json.loads(done.stdout)["splats"] == len(read_ply(tmp_path / "half.ply", strict=True))
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if CONDITIONS[name].repairs])
-def test_strict_refuses_in_one_line_and_writes_nothing(name, tmp_path):
+def test_strict_reading_refuses_what_lint_reports(name, tmp_path):
     ply = write_scene(tmp_path, name)
-    assert CONDITIONS[name].repairs[0] in refused("encode", ply, tmp_path / "scene.csplat", "--strict")
-    assert ["scene.ply"] == names_in(tmp_path)
+    with pytest.raises(CsplatError, match=CONDITIONS[name].repairs[0]):
+        read_ply(ply, strict=True)
     assert 1 == run("lint", ply).exit_code
 
 
@@ -91,7 +95,7 @@ def test_a_million_identical_splats_are_encoded_but_not_rendered(tmp_path):
     assert 0 == run("encode", ply, file, "--preset", "fast").exit_code
     assert file.stat().st_size < 6_000
     assert 0 == run("verify", file, "--source", ply).exit_code
-    assert "MAX_INTERSECTIONS" in refused("render", file, "--orbit", 1, "-o", tmp_path / "pictures")
+    assert "MAX_INTERSECTIONS" in refused("render", file, "--orbit", 1, tmp_path / "pictures")
     assert ["scene.csplat", "scene.ply"] == names_in(tmp_path)
     assert 1 == run("decode", file, tmp_path / "back.ply", "--max-splats", 999_999).exit_code
     assert ["scene.csplat", "scene.ply"] == names_in(tmp_path)
@@ -118,7 +122,7 @@ def test_a_scene_without_splats_gives_an_empty_file_and_one_of_nan_is_refused(tm
     assert 0 == run("encode", ply, file).exit_code
     assert 0 == run("verify", file, "--source", ply).exit_code
     assert "without splats cannot be simplified" in refused("simplify", ply, tmp_path / "half.ply", "--keep", 0.5)
-    assert 0 == run("render", file, "--orbit", 1, "--size", "32x24", "-o", tmp_path / "pictures").exit_code
+    assert 0 == run("render", file, "--orbit", 1, "--size", "32x24", tmp_path / "pictures").exit_code
     columns["means"][:] = np.nan
     write_columns(ply, columns)
     assert "300 splats with NaN or infinity: none is left" in refused("encode", ply, tmp_path / "none.csplat")

@@ -3,11 +3,10 @@
 `tuned_file` was tuned for a hundred steps, for all who need a file that learnt; all else takes as few steps as show it.
 """
 
-import inspect
 import json
 import math
 import re
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -20,7 +19,7 @@ pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'cspl
 
 # Importing them needs what is looked for above.
 from captures import H, W, cameras, photograph, shell
-from command_line import invoke
+from command_line import change_options, invoke
 
 import csplat
 import csplat_trainer
@@ -32,8 +31,8 @@ from csplat_render import render
 from csplat_render.camera_files import save_cameras
 from csplat_render.conventions import UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
-from csplat_tools.cli.finetune import finetune as finetune_command
 from csplat_tools.optimise.pruning_order import SimplifyOptions
+from csplat_tools.training import tuning_run
 from csplat_tools.training.tuning_report import ply_splat_bytes
 from csplat_tools.training.tuning_run import smallest_reaching
 from csplat_trainer.losses import PhotometricLoss
@@ -533,8 +532,14 @@ def test_validation_views_are_training_views_unless_they_are_held_out():
 
 # the command
 
-BARE = ("--set", "sh-coding=none,shape-codebook-size=0")  # neither SH nor codebooks, which take time
-BRIEF = ("--preset", "fast", "--iterations", 1, *BARE)  # for tests in which learning does not matter, either
+ENCODE_OPTIONS = "csplat_tools.cli.finetune.EncodeOptions"
+BRIEF = ("--preset", "fast", "--iterations", 1)  # for tests in which learning does not matter
+
+
+@pytest.fixture(autouse=True)
+def bare(monkeypatch):
+    """Let the command code neither SH nor codebooks, which take time."""
+    change_options(monkeypatch, ENCODE_OPTIONS, sh_coding="none", shape_codebook_size=0)
 
 
 def call(*words):
@@ -603,7 +608,7 @@ def test_verify_proves_what_a_tuned_file_states_and_names_what_it_does_not(tuned
 @pytest.mark.slow
 def test_splats_that_no_view_shows_are_left_out_and_counted(capture, tmp_path):
     out = tmp_path / "s.csplat"
-    told = call("finetune", capture / "scene.ply", "--data", capture, "-o", out, *BRIEF, "--json")
+    told = call("finetune", capture / "scene.ply", "--data", capture, out, *BRIEF, "--json")
     facts = json.loads(told.stdout)
     assert (301, 300, 1) == (facts["source_splats"], facts["splats"], facts["unseen"])
     stated = read_declared_bounds(out.read_bytes())
@@ -611,19 +616,12 @@ def test_splats_that_no_view_shows_are_left_out_and_counted(capture, tmp_path):
     assert 1 == read_options(out.read_bytes())["finetuned"]["unseen"]
 
 
-def test_settings_of_the_encoder_reach_it(capture, tmp_path):
-    words = ("finetune", capture / "scene.ply", "--data", capture, *BRIEF)
-    call(*words, "-o", tmp_path / "s.csplat", "--attribute-psnr", 28, "--set", "deflate=zlib")
-    assert {"attribute_psnr": 28.0, "deflate": "zlib"}.items() <= read_options((tmp_path / "s.csplat").read_bytes())[
-        "asked"
-    ].items()
-
-
 @pytest.mark.slow
-def test_a_codebook_of_shapes_can_be_done_without(capture, tmp_path):
-    words = ("finetune", capture / "scene.ply", "--data", capture, "--iterations", 1, "--set", "sh-coding=none")
-    call(*words, "-o", tmp_path / "with.csplat", "--set", "shape-codebook-size=40")
-    call(*words, "-o", tmp_path / "without.csplat", "--set", "shape-codebook-size=0")
+def test_a_codebook_of_shapes_can_be_done_without(capture, tmp_path, monkeypatch):
+    words = ("finetune", capture / "scene.ply", "--data", capture, "--iterations", 1)
+    call(*words, tmp_path / "without.csplat")
+    change_options(monkeypatch, ENCODE_OPTIONS, shape_codebook_size=40)
+    call(*words, tmp_path / "with.csplat")
     assert 0 < read_options((tmp_path / "with.csplat").read_bytes())["shape_codebook_size"] <= 40
     assert "shape_codebook_size" not in read_options((tmp_path / "without.csplat").read_bytes())
 
@@ -635,20 +633,20 @@ def test_a_file_that_is_not_what_was_tuned_is_not_written(capture, tmp_path, mon
 
     monkeypatch.setattr("csplat_trainer.tuning.tuned_encoding.decode", wrong)
     out = tmp_path / "s.csplat"
-    result = invoke("finetune", capture / "scene.ply", "--data", capture, "-o", out, *BRIEF)
+    result = invoke("finetune", capture / "scene.ply", "--data", capture, out, *BRIEF)
     assert "holds other sh0 than were tuned" in str(result.exception)
     assert not out.exists()
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("small_views")
-def test_a_scene_can_be_tuned_to_its_own_renders_which_a_page_shows(capture, tmp_path):
+def test_a_scene_can_be_tuned_to_its_own_renders_which_a_page_shows(capture, tmp_path, monkeypatch):
     out, report, page = (tmp_path / name for name in ("s.csplat", "report.json", "page.html"))
-    call(
-        "finetune", capture / "scene.ply", "--self", "-o", out, "--attribute-psnr", 28, "--iterations", 60,
-        "--views", 16, "--lr-factor", 1, "--view-size", "48x36", *BARE, "--report", report, "-q",
-        "--page", page,
-    )  # fmt: skip
+    change_options(monkeypatch, ENCODE_OPTIONS, attribute_psnr=28.0)
+    for name, value in {"VIEWS": 16, "VIEW_SIZE": (48, 36), "LEARNING_FACTOR": {True: 1.0}}.items():
+        monkeypatch.setattr(tuning_run, name, value)
+    words = ("finetune", capture / "scene.ply", "--self", out, "--iterations", 60)
+    call(*words, "--report", report, "-q", "--page", page)
     facts = json.loads(report.read_text())
     assert (301, 301) == (facts["source_splats"], facts["splats"])
     assert (True, 2) == (facts["validation"]["held_out"], facts["validation"]["views"])
@@ -664,12 +662,13 @@ def test_a_scene_can_be_tuned_to_its_own_renders_which_a_page_shows(capture, tmp
 
 
 @pytest.mark.slow
-def test_cameras_of_a_file_can_take_the_renders(capture, tmp_path):
+def test_cameras_of_a_file_can_take_the_renders(capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(tuning_run, "run_finetuning", partial(tuning_run.run_finetuning, prune_unseen=True))
     save_cameras(tmp_path / "cameras.json", cameras(40))
     out = tmp_path / "s.csplat"
     result = call(
-        "finetune", capture / "scene.ply", "--self", "--cameras", tmp_path / "cameras.json", "-o", out,
-        "--prune-unseen", *BRIEF, "--json", "-q",
+        "finetune", capture / "scene.ply", "--self", "--cameras", tmp_path / "cameras.json", out,
+        *BRIEF, "--json", "-q",
     )  # fmt: skip
     facts = json.loads(result.stdout)
     assert (301, 300, 4) == (facts["source_splats"], facts["splats"], facts["validation"]["views"])
@@ -680,7 +679,7 @@ def test_cameras_of_a_file_can_take_the_renders(capture, tmp_path):
 def test_splats_that_pictures_need_least_can_be_left_out(capture, tmp_path):
     out = tmp_path / "s.csplat"
     result = call(
-        "finetune", capture / "scene.ply", "--data", capture, "--keep", 0.5, "-o", out, *BRIEF,
+        "finetune", capture / "scene.ply", "--data", capture, "--keep", 0.5, out, *BRIEF,
         "--json",
     )  # fmt: skip
     facts = json.loads(result.stdout)
@@ -688,26 +687,30 @@ def test_splats_that_pictures_need_least_can_be_left_out(capture, tmp_path):
     stated = read_declared_bounds(out.read_bytes())
     assert (301, 151) == (stated.source_count, stated.pruned_count)
     call("verify", out, "--source", capture / "scene.ply")
-    again = call("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "t.csplat", *BRIEF)
+    again = call("finetune", capture / "scene.ply", "--data", capture, tmp_path / "t.csplat", *BRIEF)
     assert "need least" not in again.stderr
 
 
-SMALL = ("--preset", "small", "--iterations", 10, "--set", "sh-coding=scalar,shape-codebook-size=0")
+SMALL = ("--preset", "small", "--iterations", 10)
+SCALAR = {"sh_coding": "scalar", "shape_codebook_size": 0}
 
 
 @pytest.fixture(scope="module")
 def whole(capture, tmp_path_factory):
     """Return the report on a file that was tuned without a target."""
     words = ("finetune", capture / "scene.ply", "--data", capture, *SMALL)
-    return json.loads(call(*words, "-o", tmp_path_factory.mktemp("whole") / "w.csplat", "--json").stdout)
+    with pytest.MonkeyPatch.context() as patch:
+        change_options(patch, ENCODE_OPTIONS, **SCALAR)
+        return json.loads(call(*words, tmp_path_factory.mktemp("whole") / "w.csplat", "--json").stdout)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_fits")
 @pytest.mark.parametrize(("share", "splats"), [(0.9, (80, 270)), (1.15, (300, 300))], ids=["fewer splats", "finer"])
-def test_a_file_keeps_to_the_size_that_is_wanted(capture, whole, tmp_path, share, splats):
+def test_a_file_keeps_to_the_size_that_is_wanted(capture, whole, tmp_path, share, splats, monkeypatch):
+    change_options(monkeypatch, ENCODE_OPTIONS, **SCALAR)
     size, out = int(share * whole["size_bytes"]), tmp_path / "s.csplat"
-    words = ("finetune", capture / "scene.ply", "--data", capture, *SMALL, "-o", out, "--json")
+    words = ("finetune", capture / "scene.ply", "--data", capture, *SMALL, out, "--json")
     facts = json.loads(call(*words, "--target-size", f"{size}B").stdout)
     assert 0.85 * size < out.stat().st_size == facts["size_bytes"] <= size
     assert splats[0] <= facts["splats"] <= splats[1]
@@ -716,22 +719,23 @@ def test_a_file_keeps_to_the_size_that_is_wanted(capture, whole, tmp_path, share
 def test_a_size_that_no_file_of_the_scene_has_is_refused(capture, source, tmp_path):
     write_ply(tmp_path / "one.ply", source.select(slice(0, 1)))
     words = ("finetune", tmp_path / "one.ply", "--data", capture, *BRIEF)
-    result = invoke(*words, "-o", tmp_path / "x.csplat", "--target-size", "300B")
+    result = invoke(*words, tmp_path / "x.csplat", "--target-size", "300B")
     assert (1, False) == (result.exit_code, (tmp_path / "x.csplat").exists())
     assert "more than 300 (E_INPUT)" in result.stderr
 
 
 @pytest.mark.slow
-def test_a_file_is_made_larger_until_it_looks_well_enough(capture, whole, tmp_path):
+def test_a_file_is_made_larger_until_it_looks_well_enough(capture, whole, tmp_path, monkeypatch):
+    change_options(monkeypatch, ENCODE_OPTIONS, **SCALAR)
     words = ("finetune", capture / "scene.ply", "--data", capture, *SMALL)
     out, report = tmp_path / "s.csplat", tmp_path / "s.json"
     wanted = whole["validation"]["psnr"] + 1.0
-    call(*words, "-o", out, "--target-psnr", wanted, "--report", report)
+    call(*words, out, "--target-psnr", wanted, "--report", report)
     facts = json.loads(report.read_text())
     assert wanted <= facts["validation"]["psnr"]
     assert out.stat().st_size == facts["size_bytes"] > whole["size_bytes"]
     words = ("finetune", capture / "scene.ply", "--data", capture, *BRIEF)
-    result = invoke(*words, "-o", tmp_path / "x.csplat", "--target-psnr", 90)
+    result = invoke(*words, tmp_path / "x.csplat", "--target-psnr", 90)
     assert (1, False) == (result.exit_code, (tmp_path / "x.csplat").exists())
     assert "90 dB cannot be reached" in result.stderr
 
@@ -752,92 +756,83 @@ def test_sizes_are_tried_until_one_is_near_enough(wanted, size):
         smallest_reaching(31.0, partial(make, most=90_000))
 
 
-def test_weights_are_for_the_splats_of_the_source(capture, tmp_path):
-    words = ("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "s.csplat", *BRIEF)
+def test_weights_are_for_the_splats_of_the_source(capture, tmp_path, monkeypatch):
+    words = ("finetune", capture / "scene.ply", "--data", capture, tmp_path / "s.csplat", *BRIEF)
+    weighted = partial(tuning_run.run_finetuning, importance=str(tmp_path / "w.npy"))
+    monkeypatch.setattr(tuning_run, "run_finetuning", weighted)
     np.save(tmp_path / "w.npy", np.ones(300))
-    result = invoke(*words, "--importance", tmp_path / "w.npy")
+    result = invoke(*words)
     assert 1 == result.exit_code
     assert "expected (301,)" in result.stderr
     np.save(tmp_path / "w.npy", np.arange(301.0))
-    call(*words, "--importance", tmp_path / "w.npy")
+    call(*words)
 
 
 @pytest.mark.slow
-def test_sensitivities_are_those_of_the_command_that_measures_them(capture, tmp_path):
+def test_sensitivities_are_those_of_the_command_that_measures_them(capture, tmp_path, monkeypatch):
     call("sensitivity", capture / "scene.ply", tmp_path / "s.npz", "--data", capture)
     words = ("finetune", capture / "scene.ply", "--data", capture, "--preset", "fast", "--iterations", 1, "--lambda", 0)
-    call(*words, "-o", tmp_path / "a.csplat", "--importance", tmp_path / "s.npz")
-    call(*words, "-o", tmp_path / "b.csplat")
+    call(*words, tmp_path / "b.csplat")
+    weighted = partial(tuning_run.run_finetuning, importance=str(tmp_path / "s.npz"))
+    monkeypatch.setattr(tuning_run, "run_finetuning", weighted)
+    call(*words, tmp_path / "a.csplat")
     assert (tmp_path / "a.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()
 
 
 @pytest.mark.slow
-def test_the_file_says_what_the_ply_does_not(capture, tmp_path):
+def test_the_source_index_is_written(capture, tmp_path):
     out, index = tmp_path / "s.csplat", tmp_path / "index.npy"
-    call(
-        "finetune", capture / "scene.ply", "--data", capture, "-o", out, *BRIEF, "--source-index", index,
-        "--axes", "RUB", "--unit-metres", 0.5, "--licence", "CC0-1.0",
-    )  # fmt: skip
-    decoded = decode(out.read_bytes())
-    assert ("RUB", 0.5, "CC0-1.0") == (
-        decoded.coordinate_system, decoded.unit_metres, decoded.metadata["licence"]
-    )  # fmt: skip
+    call("finetune", capture / "scene.ply", "--data", capture, out, *BRIEF, "--source-index", index)
     call("verify", out, "--source", capture / "scene.ply", "--source-index", index)
     assert np.array_equal(np.arange(1, 301), np.sort(np.load(index)))  # all but the one behind the cameras
 
 
-def test_defects_can_be_refused(capture, source, tmp_path):
+def test_defects_are_repaired(capture, source, tmp_path):
     broken = source.select(np.arange(300))
     broken.means[0] = np.nan
     write_ply(tmp_path / "broken.ply", broken)
-    words = ("finetune", tmp_path / "broken.ply", "--data", capture, "-o", tmp_path / "s.csplat", *BRIEF)
-    refused = invoke(*words, "--strict")
-    assert 1 == refused.exit_code
-    assert not (tmp_path / "s.csplat").exists()
+    words = ("finetune", tmp_path / "broken.ply", "--data", capture, tmp_path / "s.csplat", *BRIEF)
     assert "repair" in call(*words).stderr
 
 
 @pytest.mark.slow
-def test_without_held_out_photographs_nothing_is_scored(capture, tmp_path):
-    words = ("finetune", capture / "scene.ply", "--data", capture, "-o", tmp_path / "s.csplat", *BRIEF)
-    facts = json.loads(call(*words, "--test-every", 0, "--validation-count", 2, "--json", "-q").stdout)
+def test_without_held_out_photographs_nothing_is_scored(capture, tmp_path, monkeypatch):
+    words = ("finetune", capture / "scene.ply", "--data", capture, tmp_path / "s.csplat", *BRIEF)
+    change_options(monkeypatch, "csplat_tools.cli.shared_options.DataOptions", test_every=0)
+    with monkeypatch.context() as patch:
+        patch.setattr(tuning_run, "default_validation_count", lambda *_, **__: 2)
+        facts = json.loads(call(*words, "--json", "-q").stdout)
     assert ({}, None) == (facts["scores"], facts["test_reference"])
     assert (True, 2) == (facts["validation"]["held_out"], facts["validation"]["views"])
-    assert "photographs" not in call(*words, "--test-every", 0, "--force").stderr
-
-
-def test_every_knob_of_encoder_and_tuning_is_an_option_or_a_setting():
-    options = set(inspect.signature(finetune_command).parameters)
-    settings = call("finetune", "--help-all").stdout.partition("Settings of --set")[2]
-    for name in {field.name for kind in (EncodeOptions, FinetuneOptions) for field in fields(kind)}:
-        assert name in options or f"\n  {name.replace('_', '-')}: " in settings, name
+    assert "photographs" not in call(*words, "--force").stderr
 
 
 @pytest.mark.slow
-def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path):
-    words = ("finetune", capture / "scene.ply", "--data", capture, "--attribute-psnr", 28, *BARE, "-q")
+def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path, monkeypatch):
+    words = ("finetune", capture / "scene.ply", "--data", capture, "-q")
     short = tmp_path / "run.npz"
-    call(*words, "-o", tmp_path / "a.csplat", "--iterations", 6, "--checkpoint", short, "--checkpoint-every", 4)
-    call(*words, "-o", tmp_path / "b.csplat", "--iterations", 6, "--resume", short, "--checkpoint", short)
+    with monkeypatch.context() as patch:
+        patch.setattr("csplat_tools.cli.finetune.CHECKPOINT_EVERY", 4)
+        call(*words, tmp_path / "a.csplat", "--iterations", 6, "--checkpoint", short)
+    call(*words, tmp_path / "b.csplat", "--iterations", 6, "--resume", short, "--checkpoint", short)
     assert (tmp_path / "a.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((), "one of --data and --self"),
+        ((), "expected --data or --self"),
         (("--self", "--data", "x"), "--data and --self: give one of them"),
         (("--data", "x", "--cameras", "y"), "--cameras and --data: give one of them"),
-        (("--self", "--attribute-psnr", "5"), "attribute_psnr is 5"),
         (("--self", "--keep", "1.5"), "--keep is 1.5"),
-        (("--self", "--lr-factor", "1e9"), "lr_"),
-        (("--self", "--near", "0.1"), "--near says nothing without --data"),
+        (("--self", "--background", "white"), "--background requires --cameras or --data"),
+        (("--self", "--lr-factor", "1e9"), "--lr-factor is FinetuneOptions.scaled in Python now"),
         (("--self", "--lambda", "0", "--target-size", "1MB"), "--lambda and --target-size: give one of them"),
         (("--self", "--lambda", "2"), "byte_cost is 2.0, wanted 0 to 1"),
     ],
 )
 def test_wrong_words_are_status_2(capture, tmp_path, words, message):
-    result = invoke("finetune", capture / "scene.ply", "-o", tmp_path / "s.csplat", *words)
+    result = invoke("finetune", capture / "scene.ply", tmp_path / "s.csplat", *words)
     assert 2 == result.exit_code
     assert message in " ".join(result.stderr.replace("│", " ").split())
 
@@ -847,7 +842,7 @@ def test_wrong_words_are_status_2(capture, tmp_path, words, message):
 )
 def test_two_outputs_in_one_place_are_refused(capture, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
-    result = invoke("finetune", capture / "scene.ply", "--self", "-o", tmp_path / "s.csplat", *words)
+    result = invoke("finetune", capture / "scene.ply", "--self", tmp_path / "s.csplat", *words)
     assert 1 == result.exit_code
     assert "is given for two outputs" in result.stderr
     assert [] == list(tmp_path.iterdir())
@@ -856,7 +851,7 @@ def test_two_outputs_in_one_place_are_refused(capture, tmp_path, monkeypatch, wo
 def test_nothing_is_replaced_unasked(capture, tmp_path):
     out = tmp_path / "s.csplat"
     out.write_bytes(b"old")
-    result = invoke("finetune", capture / "scene.ply", "--self", "-o", out)
+    result = invoke("finetune", capture / "scene.ply", "--self", out)
     assert 1 == result.exit_code
     assert "--force replaces it" in result.stderr
     assert b"old" == out.read_bytes()
@@ -866,29 +861,27 @@ def test_a_checkpoint_takes_the_place_of_no_input(source, tmp_path):
     scene = tmp_path / "scene.ply"
     write_ply(scene, source)
     before = scene.read_bytes()
-    words = ("finetune", scene, "--self", "-o", tmp_path / "s.csplat", *BRIEF, "--views", 2)
-    result = invoke(*words, "--view-size", "16x16", "--checkpoint", scene, "--force")
+    words = ("finetune", scene, "--self", tmp_path / "s.csplat", *BRIEF)
+    result = invoke(*words, "--checkpoint", scene, "--force")
     assert 1 == result.exit_code
     assert "is the input" in result.stderr
     assert before == scene.read_bytes()
 
 
-@pytest.mark.parametrize("option", ["--resume", "--importance"])
-def test_a_file_that_is_missing_is_missed_before_anything_is_read(capture, tmp_path, option):
+def test_a_file_that_is_missing_is_missed_before_anything_is_read(capture, tmp_path):
     out, absent = tmp_path / "s.csplat", tmp_path / "absent.npz"
-    result = invoke("finetune", capture / "scene.ply", "--data", tmp_path, "-o", out, option, absent)
+    result = invoke("finetune", capture / "scene.ply", "--data", tmp_path, out, "--resume", absent)
     assert 1 == result.exit_code
     assert "absent.npz: No such file" in result.stderr
 
 
-def test_cameras_that_see_nothing_are_refused(source, tmp_path):
+def test_cameras_that_see_nothing_are_refused(source, tmp_path, monkeypatch):
     away = [replace(camera, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.viewmat) for camera in cameras(40)]
     save_cameras(tmp_path / "away.json", away)
     write_ply(tmp_path / "scene.ply", source)
-    result = invoke(
-        "finetune", tmp_path / "scene.ply", "--self", "--cameras", tmp_path / "away.json", "--prune-unseen",
-        "-o", tmp_path / "s.csplat",
-    )  # fmt: skip
+    monkeypatch.setattr(tuning_run, "run_finetuning", partial(tuning_run.run_finetuning, prune_unseen=True))
+    words = ("finetune", tmp_path / "scene.ply", tmp_path / "s.csplat", "--self")
+    result = invoke(*words, "--cameras", tmp_path / "away.json")
     assert 1 == result.exit_code
     assert "no view shows any splat" in result.stderr
 

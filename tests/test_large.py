@@ -345,10 +345,10 @@ def test_the_command_asks_for_the_disk_as_its_options_say(ply, tmp_path, monkeyp
     said = json.loads(foretold.stdout)
     assert (COUNT, 3, True) == (said["splats"], said["sh_degree"], said["in_memory"])
     assert not target.exists()
-    words = ["--memory", "300MB", "--resume", "--work", "w", "--preset", "fast", "--quiet"]
+    words = ["--memory", "300MB", "--resume", "--preset", "fast", "--quiet"]
     done = run(app, ["encode", str(ply), str(target), *words])
     assert 0 == done.exit_code, done.output
-    assert [OutOfCoreOptions(memory_bytes=300_000_000, folder="w", resume=True)] == asked
+    assert [OutOfCoreOptions(memory_bytes=300_000_000, resume=True)] == asked
     refused = run(app, ["encode", str(ply), str(target), "--resume", "--target-psnr", "40", "--force"])
     assert 2 == refused.exit_code
 

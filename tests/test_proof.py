@@ -9,6 +9,7 @@ import tempfile
 from collections import namedtuple
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import cycle
 from mmap import mmap
 
@@ -33,6 +34,7 @@ from csplat_conformance.declared_bounds.partners import UNDECIDED, UNMATCHED
 from csplat_conformance.declared_bounds.partners import find_partners as match_source
 from csplat_tools.cli.app import app
 from csplat_tools.inspect.file_description import describe_file
+from csplat_tools.inspect.verification import verify_file
 
 
 def differences(source, *rest):
@@ -536,9 +538,11 @@ def test_the_command_reports_the_same_with_a_memory_limit(make_model, tmp_path):
     np.save(index, result.source_index)
     for words in ([], ["--source-index", str(index)]):
         found = []
-        for memory in ([], ["--memory", "100kB"]):
-            command = ["verify", str(file), "--source", str(ply), "--json", "--quiet", *words, *memory]
-            result = CliRunner().invoke(app, command)
+        for most in (None, 100_000):
+            command = ["verify", str(file), "--source", str(ply), "--json", "--quiet", *words]
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr("csplat_tools.cli.verify.verify_file", partial(verify_file, memory_bytes=most))
+                result = CliRunner().invoke(app, command)
             assert result.exit_code == 0, result.output
             found.append(rounded(json.loads(result.stdout)))
         assert found[0] == found[1]

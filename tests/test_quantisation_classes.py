@@ -360,13 +360,13 @@ def test_measured_weights_are_trusted_down_to_half_of_what_is_suggested(model):
 @pytest.mark.slow
 @pytest.mark.parametrize("most", [None, 2])
 def test_the_command_says_that_weights_alone_grade_nothing(model, tmp_path, most):
-    from typer.testing import CliRunner
-
-    from csplat_tools.cli.app import app
+    from command_line import change_options, invoke
 
     csplat.write_ply(tmp_path / "scene.ply", model)
     np.save(tmp_path / "weights.npy", np.ones(COUNT, np.float32))
-    words = ["encode", tmp_path / "scene.ply", tmp_path / "a.csplat", "--importance", tmp_path / "weights.npy", "-q"]
-    done = CliRunner().invoke(app, [str(word) for word in [*words, *(["--max-classes", most] if most else [])]])
+    with pytest.MonkeyPatch.context() as patch:
+        change_options(patch, "csplat_tools.cli.encode.EncodeOptions", max_classes=most)
+        words = ("encode", tmp_path / "scene.ply", tmp_path / "a.csplat", "--importance", tmp_path / "weights.npy")
+        done = invoke(*words, "-q")
     assert done.exit_code == 0
     assert ("in one quantisation class" in done.stderr) == (most is not None)

@@ -93,12 +93,12 @@ def names(folder):
 
 
 def test_pictures_take_the_names_of_the_photographs(ply, cameras, tmp_path):
-    call("render", ply, "--cameras", cameras, "-o", tmp_path / "out")
+    call("render", ply, "--cameras", cameras, tmp_path / "out")
     assert ["left.png", "right.png"] == names(tmp_path / "out")
 
 
 def test_a_ball_is_red_in_the_middle_and_the_background_around_it(ply, cameras, tmp_path):
-    call("render", ply, "--cameras", cameras, "-o", tmp_path / "out", "--background", "0,0,1")
+    call("render", ply, "--cameras", cameras, tmp_path / "out", "--background", "0,0,1")
     picture = pixels(tmp_path / "out" / "left.png")
     assert (48, 64, 3) == picture.shape
     assert picture[24, 32, 0] > 240
@@ -106,12 +106,12 @@ def test_a_ball_is_red_in_the_middle_and_the_background_around_it(ply, cameras, 
     assert [0, 0, 255] == picture[0, 0].tolist()
     trained = replace(read_ply(ply), metadata={"training": {"background": [1, 1, 1]}})
     write_ply(ply, trained)
-    call("render", ply, "--cameras", cameras, "-o", tmp_path / "trained")
+    call("render", ply, "--cameras", cameras, tmp_path / "trained")
     assert [255, 255, 255] == pixels(tmp_path / "trained" / "left.png")[0, 0].tolist()
 
 
 def test_alpha_and_depth_lie_beside_the_picture(ply, cameras, tmp_path):
-    call("render", ply, "--cameras", cameras, "-o", tmp_path / "out", "--alpha", "--depth")
+    call("render", ply, "--cameras", cameras, tmp_path / "out", "--alpha", "--depth")
     assert ["left.alpha.png", "left.depth.npy", "left.png"] == names(tmp_path / "out")[:3]
     alpha, depth = pixels(tmp_path / "out" / "left.alpha.png"), np.load(tmp_path / "out" / "left.depth.npy")
     assert alpha[24, 32] > 240
@@ -122,7 +122,7 @@ def test_alpha_and_depth_lie_beside_the_picture(ply, cameras, tmp_path):
 
 
 def test_an_orbit_is_numbered_and_of_the_size_asked_for(ply, tmp_path):
-    call("render", ply, "--orbit", 3, "--size", "40x30", "-o", tmp_path / "out")
+    call("render", ply, "--orbit", 3, "--size", "40x30", tmp_path / "out")
     assert ["0000.png", "0001.png", "0002.png"] == names(tmp_path / "out")
     picture = pixels(tmp_path / "out" / "0002.png")
     assert (30, 40, 3) == picture.shape
@@ -130,8 +130,8 @@ def test_an_orbit_is_numbered_and_of_the_size_asked_for(ply, tmp_path):
 
 
 def test_an_orbit_with_cameras_leads_along_them(ply, cameras, tmp_path):
-    call("render", ply, "--orbit", 2, "--cameras", cameras, "--size", "64x48", "-o", tmp_path / "along")
-    call("render", ply, "--orbit", 2, "--size", "64x48", "-o", tmp_path / "around")
+    call("render", ply, "--orbit", 2, "--cameras", cameras, "--size", "64x48", tmp_path / "along")
+    call("render", ply, "--orbit", 2, "--size", "64x48", tmp_path / "around")
     ball = {name: np.count_nonzero(pixels(tmp_path / name / "0001.png")[..., 0] > 128) for name in ("along", "around")}
     assert 1.5 * ball["along"] < ball["around"]  # the cameras stand ten radii away: a small ball
 
@@ -141,14 +141,14 @@ def test_a_csplat_file_shows_what_its_ply_shows(cameras, tmp_path, make_model):
     write_ply(tmp_path / "many.ply", model)
     (tmp_path / "many.csplat").write_bytes(encode(model, EncodeOptions(preset="fast")))
     for kind in ("ply", "csplat"):
-        call("render", tmp_path / f"many.{kind}", "--cameras", cameras, "-o", tmp_path / kind)
+        call("render", tmp_path / f"many.{kind}", "--cameras", cameras, tmp_path / kind)
     a, b = (pixels(tmp_path / kind / "left.png").astype(int) for kind in ("ply", "csplat"))
     assert a.max() > 50
     assert np.abs(a - b).mean() < 2.0
 
 
 def test_a_resized_camera_takes_the_same_picture(ply, cameras, tmp_path):
-    call("render", ply, "--cameras", cameras, "-o", tmp_path / "out", "--size", "128x96")
+    call("render", ply, "--cameras", cameras, tmp_path / "out", "--size", "128x96")
     picture = pixels(tmp_path / "out" / "left.png")
     assert (96, 128, 3) == picture.shape
     assert picture[48, 64, 0] > 240
@@ -156,7 +156,7 @@ def test_a_resized_camera_takes_the_same_picture(ply, cameras, tmp_path):
 
 def test_the_same_command_writes_the_same_bytes(ply, cameras, tmp_path):
     for name in ("one", "two"):
-        call("render", ply, "--cameras", cameras, "-o", tmp_path / name)
+        call("render", ply, "--cameras", cameras, tmp_path / name)
     assert (tmp_path / "one" / "left.png").read_bytes() == (tmp_path / "two" / "left.png").read_bytes()
 
 
@@ -165,11 +165,9 @@ def test_nothing_is_replaced_without_force(ply, cameras, tmp_path):
     (tmp_path / "out" / "right.png").write_bytes(b"mine")
     pytest.importorskip("numba", reason="the renderer needs numba")
     pytest.importorskip("PIL", reason="pictures need pillow")
-    assert "right.png exists: --force replaces it" in refused(
-        "render", ply, "--cameras", cameras, "-o", tmp_path / "out"
-    )
+    assert "right.png exists: --force replaces it" in refused("render", ply, "--cameras", cameras, tmp_path / "out")
     assert ["right.png"] == names(tmp_path / "out")
-    call("render", ply, "--cameras", cameras, "-o", tmp_path / "out", "--force")
+    call("render", ply, "--cameras", cameras, tmp_path / "out", "--force")
     assert (48, 64, 3) == pixels(tmp_path / "out" / "right.png").shape
 
 
@@ -185,14 +183,14 @@ def test_a_camera_file_of_another_program_is_reported(ply, tmp_path):
         "fy": 60,
     }
     (tmp_path / "inria.json").write_text(json.dumps([entry]))
-    told = call("render", ply, "--cameras", tmp_path / "inria.json", "-o", tmp_path / "out")
+    told = call("render", ply, "--cameras", tmp_path / "inria.json", tmp_path / "out")
     assert "cameras.json of INRIA: 1 camera" in told
     assert ["a.png"] == names(tmp_path / "out")
 
 
 def test_a_distorting_size_is_refused(ply, cameras, tmp_path):
     pytest.importorskip("numba", reason="the renderer needs numba")
-    assert "distorted" in refused("render", ply, "--cameras", cameras, "-o", tmp_path / "out", "--size", "64x64")
+    assert "distorted" in refused("render", ply, "--cameras", cameras, tmp_path / "out", "--size", "64x64")
 
 
 @pytest.mark.parametrize(
@@ -207,7 +205,7 @@ def test_a_distorting_size_is_refused(ply, cameras, tmp_path):
     ],
 )
 def test_a_wrong_command_line_has_status_2(ply, tmp_path, words):
-    assert 2 == invoke("render", ply, "-o", tmp_path / "out", *words).exit_code
+    assert 2 == invoke("render", ply, tmp_path / "out", *words).exit_code
 
 
 @pytest.mark.parametrize(("module", "package"), [("numba", "numba"), ("PIL", "pillow")])
@@ -215,7 +213,7 @@ def test_without_the_extra_packages_one_line_says_what_to_install(ply, cameras, 
     pytest.importorskip("numba", reason="one of the two is absent anyway")
     monkeypatch.setitem(sys.modules, module, None)
     line = f"error: this needs {package}: pip install 'csplat[render]' (E_INPUT)\n"
-    assert line == refused("render", ply, "--cameras", cameras, "-o", tmp_path / "out")
+    assert line == refused("render", ply, "--cameras", cameras, tmp_path / "out")
 
 
 def test_a_report_never_takes_the_place_of_the_film(ply, tmp_path):
@@ -267,7 +265,7 @@ def test_sizes_and_colours_are_parsed():
 def test_other_colours_are_refused(text):
     import typer
 
-    with pytest.raises(typer.BadParameter, match="wanted red,green,blue"):
+    with pytest.raises(typer.BadParameter, match="expected red,green,blue"):
         parse_colour(text)
 
 
@@ -294,7 +292,7 @@ def film_scene(tmp_path_factory):
 def pictures(film_scene, tmp_path_factory):
     """The pictures of an orbit."""
     folder = tmp_path_factory.mktemp("pictures") / "turn"
-    assert 0 == invoke("render", film_scene, *ORBIT, "-o", folder).exit_code
+    assert 0 == invoke("render", film_scene, *ORBIT, folder).exit_code
     return [read_picture(folder / f"{number:04d}.png") for number in range(4)]
 
 
@@ -317,7 +315,7 @@ def frames_of(path):
 @pytest.mark.parametrize(("ending", "tolerance"), [("webp", 6.0), ("gif", 8.0), ("png", 0.0), ("apng", 0.0)])
 def test_a_film_shows_what_the_pictures_show(film_scene, pictures, tmp_path, ending, tolerance):
     film = tmp_path / f"turn.{ending}"
-    done = invoke("render", film_scene, *ORBIT, "-o", film, "--fps", 20)
+    done = invoke("render", film_scene, *ORBIT, film, "--fps", 20)
     assert (0, "") == (done.exit_code, done.stdout), done.stderr
     assert f"4 frames in {film}\n" == done.stderr
     frames, times, loop = frames_of(film)
@@ -330,7 +328,7 @@ def test_a_film_shows_what_the_pictures_show(film_scene, pictures, tmp_path, end
 
 def test_the_same_command_writes_the_same_film(film_scene, tmp_path):
     for name in ("one.webp", "two.webp"):
-        assert 0 == invoke("render", film_scene, "--orbit", 2, "--size", "32x24", "-o", tmp_path / name).exit_code
+        assert 0 == invoke("render", film_scene, "--orbit", 2, "--size", "32x24", tmp_path / name).exit_code
     assert (tmp_path / "one.webp").read_bytes() == (tmp_path / "two.webp").read_bytes()
 
 
@@ -339,7 +337,7 @@ def test_an_mp4_shows_what_the_pictures_show_and_is_the_same_again(film_scene, t
     av = pytest.importorskip("av", reason="MP4 needs PyAV: pip install 'csplat[film]'")
     words = ("render", film_scene, "--orbit", 3, "--size", "65x49", "--background", "0.9,0.2,0.1", "--fps", 12.5)
     for name in ("one.mp4", "two.mp4", "turn"):
-        assert 0 == invoke(*words, "-o", tmp_path / name).exit_code
+        assert 0 == invoke(*words, tmp_path / name).exit_code
     assert (tmp_path / "one.mp4").read_bytes() == (tmp_path / "two.mp4").read_bytes()
     with av.open(tmp_path / "one.mp4") as film:
         stream = film.streams.video[0]
@@ -355,7 +353,7 @@ def test_an_mp4_shows_what_the_pictures_show_and_is_the_same_again(film_scene, t
 
 def test_without_pyav_one_line_says_what_to_install(film_scene, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    done = invoke("render", film_scene, "--orbit", 2, "-o", tmp_path / "turn.mp4")
+    done = invoke("render", film_scene, "--orbit", 2, tmp_path / "turn.mp4")
     assert (1, "error: this needs av: pip install 'csplat[film]' (E_INPUT)\n") == (done.exit_code, done.stderr)
     assert not (tmp_path / "turn.mp4").exists()
 
@@ -363,7 +361,7 @@ def test_without_pyav_one_line_says_what_to_install(film_scene, tmp_path, monkey
 def test_an_existing_film_is_kept_without_force(film_scene, tmp_path):
     film = tmp_path / "turn.gif"
     film.write_bytes(b"mine")
-    words = ("render", film_scene, "--orbit", 2, "--size", "32x24", "-o", film)
+    words = ("render", film_scene, "--orbit", 2, "--size", "32x24", film)
     refused = invoke(*words)
     assert 1 == refused.exit_code
     assert "turn.gif exists: --force replaces it" in refused.stderr
@@ -383,14 +381,14 @@ def test_a_film_of_one_picture_is_a_picture(tmp_path):
 @pytest.mark.parametrize(
     ("words", "status", "message"),
     [
-        (("--depth",), 2, "want a folder"),
+        (("--depth",), 2, "require a folder"),
         (("--fps", "0"), 2, "fps"),
         (("--fps", "101"), 2, "fps"),
         (("--size", "20000x10"), 1, "at most 16383 per side"),
     ],
 )
 def test_what_a_film_cannot_be_is_refused(film_scene, tmp_path, words, status, message):
-    refused = invoke("render", film_scene, "--orbit", 2, "-o", tmp_path / "turn.webp", *words)
+    refused = invoke("render", film_scene, "--orbit", 2, tmp_path / "turn.webp", *words)
     assert status == refused.exit_code
     assert message in " ".join(refused.stderr.split())
 

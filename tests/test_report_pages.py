@@ -257,7 +257,7 @@ def test_a_training_alone_has_a_page_and_the_scores_of_its_scene_are_those_of_co
 
 def test_a_page_is_not_replaced_without_being_told(folder, tmp_path):
     (tmp_path / "page.html").write_text("mine")
-    words = ["train", str(folder), "-o", str(tmp_path / "a.ply"), "--page", str(tmp_path / "page.html")]
+    words = ["train", str(folder), str(tmp_path / "a.ply"), "--page", str(tmp_path / "page.html")]
     result = CliRunner().invoke(app, words)
     assert (1, "mine") == (result.exit_code, (tmp_path / "page.html").read_text())
     assert "page.html exists" in result.stderr

@@ -6,17 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from csplat.encoder import EncodeOptions
 from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply import read_ply, write_ply
 
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
-from command_line import invoke
+from command_line import change_views, invoke
 
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.reference_rasteriser import Decisions, render_exact
 from csplat_render.scene_frame import scene_frame
+from csplat_tools.encode_file import encode_file
 from csplat_tools.importance_file import encoder_importance
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, read_sensitivity, write_sensitivity
@@ -371,9 +373,8 @@ def test_the_command_measures_what_encode_takes(tmp_path, camera_file):
     unseen = facts["unseen"]
     assert 40 <= unseen < 400
     assert 1 == invoke("sensitivity", ply, npz, "--cameras", camera_file).exit_code  # not without --force
-    done = invoke("encode", ply, out, "--importance", npz, "--prune-unseen", "--source-index", index, "--json", "-q")
-    assert 0 == done.exit_code, done.stderr
-    assert 400 - unseen == json.loads(done.stdout)["splats"]
+    encoded = encode_file(str(ply), str(out), EncodeOptions(), importance=npz, prune_unseen=True, source_index=index)
+    assert 400 - unseen == encoded.report.splat_count
     assert set(range(400)) - set(np.load(index).tolist()) >= set(range(40))
     checked = invoke("verify", out, "--source", ply, "--source-index", index)
     assert 0 == checked.exit_code, checked.stderr
@@ -394,22 +395,22 @@ def seen_in_part(tmp_path):
 @pytest.mark.slow
 def test_the_command_makes_views_where_there_are_none_and_says_how_long_it_takes(tmp_path, seen_in_part, monkeypatch):
     monkeypatch.setattr("csplat_tools.views.view_sets.render_seconds", lambda *_, **__: 1.0)
-    views = ("--views", "20", "--view-size", "48x36")
-    done = invoke("sensitivity", seen_in_part, tmp_path / "s.npz", *views, "--no-matrices")
+    change_views(monkeypatch, 20, (48, 36))
+    done = invoke("sensitivity", seen_in_part, tmp_path / "s.npz")
     assert 0 == done.exit_code, done.stderr
     assert "20 virtual views" in done.stderr
     assert "this takes about 2 to 4 minutes here" in done.stderr  # 36 pictures: 16 more check
-    assert read_sensitivity(tmp_path / "s.npz", read_ply(seen_in_part)).matrices is None
 
 
 @pytest.mark.slow
-def test_pruning_says_how_much_of_it_other_views_would_have_seen(tmp_path, seen_in_part):
+def test_pruning_says_how_much_of_it_other_views_would_have_seen(tmp_path, seen_in_part, monkeypatch):
     npz, out = tmp_path / "s.npz", tmp_path / "o.csplat"
-    invoke("sensitivity", seen_in_part, npz, "--views", "2", "--no-matrices")
+    change_views(monkeypatch, 2, None)
+    invoke("sensitivity", seen_in_part, npz)
     missed = read_sensitivity(npz, read_ply(seen_in_part)).missed_share
     assert missed > 0.0
-    done = invoke("encode", seen_in_part, out, "--importance", npz, "--prune-unseen", "-q")
-    assert f"{100 * missed:.1f} % of the splats were pruned although" in done.stderr
+    pruned = encode_file(str(seen_in_part), str(out), EncodeOptions(), importance=str(npz), prune_unseen=True)
+    assert f"{100 * missed:.1f} % of the splats were pruned although" in " ".join(pruned.report.notes)
     assert "left out" not in invoke("encode", seen_in_part, out, "--importance", npz, "--force", "-q").stderr
 
 
@@ -417,11 +418,8 @@ def test_mistakes_get_one_line(tmp_path, sample_path, camera_file):
     out = tmp_path / "out.npz"
     assert 2 == invoke("sensitivity", sample_path, out, "--cameras", camera_file, "--data", tmp_path).exit_code
     assert 2 == invoke("sensitivity", sample_path, "-").exit_code
-    assert 2 == invoke("encode", sample_path, tmp_path / "o.csplat", "--prune-unseen").exit_code
     np.save(tmp_path / "w.npy", np.ones(3))
-    done = invoke(
-        "encode", sample_path, tmp_path / "o.csplat", "--importance", tmp_path / "w.npy", "--prune-unseen", "-q"
-    )
+    done = invoke("encode", sample_path, tmp_path / "o.csplat", "--importance", tmp_path / "w.npy", "-q")
     assert 1 == done.exit_code
     assert 1 == len(done.stderr.splitlines())
 

@@ -20,10 +20,11 @@ pytest.importorskip("numba", reason="targets of size and PSNR want the extra [re
 
 # Importing it needs what is looked for above.
 from captures import cameras, photograph, shell
+from command_line import change_views
 
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import save_cameras
-from csplat_tools.cli.command import OutputOptions
+from csplat_tools.cli.command_output import Output
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
@@ -153,9 +154,10 @@ def run(*arguments):
 
 
 @pytest.mark.slow
-def test_the_command_meets_a_size_and_says_why(tmp_path, ply):
+def test_the_command_meets_a_size_and_says_why(tmp_path, ply, monkeypatch):
     out = tmp_path / "scene.csplat"
-    done = run("encode", ply, out, "--target-size", "5kB", "--no-prune", "--views", 16, "--view-size", "48x36")
+    change_views(monkeypatch, 16, (48, 36))
+    done = run("encode", ply, out, "--target-size", "5kB", "--no-prune")
     assert 0 == done.exit_code, done.output
     assert 4850 <= out.stat().st_size <= 5000
     for said in ("target: 5.0 kB", "chosen: SH degree", "measured on the file itself"):
@@ -167,7 +169,7 @@ def test_the_command_reports_a_share_as_json_and_its_file_is_proved(tmp_path, pl
     out, index = tmp_path / "scene.csplat", tmp_path / "index.npy"
     save_cameras(tmp_path / "cameras.json", cameras(40))
     words = ("encode", ply, out, "--keep", "0.5", "--effort", "1", "--cameras", tmp_path / "cameras.json")
-    done = run(*words, "--view-size", "960x720", "--source-index", index, "--json")
+    done = run(*words, "--source-index", index, "--json")
     assert 0 == done.exit_code, done.output
     report = json.loads(done.stdout)
     assert (150, {"keep": 0.5}) == (report["splats"], report["target"]["goal"])
@@ -203,7 +205,7 @@ def test_the_command_loses_no_more_against_photographs_than_is_allowed(tmp_path)
 def test_long_work_is_foretold_unless_it_is_short_or_nobody_is_told(capsys):
     told = {}
     for name, quiet, seconds in (("long", False, 170.0), ("short", False, 5.0), ("quiet", True, 170.0)):
-        OutputOptions(quiet=quiet).announce_time(lambda seconds=seconds: seconds, "a preset takes seconds")
+        Output(quiet=quiet).announce_time(lambda seconds=seconds: seconds, "a preset takes seconds")
         told[name] = capsys.readouterr().err
     assert "this takes about 2 to 5 minutes here; a preset takes seconds" in told.pop("long")
     assert {"short": "", "quiet": ""} == told
@@ -215,7 +217,8 @@ def test_the_command_foretells_a_search_before_it_begins(tmp_path, ply, monkeypa
     K = intrinsics(48, 40, 60.0)
     save_cameras(tmp_path / "away.json", [look_at((40.0, 0.0, 0.0), (80.0, 0.0, 0.0), (0, 0, 1), K, 48, 40)])
     words = ("encode", ply, tmp_path / "s.csplat", "--target-psnr", "30", "--cameras", tmp_path / "away.json")
-    done = run(*words, "--no-prune", "--views", 8)
+    change_views(monkeypatch, 8, None)
+    done = run(*words, "--no-prune")
     assert "this takes about 2 to 5 minutes here" in done.stderr
     assert "cameras belong to the scene" in done.stderr
 
@@ -229,20 +232,17 @@ REFUSED = [
     (["--max-error", "means=1mm"], 1, "--unit-metres"),
     (["--keep", "0.5", "--max-error", "means=1"], 2, "no bounds"),
     (["--target-size", "5kB", "--attribute-psnr", "40"], 2, "--attribute-psnr and --target-size: give one of them"),
-    (["--views", "9"], 2, "--views says nothing without --target-psnr or"),
-    (["--view-size", "9x9"], 2, "--view-size says nothing without --target-psnr or"),
-    (["--max-classes", "3"], 2, "--max-classes requires a target"),
-    (["--max-classes", "9", "--target-size", "5kB"], 2, "max_classes is 9"),
-    (["--no-prune"], 2, "--no-prune says nothing without --target-psnr or"),
+    (["--effort", "2"], 2, "--effort requires --target-psnr or"),
+    (["--effort", "12", "--target-size", "5kB"], 2, "--effort is 12, expected 1 to 9"),
+    (["--no-prune"], 2, "--no-prune requires --target-psnr or"),
     (["--keep", "0.5", "--no-prune"], 2, "--keep and --no-prune: give one of them"),
     (["--keep", "0.5", "--importance", "w.npy"], 2, "--keep and --importance: give one of them"),
-    (["--max-psnr-drop", "1"], 2, "--max-psnr-drop says nothing without --data"),
-    (["--max-psnr-drop", "1", "--cameras", "c.json"], 2, "--max-psnr-drop says nothing without --data"),
-    (["--background", "white"], 2, "--background says nothing"),
-    (["--background", "white", "--max-error", "means=1"], 2, "--background says nothing"),
-    (["--cameras", "c.json"], 2, "--cameras says nothing without --target-psnr or"),
-    (["--max-error", "means=1", "--data", "d"], 2, "--data says nothing without --target-psnr or"),
-    (["--size", "9x9", "--target-psnr", "30"], 2, "--size says nothing without --data"),
+    (["--max-psnr-drop", "1"], 2, "--max-psnr-drop requires --data"),
+    (["--max-psnr-drop", "1", "--cameras", "c.json"], 2, "--max-psnr-drop requires --data"),
+    (["--background", "white"], 2, "--background requires --cameras or --data"),
+    (["--background", "white", "--max-error", "means=1"], 2, "--background requires --cameras or --data"),
+    (["--cameras", "c.json"], 2, "--cameras requires --target-psnr or"),
+    (["--max-error", "means=1", "--data", "d"], 2, "--data requires --target-psnr or"),
     (["--target-size", "10", "--no-prune"], 2, "no file"),
     (["--target-psnr", "30", "--target-size", "5kB"], 2, "--target-psnr and --target-size: give one of them"),
     (["--kmeans", "16"], 2, "No such option"),

@@ -342,22 +342,24 @@ def test_a_sample_gives_about_the_same_views(sample_path):
 
 # comparisons
 @pytest.mark.usefixtures("no_least")
-def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, camera_file, tmp_path):
+def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, camera_file, tmp_path, monkeypatch):
     source, made, index = files_of_both
     words = ["compare", source, made, "--cameras", camera_file, "--source-index", index, "--json"]
     found = []
-    for more in ([], ["--memory", "1kB"]):
-        result = CliRunner().invoke(app, [*words, "--pictures", str(tmp_path / f"shown{len(more)}"), *more])
+    for more in (False, True):
+        if more:
+            monkeypatch.setattr("csplat_tools.cli.compare.open_scenes", partial(open_scenes, memory_bytes=LITTLE))
+        result = CliRunner().invoke(app, [*words, "--pictures", str(tmp_path / f"shown{more}")])
         assert 0 == result.exit_code, result.stderr
         found.append(json.loads(result.stdout))
-        assert ("by way of the disk" in result.stderr) == bool(more)
+        assert ("rendered from the disk" in result.stderr) == more
         del found[-1]["seconds"]
     errors, others = (one["attributes"].pop("errors") for one in found)
     assert found[0] == found[1]
     assert errors.keys() == others.keys()
     for name, one in errors.items():
         assert one == pytest.approx(others[name], rel=1e-12)
-    shown, also = (sorted((tmp_path / f"shown{n}").iterdir()) for n in (0, 2))
+    shown, also = (sorted((tmp_path / f"shown{n}").iterdir()) for n in (False, True))
     assert [one.read_bytes() for one in shown] == [one.read_bytes() for one in also]
 
 
@@ -376,18 +378,20 @@ def test_splats_of_one_order_are_measured_without_an_index(model, camera_file, t
 
 
 @pytest.mark.usefixtures("no_least")
-def test_without_an_index_the_errors_are_reported_as_unknown(files_of_both, camera_file):
+def test_without_an_index_the_errors_are_reported_as_unknown(files_of_both, camera_file, monkeypatch):
     source, made, _ = files_of_both
-    result = CliRunner().invoke(app, ["compare", source, made, "--cameras", camera_file, "--memory", "1kB"])
+    monkeypatch.setattr("csplat_tools.cli.compare.open_scenes", partial(open_scenes, memory_bytes=LITTLE))
+    result = CliRunner().invoke(app, ["compare", source, made, "--cameras", camera_file])
     assert 0 == result.exit_code
-    assert "errors of the splats are not known" in result.stdout
+    assert "the errors of splats are unknown" in result.stdout
 
 
 @pytest.mark.usefixtures("no_least")
-def test_mode_exact_of_scenes_beyond_the_memory_is_refused(files_of_both):
-    result = CliRunner().invoke(app, ["compare", *files_of_both[:2], "--memory", "1kB", "--mode", "exact"])
+def test_mode_exact_of_scenes_beyond_the_memory_is_refused(files_of_both, monkeypatch):
+    monkeypatch.setattr("csplat_tools.cli.compare.open_scenes", partial(open_scenes, memory_bytes=LITTLE))
+    result = CliRunner().invoke(app, ["compare", *files_of_both[:2], "--mode", "exact"])
     assert 1 == result.exit_code
-    assert ["error: --mode exact wants both scenes in memory, and they do not fit: take standard (E_INPUT)"] == [
+    assert ["error: --mode exact requires both scenes in memory, and they do not fit: use standard (E_INPUT)"] == [
         line for line in result.stderr.splitlines() if "exact" in line
     ]
 

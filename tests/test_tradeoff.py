@@ -7,6 +7,7 @@ import re
 import shlex
 import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -36,11 +37,13 @@ from csplat_tools.tradeoffs.sweep_points import StageClock, SweepFailure, fetche
 from csplat_tools.tradeoffs.sweep_run import plan_points, reduction_command, target_command, tradeoff
 from csplat_tools.tradeoffs.tradeoff_report import (
     PLOTS,
+    check_plots,
     draw_plot,
     format_tradeoff,
     label_marks,
     make_tradeoff_page,
     shown_points,
+    write_plots,
 )
 from csplat_tools.views import DataOptions, ViewSet
 from csplat_tools.views.view_sets import pose_key
@@ -81,9 +84,10 @@ def swept(capture, tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ViewSet, "__post_init__", keep)
+        patch.setattr("csplat_tools.cli.tradeoff.parse_sweep", partial(parse_sweep, iterations=5))
         result = invoke(
             capture / "a & b.ply", "--data", capture, "--what",
-            "presets,precision=40,strategies=0.3:0.97:16,targets=3kB,finetune", "--iterations", "5",
+            "presets,precision=40,strategies=0.3:0.97:16,targets=3kB,finetune",
             "--preset", "fast", "-o", folder / "report.html", "--report", folder / "report.json",
         )  # fmt: skip
     assert 0 == result.exit_code, (result.stderr, result.exception)
@@ -459,11 +463,12 @@ def test_commands_quote_what_a_shell_would_read(setting):
         setting, path="my scenes/it's.ply", cameras="$HOME/cams.json", background=(0.1, 0.0, 1.0),
         data=DataOptions('a "set"', (480, 270), None, 5),
     )  # fmt: skip
-    words = shlex.split(target_command(told, "target 2.0 MB", "small", target_size=2_000_000))
+    plain = replace(told, data=DataOptions('a "set"', images="images_4"))
+    assert "" == target_command(told, "target 2.0 MB", "small", target_size=2_000_000)
+    words = shlex.split(target_command(plain, "target 2.0 MB", "small", target_size=2_000_000))
     assert [
         "csplat", "encode", "my scenes/it's.ply", "it's-target-2.0-MB.csplat", "--target-size", "2000000", "--preset",
-        "small", "--cameras", "$HOME/cams.json", "--data", 'a "set"', "--size", "480x270", "--test-every", "5",
-        "--background", "0.1,0.0,1.0",
+        "small", "--cameras", "$HOME/cams.json", "--data", 'a "set"/images_4', "--background", "0.1,0.0,1.0",
     ] == words  # fmt: skip
     *_, program = shlex.split(reduction_command(told, "SH 0, distilled", "small", Reduction(sh_degree=0, distil=True)))
     compile(program, "command", "exec")
@@ -518,26 +523,31 @@ def test_memory_that_runs_out_costs_one_point(setting, monkeypatch):
 
 
 @pytest.mark.slow
-def test_nothing_is_overwritten_unless_forced(capture, tmp_path, monkeypatch):
-    plots = {name: PLOTS[name] for name in ("size-quality", "attribute-bytes", "sh-layers")}  # one of each kind
-    monkeypatch.setattr("csplat_tools.tradeoffs.tradeoff_report.PLOTS", plots)
-    (tmp_path / "plots").mkdir()
-    plot = tmp_path / "plots" / "size-quality.svg"
-    mine = {"-o": tmp_path / "page", "--report": tmp_path / "report", "--plots": plot}
+def test_nothing_is_overwritten_unless_forced(capture, tmp_path):
+    mine = {"-o": tmp_path / "page", "--report": tmp_path / "report"}
     words = [capture / "scene.ply", "--what", "precision=40", "--cameras", capture / "cameras.json", "--quiet"]
-    named = [(option, tmp_path / "plots" if option == "--plots" else path) for option, path in mine.items()]
-    for option, place in named:
-        mine[option].write_text("mine")
+    for option, place in mine.items():
+        place.write_text("mine")
         refused = invoke(*words, option, place)
         assert 1 == refused.exit_code
         assert re.fullmatch(r"error: \S+ exists: --force replaces it \(E_INPUT\)\n", refused.stderr)
-        assert "mine" == mine[option].read_text()
-    done = invoke(*words, "--report", mine["--report"], "--plots", tmp_path / "plots", "--force")
+        assert "mine" == place.read_text()
+    done = invoke(*words, "--report", mine["--report"], "--force")
     assert (0, "") == (done.exit_code, done.stderr)
     assert "Times are single runs" in done.stdout
     assert "mine" != mine["--report"].read_text()
+
+
+@pytest.mark.slow
+def test_plots_are_written_for_light_and_dark_pages(measured, tmp_path, monkeypatch):
+    plots = {name: PLOTS[name] for name in ("size-quality", "attribute-bytes", "sh-layers")}  # one of each kind
+    monkeypatch.setattr("csplat_tools.tradeoffs.tradeoff_report.PLOTS", plots)
+    (tmp_path / "plots").mkdir()
+    write_plots(str(tmp_path / "plots"), measured)
+    with pytest.raises(InputError, match="exists: --force replaces it"):
+        check_plots(str(tmp_path / "plots"), force=False)
     written = {path.stem: path.read_text() for path in (tmp_path / "plots").iterdir()}
-    assert {"size-quality", "attribute-bytes"} == set(written)  # no layers in this sweep
+    assert {"size-quality", "attribute-bytes"} <= set(written)
     for text in written.values():  # light or dark as the reader has it
         assert "prefers-color-scheme:dark" in text
         assert "currentColor" in text
@@ -582,12 +592,8 @@ WRONG = (
     ["--what", "simplify=1.5"],
     ["--what", "strategies=nan"],
     ["--what", "strategies=70000"],
-    ["--modes", "quick"],
-    ["--modes", ""],
-    ["--iterations", "0"],
-    ["--size", "200x200"],
     ["--data", "x", "--cameras", "y"],
-    ["--data", "x", "--size", "wide"],
+    ["--plots", "x"],
     ["-o", "-"],
 )
 

@@ -391,8 +391,8 @@ def without_up(**fields):
         (TRANSFORMS, ["--up", "-y"], "unspecified", (0, -1, 0)),
         (without_up(), [], "unspecified", None),
         (without_up(), ["--up", "0,-2,2"], "unspecified", (0, -0.707107, 0.707107)),
-        (without_up(), ["--axes", "LUF"], "LUF", (0, 1, 0)),
-        (without_up(metadata={"up": [1, 0, 0]}), ["--axes", "RDF"], "RDF", (0, -1, 0)),
+        (without_up(coordinate_system="LUF"), [], "LUF", (0, 1, 0)),
+        (without_up(metadata={"up": [1, 0, 0]}, coordinate_system="RDF"), ["--up", "-y"], "RDF", (0, -1, 0)),
         (without_up(coordinate_system="RDF"), ["--up", "z"], "unspecified", (0, 0, 1)),
         (lambda _folder, make_model: rotate_scene(make_model(60, 1), TURN), ["--up", "z"], "unspecified", (0, 0, 1)),
     ],
@@ -444,10 +444,10 @@ def upright(cameras, up):
 
 
 @pytest.mark.slow
-def test_the_page_gets_the_axes_of_the_command_line(tmp_path, make_model):
+def test_the_page_gets_the_up_direction_of_the_command_line(tmp_path, make_model):
     write_ply(tmp_path / "scene.ply", make_model(60, 0))
-    _, wishes = in_page(tmp_path / "scene.ply", "--up", "0,-1,0.1", "--axes", "RDF")
-    assert {"axes": "RDF", "up": "0,-0.995037,0.099504"} == wishes
+    _, wishes = in_page(tmp_path / "scene.ply", "--up", "0,-1,0.1")
+    assert {"up": "0,-0.995037,0.099504"} == wishes
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from captures import H, W, as_colmap, cameras, photograph, photograph_object, shell
-from command_line import call
+from command_line import call, change_options
 from PIL import Image
 
 from csplat.errors import InputError
@@ -148,6 +148,11 @@ def test_recorded_training_options_are_the_defaults(sets, scene):
     ] == [line for line in views.notes if "trained" in line]
 
 
+def test_a_folder_of_images_is_read_as_its_set(sets, scene):
+    whole, named = (find_view_set(scene, data=DataOptions(str(path))) for path in (sets["rgb"], sets["rgb"] / "images"))
+    assert (whole.name, poses(whole), whole.notes[1:]) == (named.name, poses(named), named.notes[1:])
+
+
 def test_a_scene_without_a_training_record_is_noted_once(sets, scene):
     for kind in ("rgb", "rgba"):
         views = find_view_set(scene, data=DataOptions(str(sets[kind])))
@@ -171,9 +176,12 @@ def made(monkeypatch):
 
 
 @pytest.mark.slow
-def test_no_command_uses_test_views_for_decisions_and_all_agree_on_scores(sets, made, tmp_path):
+def test_no_command_uses_test_views_for_decisions_and_all_agree_on_scores(sets, made, tmp_path, monkeypatch):
     # test_tradeoff.py tests the validation views of a sweep.
-    ply, own = sets["rgba"] / "scene.ply", ("--data", sets["rgba"], "--test-every", "5", "--size", "24x20")
+    ply, own = sets["rgba"] / "scene.ply", ("--data", sets["rgba"])
+    change_options(monkeypatch, "csplat_tools.cli.shared_options.DataOptions", size=(24, 20), test_every=5)
+    change_options(monkeypatch, "csplat_tools.optimise.pruning_order.SimplifyOptions", rounds=1)
+    change_options(monkeypatch, "csplat_tools.cli.finetune.EncodeOptions", sh_coding="none")
     found = {}
 
     def run(*words):
@@ -190,12 +198,12 @@ def test_no_command_uses_test_views_for_decisions_and_all_agree_on_scores(sets, 
         return result
 
     found["compare"] = run("compare", ply, ply)["photographs"]["a"]["psnr"]
-    simplified = run("simplify", ply, tmp_path / "half.ply", "--keep", "0.5", "--effort", "1", "--set", "rounds=1")
+    simplified = run("simplify", ply, tmp_path / "half.ply", "--keep", "0.5", "--effort", "1")
     found["simplify"] = simplified["photographs"]["source"]
-    run("simplify", ply, tmp_path / "less.ply", "--max-psnr-drop", "1", "--set", "rounds=1,refit=no")
-    run("sensitivity", ply, tmp_path / "s.npz", "--no-matrices")
-    words = ("--iterations", "2", "--set", "sh-coding=none", "--keep", "0.7")
-    found["finetune"] = run("finetune", ply, "-o", tmp_path / "s.csplat", *words)["scores"]["source"]["psnr"]
+    run("simplify", ply, tmp_path / "less.ply", "--max-psnr-drop", "1", "--effort", "1")
+    run("sensitivity", ply, tmp_path / "s.npz")
+    words = ("--iterations", "2", "--keep", "0.7")
+    found["finetune"] = run("finetune", ply, tmp_path / "s.csplat", *words)["scores"]["source"]["psnr"]
     found["tradeoff"] = run("tradeoff", ply, "--what", "precision=40")["source"]["photographs"]["psnr"]
     model = read_ply(ply)
     views = find_view_set(model, data=DataOptions(str(sets["rgba"]), (24, 20), test_every=5))
@@ -255,12 +263,15 @@ def photographs(kind, folder):
         ("colmap", 5, 4, ("compare", "finetune", "simplify", "tradeoff")),
     ],
 )
-def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, held_out, commands):
+def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, held_out, commands, monkeypatch):
     # No command gets a background, split or size: the PLY records them. `encode` runs once because it searches.
     data, ply, log = photographs(kind, tmp_path / "data"), tmp_path / "s.ply", tmp_path / "log.json"
-    quick = ("--max-splats", 60, "--sh-degree", 0, "--iterations", 10, "--set", "init=box")
+    quick = ("--max-splats", 60, "--sh-degree", 0, "--iterations", 10)
     size = "x".join(map(str, SIZE))
-    call("train", data, "-o", ply, *quick, "--size", size, "--test-every", every, "--report", log, "-q")
+    change_options(monkeypatch, "csplat_tools.cli.train.TrainOptions", init="box")
+    change_options(monkeypatch, "csplat_tools.optimise.pruning_order.SimplifyOptions", rounds=1, refit=False)
+    change_options(monkeypatch, "csplat_tools.cli.finetune.EncodeOptions", sh_coding="none")
+    call("train", data, ply, *quick, "--size", size, "--test-every", every, "--report", log, "-q")
     record = TrainingRecord.of(read_ply(ply).metadata)
     assert ((1.0, 1.0, 1.0) if kind == "blender" else (0.0, 0.0, 0.0), SIZE) == (record.background, record.size)
     trained = json.loads(log.read_text())["metrics"]
@@ -277,14 +288,14 @@ def score_of_compare(ply, data, _):
 
 def score_of_finetune(ply, data, folder):
     report = folder / "score_of_finetune.json"
-    words = ("finetune", ply, "--data", data, "-o", folder / "t.csplat", "--iterations", 1, "--set", "sh-coding=none")
+    words = ("finetune", ply, "--data", data, folder / "t.csplat", "--iterations", 1)
     call(*words, "--report", report, "-q")
     return None, json.loads(report.read_text())["scores"]["source"]["psnr"]
 
 
 def score_of_simplify(ply, data, folder):
     report = folder / "simplified.json"
-    words = ("simplify", ply, folder / "less.ply", "--data", data, "--keep", 0.9, "--set", "rounds=1,refit=no")
+    words = ("simplify", ply, folder / "less.ply", "--data", data, "--keep", 0.9)
     call(*words, "--report", report, "-q")
     return None, json.loads(report.read_text())["photographs"]["source"]
 

@@ -6,14 +6,13 @@ Nothing of csplat goes into the photographs, and the rest is the command line's:
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import change_options, invoke
 from PIL import Image
 
 from csplat_tools.training import training_run
@@ -24,9 +23,7 @@ FOCAL = 42.0  # pixels
 VIEWS = 16  # views, of which every eighth is held out
 DISTANCE = 3.2  # distance of the cameras from the centre of a ball of radius 1
 _SAMPLES = 3  # rays along each side of a pixel
-SETTINGS = "refine_start=50,refine_every=25,lr_means=1e-3"
-TRAIN = ("--max-splats", 300, "--sh-degree", 1, "--iterations", 300, "--seed", 1, "--threads", 1, "--set", SETTINGS)
-TUNE = ("--attribute-psnr", 28, "--iterations", 100, "--seed", 1, "--threads", 1)
+TRAIN = ("--max-splats", 300, "--sh-degree", 1, "--iterations", 300, "--seed", 1)
 Run = Callable[..., str]
 
 
@@ -100,35 +97,30 @@ def _photograph(pose: np.ndarray) -> np.ndarray:
     return np.rint(255.0 * means).astype(np.uint8)
 
 
-def run_alone(*words: object) -> str:
-    """Run `python -m csplat WORDS`; return what it wrote to stderr."""
-    command = [sys.executable, "-m", "csplat", *map(str, words)]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stderr
-
-
 def run_here(*words: object) -> str:
-    """Do the same in this process, which has its kernels loaded."""
-    from typer.testing import CliRunner
-
-    from csplat_tools.cli.app import app
-
-    result = CliRunner().invoke(app, [str(word) for word in words])
+    """Run a command in this process, which has its kernels loaded; return what it wrote to stderr."""
+    result = invoke(*words)
     assert result.exit_code == 0, (result.stderr, result.exception)
     return result.stderr
 
 
-def make_trained(folder: Path, run: Run = run_alone) -> TrainedScene:
+def make_trained(folder: Path, run: Run = run_here) -> TrainedScene:
     """Take the photographs and train the scene."""
     data, ply, report, checkpoint = (folder / name for name in ("photographs", "a.ply", "train.json", "train.npz"))
     write_photographs(data)
-    messages = run("train", data, "-o", ply, *TRAIN, "--report", report, "--checkpoint", checkpoint)
+    with pytest.MonkeyPatch.context() as patch:
+        change_options(patch, "csplat_tools.cli.train.TrainOptions", refine_start=50, refine_every=25, lr_means=1e-3)
+        messages = run("train", data, ply, *TRAIN, "--report", report, "--checkpoint", checkpoint)
     return TrainedScene(data, ply, report, checkpoint, messages)
 
 
-def make_tuned(folder: Path, source: TrainedScene, run: Run = run_alone) -> TunedFile:
+def make_tuned(folder: Path, source: TrainedScene, run: Run = run_here) -> TunedFile:
     """Tune a file of the trained scene."""
     path, report = folder / "a.csplat", folder / "finetune.json"
-    messages = run("finetune", source.ply, "-o", path, "--data", source.data, *TUNE, "--report", report)
+    with pytest.MonkeyPatch.context() as patch:
+        change_options(patch, "csplat_tools.cli.finetune.EncodeOptions", attribute_psnr=28.0, seed=1, threads=1)
+        change_options(patch, "csplat_trainer.tuning.tuning_options.FinetuneOptions", seed=1)
+        messages = run("finetune", source.ply, path, "--data", source.data, "--iterations", 100, "--report", report)
     return TunedFile(source, path, report, messages)
 
 
@@ -138,7 +130,7 @@ class FileRuns:
     The first, of all splats, leaves checkpoints of training and tuning, a report and a page.
     """
 
-    WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 30, "--set", "log_every=10")
+    WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 30)
     TUNED = 30  # steps, usually 1,000
 
     def __init__(self, folder: Path) -> None:
@@ -149,12 +141,13 @@ class FileRuns:
             "a.csplat", "--keep", 1, "--checkpoint", self.checkpoint, "--page", self.page
         )
 
-    def made(self, name: str, *more: object) -> tuple[dict, str]:
-        """Make a file or a PLY; return the report and the messages."""
+    def made(self, name: str, *more: object, **options: object) -> tuple[dict, str]:
+        """Make a file or a PLY, with options of the training; return the report and the messages."""
         report = self.folder / f"{name}.json"
         with pytest.MonkeyPatch.context() as patch:
+            change_options(patch, "csplat_tools.cli.train.TrainOptions", log_every=10, **options)
             patch.setattr(
                 training_run, "tuning_after", lambda **given: replace(tuning_after(**given), iterations=self.TUNED)
             )
-            messages = run_here("train", self.data, "-o", self.folder / name, *self.WORDS, "--report", report, *more)
+            messages = run_here("train", self.data, self.folder / name, *self.WORDS, "--report", report, *more)
         return json.loads(report.read_text()), messages

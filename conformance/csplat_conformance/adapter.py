@@ -1,6 +1,6 @@
 """Run csplat's Python decoder by the protocol of the suite (`protocol`), or in this process.
 
-csplat conformance decoder --cmd 'python -m csplat_conformance.adapter {input} {outdir}' --exact
+csplat conformance decoder --cmd 'python -m csplat_conformance.adapter {input} {outdir}'
 """
 
 from __future__ import annotations

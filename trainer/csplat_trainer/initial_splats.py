@@ -100,9 +100,9 @@ def place_splats(
     have_points = points is not None and len(points) > 0
     have_masks = any(image.has_alpha for image in images)
     if init == "points" and not have_points:
-        raise InputError("the data set holds no points to start from: wanted --set init=hull or init=box")
+        raise InputError("the data set holds no points to start from: expected init='hull' or 'box'")
     if init == "hull" and not have_masks:
-        raise InputError("the pictures have no alpha channel to make a hull of: wanted --set init=points or init=box")
+        raise InputError("the pictures have no alpha channel to make a hull of: expected init='points' or 'box'")
     if have_points and init in ("points", "auto"):
         assert points is not None
         bad = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
@@ -111,7 +111,7 @@ def place_splats(
         if not any(len(_pixels_at(image, points.astype(np.float64))[0]) for image in images):
             raise InputError(
                 f"no camera sees any of the data set's {len(points)} points, expected both in the same coordinates:"
-                " --set init=box starts without points"
+                " TrainOptions(init='box') starts without points"
             )
         if colours is None:
             colours = _sample_images(images, points.astype(np.float64))[2].astype(np.float32)

@@ -1,6 +1,6 @@
 // This decoder behind the protocol of the conformance runner (conformance/IMPLEMENTERS.md), a process for each file:
 //
-//   csplat conformance decoder --exact --cmd 'node codec/js/test/adapter.mjs {input} {outdir}'
+//   csplat conformance decoder --cmd 'node codec/js/test/adapter.mjs {input} {outdir}'
 //
 // and, with --serve, for any number of files: requests on standard input are a u32, the file's size, and the file;
 // each answer is a line of JSON, either {code, offset, clause} or {header, arrays: {name: [bytes, SHA-256]}}.

@@ -111,10 +111,8 @@ def decoder(
     names = [one for one in patterns if one not in clauses]
     # A renderer alone is tested at L4 alone.
     levels = checked(parse_levels, level or ("3" if render_program is None else "4"))
-    options = checked(
-        DecoderSuiteOptions, _joined(names), _joined(clauses), levels, timeout=_seconds(timeout, TIMEOUT_SECONDS), jobs=jobs,
-        by=by,
-    )  # fmt: skip
+    seconds = _seconds(timeout, TIMEOUT_SECONDS)
+    options = checked(DecoderSuiteOptions, _joined(names), _joined(clauses), levels, timeout=seconds, jobs=jobs, by=by)
     with out.bar() as bar:
         if program is None and render_program is None:
             result = run_builtin(options, _moved(bar))

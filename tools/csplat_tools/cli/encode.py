@@ -204,7 +204,7 @@ def encode(
     )  # fmt: skip
     checked(search.target, 1.0)  # errors of the target that do not depend on the scene
     overrides = parse_overrides(up, unit_metres=unit_metres, antialiased=antialiased, licence=licence)
-    scale = OutOfCoreOptions(checked(parse_bytes, memory), resume=resume, cluster=dask)
+    scale = OutOfCoreOptions(parse_bytes(memory), resume=resume, cluster=dask)
     with out.bar() as progress, assume_format(read_as):
         if dry_run:
             _publish_estimate(source, options, scale, out)

@@ -138,7 +138,7 @@ def train(
         return
     encoding = EncodeOptions(preset or "small", seed=seed, shape_codebook_size=SHAPE_ENTRIES)
     result = run_training_to_file(
-        data, output, options, files, encoding, tuning_after(options), size_bytes=size_bytes, psnr=psnr,
+        data, output, options, files, encoding, tuning_after(training=options), size_bytes=size_bytes, psnr=psnr,
         overrides=overrides, page=page, quiet=out.quiet,
     )  # fmt: skip
     out.remark(format_tuning_report(result["file"]))

@@ -375,12 +375,19 @@ def encode_command(setting: SweepSetting, name: str, preset: str, **options: Any
 
 
 def target_command(setting: SweepSetting, name: str, preset: str, **options: Any) -> str:
-    """Return the `csplat encode` command for a file that depends on views."""
+    """Return the `csplat encode` command for a file that depends on views.
+
+    It is empty if the views depend on options of the data set that the command line does not have.
+    """
+    if _has_own_data_options(setting):
+        return ""
     return _csplat_command("encode", setting, name, *_option_words(options), "--preset", preset, *_view_words(setting))
 
 
 def finetune_command(setting: SweepSetting, name: str, sweep: SweepOptions, keep: float | None) -> str:
-    """Return the `csplat finetune` command for a file."""
+    """Return the `csplat finetune` command for a file; empty as for `target_command`."""
+    if _has_own_data_options(setting):
+        return ""
     options = {"keep": keep, "iterations": None if sweep.iterations == SweepOptions.iterations else sweep.iterations}
     words = [*([] if setting.views.images else ["--self"]), *_option_words(options), "--preset", sweep.preset]
     return _csplat_command("finetune", setting, name, *words, *_view_words(setting))
@@ -424,16 +431,19 @@ def _number_text(value: Any) -> str:
     return short if float(short) == value else repr(value)
 
 
+def _has_own_data_options(setting: SweepSetting) -> bool:
+    """Return True if the data set has options that only programs can set."""
+    data = setting.data
+    return data is not None and (data.size, data.test_every, data.near) != (None, None, None)
+
+
 def _view_words(setting: SweepSetting) -> list[str]:
     """Return the options that select the views of the sweep."""
     words, data = list[str](), setting.data
     if setting.cameras is not None:
         words += ["--cameras", setting.cameras]
     if data is not None:
-        words += ["--data", data.path]
-        words += ["--size", f"{data.size[0]}x{data.size[1]}"] if data.size else []
-        words += ["--images", data.images] if data.images else []
-        words += ["--test-every", str(data.test_every)] if data.test_every else []
+        words += ["--data", data.path if data.images is None else str(PurePath(data.path, data.images))]
     if setting.background is not None:
         words += ["--background", ",".join(repr(one) for one in setting.background)]
     return words

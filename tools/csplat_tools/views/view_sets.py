@@ -197,7 +197,7 @@ class DataOptions:
     """A data set of images. `None` means the value in the scene's metadata, else the default.
 
     Attributes:
-        path: the set's folder, or its transforms.json.
+        path: the set's folder, its transforms.json, or a folder of images in it.
         size: width and height to which images are scaled; default: no scaling.
         images: folder of images of a COLMAP set; default: chosen by the reader.
         test_every: every Nth image is a test image if the set does not specify any; default: 8.
@@ -370,8 +370,11 @@ def _views_of_data(
     source: SplatModel, data: DataOptions, background: Colour | None, validation_count: int | None, split: Split
 ) -> ViewSet:
     require_data_sets()
-    from csplat_trainer.data import load
+    from csplat_trainer.data.loader import find_image_folder, load
 
+    folder, images = find_image_folder(data.path)
+    if images is not None:
+        data = replace(data, path=str(folder), images=images)
     record = TrainingRecord.of(source.metadata)
     options, notes = _complete_options(data, record)
     every = _HOLD_OUT_EVERY if options.test_every is None else options.test_every

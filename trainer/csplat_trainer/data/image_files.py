@@ -30,7 +30,7 @@ from urllib.parse import unquote
 from csplat.errors import InputError, counted
 from csplat_trainer.data.image_pixels import image_size
 
-_ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".avif", ".tif", ".tiff", ".bmp", ".jp2")
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".avif", ".tif", ".tiff", ".bmp", ".jp2")
 _SHOWN = 5  # largest number of names in a message
 
 _FOLDER_WORDS = ("without leading folders", "in folders below")  # rules 6 and 7
@@ -194,7 +194,7 @@ def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[t
 
     def unended(name: str) -> str:
         path = PurePosixPath(decoded(name))
-        return str(path.with_suffix("") if path.suffix.lower() in _ENDINGS else path)
+        return str(path.with_suffix("") if path.suffix.lower() in IMAGE_ENDINGS else path)
 
     def parts(name: str) -> list[str]:
         return decoded(name).strip("/").split("/")
@@ -299,6 +299,6 @@ def _images_below(folder: Path) -> Iterator[str]:
     for place, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith((".", "__MACOSX")))
         for name in sorted(files):
-            is_image = name.lower().endswith(_ENDINGS) and not name.startswith(".")
+            is_image = name.lower().endswith(IMAGE_ENDINGS) and not name.startswith(".")
             if is_image and Path(place, name).exists():  # no link to nowhere
                 yield Path(place, name).relative_to(folder).as_posix()

@@ -18,10 +18,12 @@ from csplat_render.camera import MAX_IMAGE_SIZE, camera_outliers, nearest_point
 from csplat_trainer.data.colmap import find_model, read_colmap
 from csplat_trainer.data.dataset import DataSet, Shot, UnreadDataSet, near_plane, open_shot
 from csplat_trainer.data.dataset_checks import check_shots, describe_images, describe_lenses, describe_poses
-from csplat_trainer.data.image_files import abbreviate
+from csplat_trainer.data.image_files import IMAGE_ENDINGS, abbreviate
 from csplat_trainer.data.image_pixels import opaque_images, read_image_header
 from csplat_trainer.data.transforms import read_blender, read_transforms
 
+_SET_LEVELS = 2  # folders above a folder of images that may be its data set
+_SETS = ("transforms_train.json", "transforms.json")
 _MAX_NAMED = 3  # folders in a message, at most
 _AGREES = math.cos(math.radians(30.0))  # least cosine of the usual up direction with that of the cameras
 
@@ -45,7 +47,7 @@ def load(
     Statements of the files are checked against their contents (`dataset_checks`), and images are undistorted (`lens`).
 
     Args:
-        path: its folder, or the `transforms.json`.
+        path: its folder, or the `transforms.json`, or a folder of images in it: `garden/images_4`.
         size: width and height to which all images are scaled, each axis by itself; `None`: unchanged.
         images: the folder of images, such as `images_4`; `None`: the set's own; for COLMAP sets with `size` the
             smallest that is large enough.
@@ -59,6 +61,8 @@ def load(
         InputError: there is no data set, it is damaged, or it has no images.
     """
     path = Path(path)
+    if images is None:
+        path, images = find_image_folder(path)
     if size is not None and not all(1 <= side <= MAX_IMAGE_SIZE for side in size):
         raise InputError(f"pictures of {size[0]}×{size[1]} pixels, wanted 1 to {MAX_IMAGE_SIZE} each way")
     found = _read(path, size, images, test_every)
@@ -124,6 +128,27 @@ def load(
     return replace(data, report=(*data.report, outliers)) if outliers else data
 
 
+def find_image_folder(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
+    """Return the folder of a data set, and the name of its folder of images if that is what `path` names.
+
+    Args:
+        path: a data set, or a folder of images without a data set of its own, which lies in the folder of one.
+
+    Returns:
+        `garden` and `images_4` for `garden/images_4`; `path` and `None` for everything else.
+    """
+    path = Path(path)
+    if path.is_dir() and not _is_set(path):
+        for folder in path.parents[:_SET_LEVELS]:
+            if _is_set(folder) and any(one.suffix.lower() in IMAGE_ENDINGS for one in path.rglob("*")):
+                return folder, path.relative_to(folder).as_posix()
+    return path, None
+
+
+def _is_set(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in _SETS) or find_model(folder) is not None
+
+
 def _choose_axes(custom: str, shots: Sequence[Shot]) -> tuple[str, Direction | None, str]:
     """Return the axes of a set, its up direction, and a line for the report.
 
@@ -149,7 +174,7 @@ def _read(path: Path, size: tuple[int, int] | None, images: str | None, test_eve
     if not path.is_dir():
         zipped = path.suffix.lower() == ".zip" and path.is_file()
         remedy = ": unpack it, and name the folder" if zipped else ""
-        raise InputError(f"{path} is neither a folder nor a transforms.json{remedy}")
+        raise InputError(f"{path} is neither a folder nor a transforms.json{remedy or _suggest_images(path)}")
     model = find_model(path)
     if (path / "transforms_train.json").is_file():
         found = read_blender(path, images)
@@ -161,7 +186,7 @@ def _read(path: Path, size: tuple[int, int] | None, images: str | None, test_eve
     else:
         raise InputError(
             f"{path} is no data set: expected transforms_train.json (Blender), transforms.json (instant-ngp) "
-            f"or sparse/0/cameras.bin (COLMAP){_suggest_place(path)}"
+            f"or sparse/0/cameras.bin (COLMAP), or a folder of images in such a set{_suggest_place(path)}"
         )
     if model is not None:
         found = replace(found, report=[*found.report, "there is a COLMAP model too, which is not read"])
@@ -170,11 +195,16 @@ def _read(path: Path, size: tuple[int, int] | None, images: str | None, test_eve
     return found
 
 
+def _suggest_images(path: Path) -> str:
+    """Return the folders of images next to a path that does not exist, or ""."""
+    found = [one for one in sorted(path.parent.glob("*/")) if find_image_folder(one)[1]] if path.parent.is_dir() else []
+    return f"; {path.parent} has {', '.join(one.name for one in found)}" if found else ""
+
+
 def _suggest_place(path: Path) -> str:
     """Return a hint where the data set may be instead, or ""."""
     folders = [*sorted(path.glob("*/")), *sorted(path.glob("*/*/"))]
-    names = ("transforms_train.json", "transforms.json")
-    sets = [one for one in folders if any((one / name).is_file() for name in names) or find_model(one)]
+    sets = [one for one in folders if _is_set(one)]
     if sets:
         return (
             "; "
