@@ -708,7 +708,7 @@ def test_another_source_does_not_prove_them(tmp_path, ply, csplat_file):
 
 def test_a_source_of_other_size_is_refused(tmp_path, csplat_file, make_model):
     write_ply(tmp_path / "other.ply", make_model(201, 2))
-    assert "200 splats" in invoke("verify", csplat_file, "--source", tmp_path / "other.ply").stderr
+    assert "201 splats" in invoke("verify", csplat_file, "--source", tmp_path / "other.ply").stderr
 
 
 def test_a_wrong_index_is_refused(tmp_path, ply, csplat_file):

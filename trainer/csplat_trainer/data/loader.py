@@ -138,9 +138,10 @@ def find_image_folder(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
         `garden` and `images_4` for `garden/images_4`; `path` and `None` for everything else.
     """
     path = Path(path)
-    if path.is_dir() and not _is_set(path):
+    files = (one for pattern in ("*", "*/*") for one in path.glob(pattern))
+    if path.is_dir() and not _is_set(path) and any(one.suffix.lower() in IMAGE_ENDINGS for one in files):
         for folder in path.parents[:_SET_LEVELS]:
-            if _is_set(folder) and any(one.suffix.lower() in IMAGE_ENDINGS for one in path.rglob("*")):
+            if _is_set(folder):
                 return folder, path.relative_to(folder).as_posix()
     return path, None
 
