@@ -370,7 +370,7 @@ def test_the_first_parts_keep_their_matrices():
 def test_reassign_finds_the_best_where_all_are_tried():
     points, matrices, metric, entries = scene()
     errors = np.stack([exact(points - entry, matrices, np.ones(len(points))) for entry in entries], axis=1)
-    found = reassign_by_metric(points, metric, entries, np.zeros(len(points), np.int64), 2, tried=len(entries))
+    found = reassign_by_metric(points, metric, entries, np.zeros(len(points), np.int64), 2, candidates=len(entries))
     np.testing.assert_allclose(errors.min(axis=1), errors[np.arange(len(points)), found], rtol=1e-4)
 
 

@@ -119,7 +119,7 @@ def test_extra_columns_are_dropped_by_default(make_model):
 
 def test_more_extra_columns_than_a_file_can_have_are_refused(make_model):
     model = make_model(2, 0, extra={f"c{i}": np.arange(2, dtype=np.uint8) for i in range(256)})
-    with pytest.raises(InputError, match="256 extra columns, a file has at most 255"):
+    with pytest.raises(InputError, match="256 extra columns, expected at most 255"):
         round_trip(model, keep_extra=True)
     fits = replace(model, extra=dict(list(model.extra.items())[:255]))
     assert len(round_trip(fits, keep_extra=True)[0].extra) == 255

@@ -105,7 +105,7 @@ def test_a_file_declares_its_source_and_pruned_count(make_model):
 
 
 def test_an_origin_of_other_splats_is_refused(make_model):
-    with pytest.raises(InputError, match="an origin of 5 splats, expected 4"):
+    with pytest.raises(InputError, match="origin has 5 splats, expected 4"):
         EncodePlan.of(make_model(4, 0), origin=Origin(9, np.arange(5)))
 
 

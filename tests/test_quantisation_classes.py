@@ -271,7 +271,7 @@ def test_the_preset_fast_has_one_class_by_default(model):
     ],
 )
 def test_other_curvatures_are_refused(model, field, value):
-    with pytest.raises(InputError, match=f"curvatures of {field}"):
+    with pytest.raises(InputError, match=f"Gauss-Newton blocks of {field}"):
         encode_with_report(model, importance=important(model, **{field: value}))
 
 

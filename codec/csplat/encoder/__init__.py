@@ -1,7 +1,7 @@
-"""The encoder's interface for other packages.
+"""Encode scenes to `.csplat` files.
 
-`encode` and `encode_with_report` make a file in one call. `EncodePlan` and `encode_tiles` make it in steps, for callers
-that refit colours to the planned geometry; `fix_quantisation` is for callers that tune all values.
+`encode` and `encode_with_report` encode in one call. `EncodePlan` and `encode_tiles` encode in steps, for callers that
+refit colours to the quantised geometry; `fix_quantisation` is for callers that tune all values.
 """
 
 from __future__ import annotations

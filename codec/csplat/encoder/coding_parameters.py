@@ -1,8 +1,8 @@
-"""Coding parameters of a file: steps, levels and codings, chosen from options, preset and scene.
+"""Choose the coding parameters of a file (steps, levels and codings) from options, preset and scene.
 
-One number, the quality in dB, sets all steps. Errors in renders that one step causes differ between scenes by a factor
-of ten; most of that is explained by three statistics. A moved, turned or resized splat is visible as far as its
-neighbours have another colour; a displacement in proportion to the scene's extent on the screen; a rotation in
+One number, the quality in dB, sets all steps. The error in renders that a step causes differs between scenes by a
+factor of ten, most of which three statistics explain. Moving, turning or resizing a splat is visible only as far as its
+neighbours have other colours; a displacement matters relative to the scene's extent on the screen, and a rotation in
 proportion to the splat's size on the screen.
 """
 
@@ -22,18 +22,18 @@ from csplat.encoder.entropy import DeflateSettings, deflate_library, morton_code
 from csplat.model import SH_C0, SplatModel
 from csplat.types import F32, F64
 
-_EXTENT_SAMPLE = 1 << 16  # splats from which the extent is estimated
-_EDGE = 0.02  # fraction of the splats on either side of an axis that are outside the extent
-_BITS_MAX = 16  # per axis of a tile
+_EXTENT_SAMPLE = 1 << 16  # splats on which the extent is estimated
+_EDGE = 0.02  # fraction of the splats outside the extent on either side of an axis
+_BITS_MAX = 16  # bits per axis of a tile
 _STEP_MIN = 1e-250  # scene units
-_GRID_TRIAL = 1024  # splats to try first: few scenes that are not on a grid pass
-_GRID_MIN = 0.8  # smallest step of the source's grid that is used, as a multiple of the chosen step
-_HALF_DIAGONAL = 3.0**0.5 / 2.0  # largest displacement of a mean, in steps
+_GRID_TRIAL = 1024  # splats to test first, which most scenes that are not on a grid fail
+_GRID_MIN = 0.8  # smallest step of a source's grid that is adopted, as a multiple of the chosen step
+_HALF_DIAGONAL = 3.0**0.5 / 2.0  # largest displacement of a mean by rounding, in steps
 _STATISTICS_SAMPLE = 1 << 16  # splats
-_RUNS = 16  # runs of neighbours among the sampled splats
-_NEIGHBOUR_DISTANCE = 8  # places in Morton order
+_RUNS = 16  # runs of neighbours in the sample
+_NEIGHBOUR_DISTANCE = 8  # positions in Morton order
 _CORE = 0.8  # fraction of the splats within the scene's reach
-_CODE_BITS = 16  # bits of a Morton code per axis
+_CODE_BITS = 16  # bits per axis of a Morton code
 _CELLS_MAX = 1e38  # cells per scene unit, within float32
 
 
@@ -42,10 +42,10 @@ class Lattice:
     """The lattice of the means.
 
     Attributes:
-        step: the file's step, scene units, > 0.
-        bits: maximum per axis and tile, 1 to 16; a tile whose box needs more is cut or coarsened.
-        finest: tiles use all their bits (the step was given in bits) instead of stopping at `step`.
-        strict: no tile has a coarser step, however many tiles that takes.
+        step: step of the file, scene units, > 0.
+        bits: maximum number of bits per axis and tile, 1 to 16; a tile whose box needs more is split or coarsened.
+        finest: tiles use all their bits instead of stopping at `step`; set if the caller specified bits.
+        strict: no tile has a coarser step, regardless of the number of tiles.
     """
 
     step: float
@@ -56,11 +56,11 @@ class Lattice:
 
 @dataclass(frozen=True)
 class StepFactors:
-    """Factors by which the steps of a tile are coarser than the file's: those of its quantisation class.
+    """Steps of a quantisation class relative to the file's.
 
     Attributes:
-        opacities, quats: integers are multiples of this, >= 1.
-        scales, means, sh0: the step is the file's times 2**this, >= 0.
+        opacities, quats: k >= 1, integers are multiples of k.
+        scales, means, sh0: k >= 0, the step is the file's times 2**k.
     """
 
     opacities: int = 1
@@ -75,7 +75,7 @@ SAME_STEPS = StepFactors()
 
 @dataclass(frozen=True)
 class CodingParameters:
-    """Everything that is chosen before the first splat is quantised.
+    """Steps, levels and codings of a file.
 
     Attributes:
         lattice: lattice of the means.
@@ -85,16 +85,16 @@ class CodingParameters:
         chroma_shift: chroma is coarser than luma by 2**chroma_shift.
         sh_degree: SH degree to keep.
         codebook_step: lattice step of the bands 1 to 3 with a codebook, whose entries deserve more precision.
-        codebook_share: entries per splat.
-        codebook_most: maximum number of entries.
+        codebook_share: number of codebook entries per splat.
+        codebook_most: maximum number of codebook entries.
         escape_fraction: fraction of the splats to escape.
-        escape_coarse: values of escapes are multiples of 2**escape_coarse steps.
+        escape_coarse: escapes are rounded to multiples of 2**escape_coarse steps.
         sh_coding: "auto", "codebook", "scalar" or "none"; "auto" until `choose_sh_coding`.
-        adaptive: how much coarser the SH of unimportant splats is, 0 to 1.
+        adaptive: exponent by which SH gets coarser with falling importance, 0 to 1.
         tile_splats: maximum number of splats per tile.
         deflate: level and library of DEFLATE.
-        canonical: shapes are in canonical axis order already, and are not to be reordered even if tuning moved them
-            across its boundary: the integers written are those that tuning saw.
+        canonical: keep the axis order of shapes, which was canonical before tuning; the file then contains the integers
+            that tuning was based on, even if a shape crossed the boundary of canonical order.
     """
 
     lattice: Lattice
@@ -123,11 +123,11 @@ class CodingParameters:
 
     @property
     def sh_coefficients(self) -> int:
-        """Coefficients of the bands 1 to `sh_degree`."""
+        """Number of coefficients of the bands 1 to `sh_degree`."""
         return (self.sh_degree + 1) ** 2 - 1
 
     def attribute_records(self) -> list[_spec.AttributeRecord]:
-        """Return the file's attribute records (spec 4.3.1)."""
+        """Return the attribute records of the file (spec 4.3.1)."""
         lattice, ycocg = _spec.MAPPING_LATTICE, _spec.MAPPING_YCOCG
         levels = self.opacity_levels, self.quat_levels
         shift = self.chroma_shift
@@ -151,9 +151,9 @@ def choose_parameters(
 
     Args:
         model: the scene.
-        options: presets and knobs.
-        importance_given: the caller knows the importance of the splats.
-        contrast: contrast of the scene, if the model is a sample of it; see `measure_contrast`.
+        options: the caller's options.
+        importance_given: the caller specifies the importance of the splats.
+        contrast: contrast of the scene that the model is a sample of; see `measure_contrast`.
     """
     preset = PRESETS[options.preset]
     degree = model.sh_degree if options.sh_degree is None else min(options.sh_degree, model.sh_degree)
@@ -191,7 +191,7 @@ def choose_parameters(
 
 
 def band_slice(band: int) -> slice:
-    """Return the coefficients of an SH band among those of the bands 1 to 3."""
+    """Return the slice of an SH band among the coefficients of the bands 1 to 3."""
     return slice(band * band - 1, (band + 1) ** 2 - 1)
 
 
@@ -200,8 +200,8 @@ class SceneStatistics:
     """Statistics of a scene.
 
     Attributes:
-        reach: distance from the median of the means within which 80 % of the splats lie, scene units, >= 0.
-        contrast: rms difference of the colours of neighbours, weighted by their opacities, in [0.02, 1].
+        reach: radius around the median of the means that contains 80 % of the splats, scene units, >= 0.
+        contrast: rms colour difference of neighbouring splats, weighted by their opacities, in [0.02, 1].
         size: median of the largest standard deviation, as a fraction of the reach, in [1e-4, 1].
     """
 
@@ -211,11 +211,11 @@ class SceneStatistics:
 
 
 def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneStatistics:
-    """Measure a sample of a scene; deterministic.
+    """Measure a scene on a deterministic sample.
 
     Args:
         model: the scene.
-        contrast: see `measure_contrast`, if the model is itself a sample, without neighbours.
+        contrast: contrast of the scene, if the model is a sample, which has no neighbours; see `measure_contrast`.
     """
     if len(model) == 0:
         return SceneStatistics(0.0, 0.2, 0.01)
@@ -228,14 +228,14 @@ def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneS
 
 
 def measure_contrast(parts: Iterable[SplatModel]) -> float:
-    """Return the contrast of a scene of which these are parts, each with all splats of its region."""
+    """Return the contrast of a scene from parts of it, each with all splats of its region."""
     sums = [_contrast(part, *_reach(part.means)) for part in parts if len(part)]
     return _rms(sum(squares for squares, _ in sums), sum(weights for _, weights in sums))
 
 
 @dataclass(frozen=True)
 class _AttributeSteps:
-    """Lattice steps and levels; `means` is 0 if the scene has no extent."""
+    """Steps and levels; `means` is 0 if the scene has no extent."""
 
     means: float
     scales: float
@@ -246,11 +246,11 @@ class _AttributeSteps:
 
 
 def _steps(statistics: SceneStatistics, quality: float, sh_quality: float, *, has_sh: bool) -> _AttributeSteps:
-    """Choose the steps at which each attribute alone costs about `quality` dB.
+    """Choose the steps at which quantising one attribute leaves a PSNR of about `quality`, dB.
 
-    The factors are the medians over ten scenes of the step that costs 50 dB, divided by the scene's statistics; they
-    scatter by a quarter to a third (2 to 3 dB). Bytes are fewest if every dimension has the same error; the differences
-    of quality between attributes were found by search, with and without SH.
+    The factors are medians over ten scenes of the step that leaves 50 dB, divided by the statistics; they scatter by a
+    quarter to a third (2 to 3 dB). The rate is lowest if every dimension has the same error; the differences between
+    attributes were found by search, with and without SH.
     """
     contrast = statistics.contrast
     for_quats, for_sh0 = (0.0, -2.0) if has_sh else (-1.5, 2.5)
@@ -275,7 +275,7 @@ def _default_to(chosen: Any, otherwise: Any) -> Any:
 
 
 def _lattice(model: SplatModel, options: EncodeOptions, by_quality: float) -> Lattice:
-    """Choose the step of the means: by an option (error, step, bits over the scene's core), or by the quality."""
+    """Choose the lattice of the means by an option (error, step, or bits over the scene's core) or by the quality."""
     if options.position_error is not None:
         return Lattice(options.position_error / _HALF_DIAGONAL, _BITS_MAX, strict=True)
     if options.position_step is not None:
@@ -295,15 +295,15 @@ def _lattice(model: SplatModel, options: EncodeOptions, by_quality: float) -> La
 
 
 def _clamp_step(step: float, reach: float) -> float:
-    """Keep the step normal, and no finer than float32 at the border of the scene's core."""
+    """Limit the step to normal numbers, and to the precision of float32 at the border of the scene's core."""
     step = max(step, reach * 2.0**-40)
     return step if np.isfinite(step) and step > _STEP_MIN else 1.0
 
 
 def _source_step(values: F32, step: float) -> float:
-    """Return the step of the grid that the values lie on, unless it is too fine: they are exact in fewer bits.
+    """Return the step of the power-of-two grid that the values are on, or `step` if there is none or it is too fine.
 
-    Means and log scales that come from SPZ are multiples of a power of two.
+    Means and log scales from SPZ are on such a grid, which represents them exactly in fewer bits.
     """
     if not (step > _STEP_MIN and values.any()):
         return step
@@ -325,7 +325,7 @@ def _spread(count: int) -> NDArray[np.intp]:
 
 
 def _reach(means: F32) -> tuple[F64, float]:
-    """Return sampled means, and the distance from their median within which 80 % of them lie."""
+    """Return a sample of the means, and the radius around their median that contains 80 % of them."""
     points = np.take(means, _spread(len(means)), axis=0).astype(np.float64)
     distance = points - np.median(points, axis=0)
     top = float(np.abs(distance).max())
@@ -337,7 +337,7 @@ def _rms(squares: float, weights: float) -> float:
 
 
 def _contrast(model: SplatModel, sample: F64, reach: float) -> tuple[float, float]:
-    """Return the summed weighted squares of colour differences of splats a few places apart in Morton order."""
+    """Return Σ w d² and Σ w over pairs of neighbours: d² is the mean square of the colour difference, w = αα'."""
     squares = weights = 0.0
     if len(model) <= _NEIGHBOUR_DISTANCE or not reach:
         return squares, weights
@@ -356,7 +356,7 @@ def _neighbours(means: F32, centre: NDArray[Any], reach: float) -> list[NDArray[
     scale, top = np.float32(min(1.0 / reach, _CELLS_MAX)), (1 << _CODE_BITS) - 1
     shift = np.float32(0.5) - (centre / reach).astype(np.float32)
     for at in range(0, len(means), _STATISTICS_SAMPLE):
-        with np.errstate(over="ignore"):  # infinity is clipped like all that is beyond the reach
+        with np.errstate(over="ignore"):  # infinity is clipped to the reach
             place = means[at : at + _STATISTICS_SAMPLE].T * scale + shift[:, None]
         codes[at : at + _STATISTICS_SAMPLE] = morton_codes((np.clip(place, 0, 1) * top).astype(np.int32))
     if len(means) <= 2 * _STATISTICS_SAMPLE:

@@ -1,4 +1,4 @@
-"""Chunks, index and header of a file (spec 4 and 5): the only module that knows offsets."""
+"""Write header, index and chunks of a file (spec 4 and 5)."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class LazyPayload:
     """A payload that is read when the file is written.
 
     Attributes:
-        size: bytes.
+        size: size in bytes.
         crc: see `chunk_crc`.
-        read: returns all of it.
+        read: returns the payload.
     """
 
     size: int
@@ -37,7 +37,7 @@ Payload = bytes | LazyPayload
 
 @dataclass(frozen=True)
 class FileChunk:
-    """A chunk of the whole file; codebooks have an id and a layer."""
+    """A chunk other than a tile; codebooks have an id and a layer."""
 
     type: bytes
     payload: Payload
@@ -70,7 +70,7 @@ class IndexedCodebook:
 
 @dataclass(frozen=True)
 class SceneFields:
-    """Everything in a file that is not a tile."""
+    """The contents of a file except tiles."""
 
     sh_degree: int
     scene_flags: int
@@ -100,7 +100,7 @@ def write_file(scene: SceneFields, tiles: Sequence[FileTile]) -> bytes:
 
 
 def file_pieces(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[bytes]:
-    """Yield a file piece by piece: header, index, and chunks in the recommended order (spec 4.3.6)."""
+    """Yield a file in pieces: header, index, and chunks in the recommended order (spec 4.3.6)."""
     index_size = _index_size(scene, tiles)
     offset = _spec.HEADER_SIZE + index_size
     directory: list[_spec.DirectoryRecord] = []
@@ -132,7 +132,7 @@ def _chunk_head(kind: bytes, size: int) -> bytes:
 def _ordered_chunks(
     scene: SceneFields, tiles: Sequence[FileTile]
 ) -> Iterator[tuple[tuple[int, int] | None, FileChunk]]:
-    """Yield each chunk with its (tile, layer), or None for chunks of the whole file."""
+    """Yield each chunk with its (tile, layer); `None` for chunks other than tiles."""
     yield from ((None, chunk) for chunk in scene.chunks if chunk.type != _spec.CHUNK_CODEBOOK)
     for layer in _spec.LAYER_NAMES:
         for chunk in scene.chunks:

@@ -1,4 +1,4 @@
-"""Options of the encoder, and the presets that supply their defaults."""
+"""Define the options of the encoder and its presets."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class EncodeOptions:
 
     Attributes:
         preset: "fast", "balanced" or "small".
-        attribute_psnr: PSNR in dB of a scene with one quantised attribute; the file's is 5 to 12 dB lower. All steps
-            follow from it; overrides the preset's.
-        position_bits: bits per axis of a tile's box, 2 to 16; overrides the step that follows from the quality.
-        position_step: lattice step of the means in scene units, > 0; overrides `position_bits`.
-        position_error: largest displacement of a mean, scene units, > 0; overrides both. The step follows from it, and
-            tiles are cut until none needs a coarser one.
+        attribute_psnr: PSNR of renders, dB, if a single attribute were quantised; the file's PSNR is 5 to 12 dB lower.
+            Sets all steps, instead of the preset.
+        position_bits: bits per axis of a tile's box, 2 to 16; instead of the step chosen by quality.
+        position_step: lattice step of the means, scene units, > 0; overrides `position_bits`.
+        position_error: maximum displacement of a mean, scene units, > 0; overrides `position_step`. Tiles are split
+            until none needs a coarser step.
         means_coding: "auto", "morton" or "axis".
         scale_step: step of the log scales, > 0.
         opacity_levels: M, 1 to 65535.
@@ -38,24 +38,25 @@ class EncodeOptions:
         chroma_shift: chroma is coarser than luma by 2**chroma_shift, 0 to 16.
         sh_degree: SH degree to keep, 0 to 3; `None` keeps all bands.
         sh_coding: "auto", "codebook", "scalar" or "none".
-        codebook_size: entries of the SH codebook.
-        escape_fraction: fraction of the splats, with the largest weighted errors, that bypass the SH codebook, 0 to 1.
-        shape_codebook_size: maximum number of entries of a codebook of shapes (rotation, and scales up to a common
-            factor); 0, the default: no codebook. It is used only if the file becomes smaller.
-        shape_escape_fraction: fraction of the splats, with the largest weighted errors, that bypass the shape codebook.
-            Default: those whose error would grow by more than the saved bits are worth, if an importance holds a
-            metric of shapes, otherwise 0.05.
-        adaptive: how much coarser the SH of unimportant splats is, 0 (not at all) to 1 (their error grows as their
-            importance falls). Default: 0 unless an importance is given.
+        codebook_size: number of entries of the SH codebook.
+        escape_fraction: fraction of the splats, those with the largest weighted errors, to escape from the SH codebook,
+            0 to 1.
+        shape_codebook_size: maximum number of entries of the codebook of shapes (rotation, and scales up to a common
+            factor), which is used only if it makes the file smaller. Default: 0, no codebook.
+        shape_escape_fraction: fraction of the splats, those with the largest weighted errors, to escape from the shape
+            codebook. Default: chosen by rate and distortion if the importance has a metric of shapes, otherwise 0.05.
+        adaptive: how much coarser the SH of unimportant splats is, from 0 (not coarser) to 1 (squared error inversely
+            proportional to importance). Default: 0 without an importance.
         max_classes: maximum number of quantisation classes, 1 to 5: splats whose errors are equally visible share
             steps. Requires an importance with Gauss-Newton blocks. Default: one per 2,500 splats; 1 with "fast".
-        tile_splats: maximum number of splats per tile, 1 to 65536. Decoders spread tiles over cores: 16384 decodes
-            scenes of few tiles 1.2 to 3.6 times as fast on four cores, for up to 1.2 % more bytes; 4096 costs 3 to 6 %.
+        tile_splats: maximum number of splats per tile, 1 to 65536. Decoders distribute tiles over cores: with 16384,
+            scenes of few tiles decode 1.2 to 3.6 times as fast on four cores and take up to 1.2 % more bytes; 4096
+            takes 3 to 6 % more.
         deflate_level: level of DEFLATE, 1 to 12 for libdeflate, 1 to 9 for zlib.
         deflate: "auto", "libdeflate" or "zlib".
         keep_extra: write the model's extra columns.
-        seed: seed of the k-means.
-        threads: number of threads; `None`: all cores. The bytes do not depend on it.
+        seed: seed of k-means.
+        threads: number of threads; `None`: all cores. Has no effect on the bytes.
 
     Examples:
         >>> import csplat
@@ -66,7 +67,7 @@ class EncodeOptions:
         csplat.errors.InputError: preset is 'tiny', expected one of fast, balanced, small
 
     Raises:
-        InputError: a word is not one of those listed, or a number is out of range.
+        InputError: a value is not one of those listed, or out of range.
     """
 
     preset: PresetName = "balanced"
@@ -108,7 +109,7 @@ class EncodeOptions:
             if number is None or not low <= number <= high:
                 what = "an integer, " if kind is int else ""
                 raise InputError(f"{name} is {value!r}, expected {what}{low:g} to {high:g}")
-            object.__setattr__(self, name, number)  # JSON does not know NumPy's numbers
+            object.__setattr__(self, name, number)  # json cannot write NumPy's numbers
 
     @property
     def thread_count(self) -> int:
@@ -116,7 +117,7 @@ class EncodeOptions:
         return self.threads or os.cpu_count() or 1
 
     def chosen(self) -> dict[str, Any]:
-        """Return the options that the caller set, without `threads`, which cannot change the bytes."""
+        """Return the options that the caller set, except `threads`, which has no effect on the bytes."""
         return {
             field.name: getattr(self, field.name)
             for field in fields(self)
@@ -129,16 +130,12 @@ class Preset:
     """Settings of a preset.
 
     Attributes:
-        quality: `attribute_psnr` for scenes with SH and for scenes without; steps follow from it and from the scene
-            (coding_parameters.py).
-        sh_quality: the same for the bands 1 to 3, whose bits are expensive.
-        sh_coding: as in `EncodeOptions`.
-        adaptive: as in `EncodeOptions`.
-        deflate_level: as in `EncodeOptions`.
-        codebook_share: entries of an SH codebook per splat.
+        quality: `attribute_psnr` for scenes with and without SH, dB.
+        sh_quality: the same for the bands 1 to 3, which take more bits.
+        sh_coding, adaptive, deflate_level, escape_fraction: as in `EncodeOptions`.
+        codebook_share: number of entries of the SH codebook per splat.
         codebook_most: maximum number of its entries.
-        codebook_finer: its lattice is finer than that of scalar coding by 2**codebook_finer.
-        escape_fraction: as in `EncodeOptions`.
+        codebook_finer: its step is the scalar step divided by 2**codebook_finer.
     """
 
     quality: tuple[float, float]
@@ -153,7 +150,7 @@ class Preset:
 
 
 PRESETS: dict[PresetName, Preset] = {
-    # 255 entries and the escape fit a byte and are searched fast; escapes make up for the small number.
+    # 255 entries and the escape fit one byte and are searched fast; more escapes make up for the small codebook.
     "fast": Preset((55.0, 63.5), 44.0, "auto", 0.5, 1, codebook_most=255, escape_fraction=0.2),
     "balanced": Preset((53.5, 53.2), 43.0, "auto", 0.5, 12),
     "small": Preset((48.6, 47.2), 39.0, "auto", 0.5, 12, 1 / 32),
@@ -193,7 +190,7 @@ _NEVER_NONE = ("tile_splats", "seed")
 
 
 def _number(value: Any, kind: type[int | float]) -> int | float | None:
-    """Return a Python number of that kind, or None if the value is not one."""
+    """Return the value as a Python int or float, `None` if it is not of that kind."""
     if kind is int:
         return int(value) if isinstance(value, Integral) else None
     return float(value) if isinstance(value, Real) else None

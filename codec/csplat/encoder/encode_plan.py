@@ -1,12 +1,12 @@
-"""The plan of a file: steps, quantisation classes, tiles and shape codebook are chosen, colours may still change.
+"""Plan the encoding of a scene: steps, quantisation classes, tiles and shape codebook, before colours are final.
 
     plan = EncodePlan.of(model, options)
     plan = plan.with_colours(*fit_colours(plan.scene))  # optional
     encoded = encode_tiles(plan)
     encoded.write({"fitted": {"psnr": measure(encoded.write().data)}})
 
-The encoder has no renderer. A caller that has one renders `EncodePlan.scene` before colours are encoded, and the file
-before it records its own PSNR. A caller that tunes all values uses `fix_quantisation` instead of `encode_tiles`.
+The encoder has no renderer. A caller with a renderer can fit colours to renders of `EncodePlan.scene`, and record the
+PSNR of the file in the file. A caller that tunes all values uses `fix_quantisation` instead of `encode_tiles`.
 """
 
 from __future__ import annotations
@@ -61,13 +61,13 @@ _EXTRA_COLUMNS_MAX = 255  # TLE-2: block_count is a byte
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """The source that a scene was derived from, by pruning or by changing values.
+    """The source of a pruned or refitted scene.
 
     Attributes:
-        source_count: splats of the source.
+        source_count: number of splats of the source.
         source_index: [N] int64, index in the source of each splat.
-        refitted: colours differ from those of the source; the file declares no errors for them.
-        adjusted: opacities, rotations or scales differ too.
+        refitted: colours differ from the source; the file declares no errors for them.
+        adjusted: opacities, rotations or scales differ, too.
     """
 
     source_count: int
@@ -83,15 +83,15 @@ class EncodePlan:
     Attributes:
         model: the scene, with the colours to encode.
         options: the caller's options.
-        origin: the source that the scene was derived from.
-        importance: importance of its splats for renders, if known.
-        parameters: steps and codings; that of SH may still be open.
-        tiles: rows of the model and steps, by tile.
+        origin: the source of the scene.
+        importance: importance of the splats, if known.
+        parameters: steps and codings; the SH coding may still be "auto".
+        tiles: rows of the model and steps of each tile.
         extras: records of the extra columns to write.
         shapes: the shape codebook, if there is one.
         classes: quantisation classes of the splats, if there are several.
-        sample: for a scene of more than `BUCKET_SPLATS` splats of unknown importance: the plan of the sample that
-            choices are made on.
+        sample: plan of the sample on which choices are made, for a scene of more than `BUCKET_SPLATS` splats without
+            importance.
         buckets: rows of each bucket of such a scene.
     """
 
@@ -123,16 +123,16 @@ class EncodePlan:
 
         Args:
             model: the scene.
-            options: presets and knobs; the default preset is "balanced".
-            importance: [N] weights >= 0 of the splats, in place of opacity × projected size; or an `Importance`.
-            origin: the source that the scene was derived from; `None`: the scene itself.
+            options: default: the preset "balanced".
+            importance: [N] weights >= 0 of the splats, or an `Importance`; default: guessed from opacity and size.
+            origin: the source of the scene; `None`: the scene itself.
             allow_classes: allow several quantisation classes, if the importance has Gauss-Newton blocks.
-            contrast: contrast of the scene that the model is a sample of (`measure_contrast`).
-            progress: called with the stage and the fraction of it that is done, 0 to 1; from any thread.
+            contrast: contrast of the scene that the model is a sample of; see `measure_contrast`.
+            progress: called with the stage and the fraction done, 0 to 1, from any thread.
 
         Raises:
-            InputError: values that no lattice can hold, an option that the model does not allow, or an importance or
-                origin with another number of splats.
+            InputError: a value fits no lattice, an option is not allowed for the model, or importance or origin have
+                another number of splats.
         """
         check_model("the encoder", model)
         options = EncodeOptions() if options is None else options
@@ -140,7 +140,7 @@ class EncodePlan:
             raise InputError(f"options is {options!r}, expected csplat.EncodeOptions(preset=...)")
         origin = origin or Origin(len(model), np.arange(len(model)))
         if len(origin.source_index) != len(model):
-            raise InputError(f"an origin of {len(origin.source_index)} splats, expected {len(model)}")
+            raise InputError(f"origin has {len(origin.source_index)} splats, expected {len(model)}")
         model = clip_scales(model)
         if len(model) > BUCKET_SPLATS and importance is None and not options.shape_codebook_size:
             return cls._of_many(model, options, origin, progress)
@@ -169,7 +169,7 @@ class EncodePlan:
 
     @cached_property
     def scene(self) -> SplatModel:
-        """The scene with means, shapes and opacities as decoded, in the model's order, colours unchanged."""
+        """The scene with means, shapes and opacities as decoded, in the model's order; colours are unchanged."""
         model, tiles, parameters = self.model, self.tiles, self.parameters
         quats, scales = dequantised_shapes(model.quats, model.scales, tiles, parameters, self.shapes)
         return replace(
@@ -189,7 +189,7 @@ class EncodePlan:
             shN: [N, K, 3] float32, of the model's SH degree.
 
         Raises:
-            InputError: they have another shape or type, or are not finite.
+            InputError: a shape or dtype is wrong, or a value is not finite.
         """
         model = replace(self.model, sh0=sh0, shN=shN)
         rows = None if self.sample is None else sample_rows(len(model))
@@ -197,11 +197,7 @@ class EncodePlan:
         return replace(self, model=model, origin=replace(self.origin, refitted=True), sample=sample)
 
     def choose_sh_coding(self, progress: Progress | None = None) -> tuple[CodingParameters, FileCodebooks]:
-        """Choose how SH is coded.
-
-        Returns:
-            The complete parameters, and the codebooks with the entry of each splat.
-        """
+        """Choose the SH coding; return the final parameters and the codebooks with the assignment of the splats."""
         model, parameters, importance = self.model, self.parameters, self.importance
         if self.sample is not None:
             return self._assign_all(*self.sample.choose_sh_coding(progress))
@@ -221,7 +217,7 @@ class EncodePlan:
     def _assign_all(
         self, parameters: CodingParameters, codebooks: FileCodebooks
     ) -> tuple[CodingParameters, FileCodebooks]:
-        """Apply the choices made on the sample to all splats."""
+        """Apply the sample's choices to all splats."""
         sh_plan, count = codebooks.sh_plan, len(self.model)
         index = None if sh_plan.book is None else np.empty(count, np.int32)
         weights = None if sh_plan.weights is None else np.empty(count, np.float32)
@@ -236,7 +232,7 @@ class EncodePlan:
 
 
 def trial_rows(model: SplatModel, tiles: Sequence[TileSplats], classes: QuantisationClasses | None) -> NDArray[np.intp]:
-    """Return about a tile's rows, of all quantisation classes, on which SH codings are compared."""
+    """Return the rows on which SH codings are compared: about one tile, from all quantisation classes."""
     if not tiles:
         return np.zeros(0, np.intp)
     if classes is None:
@@ -245,19 +241,19 @@ def trial_rows(model: SplatModel, tiles: Sequence[TileSplats], classes: Quantisa
 
 
 def clip_scales(model: SplatModel) -> SplatModel:
-    """Clip log scales to ±88, which decoders treat alike (CNF-6), so that they do not coarsen other splats' lattice."""
+    """Clip log scales to ±88, beyond which decoders treat them alike (CNF-6), so that they coarsen no lattice."""
     if not len(model) or float(np.abs(model.scales).max()) <= SCALE_MOST:
         return model
     return replace(model, scales=np.clip(model.scales, -SCALE_MOST, SCALE_MOST))
 
 
 def extra_records(model: SplatModel, options: EncodeOptions) -> list[_spec.ExtraRecord]:
-    """Return the records of the extra columns to write: none unless `keep_extra` is set."""
+    """Return the records of the extra columns to write, none without `keep_extra`."""
     records: list[_spec.ExtraRecord] = []
     if not options.keep_extra:
         return records
     if len(model.extra) > _EXTRA_COLUMNS_MAX:
-        raise InputError(f"{len(model.extra)} extra columns, a file has at most {_EXTRA_COLUMNS_MAX}")
+        raise InputError(f"the model has {len(model.extra)} extra columns, expected at most {_EXTRA_COLUMNS_MAX}")
     ids = {name: id for id, name in _spec.EXTRA_DTYPE_NAMES.items()}
     for name, column in model.extra.items():
         text = name.encode()
@@ -265,6 +261,7 @@ def extra_records(model: SplatModel, options: EncodeOptions) -> list[_spec.Extra
         if kind not in ids:
             raise InputError(f"extra column {name!r} has dtype {column.dtype}, expected one of {', '.join(ids)}")
         if not 1 <= len(text) <= _spec.EXTRA_NAME_MAX or any(ord(c) < 32 or ord(c) == 127 for c in name):
-            raise InputError(f"extra column {name!r}: a name has 1 to {_spec.EXTRA_NAME_MAX} bytes, no control codes")
+            limits = f"1 to {_spec.EXTRA_NAME_MAX} bytes without control characters"
+            raise InputError(f"the name of extra column {name!r} is invalid, expected {limits}")
         records.append(_spec.ExtraRecord(ids[kind], len(text), text.ljust(_spec.EXTRA_NAME_MAX, b"\0")))
     return records

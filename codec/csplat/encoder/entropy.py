@@ -1,4 +1,4 @@
-"""Integers to coded bytes: Morton codes, transforms, DEFLATE, and the blocks of a tile (spec 6)."""
+"""Code integers as bytes: Morton codes, transforms, DEFLATE, and the blocks of a tile (spec 6)."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from csplat.types import I64
 Integers = NDArray[Any]
 
 _FASTEST_LEVEL = 1  # DEFLATE level at which samples replace trials
-_SHORT_RUN = 1.5  # bytes, mean length from which RUN_LENGTH may save more than it costs decoders
-_LONG_RUN = 32  # bytes, mean length from which it is tried at the fastest level
+_SHORT_RUN = 1.5  # mean run length, bytes, from which RUN_LENGTH is tried
+_LONG_RUN = 32  # the same at the fastest level
 _SAMPLE = 4096  # bytes of each of four samples
-_TRIAL_LEVEL = 6  # DEFLATE level of trials: a tenth of the time of the highest, and rarely a different choice
-_GAIN = 0.98  # fraction of the bytes, below which runs are worth their time in decoders
-_MOSTLY = 0.9  # fraction of non-zero splats, above which a mask is not worth its time in decoders
-_SPREAD = (  # shifts and masks that put two zeros between bits
+_TRIAL_LEVEL = 6  # DEFLATE level of trials, which takes a tenth of the highest level's time and rarely errs
+_GAIN = 0.98  # maximum relative size with RUN_LENGTH; a smaller gain is not worth the decoding time
+_MOSTLY = 0.9  # fraction of non-zero splats above which a mask is not worth the decoding time
+_SPREAD = (  # shifts and masks that insert two zeros between bits
     (32, 0x1F00000000FFFF),
     (16, 0x1F0000FF0000FF),
     (8, 0x100F00F00F00F00F),
@@ -52,18 +52,18 @@ class DeflateSettings:
             raise InputError(f"the level of DEFLATE is {self.level}, expected 1 to 12")
 
 
-def deflate_library(wanted: str) -> str:
-    """Resolve "auto" to libdeflate if its package is installed, else zlib.
+def deflate_library(name: str) -> str:
+    """Resolve "auto" to libdeflate if its package is installed, and to zlib otherwise.
 
     Raises:
         InputError: libdeflate is requested by name and its package is not installed.
     """
     present = importlib.util.find_spec("deflate") is not None
-    if wanted == "libdeflate" and not present:
+    if name == "libdeflate" and not present:
         raise InputError("deflate: the package 'deflate' is not installed, use auto or zlib")
-    if wanted == "auto":
+    if name == "auto":
         return "libdeflate" if present else "zlib"
-    return wanted
+    return name
 
 
 def unsigned_stream(
@@ -72,11 +72,11 @@ def unsigned_stream(
     """Write a stream of unsigned integers.
 
     Args:
-        values: [n], n >= 1, integers from 0 to 2**56 - 1 (any unsigned dtype without differences).
+        values: [n], n >= 1, integers from 0 to 2**56 - 1 (any unsigned dtype if differences are not coded).
         deflate: level and library of DEFLATE.
         delta: code differences of ascending values.
-        signed_delta: code differences of any values (DELTA, then ZIGZAG).
-        fixed_width: bytes of an element; 0: those that the largest needs.
+        signed_delta: code differences of values in any order (DELTA, then ZIGZAG).
+        fixed_width: bytes per element; 0: as the largest value needs.
 
     Returns:
         Head and coded bytes.
@@ -96,28 +96,23 @@ def unsigned_stream(
 
 
 def smooth_stream(values: Integers, deflate: DeflateSettings) -> bytes:
-    """Write unsigned integers as they are or as differences, whichever is smaller.
+    """Write a stream of unsigned integers or of their differences, whichever is smaller.
 
-    Neighbours in Morton order often have similar colours and sizes, but not in every scene.
+    Neighbours in Morton order have similar colours and sizes in many scenes, but not in all.
 
     Args:
         values: [n], n >= 1, integers from 0 to 2**32 - 1.
-        deflate: level and library of DEFLATE; at the lowest level the entropies decide instead of trials.
+        deflate: level and library of DEFLATE; at the lowest level, entropies replace trials.
     """
     if deflate.level > _FASTEST_LEVEL:
         return min(unsigned_stream(values, deflate), unsigned_stream(values, deflate, signed_delta=True), key=len)
     low = values.astype(np.uint8)
-    differences = np.diff(low)  # modulo 256; a zigzag renames symbols and does not change the entropy
+    differences = np.diff(low)  # modulo 256; zigzag would not change the entropy
     return unsigned_stream(values, deflate, signed_delta=_byte_entropy(differences) < _byte_entropy(low))
 
 
 def signed_stream(values: Integers, deflate: DeflateSettings) -> bytes:
-    """Write a stream of signed integers, zigzagged.
-
-    Args:
-        values: [n], n >= 1, signed integers of at most 32 bits.
-        deflate: level and library of DEFLATE.
-    """
+    """Write a stream of signed integers of at most 32 bits, [n], n >= 1, with ZIGZAG."""
     folded = _zigzag(values)
     return _make_stream(folded, _width(int(folded.max())), (_spec.TRANSFORM_ZIGZAG,), deflate)
 
@@ -170,7 +165,7 @@ def signed_or_sparse_block(attribute: int, integers: Integers, exponent: int, de
 
 
 def order_0_entropy(counts: NDArray[np.integer]) -> float:
-    """Return bits per symbol, given how often each symbol occurs, at least once."""
+    """Return the entropy, bits per symbol, of symbols with these counts, all positive."""
     shares = counts / max(1, counts.sum())
     return -float((shares * np.log2(shares)).sum())
 
@@ -187,13 +182,13 @@ def codebook_block(
     """Return a CODEBOOK block.
 
     Args:
-        attribute: registry id.
-        codebook_id: the codebook's id.
-        index: [n]; None: that of the codebook's first block.
+        attribute: attribute id.
+        codebook_id: id of the codebook.
+        index: [n], entries; `None`: as in the codebook's first block.
         escape_count: number of escaped splats.
-        escape: their block; empty if there are none.
+        escape: block of the escaped splats; empty if there are none.
         deflate: level and library of DEFLATE.
-        summand: [n], for scales of the kind SHAPE: added to all three.
+        summand: [n], added to all three scales, for the kind SHAPE.
     """
     params = _spec.pack_codebook_params(_spec.CodebookParams(codebook_id, 0, escape_count))
     streams = b"" if index is None else unsigned_stream(index, deflate)
@@ -211,14 +206,7 @@ def raw_block(column: int, values: NDArray[Any], deflate: DeflateSettings) -> by
 
 
 def morton_codes(q: NDArray[Any]) -> NDArray[np.int64]:
-    """Interleave the bits of three axes: bit 3·b + a of a code is bit b of axis a (spec 6.4.2).
-
-    Args:
-        q: [3, n] integers, 0 to 2**21 - 1.
-
-    Returns:
-        [n] int64.
-    """
+    """Interleave the bits of [3, n] integers, 0 to 2**21 - 1: bit 3·b + a of a code is bit b of axis a (spec 6.4.2)."""
     codes = np.zeros(q.shape[1], np.int64)
     spread = np.empty(q.shape[1], np.int64)
     shifted = np.empty_like(spread)
@@ -233,8 +221,8 @@ def morton_codes(q: NDArray[Any]) -> NDArray[np.int64]:
     return codes
 
 
-def _block_head(attribute: int, deflate: int) -> bytes:
-    return _spec.pack_block_head(_spec.BlockHead(attribute, deflate, 0))
+def _block_head(attribute: int, coding: int) -> bytes:
+    return _spec.pack_block_head(_spec.BlockHead(attribute, coding, 0))
 
 
 def _code_offsets(integers: Integers, exponent: int, deflate: DeflateSettings) -> bytes:
@@ -245,7 +233,7 @@ def _code_offsets(integers: Integers, exponent: int, deflate: DeflateSettings) -
 
 
 def _make_stream(values: Integers, width: int, transforms: tuple[int, ...], deflate: DeflateSettings) -> bytes:
-    """Cut integers into byte planes, choose the coder, and return head and coded bytes."""
+    """Apply BYTE_PLANES and RUN_LENGTH, choose the coder, and return head and coded bytes."""
     steps = [step for step in transforms if step != _spec.TRANSFORM_NONE]
     if width > 1:
         steps.append(_spec.TRANSFORM_BYTE_PLANES)
@@ -295,10 +283,10 @@ def _byte_planes(values: Integers, width: int) -> NDArray[np.uint8]:
 
 
 def _run_length(data: NDArray[np.uint8], least: float) -> NDArray[np.uint8] | None:
-    """Return the runs, or None if their mean length is below `least`, so that they would save nothing.
+    """Return data transformed by RUN_LENGTH; `None` if the mean length of the runs is below `least`.
 
-    DEFLATE's longest match is 258 bytes, so it codes longer runs poorly. Short runs cost it a distance each, and their
-    lengths share a Huffman code with the bytes; as RUN_LENGTH, each has its own.
+    DEFLATE codes long runs poorly, as a match has at most 258 bytes. For short runs it needs a distance each, and a
+    Huffman code that literals and lengths share; RUN_LENGTH separates values and lengths.
     """
     if len(data) < 64:
         return None
@@ -316,13 +304,13 @@ def _run_length(data: NDArray[np.uint8], least: float) -> NDArray[np.uint8] | No
 
 
 def _is_smaller(runs: NDArray[np.uint8], planes: NDArray[np.uint8], deflate: DeflateSettings) -> bool:
-    """Return True if runs compress to at most `_GAIN` of the planes they replace, by a quick trial."""
+    """Return True if a quick trial compresses the runs to at most `_GAIN` of the planes."""
     trial = replace(deflate, level=min(deflate.level, _TRIAL_LEVEL))
     return len(_code(runs, trial)[1]) <= _GAIN * len(_code(planes, trial)[1])
 
 
 def _code(packed: NDArray[np.uint8], deflate: DeflateSettings) -> tuple[int, bytes]:
-    """Return the coder with the fewest bytes, and the bytes."""
+    """Return the coder with the smallest result, and the result."""
     raw = packed.tobytes()
     best, coded = _spec.CODER_STORED, raw
     if len(raw) > 3:
@@ -337,20 +325,20 @@ def _deflate(raw: bytes, deflate: DeflateSettings) -> bytes:
         return _zlib(raw, min(deflate.level, 9), zlib.Z_DEFAULT_STRATEGY)
     if deflate.level <= _FASTEST_LEVEL:
         return _quickest(raw)
-    # If only runs repeat, matches that libdeflate finds by chance cost more than they save.
-    return min(_libdeflate(raw, deflate.level), *(way(raw) for way in _WITHOUT_MATCHES), key=len)
+    # If only runs repeat, the accidental matches that libdeflate finds cost more than they save.
+    return min(_libdeflate(raw, deflate.level), *(compress(raw) for compress in _WITHOUT_MATCHES), key=len)
 
 
 def _quickest(raw: bytes) -> bytes:
-    """Compress in the way that is smallest on samples: fast matches, runs of one byte, or Huffman codes alone."""
-    ways: tuple[Callable[[bytes], bytes], ...] = (lambda data: _libdeflate(data, 1), *_WITHOUT_MATCHES)
+    """Compress with the method that is best on samples: fast matches, runs of one byte, or only Huffman codes."""
+    methods: tuple[Callable[[bytes], bytes], ...] = (lambda data: _libdeflate(data, 1), *_WITHOUT_MATCHES)
     step = max(_SAMPLE, len(raw) // 4)
     sample = b"".join(raw[at : at + _SAMPLE] for at in range(0, len(raw), step))
-    return min(ways, key=lambda way: len(way(sample)))(raw)
+    return min(methods, key=lambda compress: len(compress(sample)))(raw)
 
 
 def _libdeflate(raw: bytes, level: int) -> bytes:
-    import deflate  # absent where its package has no wheel
+    import deflate  # optional: some platforms have no wheel
 
     return bytes(deflate.deflate_compress(raw, level))
 
@@ -360,7 +348,7 @@ def _zlib(raw: bytes, level: int, strategy: int) -> bytes:
     return coder.compress(raw) + coder.flush()
 
 
-#: DEFLATE with runs of one byte alone, and with Huffman codes alone.
+#: DEFLATE with matches only for runs of one byte, and without matches.
 _WITHOUT_MATCHES: tuple[Callable[[bytes], bytes], ...] = (
     lambda data: _zlib(data, 1, zlib.Z_RLE),
     lambda data: _zlib(data, 1, zlib.Z_HUFFMAN_ONLY),

@@ -1,6 +1,6 @@
-"""Errors of decoded splats: the bounds that a file declares, and their verification (spec 5.5).
+"""Measure the errors of decoded splats, which a file declares (spec 5.5).
 
-The functions on columns measure tile by tile while encoding; `measured_sums` compares two models.
+The encoder measures tile by tile, by the functions on columns; `measured_sums` compares two models.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from csplat.types import F64
 
 Floats = NDArray[Any]
 
-SCALE_MOST = 88.0  # logarithm of a standard deviation beyond which binary32 does not hold it
-_BLOCK = 8192  # splats at a time: the temporaries of a covariance stay in the second-level cache
-_ROUNDING = 2.0**-40  # relative
+SCALE_MOST = 88.0  # log scale beyond which a standard deviation leaves binary32
+_BLOCK = 8192  # splats per block; the temporaries of their covariances fit the second-level cache
+_ROUNDING = 2.0**-40  # relative margin for other orders of rounding
 
 
 @dataclass(frozen=True)
 class ErrorSums:
-    """Largest error and sum of squares by measure, over `count` splats."""
+    """The largest error and the sum of squares of each measure, over `count` splats."""
 
     count: int = 0
     largest: Mapping[str, float] = field(default_factory=dict)
     squares: Mapping[str, float] = field(default_factory=dict)
 
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """Return (max, rms) by measure; rms is over splats, the square of a splat is the sum over components."""
+        """Return (max, rms) by measure; the rms is over splats, whose squares are summed over components."""
         count = max(1, self.count)
         return {name: (self.largest[name], float(np.sqrt(self.squares[name] / count))) for name in self.largest}
 
     def declared(self) -> dict[str, tuple[float, float]]:
-        """Return `bounds()`, slightly wider, as a verifier may round in another order (spec SER-5).
+        """Return `bounds()` with a margin for verifiers that round in another order (spec SER-5).
 
         Raises:
             InputError: an error is not finite, which a file cannot declare (SER-2).
@@ -46,16 +46,14 @@ class ErrorSums:
         result = {}
         for name, (largest, rms) in self.bounds().items():
             if not (math.isfinite(largest) and math.isfinite(rms)):
-                raise InputError(
-                    f"the error of {name} is too large to be stated: the step is too coarse for the values"
-                )
-            floor = _ROUNDING if name == "covariance" else 0.0  # a ratio, whose rounding does not shrink with its value
+                raise InputError(f"the error of {name} is too large to declare: the step is too coarse for the values")
+            floor = _ROUNDING if name == "covariance" else 0.0  # a ratio: its rounding does not shrink with its value
             result[name] = (largest * (1.0 + _ROUNDING) + floor, rms * (1.0 + _ROUNDING) + floor)
         return result
 
     @staticmethod
     def total(parts: Iterable[ErrorSums]) -> ErrorSums:
-        """Add up in the given order: the sum must not depend on threads."""
+        """Add up sums in the given order, so that the result does not depend on threads."""
         count, largest, squares = 0, dict[str, float](), dict[str, float]()
         for part in parts:
             count += part.count
@@ -66,7 +64,7 @@ class ErrorSums:
 
 
 def take_precise_means(model: SplatModel, rows: NDArray[Any]) -> Floats:
-    """Return means of some splats relative to the origin, [n, 3], in float64 if the model has doubles."""
+    """Return means of some splats relative to the origin, [n, 3], in float64 if the model has `means_double`."""
     if model.means_double is None:
         return np.take(model.means, rows, axis=0)
     relative: F64 = np.take(model.means_double, rows, axis=0) - np.array(model.origin)
@@ -80,7 +78,7 @@ def distance_errors(source: Floats, decoded: Floats) -> tuple[float, float]:
     largest = float(np.abs(difference).max(initial=0.0))
     if largest == 0.0:
         return 0.0, 0.0
-    difference /= largest  # squares of distances of 1e30 or 1e-30 scene units stay within float64
+    difference /= largest  # keeps squares of distances such as 1e-200 or 1e200 within float64
     squares = np.einsum("ij,ij->j", difference, difference)
     return largest * float(np.sqrt(squares.max())), largest * largest * float(squares.sum())
 
@@ -92,7 +90,7 @@ def value_errors(source: Floats, decoded: Floats) -> tuple[float, float]:
     for at in range(0, source.size, 8 * _BLOCK):
         difference = decoded[at : at + 8 * _BLOCK].astype(np.float64)
         difference -= source[at : at + 8 * _BLOCK]
-        squares += float(np.einsum("i,i->", difference, difference))  # not BLAS, whose sums depend on threads
+        squares += float(np.einsum("i,i->", difference, difference))  # a sum by BLAS would depend on threads
         np.abs(difference, out=difference)
         largest = max(largest, float(difference.max()))
     return largest, squares
@@ -101,13 +99,13 @@ def value_errors(source: Floats, decoded: Floats) -> tuple[float, float]:
 def covariance_errors(
     source_quats: Floats, source_scales: Floats, quats: Floats, scales: Floats
 ) -> tuple[float, float]:
-    """Return (largest, sum of squares) of ‖Σ − Σ'‖ / ‖Σ‖ over splats in columns.
+    """Return (largest, sum of squares) of ‖Σ - Σ'‖ / ‖Σ‖ over splats in columns.
 
     Args:
         source_quats, quats: [4, n], w x y z, any length above 0.
-        source_scales, scales: [3, n], log standard deviations, clipped to ± 88 (SER-5); all are taken relative to the
-            source's largest, so that nothing overflows.
+        source_scales, scales: [3, n], log standard deviations; they are clipped to ± 88 (SER-5).
     """
+    # Scales are relative to the source's largest, so that nothing overflows.
     largest = squares = 0.0
     for at in range(0, source_quats.shape[1], _BLOCK):
         part = slice(at, at + _BLOCK)
@@ -120,7 +118,7 @@ def covariance_errors(
         difference -= covariance_entries(source_quats[:, part], variances)
         with np.errstate(over="ignore"):  # `declared` refuses infinity
             difference *= difference
-            difference[3:] *= 2.0  # each entry off the diagonal occurs twice
+            difference[3:] *= 2.0  # entries off the diagonal occur twice
             error = difference.sum(axis=0)
         error /= (variances * variances).sum(axis=0)
         squares += float(error.sum())
@@ -129,25 +127,25 @@ def covariance_errors(
 
 
 def measured_sums(source: SplatModel, decoded: SplatModel, source_index: NDArray[Any]) -> ErrorSums:
-    """Measure every attribute of a decoded model against its source.
+    """Measure the errors of all attributes of a decoded model.
 
     Args:
         source: the model that was encoded.
-        decoded: what its file decodes to.
-        source_index: [len(decoded)] integers, which source splat each decoded one is.
+        decoded: the decoded model.
+        source_index: [len(decoded)] integers, index in the source of each decoded splat.
 
     Returns:
-        Sums by measure of the spec: means, covariance, opacities, sh0, sh1, sh2, sh3. Bands that only one of the two
-        models has are measured against 0.
+        Sums of the measures means, covariance, opacities, sh0, sh1, sh2, sh3. A band that only one of the two models
+        has is compared with 0.
 
     Raises:
-        InputError: an index of another length, or that leaves the source.
+        InputError: the index has another length, or exceeds the source.
     """
     index = np.asarray(source_index)
     if index.shape != (len(decoded),):
         raise InputError(f"source index has shape {index.shape}, expected ({len(decoded)},)")
     if len(index) and not (int(index.min()) >= 0 and int(index.max()) < len(source)):
-        raise InputError(f"source index leaves the source's {len(source)} splats")
+        raise InputError(f"source index exceeds the source's {len(source)} splats")
     parts = []
     for at in range(0, len(decoded), 4 * _BLOCK):
         part = slice(at, at + 4 * _BLOCK)
@@ -176,7 +174,7 @@ def _errors_of_rows(source: SplatModel, decoded: SplatModel, rows: NDArray[Any],
 
 
 def rotation_rows(quats: Floats) -> tuple[tuple[F64, F64, F64], ...]:
-    """Return the rows of rotation matrices, entries [n], of quaternions [4, n] of any length but 0."""
+    """Return the rows of rotation matrices, entries [n], of quaternions [4, n] of any length above 0."""
     w, x, y, z = quats.astype(np.float64)
     two = 2.0 / (w * w + x * x + y * y + z * z)
     return (

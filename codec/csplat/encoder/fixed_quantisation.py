@@ -1,8 +1,8 @@
-"""A scene whose encoding is fixed while its values change: fine-tuning sees the values that a decoder will see.
+"""Fix the quantisation of a scene while its values change, so that fine-tuning works on decoded values.
 
-`fix_quantisation` makes every discrete choice once: steps, tiles, codebooks, the entry of each splat, escapes, and zero
-SH bands. `FixedQuantisation.dequantise` then returns, for any values, the decoded values, by the functions that encode
-the tiles; `FixedQuantisation.encode` encodes these values.
+`fix_quantisation` makes all discrete choices: steps, tiles, codebooks, the assignment of splats, escapes, and zero SH
+bands. `FixedQuantisation.dequantise` then returns the decoded values for any values, by the functions that encode
+tiles; `FixedQuantisation.encode` encodes these values.
 """
 
 from __future__ import annotations
@@ -35,21 +35,23 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F32, I32, I64, Progress
 
-_THREADED_MIN = 50_000  # splats; with fewer, threads take longer to start than they save
+_THREADED_MIN = 50_000  # splats; with fewer, starting threads takes longer than they save
 
 
 @dataclass(eq=False)
 class FreeValues:
-    """Values before quantisation, float32; fine-tuning changes them in place.
+    """Values before quantisation, float32, which fine-tuning changes in place.
+
+    With a codebook, its rows are the entries, followed by the escaped splats; otherwise there is one row per splat.
 
     Attributes:
         means: [N, 3].
-        quats: [S, 4], in canonical axis order; one per splat, or the codebook's entries and then the escaped splats.
-        scales: [S, 3], log standard deviations of the same.
+        quats: [S, 4], in canonical axis order; S rows of the shape codebook.
+        scales: [S, 3], log standard deviations.
         opacities: [N], alpha.
         sh0: [N, 3].
-        sh: [R, K, 3], bands 1 to the degree kept; one per splat, or the codebook's entries and then the escaped splats.
-        sizes: [N], offset of a splat's log scales from its entry, 0 if it is escaped; [0] without a shape codebook.
+        sh: [R, K, 3], bands 1 to the degree kept; R rows of the SH codebook.
+        sizes: [N], summand of the log scales of a splat's entry, 0 for escaped splats; [0] without a shape codebook.
     """
 
     means: F32
@@ -67,7 +69,7 @@ class FreeValues:
 
 @dataclass(frozen=True, eq=False)
 class DecodedValues:
-    """Values as decoded: the arrays of a `SplatModel`, unchecked, SH up to the degree kept."""
+    """Decoded values: the arrays of a `SplatModel`, unchecked, with SH up to the degree kept."""
 
     means: F32
     quats: F32
@@ -79,14 +81,14 @@ class DecodedValues:
 
 @dataclass(frozen=True, eq=False)
 class FixedQuantisation:
-    """Choices of the encoder that stay fixed while values are tuned.
+    """Choices of the encoder that are fixed while values are tuned.
 
     Attributes:
         encode_plan: the plan, with splats in tile order and canonical axis order.
-        sh_plan: SH coding.
-        source: the scene that declared errors are measured against.
-        low, high: [N, 3] float32, the box of each splat's tile, which its mean must not leave.
-        zero: [N, K] bool, SH coefficients that stay zero, if there is no SH codebook; else None.
+        sh_plan: the SH coding.
+        source: the scene that declared errors refer to.
+        low, high: [N, 3] float32, box of each splat's tile, which its mean must not leave.
+        zero: [N, K] bool, SH coefficients that stay zero; `None` with an SH codebook.
     """
 
     encode_plan: EncodePlan
@@ -133,7 +135,7 @@ class FixedQuantisation:
         return values
 
     def constrain(self, values: FreeValues) -> None:
-        """Move values in place to what the file can hold: means inside their tiles, w >= 0, zeros at zero."""
+        """Restrict values, in place, to what the file can represent: means in their tiles, w >= 0, zeros at zero."""
         np.clip(values.means, self.low, self.high, out=values.means)
         negative = values.quats[:, 0] < 0.0
         if negative.any():
@@ -144,14 +146,14 @@ class FixedQuantisation:
             values.sizes[self.shapes.escaped] = 0.0
 
     def encode(self, values: FreeValues, progress: Progress | None = None) -> EncodedTiles:
-        """Encode values, whose decoder returns `dequantise(values)`, in the order of the file's source index.
+        """Encode values; a decoder returns `dequantise(values)`.
 
         Args:
             values: constrained values.
             progress: see `EncodePlan.of`.
 
         Returns:
-            Tiles that declare errors against the source, but none of colours, which were refitted.
+            Tiles that declare the errors against the source, except those of colours, which are refitted.
         """
         shapes, quats, scales = self._shape_values(values)
         model, kept = self.encode_plan.model, values.sh.shape[1]
@@ -172,13 +174,13 @@ class FixedQuantisation:
         )
 
     def dequantise(self, values: FreeValues) -> DecodedValues:
-        """Return what a decoder of the file returns for `values`, bit for bit, in their order."""
+        """Return the values that a decoder of the file returns, bit for bit."""
         tiles, parameters = self.encode_plan.tiles, self.parameters
         if self.encode_plan.options.threads == 1 or len(self.encode_plan.model) < _THREADED_MIN:
             shN, (quats, scales) = self.dequantise_sh(values.sh), self._dequantise_shapes(values)
             means, sh0 = dequantised_means(values.means, tiles, parameters), self.dequantise_sh0(values.sh0)
         else:
-            with ThreadPoolExecutor(2) as pool:  # NumPy releases the interpreter; the three take about as long
+            with ThreadPoolExecutor(2) as pool:  # NumPy releases the GIL; the three parts take about the same time
                 later_sh = pool.submit(self.dequantise_sh, values.sh)
                 later_shapes = pool.submit(self._dequantise_shapes, values)
                 means, sh0 = dequantised_means(values.means, tiles, parameters), self.dequantise_sh0(values.sh0)
@@ -187,7 +189,7 @@ class FixedQuantisation:
         return DecodedValues(means, quats, scales, opacities, sh0, shN)
 
     def dequantise_sh0(self, sh0: F32) -> F32:
-        """Return degree-0 colours [N, 3] as decoded."""
+        """Return decoded colours of degree 0, [N, 3]."""
         parameters, decoded = self.parameters, np.empty_like(sh0)
         for tile in self.encode_plan.tiles:
             columns = np.ascontiguousarray(sh0[tile.rows].T)
@@ -196,7 +198,7 @@ class FixedQuantisation:
         return decoded
 
     def dequantise_sh(self, sh: F32) -> F32:
-        """Return SH of all splats [N, K, 3] as decoded, from `FreeValues.sh`."""
+        """Return decoded SH of all splats, [N, K, 3], of `FreeValues.sh`."""
         parameters = self.parameters
         if self.book is not None:
             decoded = self._requantised(self.book, sh).dequantise(parameters)
@@ -209,19 +211,14 @@ class FixedQuantisation:
         return decoded
 
     def dequantise_sh_rows(self, sh: F32) -> F32:
-        """Return `FreeValues.sh` [R, K, 3] as decoded, the codebook's entries by themselves."""
+        """Return decoded SH of the rows of `FreeValues.sh`, [R, K, 3]."""
         if self.book is None:
             return self.dequantise_sh(sh)
         entries = _entry_values(self._requantised(self.book, sh).entries, self.parameters)
         return np.concatenate([entries, self._dequantise_escapes(self.book, sh)])
 
     def dequantise_shape_rows(self, values: FreeValues, decoded: DecodedValues) -> tuple[F32, F32, F32]:
-        """Return quats, scales and sizes of `values` as decoded, entries by themselves; see `dequantise` for the rest.
-
-        Args:
-            values: constrained values.
-            decoded: `dequantise(values)`.
-        """
+        """Return decoded rows of the quats, scales and sizes of `values`; `decoded` is `dequantise(values)`."""
         shapes = self._shape_values(values)[0]
         if shapes is None:
             return decoded.quats, decoded.scales, values.sizes
@@ -239,7 +236,7 @@ class FixedQuantisation:
         return quantise_sh(own, self.parameters, np.full(len(own), self.parameters.escape_coarse, np.int32))[2]
 
     def _shape_values(self, values: FreeValues) -> tuple[ShapeCodebook | None, F32, F32]:
-        """Return the shape codebook of these values, and the quats and scales of the escaped splats, by splat."""
+        """Return the shape codebook of these values, and quats and scales per splat, which only escaped splats use."""
         if self.shapes is None:
             return None, values.quats, values.scales
         parameters, size, own = self.parameters, self.shapes.size, self.shapes.escaped
@@ -258,22 +255,21 @@ class FixedQuantisation:
 def fix_quantisation(
     plan: EncodePlan, source: SplatModel | None = None, progress: Progress | None = None
 ) -> FixedQuantisation:
-    """Complete a plan, and leave all values free.
+    """Complete a plan, and fix its quantisation.
 
     Args:
-        plan: the scene.
-        source: the scene that the plan's `Origin` refers to; `None`: the plan's own.
+        plan: the plan.
+        source: the scene that the plan's `Origin` refers to; `None`: the plan's scene.
         progress: see `EncodePlan.of`.
 
     Raises:
-        InputError: there are no splats, or the source has another number of them than the origin records.
+        InputError: there are no splats, or the source does not have the origin's number of splats.
     """
     if not len(plan.model):
         raise InputError("a scene without splats has nothing to tune")
-    source = plan.model if source is None else source
-    wanted = plan.origin.source_count
-    if len(source) != wanted:
-        raise InputError(f"a source of {len(source)} splats, expected {wanted}: that of the origin")
+    source, source_count = plan.model if source is None else source, plan.origin.source_count
+    if len(source) != source_count:
+        raise InputError(f"the source has {len(source)} splats, expected {source_count} by the origin")
     parameters, codebooks = plan.choose_sh_coding(progress)
     parameters = replace(parameters, canonical=True)
     rows = [quantise_and_sort(plan.model, tile, parameters).rows for tile in plan.tiles]
@@ -287,7 +283,7 @@ def fix_quantisation(
 
 
 def _reordered(plan: EncodePlan, order: I64, counts: Sequence[int]) -> EncodePlan:
-    """Put the splats into tile order and canonical axis order; drop what only an open SH coding needs."""
+    """Put splats into tile order and canonical axis order, and drop the data that only an open SH coding needs."""
     model = plan.model.select(order)
     rotation, scales = canonicalise_shape(model.quats, model.scales)
     ends = np.cumsum(counts)
@@ -322,12 +318,12 @@ def _zero_coefficients(plan: EncodePlan, sh_plan: ShCodingPlan) -> NDArray[np.bo
 
 
 def _entry_values(entries: I32, parameters: CodingParameters) -> F32:
-    """Return [size, K, 3] float32 of Y, Co, Cg integers [3, K, size] on the SH lattice."""
+    """Dequantise the entries [3, K, size] of an SH codebook to float32 [size, K, 3]."""
     rgb = colour_lifted(entries, parameters.chroma_shift).transpose(2, 1, 0)
     return np.ascontiguousarray(rgb * parameters.sh_step, np.float32)
 
 
 def _entry_integers(values: F32, parameters: CodingParameters) -> I32:
-    """Return Y, Co, Cg integers [3, K, size] on the SH lattice of values [size, K, 3]."""
+    """Quantise values [size, K, 3] to the entries [3, K, size] of an SH codebook."""
     rgb = np.ascontiguousarray(values.transpose(2, 1, 0)) * np.float32(1.0 / parameters.sh_step)
     return colour_integers(rgb, parameters.chroma_shift).astype(np.int32, copy=False)

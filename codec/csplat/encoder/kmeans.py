@@ -1,11 +1,11 @@
-"""Weighted k-means over lattice integers: the same result at any thread count.
+"""Cluster lattice integers by weighted k-means, with the same result for any number of threads.
 
-Searches are matrix products in float32 over integers and halves, whose partial sums stay below 2**23, so that a value
-depends neither on the order in which a BLAS adds nor on its threads. Centroids are float64 sums in the order of the
-points, rounded to integers. All random numbers come from one seeded generator.
+Assignments are matrix products in float32 of integers and halves. Their partial sums stay below 2**23 and are exact, so
+the result depends neither on the order of additions in a BLAS nor on its threads. Centroids are float64 sums in the
+order of the points, rounded to integers. All random numbers come from one seeded generator.
 
-`refine_by_metric` continues from there if every point has its own error metric w · Σ_channels (x − c)ᵀ M (x − c): the
-neighbours of an entry are the candidates of its points, and means become solutions of the summed normal equations.
+`refine_by_metric` continues the iteration if every point x has its own error metric w Σ_channels (x - c)ᵀ M (x - c).
+The candidates of a point are the neighbours of its entry; centroids solve the normal equations of their points.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from csplat.encoder.splat_importance import ErrorMetric, doubled_triangles, matr
 from csplat.errors import InputError
 from csplat.types import F32, F64, I16, I32, I64, U32
 
-_Find = Callable[[F32, int], tuple[I64, F32]]  # takes rows [x, 1] and the number of the first one
+_Find = Callable[[F32, int], tuple[I64, F32]]  # (rows [x, 1], index of the first row) -> (entries, scores)
 Floats = NDArray[Any]
 
-_SEED_ROUNDS = 8  # in which the first entries are drawn
-_EXACT = 2.0**23  # below it float32 holds every multiple of 1/2
-_PRODUCT_ROWS, _PRODUCT_COLUMNS = 256, 4096  # points and entries of one product: a result of 4 MiB
-_GROUPED_ROWS = 4096  # points that share one sort by group
+_SEED_ROUNDS = 8  # rounds in which the initial entries are drawn
+_EXACT = 2.0**23  # float32 represents every multiple of 1/2 below this
+_PRODUCT_ROWS, _PRODUCT_COLUMNS = 256, 4096  # points and entries per matrix product, a result of 4 MiB
+_GROUPED_ROWS = 4096  # points that are sorted by group together
 _GROUP_ITERATIONS = 4
-_BLAS = threading.Lock()  # the thread count of a BLAS is per process: one search at a time
-_CANDIDATES = 96  # entries tried for a point: its own and that one's neighbours
-_REFINE_ROUNDS = 2  # assignments of points, each followed by a move of the entries
+_BLAS = threading.RLock()  # a BLAS has one thread count per process: one search at a time
+_CANDIDATES = 96  # candidates for a point: its entry and the nearest neighbours of that
+_REFINE_ROUNDS = 2  # iterations under the metric
 _METRIC_BLOCK = 1 << 12  # points per block of temporaries
-_RIDGE = 1e-3  # fraction of the mean diagonal: holds an entry in place if its points do not determine it
+_RIDGE = 1e-3  # fraction of the mean diagonal; keeps an entry in place along directions its points do not determine
 
 
 def cluster(
@@ -56,28 +56,28 @@ def cluster(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[I32, U32]:
-    """Find at most `size` entries that represent the points, and the entry of each point.
+    """Train a codebook of at most `size` entries, and assign the points to it.
 
-    Trains on a weighted sample, then moves the entries twice on all points. Needs memory for the sample and about 40
-    bytes per point.
+    Iterates on a weighted sample, then twice on all points. Takes memory for the sample and about 40 bytes per point.
 
     Args:
-        points: [N, D], lattice integers. Clip outliers first: if a norm is beyond about 2,300, all points are searched
+        points: [N, D], lattice integers. Clip outliers first: if a norm exceeds about 2,300, all points are assigned
             on a coarser lattice.
         weights: [N], finite and >= 0; only ratios matter; all zeros count as all ones.
         size: maximum number of entries, > 0.
-        seed: seed of the sample and of the first entries, >= 0.
-        iterations: k-means steps on the sample.
+        seed: seed of the sample and of the initial entries, >= 0.
+        iterations: k-means iterations on the sample.
         sample_per_entry: points of the sample per entry, > 0.
         near_groups: see `assign`.
         threads: see `assign`.
-        progress: called with the steps done and the total.
+        progress: called with the number of iterations done and the total.
 
     Returns:
-        entries [K, D] int32, K <= size, distinct, each used by a point, in arbitrary order; index [N] uint32.
+        entries [K, D] int32, K <= size, distinct and used, in arbitrary order; index [N] uint32, the entry of each
+        point.
 
     Raises:
-        InputError: shapes, dtypes, weights or numbers outside these ranges.
+        InputError: a shape, dtype, weight or number is outside these ranges.
     """
     w = _check_points(points, weights)
     if min(size, sample_per_entry) <= 0 or min(iterations, near_groups, seed) < 0:
@@ -106,20 +106,20 @@ def cluster(
 
 
 def assign(points: I16 | I32, entries: I32, *, near_groups: int = 0, threads: int | None = None) -> U32:
-    """Find the entry nearest to each point, the first of equally near ones.
+    """Assign each point to the nearest entry, the first of several at equal distance.
 
     Args:
         points: [N, D], lattice integers.
         entries: [K, D], K > 0.
-        near_groups: 0 searches every entry. Otherwise entries are put into about sqrt(K) groups, and only this number
-            of groups with the nearest means is searched: faster for thousands of entries, not always the nearest.
-        threads: worker threads; `None`: all processors. No effect on the result.
+        near_groups: 0 searches every entry. Otherwise entries are clustered into about sqrt(K) groups, and this number
+            of groups with the nearest centroids is searched: faster for thousands of entries, but approximate.
+        threads: number of threads; `None`: all processors. No effect on the result.
 
     Returns:
-        [N] uint32, rows of `entries`.
+        [N] uint32, indices of entries.
 
     Raises:
-        InputError: shapes or dtypes that are not those above.
+        InputError: a shape or dtype is wrong.
     """
     _check_points(points, None)
     if entries.ndim != 2 or entries.dtype != np.int32 or entries.shape[1] != points.shape[1]:
@@ -130,15 +130,7 @@ def assign(points: I16 | I32, entries: I32, *, near_groups: int = 0, threads: in
 
 
 def rank_by_frequency(index: U32, entries: I32) -> tuple[U32, I32]:
-    """Renumber so that more frequent entries come first, equal ones in their old order.
-
-    Args:
-        index: [N], rows of `entries`.
-        entries: [K, D].
-
-    Returns:
-        The new index [N] and the entries [K, D] in the new order.
-    """
+    """Sort entries [K, D] by descending frequency in `index` [N], stably; return the new index and entries."""
     count = np.bincount(index, minlength=len(entries))
     order = np.argsort(-count, kind="stable")
     rank = np.empty(len(entries), np.uint32)
@@ -149,21 +141,21 @@ def rank_by_frequency(index: U32, entries: I32) -> tuple[U32, I32]:
 def search_nearest(
     points: I16 | I32, entries: I32, near_groups: int = 0, threads: int | None = None, *, other: bool = False
 ) -> tuple[U32, F64]:
-    """Find the entry nearest to each point, and its squared distance.
+    """Assign each point to the nearest entry, and return the squared distances.
 
-    Minimises |c|**2 / 2 - x.c: one product of [x, 1] and [c, -|c|**2 / 2].
+    As |x - c|² = |x|² - 2 (x·c - |c|²/2), the nearest entry has the highest score x·c - |c|²/2, which is the product of
+    [x, 1] and [c, -|c|²/2].
 
     Args:
-        points: [N, D], lattice integers. If max|x| max|c| + max|c|**2 / 2 reaches 2**23 (norms of about 2,300), both
-            are first divided by a power of two and rounded.
+        points: [N, D], lattice integers. If max|x| max|c| + max|c|²/2 reaches 2**23 (norms of about 2,300), points and
+            entries are first divided by a power of two and rounded.
         entries: [K, D], K > 0.
-        near_groups: 0, or the number of groups of about sqrt(K) entries to search for a point.
-        threads: worker threads; `None`: all processors.
-        other: point n must not find entry n (the points are the entries; `near_groups` 0).
+        near_groups: see `assign`.
+        threads: see `assign`.
+        other: exclude entry n for point n: the points are the entries (requires `near_groups` 0).
 
     Returns:
-        index [N] uint32, the first of equally near entries if all are searched; and the squared distance [N] float64,
-        of the divided integers, in lattice units.
+        index [N] uint32; squared distances [N] float64 of the divided integers, in lattice units.
     """
     shift = _shift(points, entries)
     coarse = _divide(entries, shift)
@@ -188,7 +180,7 @@ def search_nearest(
     workers = max(1, min(threads or os.cpu_count() or 1, -(-len(points) // length)))
     jobs = [range(w * length, len(points), workers * length) for w in range(workers)]
     with one_blas_thread():
-        if workers == 1:  # starting a thread takes longer than a small search
+        if workers == 1:  # a small search takes less time than starting a thread
             work(jobs[0])
         else:
             with ThreadPoolExecutor(workers) as pool:
@@ -196,55 +188,11 @@ def search_nearest(
     return index, error
 
 
-def reassign_by_metric(
-    points: Floats, metric: ErrorMetric, entries: Floats, index: I64, threads: int, tried: int
-) -> I64:
-    """Assign each point to the best of the entries near its own.
-
-    Args:
-        points: [N, D, C].
-        metric: metric of the points.
-        entries: [K, D, C].
-        index: [N], the entry of each point.
-        threads: number to use; no effect on the result.
-        tried: number of candidates: the point's own entry and its nearest neighbours.
-
-    Returns:
-        The new index, [N].
-    """
-    with one_blas_thread():
-        return _assign_by_metric(points, metric, entries, index, threads, tried)
-
-
-def refine_by_metric(points: Floats, metric: ErrorMetric, entries: I32, index: I64, threads: int) -> tuple[I32, I64]:
-    """Assign each point to the best of the entries near its own, and move the entries; twice.
-
-    Args:
-        points: [N, D, C], in lattice steps.
-        metric: metric of the points.
-        entries: [K, D, C] lattice integers.
-        index: [N], the entry of each point.
-        threads: number to use; no effect on the result.
-
-    Returns:
-        entries [K', D, C], distinct, each used; index [N].
-    """
-    with one_blas_thread():
-        for _ in range(_REFINE_ROUNDS):
-            index = _assign_by_metric(points, metric, entries, index, threads, _CANDIDATES)
-            entries = _solve_entries(points, metric, entries, index)
-        index = _assign_by_metric(points, metric, entries, index, threads, _CANDIDATES)
-    flat, place = np.unique(entries.reshape(len(entries), -1), axis=0, return_inverse=True)
-    index = place.reshape(-1)[index]
-    used, index = np.unique(index, return_inverse=True)
-    return flat[used].reshape(-1, *entries.shape[1:]), index.reshape(-1)
-
-
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Run each product on one thread, if NumPy's BLAS is an OpenBLAS whose thread count can be set.
+    """Run matrix products on one thread, if NumPy's BLAS is an OpenBLAS whose thread count can be set.
 
-    Our threads already fill the processors. OpenBLAS's threads wait by spinning: next to one other program, these
+    Our own threads already use all processors. OpenBLAS's threads wait by spinning: next to another busy program, these
     products took 20 times as long.
     """
     control = _openblas()
@@ -260,6 +208,77 @@ def one_blas_thread() -> Iterator[None]:
             control[1](before)
 
 
+@one_blas_thread()
+def reassign_by_metric(
+    points: Floats, metric: ErrorMetric, entries: Floats, index: I64, threads: int, candidates: int
+) -> I64:
+    """Assign each point to the entry with the least error among the neighbours of its present entry.
+
+    With w xᵀ M x constant and w a factor, the error of an entry c is
+        Σ_channels cᵀ M c - 2 cᵀ (M x),
+    the product of the features [M x, upper triangle of M, off-diagonals doubled] and the table [-2 c, Σ c_i c_j].
+
+    Args:
+        points: [N, D, C].
+        metric: metric of the points.
+        entries: [K, D, C].
+        index: [N], the present entry of each point.
+        threads: number of threads; no effect on the result.
+        candidates: number of entries compared, the present one and its nearest neighbours.
+
+    Returns:
+        The new index, [N].
+    """
+    near = _neighbours(entries, candidates)
+    size, channels = entries.shape[1:]
+    upper_i, upper_j = np.triu_indices(size)
+    wide = entries.astype(np.float64)
+    squares = np.einsum("kpc,kpc->kp", wide[:, upper_i], wide[:, upper_j])
+    table = np.concatenate([-2.0 * wide.reshape(len(wide), -1), squares], axis=1)
+    order = np.argsort(index, kind="stable")
+    ends = np.searchsorted(index[order], np.arange(len(entries) + 1))
+    best = index.copy()
+
+    def work(groups: Sequence[int]) -> None:
+        for group in groups:
+            rows = order[ends[group] : ends[group + 1]]
+            if not len(rows):
+                continue
+            triangles = metric.triangles[rows]
+            features = np.empty((len(rows), table.shape[1]))
+            features[:, : size * channels] = matrix_products(triangles, points[rows]).reshape(len(rows), -1)
+            features[:, size * channels :] = doubled_triangles(triangles)
+            best[rows] = near[group, (features @ table[near[group]].T).argmin(axis=1)]
+
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        list(pool.map(work, [range(start, len(entries), threads) for start in range(threads)]))
+    return best
+
+
+@one_blas_thread()
+def refine_by_metric(points: Floats, metric: ErrorMetric, entries: I32, index: I64, threads: int) -> tuple[I32, I64]:
+    """Iterate assignment and centroids under the metric.
+
+    Args:
+        points: [N, D, C], in lattice steps.
+        metric: metric of the points.
+        entries: [K, D, C], lattice integers.
+        index: [N], the entry of each point.
+        threads: number of threads; no effect on the result.
+
+    Returns:
+        entries [K', D, C], distinct and used; index [N].
+    """
+    for _ in range(_REFINE_ROUNDS):
+        index = reassign_by_metric(points, metric, entries, index, threads, _CANDIDATES)
+        entries = _solve_entries(points, metric, entries, index)
+    index = reassign_by_metric(points, metric, entries, index, threads, _CANDIDATES)
+    flat, place = np.unique(entries.reshape(len(entries), -1), axis=0, return_inverse=True)
+    index = place.reshape(-1)[index]
+    used, index = np.unique(index, return_inverse=True)
+    return flat[used].reshape(-1, *entries.shape[1:]), index.reshape(-1)
+
+
 def _check_points(points: I16 | I32, weights: F32 | None) -> F64:
     if points.ndim != 2 or not points.shape[1] or points.dtype not in (np.int16, np.int32):
         found = f"{points.dtype} {points.shape}"
@@ -273,9 +292,10 @@ def _check_points(points: I16 | I32, weights: F32 | None) -> F64:
 
 
 def _priority_sample(w: F64, count: int, rng: np.random.Generator) -> tuple[I64, F64]:
-    """Draw an unbiased weighted sample that keeps every heavy row.
+    """Draw a weighted sample of rows; return the rows, and weights whose sums are unbiased.
 
-    Duffield, Lund, Thorup, "Priority sampling for estimation of arbitrary subset sums".
+    With uniform u, the rows with the largest priorities w / u are kept, and each counts max(w, τ), where τ is the
+    largest priority left out (Duffield, Lund, Thorup, "Priority sampling for estimation of arbitrary subset sums").
     """
     if count >= len(w):
         return np.arange(len(w)), w
@@ -292,7 +312,7 @@ def _largest(keys: F64, count: int) -> I64:
 
 
 def _draw_rows(importance: F64, count: int, rng: np.random.Generator) -> I64:
-    """Draw up to `count` different rows, with a probability that grows with their importance."""
+    """Draw up to `count` distinct rows, with a probability that grows with their importance."""
     count = min(count, int(np.count_nonzero(importance)))
     if count == 0:
         return np.empty(0, np.int64)
@@ -302,9 +322,9 @@ def _draw_rows(importance: F64, count: int, rng: np.random.Generator) -> I64:
 def _first_entries(
     sample: I16 | I32, w: F64, size: int, rng: np.random.Generator, near: int, threads: int | None
 ) -> I32:
-    """Draw points in rounds by weight times squared distance to those drawn before.
+    """Draw initial entries in rounds, with a probability that grows with w d², d being the distance to earlier draws.
 
-    Bahmani et al., "Scalable k-means++", drawing exactly `size` points.
+    Bahmani et al., "Scalable k-means++", but with exactly `size` points.
     """
     error = np.ones(len(sample))
     entries = np.empty((0, sample.shape[1]), np.int32)
@@ -318,7 +338,7 @@ def _first_entries(
 
 
 def _move_to_means(points: I16 | I32, w: F64, index: U32, entries: I32) -> I32:
-    """Move each entry to the rounded mean of its points, unless they have no weight."""
+    """Move each entry to the centroid of its points, rounded; entries without weight stay."""
     where = index.astype(np.int64)
     total = np.bincount(where, w, len(entries))
     moved = entries.copy()
@@ -339,10 +359,11 @@ def _relocate(
     rng: np.random.Generator,
     threads: int | None,
 ) -> None:
-    """Move the entries whose loss costs least, and all without weight, to where errors are largest, in place.
+    """Move the cheapest entries, and all without weight, into the clusters with the largest errors, in place.
 
-    Patane and Russo, "The enhanced LBG algorithm": k-means alone never moves an entry between distant clusters. At
-    most `most` entries with weight move; losing one costs about its weight times its squared distance to the next.
+    K-means alone never moves an entry between distant clusters (Patanè and Russo, "The enhanced LBG algorithm"). Giving
+    up an entry costs about its weight times the squared distance to its nearest neighbour; splitting a cluster halves
+    its error at best. At most `most` entries with weight move, each to a point drawn from its new cluster.
     """
     weight = np.bincount(index, w, len(entries)).astype(np.float64)
     harm = np.bincount(index, w * error, len(entries))
@@ -372,9 +393,9 @@ def _drop_unused(entries: I32, index: U32) -> tuple[I32, U32]:
 
 
 def _shift(points: I16 | I32, entries: I32) -> int:
-    """Return the least shift after which every product is exact."""
+    """Return the smallest shift after which all scores of `search_nearest` are exact."""
     x, c = _largest_norm(points), _largest_norm(entries)
-    slack = math.sqrt(points.shape[1])  # rounding moves a vector by half of this at most
+    slack = math.sqrt(points.shape[1])  # rounding moves a vector by at most half of this
     shift = 0
     while (x + slack) * (c + slack) + (c + slack) ** 2 / 2 >= _EXACT:
         x, c, shift = x / 2, c / 2, shift + 1
@@ -394,12 +415,14 @@ def _divide(rows: I16 | I32, shift: int) -> I64:
 
 
 def _matrix(entries: I64) -> F32:
-    """Return [D + 1, K]: the entries as columns, and below minus half their squares."""
+    """Return the columns [c, -|c|²/2] of the entries, [D + 1, K]."""
     half = np.einsum("kd,kd->k", entries, entries) * -0.5
     return np.concatenate([entries.T, half[None]]).astype(np.float32)
 
 
 def _every_entry(matrix: F32, other: bool) -> _Find:
+    """Return a search of every entry."""
+
     def find(x: F32, start: int) -> tuple[I64, F32]:
         rows = np.arange(len(x))
         index = np.zeros(len(x), np.int64)
@@ -421,6 +444,7 @@ def _every_entry(matrix: F32, other: bool) -> _Find:
 
 
 def _near_entries(entries: I64, near: int, threads: int | None) -> _Find:
+    """Return a search of the entries in the `near` groups with the nearest centroids."""
     centres, label = _groups(entries, threads)
     order = np.argsort(label, kind="stable")
     matrix, coarse = _matrix(entries[order]), _matrix(centres)
@@ -449,7 +473,7 @@ def _near_entries(entries: I64, near: int, threads: int | None) -> _Find:
 
 
 def _groups(entries: I64, threads: int | None) -> tuple[I64, U32]:
-    """Put the entries into about sqrt(K) groups by plain k-means; return means and labels."""
+    """Cluster the entries into about sqrt(K) groups by plain k-means; return centroids and labels."""
     count = _group_count(len(entries))
     rows = entries.astype(np.int32)
     centres = rows[np.arange(count) * len(rows) // count]
@@ -469,6 +493,7 @@ def _group_count(entry_count: int) -> int:
 
 @cache
 def _openblas() -> tuple[Callable[[], int], Callable[[int], object]] | None:
+    """Return the functions of NumPy's OpenBLAS that get and set its number of threads, if they are found."""
     core = sys.modules.get("numpy._core._multiarray_umath") or sys.modules.get("numpy.core._multiarray_umath")
     bundled = Path(np.__file__).parent.parent / "numpy.libs"
     paths = [str(getattr(core, "__file__", "")), *map(str, sorted(bundled.glob("*openblas*")))]
@@ -485,47 +510,11 @@ def _openblas() -> tuple[Callable[[], int], Callable[[int], object]] | None:
     return None
 
 
-def _assign_by_metric(
-    points: Floats, metric: ErrorMetric, entries: Floats, index: I64, threads: int, tried: int
-) -> I64:
-    """Minimise the error over the candidates: w xᵀMx is constant, the rest is linear in Mx and M."""
-    near = _neighbours(entries, tried)
-    size, channels = entries.shape[1:]
-    upper_i, upper_j = np.triu_indices(size)
-    wide = entries.astype(np.float64)
-    table = np.concatenate(
-        [
-            -2.0 * wide.reshape(len(wide), -1),
-            np.einsum("kpc,kpc->kp", wide[:, upper_i], wide[:, upper_j]),
-        ],
-        axis=1,
-    )
-    order = np.argsort(index, kind="stable")
-    ends = np.searchsorted(index[order], np.arange(len(entries) + 1))
-    best = index.copy()
-
-    def work(groups: Sequence[int]) -> None:
-        for group in groups:
-            rows = order[ends[group] : ends[group + 1]]
-            if not len(rows):
-                continue
-            features = np.empty((len(rows), table.shape[1]))
-            features[:, : size * channels] = matrix_products(metric.triangles[rows], points[rows]).reshape(
-                len(rows), -1
-            )
-            features[:, size * channels :] = doubled_triangles(metric.triangles[rows])
-            best[rows] = near[group, (features @ table[near[group]].T).argmin(axis=1)]
-
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        list(pool.map(work, [range(start, len(entries), threads) for start in range(threads)]))
-    return best
-
-
-def _neighbours(entries: Floats, tried: int) -> I64:
-    """Return each entry and those nearest to it, [K, candidates]."""
+def _neighbours(entries: Floats, candidates: int) -> I64:
+    """Return each entry and its nearest neighbours, [K, candidates], ascending."""
     flat = entries.reshape(len(entries), -1).astype(np.float64)
     squares = np.einsum("kd,kd->k", flat, flat)
-    count = min(tried, len(flat))
+    count = min(candidates, len(flat))
     near = np.empty((len(flat), count), np.int64)
     for at in range(0, len(flat), 256):
         part = slice(at, at + 256)
@@ -537,7 +526,11 @@ def _neighbours(entries: Floats, tried: int) -> I64:
 
 
 def _solve_entries(points: Floats, metric: ErrorMetric, entries: I32, index: I64) -> I32:
-    """Return the entries [K, D, C] that minimise the sums of the points' errors, rounded."""
+    """Return the centroids [K, D, C] under the metric, rounded.
+
+    The centroid c of the points x_n minimises Σ_n w_n (x_n - c)ᵀ M_n (x_n - c) + r |c - c_old|², that is
+        (Σ_n w_n M_n + r I) c = Σ_n w_n M_n x_n + r c_old.
+    """
     count, size, channels = entries.shape
     upper_i, upper_j = np.triu_indices(size)
     weights = metric.weights.astype(np.float64)
@@ -545,17 +538,17 @@ def _solve_entries(points: Floats, metric: ErrorMetric, entries: I32, index: I64
     for place, (i, j) in enumerate(zip(upper_i, upper_j, strict=True)):
         sums = np.bincount(index, weights * metric.triangles[:, place], count)
         matrices[:, i, j] = matrices[:, j, i] = sums
-    wanted = np.empty((count, size, channels))
+    right = np.empty((count, size, channels))
     products = np.empty((len(points), size, channels))
     for at in range(0, len(points), _METRIC_BLOCK):
         part = slice(at, at + _METRIC_BLOCK)
         products[part] = matrix_products(metric.triangles[part], points[part])
-    for part_of in range(size):
+    for d in range(size):
         for c in range(channels):
-            wanted[:, part_of, c] = np.bincount(index, weights * products[:, part_of, c], count)
+            right[:, d, c] = np.bincount(index, weights * products[:, d, c], count)
     ridge = _RIDGE * np.einsum("kii->k", matrices) / size
     ridge[ridge == 0.0] = 1.0
     matrices[:, range(size), range(size)] += ridge[:, None]
-    wanted += ridge[:, None, None] * entries
-    solved: I32 = np.rint(np.linalg.solve(matrices, wanted)).astype(np.int32)
+    right += ridge[:, None, None] * entries
+    solved: I32 = np.rint(np.linalg.solve(matrices, right)).astype(np.int32)
     return solved

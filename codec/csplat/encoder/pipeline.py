@@ -1,7 +1,6 @@
-"""From a model to the bytes of a file, in one call or in the steps of `encode_tiles` and `EncodedTiles.write`.
+"""Encode a model to a file, in one call or in two steps, `encode_tiles` and `EncodedTiles.write`.
 
-A file may record its own PSNR: write it, measure it, and write it again with the result, which takes no time compared
-with encoding the tiles.
+The second step takes almost no time, so that a file can be written, measured, and written again with its own PSNR.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ from csplat.types import F32, Progress
 
 Integers = NDArray[Any]
 
-_FEW_TILES, _SMALL_TILE = 16, 256  # tiles, and mean splats per tile, below which many small tiles cause no note
+_FEW_TILES, _SMALL_TILE = 16, 256  # more tiles than this, with fewer splats per tile on average, cause a note
 _COLOUR_MEASURES = tuple(_spec.MEASURE_NAMES[id] for id in range(_spec.MEASURE_SH0, _spec.MEASURE_SH0 + 4))
 _SHAPE_MEASURES = tuple(_spec.MEASURE_NAMES[id] for id in (_spec.MEASURE_COVARIANCE, _spec.MEASURE_OPACITIES))
 
@@ -62,15 +61,15 @@ _SHAPE_MEASURES = tuple(_spec.MEASURE_NAMES[id] for id in (_spec.MEASURE_COVARIA
 def encode(
     model: SplatModel, options: EncodeOptions | None = None, *, progress: Callable[[str, float], None] | None = None
 ) -> bytes:
-    """Compress a scene.
+    """Encode a scene.
 
     Args:
         model: the scene.
-        options: presets and knobs; the default preset is "balanced".
-        progress: called with the stage and the fraction of it that is done, 0 to 1.
+        options: default: the preset "balanced".
+        progress: called with the stage and the fraction done, 0 to 1.
 
     Returns:
-        The bytes of a `.csplat` file. Same model, options and library versions: same bytes, at any thread count.
+        The bytes of a `.csplat` file. They depend only on the model, the options and the versions of the libraries.
 
     Examples:
         >>> import csplat
@@ -80,7 +79,7 @@ def encode(
         True
 
     Raises:
-        InputError: values that no lattice can hold, or an option that the model does not allow; or it is no model.
+        InputError: `model` is not a model, a value fits no lattice, or an option is not allowed for the model.
     """
     return encode_with_report(model, options, progress=progress).data
 
@@ -94,21 +93,21 @@ def encode_with_report(
     metadata: Mapping[str, Any] | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> EncodeResult:
-    """Compress a scene, and report choices and errors: `csplat encode` without a target.
+    """Encode a scene, and report choices and errors.
 
     Args:
         model, options, importance, origin, progress: see `EncodePlan.of`.
-        metadata: entries to record, see `EncodedTiles.write`.
+        metadata: see `EncodedTiles.write`.
 
     Examples:
         >>> import csplat
         >>> result = csplat.encode_with_report(csplat.read_ply("scene.ply"))
-        >>> largest, rms = result.report.errors["opacities"]  # as the file declares them
+        >>> largest, rms = result.report.errors["opacities"]  # declared by the file
         >>> 0.0 < rms < largest < 0.1
         True
 
     Raises:
-        InputError: as `encode`; or an importance of another shape, or negative, or not finite.
+        InputError: as in `EncodePlan.of`.
     """
     plan = EncodePlan.of(model, options, importance=importance, origin=origin, progress=progress)
     return encode_tiles(plan, progress=progress).write(metadata)
@@ -116,15 +115,15 @@ def encode_with_report(
 
 @dataclass(frozen=True)
 class EncodeReport:
-    """Choices of the encoder, and the errors and bytes that resulted.
+    """Choices of the encoder, and the resulting errors and size.
 
     Attributes:
-        options: the options set by the caller, and the steps and codings chosen; the file records them too.
-        errors: (max, rms) by measure, as the file declares them (spec 5.5).
-        splat_count: splats in the file.
-        tile_count: tiles in the file.
+        options: the caller's options, and the steps and codings chosen; the OPTS chunk of the file.
+        errors: declared (max, rms) by measure (spec 5.5).
+        splat_count: number of splats in the file.
+        tile_count: number of tiles in the file.
         size_bytes: size of the file.
-        notes: warnings for the user, a sentence each.
+        notes: warnings for the user, one sentence each.
     """
 
     options: dict[str, Any]
@@ -137,11 +136,11 @@ class EncodeReport:
 
 @dataclass(frozen=True)
 class EncodeResult:
-    """An encoded file, and the source splat of each of its splats.
+    """An encoded scene.
 
     Attributes:
-        data: the file.
-        source_index: [N] int64; row i of the decoded arrays is row source_index[i] of the model, or of its `Origin`.
+        data: the bytes of the file.
+        source_index: [N] int64; row i of the decoded arrays is row source_index[i] of the model or its `Origin`.
         report: choices and errors.
     """
 
@@ -152,13 +151,13 @@ class EncodeResult:
 
 @dataclass(frozen=True)
 class EncodedTile:
-    """One encoded tile.
+    """An encoded tile.
 
     Attributes:
         tile: index record and payloads.
         rows: [n], rows of the model in decoding order.
-        errors: errors of its splats.
-        coarsened: attributes with a value so large that the tile's lattice had to be coarser.
+        errors: errors of the splats.
+        coarsened: attributes with such large values that the tile's lattice is coarser.
     """
 
     tile: FileTile
@@ -169,11 +168,11 @@ class EncodedTile:
 
 @dataclass(frozen=True, eq=False)
 class EncodedTiles:
-    """An encoded scene: a file but for the metadata about itself.
+    """An encoded scene before the file is written.
 
     Attributes:
         plan: the complete plan.
-        codebooks: codebooks of the whole file.
+        codebooks: codebooks of the file.
         tiles: the tiles.
         errors: errors to declare.
     """
@@ -191,7 +190,7 @@ class EncodedTiles:
         return index
 
     def against(self, source: SplatModel, decoded: SplatModel) -> EncodedTiles:
-        """Return the same tiles, declaring the errors against another scene than the one encoded.
+        """Return the same tiles with declared errors that refer to another scene than the one encoded.
 
         Args:
             source: the scene that the plan's `Origin` refers to.
@@ -203,7 +202,7 @@ class EncodedTiles:
         """Write the file.
 
         Args:
-            metadata: JSON-compatible entries to record next to the encoder's settings.
+            metadata: JSON-compatible entries to add to the OPTS chunk.
 
         Raises:
             InputError: an error is too large to be declared.
@@ -224,16 +223,16 @@ def encode_tiles(
     errors: ErrorSums | None = None,
     progress: Progress | None = None,
 ) -> EncodedTiles:
-    """Encode the tiles of a scene: most of the work.
+    """Encode the tiles of a scene, which is most of the work.
 
     Args:
-        plan: the scene; its SH coding may still be open.
-        codebooks: SH codebooks, if the plan's SH coding is decided; `None`: decide it now.
-        errors: errors to declare; `None`: those of the tiles.
+        plan: the plan.
+        codebooks: SH codebooks, if the plan's SH coding is chosen; `None`: choose it now.
+        errors: errors to declare; `None`: the errors of the tiles.
         progress: see `EncodePlan.of`.
 
     Raises:
-        InputError: values that no lattice can hold.
+        InputError: a value fits no lattice.
     """
     if codebooks is None:
         parameters, codebooks = plan.choose_sh_coding(progress)
@@ -264,16 +263,14 @@ def _encode_all(plan: EncodePlan, sh_plan: ShCodingPlan, progress: Progress | No
 
 
 def make_notes(tiles: Sequence[EncodedTile], *, strict: bool) -> tuple[str, ...]:
-    """Return warnings about outliers that cost their neighbours precision, and about too small a `position_error`."""
+    """Return warnings about outliers that coarsen their neighbours, and about too small a `position_error`."""
     notes = []
     splats = sum(part.tile.splat_count for part in tiles)
     if strict and len(tiles) > max(_FEW_TILES, splats // _SMALL_TILE):
-        notes.append(
-            f"means: so small an error takes {counted(len(tiles), 'tile')}, each of which takes bytes of its own"
-        )
+        notes.append(f"means: such a small error takes {counted(len(tiles), 'tile')}, and each tile costs bytes")
     counts = Counter(name for part in tiles for name in part.coarsened)
     notes += [
-        f"{name}: huge values coarsen {count} of {counted(len(tiles), 'tile')}; remove them, or see the stated errors"
+        f"{name}: huge values coarsen {count} of {counted(len(tiles), 'tile')}; remove them, or see the declared errors"
         for name, count in sorted(counts.items())
     ]
     return tuple(notes)
@@ -290,10 +287,10 @@ def encode_tile(
 
     Args:
         model: the whole scene.
-        tile: the tile's rows and steps.
-        parameters: the file's lattices and codings.
-        sh_plan: SH coding of the whole file.
-        shapes: shape codebook of the whole file, if there is one.
+        tile: rows and steps of the tile.
+        parameters: lattices and codings of the file.
+        sh_plan: SH coding of the file.
+        shapes: shape codebook of the file, if there is one.
     """
     result = _TileResult(parameters, tile.factors)
     quantised = quantise_and_sort(model, tile, parameters)
@@ -308,7 +305,7 @@ def encode_tile(
     if model.sh_degree:
         sh = encode_sh(model.shN, rows, parameters, sh_plan)
         layers |= {layer: [block] for layer, block in sh.blocks.items()}
-        used = (*sh.codebook_ids, *used)
+        used = (*sh_plan.codebook_ids, *used)
         if sh.exponent:
             result.coarsened.add("shN")
         for measure, errors in sh.errors.items():
@@ -335,7 +332,7 @@ def encode_tile(
 
 @dataclass
 class _TileResult:
-    """Blocks and errors of a tile, collected attribute by attribute in the order of the blocks."""
+    """Blocks and errors of a tile, added attribute by attribute in the order of the blocks."""
 
     parameters: CodingParameters
     factors: StepFactors
@@ -354,7 +351,7 @@ class _TileResult:
         self.add_errors("opacities", value_errors(opacities, opacity_values(q, levels, square=True)))
 
     def add_shapes(self, quats: F32, scales: F32, part: ShapePart | None) -> float:
-        """Add scales and rotations; return the largest decoded scale."""
+        """Add scales and rotations; return the largest decoded log scale."""
         shape = quantise_shape(quats, scales, self.parameters, part, self.factors)
         if shape.exponent > self.factors.scales:
             self.coarsened.add("scales")
@@ -385,7 +382,7 @@ class _TileResult:
 
 
 def encoding_settings(plan: EncodePlan, sh_plan: ShCodingPlan) -> dict[str, Any]:
-    """Return the options of the caller and the choices of the encoder, JSON-compatible: the OPTS chunk."""
+    """Return the content of the OPTS chunk: the caller's options and the encoder's choices."""
     parameters, options = plan.parameters, plan.options
     return {
         "asked": options.chosen(),
@@ -418,7 +415,7 @@ def _shape_settings(shapes: ShapeCodebook | None) -> dict[str, Any]:
 
 
 def declared_errors(errors: ErrorSums, origin: Origin) -> dict[str, tuple[float, float]]:
-    """Return (max, rms) by measure, without the measures of refitted values, whose errors mean nothing."""
+    """Return (max, rms) by measure, without those of refitted values, whose errors have no meaning."""
     declared = errors.declared()
     if not origin.refitted:
         return declared
@@ -427,7 +424,7 @@ def declared_errors(errors: ErrorSums, origin: Origin) -> dict[str, tuple[float,
 
 
 def file_chunks(plan: EncodePlan, errors: ErrorSums, settings: dict[str, Any]) -> list[FileChunk]:
-    """Return the chunks of the whole file: metadata, cameras, options, declared errors."""
+    """Return the chunks other than tiles and codebooks: metadata, cameras, options, declared errors."""
     model, deflate, chunks = plan.model, plan.parameters.deflate, []
     try:
         if model.metadata:
@@ -435,14 +432,14 @@ def file_chunks(plan: EncodePlan, errors: ErrorSums, settings: dict[str, Any]) -
         if model.cameras is not None:
             chunks.append(FileChunk(_spec.CHUNK_CAMERAS, json_payload(list(model.cameras), deflate)))
     except (TypeError, ValueError) as problem:
-        raise InputError(f"metadata or cameras are not JSON: {problem}") from None
+        raise InputError(f"metadata or cameras cannot be written as JSON: {problem}") from None
     chunks.append(FileChunk(_spec.CHUNK_OPTIONS, json_payload(settings, deflate)))
     chunks.append(FileChunk(_spec.CHUNK_STATED_ERRORS, _declared_errors_chunk(plan, errors)))
     return chunks
 
 
 def scene_fields(plan: EncodePlan, codebooks: FileCodebooks, chunks: Sequence[FileChunk]) -> SceneFields:
-    """Gather the scene fields of header and index."""
+    """Return the scene fields of header and index."""
     model, parameters = plan.model, plan.parameters
     directions = {letter: id for id, letter in _spec.DIRECTION_LETTER.items()}
     letters = ("", "", "") if model.coordinate_system == UNSPECIFIED else tuple(model.coordinate_system)
@@ -471,7 +468,7 @@ def _declared_errors_chunk(plan: EncodePlan, errors: ErrorSums) -> bytes:
 
 
 def _versions(parameters: CodingParameters) -> str:
-    from importlib.metadata import PackageNotFoundError, version  # a tenth of the time that importing the encoder takes
+    from importlib.metadata import PackageNotFoundError, version  # takes a tenth of the import time of the encoder
 
     try:
         own = version("csplat")

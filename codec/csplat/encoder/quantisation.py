@@ -1,6 +1,6 @@
-"""Values to lattice integers, and back as a decoder reconstructs them (spec 7).
+"""Quantise values to lattice integers, and dequantise them as a decoder does (spec 7).
 
-Arrays are in columns, [C, n], as streams need them; NumPy's inner loops are then long.
+Arrays are in columns, [C, n], in the order of the streams; NumPy's inner loops are then long.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from csplat.types import F32, I32, I64
 Floats = NDArray[Any]
 Integers = NDArray[Any]
 
-_WIDE = _spec.COLUMN_MAX / 2  # bound of the integers of scales and colours, half of LAT-4's because of rounding
-_EXACT32 = 2.0**20  # colours beyond this many steps are quantised in float64
-_ROWS = 2048  # splats per block: rows of 45 floats and their columns stay in the second-level cache
+_WIDE = _spec.COLUMN_MAX / 2  # maximum integer of scales and colours; half of LAT-4's bound, to allow for rounding
+_EXACT32 = 2.0**20  # steps from which colours are quantised in float64
+_ROWS = 2048  # splats per block; rows of 45 floats and their columns fit the second-level cache
 _ROOT2 = float.fromhex("0x1.6A09E667F3BCDp+0")  # spec 7.5
 
 Quaternion = tuple[F32, F32, F32, F32]
@@ -34,18 +34,13 @@ def lattice_step(step: float, exponent: int) -> float:
 
 
 def lattice_exponent(largest: float, step: float) -> int:
-    """Return the smallest exponent >= 0 at which the integers of scales or colours satisfy LAT-4.
-
-    Args:
-        largest: largest magnitude of the values, in the unit of `step`.
-        step: lattice step, > 0.
-    """
+    """Return the smallest exponent >= 0 at which scales or colours of this largest magnitude satisfy LAT-4."""
     ratio = largest / step
     return 0 if ratio < _WIDE else math.ceil(math.log2(ratio / _WIDE)) + 1
 
 
 def largest_exact(step: float) -> float:
-    """Return the magnitude from which `lattice_exponent` is above 0."""
+    """Return the magnitude from which `lattice_exponent` is positive."""
     return _WIDE * step
 
 
@@ -61,10 +56,10 @@ def quantise_means(means: F32, step: float) -> I64:
 
     Args:
         means: [3, n] float32.
-        step: the tile's step; |mean| / step is below 2**53, by `tile_exponent`.
+        step: step of the tile; `tile_exponent` keeps |mean| / step below 2**53.
 
     Returns:
-        [3, n] int64. If rounding up would leave float32, the integer of smaller magnitude.
+        [3, n] int64; rounded towards 0 if the nearest value is beyond float32.
     """
     scaled = means.astype(np.float64)
     scaled /= step
@@ -81,11 +76,11 @@ def opacity_levels(opacities: F32, levels: int, *, square: bool, multiple: int =
     Args:
         opacities: [n] float32, 0 to 1.
         levels: M.
-        square: levels are equidistant in the square root of alpha.
-        multiple: all q but M are multiples of this, >= 1: the same levels, fewer symbols.
+        square: the mapping is SQUARE: levels are equidistant in the square root of alpha.
+        multiple: round all q except M to multiples of this, >= 1, which leaves fewer symbols.
 
     Returns:
-        [n] int32, 0 to M; 0 and M exactly for alpha 0 and 1.
+        [n] int32, 0 to M. Alpha 0 and 1 are exact.
     """
     root = np.sqrt(opacities) if square else opacities
     q: I32 = np.rint(root * np.float32(levels / multiple)).astype(np.int32)
@@ -109,11 +104,11 @@ def quat_levels(rotation: F32, levels: int, multiple: int = 1) -> I32:
     Args:
         rotation: [4, n] float32, unit length, w >= |x|, |y|, |z|.
         levels: M >= 3.
-        multiple: q are multiples of this, 1 to M / 3: the same levels, fewer symbols.
+        multiple: round q to multiples of this, 1 to M / 3, which leaves fewer symbols.
 
     Returns:
         [3, n] int32 with |q| <= M and q1² + q2² + q3² <= 2 M². If rounding to nearest violates the second bound
-        (about w = 0.5 at small M), all three are rounded towards 0.
+        (near w = 0.5, for small M), all three are rounded towards 0.
     """
     scaled = rotation[1:] * np.float32(levels * _ROOT2 / multiple)
     most = levels // multiple
@@ -139,14 +134,17 @@ def quat_values(q: I32, levels: int) -> F32:
 def colour_integers(rgb: Floats, shift: int, coarse: I32 | None = None) -> Integers:
     """Round colours to luma and chroma integers (spec 7.1).
 
+    With the rounded chroma, Co ≈ R - B and Cg ≈ G - (R + B) / 2, Y is chosen to bring the decoded sum
+        R + G + B = 3 (Y - (Cg >> 1)) + Cg + Co - 2 (Co >> 1)
+    closest to the source's.
+
     Args:
         rgb: [3, ..., n] float32 or float64, in lattice steps, below 2**30 in magnitude.
         shift: Co and Cg are coarser by 2**shift.
-        coarse: [n], splats are rounded to multiples of 2**coarse steps: the same lattice, fewer symbols.
+        coarse: [n], exponents; splats are rounded to multiples of 2**coarse steps, which leaves fewer symbols.
 
     Returns:
-        [3, ..., n] Y, Co, Cg; int32, or int64 if 32 bits are too few. Y is the integer that brings R + G + B
-        closest to the source's, given the rounded chroma.
+        [3, ..., n] Y, Co, Cg; int32, or int64 if 32 bits are too few.
     """
     wide = float(np.abs(rgb).max(initial=0.0)) >= _EXACT32
     r, g, b = rgb.astype(np.float64) if wide else rgb
@@ -163,7 +161,7 @@ def colour_integers(rgb: Floats, shift: int, coarse: I32 | None = None) -> Integ
 
 
 def colour_lifted(columns: Integers, shift: int) -> Integers:
-    """Return R, G, B integers from Y, Co, Cg (spec 7.1), [3, ...] of the same dtype."""
+    """Return the R, G, B integers of Y, Co, Cg (spec 7.1), [3, ...]."""
     y, co, cg = columns
     co, cg = co << shift, cg << shift
     t = y - (cg >> 1)
@@ -180,14 +178,14 @@ def _round_multiples(values: Floats, kind: type[np.signedinteger[Any]], coarse: 
 
 
 def check_finite(name: str, values: F32) -> None:
-    """Raise InputError if decoded values are beyond float32."""
+    """Raise an `InputError` if decoded values are beyond float32."""
     if not np.isfinite(values).all():
-        raise InputError(f"{name} too large to quantise: values at the end of float32's range")
+        raise InputError(f"{name} are too large to quantise: values at the limit of float32")
 
 
 @dataclass(frozen=True)
 class QuantisedColour:
-    """Y, Co, Cg columns, the tile's exponent, and the decoded colours."""
+    """Colours of a tile: Y, Co, Cg columns, the exponent of their lattice, and decoded values."""
 
     columns: Integers
     exponent: int
@@ -195,7 +193,7 @@ class QuantisedColour:
 
 
 def quantise_colour(rgb: F32, step: float, shift: int, coarse: int = 0) -> QuantisedColour:
-    """Quantise colours [3, ..., n] on the lattice of `step` times 2**coarse, or a coarser one that holds them."""
+    """Quantise colours [3, ..., n] to multiples of step × 2**coarse, or of a coarser step that satisfies LAT-4."""
     exponent = max(coarse, lattice_exponent(2.0 * float(np.abs(rgb).max(initial=0.0)), step))
     tile_step = lattice_step(step, exponent)
     real = np.float32 if exponent == 0 else np.float64
@@ -204,15 +202,16 @@ def quantise_colour(rgb: F32, step: float, shift: int, coarse: int = 0) -> Quant
 
 
 def quantise_sh(source: F32, parameters: CodingParameters, coarse: I32 | None) -> tuple[Integers, int, F32]:
-    """Quantise SH splat by splat.
+    """Quantise SH without a codebook.
 
     Args:
         source: [n, K, 3] float32.
         parameters: step and chroma shift.
-        coarse: [n], see `colour_integers`; None: 0.
+        coarse: [n], see `colour_integers`; `None`: 0.
 
     Returns:
-        Columns [3, K, n] of the narrowest dtype; the tile's exponent; [n, K, 3] float32 as decoded.
+        Y, Co, Cg columns [3, K, n] of the narrowest dtype; the exponent of the tile's lattice; decoded values
+        [n, K, 3] float32.
     """
     n, coefficients, _ = source.shape
     largest = max(abs(float(source.max(initial=0.0))), abs(float(source.min(initial=0.0))))
@@ -240,22 +239,22 @@ def _narrowest(largest: float) -> type[np.signedinteger[Any]]:
 def canonicalise_shape(quats: F32, scales: F32) -> tuple[F32, F32]:
     """Bring shapes into canonical axis order: scales descending, w the largest component of the rotation.
 
-    Permuting the axes of an ellipsoid, or half a turn about one of them, changes rotation and scales but not the
-    covariance; so 24 pairs, and two signs of each quaternion, describe the same ellipsoid. This one needs no index of
-    its largest component.
+    Permuting the axes of an ellipsoid, or turning it by 180° about one of them, changes rotation and scales but not the
+    covariance: 24 pairs, with two signs of the quaternion each, describe the same ellipsoid. In canonical order, the
+    coding needs no index of the quaternion's largest component.
 
     Args:
         quats: [n, 4] float32, w x y z, unit length within 1e-3.
         scales: [n, 3] float32, log standard deviations.
 
     Returns:
-        [4, n] float32 rotation in columns, unit length, w >= |x|, |y|, |z|; [3, n] float32 scales in columns.
-        The covariance of each splat is that of the arguments.
+        [4, n] float32 rotation in columns, unit length, w >= |x|, |y|, |z|; [3, n] float32 scales in columns. The
+        covariances are unchanged.
     """
     w, x, y, z = (np.ascontiguousarray(quats[:, i]) for i in range(4))
     a, b, c = (np.ascontiguousarray(scales[:, i]) for i in range(3))
-    # Half turns about (x+y), (y+z), (x+y) exchange two axes and keep the rotation proper. Right products with
-    # (0, 1, 1, 0) and (0, 0, 1, 1); their length, sqrt 2 each, is removed by the last normalisation.
+    # Turns by 180° about x+y, y+z and x+y exchange two axes each. They are right products with (0, 1, 1, 0) and
+    # (0, 0, 1, 1), divided by √2.
     for axes in ((0, 1), (1, 2), (0, 1)):
         first, second = (a, b) if axes == (0, 1) else (b, c)
         swap = first < second
@@ -276,7 +275,7 @@ def canonicalise_shape(quats: F32, scales: F32) -> tuple[F32, F32]:
 
 
 def _exchange_axes(swap: NDArray[np.bool_], turned: Quaternion, kept: Quaternion) -> Quaternion:
-    """Select the turned rotation, at unit length, if axes are exchanged, and the old one otherwise."""
+    """Select the turned rotation, normalised, if axes are exchanged, and the old one otherwise."""
     root = np.float32(np.sqrt(0.5))
     w, x, y, z = (np.where(swap, new * root, old) for new, old in zip(turned, kept, strict=True))
     return w, x, y, z

@@ -1,13 +1,16 @@
-"""Quantisation classes: splats whose errors are equally visible share tiles, and each class has its own steps.
+"""Choose quantisation classes: splats whose errors are equally visible share tiles, and each class has its own steps.
 
-If a step doubles, the squared error of renders grows fourfold and an integer takes a bit less; so the bytes are fewest
-if every integer adds the same error. Splats differ in that by orders of magnitude. The format has no steps by splat,
-but each tile may coarsen the file's lattices by powers of two, and tiles may overlap: those of all classes fill the
-same space. Means cost more bytes, as they lie less densely in a tile; scales, opacities and colours cost fewer, as they
-are alike within a class.
+Doubling a step multiplies the squared error of renders by four and saves a bit per integer. The rate at a given
+distortion is therefore lowest if every integer adds the same error, but splats differ in that by orders of magnitude.
+The format has no steps per splat. A tile may, however, coarsen the file's lattices by powers of two, and the tiles of
+different classes may overlap. The means then take more bytes, as they are less dense in a tile; scales, opacities and
+colours take fewer, as they are similar within a class.
 
-Splats are assigned as in k-means, by their bytes at equal error (the Itakura-Saito divergence); the steps of a class
-follow from the mean errors of its splats.
+Splats are clustered as in k-means, with the rate at equal distortion in place of squared distances (the Itakura-Saito
+divergence). Let the steps of class k differ from the chosen ones by o_ka octaves for attribute a, which has m_a
+integers. The cost of a splat with relative errors e_a, in bits, is
+    Σ_a e_a 4^o_ka / (2 ln 2) - m_a o_ka.
+For the mean error ē_a of the class, it is least for o_ka = ½ log2(m_a / ē_a).
 """
 
 from __future__ import annotations
@@ -24,19 +27,19 @@ from csplat.encoder.splat_importance import CLASSED_ATTRIBUTES, GaussNewtonBlock
 from csplat.model import SplatModel
 from csplat.types import F64, U8
 
-_SPLATS_PER_CLASS = 2500  # mean; with fewer, the Huffman codes of more tiles cost more than classes save
-_CLASSES_MAX = 5  # classes, if no option sets fewer
-_CLASS_SPLATS_MIN = 500  # splats; a smaller class joins others
-_SAMPLE = 1 << 15  # splats from which the steps of classes are computed
+_SPLATS_PER_CLASS = 2500  # minimum mean; with fewer, the Huffman codes of more tiles cost more than classes save
+_CLASSES_MAX = 5  # maximum number of classes by default
+_CLASS_SPLATS_MIN = 500  # splats; smaller classes are merged into others
+_SAMPLE = 1 << 15  # splats on which the steps of classes are computed
 _BLOCK = 1 << 16  # splats per block of temporaries
-_COMMON = 0.999  # quantile of the errors above which they are clipped
-_ROUNDS_MAX = 30  # iterations of k-means
-_FINER, _COARSER = 4.0, 6.0  # octaves from the chosen steps, at most
+_COMMON = 0.999  # quantile to which errors are clipped
+_ROUNDS_MAX = 30  # maximum number of iterations
+_FINER, _COARSER = 4.0, 6.0  # maximum deviation from the chosen steps, octaves
 _SCALE_STEP_MAX = 1.0  # log scale
-_LEVELS_MAX = 255  # opacity or rotation levels, if no option sets more
-_LEVELS_MIN = 3  # opacity or rotation levels of the coarsest class; with 4, bytes jump by 7 % where multiples end
-_ONE_BYTE = {"opacities": 255, "quats": 127}  # levels whose integers fit a byte plane
-_OPTIONS = {  # options that set the steps of an attribute
+_LEVELS_MAX = 255  # maximum opacity or rotation levels by default
+_LEVELS_MIN = 3  # opacity or rotation levels of the coarsest class; with 4, bytes jump by 7 % between multiples
+_ONE_BYTE = {"opacities": 255, "quats": 127}  # maximum levels whose integers fit one byte plane
+_OPTIONS = {  # options that set the step of an attribute
     "opacities": ("opacity_levels",),
     "scales": ("scale_step",),
     "quats": ("quat_levels",),
@@ -47,10 +50,10 @@ _OPTIONS = {  # options that set the steps of an attribute
 
 @dataclass(frozen=True, eq=False)
 class QuantisationClasses:
-    """The class of each splat, and how much coarser its steps are than the file's.
+    """The class of each splat, and the steps of each class relative to the file's.
 
     Attributes:
-        index: [N] uint8; the finest class, whose tiles come first in a file, is 0.
+        index: [N] uint8; 0 is the finest class, whose tiles come first in a file.
         factors: step factors of each class.
     """
 
@@ -58,7 +61,7 @@ class QuantisationClasses:
     factors: Sequence[StepFactors]
 
     def as_json(self) -> dict[str, list[int]]:
-        """Return the number of splats and the step factors by class."""
+        """Return the number of splats and the step factors of each class."""
         counts = np.bincount(self.index, minlength=len(self.factors))
         columns = {name: [getattr(one, name) for one in self.factors] for name in CLASSED_ATTRIBUTES}
         return {"splats": [int(count) for count in counts], **columns}
@@ -67,16 +70,16 @@ class QuantisationClasses:
 def choose_classes(
     model: SplatModel, blocks: GaussNewtonBlocks | None, parameters: CodingParameters, options: EncodeOptions
 ) -> tuple[CodingParameters, QuantisationClasses | None]:
-    """Sort the splats into classes; the error of renders stays about that of the chosen steps, or less.
+    """Assign the splats to classes, keeping the error of renders at about that of the chosen steps or below.
 
     Args:
         model: the scene.
-        blocks: Gauss-Newton blocks of the splats; None: all splats are in one class.
+        blocks: Gauss-Newton blocks of the splats; `None`: there is only one class.
         parameters: the chosen steps.
-        options: `max_classes`, and options that set the steps of an attribute for all splats.
+        options: `max_classes`, and options that set the step of an attribute for all splats.
 
     Returns:
-        The parameters with the steps of the finest class, and the classes; or the unchanged parameters, and None.
+        The parameters with the steps of the finest class, and the classes; or the unchanged parameters, and `None`.
     """
     count, free = max_class_count(len(model), options), _free_attributes(options)
     if blocks is None or count < 2:
@@ -84,10 +87,10 @@ def choose_classes(
     integers = np.array([CLASSED_ATTRIBUTES[name] for name in free], np.float64)
     errors = rounding_errors(model, blocks, parameters)[:, [list(CLASSED_ATTRIBUTES).index(name) for name in free]]
     if not np.isfinite(errors).all():
-        return parameters, None  # a scene so large or small that float64 does not hold its squares
+        return parameters, None  # squares of the scene's coordinates are out of the range of float64
     # One splat close to a camera must not determine the precision of all others.
     errors = np.minimum(errors, np.quantile(errors, _COMMON, axis=0))
-    # Levels at their maximum would be finer if they could, so their errors are more than what is acceptable.
+    # The errors of attributes at their maximum levels exceed the target and are not counted.
     at_most = {"opacities": parameters.opacity_levels >= _LEVELS_MAX, "quats": parameters.quat_levels >= _LEVELS_MAX}
     counts = np.array([not at_most.get(name, False) for name in free])
     allowed = errors[:, counts].mean(axis=0).sum() / max(1.0, integers[counts].sum())
@@ -112,10 +115,10 @@ def _free_attributes(options: EncodeOptions) -> list[str]:
 
 
 def _cluster_octaves(errors: F64, integers: F64, count: int) -> F64:
-    """Return octaves [K, A] by which the steps of each class differ from the chosen ones, the finest class first.
+    """Return the octaves [K, A] by which the steps of each class differ from the chosen ones, finest class first.
 
     Args:
-        errors: [N, A], by splat and attribute at the chosen steps; 1 is the error that an integer should add.
+        errors: [N, A], error of each splat and attribute at the chosen steps, relative to the target per integer.
         integers: [A], number of integers of an attribute.
         count: maximum of K.
     """
@@ -135,7 +138,7 @@ def _cluster_octaves(errors: F64, integers: F64, count: int) -> F64:
 
 
 def _octaves(errors: F64, places: U8, integers: F64) -> F64:
-    """Return the best steps of the classes in use: those at which an integer adds an error of 1 on average."""
+    """Return the octaves of each used class at which an integer adds an error of 1 on average."""
     counts = np.bincount(places)
     sums = np.stack([np.bincount(places, column) for column in errors.T], axis=1)
     means = sums[counts > 0] / counts[counts > 0, None]
@@ -144,13 +147,13 @@ def _octaves(errors: F64, places: U8, integers: F64) -> F64:
 
 
 def _assign_classes(errors: F64, integers: F64, octaves: F64) -> U8:
-    """Return the class of each splat, [N]: the one with the fewest bits, counting error as bits."""
-    grown, saved = 4.0**octaves / (2.0 * math.log(2.0)), (integers * octaves).sum(axis=1)
+    """Return the class of least cost for each splat, [N]; see the equation of this module."""
+    distortion, saved = 4.0**octaves / (2.0 * math.log(2.0)), (integers * octaves).sum(axis=1)
     index = np.zeros(len(errors), np.uint8)
     for at in range(0, len(errors), _BLOCK):
-        columns = np.ascontiguousarray(errors[at : at + _BLOCK].T)  # five long rows are added up far faster
+        columns = np.ascontiguousarray(errors[at : at + _BLOCK].T)  # adding a few long rows is much faster
         least = np.full(columns.shape[1], np.inf)
-        for number, factors in enumerate(grown):
+        for number, factors in enumerate(distortion):
             cost = sum(factor * column for factor, column in zip(factors, columns, strict=True)) - saved[number]
             index[at : at + _BLOCK][cost < least] = number
             least = np.minimum(cost, least)
@@ -189,7 +192,7 @@ def _as_steps(
 
 
 def _coarser_levels(levels: int, octaves: F64, one_byte: int) -> tuple[int, list[int]]:
-    """Return the levels of the finest class, limited to a byte, and multiples of their step for the others."""
+    """Return the levels of the finest class, limited to one byte, and the step multiple of each class."""
     most = one_byte if levels <= one_byte else max(levels, _LEVELS_MAX)
     finest = min(max(_LEVELS_MIN, round(levels * 2.0 ** -float(octaves.min()))), most)
     coarsest = max(1, finest // _LEVELS_MIN)

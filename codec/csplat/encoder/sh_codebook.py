@@ -1,7 +1,7 @@
-"""SH bands 1 to 3: each splat coded by itself, or by a codebook with escapes, whichever is smaller at equal error.
+"""Encode SH bands 1 to 3 with scalar coding or a codebook with escapes, whichever is smaller at equal distortion.
 
-(Spec 6.4.4, 6.4.5, 7.1.) A codebook is trained on the whole scene, or on its sample if the scene has more splats than
-a bucket; an `AssignmentRule` then gives the other splats their entries.
+(Spec 6.4.4, 6.4.5, 7.1.) A codebook is trained on the whole scene. For a scene with more splats than a bucket it is
+trained on a sample, and an `AssignmentRule` assigns the other splats.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from csplat.types import F32, F64, I16, I32, U32, Progress
 
 Rows = NDArray[np.intp]
 
-_CLIP = 511  # lattice steps; beyond it a coefficient is escaped, so that searches stay exact in float32
+_CLIP = 511  # lattice steps; splats with larger coefficients are escaped, so that assignments stay exact in float32
 _BLOCK = 1 << 14  # splats per block of temporaries
-_TRIAL_SPLATS = 1 << 14  # splats on which scalar coding is tried
-_CODEBOOK_SPLATS_MIN = 256  # splats; below, a codebook costs more than it saves
-_GROUPED_ENTRIES_MIN = 4096  # entries from which searching near groups saves more time than it loses error
-_FULL_SHARE_SPLATS = 1 << 15  # a smaller scene gets as many entries as one of this size, if each has enough users
+_TRIAL_SPLATS = 1 << 14  # maximum number of splats on which scalar coding is tried
+_CODEBOOK_SPLATS_MIN = 256  # splats; in smaller scenes a codebook costs more bytes than it saves
+_GROUPED_ENTRIES_MIN = 4096  # entries from which searching near groups is worth the additional distortion
+_FULL_SHARE_SPLATS = 1 << 15  # splats; smaller scenes get the number of entries of this size, within `_USERS_MIN`
 _USERS_MIN = 6  # splats per entry, below which an entry costs more bytes than it saves
 _ESCAPE_CANDIDATES = 4  # candidates for escape, as a multiple of the number of escapes
-_IMPORTANT = 0.95  # quantile of the weights above which a splat is quantised on the full lattice
+_IMPORTANT = 0.95  # quantile of the weights above which splats are quantised on the full lattice
 _COARSEST = 6  # log2 of the coarsest multiple of the SH step
-_SLACK = 1.0 + 2.0**-18  # covers the rounding of float32 differences in declared errors
+_SLACK = 1.0 + 2.0**-18  # factor that covers the rounding of float32 differences in declared errors
 _CODEBOOK_ID = 0
 
 
 @dataclass(frozen=True, eq=False)
 class ShCodebook:
-    """An SH codebook and its users.
+    """An SH codebook and the assignment of splats to it.
 
     Attributes:
         entries: [3, K, size] Y, Co, Cg integers on the file's lattice.
-        index: [N] int32, entry of each splat; `size` means "escaped".
+        index: [N] int32, entry of each splat; `size` for escaped splats.
     """
 
     entries: I32
@@ -57,43 +57,44 @@ class ShCodebook:
 
     @property
     def size(self) -> int:
-        """Entries of the codebook."""
+        """Number of entries."""
         return int(self.entries.shape[2])
 
     @property
-    def escaped(self) -> NDArray[np.intp]:
-        """Splats that bypass the codebook, ascending."""
+    def escaped(self) -> Rows:
+        """Indices of the escaped splats, ascending."""
         return np.flatnonzero(self.index == self.size)
 
     def select(self, order: NDArray[Any]) -> ShCodebook:
-        """Return the codebook with the users `order`."""
+        """Return the codebook with the assignment of the splats `order`."""
         return ShCodebook(self.entries, self.index[order])
 
     def dequantise(self, parameters: CodingParameters) -> F32:
-        """Return SH of all splats as decoded, [N, K, 3]; rows of escaped splats have no meaning."""
+        """Return SH of all splats as decoded, [N, K, 3]; rows of escaped splats are undefined."""
         rgb = np.ascontiguousarray(colour_lifted(self.entries, parameters.chroma_shift).transpose(2, 1, 0))
         return np.take(lattice_values(rgb, parameters.sh_step), self.index, axis=0, mode="clip")
 
 
 @dataclass(frozen=True)
 class ShCodingPlan:
-    """SH coding of the whole file, as its tiles need it.
+    """The SH coding of a file, as its tiles need it.
 
     Attributes:
-        weights: [N] importance, or None if all splats are treated alike.
+        weights: [N], importance; `None`: all splats have the same.
         reference: weight above which a splat is quantised on the full lattice.
         book: the codebook, if there is one.
-        ids: codebook ids.
-        layers: layers that use them.
         extras: names of the extra columns to write.
     """
 
     weights: F32 | None = None
     reference: float = 1.0
     book: ShCodebook | None = None
-    ids: Sequence[int] = ()
-    layers: Sequence[int] = ()
     extras: Sequence[str] = ()
+
+    @property
+    def codebook_ids(self) -> tuple[int, ...]:
+        """Ids of the codebooks that a tile refers to."""
+        return () if self.book is None else (_CODEBOOK_ID,)
 
     def select(self, order: NDArray[Any]) -> ShCodingPlan:
         """Return the plan of the splats `order`."""
@@ -103,7 +104,7 @@ class ShCodingPlan:
 
 @dataclass(frozen=True, eq=False)
 class AssignmentRule:
-    """The rule that assigns splats that took no part in training.
+    """A trained codebook with the rule that assigns splats outside the training set.
 
     Attributes:
         entries: [size, 3K] int32, R, G, B of each coefficient.
@@ -118,7 +119,7 @@ class AssignmentRule:
 
 @dataclass(frozen=True)
 class FileCodebooks:
-    """SH plan, index records and chunks of the codebooks, and the rule for splats not yet assigned."""
+    """SH plan, codebooks with index records and chunks, and the rule for splats outside the training set."""
 
     sh_plan: ShCodingPlan
     records: Sequence[IndexedCodebook] = ()
@@ -128,48 +129,35 @@ class FileCodebooks:
 
 @dataclass(frozen=True)
 class EncodedSh:
-    """SH of a tile.
+    """The encoded SH of a tile.
 
     Attributes:
         blocks: block of each layer; a band of zeros has none.
         errors: largest error and sum of squares by measure.
         exponent: the tile's lattice is coarser by 2**exponent.
-        codebook_ids: ids of the codebooks used.
     """
 
     blocks: Mapping[int, bytes]
     errors: Mapping[str, tuple[float, float]]
     exponent: int
-    codebook_ids: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True)
-class _TrainedCodebook:
-    """A codebook, before its entries are written as Y, Co, Cg.
-
-    Attributes:
-        index: [N] int32; the codebook's size means "escaped".
-        entries: [size, 3K] int32, R, G, B of each coefficient.
-        error: weighted mean of the remaining squared error.
-        rule: rule for splats not trained on.
-    """
-
-    index: I32
-    entries: I32
-    error: float
-    rule: AssignmentRule
 
 
 @dataclass(frozen=True, eq=False)
 class _ErrorWeights:
-    """Weights of squared errors: by splat and, if there is a metric, by pair of coefficients."""
+    """Weights of squared errors per splat or, with a metric, per splat and pair of coefficients.
+
+    Attributes:
+        weights: [N].
+        metric: Gauss-Newton matrices of the coefficients, if known.
+        measured: the weights are measured, not guessed from opacity and size.
+    """
 
     weights: F32
     metric: ErrorMetric | None
     measured: bool
 
     def errors(self, difference: F32, rows: Rows | slice) -> F64:
-        """Return weighted squared errors [n] of differences [n, 3K]."""
+        """Return the weighted squared errors [n] of differences [n, 3K]."""
         if self.metric is not None:
             return self.metric.errors(difference.reshape(len(difference), -1, 3), rows)
         squares = np.einsum("ij,ij->i", difference, difference, dtype=np.float64)
@@ -187,14 +175,14 @@ def choose_sh_coding(
     trial: Rows,
     progress: Progress,
 ) -> tuple[CodingParameters, FileCodebooks]:
-    """Choose how SH is coded, and train the codebook if there is one.
+    """Choose the SH coding, and train the codebook if there is one.
 
     Args:
         model: the scene.
         parameters: `sh_coding` is "auto", "codebook", "scalar" or "none".
         options: `codebook_size`, `escape_fraction`, `keep_extra`, `seed`.
-        weights: [N] float32, importance of the splats; None if no choice depends on it.
-        metric: Gauss-Newton blocks of the coefficients; None: their errors add up, weighted by splat.
+        weights: [N] float32, importance of the splats; `None` if no choice depends on it.
+        metric: Gauss-Newton matrices of the coefficients; `None`: the identity, times the weights.
         measured: the weights are measured, not guessed from opacity and size.
         trial: rows of about a tile, on which scalar coding is tried.
         progress: called with the stage and the fraction done.
@@ -211,17 +199,18 @@ def choose_sh_coding(
     if is_open and (len(model) < _CODEBOOK_SPLATS_MIN or not _escapes_fit(largest_sh(model.shN[:, :kept]), fine)):
         return scalar
     error_weights = _ErrorWeights(weights, None if metric is None else metric.first(kept), measured)
-    trained = _train(model, error_weights, fine, options, progress)
-    rgb = trained.entries.reshape(len(trained.entries), -1, 3).transpose(2, 1, 0).astype(np.float32)
-    columns = colour_integers(np.ascontiguousarray(rgb), fine.chroma_shift)
-    codebooks = replace(make_codebooks(sh_plan, ShCodebook(columns, trained.index), fine), rule=trained.rule)
-    if is_open and not _codebook_pays(model, error_weights, trained, codebooks, trial[:_TRIAL_SPLATS], parameters):
+    rule, index, distortion = _train(model, error_weights, fine, options, progress)
+    rgb = rule.entries.reshape(len(rule.entries), -1, 3).transpose(2, 1, 0).astype(np.float32)
+    book = ShCodebook(colour_integers(np.ascontiguousarray(rgb), fine.chroma_shift), index)
+    codebooks = replace(make_codebooks(sh_plan, book, fine), rule=rule)
+    rate = _codebook_rate(codebooks, book)
+    if is_open and not _codebook_pays(model, error_weights, book, rate, distortion, trial[:_TRIAL_SPLATS], parameters):
         return scalar
     return fine, codebooks
 
 
 def final_parameters(parameters: CodingParameters, largest: float) -> CodingParameters:
-    """Rule out a codebook if the scene's largest SH coefficient is beyond what an escape can hold."""
+    """Choose scalar coding if an escape cannot represent the scene's largest SH coefficient."""
     fine = replace(parameters, sh_step=parameters.codebook_step)
     if parameters.sh_coding == "auto" and not _escapes_fit(largest, fine):
         return replace(parameters, sh_coding="scalar")
@@ -229,20 +218,20 @@ def final_parameters(parameters: CodingParameters, largest: float) -> CodingPara
 
 
 def largest_sh(shN: F32) -> float:
-    """Return the magnitude of the largest coefficient."""
+    """Return the largest magnitude of a coefficient."""
     return float(max(shN.max(initial=0.0), -shN.min(initial=0.0)))
 
 
 def assign_splats(
     codebooks: FileCodebooks, model: SplatModel, parameters: CodingParameters, threads: int
 ) -> ShCodingPlan:
-    """Assign splats that took no part in training.
+    """Assign splats outside the training set.
 
     Args:
         codebooks: trained on a sample of the scene.
-        model: at most a bucket of the scene; the result may depend on which splats are searched together.
+        model: a bucket of the scene; the result may depend on which splats are assigned together.
         parameters: the final parameters.
-        threads: threads of the search; no effect on the result.
+        threads: number of threads; no effect on the result.
     """
     sh_plan, rule = codebooks.sh_plan, codebooks.rule
     weights = None if sh_plan.weights is None else splat_weights(model, None)
@@ -256,21 +245,22 @@ def assign_splats(
 
 
 def make_codebooks(sh_plan: ShCodingPlan, book: ShCodebook, parameters: CodingParameters) -> FileCodebooks:
-    """Make the plan, the index record and the chunks of a codebook."""
-    bands = range(1, parameters.sh_degree + 1)
+    """Return a codebook with its index record and chunks."""
     chunks = []
-    for band in bands:
+    for band in range(1, parameters.sh_degree + 1):
         head = _spec.pack_codebook_head(_spec.CodebookHead(_CODEBOOK_ID, band, 0))
         columns = np.ascontiguousarray(book.entries[:, band_slice(band)]).reshape(-1)
         stream = signed_stream(columns, parameters.deflate)
         chunks.append(FileChunk(_spec.CHUNK_CODEBOOK, head + stream, _CODEBOOK_ID, band))
     record = IndexedCodebook(_CODEBOOK_ID, _spec.CODEBOOK_KIND_SH, (1, parameters.sh_degree), book.size)
-    sh_plan = replace(sh_plan, book=book, ids=(_CODEBOOK_ID,), layers=tuple(bands))
-    return FileCodebooks(sh_plan, (record,), tuple(chunks))
+    return FileCodebooks(replace(sh_plan, book=book), (record,), tuple(chunks))
 
 
 def sh_coarseness(rows: Rows, parameters: CodingParameters, sh_plan: ShCodingPlan) -> I32 | None:
-    """Return the power of two by which the SH of each splat is coarser than the lattice, or None for 0."""
+    """Return the exponent e of the multiples 2**e of the SH step that each splat is rounded to, [n]; `None` for 0.
+
+    With adaptivity a and reference weight w₀, e = a/2 · log₂(w₀ / w): for a = 1, w · (2**e)² is constant.
+    """
     if sh_plan.weights is None or parameters.adaptive == 0.0:
         return None
     with np.errstate(divide="ignore"):
@@ -282,10 +272,10 @@ def encode_sh(shN: F32, rows: Rows, parameters: CodingParameters, sh_plan: ShCod
     """Encode the bands 1 to `parameters.sh_degree` of a tile.
 
     Args:
-        shN: [N, K, 3], of the whole model, whose degree may be higher.
+        shN: [N, K, 3], all splats of the model, whose degree may be higher.
         rows: [n], the tile's splats in decoding order.
         parameters: steps and codings.
-        sh_plan: SH coding of the whole file.
+        sh_plan: SH coding of the file.
     """
     source = np.take(shN, rows, axis=0)
     kept = parameters.sh_coefficients
@@ -294,17 +284,17 @@ def encode_sh(shN: F32, rows: Rows, parameters: CodingParameters, sh_plan: ShCod
     layers: dict[int, bytes] = {}
     exponent = 0
     if sh_plan.book is not None:
-        layers = _encode_by_codebook(source[:, :kept], sh_plan.book.select(rows), parameters, sh_plan.ids[0], sums)
+        layers = _encode_by_codebook(source[:, :kept], sh_plan.book.select(rows), parameters, sums)
     elif kept:
         coarse = sh_coarseness(rows, parameters, sh_plan)
         columns, exponent, decoded = quantise_sh(source[:, :kept], parameters, coarse)
         sums.add(source[:, :kept], decoded, 0)
         layers = dict(_scalar_blocks(columns, exponent, parameters))
-    return EncodedSh(layers, sums.by_band(), exponent, tuple(sh_plan.ids))
+    return EncodedSh(layers, sums.by_band(), exponent)
 
 
 def _scalar_blocks(columns: NDArray[Any], exponent: int, parameters: CodingParameters) -> Iterator[tuple[int, bytes]]:
-    """Yield layer and block of each band that is not all zero, of columns [3, K, n]."""
+    """Yield layer and block of each band of columns [3, K, n] that is not all zero."""
     for band in range(1, parameters.sh_degree + 1):
         part = columns[:, band_slice(band)]
         if part.any():
@@ -314,14 +304,14 @@ def _scalar_blocks(columns: NDArray[Any], exponent: int, parameters: CodingParam
 
 
 def _encode_by_codebook(
-    source: F32, book: ShCodebook, parameters: CodingParameters, id_: int, sums: _BandSums
+    source: F32, book: ShCodebook, parameters: CodingParameters, sums: _BandSums
 ) -> dict[int, bytes]:
-    """Return blocks with the indices in band 1, and the escaped splats' own values in every band."""
+    """Return the block of each band: indices in band 1, and the integers of the escaped splats in every band."""
     decoded, escaped = book.dequantise(parameters), book.escaped
     coarse = np.full(len(escaped), parameters.escape_coarse, np.int32)
     columns, exponent, own = quantise_sh(source[escaped], parameters, coarse)
     if exponent:
-        raise InputError("SH coefficients too large to be escapes of a codebook: use scalar SH coding")
+        raise InputError("SH coefficients are too large for escapes of a codebook: use scalar SH coding")
     decoded[escaped] = own
     sums.add(source, decoded, 0)
     layers = {}
@@ -332,19 +322,19 @@ def _encode_by_codebook(
             flat = columns[:, band_slice(band)].reshape(-1, len(escaped))
             escape = entropy.signed_block(attribute, flat, 0, parameters.deflate)
         index = book.index if band == 1 else None
-        layers[band] = entropy.codebook_block(attribute, id_, index, len(escaped), escape, parameters.deflate)
+        layers[band] = entropy.codebook_block(attribute, _CODEBOOK_ID, index, len(escaped), escape, parameters.deflate)
     return layers
 
 
 class _BandSums:
-    """Largest error and sum of squares of a tile, by coefficient."""
+    """Largest error and sum of squares of each coefficient of a tile."""
 
     def __init__(self, coefficients: int) -> None:
         self._largest = np.zeros(coefficients)
         self._squares = np.zeros(coefficients)
 
     def add(self, source: F32, decoded: F32 | np.float32, first: int) -> None:
-        """Add [n, k, 3] values of the coefficients `first` to `first` + k - 1."""
+        """Add values [n, k, 3] of the coefficients `first` to `first` + k - 1."""
         difference = source - decoded
         if not difference.size:
             return
@@ -356,7 +346,7 @@ class _BandSums:
         np.maximum(self._largest[span], flat.max(axis=0).reshape(-1, 3).max(axis=1), out=self._largest[span])
 
     def by_band(self) -> dict[str, tuple[float, float]]:
-        """Return (largest, sum of squares) by measure, with a margin for the rounding of float32 differences."""
+        """Return (largest, sum of squares) by measure, enlarged by `_SLACK`."""
         result = {}
         for band in range(1, round((len(self._largest) + 1) ** 0.5)):
             largest = float(self._largest[band_slice(band)].max()) * _SLACK
@@ -366,7 +356,7 @@ class _BandSums:
 
 
 def _reference_weight(weights: F32 | None) -> float:
-    """Return the 95th percentile of the weights, of the positive ones if most are 0."""
+    """Return the 95th percentile of the weights or, if that is 0, of the positive weights."""
     if weights is None or not len(weights):
         return 1.0
     if (reference := float(np.quantile(weights, _IMPORTANT))) > 0.0:
@@ -376,7 +366,7 @@ def _reference_weight(weights: F32 | None) -> float:
 
 
 def _escapes_fit(largest: float, parameters: CodingParameters) -> bool:
-    """Return True if every splat could be an escape: its lattice is the file's, which no tile makes coarser."""
+    """Return True if every splat can be escaped; escapes are on the file's lattice, which tiles cannot coarsen."""
     return 2.0 * largest < largest_exact(parameters.sh_step)
 
 
@@ -386,7 +376,8 @@ def _train(
     parameters: CodingParameters,
     options: EncodeOptions,
     progress: Progress,
-) -> _TrainedCodebook:
+) -> tuple[AssignmentRule, I32, float]:
+    """Train a codebook; return it with the entry of each splat [N] and the weighted mean squared error."""
     weights, threads = error_weights.weights, options.thread_count
     points = _lattice_points(model.shN, parameters)
     size = _codebook_size(len(model), parameters, options)
@@ -407,13 +398,13 @@ def _train(
     index[escaped] = len(entries)
     total = float(weights.sum(dtype=np.float64)) or 1.0
     rule = AssignmentRule(entries, effort.get("near_groups", 0), threshold)
-    return _TrainedCodebook(index, entries, float(errors.sum()) / total, rule)
+    return rule, index, float(errors.sum()) / total
 
 
 def _refine(
     shN: F32, points: I16, metric: ErrorMetric, found: tuple[I32, U32], parameters: CodingParameters, threads: int
 ) -> tuple[I32, U32]:
-    """Improve a codebook under the metric."""
+    """Refine a codebook and its assignment under the metric."""
     entries, index = found
     count = points.shape[1] // 3
     targets = np.clip(shN[:, :count] * np.float32(1.0 / parameters.sh_step), -_CLIP, _CLIP)
@@ -423,7 +414,7 @@ def _refine(
 
 
 def _lattice_points(shN: F32, parameters: CodingParameters) -> I16:
-    """Return [N, 3K] R, G, B integers of the bands that are kept, clipped to what searches are exact for."""
+    """Return R, G, B integers [N, 3K] of the kept bands, clipped to `_CLIP`."""
     kept = parameters.sh_coefficients
     points = np.empty((len(shN), 3 * kept), np.int16)
     for at in range(0, len(shN), _BLOCK):
@@ -434,7 +425,7 @@ def _lattice_points(shN: F32, parameters: CodingParameters) -> I16:
 
 
 def _codebook_size(count: int, parameters: CodingParameters, options: EncodeOptions) -> int:
-    """Return the number of entries: an entry costs about 20 bytes, and saves error for its users."""
+    """Return the number of entries; an entry costs about 20 bytes and reduces the distortion of its users."""
     if options.codebook_size is not None:
         return options.codebook_size
     share = parameters.codebook_share
@@ -443,7 +434,7 @@ def _codebook_size(count: int, parameters: CodingParameters, options: EncodeOpti
 
 
 def _errors(shN: F32, index: I32, entries: I32, parameters: CodingParameters, error_weights: _ErrorWeights) -> F64:
-    """Return the weighted squared error of each splat, [N]; infinite if a coefficient was clipped."""
+    """Return the weighted squared error of each splat, [N], infinite if a coefficient was clipped."""
     kept = parameters.sh_coefficients
     table = entries.astype(np.float32) * np.float32(parameters.sh_step)
     errors = np.empty(len(shN))
@@ -460,10 +451,10 @@ def _errors(shN: F32, index: I32, entries: I32, parameters: CodingParameters, er
 def _choose_escapes(
     shN: F32, errors: F64, parameters: CodingParameters, options: EncodeOptions, error_weights: _ErrorWeights
 ) -> Rows:
-    """Return the splats to escape: those with the largest weighted error, and all that were clipped.
+    """Return the splats to escape: those with the largest weighted errors, including all that were clipped.
 
-    If weights were measured, those that gain most, and none that gains nothing: the splat with the largest weight may
-    lie near its entry, and escapes are coarser than entries.
+    If weights are measured, rank by the reduction of the error instead, and escape no splat that gains nothing: an
+    important splat may be near its entry, and the lattice of escapes is coarser.
     """
     fraction = parameters.escape_fraction if options.escape_fraction is None else options.escape_fraction
     clipped = int(np.count_nonzero(~np.isfinite(errors)))
@@ -480,37 +471,42 @@ def _choose_escapes(
     return np.sort(candidates[np.argsort(-gain, kind="stable")[:count]])
 
 
+def _codebook_rate(codebooks: FileCodebooks, book: ShCodebook) -> float:
+    """Estimate the bytes per splat of the entries and, by their entropy, of the indices."""
+    entries = sum(len(chunk.payload) for chunk in codebooks.chunks) / len(book.index)
+    shares = np.bincount(book.index) / len(book.index)
+    return entries - float((shares * np.log2(np.maximum(shares, 1e-12))).sum()) / 8
+
+
 def _codebook_pays(
     model: SplatModel,
     error_weights: _ErrorWeights,
-    trained: _TrainedCodebook,
-    codebooks: FileCodebooks,
+    book: ShCodebook,
+    rate: float,
+    distortion: float,
     trial: Rows,
     parameters: CodingParameters,
 ) -> bool:
-    """Return True if the codebook has fewer bytes than scalar coding at equal error.
+    """Return True if the codebook has a lower rate than scalar coding at equal distortion.
 
-    Scalar coding is tried on a few splats at two steps, between which its bytes are linear in the error's logarithm.
+    Scalar coding is tried on a few splats at two steps, between which its rate R is linear in the logarithm of the
+    distortion D. The codebook has the distortion D_book; scalar coding would save s · log2(D_book / D) with
+    s = -ΔR / Δlog2 D, which is added to the rate of the codebook.
     """
-    count = len(model)
-    spent = sum(len(chunk.payload) for chunk in codebooks.chunks) / count
-    shares = np.bincount(trained.index) / count
-    spent -= float((shares * np.log2(np.maximum(shares, 1e-12))).sum()) / 8
-    fine_bytes, fine_error = _try_scalar(model, error_weights, trial, parameters)
+    fine_rate, fine_distortion = _try_scalar(model, error_weights, trial, parameters)
     coarser = replace(parameters, sh_step=2 * parameters.sh_step)
-    coarse_bytes, coarse_error = _try_scalar(model, error_weights, trial, coarser)
-    escaped = float((trained.index == len(trained.entries)).mean())
-    spent += escaped * fine_bytes
-    if not 0.0 < fine_error < coarse_error:
-        return spent < fine_bytes
-    per_halving = (fine_bytes - coarse_bytes) / math.log2(coarse_error / fine_error)
-    return spent + per_halving * math.log2(max(trained.error, 1e-30) / fine_error) < fine_bytes
+    coarse_rate, coarse_distortion = _try_scalar(model, error_weights, trial, coarser)
+    rate += float((book.index == book.size).mean()) * fine_rate  # escapes
+    if not 0.0 < fine_distortion < coarse_distortion:
+        return rate < fine_rate
+    slope = (fine_rate - coarse_rate) / math.log2(coarse_distortion / fine_distortion)
+    return rate + slope * math.log2(max(distortion, 1e-30) / fine_distortion) < fine_rate
 
 
 def _try_scalar(
     model: SplatModel, error_weights: _ErrorWeights, trial: Rows, parameters: CodingParameters
 ) -> tuple[float, float]:
-    """Return bytes per splat and weighted mean squared error of scalar coding."""
+    """Return rate (bytes per splat) and distortion (weighted mean squared error) of scalar coding."""
     source = np.take(model.shN, trial, axis=0)[:, : parameters.sh_coefficients]
     columns, _, decoded = quantise_sh(source, parameters, None)
     size = sum(len(block) for _, block in _scalar_blocks(columns, 0, parameters))

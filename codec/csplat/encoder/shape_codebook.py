@@ -1,8 +1,8 @@
-"""Shapes: scales and rotations, coded by themselves or by a codebook if that makes the file smaller (spec 6.4.5).
+"""Encode shapes (scales and rotations), with a codebook if that makes the file smaller (spec 6.4.5).
 
 The covariance divided by its trace is clustered, as in Niedermayr, Stumpfegger and Westermann ("Compressed 3D Gaussian
-Splatting for Accelerated Novel View Synthesis", CVPR 2024); each splat keeps its trace. Means of matrices of trace 1
-have trace 1, so they need no normalisation. `_worth_assigning` weighs bytes against error to find the escapes.
+Splatting for Accelerated Novel View Synthesis", CVPR 2024); each splat keeps its trace. The centroid of matrices of
+trace 1 has trace 1 and needs no normalisation. `_worth_assigning` chooses the escapes by rate and distortion.
 """
 
 from __future__ import annotations
@@ -39,33 +39,34 @@ from csplat.types import F32, F64, I16, I32, I64, Mask, Progress
 Integers = NDArray[Any]
 Floats = NDArray[Any]
 
-#: Id of the codebook, above those of SH.
+#: Codebook id, above that of SH.
 SHAPE_CODEBOOK_ID = _spec.SH_DEGREE_MAX + 1
 
-_TRACE_STEPS = 2048  # lattice steps of a trace: searches are exact up to norms of about 2,300
+_TRACE_STEPS = 2048  # lattice steps per trace; assignments are exact up to norms of about 2,300
 _USERS_MIN = 6  # splats per entry, below which an entry costs more bytes than it saves
-_ROUNDS = 2  # clusterings; escapes of one round have no weight in the next
-_METRIC_ROUNDS = 2  # assignments under the metric, each followed by a move of the entries
+_ROUNDS = 2  # trainings; the escapes of one have no weight in the next
+_METRIC_ROUNDS = 2  # iterations under the metric
 _CANDIDATES = 64  # entries tried for a splat under the metric
-_SUMMAND_MAX = 0.7  # log scale; beyond it, the metric is not linear
-_LOG_SIZE_MAX = 30.0  # log sizes are clipped to this, where the error is already enormous
-_ESCAPES = 0.05  # fraction of the splats, if the cost of errors is unknown
-_OFF_DIAGONAL_ROOTS = np.sqrt([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # an entry off the diagonal occurs twice
-_DIMENSIONS = 6  # dimensions of a shape: a bit per splat divides its squared error by 2**(2/6)
-_STEPS_MAX = 2.0**20  # log scale, in steps, above which a tile's lattice may be coarser than the file's
-_TABLE_ID = 2  # bytes of the table id in a tile's record
+_SUMMAND_MAX = 0.7  # log scale, beyond which the metric is not linear
+_LOG_SIZE_MAX = 30.0  # log scale to which size errors are clipped, to stay within float64
+_ESCAPES = 0.05  # fraction of the splats to escape if the importance has no metric
+_OFF_DIAGONAL_ROOTS = np.sqrt([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # each entry off the diagonal occurs twice
+_DIMENSIONS = 6  # dimensions of a shape: one more bit per splat divides the squared error by 2**(2/6)
+_STEPS_MAX = 2.0**20  # steps of the log scales, above which a tile's lattice may be coarser than the file's
+_CODEBOOK_ID_SIZE = 2  # bytes of a codebook id in a tile's record
 _OVERHEAD = 128  # bytes of records, heads and checksums of a codebook
-_FLATTEST = 1e-30  # fraction of the trace: rounding may leave an eigenvalue at 0 or below
+_FLATTEST = 1e-30  # smallest variance as a fraction of the trace; rounding may leave an eigenvalue at 0 or below
+_THINNEST = 20.0  # log scales by which an axis of an entry is at most smaller than the largest
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeCodebook:
-    """A shape codebook and its users.
+    """A shape codebook and the assignment of splats to it.
 
     Attributes:
-        entries: [6, K] int32, log scales up to a summand, x, y, z of the rotation, on the file's lattices.
-        index: [N] int32, entry of each splat; K means "escaped"; in a tile that is smaller without a codebook, all are.
-        summand: [N] int32, in steps of the scales' lattice; 0 for escaped splats.
+        entries: [6, K] int32, log scales relative to the largest and x, y, z of the rotation, on the file's lattices.
+        index: [N] int32, entry of each splat; K for escaped splats.
+        summand: [N] int32, added to the log scales of a splat's entry, in steps; 0 for escaped splats.
     """
 
     entries: I32
@@ -74,16 +75,16 @@ class ShapeCodebook:
 
     @property
     def size(self) -> int:
-        """Entries of the codebook."""
+        """Number of entries."""
         return int(self.entries.shape[1])
 
     @property
     def escaped(self) -> Mask:
-        """True for splats that bypass the codebook, [N]."""
+        """True for escaped splats, [N]."""
         return np.asarray(self.index == self.size, np.bool_)
 
     def part(self, rows: NDArray[np.intp]) -> ShapePart | None:
-        """Return the entries of some splats; None if all are escaped."""
+        """Return the assignment of some splats; `None` if all are escaped."""
         index, summand = self.index[rows], self.summand[rows]
         assigned = np.asarray(index < self.size, np.bool_)
         if not assigned.any():
@@ -92,21 +93,21 @@ class ShapeCodebook:
         return ShapePart(index, self.size, assigned, entries[:3] + summand[assigned], entries[3:], summand)
 
     def select(self, order: NDArray[Any]) -> ShapeCodebook:
-        """Return the codebook with the users `order`."""
+        """Return the codebook with the assignment of the splats `order`."""
         return ShapeCodebook(self.entries, self.index[order], self.summand[order])
 
 
 @dataclass(frozen=True, eq=False)
 class ShapePart:
-    """Codebook entries of the splats of a tile.
+    """The assignment of a tile's splats to a shape codebook.
 
     Attributes:
-        index: [n] int32, entry of each splat; `size` means "escaped".
-        size: entries of the codebook.
+        index: [n] int32, entry of each splat; `size` for escaped splats.
+        size: number of entries.
         assigned: [n] bool, True for splats that are not escaped.
-        scales: [3, assigned] int32, log scales on the file's lattice.
-        quats: [3, assigned] int32, x, y, z of the rotation.
-        summand: [n] int32, difference of log scales to the entry's; 0 for escaped splats.
+        scales: [3, assigned] int32, log scales of the assigned splats.
+        quats: [3, assigned] int32, x, y, z of their rotations.
+        summand: [n] int32; see `ShapeCodebook`.
     """
 
     index: I32
@@ -119,7 +120,7 @@ class ShapePart:
 
 @dataclass(frozen=True)
 class QuantisedShape:
-    """Scales and rotations of a tile in columns: integers, the scales' exponent, and decoded values."""
+    """Scales and rotations of a tile in columns: integers, the exponent of the scales, and decoded values."""
 
     scales: Integers
     exponent: int
@@ -141,15 +142,15 @@ def choose_shapes(
 
     Args:
         model: the scene.
-        weights: [N], of the squared error of a covariance divided by its trace; only ratios matter.
-        metric: metric of xx, yy, zz, √2 xy, √2 xz, √2 yz; None: their errors add up.
-        tiles: the scene's tiles.
+        weights: [N], weights of the squared errors of covariances divided by their trace; only ratios matter.
+        metric: metric of xx, yy, zz, √2 xy, √2 xz, √2 yz; `None`: the identity, times the weights.
+        tiles: tiles of the scene.
         parameters: steps and codings.
         options: `shape_codebook_size`, `shape_escape_fraction`, `seed`.
         progress: called with the stage and the fraction done.
 
     Returns:
-        The codebook, or None if the file is not smaller with one.
+        The codebook, or `None` if it would not make the file smaller.
     """
     size = min(options.shape_codebook_size or 0, len(model) // _USERS_MIN)
     if size < 1:
@@ -190,8 +191,8 @@ def quantise_shape(
     Args:
         quats: [n, 4], w x y z.
         scales: [n, 3], log standard deviations.
-        parameters: steps; and whether shapes are in canonical axis order already.
-        part: codebook entries, whose integers assigned splats take.
+        parameters: steps; `canonical` if shapes are in canonical axis order already.
+        part: codebook assignment; assigned splats take the integers of their entries.
         factors: step factors of the tile; not together with a codebook.
     """
     rotation, sorted_scales = _canonical(quats, scales, parameters)
@@ -223,13 +224,13 @@ def dequantised_shapes(
 def shape_blocks(
     scales: Integers, exponent: int, quats: Integers, part: ShapePart | None, deflate: DeflateSettings
 ) -> list[bytes]:
-    """Return the blocks of scales and quats [3, n] of a tile, by codebook if there is a part."""
+    """Return the blocks of a tile's scales and quats [3, n], with a codebook if `part` is given."""
     if part is None:
         return [
             entropy.offset_block(_spec.ATTRIBUTE_SCALES, scales, exponent, deflate),
             entropy.signed_block(_spec.ATTRIBUTE_QUATS, quats, 0, deflate),
         ]
-    assert exponent == 0, "a codebook lies on the file's lattice"
+    assert exponent == 0, "codebooks are on the file's lattice"
     escaped = ~part.assigned
     count = int(np.count_nonzero(escaped))
     own_scales = own_quats = b""
@@ -245,7 +246,7 @@ def shape_blocks(
 
 
 def shape_codebook_chunk(codebook: ShapeCodebook, deflate: DeflateSettings) -> tuple[IndexedCodebook, FileChunk]:
-    """Return index record and chunk of the codebook."""
+    """Return the index record and the chunk of a codebook."""
     head = _spec.pack_codebook_head(_spec.CodebookHead(SHAPE_CODEBOOK_ID, 0, 0))
     stream = signed_stream(np.ascontiguousarray(codebook.entries).reshape(-1), deflate)
     record = IndexedCodebook(SHAPE_CODEBOOK_ID, _spec.CODEBOOK_KIND_SHAPE, (0, 0), codebook.size)
@@ -253,7 +254,7 @@ def shape_codebook_chunk(codebook: ShapeCodebook, deflate: DeflateSettings) -> t
 
 
 def unit_covariances(quats: Floats, scales: Floats) -> tuple[F64, F64]:
-    """Return covariances divided by their trace, and half the logarithm of the trace.
+    """Return covariances divided by their trace, Σ / tr Σ, and log sizes, ½ ln tr Σ.
 
     Args:
         quats: [4, n], w x y z.
@@ -270,11 +271,14 @@ def unit_covariances(quats: Floats, scales: Floats) -> tuple[F64, F64]:
 
 
 def mean_axes(covariances: F64) -> tuple[F32, F32]:
-    """Return rotations [n, 4] and log standard deviations [n, 3] of covariances [6, n], in any axis order."""
+    """Return rotations [n, 4] and log standard deviations [n, 3] of covariances [6, n], in any axis order.
+
+    Σ = R diag(σ²) Rᵀ: columns of R are eigenvectors, σ² eigenvalues.
+    """
     xx, yy, zz, xy, xz, yz = covariances
     matrices = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
     values, axes = np.linalg.eigh(matrices)
-    axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # a rotation, no reflection
+    axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # turns a reflection into a rotation
     scales = 0.5 * np.log(np.maximum(values, _FLATTEST))
     return _quaternions(axes).astype(np.float32), scales.astype(np.float32)
 
@@ -285,25 +289,25 @@ def _canonical(quats: F32, scales: F32, parameters: CodingParameters) -> tuple[F
 
 @dataclass(frozen=True, eq=False)
 class _ShapeInput:
-    """Shapes to cluster, and what they cost without a codebook.
+    """Shapes to cluster, with their rate and distortion without a codebook.
 
     Attributes:
         covariances: [6, N], divided by their trace.
-        sizes: [N], half the logarithm of the trace.
-        weights: [N], of squared errors.
-        metric: metric of the entries, if known.
-        plain: [N], weighted squared error without a codebook.
-        fits: [N] bool, True if the file's lattice holds the scales; tiles with outliers have a coarser one.
-        bits: entropy of the integers of a shape without a codebook.
+        sizes: [N], log sizes.
+        weights: [N], weights of squared errors.
+        metric: metric of the covariances, if known.
+        plain_errors: [N], weighted squared errors without a codebook.
+        fits: [N] bool, True if the scales fit the file's lattice; tiles with outliers have coarser lattices.
+        plain_bits: bits per shape without a codebook: the entropy of the integers.
     """
 
     covariances: F64
     sizes: F64
     weights: F64
     metric: ErrorMetric | None
-    plain: F64
+    plain_errors: F64
     fits: Mask
-    bits: float
+    plain_bits: float
 
 
 def _shape_input(
@@ -320,76 +324,83 @@ def _shape_input(
     return _ShapeInput(covariances, sizes, weights.astype(np.float64), metric, plain, fits, bits)
 
 
-def _covariance_errors(target: F64, found: F64, larger: F64, weights: NDArray[Any], metric: ErrorMetric | None) -> F64:
-    """Return the weighted squared error, [N], of covariances `found` · e^(2 · larger), [6, N]."""
-    difference = _vectors(found * np.exp(2.0 * np.clip(larger, -_LOG_SIZE_MAX, _LOG_SIZE_MAX)) - target)
+def _covariance_errors(target: F64, found: F64, growth: F64, weights: NDArray[Any], metric: ErrorMetric | None) -> F64:
+    """Return the weighted squared errors [N] of `found` · e^(2 · growth) against `target`, both [6, N]."""
+    difference = _vectors(found * np.exp(2.0 * np.clip(growth, -_LOG_SIZE_MAX, _LOG_SIZE_MAX)) - target)
     if metric is not None:
         return metric.errors(difference[:, :, None], slice(None))
     return np.asarray(np.einsum("ni,ni->n", difference, difference) * weights)
 
 
 def _vectors(covariances: F64) -> F64:
-    """Return vectors [N, 6] whose distances are those of the matrices."""
+    """Return vectors [N, 6] whose Euclidean distances are the Frobenius distances of the matrices."""
     return np.ascontiguousarray((covariances * _OFF_DIAGONAL_ROOTS[:, None]).T)
 
 
 def _points(covariances: F64) -> I16:
-    """Return `_vectors` on a lattice."""
+    """Return `_vectors` rounded to the lattice of k-means."""
     return np.rint(_vectors(covariances) * _TRACE_STEPS).astype(np.int16)
 
 
 def _cluster(
     shapes: _ShapeInput, weights: F64, size: int, parameters: CodingParameters, seed: int, threads: int
 ) -> tuple[I32, I64]:
-    """Train entries [6, K] on the file's lattices, and return the entry of each splat, [N]."""
+    """Train entries [6, K] on the file's lattices, and return them with the entry of each splat, [N]."""
     points = _points(shapes.covariances)
     _, start = cluster(points, weights.astype(np.float32), size, seed=seed, threads=threads)
-    entries, decoded = _move_to_means(shapes, weights, start.astype(np.int64), parameters)
-    index = search_nearest(points, _points(decoded).astype(np.int32), 0, threads)[0].astype(np.int64)
-    if shapes.metric is None:
-        return entries, index
-    vectors = _vectors(shapes.covariances)[:, :, None]
-    for step in range(_METRIC_ROUNDS):
-        if step:
-            entries, decoded = _move_to_means(shapes, weights, index, parameters)
-            index = search_nearest(points, _points(decoded).astype(np.int32), 0, threads)[0].astype(np.int64)
-        index = reassign_by_metric(vectors, shapes.metric, _vectors(decoded)[:, :, None], index, threads, _CANDIDATES)
+    entries = _centroids(shapes, weights, start.astype(np.int64), parameters)
+    index = _assign(shapes, points, entries, parameters, threads)
+    for _ in range(1, 1 if shapes.metric is None else _METRIC_ROUNDS):
+        entries = _centroids(shapes, weights, index, parameters)
+        index = _assign(shapes, points, entries, parameters, threads)
     return entries, index
 
 
-def _move_to_means(shapes: _ShapeInput, weights: F64, index: I64, parameters: CodingParameters) -> tuple[I32, F64]:
-    """Return the integers of the weighted mean covariance of each entry's splats, [6, K], and its decoded values."""
-    index = np.unique(index, return_inverse=True)[1].reshape(-1)  # without unused entries
+def _assign(shapes: _ShapeInput, points: I16, entries: I32, parameters: CodingParameters, threads: int) -> I64:
+    """Return the nearest entry of each splat, [N], under the metric if there is one."""
+    decoded = _dequantise(entries, parameters)[0]
+    index = search_nearest(points, _points(decoded).astype(np.int32), 0, threads)[0].astype(np.int64)
+    if shapes.metric is None:
+        return index
+    vectors, centroids = _vectors(shapes.covariances)[:, :, None], _vectors(decoded)[:, :, None]
+    return reassign_by_metric(vectors, shapes.metric, centroids, index, threads, _CANDIDATES)
+
+
+def _centroids(shapes: _ShapeInput, weights: F64, index: I64, parameters: CodingParameters) -> I32:
+    """Return the weighted mean covariance of each used entry's splats, quantised to an entry, [6, K]."""
+    index = np.unique(index, return_inverse=True)[1].reshape(-1)  # drops unused entries
     count = int(index.max()) + 1
     total = np.bincount(index, weights, count)
-    weights = np.where(total[index] > 0.0, weights, 1.0)  # splats without weight count alike
+    weights = np.where(total[index] > 0.0, weights, 1.0)  # equal weights if all are 0
     total = np.bincount(index, weights, count)
     sums = np.stack([np.bincount(index, weights * entry, count) for entry in shapes.covariances])
-    rotation, scales = mean_axes(sums / total)
-    rotation, scales = canonicalise_shape(rotation, scales)
-    scales = np.maximum(scales, scales[0] - 20.0)  # anything thinner is flat
+    rotation, scales = canonicalise_shape(*mean_axes(sums / total))
+    scales = np.maximum(scales, scales[0] - _THINNEST)
     n = np.rint(scales.astype(np.float64) / parameters.scale_step).astype(np.int32)
-    entries = np.unique(np.concatenate([n - n[:1], quat_levels(rotation, parameters.quat_levels)]), axis=1)
-    return entries, unit_covariances(
-        quat_values(entries[3:], parameters.quat_levels), entries[:3] * parameters.scale_step
-    )[0]
+    return np.unique(np.concatenate([n - n[:1], quat_levels(rotation, parameters.quat_levels)]), axis=1)
+
+
+def _dequantise(entries: I32, parameters: CodingParameters) -> tuple[F64, F64]:
+    """Return `unit_covariances` of entries [6, K]."""
+    return unit_covariances(quat_values(entries[3:], parameters.quat_levels), entries[:3] * parameters.scale_step)
 
 
 def _assignment_errors(shapes: _ShapeInput, entries: I32, index: I64, parameters: CodingParameters) -> tuple[F64, I32]:
-    """Return the weighted squared error of each splat with its entry, [N], and the summand that minimises it, [N]."""
-    decoded, sizes = unit_covariances(
-        quat_values(entries[3:], parameters.quat_levels), entries[:3] * parameters.scale_step
-    )
+    """Return the weighted squared error of each splat's assignment, [N], and the summand that minimises it, [N]."""
+    decoded, sizes = _dequantise(entries, parameters)
     found = decoded[:, index]
-    factor = np.zeros(len(index)) if shapes.metric is None else _best_size(shapes.covariances, found, shapes.metric)
-    steps = (shapes.sizes + factor - sizes[index]) / parameters.scale_step
+    growth = np.zeros(len(index)) if shapes.metric is None else _best_growth(shapes.covariances, found, shapes.metric)
+    steps = (shapes.sizes + growth - sizes[index]) / parameters.scale_step
     summand = np.rint(np.where(shapes.fits, steps, 0.0)).astype(np.int32)
-    larger = sizes[index] + summand * parameters.scale_step - shapes.sizes
-    return _covariance_errors(shapes.covariances, found, larger, shapes.weights, shapes.metric), summand
+    growth = sizes[index] + summand * parameters.scale_step - shapes.sizes
+    return _covariance_errors(shapes.covariances, found, growth, shapes.weights, shapes.metric), summand
 
 
-def _best_size(target: F64, found: F64, metric: ErrorMetric) -> F64:
-    """Return [N], the summand of the log scales that brings `found` [6, N] closest to `target`; 0 keeps the trace."""
+def _best_growth(target: F64, found: F64, metric: ErrorMetric) -> F64:
+    """Return the summand of the log scales, [N], that brings covariances `found` closest to `target`, both [6, N].
+
+    A summand t scales a covariance a by s = e^(2t). The error (s a - b)ᵀ M (s a - b) is least for s = aᵀ M b / aᵀ M a.
+    """
     a, b = _vectors(found)[:, :, None], _vectors(target)[:, :, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = metric.products(a, b) / metric.products(a, a)
@@ -398,21 +409,21 @@ def _best_size(target: F64, found: F64, metric: ErrorMetric) -> F64:
 
 
 def _worth_assigning(shapes: _ShapeInput, errors: F64, index: I64, summand: I32) -> Mask:
-    """Return True for the splats to assign: those whose error grows by less than the saved bits are worth.
+    """Return True for the splats to assign: those whose assignment lowers D + λ R.
 
-    Another bit for every splat would remove 2 ln 2 / 6 of the squared error. The cost of a shape is the entropy of its
-    integers, or of index and summand.
+    R is the entropy of the integers of a shape, or of index and summand. A scalar quantiser of 6 dimensions has
+    D ∝ 2^(-2R/6), so λ = -dD/dR = 2 ln 2 / 6 · D with the mean distortion D without a codebook.
     """
     fits = shapes.fits
     if not fits.any():
         return fits
-    worth = 2.0 * math.log(2.0) / _DIMENSIONS * float(shapes.plain[fits].mean())
-    saved = shapes.bits - _entropy(index[fits]) - _entropy(summand[fits])
-    return np.asarray(fits & (errors - shapes.plain < worth * saved))
+    lambda_ = 2.0 * math.log(2.0) / _DIMENSIONS * float(shapes.plain_errors[fits].mean())
+    saved = shapes.plain_bits - _entropy(index[fits]) - _entropy(summand[fits])
+    return np.asarray(fits & (errors - shapes.plain_errors < lambda_ * saved))
 
 
 def _all_but_worst(shapes: _ShapeInput, errors: F64, fraction: float) -> Mask:
-    """Return True for the splats to assign: all but a fraction of them with the largest weighted error."""
+    """Return True for the splats to assign: all but the given fraction, which has the largest weighted errors."""
     assigned = shapes.fits.copy()
     worst = np.argsort(-np.where(shapes.fits, errors, np.inf), kind="stable")
     assigned[worst[: int(len(errors) * fraction)]] = False
@@ -424,7 +435,7 @@ def _entropy(values: NDArray[Any]) -> float:
 
 
 def _rank_entries(entries: I32, index: I64, summand: I32, assigned: Mask) -> ShapeCodebook:
-    """Drop unused entries, and number the others by their number of users."""
+    """Escape the splats that are not assigned, drop unused entries, and sort the others by frequency."""
     used, place = np.unique(index[assigned], return_inverse=True)
     ranked, order = rank_by_frequency(place.astype(np.uint32), np.ascontiguousarray(entries[:, used].T))
     full = np.full(len(index), len(used), np.int32)
@@ -435,7 +446,7 @@ def _rank_entries(entries: I32, index: I64, summand: I32, assigned: Mask) -> Sha
 def _keep_where_smaller(
     model: SplatModel, codebook: ShapeCodebook, tiles: Sequence[TileSplats], parameters: CodingParameters
 ) -> ShapeCodebook | None:
-    """Escape all splats of the tiles that are not smaller with the codebook; None if the file is not."""
+    """Escape all splats of tiles that are not smaller with the codebook; return `None` if the file is not smaller."""
     escaped, saved = codebook.escaped, 0
     for tile in tiles:
         rows = quantise_and_sort(model, tile, parameters).rows
@@ -447,7 +458,7 @@ def _keep_where_smaller(
         gain = -1
         if plain.exponent == 0:
             assigned = quantise_shape(quats, scales, parameters, part)
-            gain = _shape_bytes(plain, None, parameters) - _shape_bytes(assigned, part, parameters) - _TABLE_ID
+            gain = _shape_bytes(plain, None, parameters) - _shape_bytes(assigned, part, parameters) - _CODEBOOK_ID_SIZE
         if gain > 0:
             saved += gain
         else:
@@ -465,7 +476,10 @@ def _shape_bytes(shape: QuantisedShape, part: ShapePart | None, parameters: Codi
 
 
 def _quaternions(R: F64) -> F64:
-    """Return quaternions [n, 4] of rotation matrices, by the formula that divides by the largest component."""
+    """Return quaternions [n, 4] of rotation matrices.
+
+    The rows of 4 q qᵀ are computed from R; the row with the largest diagonal entry is normalised.
+    """
     xx, yy, zz = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
     x, y, z = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
     xy, xz, yz = R[:, 0, 1] + R[:, 1, 0], R[:, 0, 2] + R[:, 2, 0], R[:, 1, 2] + R[:, 2, 1]

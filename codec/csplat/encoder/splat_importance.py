@@ -1,7 +1,8 @@
-"""Importance of splats, and how much errors of their values show in renders.
+"""Weigh the errors of splats by their effect on renders.
 
-Importance is one number per splat. Gauss-Newton blocks are matrices: errors e of a splat's values add eᵀ M e to the
-squared error of renders. They are measured by a renderer; without one, importance is guessed from opacity and size.
+Importance is one number per splat. Gauss-Newton blocks are matrices M: an error e of a splat's values adds eᵀ M e to
+the squared error of renders. Both are measured with a renderer; without one, importance is guessed from opacity and
+size.
 """
 
 from __future__ import annotations
@@ -25,30 +26,30 @@ Rows = NDArray[np.intp]
 #: Attributes whose steps may differ between quantisation classes, and the number of integers of each.
 CLASSED_ATTRIBUTES = {"opacities": 1, "scales": 3, "quats": 3, "means": 3, "sh0": 3}
 
-_WEIGHT_BLOCK = 1 << 16  # splats per block of temporaries: one number each,
-_METRIC_BLOCK = 1 << 12  # a matrix each,
-_SHAPE_BLOCK = 1 << 14  # a few vectors each
-_PLAIN_NORM_SHARE = 0.2  # share of the identity in a metric: other views see the scene from other directions
+_WEIGHT_BLOCK = 1 << 16  # splats per block of scalar temporaries
+_METRIC_BLOCK = 1 << 12  # splats per block of matrices
+_SHAPE_BLOCK = 1 << 14  # splats per block of vectors
+_PLAIN_NORM_SHARE = 0.2  # share of the identity in the SH metric, as other views have other directions
 _SHAPE = 6  # distinct entries of a covariance
 _TRIANGLE = 21  # distinct entries of a symmetric 6 × 6 matrix
-_FLOOR = 0.5  # a measured weight is at least this fraction of the guessed one
-_COMMON = 0.99  # quantile of the guessed weights above which they are clipped
-_LOG_SIZE_MAX = 80.0  # log sizes beyond ± this are treated as equal: float32 holds the weights
+_FLOOR = 0.5  # minimum of a measured weight, as a fraction of the guessed weight
+_COMMON = 0.99  # quantile to which guessed weights are clipped
+_LOG_SIZE_MAX = 80.0  # log sizes are clipped to ± this, so that the weights stay within float32
 _UNIFORM = 1.0 / 12.0  # mean squared error of rounding, in squared steps
 _ROOT2 = 2.0**0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Importance:
-    """Weights of squared errors by attribute; only their ratios matter, except for `blocks`.
+    """Weights of the squared errors of splats; only ratios matter, except in `blocks`.
 
     Attributes:
-        sh: [N], finite, >= 0, weight of an SH coefficient.
-        shape: [N], weight of the covariance divided by its trace; `None`: as `sh`.
+        sh: [N], finite, >= 0, weights of the SH coefficients.
+        shape: [N], weights of the covariance divided by its trace; `None`: `sh`.
         sh_metric: [N, K (K + 1) / 2], Gauss-Newton matrices of the coefficients of bands 1 to d, normalised to a mean
             diagonal of 1 for visible splats: upper triangles, row by row; `None`: the identity.
         shape_metric: [N, 21], the same for xx, yy, zz, √2 xy, √2 xz, √2 yz of the covariance divided by its trace.
-        blocks: Gauss-Newton blocks in absolute terms, which allow several quantisation classes.
+        blocks: Gauss-Newton blocks in absolute units, required for several quantisation classes.
     """
 
     sh: Floats
@@ -58,7 +59,7 @@ class Importance:
     blocks: GaussNewtonBlocks | None = None
 
     def select(self, rows: Floats) -> Importance:
-        """Return the importance of some of the splats."""
+        """Return the importance of some splats."""
 
         def select_rows(array: Floats | None) -> Floats | None:
             return None if array is None else array[rows]
@@ -74,16 +75,16 @@ class Importance:
 
 @dataclass(frozen=True, eq=False)
 class GaussNewtonBlocks:
-    """Diagonals and blocks of the Gauss-Newton matrix of renders, by splat.
+    """Blocks of the diagonal of the Gauss-Newton matrix of renders, per splat.
 
-    An error e of a value adds c e² to the squared error of renders, averaged over pixels and channels.
+    An error e adds c e², or eᵀ M e, to the squared error of renders averaged over pixels and channels.
 
     Attributes:
-        opacities: [N], c of alpha.
-        shapes: [N, 21], c of the covariance divided by its trace: upper triangles, row by row, over xx, yy, zz, √2 xy,
-            √2 xz, √2 yz.
-        means: [N], c of an error of e scene units in each coordinate.
-        colours: [N], c of an error of e in each channel.
+        opacities: [N], c for alpha.
+        shapes: [N, 21], M for xx, yy, zz, √2 xy, √2 xz, √2 yz of the covariance divided by its trace: upper triangles,
+            row by row.
+        means: [N], c for an error of e scene units in each coordinate.
+        colours: [N], c for an error of e in each channel.
     """
 
     opacities: Floats
@@ -92,28 +93,24 @@ class GaussNewtonBlocks:
     colours: Floats
 
     def select(self, rows: Rows) -> GaussNewtonBlocks:
-        """Return the blocks of some of the splats."""
+        """Return the blocks of some splats."""
         return GaussNewtonBlocks(*(getattr(self, one.name)[rows] for one in fields(self)))
 
     def check(self, count: int) -> None:
-        """Check number, sign and finiteness.
-
-        Raises:
-            InputError: an array has another number of splats than `count`, or values that are negative or not finite.
-        """
+        """Raise an `InputError` unless all arrays have `count` rows and are finite and, except `shapes`, >= 0."""
         for one in fields(self):
             array = getattr(self, one.name)
-            wanted = (count, _TRIANGLE) if one.name == "shapes" else (count,)
-            if array.shape != wanted or array.dtype.kind != "f":
+            shape = (count, _TRIANGLE) if one.name == "shapes" else (count,)
+            if array.shape != shape or array.dtype.kind != "f":
                 found = f"{array.dtype} {list(array.shape)}"
-                raise InputError(f"curvatures of {one.name} are {found}, expected floats {list(wanted)}")
+                raise InputError(f"Gauss-Newton blocks of {one.name} are {found}, expected floats {list(shape)}")
             if not np.isfinite(array).all() or (one.name != "shapes" and (array < 0.0).any()):
-                raise InputError(f"curvatures of {one.name} are negative or not finite")
+                raise InputError(f"Gauss-Newton blocks of {one.name} are negative or not finite")
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorMetric:
-    """Errors of points: w eᵀ M e, with a weight and a Gauss-Newton matrix for each point, summed over channels.
+    """A metric w Σ_channels eᵀ M e for each point, with a weight and a Gauss-Newton matrix.
 
     Attributes:
         weights: [N], w >= 0.
@@ -129,12 +126,12 @@ class ErrorMetric:
         return _matrix_size(self.triangles)
 
     def first(self, size: int) -> ErrorMetric:
-        """Return the metric of the first `size` coordinates of a point."""
+        """Return the metric of the first `size` coordinates."""
         rows, columns = np.triu_indices(self.size)
         return ErrorMetric(self.weights, self.triangles[:, (rows < size) & (columns < size)])
 
     def products(self, a: Floats, b: Floats) -> F64:
-        """Return aᵀ M b of every point, [N], without the weights; a and b are [N, D, C]."""
+        """Return aᵀ M b for every point, [N], without weights; a and b are [N, D, C]."""
         found = np.empty(len(a))
         for at in range(0, len(a), _METRIC_BLOCK):
             part = slice(at, at + _METRIC_BLOCK)
@@ -142,7 +139,7 @@ class ErrorMetric:
         return found
 
     def errors(self, difference: Floats, rows: Rows | slice) -> F64:
-        """Return the errors [n] of the points `rows` for the differences [n, D, C]."""
+        """Return the weighted squared errors [n] of differences [n, D, C] for the points `rows`."""
         triangles, weights = self.triangles[rows], self.weights[rows]
         upper_i, upper_j = np.triu_indices(self.size)
         found = np.empty(len(difference))
@@ -155,18 +152,18 @@ class ErrorMetric:
 
 
 def splat_weights(model: SplatModel, importance: Floats | Importance | None) -> F32:
-    """Return the weight of each splat's squared error, [N] float32, >= 0; only ratios matter.
+    """Return the weights of squared errors, [N] float32, >= 0; only ratios matter.
 
-    The guess is alpha · √(σ1 σ2), with the two larger standard deviations. Without occlusion alpha · σ1 σ2 would follow
-    from the error of renders; but in captures the largest splats are mostly hidden background, and the root was
-    better in all scenes tried.
+    Without importance, the weight is α √(σ1 σ2) with the two larger standard deviations. Without occlusion, the error
+    of renders would suggest α σ1 σ2. In captures, however, the largest splats are mostly hidden background, and the
+    root was better in all scenes tried.
 
     Args:
         model: the scene.
-        importance: [N], finite, >= 0, or an `Importance`, whose weights of SH are used; `None`: guess.
+        importance: [N], finite, >= 0; or an `Importance`, whose `sh` is used; `None`: guess.
 
     Raises:
-        InputError: an importance of another shape or type, negative or not finite.
+        InputError: the importance has the wrong shape or dtype, is negative or not finite.
     """
     if isinstance(importance, Importance):
         importance = importance.sh
@@ -175,7 +172,7 @@ def splat_weights(model: SplatModel, importance: Floats | Importance | None) -> 
         for at in range(0, len(model), _WEIGHT_BLOCK):
             part = slice(at, at + _WEIGHT_BLOCK)
             scales = model.scales[part]
-            with np.errstate(over="ignore"):  # infinity is clipped like all that is too large
+            with np.errstate(over="ignore"):  # infinity is clipped
                 size = (scales.sum(axis=1) - scales.min(axis=1)) * np.float32(0.5)
             np.clip(size, -_LOG_SIZE_MAX, _LOG_SIZE_MAX, out=size)
             weights[part] = model.opacities[part] * np.exp(size)
@@ -187,13 +184,13 @@ def splat_weights(model: SplatModel, importance: Floats | Importance | None) -> 
         raise InputError(f"importance has dtype {given.dtype}, expected real numbers")
     values = given.astype(np.float64)
     if not (np.isfinite(values).all() and (values >= 0).all()):
-        raise InputError("importance has negative or non-finite values")
+        raise InputError("importance is negative or not finite")
     top = float(values.max(initial=0.0))
     return (values / top if top > 0 else values + 1.0).astype(np.float32)
 
 
 def shape_weights(model: SplatModel, importance: Floats | Importance | None) -> F32:
-    """Return the weight of each splat's covariance divided by its trace; see `splat_weights`."""
+    """Return the weights of covariances divided by their trace; see `splat_weights`."""
     if isinstance(importance, Importance):
         importance = importance.sh if importance.shape is None else importance.shape
     return splat_weights(model, importance)
@@ -205,10 +202,10 @@ def sh_metric(model: SplatModel, weights: F32 | None, importance: Floats | Impor
     Args:
         model: the scene.
         weights: [N], see `splat_weights`.
-        importance: importance given by the caller.
+        importance: the caller's importance.
 
     Raises:
-        InputError: matrices of another number or size, or not finite.
+        InputError: the matrices have the wrong number or size, or are not finite.
     """
     if weights is None or not isinstance(importance, Importance) or importance.sh_metric is None:
         return None
@@ -242,15 +239,15 @@ def checked_blocks(model: SplatModel, importance: Floats | Importance | None) ->
 def apply_weight_floor(measured: Floats, model: SplatModel) -> F64:
     """Raise measured weights that are far below the guess from opacity and size.
 
-    Other views see more of what the measured views hardly saw; and if a splat is hidden or small, a large error
-    has more effect than the gradient at its place suggests.
+    Splats that the measured views hardly saw may be visible in others; and for hidden or small splats, a large error
+    has more effect than the gradient suggests. The floor is _FLOOR · mean(measured) · guess / mean(guess).
 
     Args:
         measured: [N] or [N, A], >= 0.
         model: the scene.
 
     Returns:
-        Like `measured`, float64: at least half of the column's mean, times the guess divided by its mean.
+        The raised weights, float64.
     """
     guessed = splat_weights(model, None).astype(np.float64)
     guessed = np.minimum(guessed, np.quantile(guessed, _COMMON)) if len(guessed) else guessed
@@ -262,22 +259,22 @@ def apply_weight_floor(measured: Floats, model: SplatModel) -> F64:
 
 
 def rounding_errors(model: SplatModel, blocks: GaussNewtonBlocks, parameters: CodingParameters) -> F64:
-    """Estimate the squared error of renders caused by rounding, in linear approximation.
+    """Estimate the squared error of renders that rounding causes: c step² / 12 for an error coefficient c.
 
     Args:
         model: the scene.
-        blocks: Gauss-Newton blocks of its splats.
-        parameters: the steps.
+        blocks: Gauss-Newton blocks of the splats.
+        parameters: steps.
 
     Returns:
-        [N, 5] float64, >= 0, by splat and attribute, in the order of `CLASSED_ATTRIBUTES`; proportional to step².
-        Not finite if a scene is so large that squares leave float64.
+        [N, 5] float64, >= 0, by splat and attribute, in the order of `CLASSED_ATTRIBUTES`. Infinite or NaN if squares
+        are beyond float64.
     """
     errors = np.empty((len(model), len(CLASSED_ATTRIBUTES)))
     squared_levels = float(parameters.opacity_levels) ** 2
-    # Squared error that the RGB channels get from rounding Y, Co and Cg, in squared steps.
+    # Squared error of the RGB channels from rounding Y, Co and Cg, in squared steps.
     rgb = SH_C0**2 * (1.0 + 4.0**parameters.chroma_shift * (1.0 / 4.0 + 1.0 / 6.0))
-    # A component of a quaternion errs by half the angle.
+    # The error of a quaternion's component is half the angle.
     angle = 2.0 / (parameters.quat_levels * np.sqrt(2.0))
     with np.errstate(over="ignore", invalid="ignore"):
         steps = np.square(
@@ -296,7 +293,7 @@ def rounding_errors(model: SplatModel, blocks: GaussNewtonBlocks, parameters: Co
 
 
 def matrix_products(triangles: Floats, points: Floats) -> F64:
-    """Return the product of each matrix and its point, [n, D, C]."""
+    """Return the products M x, [n, D, C], of upper triangles and points [n, D, C]."""
     size = points.shape[1]
     upper_i, upper_j = np.triu_indices(size)
     matrices = np.empty((len(points), size, size))
@@ -307,15 +304,15 @@ def matrix_products(triangles: Floats, points: Floats) -> F64:
 
 
 def doubled_triangles(triangles: Floats) -> F64:
-    """Return the triangles with their off-diagonal entries doubled."""
+    """Return upper triangles with doubled off-diagonal entries."""
     upper_i, upper_j = np.triu_indices(_matrix_size(triangles))
     return np.asarray(triangles * np.where(upper_i == upper_j, 1.0, 2.0), np.float64)
 
 
 def _checked_metric(name: str, weights: F32, found: Floats, size: int) -> ErrorMetric:
-    wanted = (len(weights), size * (size + 1) // 2)
-    if found.shape != wanted or found.dtype.kind != "f":
-        raise InputError(f"importance has {name} {found.dtype} {list(found.shape)}, expected floats {list(wanted)}")
+    shape = (len(weights), size * (size + 1) // 2)
+    if found.shape != shape or found.dtype.kind != "f":
+        raise InputError(f"importance has {name} {found.dtype} {list(found.shape)}, expected floats {list(shape)}")
     if not np.isfinite(found).all():
         raise InputError(f"importance has {name} that are not finite")
     return ErrorMetric(weights, found)
@@ -327,7 +324,11 @@ def _matrix_size(triangles: Floats) -> int:
 
 
 def _shape_curvatures(model: SplatModel, blocks: GaussNewtonBlocks, part: slice) -> tuple[F64, F64]:
-    """Return the summed second derivatives by the three log scales and the three angles, [n] each."""
+    """Return the sums of the error coefficients of the three log scales and of the three angles, [n] each.
+
+    With axes a_i and variances v_i of the covariance Σ = Σ_i v_i a_i a_iᵀ, divided by its trace,
+        ∂Σ / ∂(log scale i) = 2 v_i a_i a_iᵀ  and  ∂Σ / ∂(angle of a_i and a_j) = (v_i - v_j) (a_i a_jᵀ + a_j a_iᵀ).
+    """
     axes = [np.stack(axis) for axis in zip(*rotation_rows(model.quats[part].T), strict=True)]
     scales = model.scales[part].T.astype(np.float64)
     variances = np.exp(2.0 * (scales - scales.max(axis=0)))

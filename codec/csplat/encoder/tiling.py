@@ -1,8 +1,8 @@
-"""Tiles: which splats share one, and their order (spec 3, 4.3.5).
+"""Partition splats into tiles, and order them (spec 3, 4.3.5).
 
-A scene of up to `BUCKET_SPLATS` splats is analysed as a whole. Of a larger one a sample of that size is analysed; a
-Morton curve through the sample cuts space into buckets, and each bucket is cut into tiles by itself, so that no more
-than a bucket has to be in memory. Neither depends on how much memory there is, so the file does not either.
+A scene of up to `BUCKET_SPLATS` splats is analysed as a whole. For a larger scene, a sample of that size is analysed: a
+Morton curve through it divides space into buckets, each of which is cut into tiles by itself, so that only one bucket
+has to be in memory. The file does not depend on the available memory.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ from csplat.types import F32, F64, I64, U8, Mask
 Rows = NDArray[np.intp]
 Integers = NDArray[Any]
 
-#: Splats that are analysed as a whole: maximum size of a bucket, and size of the sample of a larger scene.
+#: Maximum number of splats in a bucket, and size of the sample of a larger scene.
 BUCKET_SPLATS = 1 << 19
 
-_OWN_TILE_MIN = 48  # splats; a smaller tile costs more bytes than the coarser lattice that it avoids
-_FINEST = 2.0**45  # steps from zero to a tile's far corner: float32 holds 2**24 of them
+_OWN_TILE_MIN = 48  # splats; a smaller tile takes more bytes than a coarser lattice would lose
+_FINEST = 2.0**45  # maximum number of steps from zero to a tile's far corner; float32 resolves 2**24
 _OUTLIER_BLOCK = 1 << 14  # splats per block of temporaries
-_BUCKET_FILL = 0.8  # fraction of a bucket to fill: the sample predicts bucket sizes within a few per cent
-_CURVE_EDGE = 0.005  # fraction of the splats on either side that lies beyond the curve's cube
-_CURVE_TOP = (1 << 16) - 1  # cells along a side of the cube, less one
+_BUCKET_FILL = 0.8  # fraction of a bucket to fill; the sample predicts bucket sizes within a few per cent
+_CURVE_EDGE = 0.005  # fraction of the splats beyond either side of the curve's cube
+_CURVE_TOP = (1 << 16) - 1  # cells along a side of the cube, minus one
 _CURVE_BLOCK = 1 << 16  # splats per block of temporaries
-_CONTRAST_BUCKETS = 16  # buckets in which neighbours are compared
+_CONTRAST_BUCKETS = 16  # buckets in which the contrast is measured
 
 
 @dataclass(frozen=True)
 class TileSplats:
-    """Splats of one tile, not yet sorted.
+    """The splats of a tile, unsorted.
 
     Attributes:
-        rows: [n] rows of the model.
+        rows: [n], rows of the model.
         exponent: the tile's step of the means is the file's times 2**exponent.
-        factors: how much coarser the other steps are than the file's.
+        factors: the other steps relative to the file's.
     """
 
     rows: Rows
@@ -63,13 +63,13 @@ class TileSplats:
 
 @dataclass(frozen=True, eq=False)
 class QuantisedTile:
-    """Means of a tile as integers, in decoding order.
+    """The quantised means of a tile, in decoding order.
 
     Attributes:
-        rows: [n] rows of the model.
-        q: [3, n] integers from the tile's corner, >= 0.
-        corner: [3] integers from the file's origin.
-        codes: [n] Morton codes, ascending; None if means are coded AXIS.
+        rows: [n], rows of the model.
+        q: [3, n], lattice integers relative to the corner, >= 0.
+        corner: [3], lattice integers of the tile's corner.
+        codes: [n], Morton codes, ascending; `None` if means are coded AXIS.
     """
 
     rows: Rows
@@ -84,15 +84,15 @@ def cut_scene(
     classes: QuantisationClasses | None = None,
     buckets: Sequence[Rows] | None = None,
 ) -> list[TileSplats]:
-    """Cut a scene into tiles: by class or bucket, and within it by which attributes are outliers.
+    """Partition a scene into tiles: by class or bucket, by outliers, and by space.
 
-    An outlier is a value that the file's lattice does not hold; one of them coarsens the lattice of its tile, up to
-    65,535 other splats. They get tiles of their own, after those of the other splats of their class or bucket.
+    An outlier is a value that does not fit the file's lattice and would coarsen that of up to 65,535 other splats in
+    its tile. Splats with outliers in the same attributes share tiles, after the other tiles of their class or bucket.
 
     Args:
         model: the scene.
         parameters: steps and tile size.
-        classes: quantisation classes, whose splats share steps; `None`: all splats share them.
+        classes: quantisation classes; `None`: all splats have the same steps.
         buckets: `bucket_rows` of the model, if known.
     """
     flags = _outlier_flags(model, parameters)
@@ -106,22 +106,22 @@ def cut_scene(
 
 
 def cut_tiles(means: F32, lattice: Lattice, tile_splats: int) -> list[TileSplats]:
-    """Cut by k-d medians down to `tile_splats`, and by halves of space what is too wide for the lattice.
+    """Split by k-d medians down to `tile_splats`; halve the box of tiles that are too wide for the lattice.
 
-    Halving space separates distant outliers, so that the core keeps its step.
+    Halving the box separates distant outliers, so that the core keeps its step.
 
     Args:
         means: [N, 3] float32.
-        lattice: the file's step, and the bits per axis of a tile.
+        lattice: step of the file, and bits per axis of a tile.
         tile_splats: maximum number of splats per tile.
 
     Returns:
-        Tiles, neighbours next to each other.
+        Tiles in spatial order.
     """
     if len(means) == 0:
         return []
     limit = float((1 << lattice.bits) - 1)
-    wide = 4.0 if lattice.finest else 1.0  # a step given in bits follows the box; only outliers are cut off
+    wide = 4.0 if lattice.finest else 1.0  # with `finest`, steps adapt to the box, and only outliers are separated
     few = 1 if lattice.strict else _OWN_TILE_MIN
     tiles: list[TileSplats] = []
     pending = [(np.arange(len(means), dtype=np.intp), np.ascontiguousarray(means.T))]
@@ -145,7 +145,7 @@ def cut_tiles(means: F32, lattice: Lattice, tile_splats: int) -> list[TileSplats
 
 
 def tile_exponent(extent: float, reach: float, lattice: Lattice) -> int:
-    """Return the power of two by which a tile's step differs from the file's.
+    """Return the exponent of a tile, whose step is the file's times 2**exponent.
 
     Args:
         extent: longest side of the tile's box, scene units.
@@ -171,7 +171,7 @@ def quantise_and_sort(model: SplatModel, tile: TileSplats, parameters: CodingPar
     q = n - corner[:, None]
     if not parameters.morton:
         return QuantisedTile(tile.rows, q, corner, None)
-    # 48 bits of code and 16 of place: sorting whole keys is stable, and much faster than sorting places.
+    # Keys of 48 bits of code and 16 bits of position: sorting them is stable and much faster than an argsort.
     keys = morton_codes(q).astype(np.uint64)
     keys <<= np.uint64(16)
     keys |= np.arange(len(keys), dtype=np.uint64)
@@ -182,7 +182,7 @@ def quantise_and_sort(model: SplatModel, tile: TileSplats, parameters: CodingPar
 
 
 def dequantised_means(means: F32, tiles: Sequence[TileSplats], parameters: CodingParameters) -> F32:
-    """Return means [N, 3] as decoded."""
+    """Return decoded means, [N, 3]."""
     decoded = np.empty_like(means)
     for tile in tiles:
         step = lattice_step(parameters.lattice.step, tile.exponent)
@@ -191,7 +191,7 @@ def dequantised_means(means: F32, tiles: Sequence[TileSplats], parameters: Codin
 
 
 def dequantised_opacities(opacities: F32, tiles: Sequence[TileSplats], parameters: CodingParameters) -> F32:
-    """Return alpha [N] as decoded."""
+    """Return decoded alpha, [N]."""
     decoded, levels = np.empty_like(opacities), parameters.opacity_levels
     for tile in tiles:
         q = opacity_levels(opacities[tile.rows], levels, square=True, multiple=tile.factors.opacities)
@@ -200,18 +200,18 @@ def dequantised_opacities(opacities: F32, tiles: Sequence[TileSplats], parameter
 
 
 def take_rows(values: NDArray[Any], rows: NDArray[np.intp]) -> NDArray[Any]:
-    """Return rows of an array: `take` is twice as fast as indexing."""
+    """Return rows of an array; `take` is twice as fast as indexing."""
     return np.take(values, rows, axis=0)
 
 
 @dataclass(frozen=True, eq=False)
 class BucketCurve:
-    """A Morton curve through space, cut into buckets.
+    """A Morton curve through space, divided into buckets.
 
     Attributes:
-        corner: [3] float64, corner of the cube that the curve fills; splats outside are moved to its faces.
+        corner: [3] float64, corner of the cube that the curve fills; splats outside are clamped to it.
         scale: cells per scene unit.
-        bounds: [B - 1] int64, first code of each bucket but the first, ascending.
+        bounds: [B - 1] int64, first code of each bucket except the first, ascending.
     """
 
     corner: F64
@@ -220,11 +220,11 @@ class BucketCurve:
 
     @classmethod
     def through(cls, means: F32, count: int) -> BucketCurve:
-        """Cut the curve so that buckets get about equal numbers of splats.
+        """Divide the curve into buckets of about equal numbers of splats.
 
         Args:
             means: [n, 3] float32, means of the sample.
-            count: splats in the scene.
+            count: number of splats in the scene.
         """
         if count <= BUCKET_SPLATS:
             return cls(np.zeros(3), 0.0, np.zeros(0, np.int64))
@@ -270,25 +270,25 @@ def bucket_rows(means: F32) -> Sequence[Rows]:
 
 
 def bucket_slices(count: int) -> list[slice]:
-    """Cut a bucket that got more than `BUCKET_SPLATS` splats into equal parts, in the scene's order."""
+    """Split a bucket of more than `BUCKET_SPLATS` splats into equal parts, in the scene's order."""
     parts = max(1, math.ceil(count / BUCKET_SPLATS))
     return [slice(count * part // parts, count * (part + 1) // parts) for part in range(parts)]
 
 
 def sample_rows(count: int) -> I64:
-    """Return the rows of the sample of a scene with more than `BUCKET_SPLATS` splats, evenly spaced."""
+    """Return the evenly spaced rows of the sample of a scene with more than `BUCKET_SPLATS` splats."""
     return np.arange(BUCKET_SPLATS, dtype=np.int64) * count // BUCKET_SPLATS
 
 
 def contrast_buckets(buckets: int) -> list[int]:
-    """Return the buckets in which neighbours are compared, which a sample of the scene does not contain."""
+    """Return the buckets in which the contrast is measured; a sample of the scene has no neighbours for it."""
     return sorted({place * buckets // _CONTRAST_BUCKETS for place in range(_CONTRAST_BUCKETS)})
 
 
 def _cut_groups(
     means: F32, rows: Rows, groups: U8 | None, factors: Sequence[StepFactors], parameters: CodingParameters
 ) -> list[TileSplats]:
-    """Cut the splats `rows`, each group by itself; the class of a group is its number modulo the classes."""
+    """Cut each group of the splats `rows` into tiles; the class of a group is its number modulo the classes."""
     tiles: list[TileSplats] = []
     for group in (0,) if groups is None else np.unique(groups):
         chosen = rows if groups is None else rows[groups == group]
@@ -302,8 +302,8 @@ def _cut_groups(
 
 
 def _outlier_flags(model: SplatModel, parameters: CodingParameters) -> U8 | None:
-    """Return [N] with a bit for each attribute that has an outlier; None if no splat has one."""
-    # Colours go through sums and differences of two channels.
+    """Return a bit mask of the attributes with outliers, [N]; `None` if no splat has any."""
+    # Chroma is a difference of two channels, hence half the limit for colours.
     limits = (
         (model.scales, largest_exact(parameters.scale_step)),
         (model.sh0, largest_exact(parameters.sh0_step) / 2.0),
@@ -321,15 +321,15 @@ def _outlier_flags(model: SplatModel, parameters: CodingParameters) -> U8 | None
 
 
 def _may_exceed(values: F32, limit: float) -> bool:
-    """Return True if a value may reach the limit: one pass over memory, by the sum of squares."""
+    """Return True if a value may reach the limit, by the sum of squares, which takes one pass over memory."""
     flat: NDArray[Any] = values.reshape(-1) if values.flags.c_contiguous else values
     with np.errstate(over="ignore"):
         axes = "ijk"[: flat.ndim]
-        return not 4.0 * float(np.einsum(f"{axes},{axes}->", flat, flat)) < limit * limit  # float32 sums lose digits
+        return not 4.0 * float(np.einsum(f"{axes},{axes}->", flat, flat)) < limit * limit  # 4: float32 sums round
 
 
 def _exceeds(values: F32, limit: float) -> Mask:
-    """Return True for the rows with a value that reaches the limit, [N]."""
+    """Return True for rows with a value that reaches the limit, [N]."""
     found = np.zeros(len(values), bool)
     for at in range(0, len(values), _OUTLIER_BLOCK):
         part = values[at : at + _OUTLIER_BLOCK]
@@ -338,7 +338,7 @@ def _exceeds(values: F32, limit: float) -> Mask:
 
 
 def _halve(coordinate: F32, tile_splats: int) -> list[Rows]:
-    """Split at a multiple of the tile size, so that tiles are full; return the first half last, to be popped first."""
+    """Split at a multiple of the tile size, so that tiles are full; the first half is last, to be popped first."""
     parts = math.ceil(len(coordinate) / tile_splats)
     share = len(coordinate) * (parts // 2) // parts
     order = np.argpartition(coordinate, share)
