@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from csplat.disk_files import atomic_writer
+from csplat.errors import InputError
 
 MISSING = "–"  # cell of a template with a field that is absent or null
 
@@ -90,7 +91,7 @@ def select_rows(spec: Mapping[str, Any], folder: Path) -> list[Row]:
         spec: `source`, one or more JSON files. Optional keys: `rows`, the key of the list in them, or "." for a single
             row with the file's own fields; `where`, allowed values by field, which also give the order; `group` and
             `by`: rows with equal fields `group` are merged into one, and the other fields of a row with `by = VALUE`
-            are renamed to `VALUE.FIELD`.
+            are renamed to `VALUE.FIELD`. A row without `series` gets its `case`.
         folder: folder of the JSON files.
 
     Raises:
@@ -98,6 +99,7 @@ def select_rows(spec: Mapping[str, Any], folder: Path) -> list[Row]:
     """
     key = spec.get("rows", "rows")
     rows: list[Row] = [flatten(row) for name in _listed(spec["source"]) for row in _read(folder / name, key)]
+    rows = [{"series": row["case"], **row} if "case" in row else row for row in rows]
     for field, values in reversed(spec.get("where", {}).items()):
         order = {value: place for place, value in enumerate(_listed(values))}
         rows = sorted((row for row in rows if row.get(field) in order), key=lambda row: order[row[field]])
@@ -151,11 +153,16 @@ def draw_plot(rows: Sequence[Row], spec: Mapping[str, Any], path: Path) -> None:
             matplotlib's format by series; `labels` of series; `x_title`, `y_title`, `x_scale` (log or linear), `ticks`,
             `x_limits`, `y_limits`, `size` in inches.
         path: the file, which is replaced.
+
+    Raises:
+        InputError: there are no rows.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    if not rows:
+        raise InputError(f"no row has both {spec['x']} and {spec['y']}")
     panels = list(dict.fromkeys(_value(spec.get("per"), row) for row in rows))
     across = min(spec.get("columns", 1), len(panels))
     buffer = io.BytesIO()
@@ -184,6 +191,8 @@ def digest(spec: Mapping[str, Any], rows: Sequence[Row]) -> str:
 
 
 def _draw_panel(axis: Any, spec: Mapping[str, Any], rows: Sequence[Row]) -> None:
+    from matplotlib.ticker import LogFormatter
+
     styles, labels = spec.get("styles", {}), spec.get("labels", {})
     axis.set_xscale(spec.get("x_scale", "linear"))
     for number, name in enumerate(dict.fromkeys(_value(spec["series"], row) for row in rows)):
@@ -199,6 +208,9 @@ def _draw_panel(axis: Any, spec: Mapping[str, Any], rows: Sequence[Row]) -> None
     if "ticks" in spec:
         axis.set_xticks(spec["ticks"], [f"{tick:g}" for tick in spec["ticks"]])
         axis.set_xticks([], minor=True)
+    elif spec.get("x_scale") == "log":
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.6)))
     axis.set(xlim=spec.get("x_limits"), ylim=spec.get("y_limits"))
     axis.grid(color="0.9", linewidth=0.6)
     axis.spines[["top", "right"]].set_visible(False)
