@@ -159,6 +159,10 @@ def test_a_suite_gives_rows_a_table_and_a_plot(suite, tmp_path, capsys):
     assert fast["seconds"] == pytest.approx(np.median(fast["turns"]["seconds"]), rel=1e-4)
     table = capsys.readouterr().out
     assert "| scene | case | bytes | beaten by |" in table
+    assert 0 == main(["table", str(tmp_path / "out.json"), "--suite", str(suite)])
+    assert table == capsys.readouterr().out
+    assert 0 == main(["plot", str(tmp_path / "out.json"), "--suite", str(suite)])
+    assert (tmp_path / "out.svg").stat().st_size > 1000
 
 
 def test_the_table_and_the_plot_come_from_the_results_alone(tmp_path, capsys):
@@ -255,7 +259,7 @@ def test_failures_are_rows_and_absent_programs_are_left_out(tmp_path, capsys):
     file = Results(tmp_path / "r.json", suite, "c")
     assert not run_suite(suite, fake(measure), setup_of(tmp_path), file, ["a"])
     assert [("bad", "it broke"), ("good", None)] == [(row["case"], row.get("error")) for row in file.rows]
-    assert "a absent: not installed" in capsys.readouterr().err
+    assert "a absent is left out: not installed" in capsys.readouterr().err
 
 
 def test_a_command_that_fails_gives_its_message_and_status_1(suite, tmp_path):

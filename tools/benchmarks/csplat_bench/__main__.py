@@ -27,6 +27,7 @@ from csplat_tools.console import note
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False, help=__doc__)
 
 _ResultFile = Annotated[Path, typer.Argument(metavar="RESULT.json", help="Results of a suite.")]
+_SuiteOption = Annotated[str, typer.Option(help="A suite, or a TOML file. Default: the one that the results name.")]
 
 
 @app.command(name="list")
@@ -57,7 +58,8 @@ def run(
     program = shlex.split(csplat) or [sys.executable, "-m", "csplat_tools"]
     setup = Setup(work, peers, data, program, chromium, lpips, chosen.options)
     path = out or work / f"{chosen.name}.json"
-    results = Results(path, chosen, f"python -m csplat_bench run {suite}")
+    by = f" --csplat {shlex.quote(csplat)}" if csplat else ""
+    results = Results(path, chosen, f"python -m csplat_bench run {chosen.name}{by}")
     note(f"{results.machine}, {results.document['versions']}")
     names, patterns = _listed(scenes) or list(chosen.scenes), _listed(only)
     if chosen.subject in SCENE_FINDERS:
@@ -74,13 +76,14 @@ def run(
 def table(
     result: _ResultFile,
     *,
+    suite: _SuiteOption = "",
     before: Annotated[Path | None, typer.Option(metavar="OTHER.json", help="Add size ratios at equal PSNR.")] = None,
     mean: Annotated[str, typer.Option(metavar="FIELD", help="Means over the scenes of a group, such as set.")] = "",
 ) -> None:
     """Print the table of a suite's results, in Markdown; `beaten_by` names the file that is smaller and better."""
     document = read_results(result)
-    suite, rows = load_suite(document["suite"], list(SUBJECTS)), mark_beaten(document["rows"])
-    columns = [tuple(column) for column in suite.columns]
+    chosen, rows = load_suite(suite or document["suite"], list(SUBJECTS)), mark_beaten(document["rows"])
+    columns = [tuple(column) for column in chosen.columns]
     if before is not None:
         rows = size_ratios(read_results(before)["rows"], rows)
         columns += [("same dB, now/before", "{ratio:.3f}"), ("estimated", "{estimated}")]
@@ -94,16 +97,18 @@ def table(
 def plot(
     result: _ResultFile,
     output: Annotated[Path | None, typer.Argument(metavar="OUT.svg", help="Default: RESULT.svg.")] = None,
+    *,
+    suite: _SuiteOption = "",
 ) -> None:
     """Draw the plot of a suite's results."""
     document = read_results(result)
-    suite = load_suite(document["suite"], list(SUBJECTS))
-    if suite.plot is None:
-        raise typer.BadParameter(f"suite {suite.name} declares no plot")
-    axes = [suite.plot["x"].split(" ")[0], suite.plot["y"].split(" ")[0]]
+    chosen = load_suite(suite or document["suite"], list(SUBJECTS))
+    if chosen.plot is None:
+        raise typer.BadParameter(f"suite {chosen.name} declares no plot")
+    axes = [chosen.plot["x"].split(" ")[0], chosen.plot["y"].split(" ")[0]]
     rows = [{"series": row["case"], **row} for row in document["rows"] if all(row.get(axis) for axis in axes)]
     path = output or result.with_suffix(".svg")
-    draw_plot(rows, suite.plot, path)
+    draw_plot(rows, chosen.plot, path)
     note(f"wrote {path}")
 
 

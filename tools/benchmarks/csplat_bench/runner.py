@@ -71,8 +71,9 @@ def _take_turns(
                 values = measure(case)
             except (CsplatError, OSError, CalledProcessError) as error:
                 active.remove(case)
-                note(f"{scene} {case.name}: {_last_line(error)}")
-                if not isinstance(error, AbsentError):
+                absent = isinstance(error, AbsentError)
+                note(f"{scene} {case.name} {'is left out' if absent else 'failed'}: {_last_line(error)}")
+                if not absent:
                     yield case, {"error": _last_line(error)}
                 continue
             turns[case.name].append(values)

@@ -1,5 +1,5 @@
-// node convert.mjs NAME: NAME.ply becomes NAME.ksplat, NAME.spz (of any version) NAME.v2.spz, NAME.v3.spz and NAME.v4.spz.
-// By the formats' owners, with their defaults: SH of SPZ in 5 and 4 bits, KSPLAT of level 1.
+// node convert.mjs NAME: converts NAME.ply to NAME.ksplat, and NAME.spz of any version to NAME.v2.spz, .v3.spz, .v4.spz.
+// The formats' owners write them, with their defaults: SH of SPZ in 5 and 4 bits, KSPLAT of level 1.
 
 import { readFileSync, writeFileSync } from 'node:fs';
 
@@ -13,7 +13,7 @@ const cloud = spz.loadSpzFromBuffer(new Uint8Array(readFileSync(`${name}.spz`)),
 for (const version of [2, 3, 4]) {
   writeFileSync(`${name}.v${version}.spz`, spz.saveSpzToBuffer(cloud, { version, from, sh1Bits: 5, shRestBits: 4 }));
 }
-globalThis.window ??= globalThis; // GaussianSplats3D takes setTimeout from it
+globalThis.window ??= globalThis; // GaussianSplats3D reads setTimeout from it
 const ply = new Uint8Array(readFileSync(`${name}.ply`)).buffer;
 const splats = await PlyLoader.loadFromFileData(ply, 1, 1, true, 2);
 writeFileSync(`${name}.ksplat`, new Uint8Array(splats.bufferData));

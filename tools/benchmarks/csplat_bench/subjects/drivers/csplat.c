@@ -1,5 +1,5 @@
-/* csplat FILE THREADS: says "ready", then decodes once for every line that comes in. Prints seconds and bytes of arrays.
- * Several threads open the file each and share its tiles. */
+/* csplat FILE THREADS: prints "ready", then decodes once for each input line and prints seconds and bytes of arrays.
+ * Each thread opens the file, and they share its tiles. */
 #include "csplat.h"
 
 #include <pthread.h>
@@ -36,7 +36,7 @@ static void *share(void *unused)
     size_t rest = ((info->sh_degree + 1) * (info->sh_degree + 1) - 1) * 3;
     for (uint32_t i; (i = atomic_fetch_add(&next, 1)) <= info->tile_count;) {
         csplat_tile tile;
-        if (i == info->tile_count) { /* the last share: what no tile needs */
+        if (i == info->tile_count) { /* the last share: parts of the file that no tile needs */
             check(csplat_check(file), csplat_last_error(file));
             break;
         }

@@ -1,4 +1,4 @@
-// Ways to decode in JavaScript, for Node and pages. An export gives, once it is ready, a function of a file's bytes.
+// Ways to decode in JavaScript, for Node and pages. An export returns, once it is ready, a function of a file's bytes.
 
 import { CsplatReader, decode } from '../../../../../codec/js/decoder.mjs';
 import { platformInflate } from '../../../../../codec/js/inflate.mjs';

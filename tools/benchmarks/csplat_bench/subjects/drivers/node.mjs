@@ -1,4 +1,4 @@
-// node --expose-gc node.mjs MODULE EXPORT FILE: says "ready", then decodes once for every line that comes in.
+// node --expose-gc node.mjs MODULE EXPORT FILE: prints "ready", then decodes once for each input line.
 
 import { readFileSync } from 'node:fs';
 import { createInterface } from 'node:readline';

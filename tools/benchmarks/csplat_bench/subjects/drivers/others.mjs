@@ -1,4 +1,4 @@
-// What others decode in JavaScript, bundled for Node and pages. As csplat.mjs; each loads what it needs alone.
+// Decoders of others in JavaScript, bundled for Node and pages; exports as in csplat.mjs. Each loads only its own package.
 
 const geometry = (loader) => async (bytes) => {
   const { attributes } = await loader.parse(bytes.buffer);
@@ -23,7 +23,7 @@ export async function threeSplat() {
 }
 
 export async function gaussianSplats3d() {
-  globalThis.window ??= globalThis; // it takes setTimeout from it
+  globalThis.window ??= globalThis; // it reads setTimeout from it
   const { SpzLoader } = await import('@mkkellogg/gaussian-splats-3d');
   return async (bytes) => [new Uint8Array((await SpzLoader.loadFromFileData(bytes.buffer, 0, 0, false, 2)).bufferData)];
 }

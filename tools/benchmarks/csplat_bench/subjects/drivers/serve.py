@@ -1,4 +1,4 @@
-"""serve.py FILE THREADS: prints "ready", then decodes for every line that comes in: seconds, bytes of arrays."""
+"""serve.py FILE THREADS: print "ready", then decode once for each input line; print seconds and bytes of arrays."""
 
 import sys
 import time

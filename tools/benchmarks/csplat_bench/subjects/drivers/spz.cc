@@ -1,4 +1,4 @@
-// spz FILE floats|packed: says "ready", then decodes once for every line that comes in. Prints seconds and bytes of arrays.
+// spz FILE floats|packed: prints "ready", then decodes once for each input line and prints seconds and bytes of arrays.
 #include "load-spz.h"
 
 #include <chrono>
@@ -13,7 +13,7 @@ int main(int, char **arguments) {
     const std::vector<uint8_t> data{std::istreambuf_iterator<char>(file), {}};
     const bool packed = std::string(arguments[2]) == "packed";
     FILE *out = fdopen(dup(1), "w");
-    if (!freopen("/dev/null", "w", stdout)) return 1; // where the library talks
+    if (!freopen("/dev/null", "w", stdout)) return 1; // the library prints there
     std::fprintf(out, "ready\n");
     std::fflush(out);
     for (std::string line; std::getline(std::cin, line);) {

@@ -1,4 +1,4 @@
-// One decoding, timed: [seconds, bytes of all arrays]. A gc() in between would undo what was compiled.
+// Times one decoding: [seconds, bytes of all arrays]. A gc() in between would discard compiled code.
 
 export async function once(decode, bytes) {
   const start = performance.now();

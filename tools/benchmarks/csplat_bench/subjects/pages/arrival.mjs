@@ -1,12 +1,12 @@
-// Looks at what a viewer shows while a scene comes in: small pictures of its canvas, and when they were there.
-// `begin` does not wait; `state` says how far it is, `pictures` gives what was seen.
+// Records what a viewer shows while a scene arrives: small images of its canvas and their times.
+// `begin` does not wait; `state` reports progress, `pictures` returns the images.
 
 const WIDTH = 160, HEIGHT = 120;
 
 const seen = [];
 let failed = '', version = '', whole = false, drawn = false, changed = 0, frames = 0;
 
-/** Shows a file, and takes a picture after every frame in which something was drawn. */
+/** Shows a file, and records an image after every frame in which something was drawn. */
 export function begin(viewer, url, camera) {
   keepBuffers();
   noticeDrawing();
@@ -23,7 +23,7 @@ export function begin(viewer, url, camera) {
   };
   const look = () => {
     drawn = false;
-    const from = [...document.querySelectorAll('canvas')].at(-1); // a viewer may bring its own
+    const from = [...document.querySelectorAll('canvas')].at(-1); // a viewer may add its own
     ink.fillRect(0, 0, WIDTH, HEIGHT);
     if (from.width && from.height) ink.drawImage(from, 0, 0, WIDTH, HEIGHT);
     const { data } = ink.getImageData(0, 0, WIDTH, HEIGHT); // waits until it is drawn
@@ -46,10 +46,10 @@ async function show(viewer, canvas, url, camera) {
   whole = true;
 }
 
-/** Whether all is there, for how many milliseconds and frames the picture has been the same. */
+/** Progress, and for how many milliseconds and frames the image has been the same. */
 export const state = () => ({ failed, version, whole, still: performance.now() - changed, frames, pictures: seen.length });
 
-/** Each picture that differs from the one before: milliseconds since the epoch, RGBA in base64. */
+/** Every image that differs from the one before: milliseconds since the epoch, RGBA in base64. */
 export function pictures() {
   return seen.map(({ at, data }) => {
     let text = '';
@@ -58,7 +58,7 @@ export function pictures() {
   });
 }
 
-// What has been drawn stays in the canvas until the next frame, whoever makes it.
+// Drawn content stays in the canvas until the next frame, whichever engine draws.
 function keepBuffers() {
   const get = HTMLCanvasElement.prototype.getContext;
   HTMLCanvasElement.prototype.getContext = function (kind, options) {

@@ -1,4 +1,4 @@
-// Babylon.js: its loaders append to a scene, in a world of left-handed axes as they have it by themselves.
+// Babylon.js: its loaders append to a scene whose world has left-handed axes, the default.
 import '@babylonjs/core/Loading/loadingScreen.js';
 import { FreeCamera } from '@babylonjs/core/Cameras/freeCamera.js';
 import { ImportMeshAsync } from '@babylonjs/core/Loading/sceneLoader.js';
@@ -42,7 +42,7 @@ export async function start(canvas, { width, height }, { webgpu = false } = {}) 
 }
 
 function look(eye, { view: columns, fovY, near, far }, world) {
-  // Matrices of row vectors lie in memory as ours of columns do; products are the other way round.
+  // Matrices of row vectors have the same memory layout as ours of column vectors; products are reversed.
   const view = world.clone().invert().multiply(Matrix.FromArray(columns)).multiply(Matrix.Scaling(1, -1, 1));
   const position = new Vector3(), rotation = new Quaternion();
   view.invert().decompose(undefined, rotation, position);

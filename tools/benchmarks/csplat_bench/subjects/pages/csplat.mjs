@@ -1,4 +1,4 @@
-// The viewer of this project: its engine on a canvas.
+// The viewer of this project: its engine alone, on a canvas.
 import { createEngine } from '/tools/viewer/engine.mjs';
 
 export const version = '';

@@ -1,4 +1,4 @@
-// PlayCanvas: a component with an asset, of SPZ by the parser that comes with its package.
+// PlayCanvas: a component with an asset; SPZ by the parser in its package.
 import * as pc from 'playcanvas';
 import { CsplatParser } from 'csplat-decoder/playcanvas';
 import { SpzParser } from '/node_modules/playcanvas/scripts/esm/parsers/spz-parser.mjs';
@@ -47,7 +47,7 @@ export async function start(canvas, { width, height }, { webgpu = false } = {}) 
 }
 
 function addSpz(app) {
-  // The decoder is the application's to bring: three's, behind the functions that are called.
+  // The application provides the decoder: three's, wrapped in the functions that the parser calls.
   const glue = `window.ZstdDecoderModule = async () => window.zstd;`;
   const decoder = new ZSTDDecoder();
   window.zstd = decoder.init().then(() => ({ decompress: (bytes, size) => decoder.decode(bytes, size) }));
@@ -70,7 +70,7 @@ function entityOf(asset) {
   if (asset.type === 'container') return asset.resource.instantiateRenderEntity();
   const entity = new pc.Entity();
   entity.addComponent('gsplat', { asset });
-  asset.resource.stand?.(entity); // of .csplat
+  asset.resource.stand?.(entity); // .csplat alone
   return entity;
 }
 

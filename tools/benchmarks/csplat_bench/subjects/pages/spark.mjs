@@ -1,4 +1,4 @@
-// Spark, over three.js: its own loader, and the adapter for .csplat.
+// Spark on three.js: its own loader, and the adapter for .csplat.
 import { SparkRenderer, SplatMesh } from '@sparkjsdev/spark';
 import { loadCsplat } from 'csplat-decoder/spark';
 import * as THREE from 'three';
@@ -13,7 +13,7 @@ export async function start(canvas, { width, height }) {
   renderer.setSize(width, height, false);
   renderer.setClearColor(0x000000, 1);
   const scene = new THREE.Scene();
-  // Without opacity compensation, as these scenes want it, and with colours that are not cut to bytes on their way.
+  // Without opacity compensation, which these scenes require, and with colours that are not rounded to bytes.
   const spark = new SparkRenderer({ renderer, preBlurAmount: 0.3, blurAmount: 0, accumExtSplats: true });
   scene.add(spark);
   const eye = new THREE.PerspectiveCamera(50, width / height);

@@ -1,4 +1,4 @@
-// The viewer of SuperSplat, in an element of its own: it takes scenes as they lie in a PLY, and turns them about z.
+// The viewer of SuperSplat, in an element of its own: it takes scenes in a PLY's axes and rotates them about z.
 import { createViewer } from '@playcanvas/supersplat-viewer/viewer.js';
 
 export const version = '1';
@@ -33,12 +33,12 @@ export async function show(canvas, url, camera) {
   return { whole };
 }
 
-// Where it stands and what it looks at; its up is the world's, whose x and y are those of the file negated.
+// Position and target; the viewer's up is the world's, whose x and y are the file's negated.
 function poseOf({ view, fovY, depth, width, height }) {
   const turned = ([x, y, z]) => [-x, -y, z];
   const row = (i) => [view[i], view[4 + i], view[8 + i]];
   const eye = [0, 1, 2].map((axis) => -[0, 1, 2].reduce((sum, i) => sum + row(i)[axis] * view[12 + i], 0));
-  // Of the wider side, as it takes it.
+  // The viewer takes the field of view of the wider side.
   const wide = (360 / Math.PI) * Math.atan(Math.tan((fovY * Math.PI) / 360) * Math.max(1, width / height));
   const target = eye.map((value, axis) => value + depth * row(2)[axis]);
   return { position: turned(eye), target: turned(target), fov: wide };

@@ -1,4 +1,4 @@
-// three.js: GaussianSplat and its loaders. Colours go through as they are: what is SH to us, three takes for linear light.
+// three.js: GaussianSplat and its loaders. Colours pass unchanged: three takes SH colours for linear light.
 import * as THREE from 'three';
 import { CSPLATLoader } from 'csplat-decoder/three';
 import { GLTFGaussianSplatLoaderExtension } from 'three/addons/loaders/GLTFGaussianSplatLoaderExtension.js';

@@ -1,5 +1,5 @@
-// What loaders do beside showing a scene: an engine on a canvas, and what becomes of loads, wanted and unwanted.
-// GPU memory is counted by what is asked of WebGL; to be imported before the engine.
+// An engine on a canvas, and loads that succeed, fail or are aborted. GPU memory is counted from the calls to WebGL, so
+// that this module must be imported before the engine.
 
 const TEXEL = {
   R8: 1, R8UI: 1, RG8: 2, RG8UI: 2, R16F: 2, R16UI: 2, RGBA8: 4, SRGB8_ALPHA8: 4, RGBA8UI: 4, RG16F: 4, RG16UI: 4, R32F: 4,
@@ -50,7 +50,7 @@ export const gpuBytes = () => [...live.values()].reduce((sum, bytes) => sum + by
 
 let stage, shown;
 
-/** Starts an engine; the name of its version. */
+/** Starts an engine; returns its version. */
 export async function start(engine, camera, options) {
   const page = await import(`/pages/${engine}.mjs`);
   stage = await page.start(document.querySelector('canvas'), camera, options);
@@ -61,7 +61,7 @@ const frames = async (count) => {
   for (let i = 0; i < count; i++) await new Promise((resolve) => requestAnimationFrame(resolve));
 };
 
-/** Shows a scene until it is whole; what is wrong with it, if anything. `abortAt`: bytes received. */
+/** Shows a scene until it is complete; returns the failure, if any. `abortAt`: bytes received. */
 export async function show(url, camera, { abortAt, ...options } = {}) {
   const begun = performance.now();
   const controller = new AbortController();
@@ -81,16 +81,16 @@ export async function show(url, camera, { abortAt, ...options } = {}) {
   }
 }
 
-/** Some engines wrap what a loader throws. */
+/** Some engines wrap a loader's error. */
 const cause = (error) => (error.innerError ? cause(error.innerError) : error);
 
-/** Takes the scene away. */
+/** Removes the scene. */
 export async function remove() {
   shown.remove();
   await frames(2);
 }
 
-/** Shows a scene and takes it away, so many times. */
+/** Shows and removes a scene, `times` times. */
 export async function repeat(url, camera, times) {
   for (let i = 0; i < times; i++) {
     await show(url, camera);
