@@ -205,7 +205,7 @@ HEADER_OFFSETS: Final[dict[str, int]] = {"magic": 0, "version_major": 8, "versio
 
 
 def unpack_header(data: bytes | bytearray | memoryview, offset: int = 0) -> Header:
-    """Read a Header at a byte offset; struct.error where the data is too short."""
+    """Read a Header at a byte offset; raise struct.error if the data is too short."""
     v = HEADER_STRUCT.unpack_from(data, offset)
     return Header(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8])
 
@@ -245,7 +245,7 @@ INDEX_HEAD_OFFSETS: Final[dict[str, int]] = {"head_size": 0, "attribute_size": 1
 
 
 def unpack_index_head(data: bytes | bytearray | memoryview, offset: int = 0) -> IndexHead:
-    """Read a IndexHead at a byte offset; struct.error where the data is too short."""
+    """Read a IndexHead at a byte offset; raise struct.error if the data is too short."""
     v = INDEX_HEAD_STRUCT.unpack_from(data, offset)
     return IndexHead(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11], v[12], v[13], v[14], v[15], v[16], v[17], (v[18], v[19], v[20]))
 
@@ -272,7 +272,7 @@ ATTRIBUTE_RECORD_OFFSETS: Final[dict[str, int]] = {"attribute": 0, "mapping": 1,
 
 
 def unpack_attribute_record(data: bytes | bytearray | memoryview, offset: int = 0) -> AttributeRecord:
-    """Read a AttributeRecord at a byte offset; struct.error where the data is too short."""
+    """Read a AttributeRecord at a byte offset; raise struct.error if the data is too short."""
     v = ATTRIBUTE_RECORD_STRUCT.unpack_from(data, offset)
     return AttributeRecord(v[0], v[1], v[2], v[3], v[4], v[5])
 
@@ -300,7 +300,7 @@ CODEBOOK_RECORD_OFFSETS: Final[dict[str, int]] = {"codebook_id": 0, "kind": 2, "
 
 
 def unpack_codebook_record(data: bytes | bytearray | memoryview, offset: int = 0) -> CodebookRecord:
-    """Read a CodebookRecord at a byte offset; struct.error where the data is too short."""
+    """Read a CodebookRecord at a byte offset; raise struct.error if the data is too short."""
     v = CODEBOOK_RECORD_STRUCT.unpack_from(data, offset)
     return CodebookRecord(v[0], v[1], v[2], v[3], v[4], v[5], v[6])
 
@@ -324,7 +324,7 @@ EXTRA_RECORD_OFFSETS: Final[dict[str, int]] = {"dtype": 0, "name_size": 1, "name
 
 
 def unpack_extra_record(data: bytes | bytearray | memoryview, offset: int = 0) -> ExtraRecord:
-    """Read a ExtraRecord at a byte offset; struct.error where the data is too short."""
+    """Read a ExtraRecord at a byte offset; raise struct.error if the data is too short."""
     v = EXTRA_RECORD_STRUCT.unpack_from(data, offset)
     return ExtraRecord(v[0], v[1], v[2])
 
@@ -354,7 +354,7 @@ DIRECTORY_RECORD_OFFSETS: Final[dict[str, int]] = {"type": 0, "flags": 4, "id": 
 
 
 def unpack_directory_record(data: bytes | bytearray | memoryview, offset: int = 0) -> DirectoryRecord:
-    """Read a DirectoryRecord at a byte offset; struct.error where the data is too short."""
+    """Read a DirectoryRecord at a byte offset; raise struct.error if the data is too short."""
     v = DIRECTORY_RECORD_STRUCT.unpack_from(data, offset)
     return DirectoryRecord(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8])
 
@@ -384,7 +384,7 @@ TILE_RECORD_OFFSETS: Final[dict[str, int]] = {"splat_count": 0, "level": 4, "lay
 
 
 def unpack_tile_record(data: bytes | bytearray | memoryview, offset: int = 0) -> TileRecord:
-    """Read a TileRecord at a byte offset; struct.error where the data is too short."""
+    """Read a TileRecord at a byte offset; raise struct.error if the data is too short."""
     v = TILE_RECORD_STRUCT.unpack_from(data, offset)
     return TileRecord(v[0], v[1], v[2], v[3], v[4], v[5], (v[6], v[7], v[8]), (v[9], v[10], v[11]), v[12])
 
@@ -411,7 +411,7 @@ LAYER_RECORD_OFFSETS: Final[dict[str, int]] = {"layer": 0, "reserved_0": 1, "res
 
 
 def unpack_layer_record(data: bytes | bytearray | memoryview, offset: int = 0) -> LayerRecord:
-    """Read a LayerRecord at a byte offset; struct.error where the data is too short."""
+    """Read a LayerRecord at a byte offset; raise struct.error if the data is too short."""
     v = LAYER_RECORD_STRUCT.unpack_from(data, offset)
     return LayerRecord(v[0], v[1], v[2], v[3], v[4], v[5])
 
@@ -436,7 +436,7 @@ CHUNK_HEADER_OFFSETS: Final[dict[str, int]] = {"type": 0, "flags": 4, "reserved_
 
 
 def unpack_chunk_header(data: bytes | bytearray | memoryview, offset: int = 0) -> ChunkHeader:
-    """Read a ChunkHeader at a byte offset; struct.error where the data is too short."""
+    """Read a ChunkHeader at a byte offset; raise struct.error if the data is too short."""
     v = CHUNK_HEADER_STRUCT.unpack_from(data, offset)
     return ChunkHeader(v[0], v[1], v[2], v[3])
 
@@ -460,7 +460,7 @@ TILE_HEAD_OFFSETS: Final[dict[str, int]] = {"layer": 0, "block_count": 1, "reser
 
 
 def unpack_tile_head(data: bytes | bytearray | memoryview, offset: int = 0) -> TileHead:
-    """Read a TileHead at a byte offset; struct.error where the data is too short."""
+    """Read a TileHead at a byte offset; raise struct.error if the data is too short."""
     v = TILE_HEAD_STRUCT.unpack_from(data, offset)
     return TileHead(v[0], v[1], v[2])
 
@@ -484,7 +484,7 @@ CODEBOOK_HEAD_OFFSETS: Final[dict[str, int]] = {"codebook_id": 0, "layer": 2, "r
 
 
 def unpack_codebook_head(data: bytes | bytearray | memoryview, offset: int = 0) -> CodebookHead:
-    """Read a CodebookHead at a byte offset; struct.error where the data is too short."""
+    """Read a CodebookHead at a byte offset; raise struct.error if the data is too short."""
     v = CODEBOOK_HEAD_STRUCT.unpack_from(data, offset)
     return CodebookHead(v[0], v[1], v[2])
 
@@ -508,7 +508,7 @@ BLOCK_HEAD_OFFSETS: Final[dict[str, int]] = {"attribute": 0, "coding": 1, "reser
 
 
 def unpack_block_head(data: bytes | bytearray | memoryview, offset: int = 0) -> BlockHead:
-    """Read a BlockHead at a byte offset; struct.error where the data is too short."""
+    """Read a BlockHead at a byte offset; raise struct.error if the data is too short."""
     v = BLOCK_HEAD_STRUCT.unpack_from(data, offset)
     return BlockHead(v[0], v[1], v[2])
 
@@ -531,7 +531,7 @@ LATTICE_PARAMS_OFFSETS: Final[dict[str, int]] = {"exponent": 0, "reserved_0": 2}
 
 
 def unpack_lattice_params(data: bytes | bytearray | memoryview, offset: int = 0) -> LatticeParams:
-    """Read a LatticeParams at a byte offset; struct.error where the data is too short."""
+    """Read a LatticeParams at a byte offset; raise struct.error if the data is too short."""
     v = LATTICE_PARAMS_STRUCT.unpack_from(data, offset)
     return LatticeParams(v[0], v[1])
 
@@ -555,7 +555,7 @@ MORTON_PARAMS_OFFSETS: Final[dict[str, int]] = {"bits": 0, "reserved_0": 1, "res
 
 
 def unpack_morton_params(data: bytes | bytearray | memoryview, offset: int = 0) -> MortonParams:
-    """Read a MortonParams at a byte offset; struct.error where the data is too short."""
+    """Read a MortonParams at a byte offset; raise struct.error if the data is too short."""
     v = MORTON_PARAMS_STRUCT.unpack_from(data, offset)
     return MortonParams(v[0], v[1], v[2])
 
@@ -579,7 +579,7 @@ CODEBOOK_PARAMS_OFFSETS: Final[dict[str, int]] = {"codebook_id": 0, "reserved_0"
 
 
 def unpack_codebook_params(data: bytes | bytearray | memoryview, offset: int = 0) -> CodebookParams:
-    """Read a CodebookParams at a byte offset; struct.error where the data is too short."""
+    """Read a CodebookParams at a byte offset; raise struct.error if the data is too short."""
     v = CODEBOOK_PARAMS_STRUCT.unpack_from(data, offset)
     return CodebookParams(v[0], v[1], v[2])
 
@@ -603,7 +603,7 @@ SPARSE_PARAMS_OFFSETS: Final[dict[str, int]] = {"exponent": 0, "reserved_0": 2, 
 
 
 def unpack_sparse_params(data: bytes | bytearray | memoryview, offset: int = 0) -> SparseParams:
-    """Read a SparseParams at a byte offset; struct.error where the data is too short."""
+    """Read a SparseParams at a byte offset; raise struct.error if the data is too short."""
     v = SPARSE_PARAMS_STRUCT.unpack_from(data, offset)
     return SparseParams(v[0], v[1], v[2])
 
@@ -626,7 +626,7 @@ RAW_PARAMS_OFFSETS: Final[dict[str, int]] = {"column": 0, "reserved_0": 2}
 
 
 def unpack_raw_params(data: bytes | bytearray | memoryview, offset: int = 0) -> RawParams:
-    """Read a RawParams at a byte offset; struct.error where the data is too short."""
+    """Read a RawParams at a byte offset; raise struct.error if the data is too short."""
     v = RAW_PARAMS_STRUCT.unpack_from(data, offset)
     return RawParams(v[0], v[1])
 
@@ -654,7 +654,7 @@ STREAM_HEAD_OFFSETS: Final[dict[str, int]] = {"width": 0, "coder": 1, "transform
 
 
 def unpack_stream_head(data: bytes | bytearray | memoryview, offset: int = 0) -> StreamHead:
-    """Read a StreamHead at a byte offset; struct.error where the data is too short."""
+    """Read a StreamHead at a byte offset; raise struct.error if the data is too short."""
     v = STREAM_HEAD_STRUCT.unpack_from(data, offset)
     return StreamHead(v[0], v[1], v[2], v[3], v[4], v[5], v[6])
 
@@ -680,7 +680,7 @@ STATED_ERRORS_HEAD_OFFSETS: Final[dict[str, int]] = {"source_count": 0, "pruned_
 
 
 def unpack_stated_errors_head(data: bytes | bytearray | memoryview, offset: int = 0) -> StatedErrorsHead:
-    """Read a StatedErrorsHead at a byte offset; struct.error where the data is too short."""
+    """Read a StatedErrorsHead at a byte offset; raise struct.error if the data is too short."""
     v = STATED_ERRORS_HEAD_STRUCT.unpack_from(data, offset)
     return StatedErrorsHead(v[0], v[1], v[2], v[3], v[4])
 
@@ -707,7 +707,7 @@ STATED_ERROR_RECORD_OFFSETS: Final[dict[str, int]] = {"measure": 0, "reserved_0"
 
 
 def unpack_stated_error_record(data: bytes | bytearray | memoryview, offset: int = 0) -> StatedErrorRecord:
-    """Read a StatedErrorRecord at a byte offset; struct.error where the data is too short."""
+    """Read a StatedErrorRecord at a byte offset; raise struct.error if the data is too short."""
     v = STATED_ERROR_RECORD_STRUCT.unpack_from(data, offset)
     return StatedErrorRecord(v[0], v[1], v[2], v[3], v[4], v[5])
 

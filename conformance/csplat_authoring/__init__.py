@@ -1,5 +1,5 @@
 """Authoring of the vectors: `python -m csplat_authoring` writes them, the manifest, and annexes A and C of the spec.
 
-Every byte is written here (`builder`) and every expected number computed here (`reference`): neither our
-encoder nor our decoder has a part in them. In a checkout only, not in the wheel.
+`builder` writes every byte and `reference` computes every expected number, without our encoder and decoder. Only in a
+checkout, not in the wheel.
 """

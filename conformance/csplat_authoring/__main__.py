@@ -1,11 +1,11 @@
 """Write the vectors, the manifest, and annexes A and C of the spec.
 
 Usage:
-    python -m csplat_authoring           # write what is out of date, remove what no recipe makes
-    python -m csplat_authoring --check   # write nothing, exit 1 and name what is out of date
+    python -m csplat_authoring           # write outdated files, remove files without a recipe
+    python -m csplat_authoring --check   # write nothing, list outdated files and exit with 1
 
-Reference pictures need the packages of the extra `render`; if they are absent, the pictures are left as they are.
-A picture is out of date when it differs visibly: exponentials may round differently on another machine.
+Reference pictures need the packages of the extra `render`. Without them, existing pictures are kept. A picture is only
+outdated if it differs visibly, because exponentials may round differently on another machine.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from csplat_conformance.reference_renders import can_render, psnr, read_png, ref
 #: The text of the specification.
 FORMAT = Path(__file__).parents[2] / "spec" / "format.md"
 
-_SAME_PICTURE = 60.0  # dB: one of 16 values is off by one
+_SAME_PICTURE = 60.0  # dB; one of 16 values differs by 1
 
 
 def main() -> int:
-    """Compare or write; the exit status is 1 when --check finds a difference."""
+    """Write or compare the generated files; return exit status 1 if --check finds a difference."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--check", action="store_true", help="write nothing, fail when out of date")
+    parser.add_argument("--check", action="store_true", help="write nothing, fail if a file is outdated")
     check = parser.parse_args().check
-    wanted = files()
-    stale = [path for path, data in wanted.items() if not path.exists() or path.read_bytes() != data]
+    generated = files()
+    stale = [path for path, data in generated.items() if not path.exists() or path.read_bytes() != data]
     found = sorted([*VECTORS.rglob("*.csplat"), *VECTORS.rglob("*.png")])
-    extra = [path for path in found if path not in wanted]
+    extra = [path for path in found if path not in generated]
     if not can_render():
         sys.stderr.write("SKIPPED: reference pictures, which need the packages of the extra render\n")
     if not check:
         for path in stale:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(wanted[path])
+            path.write_bytes(generated[path])
         for path in extra:
             path.unlink()
     if stale or extra:
@@ -65,7 +65,7 @@ def files() -> dict[Path, bytes]:
         result |= pictures
         path = VECTORS / vector.file
         if path in result:
-            raise SystemExit(f"two recipes make {vector.file}")
+            raise SystemExit(f"two recipes have the name {vector.file}")
         result[path] = data
         vectors.append(vector)
     result[VECTORS / "manifest.json"] = to_json(vectors).encode()
@@ -78,7 +78,7 @@ def files() -> dict[Path, bytes]:
 
 
 def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vector:
-    """Return a recipe's entry for the bytes that it made.
+    """Return the manifest entry of a recipe.
 
     Args:
         recipe: the recipe of the entry.
@@ -118,7 +118,7 @@ def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vec
 
 
 def _pictures(recipe: Recipe) -> dict[Path, bytes]:
-    """Return the reference pictures of a recipe: the existing ones, unless they differ from the equations."""
+    """Return the reference pictures of a recipe: the existing ones, unless they are missing or outdated."""
     result = {}
     for number, view in enumerate(recipe.views):
         path = VECTORS / picture_name(recipe.name, number)
@@ -130,7 +130,7 @@ def _pictures(recipe: Recipe) -> dict[Path, bytes]:
             if not old or psnr(picture, read_png(old)) < _SAME_PICTURE:
                 old = write_png(picture)
         if not old:
-            raise SystemExit(f"{path.name} is missing, and the packages of the extra render to make it are too")
+            raise SystemExit(f"{path.name} is missing: install the packages of the extra render to create it")
         result[path] = old
     return result
 

@@ -1,6 +1,7 @@
-"""Boundary cases: for each rule of the registry about a field, files whose field holds what is just not allowed.
+"""Boundary cases: for each rule of the registry, files with the nearest forbidden values in the field.
 
-The checks that refuse them are written by hand, in the decoders and in the validator; a rule that differs is found.
+The checks that refuse them are written by hand in the decoders and in the validator, so that the cases reveal a rule
+that differs.
 """
 
 from __future__ import annotations
@@ -20,37 +21,37 @@ from csplat_authoring.samples import MEANS, SH0, attributes, morton, rich_scene,
 
 Rule = Range | Choice | Mask
 
-#: The field that an error names in place of the one that is wrong.
+#: The field that an error reports instead of the one that is wrong.
 _BLAMED: Final = {
     ("header", "version_minor"): "version_major",
     ("codebook_record", "band_last"): "band_first",
     ("stated_error_record", "rms"): "max",
 }
-#: Further codes with which a decoder may refuse, which meets another clause first.
+#: Further codes with which a decoder may refuse, because it checks another clause first.
 _ALSO: Final = {
     ("index_head", "axes"): ("E_UNSUPPORTED",),
     ("attribute_record", "mapping"): ("E_UNSUPPORTED",),
     ("directory_record", "flags"): ("E_VALUE",),
     ("tile_record", "extent"): ("E_BOX",),
 }
-#: Fields of whose elements the last one is set, not the first: a decoder has to look at each.
+#: Array fields whose last element is set instead of the first, because decoders have to check every element.
 _LAST: Final = {("index_head", "origin"), ("tile_record", "corner"), ("tile_record", "extent")}
-#: Layers that must be there, or have others behind them.
+#: Layers that are required, or precede others.
 _TIED: Final = {f"tile[{i}].layer[{layer}].layer" for i, layer in ((0, 0), (0, 1), (1, 0), (1, 1))}
-#: Rules whose files break a further clause of the same code: vectors of them are made by hand, with streams to match.
+#: Rules whose cases violate another clause with the same code; vectors for them are declared, with matching streams.
 _NO_VECTORS: Final = {("stream_head", "width")}
 
 
 @dataclass(frozen=True)
 class BoundaryCase:
-    """A file with one field beyond a rule.
+    """A file with one field that violates a rule.
 
     Attributes:
         rule: rule of the registry.
         base: the valid file.
-        name: name of the field in it.
-        value: the value that replaces an element of it.
-        suffix: tells the cases of a rule apart.
+        name: name of the field in the file.
+        value: the new value of an element of the field.
+        suffix: suffix that distinguishes the cases of a rule.
     """
 
     rule: Rule
@@ -61,7 +62,7 @@ class BoundaryCase:
 
     @property
     def changes(self) -> dict[str, Any]:
-        """Changed fields and their values: the field, and others that depend on it, so that nothing else is wrong."""
+        """New values of the field and of the fields that depend on it, so that nothing else is wrong."""
         changes = {self.name: self._with(self.name, self.value)}
         prefix, _, field = self.name.rpartition(".")
         if (self.rule.structure, field) == ("tile_record", "splat_count"):
@@ -79,18 +80,18 @@ class BoundaryCase:
 
     @property
     def offset(self) -> int:
-        """Byte of the field that is to blame."""
+        """Offset of the byte to report."""
         return self.base.fields[self.blamed].offset + self.within
 
     @property
     def blamed(self) -> str:
-        """Name of that field."""
+        """Name of the field to report."""
         prefix, _, field = self.name.rpartition(".")
         return f"{prefix}.{_BLAMED.get((self.rule.structure, field), field)}"
 
     @property
     def within(self) -> int:
-        """Byte of the element in its field."""
+        """Offset of the element in its field."""
         entry = self.base.fields[self.name]
         return self._element * struct.calcsize(entry.format[-1])
 
@@ -100,18 +101,18 @@ class BoundaryCase:
         return len(_holding(self.base, self.name)) - 1 if is_last else 0
 
     def _with(self, name: str, value: float) -> Any:
-        """Return what a field is to hold, one element of which is new."""
+        """Return the value of a field with one element replaced."""
         values = list(_holding(self.base, name))
         values[self._element] = value
         return bytes(values) if self.base.fields[name].format.endswith("s") else tuple(values)
 
     def data(self) -> bytes:
-        """Return the file, its checksums right."""
+        """Return the file, with valid checksums."""
         return self.base.patched(self.changes)
 
 
 def cases() -> Iterator[BoundaryCase]:
-    """Yield every case: each end of each range, ids around each enum, each bit that is not listed."""
+    """Yield every case: both ends of each range, ids around each enum, each unlisted bit."""
     rules: tuple[Rule, ...] = (*RANGES, *CHOICES, *MASKS)
     for rule in rules:
         base, name = next((b, name) for b in _bases() for name in _places(b, rule) if name not in _TIED)
@@ -121,7 +122,7 @@ def cases() -> Iterator[BoundaryCase]:
 
 
 def boundary_recipes() -> list[Recipe]:
-    """Return the recipes of the cases that are vectors: of a mask, its first bit, and the last beyond a byte."""
+    """Return recipes for the cases; of a mask only the first bit, and the last bit if it has more than eight."""
     result = []
     for case in cases():
         rule = case.rule
@@ -149,7 +150,7 @@ def boundary_recipes() -> list[Recipe]:
 
 
 def held(built: Built, rule: Rule) -> set[float]:
-    """Return the values in the fields of a file that a rule is about."""
+    """Return the values of the fields of a file to which a rule applies."""
     values: set[float] = set()
     for name in _places(built, rule):
         values |= set(_holding(built, name))
@@ -157,13 +158,13 @@ def held(built: Built, rule: Rule) -> set[float]:
 
 
 def _holding(built: Built, name: str) -> tuple[Any, ...]:
-    """Return what a field of a file holds, element by element."""
+    """Return the elements of a field of a file."""
     entry = built.fields[name]
     return struct.unpack_from(entry.format.replace("s", "B"), built.data, entry.offset)
 
 
 def _places(built: Built, rule: Rule) -> Iterator[str]:
-    """Yield the fields of a file that a rule is about."""
+    """Yield the fields of a file to which a rule applies."""
     for name, entry in built.fields.items():
         prefix, _, field = name.rpartition(".")
         if (entry.structure, field) != (rule.structure, rule.field):
@@ -173,7 +174,7 @@ def _places(built: Built, rule: Rule) -> Iterator[str]:
 
 
 def _beyond(rule: Rule, code: str) -> Iterator[tuple[str, float]]:
-    """Yield the nearest forbidden values that the field's struct code can hold; for a mask, bits."""
+    """Yield the nearest forbidden values that the struct code can represent; for a mask, bits."""
     if isinstance(rule, Choice):
         yield from ((f"is_{value}", value) for value in rule.others)
     elif isinstance(rule, Mask):
@@ -192,7 +193,7 @@ def _beyond(rule: Rule, code: str) -> Iterator[tuple[str, float]]:
 
 @cache
 def _bases() -> tuple[Built, ...]:
-    """Return a file without tiles, so that nothing uses what records say, a small one, and two that have the rest."""
+    """Return a file without tiles, whose records nothing uses, a small file, and two with all other structures."""
     known = (_spec.DIRECTION_RIGHT, _spec.DIRECTION_DOWN, _spec.DIRECTION_FORWARD)
     rich = rich_scene()
     second = replace(rich.tiles[1], blocks=rich.tiles[1].blocks | {MEANS: morton([[0, 1, 0], [1, 0, 0]], 2)})
@@ -205,7 +206,7 @@ def _bases() -> tuple[Built, ...]:
 
 
 def _words(built: Built, structure: str, prefix: str) -> set[str]:
-    """Return by which words rules name a structure: attribute, mapping, kind of codebook, coding."""
+    """Return the values of `of` in rules for a structure: attribute, mapping, codebook kind or coding."""
 
     def number(field: str) -> int:
         return int(_holding(built, f"{prefix}.{field}")[0])

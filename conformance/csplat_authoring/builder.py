@@ -1,8 +1,7 @@
-"""Turn a declared scene into the bytes of a csplat file, field by field as the spec lists them; repair checksums.
+"""Write a declared scene as the bytes of a csplat file, field by field in the order of the spec; repair checksums.
 
-Nothing is shared with the encoder or checked: the builder writes nonsense if the scene declares nonsense.
-Every field of the result has a name (`tile[0].extent`, `TILE.0.0/sh0.stream.count`), so that a vector can
-overwrite it afterwards.
+The builder shares no code with the encoder and checks nothing: it writes invalid files if the scene is invalid. Every
+field of the result has a name (`tile[0].extent`, `TILE.0.0/sh0.stream.count`), so that a vector can overwrite it.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from csplat_authoring.reference import max_scale
 from csplat_authoring.scene import Block, Chunk, Codebook, Scene, Stream, Tile, transpose
 from csplat_conformance.fields import Field, Writer
 
-#: Structures whose sizes the index head states, in its order, by the names that `Scene.tails` has for them.
+#: Structures whose sizes are in the index head, in its order, by their names in `Scene.tails`.
 SIZED: Final = {
     "head": "index_head",
     "attribute": "attribute_record",
@@ -34,12 +33,12 @@ _CODERS = {"stored": _spec.CODER_STORED, "deflate": _spec.CODER_DEFLATE}
 
 @dataclass(frozen=True)
 class Built:
-    """A file and the places of its fields.
+    """A file and the positions of its fields.
 
     Attributes:
         data: the bytes.
-        fields: name to place.
-        spans: chunk name to (offset, size).
+        fields: fields by name.
+        spans: (offset, size) by chunk name.
     """
 
     data: bytes
@@ -47,10 +46,7 @@ class Built:
     spans: dict[str, tuple[int, int]]
 
     def patched(self, changes: dict[str, Any], repaired: bool = True) -> bytes:
-        """Return the bytes with fields overwritten and, unless told otherwise, all checksums repaired.
-
-        The CRCs that the changes name stay as they are given.
-        """
+        """Return the bytes with changed fields and, by default, repaired checksums, except those in `changes`."""
         data = self._with(self.data, changes)
         if not repaired:
             return data
@@ -66,7 +62,7 @@ class Built:
 
     @property
     def records(self) -> list[tuple[str, int]]:
-        """Structure and place of the records that name chunks."""
+        """Structure and offset of the records that refer to chunks."""
         return [
             (entry.structure, entry.offset - CHUNK_RECORDS[entry.structure])
             for name, entry in self.fields.items()
@@ -351,7 +347,7 @@ def _coded(packed: bytes, coding: Stream) -> bytes:
 
 _CRC_SIZE = 4
 
-#: Structures that name a chunk, and where their `crc` lies.
+#: Structures that refer to a chunk, and the offset of their `crc`.
 CHUNK_RECORDS: Final = {
     "directory_record": _spec.DIRECTORY_RECORD_OFFSETS["crc"],
     "layer_record": _spec.LAYER_RECORD_OFFSETS["crc"],
@@ -359,12 +355,12 @@ CHUNK_RECORDS: Final = {
 
 
 def repair(data: bytes, records: Sequence[tuple[str, int]] | None = None) -> bytes:
-    """Return the file with the CRCs of chunks, index and header computed anew.
+    """Return the file with recomputed CRCs of chunks, index and header.
 
     Args:
-        data: a file, damaged or not; shorter than a header it comes back as it is.
-        records: structure and place of each record that names a chunk, where the index cannot be trusted to lead to
-            them; None walks the index. A record that names bytes beyond the file keeps its CRC.
+        data: a file, damaged or not. Data shorter than a header are returned unchanged.
+        records: structure and offset of each record that refers to a chunk, if the index may be damaged; None: read
+            the index. A record that refers to bytes beyond the file keeps its CRC.
     """
     if len(data) < _spec.HEADER_SIZE:
         return data
@@ -378,7 +374,7 @@ def repair(data: bytes, records: Sequence[tuple[str, int]] | None = None) -> byt
 
 
 def seal(data: bytes | bytearray) -> bytes:
-    """Return the file with the CRCs of index and header computed anew."""
+    """Return the file with recomputed CRCs of index and header."""
     out = bytearray(data)
     index_size = _spec.unpack_header(out).index_size
     crc_at = _spec.HEADER_SIZE + index_size - _CRC_SIZE
@@ -389,13 +385,13 @@ def seal(data: bytes | bytearray) -> bytes:
 
 
 def chunk_records(data: bytes) -> list[tuple[str, int]]:
-    """Walk the index, as far as it holds what its counts announce: structure and place of what names chunks."""
+    """Return structure and offset of the records that refer to chunks, as far as the index contains them."""
     end = min(len(data), _spec.HEADER_SIZE + _spec.unpack_header(data).index_size)
     return [(structure, at) for structure, at, size in _records(data) if at + size <= end]
 
 
 def _records(data: bytes) -> Iterator[tuple[str, int, int]]:
-    """Yield structure, place and size of the records that name chunks, up to the first beyond the data."""
+    """Yield structure, offset and size of the records that refer to chunks, up to the first beyond the data."""
     at = _spec.HEADER_SIZE
     if at + _spec.INDEX_HEAD_SIZE > len(data):
         return

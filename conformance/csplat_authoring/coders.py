@@ -1,7 +1,7 @@
-"""The transforms and coders of streams, written for vectors: plain, slow, the same bytes everywhere.
+"""Transforms and coders of streams for vectors: simple and slow, with the same bytes on every machine.
 
-No compression library takes part, so that a vector never changes because a library did. DEFLATE streams (RFC 1951)
-are made right or wrong.
+No compression library is used, so that vectors do not change with library versions. DEFLATE streams (RFC 1951) can be
+valid or invalid.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from csplat import _spec
 
 
 def to_bytes(values: Sequence[int], width: int) -> bytes:
-    """Write integers little-endian, modulo 2^(8·width): what a sequence is when no byte transform follows."""
+    """Write integers little-endian, modulo 2^(8·width)."""
     data = bytearray(width * len(values))
     for plane in range(width):
         data[plane::width] = bytes([value >> (8 * plane) & 255 for value in values])
@@ -23,7 +23,7 @@ def to_bytes(values: Sequence[int], width: int) -> bytes:
 
 
 def apply_transforms(values: Sequence[int], width: int, transforms: Sequence[int]) -> bytes:
-    """Apply transforms in their order and return the bytes that reach the coder (spec 6.3)."""
+    """Apply transforms in order and return the bytes for the coder (spec 6.3)."""
     modulus = 1 << (8 * width)
     elements = [value % modulus for value in values]
     packed: bytes | None = None
@@ -56,15 +56,15 @@ END_OF_BLOCK = 256
 
 _FIXED, _DYNAMIC = 1, 2
 _ORDER = (16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15)
-_REPEATS = {16: (3, 2), 17: (3, 3), 18: (11, 7)}  # symbols of the code length code: fewest repetitions, extra bits
+_REPEATS = {16: (3, 2), 17: (3, 3), 18: (11, 7)}  # by symbol of the code length code: minimum count, extra bits
 _FIXED_LITERALS = {s: 8 if s < 144 else 9 if s < 256 else 7 if s < 280 else 8 for s in range(288)}
 _FIXED_DISTANCES = dict.fromkeys(range(32), 5)
 
 
 class Deflate:
-    """A stream that is written piece by piece and checks nothing. Each method returns the stream.
+    """A writer of a DEFLATE stream, symbol by symbol and without checks. Each method returns the writer.
 
-    Tables are maps from symbols to the lengths of their codes.
+    Codes are maps from symbols to code lengths.
     """
 
     def __init__(self) -> None:
@@ -73,7 +73,7 @@ class Deflate:
         self._distances: dict[int, tuple[int, int]] = {}
 
     def number(self, value: int, count: int) -> Self:
-        """Append a number of `count` bits, lowest bit first: a field of a header, the extra bits of a symbol."""
+        """Append a number of `count` bits, lowest bit first, such as a header field or extra bits."""
         self._bits += [value >> i & 1 for i in range(count)]
         return self
 
@@ -104,9 +104,9 @@ class Deflate:
             distances: the distance code.
             final: 1 for the last block.
             counts: HLIT + 257 and HDIST + 1.
-            header: symbols of the code length code, each repetition followed by how often it repeats; left out, one
-                symbol for each length.
-            meta: the code length code; left out, a complete one for the symbols that occur.
+            header: symbols of the code length code, each repetition followed by its count; default: one symbol for
+                each length.
+            meta: the code length code; default: a complete one for the symbols that occur.
         """
         self._literals, self._distances = _codes(literals), _codes(distances)
         plain = [literals.get(s, 0) for s in range(counts[0])] + [distances.get(s, 0) for s in range(counts[1])]
@@ -137,27 +137,27 @@ class Deflate:
         """Append a match of 3 to 258 bytes.
 
         Args:
-            length: bytes.
-            distance: symbol of the distance code, whose extra bits the caller appends.
+            length: number of bytes.
+            distance: symbol of the distance code; the caller appends its extra bits.
         """
         if length == 258:
             self.literals(285)
         else:
-            # RFC 1951, 3.2.5: from length 11 on, four symbols per number of extra bits
+            # RFC 1951, 3.2.5: from length 11 on, there are four symbols for each number of extra bits.
             extra = max(0, (length - 3).bit_length() - 3)
             base = length - 3 >> extra
             self.literals(257 + 4 * extra + base).number(length - 3 & (1 << extra) - 1, extra)
         return self.distance(distance)
 
     def end(self, last_bits: int = 0) -> bytes:
-        """Fill the last byte with bits of `last_bits` and return the bytes."""
+        """Fill the last byte with `last_bits`, 0 or 1, and return the bytes."""
         bits = self._bits + [last_bits] * (-len(self._bits) % 8)
         groups = zip(*[iter(bits)] * 8, strict=True)
         return bytes(sum(bit << i for i, bit in enumerate(group)) for group in groups)
 
 
 def _codes(lengths: Mapping[int, int]) -> dict[int, tuple[int, int]]:
-    """Return the canonical code (RFC 1951, 3.2.2): symbol to codeword and its bits."""
+    """Return the canonical code (RFC 1951, 3.2.2): codeword and length by symbol."""
     codes, code = {}, 0
     for length in range(1, 16):
         for symbol in sorted(s for s, bits in lengths.items() if bits == length):
@@ -173,7 +173,7 @@ def _with_repeats(header: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def flat_lengths(symbols: Sequence[int]) -> dict[int, int]:
-    """Return the code of the symbols whose lengths are as equal as a complete code allows."""
+    """Return the code lengths of a complete code for the symbols, as equal as possible."""
     longest = max(1, (len(symbols) - 1).bit_length())
     short = (1 << longest) - len(symbols) if len(symbols) > 1 else 0
     return {symbol: longest - (i < short) for i, symbol in enumerate(symbols)}
@@ -193,7 +193,7 @@ def deflate_fixed(data: bytes, last_bits: int = 0) -> bytes:
 
     Args:
         data: the bytes to code.
-        last_bits: the unused bits after the block, 0 if a writer obeys the spec.
+        last_bits: value of the unused bits after the block; the spec requires writers to use 0.
     """
     stream = Deflate().fixed()
     at = 0
@@ -211,6 +211,6 @@ def deflate_fixed(data: bytes, last_bits: int = 0) -> bytes:
 
 
 def deflate_dynamic(data: bytes) -> bytes:
-    """Return one block of dynamic Huffman codes without matches; lengths are as equal as a complete code allows."""
+    """Return one block of dynamic Huffman codes without matches, with code lengths as equal as possible."""
     table = flat_lengths(sorted({*data, END_OF_BLOCK}))
     return Deflate().dynamic(table, {}).literals(*data, END_OF_BLOCK).end()

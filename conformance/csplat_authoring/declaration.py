@@ -1,25 +1,25 @@
 """Scenes and vectors declared in TOML.
 
-The files of `chapters/` hold a section of the specification each. A table is a vector: `[valid.NAME]`,
-`[extreme.NAME]` or `[invalid.NAME]`. The keys from `code` on are for invalid ones:
+Each file of `chapters/` covers a section of the specification. A table is a vector: `[valid.NAME]`, `[extreme.NAME]` or
+`[invalid.NAME]`. The keys from `code` on are only for invalid vectors:
 
 | key | meaning |
 |---|---|
-| why | one line |
-| clauses | ids, the broken one first |
-| scene | the scene that the file holds; default: one tile of two splats |
-| base | name of the scene, if several vectors have it: `rich`, or a key of the table `scenes` of the file |
+| why | description, one line |
+| clauses | ids, the violated one first |
+| scene | the scene of the file; default: one tile of two splats |
+| base | name of a shared scene: `rich`, or a key of the table `scenes` of the file |
 | code | error code |
-| set | fields to overwrite afterwards, and their values (`_value`); checksums are repaired |
-| swap | two layer records that change places |
-| cut | bytes missing at the end of the last chunk, or the field in which it ends and how many of its bytes are left |
-| at, within | field to blame, and byte in it; default: the first that is overwritten |
-| also | further codes that do as well |
+| set | fields to overwrite, and their values (`_value`); checksums are repaired |
+| swap | two layer records to swap |
+| cut | bytes missing at the end of the last chunk, or the field in which it ends and its remaining bytes |
+| at, within | field to report, and byte in it; default: the first overwritten field |
+| also | further acceptable codes |
 
-A scene starts as that of `samples.scene`, or of `samples.rich_scene` (`like = "rich"`), and a tile as that of
-`samples.tile`, or as tile K of the rich scene (`like = K`); the other keys are changes. Rows are arrays,
-`{ seed, size, range }` or `{ all, size }`; a mask is a string of 0 and 1. Bytes are strings of characters up to
-U+00FF. Numbers near a power of 2 are strings: `"2^22 + 1"`, `"-2^-30"`.
+A scene starts as `samples.scene`, or as `samples.rich_scene` (`like = "rich"`). A tile starts as `samples.tile`, or as
+tile K of the rich scene (`like = K`). The other keys are changes. Rows are arrays, `{ seed, size, range }` or
+`{ all, size }`. A mask is a string of 0 and 1. Bytes are strings of characters up to U+00FF. Numbers near a power of 2
+are strings: `"2^22 + 1"`, `"-2^-30"`.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ _MEASURES: Final = _ids(_spec.MEASURE_NAMES)
 _TRANSFORMS: Final = _ids(_spec.TRANSFORM_NAMES)
 _DTYPES: Final = _ids(_spec.EXTRA_DTYPE_NAMES)
 
-#: Fields whose values have names.
+#: Names of values, by field.
 _NAMED: Final = {
     "attribute": _ATTRIBUTES,
     "coding": _CODINGS,
@@ -107,7 +107,7 @@ def _recipes(path: Path, groups: Collection[str]) -> Iterator[Recipe]:
 
 
 def _numbers(value: Any) -> Any:
-    """Return a value of TOML with its strings like `-2^22 + 1` turned into numbers."""
+    """Return a TOML value with strings such as `-2^22 + 1` converted to numbers."""
     if isinstance(value, dict):
         return {key: _numbers(one) for key, one in value.items()}
     if isinstance(value, list):
@@ -140,11 +140,11 @@ def _invalid(name: str, table: dict[str, Any], base: Built) -> Recipe:
 
 
 def _value(base: Built, field: str, value: Any) -> Any:
-    """Return a value of `set`: a number, a name, bytes, the elements of a field, or relative to the base.
+    """Return a value of `set`: a number, a name, bytes, the elements of a field, or a value relative to the base.
 
-    `{ of = "index.splat_count", plus = 1 }` is the value that a field of the base has, plus a number or, of several
-    elements, numbers; `ulps` in place of `plus` counts numbers of binary32. `{ size = "index_head", plus = 3 }` is the
-    size of a structure.
+    `{ of = "index.splat_count", plus = 1 }` is the value of a field of the base plus a number, or plus a list of
+    numbers for an array; `ulps` instead of `plus` counts binary32 numbers. `{ size = "index_head", plus = 3 }` is the
+    size of a structure plus a number.
     """
     entry, name = base.fields[field], field.rpartition(".")[2]
     if isinstance(value, dict):
@@ -180,7 +180,7 @@ def _swapped(base: Built, one: str, other: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _PartialTile(Tile):
-    """A tile of which some layers are in the file."""
+    """A tile with only some of its layers in the file."""
 
     present: tuple[int, ...] = ()
 

@@ -1,4 +1,4 @@
-"""Recipes of vectors: files that hold a scene, and files with a defect."""
+"""Recipes of vectors: valid files, and files with a defect."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _ANCILLARY = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _s
 
 @dataclass(frozen=True)
 class View:
-    """A rendering.
+    """A view of a rendered vector.
 
     Attributes:
-        camera: K, viewmat, W, H and near, as a camera file has them.
-        psnr: PSNR that a renderer's picture must reach against the reference, dB.
+        camera: K, viewmat, W, H and near, in the form of a camera file.
+        psnr: required PSNR of a renderer compared with the reference, dB.
     """
 
     camera: dict[str, Any]
@@ -29,20 +29,20 @@ class View:
 
 @dataclass(frozen=True)
 class Recipe:
-    """One vector.
+    """The recipe of one vector.
 
     Attributes:
         name: group and name, `valid/morton`.
-        why: one line: what it shows, why it hurts.
-        clauses: ids that it covers; for invalid files first the one it breaks.
-        data: makes the file.
+        why: purpose of the vector, one line.
+        clauses: ids of the clauses that it covers; for invalid files, the violated one comes first.
+        data: returns the file.
         scene: the scene that it must decode to; None if it must be refused.
         code: error code, if it must be refused.
-        offset: the defect's byte, if a single one is to blame.
+        offset: offset of the defect, if it is a single byte.
         also: further codes that a decoder may report.
-        optional: type of the chunk in whose payload the defect lies, `META`: decoders that leave it unread (CHK-6)
-            accept the file. Empty if every decoder refuses it.
-        views: reference views, for scenes that are rendered.
+        optional: type of the chunk whose payload has the defect, such as `META`; decoders that leave it unread (CHK-6)
+            accept the file. Empty if every decoder must refuse the file.
+        views: reference views, for rendered scenes.
     """
 
     name: str
@@ -58,13 +58,13 @@ class Recipe:
 
 
 def valid_recipe(group: str, name: str, why: str, clauses: str, made: Scene) -> Recipe:
-    """Return the recipe of a file that holds a scene.
+    """Return the recipe of a valid file.
 
     Args:
         group: `valid`, `extreme` or `render`.
         name: name of the vector.
-        why: one line.
-        clauses: ids that it covers.
+        why: purpose of the vector, one line.
+        clauses: ids of the clauses that it covers, separated by blanks.
         made: the scene.
     """
     return Recipe(f"{group}/{name}", why, tuple(clauses.split()), lambda: build(made).data, made)
@@ -86,15 +86,15 @@ def invalid_recipe(
 
     Args:
         name: name of the vector.
-        why: one line: the defect.
-        clauses: the one that is broken, and others that the vector covers.
+        why: the defect, one line.
+        clauses: the violated clause, and others that the vector covers.
         code: error code.
-        base: the file, or the scene that it holds.
-        changes: field to value, overwritten in the file; checksums are repaired.
-        also: further codes that do as well.
-        at: field that is to blame; by default the first that changes.
+        base: the file, or its scene.
+        changes: new values of fields by name; checksums are repaired.
+        also: further acceptable codes.
+        at: field to report; default: the first that changes.
         within: byte within that field.
-        cut: bytes that the payload of the last chunk lacks at its end; all sizes of the container follow.
+        cut: number of bytes to remove at the end of the last chunk's payload; all sizes are adjusted.
     """
     built = build(base) if isinstance(base, Scene) else base
     changes = dict(changes or {})
@@ -111,13 +111,13 @@ def invalid_recipe(
 
 
 def _unread(field: str) -> str:
-    """Return the ancillary chunk in whose payload a field lies, neither in its frame nor in its CRC; or nothing."""
+    """Return the ancillary chunk whose payload contains a field, or an empty string."""
     chunk, _, part = field.partition("/")
     return chunk if chunk.encode() in _ANCILLARY and part != "crc" and not part.startswith("header.") else ""
 
 
 def _sizes(base: Built, cut: int) -> dict[str, int]:
-    """Return the sizes of a file whose last chunk is shorter."""
+    """Return the size fields of a file whose last chunk is shorter."""
     chunk, (offset, length) = max(base.spans.items(), key=lambda item: item[1])
     kind, *numbers = chunk.split(".")
     record = "tile[{}].layer[{}]".format(*numbers) if kind == "TILE" else f"directory[{chunk}]"

@@ -1,6 +1,6 @@
-"""Compute what a decoder must return for a scene, straight from the formulae of the spec (sections 6.4.5, 7 and 9.2).
+"""Compute the expected result of decoding a scene, directly from the formulae of the spec (sections 6.4.5, 7, 9.2).
 
-Python integers and one IEEE operation at a time; slow on purpose, and independent of `csplat.decoder`.
+It uses Python integers and single IEEE operations: slow on purpose, and independent of `csplat.decoder`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _COLOURS = (_spec.ATTRIBUTE_SH0, _spec.ATTRIBUTE_SH1, _spec.ATTRIBUTE_SH2, _spec
 
 @dataclass
 class Expected:
-    """Header facts and arrays."""
+    """Header fields and arrays."""
 
     header: dict[str, Any]
     integers: dict[str, Array] = field(default_factory=dict)
@@ -35,7 +35,7 @@ class Expected:
 
 
 def expected(scene: Scene) -> Expected:
-    """Compute everything that the manifest states about a valid file."""
+    """Compute the expected result in the manifest for a valid file."""
     result = Expected(_header(scene))
     rows = {attribute: _all_rows(scene, attribute) for attribute in scene.attributes}
     result.integers = _integers(scene, rows)
@@ -64,7 +64,7 @@ def _header(scene: Scene) -> dict[str, Any]:
 
 
 def block_rows(scene: Scene, tile: Tile, attribute: int, block: Block) -> list[list[int]]:
-    """Return [n, C] integers of a block: for means q, for colours before the lifting of 7.1."""
+    """Return [n, C] integers of a block: q for means; colours before the lifting of 7.1."""
     if block.coding == _spec.CODING_SPARSE:
         present, zeros = iter(block.rows), [0] * _spec.ATTRIBUTE_COLUMNS[attribute]
         return [list(next(present)) if bit else zeros for bit in block.mask]
@@ -89,7 +89,7 @@ def block_rows(scene: Scene, tile: Tile, attribute: int, block: Block) -> list[l
 
 
 def _all_rows(scene: Scene, attribute: int) -> list[list[list[int]]]:
-    """Return for each tile the integers of an attribute, zeros for a band left out."""
+    """Return the integers of an attribute for each tile, with zeros for omitted bands."""
     zero = [0] * _spec.ATTRIBUTE_COLUMNS[attribute]
     result = []
     for tile in scene.tiles:
@@ -150,7 +150,7 @@ def _integers(scene: Scene, rows: dict[int, list[list[list[int]]]]) -> dict[str,
 
 def lattice_value(n: int, step: float, exponent: int) -> np.float32:
     """Return the value of a lattice integer (spec 7.2)."""
-    with np.errstate(over="ignore"):  # files to be refused overflow on purpose
+    with np.errstate(over="ignore"):  # invalid files overflow on purpose
         return np.float32(float(n) * math.ldexp(step, exponent))
 
 

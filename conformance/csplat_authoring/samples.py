@@ -1,4 +1,4 @@
-"""Small scenes and blocks that the recipes vary: seeded integers, no meaning."""
+"""Small scenes and blocks of pseudo-random integers, which the recipes vary."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _LEVELS_OPACITIES, _LEVELS_QUATS = 255, 127
 
 
 def integers(seed: int, count: int, low: int, high: int) -> list[int]:
-    """Return seeded integers from low to high (a 64-bit linear congruential generator, Knuth's constants)."""
+    """Return pseudo-random integers from low to high (64-bit linear congruential generator, Knuth's constants)."""
     state, result = seed * 2 + 1, []
     for _ in range(count):
         state = (state * 6364136223846793005 + 1442695040888963407) % 2**64
@@ -44,7 +44,7 @@ def integers(seed: int, count: int, low: int, high: int) -> list[int]:
 
 
 def rows_of(seed: int, n: int, columns: int, low: int, high: int) -> list[list[int]]:
-    """Return [n, columns] seeded integers."""
+    """Return [n, columns] pseudo-random integers."""
     flat = integers(seed, n * columns, low, high)
     return [flat[i * columns : (i + 1) * columns] for i in range(n)]
 
@@ -77,7 +77,7 @@ def axis(rows: Rows, stream_coding: Stream = PLAIN) -> Block:
 
 
 def offset(rows: Rows, stream_coding: Stream = PLAIN, exponent: int = 0, offsets: tuple[int, ...] = ()) -> Block:
-    """Return a block coded OFFSET; the offsets are the columns' minima unless given."""
+    """Return a block coded OFFSET; by default, the offsets are the minima of the columns."""
     return Block(_spec.CODING_OFFSET, rows, stream_coding, exponent=exponent, offsets=offsets)
 
 
@@ -89,7 +89,7 @@ def signed(rows: Rows, stream_coding: Stream = PLAIN, exponent: int = 0) -> Bloc
 def sparse(
     mask: tuple[int, ...], rows: Rows, stream_coding: Stream = PLAIN, mask_coding: Stream = PLAIN, exponent: int = 0
 ) -> Block:
-    """Return a block coded SPARSE: a bit per splat, and the rows of those whose bit is 1."""
+    """Return a block coded SPARSE: a bit per splat, and the rows of the splats whose bit is 1."""
     return Block(_spec.CODING_SPARSE, rows, stream_coding, exponent=exponent, mask=mask, mask_coding=mask_coding)
 
 
@@ -131,7 +131,7 @@ def attributes(degree: int = 0, ycocg: bool = False, chroma_shift: int = 0) -> d
 
 
 def tile(seed: int = 1, n: int = 2, degree: int = 0, changes: dict[int, Block] | None = None, **rest: Any) -> Tile:
-    """Return a tile of seeded integers in one-byte streams."""
+    """Return a tile of pseudo-random integers in one-byte streams."""
     blocks = {
         OPACITIES: levels(integers(seed, n, 0, _LEVELS_OPACITIES)),
         SCALES: offset(rows_of(seed + 1, n, 3, -90, 20)),
@@ -147,7 +147,7 @@ def tile(seed: int = 1, n: int = 2, degree: int = 0, changes: dict[int, Block] |
 
 
 def scene(degree: int = 0, tiles: Sequence[Tile] | None = None, **rest: Any) -> Scene:
-    """Return a scene of one small tile, or of the tiles given."""
+    """Return a scene of one small tile, or of the given tiles."""
     values: dict[str, Any] = {"attributes": attributes(degree), "sh_degree": degree}
     values["tiles"] = (tile(degree=degree),) if tiles is None else tuple(tiles)
     return Scene(**(values | rest))

@@ -1,7 +1,7 @@
-"""A scene as a vector declares it: every number that the file will hold, and how each stream is coded.
+"""The declared scene of a vector: every number of the file, and the coding of each stream.
 
-Nothing is derived that a vector may want to get wrong; `builder` turns a scene into bytes, `reference`
-into the arrays that a decoder must return.
+Values that a vector may set incorrectly are never derived. `builder` writes a scene as bytes, and `reference` computes
+the arrays that a decoder must return.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class Stream:
         width: bytes of an element.
         transforms: registry values, as in the file.
         coder: `stored`, `deflate_stored`, `deflate_fixed` or `deflate_dynamic`.
-        packed: bytes between transforms and coder, in place of the true ones.
-        coded: bytes after the coder, in place of the true ones.
+        packed: bytes between transforms and coder, instead of the correct ones.
+        coded: bytes after the coder, instead of the correct ones.
     """
 
     width: int = 1
@@ -42,23 +42,23 @@ PLAIN, PAIRS = Stream(), Stream(2)
 
 @dataclass(frozen=True)
 class Block:
-    """One attribute in one layer of one tile, as one coding holds it.
+    """One attribute in one layer of one tile.
 
     Attributes:
         coding: registry value.
-        rows: [n, C] integers: q of LEVELS, MORTON and AXIS, lattice integers of OFFSET and SIGNED, bits of RAW;
-            for SPARSE, only of the splats that the mask names.
-        stream_coding: coding of the stream of these.
+        rows: [n, C] integers: q for LEVELS, MORTON and AXIS, lattice integers for OFFSET and SIGNED, bits for RAW;
+            for SPARSE, only those of the splats in the mask.
+        stream_coding: coding of the stream of rows.
         exponent: exponent, for OFFSET, SIGNED and SPARSE.
-        offsets: offsets, for OFFSET one per column; for SHAPE's summand one.
-        mask: mask, for SPARSE, a bit per splat.
-        mask_coding: coding of its stream.
+        offsets: one offset per column, for OFFSET; one offset, for the summand of SHAPE.
+        mask: a bit per splat, for SPARSE.
+        mask_coding: coding of the mask's stream.
         bits: bits per axis, for MORTON.
-        codebook: id, for CODEBOOK.
-        indices: n of them; none in a block that is not the first of its codebook.
-        index_coding: coding of their stream.
-        summands: n common summands, of kind SHAPE in the block of the scales.
-        escape: the block of the escaped splats.
+        codebook: codebook id, for CODEBOOK.
+        indices: [n] indices; empty in a block that is not the first of its codebook.
+        index_coding: coding of the indices' stream.
+        summands: [n] common summands, for scales of the kind SHAPE.
+        escape: the escape block.
         tail: bytes after the block.
     """
 
@@ -80,17 +80,17 @@ class Block:
 
 @dataclass(frozen=True)
 class Tile:
-    """A tile. Attributes that `blocks` lacks are left out; corner and extent are computed from the means' rows.
+    """A tile. Attributes without a block are omitted. The extent is computed from the rows of the means.
 
     Attributes:
-        blocks: attribute (registry value) to block.
+        blocks: blocks by attribute (registry value).
         corner: lattice integers.
         exponent: exponent of the means.
-        extras: blocks RAW, one per extra column.
-        codebook_ids: ids of codebooks, or None for those that the blocks use.
-        order: attributes of layer 0 as their blocks follow one another.
-        tails: layer to bytes after the last block.
-        unknown: layers that this version does not have, and their payloads.
+        extras: blocks coded RAW, one per extra column.
+        codebook_ids: ids of codebooks; None: those that the blocks use.
+        order: attributes of layer 0 in the order of their blocks.
+        tails: bytes after the last block, by layer.
+        unknown: layers that this version does not define, with their payloads.
     """
 
     blocks: dict[int, Block]
@@ -104,12 +104,12 @@ class Tile:
 
     @property
     def splat_count(self) -> int:
-        """Number of splats: the rows of the means."""
+        """Number of splats: that of the rows of the means."""
         return len(self.blocks[_spec.ATTRIBUTE_MEANS].rows)
 
     @property
     def layers(self) -> list[int]:
-        """Layers that the tile holds, ascending."""
+        """Layers of the tile, ascending."""
         layers = {_spec.ATTRIBUTE_LAYER[attribute] for attribute in self.blocks}
         return sorted(layers | ({_spec.LAYER_EXTRA} if self.extras else set()) | {layer for layer, _ in self.unknown})
 
@@ -126,14 +126,14 @@ class Attribute:
 
 @dataclass(frozen=True)
 class Codebook:
-    """A codebook: for each layer the entries as rows.
+    """A codebook.
 
     Attributes:
         id: id of the record.
         kind: registry value.
-        entries: layer to rows [size, C].
+        entries: entries, rows [size, C], by layer.
         bands: first and last SH band; zeros for other kinds.
-        stream_coding: coding of the entries, the same for all chunks.
+        stream_coding: coding of the entries in all chunks.
         tail: bytes after the stream of each chunk.
     """
 
@@ -186,15 +186,15 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Scene:
-    """All of a file.
+    """The contents of a file.
 
     Attributes:
-        attributes: registry value to record, in the order of the file.
-        order: names of the chunks as they follow one another; None for the order that the spec recommends.
-        directory: names in the order of the directory; None for the order of the chunks.
+        attributes: records by attribute (registry value), in the order of the file.
+        order: names of the chunks in their order; None: the order that the spec recommends.
+        directory: names in the order of the directory; None: the order of the chunks.
         gap: bytes between the index and the first chunk.
         trailing: bytes after the end.
-        tails: kind of record, or `head`, to the bytes behind what this version knows of it (IDX-9).
+        tails: tails (IDX-9) by kind of record, or `head`.
     """
 
     attributes: dict[int, Attribute]
@@ -225,5 +225,5 @@ def band_of(attribute: int) -> int:
 
 
 def transpose(rows: Rows) -> list[int]:
-    """Return rows in columns: all of column 0, then all of column 1."""
+    """Return the values of column 0, then those of column 1, and so on."""
     return [value for column in zip(*rows, strict=True) for value in column]

@@ -1,4 +1,4 @@
-"""Recipes of all vectors: those that tables declare (`declaration`), and those that code makes."""
+"""Recipes of all vectors, both declared (`declaration`) and computed."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from csplat_authoring.boundaries import boundary_recipes
 from csplat_authoring.declaration import declared_recipes
 from csplat_authoring.recipe import Recipe
-from csplat_authoring.recipes.combined import combined_recipes
 from csplat_authoring.recipes.deflate_streams import invalid_deflate_recipes, valid_deflate_recipes
 from csplat_authoring.recipes.extreme import edge_recipes, extreme_stream_recipes
 from csplat_authoring.recipes.invalid_bytes import invalid_bytes_recipes
 from csplat_authoring.recipes.rendered import rendered_recipes
 from csplat_authoring.recipes.texts import bad_text_recipes, good_text_recipes
-from csplat_authoring.recipes.valid import valid_recipes, valid_stream_recipes
+from csplat_authoring.recipes.valid import combined_recipes, valid_recipes, valid_stream_recipes
 from csplat_authoring.reference import expected
 from csplat_authoring.scene import Scene
 from csplat_conformance.manifest import load
@@ -26,7 +25,7 @@ __all__ = ["all_recipes", "exact_floats", "sound_recipes"]
 
 
 def sound_recipes() -> list[Recipe]:
-    """Return the recipes of valid files, in a twentieth of the time: the others build a file and break it."""
+    """Return the recipes of valid files. This is much faster than `all_recipes`, which builds the invalid files."""
     makers = (
         valid_recipes,
         valid_stream_recipes,
@@ -48,14 +47,14 @@ def all_recipes() -> list[Recipe]:
 
 
 def _ordered(recipes: list[Recipe]) -> list[Recipe]:
-    """Return recipes in the order that the manifest has them in, new ones last: a change to it stays short."""
+    """Return recipes in the order of the manifest, new ones last, so that changes of the manifest stay small."""
     places = {vector.name: place for place, vector in enumerate(load())}
     return sorted(recipes, key=lambda recipe: places.get(recipe.name, math.inf))
 
 
 @lru_cache(maxsize=8)
 def exact_floats(name: str) -> dict[str, NDArray[Any]]:
-    """Return the float arrays of a vector: the manifest has only their hashes."""
+    """Return the float arrays of a vector; the manifest has only their hashes."""
     made = _scenes()[name]
     assert made is not None, f"{name} has no values"
     return expected(made).floats

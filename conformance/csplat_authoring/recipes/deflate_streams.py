@@ -1,4 +1,4 @@
-"""DEFLATE streams at the edges of what section 6.2 allows, on both sides."""
+"""DEFLATE streams at the limits of section 6.2: just valid and just invalid."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from csplat_authoring.scene import Scene, Stream
 _LENGTH_3 = 257
 _TABLE = {7: 2, 8: 2, END_OF_BLOCK: 2, _LENGTH_3: 2}  # complete
 _BOTH = {0: 1, 1: 1}
-_SH3, _WIDTH = SH0 + 3, 4  # the band with the most bytes per splat: long outputs in small files
-_FAR, _FARTHEST = 24577, 32768  # distances of symbol 29; what takes 30 or 31 for it gets the former
+_SH3, _WIDTH = SH0 + 3, 4  # the band with the most bytes per splat, for long outputs of few splats
+_FAR, _FARTHEST = 24577, 32768  # smallest and largest distance of symbol 29, for which some take symbols 30 and 31
 
 
 @dataclass(frozen=True)
@@ -21,11 +21,11 @@ class DeflateCase:
     """One stream.
 
     Attributes:
-        name: name of the vector, behind `deflate_`.
-        why: one line.
-        clause: the clause that it breaks, or shows.
+        name: name of the vector, without `deflate_`.
+        why: purpose of the vector, one line.
+        clause: the clause that it violates or demonstrates.
         coded: the stream.
-        output: its decoded bytes; for a broken one, the output of a decoder that does not notice.
+        output: its decoded bytes; for an invalid stream, those of a decoder without the check.
     """
 
     name: str
@@ -36,12 +36,12 @@ class DeflateCase:
 
 
 def valid_deflate_recipes() -> list[Recipe]:
-    """Return recipes of streams that a decoder reads."""
+    """Return recipes of valid streams."""
     return [_valid(case, _scene(case)) for case in sound_streams()]
 
 
 def invalid_deflate_recipes() -> list[Recipe]:
-    """Return recipes of streams that a decoder refuses."""
+    """Return recipes of invalid streams."""
     return [
         invalid_recipe(
             f"deflate_{case.name}", case.why, case.clause, "E_CODER", _scene(case), at=f"{_place(case)}.coded"
@@ -59,7 +59,7 @@ def _place(case: DeflateCase) -> str:
 
 
 def _scene(case: DeflateCase) -> Scene:
-    """Return a scene that has the stream: as opacities, or if it is long as band 3."""
+    """Return a scene with the stream as opacities or, if it is long, as band 3."""
     stream_coding = Stream(coder="deflate", coded=case.coded)
     if len(case.output) < _FAR:
         n = len(case.output)
@@ -75,7 +75,7 @@ def _scene(case: DeflateCase) -> Scene:
 
 
 def sound_streams() -> list[DeflateCase]:
-    """Return streams that a decoder reads."""
+    """Return valid streams."""
     crossing = (18, 138, 18, 117, 2, 2, 16, 6)  # 255 zeros, 2, 2, and the 2 six times more
     literals = {7: 1, 8: 2, _LENGTH_3: 15, END_OF_BLOCK: 15} | {9 + i: 3 + i for i in range(12)}
     distances = {i: min(15, 1 + i) for i in range(16)}
@@ -173,7 +173,7 @@ def sound_streams() -> list[DeflateCase]:
 
 
 def _copies() -> tuple[Deflate, bytes]:
-    """Forty literals, and matches; and what they give."""
+    """Return a stream of forty literals and matches, and its output."""
     stream, output = Deflate().fixed().literals(*range(40)), bytearray(range(40))
     for distance, length in ((2, 20), (15, 40), (16, 17), (17, 33), (31, 48), (40, 35)):
         extra = max(0, (distance - 1).bit_length() - 2)
@@ -185,7 +185,7 @@ def _copies() -> tuple[Deflate, bytes]:
 
 
 def broken_streams() -> list[DeflateCase]:
-    """Return streams that a decoder refuses."""
+    """Return invalid streams."""
     return [*_counts(), *_codes(), *_lengths(), *_symbols()]
 
 
@@ -305,7 +305,7 @@ def _symbols() -> list[DeflateCase]:
 
 
 def _zeros(count: int, first: int = 0) -> Deflate:
-    """Return a block of fixed codes that has given a byte, then zeros, `count` in all."""
+    """Return a block of fixed codes whose output is a byte followed by zeros, `count` bytes in total."""
     stream = Deflate().fixed().literals(first, 0)
     left = count - 2
     while left:
@@ -315,6 +315,6 @@ def _zeros(count: int, first: int = 0) -> Deflate:
 
 
 def _long(before: int, length: int, first: int = 0) -> bytes:
-    """Return what `_zeros` gives, then what lies `before` bytes back."""
+    """Return the output of `_zeros`, followed by a copy from `before` bytes back."""
     begun = bytes([first])
     return begun.ljust(before, b"\0") + begun.ljust(length, b"\0")

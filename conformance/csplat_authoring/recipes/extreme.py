@@ -1,4 +1,4 @@
-"""Valid files at the limits that code makes: codebooks, streams, texts, integers of all widths."""
+"""Computed valid files at the limits: codebooks, streams, texts, integers of all widths."""
 
 from __future__ import annotations
 
@@ -337,7 +337,7 @@ def _widths() -> Scene:
 
 
 def _lifting() -> Scene:
-    """For b of 15 and 21: parts on either side of 2^b / 3 and 2^b / 2, whose sums are up to three times as large."""
+    """Return colours near 2^b / 3 and 2^b / 2 for b of 15 and 21; their sums are up to three times larger."""
     tiles = []
     for bits in (15, 21):
         for q in (*(2**bits // 3 + d for d in (-1, 0, 1)), 2 ** (bits - 1) - 1, 2 ** (bits - 1), 2**bits - 1):
@@ -392,7 +392,7 @@ def _bounds() -> Scene:
 
 
 def _summands() -> Scene:
-    """Entries as far below 0 as they can be."""
+    """Return a scene with the most negative entries and summands that compensate them."""
     far = 2**31
     table = Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[-far, -far, -far, 1, 2, 3]]}, stream_coding=Stream(4))
     summands = (far + _COLUMN, far - _COLUMN + 1)
@@ -403,7 +403,7 @@ def _summands() -> Scene:
 
 
 def _many() -> Scene:
-    """16,400 splats; every index and escape in long runs."""
+    """Return a scene of 16,400 splats with long runs of indices and escapes."""
     n, border = 16_400, 16_384
     stream_coding = Stream(1, _RUNS)
     shapes = Codebook(2, _spec.CODEBOOK_KIND_SHAPE, {0: [[-9, -1, 0, 1, 2, 3], [9, 1, 0, 4, 5, 6]]})

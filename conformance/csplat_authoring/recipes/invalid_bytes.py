@@ -1,4 +1,4 @@
-"""Invalid files whose bytes are changed, or too many to declare (`declaration`)."""
+"""Computed invalid files: with changed bytes, or too large to declare."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _of_bytes(name: str, why: str, clause: str, code: str, data: bytes, at: int)
 
 
 def _misplaced_chunks() -> list[Recipe]:
-    """Return files whose first chunks are replaced by equally long ones, of another file or their own."""
+    """Return files whose first chunk is replaced by one of the same size, from another file or from the same one."""
     one = build(scene())
     two = build(scene(tiles=[tile(1), tile(1, changes={OPACITIES: levels([3, 1])})]))
 
@@ -81,7 +81,7 @@ def _misplaced_chunks() -> list[Recipe]:
 def _bombs() -> list[Recipe]:
     zeros = Stream(coder="deflate", coded=deflate_fixed(bytes(200_000)))
     bomb = scene(tiles=[tile(changes={OPACITIES: levels([7, 8], zeros)})])
-    runs = 1024  # runs of 65,536 spaces: beyond the default budget, and 3 kB in the file
+    runs = 1024  # runs of 65,536 spaces: they exceed the default budget, but take 3 kB in the file
     values = b"{}" + b" " * runs
     packed = values + b"\0\0" + b"\xff" * runs + b"\0\0" + b"\xff" * runs
     text = scene(chunks=(Chunk(_spec.CHUNK_METADATA, b"{}", Stream(1, _RUNS, "deflate_fixed", packed=packed)),))
@@ -106,7 +106,7 @@ def _bombs() -> list[Recipe]:
 
 
 def _full_runs(block: Block) -> Stream:
-    """Return the stream of a full tile whose splats are all like the one of a block."""
+    """Return the stream of a full tile in which all splats equal the one of a block."""
     (row,) = block.rows
     return Stream(1, _RUNS, packed=bytes(q & 255 for q in row) + b"\xff\xff" * len(row))
 
@@ -135,7 +135,7 @@ def _arrays_beyond_budget() -> Recipe:
 
 
 def _surplus_codebooks() -> list[Recipe]:
-    """Return files with one chunk of a codebook too many, a copy of the right one."""
+    """Return files with a surplus chunk of a codebook, a copy of the required one."""
     table = Codebook(3, _spec.CODEBOOK_KIND_SHAPE, {0: rows_of(0, 2, 6, -9, 9)})
     built = build(scene(tiles=[], codebooks=(table,)))
     offset, size = built.spans["CODB.3.0"]

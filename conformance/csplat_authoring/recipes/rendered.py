@@ -1,4 +1,4 @@
-"""Scenes that are rendered: what a viewer must show, camera by camera."""
+"""Rendered scenes and their cameras."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from csplat_authoring.scene import PAIRS, Attribute, Scene, Tile
 
 _SIDE = 128  # pixels
 _NEAR = 0.2  # scene units
-_PSNR = 45.0  # dB: rounding to 8 bits costs 59, a cut at three standard deviations is seen at 40
+_PSNR = 45.0  # dB; rounding to 8 bits gives 59, cutting splats at three standard deviations 40
 _MEANS_STEP, _MEANS_CELLS = 1 / 128, 256  # a box of two scene units
 _SCALES_STEP = as_binary32(0.05)
 
@@ -82,11 +82,11 @@ def _recipe(name: str, why: str, made: Scene, cameras: list[dict[str, Any]]) -> 
 
 
 def _scene(degree: int, n: int, scales: tuple[float, float]) -> Scene:
-    """Return seeded splats in a box from −1 to 1.
+    """Return pseudo-random splats in a box from −1 to 1.
 
     Args:
-        degree: degree of the harmonics.
-        n: splats.
+        degree: SH degree.
+        n: number of splats.
         scales: smallest and largest log scale.
     """
     low, high = (round(value / _SCALES_STEP) for value in scales)
@@ -111,7 +111,7 @@ def _scene(degree: int, n: int, scales: tuple[float, float]) -> Scene:
 def _camera(
     position: _Vec, target: _Vec, focal: float = 150.0, centre: tuple[float, float] = (64.0, 64.0)
 ) -> dict[str, Any]:
-    """Return a camera that looks at a point; −y is up."""
+    """Return a camera that looks at a point; the up direction is −y."""
     forward = _unit(tuple(t - p for t, p in zip(target, position, strict=True)))
     right = _unit(_cross((0.0, 1.0, 0.0), forward))
     rows = (right, _cross(forward, right), forward)

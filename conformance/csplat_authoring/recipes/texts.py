@@ -1,4 +1,4 @@
-"""JSON texts and stated errors, each rule of their grammar alone: what must be read, and what must be refused."""
+"""JSON texts and stated errors: valid ones, and invalid ones that violate one rule each."""
 
 from __future__ import annotations
 
@@ -115,12 +115,12 @@ _GOOD: Final = b"""\t\r\n { "numbers" : [ 0 , -0 , 9 , -9 , 19 , 90.9 , -0.99 , 
 
 
 def good_text_recipes() -> list[Recipe]:
-    """Return valid files whose texts use every production of JSON, and errors stated at their bounds."""
+    """Return valid files whose texts use every production of JSON, and stated errors at their limits."""
     many = b'{"a":[' + b",".join(b"[" * 62 + b"]" * 62 for _ in range(3)) + b"]}"
     texts = (Chunk(_META, _GOOD), Chunk(_CAMS, b" [ ] "), Chunk(_OPTS, b"{}"))
     deep = (Chunk(_META, many), Chunk(_CAMS, b"[{},{}]"))
     slack = 1.0 + 2.0**-20
-    # Roots of whole numbers are exact, and so is their product; of the others a little less.
+    # With an integer root the limit is exact; the others stay slightly below it.
     roots = {_spec.MEASURE_SH0: math.sqrt(3.0), _spec.MEASURE_SH1: 3.0 * slack}
     roots |= {_spec.MEASURE_SH2: math.sqrt(15.0), _spec.MEASURE_SH3: math.sqrt(21.0)}
     at_bounds = tuple((measure, 1.0, roots.get(measure, slack)) for measure in _spec.MEASURE_NAMES)
@@ -145,7 +145,7 @@ def good_text_recipes() -> list[Recipe]:
 
 
 def bad_text_recipes() -> list[Recipe]:
-    """Return files of which a text or a stated error alone is invalid."""
+    """Return files with an invalid text or stated error."""
     result = [_bad(name, _META, text, why) for name, (text, why) in _BAD.items()]
     result += [_bad(name, kind, text, why) for name, (kind, text, why) in _BAD_ELSEWHERE.items()]
     slack = 1.0 + 2.0**-20

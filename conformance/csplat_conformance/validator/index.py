@@ -22,7 +22,6 @@ _SIZES_MIN = {
     "tile": _spec.TILE_RECORD_SIZE,
     "layer": _spec.LAYER_RECORD_SIZE,
 }
-_CRC_SIZE = 4
 _STEP_MIN = Fraction(1, 2**1022)
 _SINGLE_MIN, _SINGLE_MAX = Fraction(1, 2**126), Fraction(2**128 - 2**104)
 _STEP_MAX = Fraction((2**53 - 1) * 2**971)  # the largest finite binary64

@@ -16,7 +16,6 @@ from csplat_authoring.coders import deflate_fixed, deflate_stored
 from csplat_conformance.fields import Field, read_fields
 
 _UNREPAIRED_SHARE = 0.1
-_CRC_SIZE = 4
 _PACKED_MAX = 2000
 _BOMB = deflate_fixed(bytes(100_000))
 _FLOATS = (0.0, -0.0, 1.0, -1.0, 5e-324, 2.0**-1022, 1e-30, 1e30, 1.7e308, float("inf"), float("-inf"), float("nan"))
