@@ -191,8 +191,6 @@ def digest(spec: Mapping[str, Any], rows: Sequence[Row]) -> str:
 
 
 def _draw_panel(axis: Any, spec: Mapping[str, Any], rows: Sequence[Row]) -> None:
-    from matplotlib.ticker import LogFormatter
-
     styles, labels = spec.get("styles", {}), spec.get("labels", {})
     axis.set_xscale(spec.get("x_scale", "linear"))
     for number, name in enumerate(dict.fromkeys(_value(spec["series"], row) for row in rows)):
@@ -210,7 +208,7 @@ def _draw_panel(axis: Any, spec: Mapping[str, Any], rows: Sequence[Row]) -> None
         axis.set_xticks([], minor=True)
     elif spec.get("x_scale") == "log":
         axis.xaxis.set_major_formatter("{x:g}")
-        axis.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.6)))
+        axis.xaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:.0e}"[0] in "235" else "")
     axis.set(xlim=spec.get("x_limits"), ylim=spec.get("y_limits"))
     axis.grid(color="0.9", linewidth=0.6)
     axis.spines[["top", "right"]].set_visible(False)
