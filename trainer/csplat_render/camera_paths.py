@@ -93,7 +93,7 @@ def orbit_cameras(
     if first is not None:
         return _sway(cloud, first, frame, count, K, width, height)
     angles, elevation, distance = _arc(cloud, frame, count)
-    return [_camera_towards(frame, float(angle), elevation, distance, K, width, height) for angle in angles]
+    return [frame.camera_at(float(angle), elevation, distance, K, width, height) for angle in angles]
 
 
 def _main_parts(cloud: Cloud, frame: SceneFrame) -> F64:
@@ -199,7 +199,7 @@ def _arc(cloud: Cloud, frame: SceneFrame, count: int) -> tuple[F64, float, float
     circles = [(elevation, distance) for distance in _ARC_DISTANCES for elevation in _ARC_ELEVATIONS]
     details = np.array(
         [
-            [detail(cloud, _camera_towards(frame, a, *circle, K, 640, 480), HIDING * frame.extent) for a in azimuths]
+            [detail(cloud, frame.camera_at(a, *circle, K, 640, 480), HIDING * frame.extent) for a in azimuths]
             for circle in circles
         ]
     )
@@ -219,14 +219,6 @@ def _arc(cloud: Cloud, frame: SceneFrame, count: int) -> tuple[F64, float, float
     step = 360.0 / _TURNS
     half = max(0.5 * (length - 1) * step, _ARC_MIN)
     return (start + 0.5 * (length - 1)) * step + half * np.sin(2.0 * np.pi * turns), *circles[number]
-
-
-def _camera_towards(
-    frame: SceneFrame, azimuth: float, elevation: float, distance: float, K: F64, width: int, height: int
-) -> Camera:
-    """Return a camera that looks at the middle of a scene; angles in degrees, distance in extents."""
-    eye = frame.centre + distance * frame.extent * direction_at(frame.up, azimuth, elevation)
-    return look_at(eye, frame.centre, frame.up, K, width, height, frame.near)
 
 
 def _path_along(cameras: Sequence[Camera], count: int, up: Sequence[float] | None) -> tuple[F64, F64, F64]:

@@ -18,7 +18,7 @@ import numpy as np
 from csplat.editing.up_axis import up_of
 from csplat.model import SplatModel
 from csplat.types import F64, I64
-from csplat_render.camera import DEFAULT_NEAR, Camera
+from csplat_render.camera import DEFAULT_NEAR, Camera, direction_at, look_at
 
 #: Splats of lower opacity are never drawn.
 MIN_OPACITY = 1.0 / 255.0
@@ -54,6 +54,29 @@ class SceneFrame:
     def near(self) -> float:
         """Near plane for cameras of this scene, scene units."""
         return min(DEFAULT_NEAR, _NEAR * self.extent)
+
+    def camera_at(
+        self,
+        azimuth: float,
+        elevation: float,
+        distance: float,
+        K: F64,
+        width: int,
+        height: int,
+        offset: F64 | None = None,
+    ) -> Camera:
+        """Return a camera that looks at the centre, or at an offset from it.
+
+        Args:
+            azimuth, elevation: see `direction_at`, degrees.
+            distance: distance from the centre, extents.
+            K: [3, 3], intrinsics.
+            width, height: pixels.
+            offset: [3], extents; `None`: 0.
+        """
+        eye = self.centre + distance * self.extent * direction_at(self.up, azimuth, elevation)
+        target = self.centre if offset is None else self.centre + self.extent * offset
+        return look_at(eye, target, self.up, K, width, height, self.near)
 
 
 def scene_frame(model: SplatModel) -> SceneFrame:

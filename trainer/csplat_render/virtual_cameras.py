@@ -10,14 +10,15 @@ the source and the seed, which determines directions.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F64
-from csplat_render.camera import Camera, direction_at, intrinsics, look_at, orbit
+from csplat_render.camera import Camera, intrinsics, orbit
 from csplat_render.scene_frame import (
     Cloud,
     SceneFrame,
@@ -53,6 +54,8 @@ _CLEAR_SHARE = 0.01  # maximum fraction of an object's surface within this radiu
 _GOOD_DETAIL = 0.65  # minimum detail, as a fraction of the best view's
 _AZIMUTH_STEP = 15.0  # degrees
 _POINTS = 60_000  # cloud points
+
+_CameraAt = Callable[..., Camera]  # `SceneFrame.camera_at` without intrinsics
 
 
 def is_clear(frame: SceneFrame, cloud: Cloud, camera: Camera) -> bool:
@@ -90,30 +93,14 @@ def virtual_cameras(
         return orbit(frame.centre, 2.2, frame.up, count, K, width, height, near=frame.near)
     cloud = sample_cloud(model, _POINTS, rng, every)
     K = intrinsics(width, height, FIELD_OF_VIEW)
-    views = _CameraPlacement(frame, K, width, height)
+    camera_at = partial(frame.camera_at, K=K, width=width, height=height)
     if frame.kind == "object":
-        return _around_object(views, cloud, count, begin, rng)
-    return _in_surroundings(views, cloud, count, begin)
-
-
-@dataclass(frozen=True, eq=False)
-class _CameraPlacement:
-    """A scene frame and intrinsics, for cameras specified by angles in degrees and lengths in extents."""
-
-    frame: SceneFrame
-    K: F64
-    width: int
-    height: int
-
-    def at(self, azimuth: float, elevation: float, distance: float, offset: F64 | None = None) -> Camera:
-        frame = self.frame
-        eye = frame.centre + distance * frame.extent * direction_at(frame.up, azimuth, elevation)
-        target = frame.centre if offset is None else frame.centre + frame.extent * offset
-        return look_at(eye, target, frame.up, self.K, self.width, self.height, frame.near)
+        return _around_object(frame, camera_at, cloud, count, begin, rng)
+    return _in_surroundings(frame, camera_at, cloud, count, begin)
 
 
 def _around_object(
-    views: _CameraPlacement, cloud: Cloud, count: int, begin: float, rng: np.random.Generator
+    frame: SceneFrame, camera_at: _CameraAt, cloud: Cloud, count: int, begin: float, rng: np.random.Generator
 ) -> list[Camera]:
     """Place a camera in each of `count` equal sectors, at the largest distance at which the cover is sufficient."""
     width = 360.0 / count
@@ -126,24 +113,26 @@ def _around_object(
             for elevation in elevations
             for step in (0.0, 1.0 / 3.0, -1.0 / 3.0)
         ]
-        cameras.append(_object_view(views, cloud, angles, offset))
+        cameras.append(_object_view(frame, camera_at, cloud, angles, offset))
     return cameras
 
 
-def _object_view(views: _CameraPlacement, cloud: Cloud, angles: list[tuple[float, float]], offset: F64) -> Camera:
+def _object_view(
+    frame: SceneFrame, camera_at: _CameraAt, cloud: Cloud, angles: list[tuple[float, float]], offset: F64
+) -> Camera:
     """Return the farthest view with sufficient cover and nothing close to the camera."""
     needed = MIN_COVER + _COVER_MARGIN
-    best, best_rank = views.at(*angles[0], OBJECT_DISTANCES[0], offset), (False, -1.0)
+    best, best_rank = camera_at(*angles[0], OBJECT_DISTANCES[0], offset=offset), (False, -1.0)
     highest, highest_at = 1.0, OBJECT_DISTANCES[0]
     for distance in OBJECT_DISTANCES:
         if highest * (highest_at / distance) ** 2 < 0.8 * needed:
             continue  # the cover at the last distance implies that this one is not sufficient either
         covers = []
         for angle in angles:
-            camera = views.at(*angle, distance, offset)
+            camera = camera_at(*angle, distance, offset=offset)
             covers.append(covered_fraction(cloud, camera))
             enough = covers[-1] >= needed
-            if enough and is_clear(views.frame, cloud, camera):
+            if enough and is_clear(frame, cloud, camera):
                 return camera
             if (enough, covers[-1]) > best_rank:
                 best, best_rank = camera, (enough, covers[-1])
@@ -153,12 +142,12 @@ def _object_view(views: _CameraPlacement, cloud: Cloud, angles: list[tuple[float
     return best
 
 
-def _in_surroundings(views: _CameraPlacement, cloud: Cloud, count: int, begin: float) -> list[Camera]:
+def _in_surroundings(frame: SceneFrame, camera_at: _CameraAt, cloud: Cloud, count: int, begin: float) -> list[Camera]:
     """Choose views with fine detail that are farthest from each other."""
     azimuths = begin + np.arange(0.0, 360.0, _AZIMUTH_STEP)
     angles = [(azimuth, elevation) for azimuth in azimuths for elevation in _SURROUNDING_ELEVATIONS]
-    cameras = [views.at(*angle, distance) for distance in SURROUNDING_DISTANCES for angle in angles]
-    details = np.array([detail(cloud, camera, HIDING * views.frame.extent) for camera in cameras])
+    cameras = [camera_at(*angle, distance) for distance in SURROUNDING_DISTANCES for angle in angles]
+    details = np.array([detail(cloud, camera, HIDING * frame.extent) for camera in cameras])
     good = details >= _GOOD_DETAIL * details.max()
     enough = len(angles)
     while enough < len(cameras) and np.count_nonzero(good[:enough]) < count:

@@ -139,7 +139,7 @@ def merge(
             axes=next((one.axes for one in fields if any(one.axes)), fields[0].axes),
             unit_metres=next((one.unit_metres for one in fields if one.unit_metres), 0.0),
             codebooks=books.records,
-            chunks=[*_agreed_chunks(scenes), *books.chunks],
+            chunks=[*_common_chunks(scenes), *books.chunks],
         )
         return _write_merged(together, tiles, output)
 
@@ -175,10 +175,10 @@ def _difference(fields: Sequence[SceneFields], names: Sequence[str]) -> str:
     return ""
 
 
-def _agreed_chunks(scenes: Sequence[SplatFile]) -> list[FileChunk]:
+def _common_chunks(scenes: Sequence[SplatFile]) -> list[FileChunk]:
     """Return chunks of the metadata and cameras that all files have in common."""
     chunks = []
-    if metadata := _agreed([scene.metadata or {} for scene in scenes]):
+    if metadata := _common_entries([scene.metadata or {} for scene in scenes]):
         chunks.append(FileChunk(_spec.CHUNK_METADATA, json_payload(metadata, DeflateSettings())))
     cameras = [scene.cameras for scene in scenes]
     if cameras[0] is not None and all(one == cameras[0] for one in cameras):
@@ -186,7 +186,7 @@ def _agreed_chunks(scenes: Sequence[SplatFile]) -> list[FileChunk]:
     return chunks
 
 
-def _agreed(values: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _common_entries(values: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     first, *others = values
     return {key: value for key, value in first.items() if all(key in one and one[key] == value for one in others)}
 
@@ -239,7 +239,7 @@ def _metadata_model(scenes: Sequence[SplatFile]) -> SplatModel:
         antialiased=headers[0].antialiased,
         flat=headers[0].flat,
         cameras=cameras[0] if all(one == cameras[0] for one in cameras) else None,
-        metadata=_agreed([scene.metadata or {} for scene in scenes]),
+        metadata=_common_entries([scene.metadata or {} for scene in scenes]),
         extra={
             column.name: np.zeros(0, column.dtype)
             for column in headers[0].extras

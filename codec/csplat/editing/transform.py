@@ -97,18 +97,18 @@ def rotate_scene(model: SplatModel, rotation: ArrayLike) -> SplatModel:
     matrix = np.asarray(rotation, np.float64)
     if matrix.shape != (3, 3) or not (np.abs(matrix @ matrix.T - np.eye(3)) < _ORTHOGONAL).all():
         raise InputError(f"the rotation is {matrix.tolist()}, expected an orthogonal matrix [3, 3]")
-    quats, scales = _turned_shapes(model, matrix)
-    x, y, z = (_applied(matrix, np.array(model.origin)) + 0.0).tolist()  # no negative zeros
-    doubles = None if model.means_double is None else _applied(matrix, model.means_double)
+    quats, scales = _rotate_shapes(model, matrix)
+    x, y, z = (_multiply_rows(matrix, np.array(model.origin)) + 0.0).tolist()  # no negative zeros
+    doubles = None if model.means_double is None else _multiply_rows(matrix, model.means_double)
     return replace(
         model,
-        means=_applied(matrix, model.means) if doubles is None else (doubles - (x, y, z)).astype(np.float32),
+        means=_multiply_rows(matrix, model.means) if doubles is None else (doubles - (x, y, z)).astype(np.float32),
         quats=quats,
         scales=scales,
-        shN=_turned_sh(model.shN, matrix),
+        shN=_rotate_sh(model.shN, matrix),
         origin=(x, y, z),
         means_double=doubles,
-        **_turned_metadata(model, matrix),
+        **_rotate_metadata(model, matrix),
     )
 
 
@@ -132,7 +132,7 @@ def scale_scene(model: SplatModel, factor: float) -> SplatModel:
             origin=(x, y, z),
             means_double=doubles,
             unit_metres=None if model.unit_metres is None else model.unit_metres / factor,
-            **_with_cameras(model, lambda camera: _scaled_camera(camera, factor)),
+            **_with_cameras(model, lambda camera: _scale_camera(camera, factor)),
         )
 
 
@@ -149,21 +149,21 @@ def stretch_scene(model: SplatModel, matrix: ArrayLike) -> SplatModel:
         InputError: a value exceeds float32.
     """
     left, lengths, right = np.linalg.svd(np.asarray(matrix, np.float64))
-    model = rotate_scene(model, _snapped(left @ right))
+    model = rotate_scene(model, _round_near_integers(left @ right))
     factor = float(lengths.mean())
     if np.ptp(lengths) < _EVEN * factor:
         return model if abs(factor - 1.0) < _WHOLE else scale_scene(model, factor)
     stretch: F64 = (left * lengths) @ left.T
     x, y, z = (stretch @ model.origin).tolist()
-    doubles = None if model.means_double is None else _applied(stretch, model.means_double)
+    doubles = None if model.means_double is None else _multiply_rows(stretch, model.means_double)
     with np.errstate(over="ignore"):
         root = stretch @ _matrices(model.quats) * np.exp(model.scales.astype(np.float64))[:, None]
         turns, axes, _ = np.linalg.svd(root)
         turns[:, :, 2] *= np.linalg.det(turns)[:, None]
         return replace(
             model,
-            means=_applied(stretch, model.means) if doubles is None else (doubles - (x, y, z)).astype(np.float32),
-            quats=normalise_quats(_quat_of(turns)),
+            means=_multiply_rows(stretch, model.means) if doubles is None else (doubles - (x, y, z)).astype(np.float32),
+            quats=normalise_quats(_quats_of(turns)),
             scales=np.log(np.maximum(axes, np.finfo(np.float32).tiny)).astype(np.float32),
             origin=(x, y, z),
             means_double=doubles,
@@ -177,7 +177,7 @@ def translate_scene(model: SplatModel, offset: Direction) -> SplatModel:
     step = np.array(offset, np.float64)
     doubles = None if model.means_double is None else model.means_double + step
     means = model.means + step if doubles is None else doubles - np.array(model.origin)
-    cameras = _with_cameras(model, lambda camera: _moved_camera(camera, step))
+    cameras = _with_cameras(model, lambda camera: _translate_camera(camera, step))
     return replace(model, means=means.astype(np.float32), means_double=doubles, **cameras)
 
 
@@ -187,7 +187,7 @@ def _rotation_to(metadata_model: SplatModel, axes: str) -> F64:
     up, wanted = up_of(metadata_model.metadata), up_of_axes(axes)
     if known or up is None or wanted is None:
         return matrix
-    tilted: F64 = _tilt(_applied(matrix, np.array(up, np.float64)), np.array(wanted)) @ matrix
+    tilted: F64 = _tilt(_multiply_rows(matrix, np.array(up, np.float64)), np.array(wanted)) @ matrix
     return tilted
 
 
@@ -197,13 +197,13 @@ def _tilt(start: F64, end: F64) -> F64:
     if cosine < -1.0 + 1e-12:  # half a turn about any perpendicular axis
         axis = np.eye(3)[int(np.abs(start).argmin())]
         axis -= start * (axis @ start)
-        return _snapped(2.0 * np.outer(axis, axis) / (axis @ axis) - np.eye(3))
+        return _round_near_integers(2.0 * np.outer(axis, axis) / (axis @ axis) - np.eye(3))
     cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     left, _, right = np.linalg.svd(np.eye(3) + cross + cross @ cross / (1.0 + cosine))
-    return _snapped(left @ right)  # orthogonal even if the vectors are unit to six digits only
+    return _round_near_integers(left @ right)  # orthogonal even if the vectors are unit to six digits only
 
 
-def _applied(matrix: F64, rows: _Rows) -> _Rows:
+def _multiply_rows(matrix: F64, rows: _Rows) -> _Rows:
     """Multiply each row by a square matrix; exact if it only permutes and flips axes."""
     order = np.abs(matrix).argmax(axis=1)
     signs: F64 = matrix[np.arange(len(matrix)), order]
@@ -219,7 +219,7 @@ def _applied(matrix: F64, rows: _Rows) -> _Rows:
     return out
 
 
-def _turned_shapes(model: SplatModel, matrix: F64) -> tuple[F32, F32]:
+def _rotate_shapes(model: SplatModel, matrix: F64) -> tuple[F32, F32]:
     """Return rotations and scales; a permutation of axes permutes the scales, which is exact."""
     proper = matrix * np.sign(np.linalg.det(matrix))
     order = np.abs(matrix).argmax(axis=1)
@@ -228,11 +228,11 @@ def _turned_shapes(model: SplatModel, matrix: F64) -> tuple[F32, F32]:
     if whole and not (model.flat and order[2] != 2):
         turn = np.eye(4)
         turn[1:, 1:] = np.rint(proper)
-        return _applied(turn, model.quats), model.scales[:, order]
-    return normalise_quats(_applied(_product(_quat_of(proper)), model.quats)), model.scales
+        return _multiply_rows(turn, model.quats), model.scales[:, order]
+    return normalise_quats(_multiply_rows(_left_product(_quats_of(proper)), model.quats)), model.scales
 
 
-def _quat_of(matrix: F64) -> F64:
+def _quats_of(matrix: F64) -> F64:
     """Convert rotation matrices [..., 3, 3] to quaternions: eigenvectors, accurate at any angle (Bar-Itzhack 2000)."""
     a, b, c, d, e, f, g, h, i = np.moveaxis(matrix.reshape(*matrix.shape[:-2], 9), -1, 0)
     lower = np.zeros((*matrix.shape[:-2], 4, 4))
@@ -253,27 +253,27 @@ def _matrices(quats: F32) -> F64:
     return np.moveaxis(np.array(rows), 2, 0)
 
 
-def _product(quat: F64) -> F64:
+def _left_product(quat: F64) -> F64:
     """Return the matrix of the left multiplication by a quaternion."""
     w, x, y, z = quat
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
 
 
-def _turned_sh(shN: F32, matrix: F64) -> F32:
+def _rotate_sh(shN: F32, matrix: F64) -> F32:
     """Rotate SH band by band: the colour in direction v becomes the one in direction M v."""
     directions = sphere_lattice(_DIRECTIONS)
     after, before = sh_bands(directions), sh_bands(directions @ matrix)  # row v of `after` is Mᵀ v before
     out = np.empty_like(shN)
     for band in range(1, sh_degree_of(shN.shape[1]) + 1):
         part = slice(band**2 - 1, (band + 1) ** 2 - 1)
-        turn = _snapped(np.linalg.lstsq(after[band - 1], before[band - 1], rcond=None)[0])
+        turn = _round_near_integers(np.linalg.lstsq(after[band - 1], before[band - 1], rcond=None)[0])
         shape = len(shN), 2 * band + 1, 3
         channels = np.kron(turn, np.eye(3)).astype(np.float64)  # rotates all three channels
-        out[:, part] = _applied(channels, shN[:, part].reshape(len(shN), channels.shape[0])).reshape(shape)
+        out[:, part] = _multiply_rows(channels, shN[:, part].reshape(len(shN), channels.shape[0])).reshape(shape)
     return out
 
 
-def _snapped(matrix: NDArray[Any]) -> F64:
+def _round_near_integers(matrix: NDArray[Any]) -> F64:
     whole = np.rint(matrix)
     snapped: F64 = np.where(np.abs(matrix - whole) < _WHOLE, whole, matrix)
     return snapped
@@ -308,10 +308,10 @@ def sh_bands(directions: F64) -> list[F64]:
     return [np.stack(band, axis=1) for band in (first, second, third)]
 
 
-def _turned_metadata(model: SplatModel, matrix: F64) -> dict[str, Any]:
+def _rotate_metadata(model: SplatModel, matrix: F64) -> dict[str, Any]:
     """Return the rotated axes, metadata and cameras as fields of a model."""
     letters = model.coordinate_system
-    fields = _with_cameras(model, lambda camera: _turned_camera(camera, matrix))
+    fields = _with_cameras(model, lambda camera: _rotate_camera(camera, matrix))
     up = up_of(model.metadata)
     if letters != UNSPECIFIED:
         whole = np.count_nonzero(matrix) == 3
@@ -335,7 +335,7 @@ def _with_cameras(model: SplatModel, change: Callable[[Mapping[str, Any]], dict[
     return fields
 
 
-def _turned_camera(camera: Mapping[str, Any], matrix: F64) -> dict[str, Any]:
+def _rotate_camera(camera: Mapping[str, Any], matrix: F64) -> dict[str, Any]:
     view, K = np.array(camera["viewmat"], np.float64), np.array(camera["K"], np.float64)
     view[:3, :3] = view[:3, :3] @ matrix.T
     if np.linalg.det(matrix) < 0.0:  # mirror the image horizontally, so that the view stays a rotation
@@ -344,13 +344,13 @@ def _turned_camera(camera: Mapping[str, Any], matrix: F64) -> dict[str, Any]:
     return {**camera, "viewmat": view.tolist(), "K": K.tolist()}
 
 
-def _moved_camera(camera: Mapping[str, Any], step: F64) -> dict[str, Any]:
+def _translate_camera(camera: Mapping[str, Any], step: F64) -> dict[str, Any]:
     view = np.array(camera["viewmat"], np.float64)
     view[:3, 3] -= view[:3, :3] @ step
     return {**camera, "viewmat": view.tolist()}
 
 
-def _scaled_camera(camera: Mapping[str, Any], factor: float) -> dict[str, Any]:
+def _scale_camera(camera: Mapping[str, Any], factor: float) -> dict[str, Any]:
     view = np.array(camera["viewmat"], np.float64)
     view[:3, 3] *= factor
     near = {"near": camera["near"] * factor} if "near" in camera else {}

@@ -230,29 +230,6 @@ def _fill(name: str, stream: Any, data: U8) -> None:
         at += got
 
 
-def write_spz_file(path: Path, packed: SpzArrays, data: U8) -> None:
-    """Write version 3 or 4, without extensions.
-
-    Args:
-        path: path of the file.
-        packed: header and filled parts.
-        data: result of `packed.allocate()`; its space for the header is filled.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    parts = [part for part in packed.parts if part.size] if packed.version > 3 else []
-    head = _HEADER.pack(_MAGIC, packed.version, packed.count, packed.degree, packed.bits, packed.flags, len(parts))
-    with atomic_writer(path) as stream:
-        if packed.version < 4:
-            data[: len(head)] = np.frombuffer(head, np.uint8)
-            stream.write(deflate.gzip_compress(data, _GZIP_LEVEL))
-            return
-        streams = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(part.data) for part in parts]
-        rows = [_STREAM.pack(len(small), part.size) for small, part in zip(streams, parts, strict=True)]
-        stream.writelines([head, _HEADER_REST.pack(_HEADER.size + _HEADER_REST.size), *rows, *streams])
-
-
 _COLOUR = np.float32(0.15)  # colour per unit of an SH coefficient of degree 0
 _PART = np.sqrt(np.float32(0.5)) / np.float32(511)  # quantisation step of a quaternion component
 _LARGEST_POSITION = (1 << 23) - 1
@@ -275,17 +252,25 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
 
 
 def write_spz(path: Path, scene: SceneSource, *, version: int) -> None:
-    """Write version 3 or 4 (`Format.write`)."""
+    """Write version 3 or 4, without extensions (`Format.write`)."""
     scene = convert_axes(scene, SPZ_AXES)
+    degree, bits = scene.metadata_model.sh_degree, _choose_fraction_bits(path, scene)
     flags = ANTIALIASED if scene.metadata_model.antialiased else 0
-    packed = SpzArrays(
-        path.name, version, scene.count, scene.metadata_model.sh_degree, _choose_fraction_bits(path, scene), flags
-    )
+    packed = SpzArrays(path.name, version, scene.count, degree, bits, flags)
     data = packed.allocate()
     for rows, block in scene.numbered():
-        for part, codes in zip(packed.parts, _encode_block(block, packed.bits), strict=True):
+        for part, codes in zip(packed.parts, _encode_block(block, bits), strict=True):
             part[rows] = codes
-    write_spz_file(path, packed, data)
+    parts = [part for part in packed.parts if part.size] if version > 3 else []
+    head = _HEADER.pack(_MAGIC, version, scene.count, degree, bits, flags, len(parts))
+    with atomic_writer(path) as stream:
+        if version < 4:
+            data[: len(head)] = np.frombuffer(head, np.uint8)
+            stream.write(deflate.gzip_compress(data, _GZIP_LEVEL))
+            return
+        streams = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(part.data) for part in parts]
+        table = [_STREAM.pack(len(small), part.size) for small, part in zip(streams, parts, strict=True)]
+        stream.writelines([head, _HEADER_REST.pack(_HEADER.size + _HEADER_REST.size), *table, *streams])
 
 
 def decode_block(packed: SpzArrays, rows: slice, degree: int) -> SplatModel:

@@ -72,7 +72,7 @@ def code_bucket(folder: Path, bucket: Bucket, coding: BucketCoding) -> None:
         stream.write(zlib.crc32(text).to_bytes(4, "little") + text)
 
 
-def coded_bucket(folder: Path, bucket: Bucket) -> list[EncodedTile] | None:
+def read_coded_bucket(folder: Path, bucket: Bucket) -> list[EncodedTile] | None:
     """Return the tiles of a bucket; `None` if it is not coded yet.
 
     Raises:

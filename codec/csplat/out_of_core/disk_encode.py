@@ -21,7 +21,7 @@ from csplat.encoder.pipeline import EncodedTile, encoding_settings, file_chunks,
 from csplat.encoder.sh_codebook import FileCodebooks, final_parameters, largest_sh
 from csplat.encoder.tiling import BUCKET_SPLATS, BucketCurve, contrast_buckets, sample_rows
 from csplat.errors import InputError
-from csplat.out_of_core.bucket_workers import BucketCoding, code_here, code_on_cluster, coded_bucket
+from csplat.out_of_core.bucket_workers import BucketCoding, code_here, code_on_cluster, read_coded_bucket
 from csplat.out_of_core.spill_files import BucketWriter, SplatLayout, Survey, WorkingFolder, bucket_path, read_splats
 from csplat.scene_source import SceneSource, with_progress
 from csplat.system import default_memory_bytes
@@ -153,7 +153,7 @@ def encode_scene(
         "splats": scene.count,
         "csplat": __version__,
     }
-    work = WorkingFolder.begun(work_folder, _layout(scene, options), key, resume=resume)
+    work = WorkingFolder.create(work_folder, _layout(scene, options), key, resume=resume)
     return _Encoding(scene, path, options, work, needs, cluster, progress or null_progress).run()
 
 
@@ -231,7 +231,7 @@ class _Encoding:
 
     def _code(self, coding: BucketCoding) -> None:
         folder, buckets = self.work.folder, self.work.buckets
-        left = {one.number: one for one in buckets if coded_bucket(folder, one) is None}
+        left = {one.number: one for one in buckets if read_coded_bucket(folder, one) is None}
         for bucket in buckets:
             if bucket.number not in left:
                 self.work.drop(bucket, list(left.values()))
@@ -250,7 +250,7 @@ class _Encoding:
     def _write(self, draft: EncodePlan, books: FileCodebooks) -> EncodeReport:
         tiles: list[EncodedTile] = []
         for bucket in self.work.buckets:
-            tiles += coded_bucket(self.work.folder, bucket) or ()
+            tiles += read_coded_bucket(self.work.folder, bucket) or ()
         errors = ErrorSums.total(part.errors for part in tiles)
         settings = encoding_settings(draft, books.sh_plan)
         fields = scene_fields(draft, books, file_chunks(draft, errors, settings))

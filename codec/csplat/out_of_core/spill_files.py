@@ -168,16 +168,6 @@ def bucket_path(folder: Path, place: int) -> Path:
     return folder / f"bucket-{place:06}"
 
 
-def write_splats(path: Path, layout: SplatLayout, model: SplatModel) -> None:
-    """Write splats to a new file.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    with path.open("wb") as stream:
-        _append(stream, layout.arrays(model))
-
-
 def read_splats(path: Path, layout: SplatLayout, part: slice | None = None) -> SplatModel:
     """Read the splats of a file, or a range of them.
 
@@ -263,7 +253,7 @@ class WorkingFolder:
     state: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def begun(cls, folder: Path, layout: SplatLayout, key: dict[str, Any], *, resume: bool) -> WorkingFolder:
+    def create(cls, folder: Path, layout: SplatLayout, key: dict[str, Any], *, resume: bool) -> WorkingFolder:
         """Create a folder, or open an existing one to resume.
 
         Raises:
@@ -321,7 +311,8 @@ class WorkingFolder:
         Raises:
             OSError: they cannot be written.
         """
-        write_splats(self.folder / _SAMPLE, self.layout, survey.sample)
+        with (self.folder / _SAMPLE).open("wb") as stream:
+            _append(stream, self.layout.arrays(survey.sample))
         curve = survey.curve
         stored = {"corner": curve.corner.tolist(), "scale": curve.scale, "bounds": curve.bounds.tolist()}
         self.note(curve=stored, largest=survey.largest)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -41,12 +41,13 @@ def write_gltf(path: Path, scene: SceneSource) -> None:
             lambda: (scale_scene(one, metres) for one in before.blocks()),
         )
     scene = convert_axes(scene, AXES)
-    attributes = _list_attributes(scene.metadata_model.sh_degree)
+    attributes = _attributes(scene.metadata_model)  # empty arrays: their names, dtypes and widths
+    row_sizes = [column.dtype.itemsize * math.prod(column.shape[1:]) for column in attributes.values()]
     lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
     for block in scene.blocks():
         lowest = np.minimum(lowest, block.means.min(axis=0, initial=np.inf))
         highest = np.maximum(highest, block.means.max(axis=0, initial=-np.inf))
-    offsets = np.cumsum([0, *(attribute.row_size * scene.count for attribute in attributes)]).tolist()
+    offsets = np.cumsum([0, *(size * scene.count for size in row_sizes)]).tolist()
     text = json.dumps(_build_json(scene, attributes, offsets, (lowest, highest)), ensure_ascii=False).encode()
     text += b" " * (-len(text) % 4)
     start = GLB_HEAD.size + 8 + len(text) + 8
@@ -60,34 +61,14 @@ def write_gltf(path: Path, scene: SceneSource) -> None:
         stream.write(struct.pack("<I4s", offsets[-1], BIN))
         done = 0
         for block in scene.blocks():
-            rows = _attributes(block)
-            for attribute, offset in zip(attributes, offsets, strict=False):
-                stream.seek(start + offset + done * attribute.row_size)
-                stream.write(np.ascontiguousarray(rows[attribute.name]).view(np.uint8).data)
+            for column, offset, size in zip(_attributes(block).values(), offsets, row_sizes, strict=False):
+                stream.seek(start + offset + done * size)
+                stream.write(np.ascontiguousarray(column).view(np.uint8).data)
             done += len(block)
 
 
-@dataclass(frozen=True)
-class _Attribute:
-    """A vertex attribute of the file."""
-
-    name: str
-    width: int
-    component: int = _FLOAT
-
-    @property
-    def row_size(self) -> int:
-        return self.width * (4 if self.component == _FLOAT else 1)
-
-
-def _list_attributes(degree: int) -> list[_Attribute]:
-    names = [name for band in range(degree + 1) for name in sh_names(band)]
-    first = [_Attribute("POSITION", 3), _Attribute("ROTATION", 4), _Attribute("SCALE", 3), _Attribute("OPACITY", 1)]
-    return [*first, _Attribute("COLOR_0", 4, _BYTE), *(_Attribute(name, 3) for name in names)]
-
-
 def _attributes(model: SplatModel) -> dict[str, NDArray[Any]]:
-    """Compute all attributes of some splats."""
+    """Compute the vertex attributes of some splats by name, in the order of the file."""
     with np.errstate(over="ignore", under="ignore"):
         scales = np.exp(model.scales.astype(np.float64))
     names = [name for band in range(1, model.sh_degree + 1) for name in sh_names(band)]
@@ -110,7 +91,7 @@ def _point_colours(model: SplatModel) -> NDArray[np.uint8]:
 
 
 def _build_json(
-    scene: SceneSource, attributes: list[_Attribute], offsets: list[int], bounds: tuple[F64, F64]
+    scene: SceneSource, attributes: dict[str, NDArray[Any]], offsets: list[int], bounds: tuple[F64, F64]
 ) -> dict[str, Any]:
     metadata_model = scene.metadata_model
     asset: dict[str, Any] = {"version": "2.0", "generator": "csplat"}
@@ -119,21 +100,14 @@ def _build_json(
     if isinstance(licence, str):
         asset["copyright"] = licence
     kinds = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-    accessors: list[dict[str, Any]] = [
-        {
-            "bufferView": index,
-            "componentType": attribute.component,
-            "count": scene.count,
-            "type": kinds[attribute.width],
-        }
-        for index, attribute in enumerate(attributes)
-    ]
+    accessors: list[dict[str, Any]] = []
+    for index, column in enumerate(attributes.values()):
+        is_float = column.dtype.kind == "f"
+        component, kind = _FLOAT if is_float else _BYTE, kinds[math.prod(column.shape[1:])]
+        accessors.append({"bufferView": index, "componentType": component, "count": scene.count, "type": kind})
+        accessors[index] |= {} if is_float else {"normalized": True}
     accessors[0] |= {"min": bounds[0].tolist(), "max": bounds[1].tolist()}
-    plain = ("POSITION", "COLOR_0")
-    for index, attribute in enumerate(attributes):
-        if attribute.component == _BYTE:
-            accessors[index]["normalized"] = True
-    names = [attribute.name if attribute.name in plain else f"{EXTENSION}:{attribute.name}" for attribute in attributes]
+    names = [name if name in ("POSITION", "COLOR_0") else f"{EXTENSION}:{name}" for name in attributes]
     splats = {"kernel": "ellipse", "colorSpace": COLOURS}
     primitive = {
         "attributes": {name: index for index, name in enumerate(names)},

@@ -31,7 +31,7 @@ _FREE = 1 << 20  # bytes of a member that are accepted regardless of its expansi
 
 
 class _ZipDirectory:
-    """The directory of a zip, which is read once; owns the open archive within `held`.
+    """The directory of a zip, which is read once; owns the open archive within `kept_open`.
 
     Args:
         path: path of the zip.
@@ -51,7 +51,7 @@ class _ZipDirectory:
             self._named.append(named)
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def kept_open(self) -> Iterator[None]:
         """Keep the archive open until the context ends; otherwise each `read` opens it."""
         with self._opened() as archive:
             self._archive = archive
@@ -87,12 +87,8 @@ def use_slashes(name: str) -> str:
     return name.replace("\\", "/")
 
 
-def _ignore_case(name: str) -> str:
-    return use_slashes(name).casefold()
-
-
 #: Keys by which names are compared, tried in this order.
-_NAME_KEYS: tuple[Callable[[str], str], ...] = (str, use_slashes, _ignore_case)
+_NAME_KEYS: tuple[Callable[[str], str], ...] = (str, use_slashes, lambda name: use_slashes(name).casefold())
 
 
 @dataclass(frozen=True)
@@ -114,9 +110,9 @@ class SogParts:
     findings: tuple[Finding, ...] = ()
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def kept_open(self) -> Iterator[None]:
         """Keep a zip open until the context ends, so its directory is not read for each part."""
-        with nullcontext() if self.zip is None else self.zip.held():
+        with nullcontext() if self.zip is None else self.zip.kept_open():
             yield
 
     def inner(self, name: str) -> tuple[SogParts, str]:

@@ -34,7 +34,7 @@ _Range = tuple[int, int, int]  # file index, first splat, end
 def open_sog(path: Path, level: int = 0) -> Iterator[SceneSource]:
     """Open a file or folder (`Format.open`, `Format.open_level`)."""
     parts, name = find_parts(path)
-    with parts.held():
+    with parts.kept_open():
         yield _open_scene(path, parts, name, level)
 
 
