@@ -218,7 +218,7 @@ def test_integers_of_each_class_are_counted_as_they_are_coded(make_model):
         alpha = opacity_levels(values.opacities[rows], plan.opacity_levels, square=True, multiple=factors.opacities)
         colour = quantise_colour(
             np.ascontiguousarray(values.sh0[rows].T), plan.sh0_step, plan.chroma_shift, factors.sh0
-        ).columns
+        )[0]
         for columns in (shape.scales, shape.quats // factors.quats, alpha[None] // factors.opacities, colour):
             bits += cost_slopes([columns.T])[1]
     assert scene.count(scene.dequantise()[0], 1.0).bits == pytest.approx(bits, rel=1e-3)

@@ -94,11 +94,6 @@ def tile_payload(layer: int, blocks: Sequence[bytes]) -> bytes:
     return _spec.pack_tile_head(_spec.TileHead(layer, len(blocks), 0)) + b"".join(blocks)
 
 
-def write_file(scene: SceneFields, tiles: Sequence[FileTile]) -> bytes:
-    """Return a whole file; see `file_pieces`."""
-    return b"".join(file_pieces(scene, tiles))
-
-
 def file_pieces(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[bytes]:
     """Yield a file in pieces: header, index, and chunks in the recommended order (spec 4.3.6)."""
     index_size = _index_size(scene, tiles)

@@ -33,7 +33,7 @@ from csplat.encoder.sh_codebook import (
     final_parameters,
     largest_sh,
 )
-from csplat.encoder.shape_codebook import ShapeCodebook, choose_shapes, dequantised_shapes
+from csplat.encoder.shape_codebook import ShapeCodebook, choose_shapes, dequantise_shapes
 from csplat.encoder.splat_importance import (
     Importance,
     checked_blocks,
@@ -48,8 +48,8 @@ from csplat.encoder.tiling import (
     bucket_rows,
     contrast_buckets,
     cut_scene,
-    dequantised_means,
-    dequantised_opacities,
+    dequantise_means,
+    dequantise_opacities,
     sample_rows,
 )
 from csplat.errors import InputError
@@ -171,13 +171,13 @@ class EncodePlan:
     def scene(self) -> SplatModel:
         """The scene with means, shapes and opacities as decoded, in the model's order; colours are unchanged."""
         model, tiles, parameters = self.model, self.tiles, self.parameters
-        quats, scales = dequantised_shapes(model.quats, model.scales, tiles, parameters, self.shapes)
+        quats, scales = dequantise_shapes(model.quats, model.scales, tiles, parameters, self.shapes)
         return replace(
             model,
-            means=dequantised_means(model.means, tiles, parameters),
+            means=dequantise_means(model.means, tiles, parameters),
             quats=quats,
             scales=scales,
-            opacities=dequantised_opacities(model.opacities, tiles, parameters),
+            opacities=dequantise_opacities(model.opacities, tiles, parameters),
             means_double=None,
         )
 

@@ -29,8 +29,8 @@ from csplat.encoder.quantisation import (
     quat_values,
 )
 from csplat.encoder.sh_codebook import FileCodebooks, ShCodebook, ShCodingPlan, make_codebooks, sh_coarseness
-from csplat.encoder.shape_codebook import ShapeCodebook, dequantised_shapes
-from csplat.encoder.tiling import dequantised_means, dequantised_opacities, quantise_and_sort
+from csplat.encoder.shape_codebook import ShapeCodebook, dequantise_shapes
+from csplat.encoder.tiling import dequantise_means, dequantise_opacities, quantise_and_sort
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F32, I32, I64, Progress
@@ -178,14 +178,14 @@ class FixedQuantisation:
         tiles, parameters = self.encode_plan.tiles, self.parameters
         if self.encode_plan.options.threads == 1 or len(self.encode_plan.model) < _THREADED_MIN:
             shN, (quats, scales) = self.dequantise_sh(values.sh), self._dequantise_shapes(values)
-            means, sh0 = dequantised_means(values.means, tiles, parameters), self.dequantise_sh0(values.sh0)
+            means, sh0 = dequantise_means(values.means, tiles, parameters), self.dequantise_sh0(values.sh0)
         else:
             with ThreadPoolExecutor(2) as pool:  # NumPy releases the GIL; the three parts take about the same time
                 later_sh = pool.submit(self.dequantise_sh, values.sh)
                 later_shapes = pool.submit(self._dequantise_shapes, values)
-                means, sh0 = dequantised_means(values.means, tiles, parameters), self.dequantise_sh0(values.sh0)
+                means, sh0 = dequantise_means(values.means, tiles, parameters), self.dequantise_sh0(values.sh0)
                 shN, (quats, scales) = later_sh.result(), later_shapes.result()
-        opacities = dequantised_opacities(values.opacities, tiles, parameters)
+        opacities = dequantise_opacities(values.opacities, tiles, parameters)
         return DecodedValues(means, quats, scales, opacities, sh0, shN)
 
     def dequantise_sh0(self, sh0: F32) -> F32:
@@ -194,7 +194,7 @@ class FixedQuantisation:
         for tile in self.encode_plan.tiles:
             columns = np.ascontiguousarray(sh0[tile.rows].T)
             colour = quantise_colour(columns, parameters.sh0_step, parameters.chroma_shift, tile.factors.sh0)
-            decoded[tile.rows] = colour.decoded.T
+            decoded[tile.rows] = colour[2].T
         return decoded
 
     def dequantise_sh(self, sh: F32) -> F32:
@@ -229,7 +229,7 @@ class FixedQuantisation:
 
     def _dequantise_shapes(self, values: FreeValues) -> tuple[F32, F32]:
         shapes, quats, scales = self._shape_values(values)
-        return dequantised_shapes(quats, scales, self.encode_plan.tiles, self.parameters, shapes)
+        return dequantise_shapes(quats, scales, self.encode_plan.tiles, self.parameters, shapes)
 
     def _dequantise_escapes(self, book: ShCodebook, sh: F32) -> F32:
         own = sh[book.size :]

@@ -163,7 +163,7 @@ def search_nearest(
     error = np.zeros(len(points))
     width, length = points.shape[1] + 1, _PRODUCT_ROWS
     find = _every_entry(_matrix(coarse), other)
-    if 0 < near_groups < _group_count(len(entries)):
+    if 0 < near_groups < math.isqrt(len(entries)):
         length = _GROUPED_ROWS
         find = _near_entries(coarse, near_groups, threads)
 
@@ -474,7 +474,7 @@ def _near_entries(entries: I64, near: int, threads: int | None) -> _Find:
 
 def _groups(entries: I64, threads: int | None) -> tuple[I64, U32]:
     """Cluster the entries into about sqrt(K) groups by plain k-means; return centroids and labels."""
-    count = _group_count(len(entries))
+    count = math.isqrt(len(entries))
     rows = entries.astype(np.int32)
     centres = rows[np.arange(count) * len(rows) // count]
     label, _ = search_nearest(rows, centres, 0, threads)
@@ -485,10 +485,6 @@ def _groups(entries: I64, threads: int | None) -> tuple[I64, U32]:
         centres[used] = np.rint(np.stack(sums, 1)[used] / size[used, None])
         label, _ = search_nearest(rows, centres, 0, threads)
     return centres.astype(np.int64), label
-
-
-def _group_count(entry_count: int) -> int:
-    return math.isqrt(entry_count)
 
 
 @cache

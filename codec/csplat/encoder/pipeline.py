@@ -5,6 +5,7 @@ The second step takes almost no time, so that a file can be written, measured, a
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.encoder import entropy
 from csplat.encoder.coding_parameters import CodingParameters, StepFactors
-from csplat.encoder.container import FileChunk, FileTile, SceneFields, json_payload, tile_payload, write_file
+from csplat.encoder.container import FileChunk, FileTile, SceneFields, file_pieces, json_payload, tile_payload
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.encode_plan import EncodePlan, Origin
 from csplat.encoder.error_bounds import (
@@ -28,14 +29,7 @@ from csplat.encoder.error_bounds import (
     take_precise_means,
     value_errors,
 )
-from csplat.encoder.quantisation import (
-    check_finite,
-    lattice_step,
-    lattice_values,
-    opacity_levels,
-    opacity_values,
-    quantise_colour,
-)
+from csplat.encoder.quantisation import check_finite, lattice_values, opacity_levels, opacity_values, quantise_colour
 from csplat.encoder.sh_codebook import FileCodebooks, ShCodingPlan, encode_sh
 from csplat.encoder.shape_codebook import (
     SHAPE_CODEBOOK_ID,
@@ -46,7 +40,7 @@ from csplat.encoder.shape_codebook import (
     shape_codebook_chunk,
 )
 from csplat.encoder.splat_importance import Importance
-from csplat.encoder.tiling import QuantisedTile, TileSplats, quantise_and_sort, take_rows
+from csplat.encoder.tiling import QuantisedTile, TileSplats, quantise_and_sort
 from csplat.errors import InputError, counted
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.types import F32, Progress
@@ -209,7 +203,8 @@ class EncodedTiles:
         """
         settings = {**(metadata or {}), **encoding_settings(self.plan, self.codebooks.sh_plan)}
         chunks = file_chunks(self.plan, self.errors, settings)
-        data = write_file(scene_fields(self.plan, self.codebooks, chunks), [part.tile for part in self.tiles])
+        scene, tiles = scene_fields(self.plan, self.codebooks, chunks), [part.tile for part in self.tiles]
+        data = b"".join(file_pieces(scene, tiles))
         notes = make_notes(self.tiles, strict=self.plan.parameters.lattice.strict)
         errors = declared_errors(self.errors, self.plan.origin)
         report = EncodeReport(settings, errors, self.errors.count, len(self.tiles), len(data), notes)
@@ -296,23 +291,23 @@ def encode_tile(
     quantised = quantise_and_sort(model, tile, parameters)
     rows = quantised.rows
     part = None if shapes is None else shapes.part(rows)
-    result.add_opacities(take_rows(model.opacities, rows))
-    max_scale = result.add_shapes(take_rows(model.quats, rows), take_rows(model.scales, rows), part)
-    result.add_means(take_precise_means(model, rows), quantised, lattice_step(parameters.lattice.step, tile.exponent))
-    result.add_sh0(take_rows(model.sh0, rows))
+    result.add_opacities(np.take(model.opacities, rows))
+    max_scale = result.add_shapes(np.take(model.quats, rows, axis=0), np.take(model.scales, rows, axis=0), part)
+    result.add_means(take_precise_means(model, rows), quantised, math.ldexp(parameters.lattice.step, tile.exponent))
+    result.add_sh0(np.take(model.sh0, rows, axis=0))
     layers: dict[int, list[bytes]] = {_spec.ATTRIBUTE_LAYER[_spec.ATTRIBUTE_SH0]: result.blocks}
     used: tuple[int, ...] = () if part is None else (SHAPE_CODEBOOK_ID,)
     if model.sh_degree:
-        sh = encode_sh(model.shN, rows, parameters, sh_plan)
-        layers |= {layer: [block] for layer, block in sh.blocks.items()}
+        blocks, exponent, errors = encode_sh(model.shN, rows, parameters, sh_plan)
+        layers |= {layer: [block] for layer, block in blocks.items()}
         used = (*sh_plan.codebook_ids, *used)
-        if sh.exponent:
+        if exponent:
             result.coarsened.add("shN")
-        for measure, errors in sh.errors.items():
-            result.add_errors(measure, errors)
+        for measure, pair in errors.items():
+            result.add_errors(measure, pair)
     if sh_plan.extras:
         layers[_spec.LAYER_EXTRA] = [
-            entropy.raw_block(column, take_rows(model.extra[name], rows), parameters.deflate)
+            entropy.raw_block(column, np.take(model.extra[name], rows), parameters.deflate)
             for column, name in enumerate(sh_plan.extras)
         ]
     corner, extent = quantised.corner, quantised.q.max(axis=1)
@@ -372,18 +367,19 @@ class _TileResult:
 
     def add_sh0(self, sh0: F32) -> None:
         parameters, source = self.parameters, np.ascontiguousarray(sh0.T)
-        colour = quantise_colour(source, parameters.sh0_step, parameters.chroma_shift, self.factors.sh0)
-        if colour.exponent > self.factors.sh0:
+        columns, exponent, decoded = quantise_colour(
+            source, parameters.sh0_step, parameters.chroma_shift, self.factors.sh0
+        )
+        if exponent > self.factors.sh0:
             self.coarsened.add("sh0")
-        block = entropy.offset_block(_spec.ATTRIBUTE_SH0, colour.columns, colour.exponent, parameters.deflate)
-        self.blocks.append(block)
-        check_finite("sh0", colour.decoded)
-        self.add_errors("sh0", value_errors(source, colour.decoded))
+        self.blocks.append(entropy.offset_block(_spec.ATTRIBUTE_SH0, columns, exponent, parameters.deflate))
+        check_finite("sh0", decoded)
+        self.add_errors("sh0", value_errors(source, decoded))
 
 
 def encoding_settings(plan: EncodePlan, sh_plan: ShCodingPlan) -> dict[str, Any]:
     """Return the content of the OPTS chunk: the caller's options and the encoder's choices."""
-    parameters, options = plan.parameters, plan.options
+    parameters, options, shapes = plan.parameters, plan.options, plan.shapes
     return {
         "asked": options.chosen(),
         "encoder": _versions(parameters),
@@ -400,18 +396,13 @@ def encoding_settings(plan: EncodePlan, sh_plan: ShCodingPlan) -> dict[str, Any]
         "chroma_shift": parameters.chroma_shift,
         "adaptive": parameters.adaptive if parameters.sh_coding == "scalar" else 0.0,
         "codebook_size": 0 if sh_plan.book is None else sh_plan.book.size,
-        **_shape_settings(plan.shapes),
+        **({} if shapes is None else {"shape_codebook_size": shapes.size}),
+        **({} if shapes is None else {"shape_escape_fraction": float(shapes.escaped.mean())}),
         **({} if plan.classes is None else {"classes": plan.classes.as_json()}),
         "deflate_level": parameters.deflate.level,
         "deflate": parameters.deflate.library,
         "seed": options.seed,
     }
-
-
-def _shape_settings(shapes: ShapeCodebook | None) -> dict[str, Any]:
-    if shapes is None:
-        return {}
-    return {"shape_codebook_size": shapes.size, "shape_escape_fraction": float(shapes.escaped.mean())}
 
 
 def declared_errors(errors: ErrorSums, origin: Origin) -> dict[str, tuple[float, float]]:

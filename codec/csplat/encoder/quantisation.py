@@ -6,7 +6,6 @@ Arrays are in columns, [C, n], in the order of the streams; NumPy's inner loops 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,11 +25,6 @@ _ROWS = 2048  # splats per block; rows of 45 floats and their columns fit the se
 _ROOT2 = float.fromhex("0x1.6A09E667F3BCDp+0")  # spec 7.5
 
 Quaternion = tuple[F32, F32, F32, F32]
-
-
-def lattice_step(step: float, exponent: int) -> float:
-    """Return step × 2**exponent: normal and finite in binary32 (LAT-1) and binary64 (TIL-9)."""
-    return math.ldexp(step, exponent)
 
 
 def lattice_exponent(largest: float, step: float) -> int:
@@ -183,22 +177,17 @@ def check_finite(name: str, values: F32) -> None:
         raise InputError(f"{name} are too large to quantise: values at the limit of float32")
 
 
-@dataclass(frozen=True)
-class QuantisedColour:
-    """Colours of a tile: Y, Co, Cg columns, the exponent of their lattice, and decoded values."""
+def quantise_colour(rgb: F32, step: float, shift: int, coarse: int = 0) -> tuple[Integers, int, F32]:
+    """Quantise colours [3, ..., n] to multiples of step × 2**coarse, or of a coarser step that satisfies LAT-4.
 
-    columns: Integers
-    exponent: int
-    decoded: F32
-
-
-def quantise_colour(rgb: F32, step: float, shift: int, coarse: int = 0) -> QuantisedColour:
-    """Quantise colours [3, ..., n] to multiples of step × 2**coarse, or of a coarser step that satisfies LAT-4."""
+    Returns:
+        Y, Co, Cg columns; the exponent of their lattice; decoded colours.
+    """
     exponent = max(coarse, lattice_exponent(2.0 * float(np.abs(rgb).max(initial=0.0)), step))
-    tile_step = lattice_step(step, exponent)
+    tile_step = math.ldexp(step, exponent)
     real = np.float32 if exponent == 0 else np.float64
     columns = colour_integers(rgb * real(1.0 / tile_step), shift)
-    return QuantisedColour(columns, exponent, lattice_values(colour_lifted(columns, shift), tile_step))
+    return columns, exponent, lattice_values(colour_lifted(columns, shift), tile_step)
 
 
 def quantise_sh(source: F32, parameters: CodingParameters, coarse: I32 | None) -> tuple[Integers, int, F32]:
@@ -216,7 +205,7 @@ def quantise_sh(source: F32, parameters: CodingParameters, coarse: I32 | None) -
     n, coefficients, _ = source.shape
     largest = max(abs(float(source.max(initial=0.0))), abs(float(source.min(initial=0.0))))
     exponent = lattice_exponent(2.0 * largest, parameters.sh_step)
-    step = lattice_step(parameters.sh_step, exponent)
+    step = math.ldexp(parameters.sh_step, exponent)
     coarsest = 0 if coarse is None else int(coarse.max(initial=0))
     columns = np.empty((3, coefficients, n), _narrowest(2.0 * largest / step + 1.0 + 2.0**coarsest))
     decoded = np.empty(source.shape, np.float32)

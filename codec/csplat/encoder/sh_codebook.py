@@ -7,7 +7,7 @@ trained on a sample, and an `AssignmentRule` assigns the other splats.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -125,21 +125,6 @@ class FileCodebooks:
     records: Sequence[IndexedCodebook] = ()
     chunks: Sequence[FileChunk] = ()
     rule: AssignmentRule | None = None
-
-
-@dataclass(frozen=True)
-class EncodedSh:
-    """The encoded SH of a tile.
-
-    Attributes:
-        blocks: block of each layer; a band of zeros has none.
-        errors: largest error and sum of squares by measure.
-        exponent: the tile's lattice is coarser by 2**exponent.
-    """
-
-    blocks: Mapping[int, bytes]
-    errors: Mapping[str, tuple[float, float]]
-    exponent: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +253,9 @@ def sh_coarseness(rows: Rows, parameters: CodingParameters, sh_plan: ShCodingPla
     return np.clip(np.rint(0.5 * parameters.adaptive * ratio), 0, _COARSEST).astype(np.int32)
 
 
-def encode_sh(shN: F32, rows: Rows, parameters: CodingParameters, sh_plan: ShCodingPlan) -> EncodedSh:
+def encode_sh(
+    shN: F32, rows: Rows, parameters: CodingParameters, sh_plan: ShCodingPlan
+) -> tuple[dict[int, bytes], int, dict[str, tuple[float, float]]]:
     """Encode the bands 1 to `parameters.sh_degree` of a tile.
 
     Args:
@@ -276,6 +263,10 @@ def encode_sh(shN: F32, rows: Rows, parameters: CodingParameters, sh_plan: ShCod
         rows: [n], the tile's splats in decoding order.
         parameters: steps and codings.
         sh_plan: SH coding of the file.
+
+    Returns:
+        The block of each layer, none for a band of zeros; the exponent of the tile's lattice; largest error and sum of
+        squares by measure.
     """
     source = np.take(shN, rows, axis=0)
     kept = parameters.sh_coefficients
@@ -290,7 +281,7 @@ def encode_sh(shN: F32, rows: Rows, parameters: CodingParameters, sh_plan: ShCod
         columns, exponent, decoded = quantise_sh(source[:, :kept], parameters, coarse)
         sums.add(source[:, :kept], decoded, 0)
         layers = dict(_scalar_blocks(columns, exponent, parameters))
-    return EncodedSh(layers, sums.by_band(), exponent)
+    return layers, exponent, sums.by_band()
 
 
 def _scalar_blocks(columns: NDArray[Any], exponent: int, parameters: CodingParameters) -> Iterator[tuple[int, bytes]]:

@@ -23,14 +23,7 @@ from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.entropy import DeflateSettings, signed_stream
 from csplat.encoder.error_bounds import covariance_entries
 from csplat.encoder.kmeans import cluster, rank_by_frequency, reassign_by_metric, search_nearest
-from csplat.encoder.quantisation import (
-    canonicalise_shape,
-    lattice_exponent,
-    lattice_step,
-    lattice_values,
-    quat_levels,
-    quat_values,
-)
+from csplat.encoder.quantisation import canonicalise_shape, lattice_exponent, lattice_values, quat_levels, quat_values
 from csplat.encoder.splat_importance import ErrorMetric
 from csplat.encoder.tiling import TileSplats, quantise_and_sort
 from csplat.model import SplatModel
@@ -197,7 +190,7 @@ def quantise_shape(
     """
     rotation, sorted_scales = _canonical(quats, scales, parameters)
     exponent = max(factors.scales, lattice_exponent(float(np.abs(sorted_scales).max()), parameters.scale_step))
-    step = lattice_step(parameters.scale_step, exponent)
+    step = math.ldexp(parameters.scale_step, exponent)
     n = np.rint(sorted_scales.astype(np.float64) / step).astype(np.int64)
     q = quat_levels(rotation, parameters.quat_levels, factors.quats)
     if part is not None:
@@ -205,7 +198,7 @@ def quantise_shape(
     return QuantisedShape(n, exponent, q, lattice_values(n, step), quat_values(q, parameters.quat_levels))
 
 
-def dequantised_shapes(
+def dequantise_shapes(
     quats: F32,
     scales: F32,
     tiles: Sequence[TileSplats],
