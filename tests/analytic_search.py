@@ -1,19 +1,19 @@
-"""A scene and an encoder as formulas, for tests of the search for a target: no file is encoded, nothing is rendered.
+"""A scene and an encoder as formulas, for tests of the search for a target without encoding or rendering.
 
 The law, for a file of n splats whose attributes keep q dB each, with x = E(p) the mean squared error of p dB:
 
     size  = frame + n · (geometry · grading + sh(coding)) · exp(rate · (q - 42)) + book(entries)
     error = E(q - lost) + removal(n) + missing(degree) + book(entries) + E(ceiling)
 
-- `sh` is in proportion to the coefficients that are kept; a codebook costs its indices and its entries instead, and
-  errs by what too few of these leave.
-- `removal` is a power of the number of pruned splats, not counting those that no view needs; a refit divides it.
-- `missing` is what the scene shows without its upper bands.
-- `ceiling` bounds what any precision reaches: the search has to notice that finer steps gain nothing.
+- `sh` is proportional to the kept coefficients; a codebook costs its indices and entries instead, and its error
+  falls with the number of entries.
+- `removal` is a power of the number of pruned splats without the unneeded ones; a refit divides it.
+- `missing` is the error of the scene without its upper bands.
+- `ceiling` bounds the PSNR at any precision: the search has to notice that finer steps gain nothing.
 
-A plateau of q and jumps (every other step of q loses some dB) break the monotony that a search likes to rely on. Each
-view sees the same error; test views may see more of all of it, or of removal.
-`AnalyticScene.smallest` and `best` find the best file by trying everything, as a reference for the search.
+A plateau of q and jumps (every other step of q loses some dB) break the monotony. Each view has the same error; test
+views may have a larger one, or a larger one of removal. `AnalyticScene.smallest` and `best` are the reference: they
+find the best file by trying everything.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from csplat_tools.optimise.subsets import Pruner
 from csplat_tools.optimise.target_search import TargetSearch, find_goal
 from csplat_tools.optimise.targets import Target
 
-USUAL_QUALITY = 42.0  # dB that each attribute keeps when bytes per splat are those of the scene
+USUAL_QUALITY = 42.0  # dB per attribute at which bytes per splat are those of the scene
 QUALITIES = np.arange(24.0, 110.0, 0.2)  # dB, the qualities that a search may request
 PSNR_CAP = 99.0  # dB
 BOOKS = tuple(2**power for power in range(5, 13))
@@ -57,12 +57,12 @@ def psnr_of(error):
 
 @dataclass(frozen=True)
 class Views:
-    """Views, and what they see.
+    """Views and their errors.
 
     Attributes:
-        offset: dB by which they see errors larger than the validation views.
-        removal_offset: dB by which they see errors of removal larger still.
-        photo_psnr: dB by which the source misses their photographs; `None`: they compare with the source.
+        offset: dB by which errors are larger than in the validation views.
+        removal_offset: dB by which errors of removal are larger in addition.
+        photo_psnr: PSNR of the source against their images, dB; None to compare with the source.
     """
 
     offset: float = 0.0
@@ -78,7 +78,7 @@ class Contents:
     """A request for a file.
 
     Attributes:
-        options: options of the encoder, without any that is still to be chosen.
+        options: options of the encoder; those still to be chosen are left open.
         splats: number of splats.
         refitted: whether the kept splats were fitted to renders of the source.
         graded: whether splats are sorted by importance.
@@ -94,15 +94,15 @@ class Contents:
 
 @dataclass(frozen=True)
 class AnalyticScene:
-    """A scene, and the cost of files of it.
+    """A scene and the cost of its files.
 
     Attributes:
         splats, sh_degree: number of splats and SH degree of the scene.
-        unneeded: splats that no view needs.
-        removal_psnr: PSNR once half of the others are gone, dB, before a refit.
+        unneeded: splats without effect in any view.
+        removal_psnr: PSNR after half of the others are pruned, dB, before a refit.
         removal_power: exponent with which the error grows with the number of pruned splats.
         mended: dB by which a refit reduces that error. tuned: dB that a refit through a file's quantisers gains.
-        shown: PSNR of the scene with bands up to degree 0, 1 and 2 alone, dB.
+        shown: PSNR of the scene with bands up to degree 0, 1 and 2, dB.
         frame_bytes: bytes of a file without splats. splat_bytes, sh_bytes: bytes per splat at the usual quality.
         rate: share by which bytes grow with each dB.
         lost: dB between the quality of the attributes and that of renders.
@@ -110,9 +110,9 @@ class AnalyticScene:
         index_bytes, entry_bytes: bytes of a codebook of SH, per splat and per entry.
         book_psnr: PSNR that a codebook of one entry for 64 splats leaves, dB. book_octave: dB with twice the entries.
         ceiling: dB that no precision exceeds.
-        plateau: from and to which quality more of it gains nothing; what is above gains as much less.
+        plateau: range of quality that gains nothing, dB.
         jump: dB that every other step of 0.6 dB of quality loses.
-        packing: factor of the bytes of a file that is not packed as tightly as possible.
+        packing: factor of the bytes of a file with fast compression.
         preset_saving: a preset, and the share by which its own file is smaller than others of its quality.
     """
 
@@ -153,7 +153,7 @@ class AnalyticScene:
         )
 
     def options_of(self, contents: Contents) -> dict[str, Any]:
-        """Return what the encoder chooses if the options leave it open, under the names of a file's options."""
+        """Return the encoder's choices, under the names of a file's options."""
         asked = contents.options
         degree = self.sh_degree if asked.sh_degree is None else min(asked.sh_degree, self.sh_degree)
         coding = "scalar" if asked.sh_coding == "auto" else asked.sh_coding
@@ -189,7 +189,7 @@ class AnalyticScene:
         return np.rint((self.frame_bytes + contents.splats * splat * saved) * packed + book)
 
     def error_of(self, contents: Contents, views: Views = DECIDING, quality: Any = None) -> Any:
-        """Return what a file errs by in some views, or one file for each of some qualities."""
+        """Return the error of a file in some views, or of one file for each of some qualities."""
         chosen = self.options_of(contents)
         q = np.asarray(chosen["quality"] if quality is None else quality, np.float64)
         q = q - np.clip(q - self.plateau[0], 0.0, self.plateau[1] - self.plateau[0])
@@ -203,7 +203,7 @@ class AnalyticScene:
         return self._seen(error + self.missing(chosen["sh_degree"]), removed, views)
 
     def source_error(self, splats: int, sh_degree: int, views: Views, *, refitted: bool = False) -> float:
-        """Return what some splats, before any quantisation, and some bands err by."""
+        """Return the error of some splats and bands before quantisation."""
         return float(self._seen(self.missing(sh_degree), self.removed(splats, refitted=refitted), views))
 
     def removed(self, splats: Any, *, refitted: bool) -> Any:
@@ -220,7 +220,7 @@ class AnalyticScene:
         seen = (error + removed / error_of(views.removal_offset)) / error_of(views.offset)
         return seen if views.photo_psnr is None else seen + error_of(views.photo_psnr)
 
-    # by trying everything
+    # The reference, by trying everything.
 
     def smallest(self, psnr: float, views: Views = DECIDING, *, no_prune: bool = False) -> float:
         """Return the size of the smallest file of a PSNR; infinite if there is none."""
@@ -247,10 +247,10 @@ class AnalyticScene:
 
 @dataclass(frozen=True, eq=False)
 class AnalyticFile:
-    """A file, as long as its size says; it cannot be read.
+    """A file of the computed size without content.
 
     Attributes:
-        scene, contents: the scene and the request that it was made from.
+        scene, contents: the scene and the request.
     """
 
     scene: AnalyticScene
@@ -277,8 +277,8 @@ class Found:
     Attributes:
         file: the chosen file.
         tried: every file that was made, in order.
-        scored: the files that the test views were shown.
-        report: the report that users get.
+        scored: the files that were scored in test views.
+        report: the report for users.
     """
 
     file: AnalyticFile
@@ -299,17 +299,17 @@ def search(
     tried: list[AnalyticFile] | None = None,
     **target: object,
 ) -> Found:
-    """Look for a file of an analytic scene.
+    """Search for a file of an analytic scene.
 
     Args:
         scene: the scene.
-        options: knobs of the encoder that the caller fixed.
-        no_prune: no splat may be removed.
-        judging: the test views; by default they see the same as the validation views.
-        photo_psnr: PSNR of the source against photographs, dB; photographs decide a loss.
-        grades: splats may be sorted by importance.
+        options: options fixed by the caller.
+        no_prune: keep all splats.
+        judging: the test views; by default they have the errors of the validation views.
+        photo_psnr: PSNR of the source against images, dB, for a PSNR drop.
+        grades: allow quantisation classes.
         effort: effort of the refit.
-        tried: receives the files that are made, even if the search is refused.
+        tried: receives the candidates, even if the search fails.
         target: arguments of `Target`.
     """
     encoding, model, asked = options or EncodeOptions(), scene.model(), Target(**target)
@@ -334,14 +334,14 @@ def search(
 
 
 def analytic_removal(scene: AnalyticScene, *, grades: bool = False, effort: int = 3) -> Pruner:
-    """Return the object that decides how many splats may be pruned."""
+    """Return the pruner of an analytic scene."""
     how = SimplifyOptions(effort=effort)
     return _Removal(scene.model(), None, how, use_classes=grades, progress=None, psnr=None, scene=scene)
 
 
 @dataclass(eq=False)
 class _Judge:
-    """Views that see the errors of the law. Remembers the files that it was shown."""
+    """A scorer with the errors of the law, which records the files it scores."""
 
     scene: AnalyticScene
     views: Views
@@ -367,7 +367,7 @@ class _Judge:
 
 @dataclass(frozen=True)
 class _Shown:
-    """Splats before they are quantised."""
+    """Splats before quantisation."""
 
     splats: int
     refitted: bool
@@ -375,7 +375,7 @@ class _Shown:
 
 @dataclass(eq=False)
 class _Splats:
-    """Splats that a file is to hold: a `Subset`."""
+    """Splats of a file: a `Subset`."""
 
     scene: AnalyticScene
     model: object
@@ -404,12 +404,12 @@ class _Splats:
         contents = Contents(options, len(self.model), self.refits, graded=use_classes, draft=quick and self.refits)
         return SimpleNamespace(write=lambda _: _encoded(AnalyticFile(self.scene, contents)))
 
-    def options_entry(self, candidate):  # noqa: ARG002  # the file does not record it
+    def options_entry(self, candidate):  # noqa: ARG002  # not recorded in the file
         return None
 
 
 def _encoded(file):
-    """Return a file as the encoder does."""
+    """Wrap a file like the encoder's result."""
     options = file.scene.options_of(file.contents)
     report = SimpleNamespace(options=options, errors=file.errors, splat_count=file.contents.splats)
     return SimpleNamespace(data=file, report=report)
@@ -417,7 +417,7 @@ def _encoded(file):
 
 @dataclass(frozen=True)
 class _Session:
-    """The order of removal, which every number of splats shares."""
+    """The pruning order, which is shared by every number of splats."""
 
     order: PruningOrder
     splats: int
@@ -431,7 +431,7 @@ class _Session:
 
 @dataclass(eq=False)
 class _Removal(Pruner):
-    """The order of removal and the refit that the law gives, in place of measured ones."""
+    """The pruning order and refit by the law, in place of measured ones."""
 
     scene: AnalyticScene = None
 
@@ -442,6 +442,6 @@ class _Removal(Pruner):
         order = PruningOrder(np.arange(count - 1), np.diff(errors), ())
         return _Session(order, count, self.options)
 
-    def refit(self, kept_count, allowed, psnr_of):  # noqa: ARG002  # as the measured one is called
+    def refit(self, kept_count, allowed, psnr_of):  # noqa: ARG002  # the signature of `Pruner`
         model = self.source.select(np.arange(len(self.source) - kept_count, len(self.source)))
         return _Splats(self.scene, model, refits=True, classifiable=self.use_classes)

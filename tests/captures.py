@@ -1,4 +1,4 @@
-"""A small scene, and photographs of it, for tests of what learns from photographs. Requires the extra [render]."""
+"""A small scene and images of it, for tests of training, tuning and searches. Requires the extra [render]."""
 
 import json
 import math
@@ -27,12 +27,12 @@ def cameras(count):
 
 
 def views_of(seen_from, photographs=()):
-    """Views of which every eighth decides and the others teach; none judges."""
+    """Return training views and every eighth as a validation view, without test views."""
     return with_validation_views(ViewSet("cameras", BLACK, seen_from, (), (), photographs))
 
 
 def shell(coefficients):
-    """Return 300 overlapping splats on a sphere, of smoothly varying colours, with SH coefficients above degree 0."""
+    """Return 300 overlapping splats on a sphere with smoothly varying colours; `coefficients` of SH beyond degree 0."""
     rng = np.random.default_rng(0)
     means = rng.standard_normal((300, 3))
     means /= np.linalg.norm(means, axis=1, keepdims=True)
@@ -47,7 +47,7 @@ def shell(coefficients):
 
 
 def photograph(scene, folder):
-    """Write a PLY with one splat more, far behind all cameras, and sixteen photographs in front of black."""
+    """Write sixteen images on black, and a PLY with an additional splat far behind all cameras."""
     (folder / "images").mkdir()
     frames = []
     for number, camera in enumerate(cameras(16)):
@@ -65,7 +65,7 @@ def photograph(scene, folder):
 
 
 def as_colmap(folder):
-    """Say with COLMAP's files instead where the photographs of such a folder were taken."""
+    """Replace the poses of such a folder by COLMAP's files."""
     (folder / "transforms.json").unlink()
     model = folder / "sparse" / "0"
     model.mkdir(parents=True)
@@ -80,7 +80,7 @@ def as_colmap(folder):
 
 
 def photograph_object(scene, folder):
-    """Write Blender's layout: sixteen transparent pictures, of which those for training and for tests are named."""
+    """Write a Blender set of sixteen transparent images, twelve of them for training."""
     for part, seen_from in (("train", cameras(16)[1:13]), ("test", [*cameras(16)[:1], *cameras(16)[13:]])):
         (folder / part).mkdir()
         frames = []
@@ -96,11 +96,11 @@ def photograph_object(scene, folder):
     return folder
 
 
-SMALL = (32, 24)  # pixels of views in which a search takes a second
+SMALL = (32, 24)  # pixels of a view; a search then takes a second
 
 
 def crowded():
-    """Return a shell, and twice as many splats that hardly anybody sees."""
+    """Return a shell and 600 nearly invisible splats."""
     rng, scene = np.random.default_rng(1), shell(3)
     faint = {
         "means": (0.5 * rng.standard_normal((600, 3))).astype(np.float32),
@@ -121,13 +121,13 @@ def around(source, count=24):
 
 
 def judged_by(seen_from):
-    """Return views of which every fourth judges, and the others teach."""
+    """Return training views, and every fourth as a test view."""
     training = [camera for number, camera in enumerate(seen_from) if number % 4]
     return ViewSet("cameras", BLACK, training, (), seen_from[::4])
 
 
 def photographed(scene):
-    """Return photographs that a scene misses by 25 dB, every eighth of which judges."""
+    """Return views with images that differ from the scene by 25 dB; every eighth is a test view."""
     seen_from = camera_sequence(scene, 48, SMALL, seed=3)
     rng, draw = np.random.default_rng(1), renderer(scene, BLACK)
     noisy = [np.clip(draw(c).rgb + 0.06 * rng.standard_normal((c.H, c.W, 3)), 0, 1) for c in seen_from]
@@ -137,9 +137,9 @@ def photographed(scene):
 
 
 def found_within(source, views=None, encoding=None, *, no_prune=False, importance=None, refit=True, **goal):
-    """Return the file on a target, by a brief search in small views: those of forty cameras unless others are given."""
+    """Return the file at a target by a brief search in small views, by default of forty cameras."""
     views = views or judged_by(cameras(40))
-    # Fits of larger pictures take fewer steps; these are small all the same, unless virtual ones are to be added.
+    # Larger views take fewer steps of a fit. The size only matters if virtual views are added.
     size = SMALL if views.virtual else (960, 720)
     simplifying = SimplifyOptions(effort=1, rounds=2, view_size=size, refit=refit)
     chosen = {"no_prune": no_prune, "importance": importance, "simplifying": simplifying}

@@ -1,6 +1,6 @@
-"""Fine-tuning: that it learns, repeats itself, resumes and stops, and what the command reports and writes.
+"""Fine-tuning: learning, determinism, resumed runs, ends of a run, and the reports and files of the command.
 
-`tuned_file` was tuned for a hundred steps, for all who need a file that learnt; all else takes as few steps as show it.
+The fixture `tuned_file` was tuned for a hundred steps; other tests use as few steps as possible.
 """
 
 import json
@@ -17,9 +17,8 @@ pytest.importorskip("numba", reason="fine-tuning needs numba: pip install 'cspla
 pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
 pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
 
-# Importing them needs what is looked for above.
 from captures import H, W, cameras, photograph, shell
-from command_line import change_options, invoke
+from command_line import call, change_options, invoke
 
 import csplat
 import csplat_trainer
@@ -61,7 +60,7 @@ def source():
 
 @pytest.fixture(scope="module")
 def coarse(source):
-    """The scene as a coarse file holds it, with a codebook."""
+    """The fixed quantisation of a coarse file with a codebook."""
     return fix_quantisation(EncodePlan.of(source, COARSE))
 
 
@@ -75,15 +74,12 @@ def psnr(model, views):
     return -10.0 * math.log10(float(np.mean(error)))
 
 
-# from a program
-
-
+# From a program.
 @pytest.mark.slow
-def test_a_program_hands_over_a_model_and_views_and_is_told_of_every_step(source, views):
+def test_finetune_takes_a_model_and_views_and_reports_every_step(source, views):
     steps, stages = [], []
-    found = csplat_trainer.finetune(
-        source, views, COARSE, QUICK, on_step=steps.append, progress=lambda stage, done: stages.append((stage, done))
-    )
+    note = lambda stage, done: stages.append((stage, done))  # noqa: E731
+    found = csplat_trainer.finetune(source, views, COARSE, QUICK, on_step=steps.append, progress=note)
     assert len(found.data) < len(csplat.encode(source))
     assert psnr(found.decoded, views.validation) > psnr(decode(found.plain.data), views.validation)
     assert np.array_equal(decode(found.data).sh0, found.decoded.sh0)
@@ -93,7 +89,7 @@ def test_a_program_hands_over_a_model_and_views_and_is_told_of_every_step(source
 
 
 @pytest.mark.slow
-def test_photographs_of_a_data_set_teach_in_front_of_what_was_behind_the_scene(capture):
+def test_finetune_takes_a_data_set(capture):
     model, data = csplat.read_ply(capture / "scene.ply"), csplat_trainer.load(capture)
     found = csplat_trainer.finetune(model, data, COARSE, replace(QUICK, iterations=2))
     assert (len(data.train), 2) == (found.log["train_views"], found.log["steps"])
@@ -101,27 +97,25 @@ def test_photographs_of_a_data_set_teach_in_front_of_what_was_behind_the_scene(c
 
 @pytest.fixture(scope="module")
 def fine():
-    """Few splats, coded so finely that tuning gains nothing, and views of them."""
+    """A few splats, coded so finely that tuning gains nothing, and views of them."""
     few = shell(3).select(slice(0, 40))
     fixed = fix_quantisation(EncodePlan.of(few, EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar")))
     return fixed, split_views(renders_of(few, cameras(8), BLACK, None), BLACK, validation_count=3)
 
 
-# learning
-
-
+# Learning.
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "encoding",
     [
         COARSE,
         EncodeOptions(attribute_psnr=28.0, sh_coding="scalar"),
-        EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32),
+        replace(COARSE, shape_codebook_size=32),
         EncodeOptions(attribute_psnr=28.0, sh_coding="none", tile_splats=80),
     ],
     ids=["codebook", "scalar", "shapes", "no SH"],
 )
-def test_a_tuned_file_looks_better_than_one_that_is_not_and_is_hardly_larger(source, views, encoding):
+def test_tuning_increases_the_psnr_at_nearly_the_same_size(source, views, encoding):
     fixed = fix_quantisation(EncodePlan.of(source, encoding))
     before = fixed.encode(fixed.start()).write().data
     tuned = tune(fixed, views, QUICK)
@@ -131,7 +125,7 @@ def test_a_tuned_file_looks_better_than_one_that_is_not_and_is_hardly_larger(sou
 
 
 @pytest.mark.slow
-def test_pixels_that_do_not_count_teach_nothing(coarse, views):
+def test_masked_pixels_do_not_influence_tuning(coarse, views):
     taken = [one.camera for one in views.train]
     mask = np.ones((taken[0].H, taken[0].W), bool)
     mask[:, ::3] = False
@@ -151,7 +145,7 @@ def test_pixels_that_do_not_count_teach_nothing(coarse, views):
 
 
 @pytest.mark.slow
-def test_the_decoded_file_scores_what_was_scored_while_tuning(coarse, views):
+def test_the_decoded_file_has_the_psnr_of_the_tuning(coarse, views):
     fixed, tuned = coarse, tune(coarse, views, FEW)
     decoded = decode(fixed.encode(tuned.best_values).write().data)
     rasteriser, error = Rasteriser(), []
@@ -168,7 +162,7 @@ def test_the_decoded_file_scores_what_was_scored_while_tuning(coarse, views):
 
 
 @pytest.mark.slow
-def test_costly_bytes_make_small_files(source, views):
+def test_a_larger_lambda_gives_a_smaller_file(source, views):
     sizes, fixed = [], fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar")))
     for cost in (0.0, 1e-3, 1e-2):
         tuned = tune(fixed, views, replace(QUICK, byte_cost=cost))
@@ -177,7 +171,7 @@ def test_costly_bytes_make_small_files(source, views):
 
 
 @pytest.mark.slow
-def test_what_does_not_get_better_stays_as_it_was(fine):
+def test_a_run_without_gain_keeps_the_start(fine):
     fixed, views = fine
     tuned = tune(fixed, views, replace(FEW.scaled(5.0), byte_cost=0.0))
     assert 0 == tuned.log["best_iteration"]
@@ -186,17 +180,17 @@ def test_what_does_not_get_better_stays_as_it_was(fine):
 
 
 @pytest.mark.slow
-def test_a_run_that_gains_nothing_ends_early(fine):
+def test_a_run_without_gain_ends_early(fine):
     fixed, views = fine
     options = replace(FEW, iterations=30, patience=2, byte_cost=0.0).scaled(5.0)
     log = tune(fixed, views, options).log
     assert log["converged"]
-    assert 2 / 3 * 30 < log["steps"] < 30  # not before values have calmed down
+    assert 2 / 3 * 30 < log["steps"] < 30  # not before the learning rates are small
     assert not tune(fixed, views, replace(options, patience=0)).log["converged"]
 
 
 @pytest.mark.slow
-def test_a_run_whose_files_are_too_large_yet_goes_on(fine, monkeypatch):
+def test_a_run_with_too_large_files_does_not_end_early(fine, monkeypatch):
     fixed, views = fine
     options = replace(FEW, iterations=30, patience=2, byte_cost=0.0).scaled(5.0)
     assert tune(fixed, views, options, size_bytes=10**9).log["converged"]
@@ -204,15 +198,12 @@ def test_a_run_whose_files_are_too_large_yet_goes_on(fine, monkeypatch):
     assert 30 == tune(fixed, views, options, size_bytes=10**9).log["steps"]
 
 
-# gradients
-
-
+# Gradients.
 @pytest.mark.area(name="rasteriser")
-def test_gradients_of_entries_are_those_of_all_their_users(source, views):
-    """A sum over users, against finite differences of the loss by an entry's values."""
-    fixed = fix_quantisation(
-        EncodePlan.of(source, EncodeOptions(attribute_psnr=60.0, sh_coding="codebook", codebook_size=16))
-    )
+def test_the_gradient_of_an_entry_is_the_sum_over_its_users(source, views):
+    # The sum over users, against finite differences of the loss by an entry's values.
+    encoding = EncodeOptions(attribute_psnr=60.0, sh_coding="codebook", codebook_size=16)
+    fixed = fix_quantisation(EncodePlan.of(source, encoding))
     scene, view = TunedScene(fixed), views.train[0]
     loss, rasteriser = PhotometricLoss(H, W, 1.0, 0.0), Rasteriser(dtype=np.float64)
     seen, _ = scene.dequantise()
@@ -263,24 +254,22 @@ def test_a_step_moves_values_through_their_quantisers(coarse, views):
     assert np.array_equal(before["means"], after["means"])
     for name in ("scales", "logits", "sh0", "shN"):
         moved = np.abs(after[name] - before[name])
-        assert 0 < moved.max() <= 1.01e-4, name  # Adam's first step is as long as the rate
+        assert 0 < moved.max() <= 1.01e-4, name  # Adam's first step has the length of the rate
 
 
-# the cost of bytes
-
-
-def test_costs_are_the_entropy_and_their_slopes_point_away_from_what_is_common():
+# The cost of bytes.
+def test_costs_are_the_entropy_with_slopes_away_from_common_values():
     columns = np.repeat([0, 1, -1, 2], [800, 100, 90, 10])[:, None]
     slopes, bits = cost_slopes([columns[:700], columns[700:]])
     shares = np.array([800, 100, 90, 10]) / 1000
     assert bits == pytest.approx(-1000 * (shares * np.log2(shares)).sum())
-    assert slopes[0, 128 + 1] > 0.5  # towards 2 it gets dearer
+    assert slopes[0, 128 + 1] > 0.5  # towards 2 the cost rises
     assert slopes[0, 128 - 1] < -0.5
     assert abs(slopes[0, 128]) < 0.2
     assert np.abs(slopes).max() <= 4.0
 
 
-def test_costs_take_the_integers_that_are_coded(source):
+def test_costs_use_the_encoded_integers(source):
     fixed = fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar", chroma_shift=1)))
     scene = TunedScene(fixed)
     seen, _ = scene.dequantise()
@@ -292,8 +281,8 @@ def test_costs_take_the_integers_that_are_coded(source):
 
 
 @pytest.mark.parametrize("group", ["scales", "sh0", "logits", "quats", "shN"])
-def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, group):
-    """A made-up cost, quadratic in the integers, has slopes that finite differences know."""
+def test_gradients_of_costs_agree_with_the_definition(source, group):
+    # The slopes of a cost that is quadratic in the integers are known.
     fixed = fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)))
     scene = TunedScene(fixed)
     seen, _ = scene.dequantise()
@@ -313,7 +302,7 @@ def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, g
     elif group == "quats":
         assert not steps["quats"][:, 0].any()
         unit = 1.0 / (math.sqrt(2.0) * plan.quat_levels)
-        expected = 0.01 * np.clip(stored.quats[:, 1:] / unit, -128, 128) / unit  # the table ends there
+        expected = 0.01 * np.clip(stored.quats[:, 1:] / unit, -128, 128) / unit  # the range of the table
         assert np.allclose(steps["quats"][:, 1:], expected, rtol=1e-3, atol=1e-3)
     elif group == "logits":
         level = np.sqrt(stored.opacities) * plan.opacity_levels
@@ -329,10 +318,10 @@ def test_slopes_of_costs_reach_the_gradients_as_finite_differences_say(source, g
         scale = 2.0**plan.chroma_shift
         by_y, by_co, by_cg = 0.01 * y, 0.01 * co / scale**2, 0.01 * cg / scale**2
         expected = np.stack([by_y / 4 + by_co - by_cg / 2, by_y / 2 + by_cg, by_y / 4 - by_co - by_cg / 2], axis=-1)
-        assert np.abs(gradient - expected / step).max() < 0.05 / step  # integers are rounded, this is not
+        assert np.abs(gradient - expected / step).max() < 0.05 / step  # the expected values are not rounded
 
 
-def test_a_weight_of_bytes_is_loss_per_bit_and_splat(coarse):
+def test_lambda_is_loss_per_bit_and_splat(coarse):
     scene = TunedScene(coarse)
     seen, _ = scene.dequantise()
     costs = RateTerm.count(scene.fixed, scene.stream_values(seen), 2e-4)
@@ -340,11 +329,9 @@ def test_a_weight_of_bytes_is_loss_per_bit_and_splat(coarse):
     assert 5 < costs.bits / 300 < 200
 
 
-# repeating
-
-
+# Determinism and resumed runs.
 @pytest.mark.slow
-def test_the_same_seed_makes_the_same_bytes_at_any_number_of_threads(source, views):
+def test_the_same_seed_gives_the_same_bytes_at_any_number_of_threads(source, views):
     files = []
     for seed, threads in ((1, 1), (1, 2), (2, 1)):
         fixed = fix_quantisation(EncodePlan.of(source, COARSE))
@@ -354,18 +341,13 @@ def test_the_same_seed_makes_the_same_bytes_at_any_number_of_threads(source, vie
     assert files[0] != files[2]
 
 
-def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path):
-    fixed = fix_quantisation(
-        EncodePlan.of(
-            source, EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32)
-        )
-    )
-    file = tmp_path / "c.npz"
-    middle = []
+def test_a_resumed_run_equals_an_uninterrupted_one(source, views, tmp_path):
+    fixed = fix_quantisation(EncodePlan.of(source, replace(COARSE, shape_codebook_size=32)))
+    file, middle = tmp_path / "c.npz", []
 
     def keep(now):
         if now.iteration == 8:
-            middle.append(file.read_bytes())  # the one of step 6
+            middle.append(file.read_bytes())  # of step 6
 
     whole = tune(fixed, views, FEW, progress=keep, checkpoint=file, checkpoint_every=3)
     file.write_bytes(middle[0])
@@ -376,7 +358,7 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(source, views, tmp_path)
 
 
 @pytest.mark.slow
-def test_bytes_cost_what_keeps_a_file_to_its_size(source, views, tmp_path):
+def test_lambda_is_controlled_to_meet_a_size(source, views, tmp_path):
     fixed = fix_quantisation(EncodePlan.of(source, EncodeOptions(attribute_psnr=34.0)))
     before = len(fixed.encode(fixed.start()).write().data)
     options, costs = replace(QUICK, byte_cost=4e-3), []
@@ -397,13 +379,13 @@ def test_bytes_cost_what_keeps_a_file_to_its_size(source, views, tmp_path):
         tune(fixed, views, half, resume=file)
 
 
-def test_a_file_that_is_too_large_adds_its_excess_to_the_loss():
+def test_the_excess_of_a_file_is_added_to_the_loss():
     budget = RateController(1_000, 1e-4)
     assert (0.0, 0.0, 0.25) == tuple(budget.excess(size, 4_000.0) for size in (900, 1_000, 1_250))
 
 
-def test_bytes_that_are_free_at_first_are_dear_in_time():
-    """A scene whose bits grow while values move far, unless they cost what a run begins with."""
+def test_the_rate_controller_raises_lambda_in_time():
+    # A scene whose bits grow while learning rates are large, unless they cost the initial lambda.
     budget, bits = RateController(100_000, 1e-4), 470_000.0
     for count in range(20):
         done = count / 20
@@ -426,7 +408,7 @@ def test_a_checkpoint_of_other_views_or_options_is_refused(coarse, views, tmp_pa
         tune(fixed, replace(views, background=views.background + np.float32(0.5)), QUICK, resume=file)
 
 
-def test_a_checkpoint_that_does_not_name_an_option_had_it_as_usual(coarse, views, tmp_path):
+def test_a_checkpoint_without_an_option_has_its_default(coarse, views, tmp_path):
     file, fixed = tmp_path / "run.npz", coarse
     tune(fixed, views, replace(QUICK, iterations=5), checkpoint=file)
     arrays = dict(np.load(file))
@@ -457,8 +439,8 @@ def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, coarse, views,
         assert "pickle" not in str(caught.value)
 
 
-def test_values_that_are_not_finite_end_a_run(coarse, views, monkeypatch):
-    """Kernels survive NaN, so a loss may be finite all the same; a file cannot hold it."""
+def test_non_finite_values_end_a_run_with_an_error(coarse, views, monkeypatch):
+    # Kernels survive NaN, so the loss may be finite; a file cannot represent it.
     step = TunedScene.step
 
     def spoilt(self, *arguments):
@@ -470,11 +452,9 @@ def test_values_that_are_not_finite_end_a_run(coarse, views, monkeypatch):
         tune(coarse, views, FEW)
 
 
-# options and views
-
-
+# Options and views.
 @pytest.mark.parametrize("wrong", [{"iterations": 0}, {"lr_sh0": -1.0}, {"byte_cost": float("nan")}, {"loss": "l3"}])
-def test_refuses_options_out_of_range(wrong):
+def test_options_out_of_range_are_refused(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):
         FinetuneOptions(**wrong)
 
@@ -489,25 +469,21 @@ def test_learning_rates_rise_and_fall():
     assert options.byte_cost == options.scaled(2.0).byte_cost
 
 
-def test_every_learning_rate_rises_with_the_others(coarse, views, tmp_path):
+def test_every_learning_rate_warms_up(coarse, views, tmp_path):
     fixed, file, moved = coarse, tmp_path / "c.npz", []
     start = {name: values.copy() for name, values in TunedScene(fixed).parameters.values.items() if values.size}
     for warm_up in (0, 100):
         options = FinetuneOptions(iterations=1, warm_up=warm_up, byte_cost=0.0)
         tune(fixed, views, options, checkpoint=file)
         with np.load(file) as stored:
-            moved.append(
-                {
-                    name: np.abs(stored[f"values_{name}"] - start[name]).max() / options.learning_rate_factor(1)
-                    for name in start
-                }
-            )
+            steps = {name: np.abs(stored[f"values_{name}"] - start[name]).max() for name in start}
+            moved.append({name: step / options.learning_rate_factor(1) for name, step in steps.items()})
     assert {"means", "quats", "scales", "logits", "sh0", "shN"} <= moved[0].keys()
     for name in start:
         assert moved[0][name] == pytest.approx(moved[1][name], rel=0.05), name
 
 
-def test_renders_that_teach_are_those_of_the_source(source):
+def test_training_renders_are_those_of_the_source(source):
     bright = replace(source, sh0=source.sh0 * np.float32(1e6))
     for model in (source, bright):
         camera = cameras(1)[0]
@@ -519,7 +495,7 @@ def test_renders_that_teach_are_those_of_the_source(source):
         TuningView(camera, np.zeros((1, 1, 3), np.float32))
 
 
-def test_validation_views_are_training_views_unless_they_are_held_out():
+def test_validation_views_are_training_views_by_default():
     views = [TuningView(camera, np.zeros((H, W, 3), np.float32)) for camera in cameras(20)]
     together, apart = split_views(views, BLACK), split_views(views, BLACK, validation_count=4)
     assert (20, 16, False) == (len(together.train), len(together.validation), together.is_held_out)
@@ -533,19 +509,13 @@ def test_validation_views_are_training_views_unless_they_are_held_out():
 # the command
 
 ENCODE_OPTIONS = "csplat_tools.cli.finetune.EncodeOptions"
-BRIEF = ("--preset", "fast", "--iterations", 1)  # for tests in which learning does not matter
+BRIEF = ("--preset", "fast", "--iterations", 1)  # for tests that do not depend on learning
 
 
 @pytest.fixture(autouse=True)
 def bare(monkeypatch):
-    """Let the command code neither SH nor codebooks, which take time."""
+    """Make the command encode neither SH nor codebooks, which take time."""
     change_options(monkeypatch, ENCODE_OPTIONS, sh_coding="none", shape_codebook_size=0)
-
-
-def call(*words):
-    result = invoke(*words)
-    assert result.exit_code == 0, (result.stderr, result.exception)
-    return result
 
 
 @pytest.fixture(scope="module")
@@ -555,14 +525,14 @@ def capture(source, tmp_path_factory):
 
 @pytest.fixture
 def brief_fits(monkeypatch):
-    """Fit the splats that are left in a quarter of the usual steps, once."""
+    """Refit kept splats once, in a quarter of the usual steps."""
     brief = partial(SimplifyOptions, effort=1, bands=False)
     monkeypatch.setattr("csplat_tools.training.tuning_run.SimplifyOptions", brief)
 
 
 @pytest.fixture
 def no_fits(monkeypatch):
-    """Leave the splats that are left as they were: where their number is the point."""
+    """Do not refit kept splats, in tests of their number."""
     bare = partial(SimplifyOptions, refit=False, bands=False)
     monkeypatch.setattr("csplat_tools.training.tuning_run.SimplifyOptions", bare)
 
@@ -579,19 +549,19 @@ def test_the_command_tunes_and_reports(tuned_file):
     assert sum(facts["bytes_by_attribute"].values()) + facts["overhead_bytes"] == len(data)
     assert {"choosing", "encoding", "tuning", "judging"} == set(facts["seconds"])
     assert 100 == len(facts["log"]["losses"])
-    said = read_options(data)
-    assert (facts["unseen"], 4096) == (said["finetuned"]["unseen"], said["asked"]["shape_codebook_size"])
+    options = read_options(data)
+    assert (facts["unseen"], 4096) == (options["finetuned"]["unseen"], options["asked"]["shape_codebook_size"])
 
 
 @pytest.mark.slow
-def test_a_file_that_was_tuned_for_a_hundred_steps_looks_better_by_held_out_photographs(tuned_file):
+def test_tuning_increases_the_psnr_of_test_images(tuned_file):
     scores = json.loads(tuned_file.report.read_text())["scores"]
     assert scores["file"]["psnr"] > scores["before tuning"]["psnr"] + 1.0
     assert scores["source"]["psnr"] > scores["before tuning"]["psnr"]
 
 
 @pytest.mark.slow
-def test_compare_finds_the_scores_of_the_report(tuned_file):
+def test_compare_agrees_with_the_report(tuned_file):
     scores = json.loads(tuned_file.report.read_text())["scores"]
     scene, path, data = tuned_file.source.ply, tuned_file.path, tuned_file.source.data
     compared = json.loads(call("compare", scene, path, "--data", data, "--json").stdout)["photographs"]
@@ -600,13 +570,13 @@ def test_compare_finds_the_scores_of_the_report(tuned_file):
 
 
 @pytest.mark.slow
-def test_verify_proves_what_a_tuned_file_states_and_names_what_it_does_not(tuned_file):
+def test_verify_names_undeclared_attributes_of_a_tuned_file(tuned_file):
     proof = call("verify", tuned_file.path, "--source", tuned_file.source.ply)
     assert "not proved: sh0, sh1: the file states no error of them, compare renders" in proof.stdout
 
 
 @pytest.mark.slow
-def test_splats_that_no_view_shows_are_left_out_and_counted(capture, tmp_path):
+def test_unseen_splats_are_pruned_and_counted(capture, tmp_path):
     out = tmp_path / "s.csplat"
     told = call("finetune", capture / "scene.ply", "--data", capture, out, *BRIEF, "--json")
     facts = json.loads(told.stdout)
@@ -617,7 +587,7 @@ def test_splats_that_no_view_shows_are_left_out_and_counted(capture, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_codebook_of_shapes_can_be_done_without(capture, tmp_path, monkeypatch):
+def test_a_codebook_of_shapes_is_optional(capture, tmp_path, monkeypatch):
     words = ("finetune", capture / "scene.ply", "--data", capture, "--iterations", 1)
     call(*words, tmp_path / "without.csplat")
     change_options(monkeypatch, ENCODE_OPTIONS, shape_codebook_size=40)
@@ -626,7 +596,7 @@ def test_a_codebook_of_shapes_can_be_done_without(capture, tmp_path, monkeypatch
     assert "shape_codebook_size" not in read_options((tmp_path / "without.csplat").read_bytes())
 
 
-def test_a_file_that_is_not_what_was_tuned_is_not_written(capture, tmp_path, monkeypatch):
+def test_a_file_that_decodes_differently_is_not_written(capture, tmp_path, monkeypatch):
     def wrong(data):
         model = decode(data)
         return replace(model, sh0=model.sh0 + np.float32(1e-6))
@@ -640,7 +610,7 @@ def test_a_file_that_is_not_what_was_tuned_is_not_written(capture, tmp_path, mon
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("small_views")
-def test_a_scene_can_be_tuned_to_its_own_renders_which_a_page_shows(capture, tmp_path, monkeypatch):
+def test_a_scene_is_tuned_to_its_own_renders_with_a_report_page(capture, tmp_path, monkeypatch):
     out, report, page = (tmp_path / name for name in ("s.csplat", "report.json", "page.html"))
     change_options(monkeypatch, ENCODE_OPTIONS, attribute_psnr=28.0)
     for name, value in {"VIEWS": 16, "VIEW_SIZE": (48, 36), "LEARNING_FACTOR": {True: 1.0}}.items():
@@ -662,7 +632,7 @@ def test_a_scene_can_be_tuned_to_its_own_renders_which_a_page_shows(capture, tmp
 
 
 @pytest.mark.slow
-def test_cameras_of_a_file_can_take_the_renders(capture, tmp_path, monkeypatch):
+def test_renders_for_tuning_may_use_a_camera_file(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(tuning_run, "run_finetuning", partial(tuning_run.run_finetuning, prune_unseen=True))
     save_cameras(tmp_path / "cameras.json", cameras(40))
     out = tmp_path / "s.csplat"
@@ -676,7 +646,7 @@ def test_cameras_of_a_file_can_take_the_renders(capture, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("brief_fits")
-def test_splats_that_pictures_need_least_can_be_left_out(capture, tmp_path):
+def test_keep_prunes_splats_with_the_least_effect(capture, tmp_path):
     out = tmp_path / "s.csplat"
     result = call(
         "finetune", capture / "scene.ply", "--data", capture, "--keep", 0.5, out, *BRIEF,
@@ -707,7 +677,7 @@ def whole(capture, tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_fits")
 @pytest.mark.parametrize(("share", "splats"), [(0.9, (80, 270)), (1.15, (300, 300))], ids=["fewer splats", "finer"])
-def test_a_file_keeps_to_the_size_that_is_wanted(capture, whole, tmp_path, share, splats, monkeypatch):
+def test_a_target_size_is_met(capture, whole, tmp_path, share, splats, monkeypatch):
     change_options(monkeypatch, ENCODE_OPTIONS, **SCALAR)
     size, out = int(share * whole["size_bytes"]), tmp_path / "s.csplat"
     words = ("finetune", capture / "scene.ply", "--data", capture, *SMALL, out, "--json")
@@ -716,7 +686,7 @@ def test_a_file_keeps_to_the_size_that_is_wanted(capture, whole, tmp_path, share
     assert splats[0] <= facts["splats"] <= splats[1]
 
 
-def test_a_size_that_no_file_of_the_scene_has_is_refused(capture, source, tmp_path):
+def test_an_impossible_target_size_is_refused(capture, source, tmp_path):
     write_ply(tmp_path / "one.ply", source.select(slice(0, 1)))
     words = ("finetune", tmp_path / "one.ply", "--data", capture, *BRIEF)
     result = invoke(*words, tmp_path / "x.csplat", "--target-size", "300B")
@@ -725,7 +695,7 @@ def test_a_size_that_no_file_of_the_scene_has_is_refused(capture, source, tmp_pa
 
 
 @pytest.mark.slow
-def test_a_file_is_made_larger_until_it_looks_well_enough(capture, whole, tmp_path, monkeypatch):
+def test_a_target_psnr_is_met(capture, whole, tmp_path, monkeypatch):
     change_options(monkeypatch, ENCODE_OPTIONS, **SCALAR)
     words = ("finetune", capture / "scene.ply", "--data", capture, *SMALL)
     out, report = tmp_path / "s.csplat", tmp_path / "s.json"
@@ -741,7 +711,7 @@ def test_a_file_is_made_larger_until_it_looks_well_enough(capture, whole, tmp_pa
 
 
 @pytest.mark.parametrize(("wanted", "size"), [(30.0, 100_000), (33.0, 400_000), (24.0, 6_250)])
-def test_sizes_are_tried_until_one_is_near_enough(wanted, size):
+def test_sizes_are_searched_for_a_psnr(wanted, size):
     tried = []
 
     def make(size_bytes, most=1_000_000):
@@ -756,7 +726,7 @@ def test_sizes_are_tried_until_one_is_near_enough(wanted, size):
         smallest_reaching(31.0, partial(make, most=90_000))
 
 
-def test_weights_are_for_the_splats_of_the_source(capture, tmp_path, monkeypatch):
+def test_importance_is_per_source_splat(capture, tmp_path, monkeypatch):
     words = ("finetune", capture / "scene.ply", "--data", capture, tmp_path / "s.csplat", *BRIEF)
     weighted = partial(tuning_run.run_finetuning, importance=str(tmp_path / "w.npy"))
     monkeypatch.setattr(tuning_run, "run_finetuning", weighted)
@@ -769,7 +739,7 @@ def test_weights_are_for_the_splats_of_the_source(capture, tmp_path, monkeypatch
 
 
 @pytest.mark.slow
-def test_sensitivities_are_those_of_the_command_that_measures_them(capture, tmp_path, monkeypatch):
+def test_sensitivities_agree_with_the_command_sensitivity(capture, tmp_path, monkeypatch):
     call("sensitivity", capture / "scene.ply", tmp_path / "s.npz", "--data", capture)
     words = ("finetune", capture / "scene.ply", "--data", capture, "--preset", "fast", "--iterations", 1, "--lambda", 0)
     call(*words, tmp_path / "b.csplat")
@@ -784,7 +754,7 @@ def test_the_source_index_is_written(capture, tmp_path):
     out, index = tmp_path / "s.csplat", tmp_path / "index.npy"
     call("finetune", capture / "scene.ply", "--data", capture, out, *BRIEF, "--source-index", index)
     call("verify", out, "--source", capture / "scene.ply", "--source-index", index)
-    assert np.array_equal(np.arange(1, 301), np.sort(np.load(index)))  # all but the one behind the cameras
+    assert np.array_equal(np.arange(1, 301), np.sort(np.load(index)))  # all except the one behind the cameras
 
 
 def test_defects_are_repaired(capture, source, tmp_path):
@@ -796,7 +766,7 @@ def test_defects_are_repaired(capture, source, tmp_path):
 
 
 @pytest.mark.slow
-def test_without_held_out_photographs_nothing_is_scored(capture, tmp_path, monkeypatch):
+def test_without_test_images_nothing_is_scored(capture, tmp_path, monkeypatch):
     words = ("finetune", capture / "scene.ply", "--data", capture, tmp_path / "s.csplat", *BRIEF)
     change_options(monkeypatch, "csplat_tools.cli.shared_options.DataOptions", test_every=0)
     with monkeypatch.context() as patch:
@@ -808,7 +778,7 @@ def test_without_held_out_photographs_nothing_is_scored(capture, tmp_path, monke
 
 
 @pytest.mark.slow
-def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path, monkeypatch):
+def test_the_command_resumes(capture, tmp_path, monkeypatch):
     words = ("finetune", capture / "scene.ply", "--data", capture, "-q")
     short = tmp_path / "run.npz"
     with monkeypatch.context() as patch:
@@ -831,7 +801,7 @@ def test_a_run_can_be_taken_up_by_the_command(capture, tmp_path, monkeypatch):
         (("--self", "--lambda", "2"), "byte_cost is 2.0, wanted 0 to 1"),
     ],
 )
-def test_wrong_words_are_status_2(capture, tmp_path, words, message):
+def test_invalid_options_have_status_2(capture, tmp_path, words, message):
     result = invoke("finetune", capture / "scene.ply", tmp_path / "s.csplat", *words)
     assert 2 == result.exit_code
     assert message in " ".join(result.stderr.replace("│", " ").split())
@@ -840,7 +810,7 @@ def test_wrong_words_are_status_2(capture, tmp_path, words, message):
 @pytest.mark.parametrize(
     "words", [("--report", "r.json", "--source-index", "./r.json"), ("--report", "r", "--checkpoint", "r", "--force")]
 )
-def test_two_outputs_in_one_place_are_refused(capture, tmp_path, monkeypatch, words):
+def test_two_outputs_at_one_path_are_refused(capture, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     result = invoke("finetune", capture / "scene.ply", "--self", tmp_path / "s.csplat", *words)
     assert 1 == result.exit_code
@@ -848,7 +818,7 @@ def test_two_outputs_in_one_place_are_refused(capture, tmp_path, monkeypatch, wo
     assert [] == list(tmp_path.iterdir())
 
 
-def test_nothing_is_replaced_unasked(capture, tmp_path):
+def test_files_are_not_replaced_without_force(capture, tmp_path):
     out = tmp_path / "s.csplat"
     out.write_bytes(b"old")
     result = invoke("finetune", capture / "scene.ply", "--self", out)
@@ -857,7 +827,7 @@ def test_nothing_is_replaced_unasked(capture, tmp_path):
     assert b"old" == out.read_bytes()
 
 
-def test_a_checkpoint_takes_the_place_of_no_input(source, tmp_path):
+def test_a_checkpoint_does_not_replace_the_input(source, tmp_path):
     scene = tmp_path / "scene.ply"
     write_ply(scene, source)
     before = scene.read_bytes()
@@ -868,14 +838,14 @@ def test_a_checkpoint_takes_the_place_of_no_input(source, tmp_path):
     assert before == scene.read_bytes()
 
 
-def test_a_file_that_is_missing_is_missed_before_anything_is_read(capture, tmp_path):
+def test_missing_files_are_reported_first(capture, tmp_path):
     out, absent = tmp_path / "s.csplat", tmp_path / "absent.npz"
     result = invoke("finetune", capture / "scene.ply", "--data", tmp_path, out, "--resume", absent)
     assert 1 == result.exit_code
     assert "absent.npz: No such file" in result.stderr
 
 
-def test_cameras_that_see_nothing_are_refused(source, tmp_path, monkeypatch):
+def test_cameras_without_splats_in_view_are_refused(source, tmp_path, monkeypatch):
     away = [replace(camera, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.viewmat) for camera in cameras(40)]
     save_cameras(tmp_path / "away.json", away)
     write_ply(tmp_path / "scene.ply", source)
@@ -887,8 +857,8 @@ def test_cameras_that_see_nothing_are_refused(source, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_trained_scene_loses_less_when_tuned(data_dir):
-    """Lego with few splats, coarse: tuning by photographs regains most of what quantisation lost."""
+def test_tuning_regains_most_of_the_loss_of_a_trained_scene(data_dir):
+    # Lego with few, coarsely quantised splats: tuning regains most of the loss of quantisation.
     from csplat_trainer.data import load
     from csplat_trainer.training_loop import train
     from csplat_trainer.training_options import TrainOptions

@@ -37,7 +37,7 @@ def run_of(lane, lanes, count):
     return lane_range(lane, lanes, count)
 
 
-def test_the_runs_of_all_lanes_make_up_the_whole():
+def test_the_ranges_of_all_lanes_cover_everything():
     for count in (0, 1, 5, 100):
         runs = [run_of(lane, 3, count) for lane in range(3)]
         assert list(range(count)) == [i for first, end in runs for i in range(first, end)]
@@ -53,8 +53,8 @@ def test_every_lane_runs_once():
         assert counts.sum() == counts[1 : lanes + 1].sum() == count
 
 
-def test_little_work_wakes_no_thread_unless_a_number_is_asked_for():
-    """Every lane notes its number, and one more: the largest is how many there were."""
+def test_little_work_runs_in_one_thread_by_default():
+    # Every lane adds its number plus 1, so the largest value is the number of lanes.
     several = available_threads()
     for threads, count, lanes in ((None, 1000, 1), (None, 100_000, several), (several, 1000, several)):
         seen = np.zeros(count, np.int64)
@@ -72,8 +72,8 @@ def test_the_error_of_any_lane_reaches_the_caller():
         fail_at(-1)
 
 
-def test_an_error_waits_for_the_lanes_that_still_write():
-    """Afterwards nothing more is written, and the number of threads is as before."""
+def test_an_error_waits_for_the_other_lanes():
+    # Nothing is written after the error, and no thread is left.
 
     def slow(lane, _lanes, written):
         if lane == 0:
@@ -92,7 +92,7 @@ def test_an_error_waits_for_the_lanes_that_still_write():
         assert threading.active_count() <= before + lanes - 1
 
 
-def test_the_number_of_threads_is_given_back():
+def test_the_number_of_threads_is_restored():
     with thread_count(1):
         with pytest.raises(InputError), thread_count(0):
             pass
@@ -104,7 +104,7 @@ def test_the_number_of_threads_is_given_back():
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
-def test_a_forked_child_has_threads_of_its_own_and_waits_for_no_lock_that_nobody_frees():
+def test_a_forked_child_has_its_own_threads_and_locks():
     script = """
 import os, signal, threading, time
 import numpy as np
@@ -143,20 +143,20 @@ os._exit(0)
     assert ["0", "7"] == run.stdout.split()
 
 
-def test_compiling_is_told_once_and_running_what_is_compiled_is_not():
-    told = []
+def test_compilation_is_reported_once():
+    calls = []
     plain = kernels.numba.njit(lambda x: x + 1)
-    with kernels.on_compiling(lambda: told.append(1)):
+    with kernels.on_compiling(lambda: calls.append(1)):
         assert (2, 2.5) == (plain(1), plain(1.5))  # two types, two compilations
-    assert [1] == told
-    with kernels.on_compiling(lambda: told.append(2)):
+    assert [1] == calls
+    with kernels.on_compiling(lambda: calls.append(2)):
         plain(3)
-    assert [1] == told
+    assert [1] == calls
     assert kernels.is_cached(plain)
     assert not kernels.is_cached(kernels.numba.njit(lambda x: x + 2))
 
 
-# The versions of each kernel after warming up, and the versions that using it for a scene adds.
+# The compiled versions of each kernel after warming up, and those added by using it for a scene.
 _USE = """
 import json, os, sys
 import numpy as np
@@ -213,7 +213,7 @@ _TELL = "print(json.dumps([plain, before, compiled()]), flush=True)"
 
 @pytest.fixture(scope="module")
 def versions():
-    """Count the compiled versions of each kernel at three times of each part, in processes that share only imports."""
+    """Count the compiled versions of each kernel at three points of each part, in processes that share only imports."""
     parts = [f"{part}{_TELL}" for part in (_PLAIN + _SIMPLIFY, _COMPARE)]
     code = f"""{_USE}
 for part in {parts!r}:
@@ -234,7 +234,7 @@ def assert_nothing_was_compiled(before, after):
 
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
-def test_nothing_is_left_to_compile_after_warming_up_for_simplify_and_a_plain_renderer_needs_less(versions):
+def test_warming_up_compiles_all_kernels_of_simplify(versions):
     plain, before, after = versions[0]
     assert_nothing_was_compiled(before, after)
     assert "csplat_render.contributions.sum_pruning" in {name for name in after if after[name] > plain.get(name, 0)}
@@ -242,6 +242,6 @@ def test_nothing_is_left_to_compile_after_warming_up_for_simplify_and_a_plain_re
 
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
-def test_nothing_is_left_to_compile_after_warming_up_for_compare(versions):
+def test_warming_up_compiles_all_kernels_of_compare(versions):
     _, before, after = versions[1]
     assert_nothing_was_compiled(before, after)

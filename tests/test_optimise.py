@@ -1,4 +1,7 @@
-"""Targets on real scenes: files of three searches, what is fitted, measured and reported; logic: test_target_search."""
+"""Targets on real scenes: the files of three searches, refits, measurements and reports.
+
+test_target_search.py tests the logic of the search on analytic scenes.
+"""
 
 import json
 import math
@@ -10,7 +13,6 @@ import pytest
 
 pytest.importorskip("numba", reason="targets want the extra [render]")
 
-# Importing them needs what is looked for above.
 import extremes
 from analytic_search import AnalyticScene, analytic_removal
 from captures import around, cameras, crowded, found_within, judged_by, photographed, shell, views_of
@@ -59,24 +61,21 @@ def photographs(many):
 
 
 def search(*given, **how):
-    """Search without renders from elsewhere, which are reported alone, and whose cameras take a second to place."""
+    """Search without extra test cameras, which are only reported and take a second to place."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("csplat_tools.optimise.target_search.extra_test_cameras", lambda _: {})
         return found_within(*given, **how)
 
 
-# looking for a number
-
-
-def test_meet_ends_inside_the_window():
-    points = find_in_window(
-        lambda q: q * q / 50, SearchWindow(31.9, 32.1, 32.0), start=20.0, slope=1.0, bounds=(0, 100), tries=9
-    )
+# Searches for a number.
+def test_a_search_ends_within_the_window():
+    window = SearchWindow(31.9, 32.1, 32.0)
+    points = find_in_window(lambda q: q * q / 50, window, start=20.0, slope=1.0, bounds=(0, 100), tries=9)
     assert 31.9 <= points[-1][1] <= 32.1
     assert 40.0 == pytest.approx(points[-1][0], abs=0.1)
 
 
-def test_meet_stops_at_a_bound():
+def test_a_search_stops_at_a_bound():
     points = find_in_window(lambda q: q, SearchWindow(200, 201, 200), start=50.0, slope=1.0, bounds=(0, 100), tries=9)
     assert [50.0, 100.0] == [place for place, _ in points]
 
@@ -89,16 +88,15 @@ def test_a_plateau_is_crossed():
     assert 38.0 <= points[-1][1] <= 38.25
 
 
-def test_meet_gives_up_where_values_grow_no_more():
-    points = find_in_window(
-        lambda q: min(q, 40.0), SearchWindow(50, 51, 50.5), start=39.0, slope=1.0, bounds=(0, 1000), tries=30
-    )
+def test_a_search_gives_up_when_values_stop_growing():
+    window = SearchWindow(50, 51, 50.5)
+    points = find_in_window(lambda q: min(q, 40.0), window, start=39.0, slope=1.0, bounds=(0, 1000), tries=30)
     assert len(points) < 6
     assert points[-1][0] < 1000.0
 
 
 @pytest.mark.parametrize(("fine", "stalls"), [(36.2, True), (37.5, False), (40.5, False)])
-def test_a_coding_that_more_precision_hardly_betters_is_no_choice(fine, stalls):
+def test_a_coding_that_gains_little_from_precision_is_not_chosen(fine, stalls):
     part, coding = SimpleNamespace(psnr=45.0, refits=False), CodingChoice("codebook", 1 / 8)
     alike = {"subset": part, "coding": coding, "is_final": True, "is_scored": False, "psnr": 40.0, "size_bytes": 9}
     deflate = SimpleNamespace(deflate_level=10)
@@ -111,8 +109,8 @@ def test_a_coding_that_more_precision_hardly_betters_is_no_choice(fine, stalls):
     assert stalls == solver.is_stalled(files[0]) == math.isinf(solver.expected_cost(files[1]))
 
 
-def test_what_views_that_judge_see_of_removal_says_where_a_file_has_to_stand():
-    """Removal takes 0.45 of the allowed error on the validation views; what it leaves on the test views is added."""
+def test_the_pruning_error_in_test_views_raises_the_validation_goal():
+    # Pruning takes 0.45 of the allowed error on the validation views; its excess on the test views is added.
     allowed, gains = error_of_psnr(34.0), REFIT_GAIN
     part = SimpleNamespace(refits=True, psnr=psnr_of_mse(0.45 * allowed) - gains)
 
@@ -126,36 +124,33 @@ def test_what_views_that_judge_see_of_removal_says_where_a_file_has_to_stand():
     assert not PrecisionSearch(solver(0.95).candidates, SearchGoal(size_bytes=1000)).is_hopeless(part)
 
 
-def test_near_what_removal_took_a_decibel_is_dear():
-    """Two files as far below the goal as each other: the one whose splats err more needs more precision."""
+def test_a_decibel_is_expensive_near_the_pruning_error():
+    # Two files equally far below the goal: the one with the larger pruning error needs more precision.
     part, better = (SimpleNamespace(refits=True, psnr=psnr) for psnr in (34.5, 40.0))
     packed = SimpleNamespace(deflate_level=12)
-    said = {"coding": CodingChoice("scalar"), "quality": 40.0, "options": packed, "is_final": True, "is_scored": True}
-    seen = {"psnr": 33.8, "validation_psnr": 33.8, "size_bytes": 1000}
-    made = [SimpleNamespace(subset=one, **said, **seen) for one in (part, better)]
+    plan = {"coding": CodingChoice("scalar"), "quality": 40.0, "options": packed, "is_final": True, "is_scored": True}
+    scores = {"psnr": 33.8, "validation_psnr": 33.8, "size_bytes": 1000}
+    made = [SimpleNamespace(subset=one, **plan, **scores) for one in (part, better)]
     trials = SimpleNamespace(made=made, of=lambda part, _coding: [one for one in made if one.subset is part])
     solver = PrecisionSearch(trials, SearchGoal(psnr=34.0))
     assert solver.expected_cost(made[0]) > solver.expected_cost(made[1]) > math.log(1000)
 
 
-def test_spread_is_that_of_the_views():
+def test_the_spread_is_over_views():
     assert 0.0 == psnr_spread(np.full(8, 1e-4))
     assert 10 * math.log10(4) / 2 == pytest.approx(psnr_spread(np.array([1e-4, 4e-4])))
     assert math.isnan(psnr_spread(np.array([1e-4])))
 
 
-# three searches
-
-
+# Three searches.
 @pytest.mark.slow
-def test_a_psnr_is_reached_by_fewer_splats_and_the_file_says_what_it_is(many, search_at_psnr):
+def test_a_psnr_is_reached_with_fewer_splats(many, search_at_psnr):
     found, views = search_at_psnr, with_validation_views(judged_by(cameras(40)))
     decoded = decode_scene(found.data)
-    assert 30.0 <= found.report.psnr <= 31.0  # files of so few splats jump
+    assert 30.0 <= found.report.psnr <= 31.0  # the PSNR of such small files jumps
     assert found.report.psnr == pytest.approx(views.test_scorer(many).psnr(decoded.model), abs=1e-4)
-    assert found.report.chosen["validation_psnr"] == pytest.approx(
-        views.validation_scorer(many).psnr(decoded.model), abs=1e-3
-    )
+    validation_psnr = views.validation_scorer(many).psnr(decoded.model)
+    assert found.report.chosen["validation_psnr"] == pytest.approx(validation_psnr, abs=1e-3)
     assert (len(found.data), len(decoded.model)) == (found.report.size_bytes, found.report.splats)
     assert found.report.splats < 600
     assert 900 == found.result.report.options["simplified"]["splats"] == decoded.declared_bounds.source_count
@@ -163,46 +158,46 @@ def test_a_psnr_is_reached_by_fewer_splats_and_the_file_says_what_it_is(many, se
 
 
 @pytest.mark.slow
-def test_stated_errors_hold_in_a_file_that_a_search_found(many, search_at_psnr):
+def test_declared_errors_of_a_found_file_hold(many, search_at_psnr):
     measured = measure_errors(many, decode(search_at_psnr.data), search_at_psnr.result.source_index)
     stated = search_at_psnr.result.report.errors
     assert [] == [name for name in stated if measured[name][0] > stated[name][0]]
 
 
 @pytest.mark.slow
-def test_no_file_that_a_search_tried_reaches_its_psnr_with_fewer_bytes(search_at_psnr):
+def test_no_candidate_reaches_the_psnr_with_fewer_bytes(search_at_psnr):
     report = search_at_psnr.report
     good = [one["size_bytes"] for one in report.tried if one["psnr"] is not None and one["psnr"] >= 30.0]
     assert min(good) == report.size_bytes
 
 
 @pytest.mark.slow
-def test_a_size_that_starves_all_splats_is_met_by_fewer(search_at_size):
+def test_a_small_size_is_met_with_fewer_splats(search_at_size):
     assert 0.9 * 1500 <= len(search_at_size.data) <= 1500
     assert search_at_size.report.splats < 900
     assert search_at_size.report.psnr > 24.0
 
 
 @pytest.mark.slow
-def test_a_loss_against_photographs_lets_splats_go(many, photographs, search_at_loss):
+def test_a_psnr_drop_against_images_prunes_splats(many, photographs, search_at_loss):
     decoded, scores = decode(search_at_loss.data), search_at_loss.report.photographs
     scorer = with_validation_views(photographs).image_validation_scorer()
     assert scores["source"] < 28.0
     assert scores["file"] == pytest.approx(photographs.image_test_scorer().psnr(decoded))
-    assert scores["file"] >= scores["source"] - 1.0  # other photographs decided:
+    assert scores["file"] >= scores["source"] - 1.0  # the validation images decide
     assert scorer.psnr(many) - 0.5 <= scorer.psnr(decoded) <= scorer.psnr(many) - 0.3
     assert search_at_loss.report.splats < 900
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["search_at_size", "search_at_loss"])
-def test_whoever_judges_looks_at_nothing_but_the_chosen_file_of_a_size_or_a_loss(request, name):
+def test_test_views_only_score_the_chosen_file_of_a_size_or_drop(request, name):
     report = request.getfixturevalue(name).report
     assert [report.chosen] == [one for one in report.tried if one["psnr"] is not None]
 
 
 @pytest.mark.slow
-def test_the_report_says_what_why_and_how_sure(search_at_psnr):
+def test_the_report_has_goal_reasons_and_spread(search_at_psnr):
     report = search_at_psnr.report
     assert {"psnr": 30.0} == report.goal
     assert len(report.tried) == report.encodes
@@ -215,25 +210,23 @@ def test_the_report_says_what_why_and_how_sure(search_at_psnr):
     json.dumps(report.as_json(), allow_nan=False)
 
 
-# bytes
-
-
+# Bytes.
 @pytest.mark.slow
-def test_the_same_target_gives_the_same_bytes_at_any_number_of_threads(kept, alike):
+def test_the_number_of_threads_does_not_change_the_bytes(kept, alike):
     other = search(alike, None, replace(SHAPES, threads=1), keep=0.6)
     assert kept.data == other.data
 
 
 @pytest.mark.slow
-def test_bounds_hold_beside_a_psnr_and_all_splats_stay(scene):
+def test_bounds_in_addition_to_a_psnr_hold_without_pruning(scene):
     found = search(scene, psnr=18.0, errors={"means": 1e-3, "sh1": 1e-2})
-    for name, most in (("means", 1e-3), ("sh1", 1e-2)):  # though pictures need no SH at 18 dB
+    for name, most in (("means", 1e-3), ("sh1", 1e-2)):  # although 18 dB need no SH
         assert most >= found.result.report.errors[name][0] == found.report.reached[name]
     assert found.report.psnr >= 18.0
     assert 300 == found.report.splats
 
 
-def test_bounds_that_no_number_keeps_are_refused(scene):
+def test_impossible_bounds_are_refused(scene):
     for measure in ("opacities", "covariance"):
         with pytest.raises(InputError, match=f"no lattice keeps the error of {measure}"):
             search(scene, errors={measure: 1e-310}, size=10**6)
@@ -258,26 +251,24 @@ def test_extreme_scenes_meet_a_psnr(name, views):
     assert len(decode(found.data)) >= 1
 
 
-# shares of the splats, and what is fitted
-
-
+# Shares of the splats, and refits.
 SHAPES = EncodeOptions(shape_codebook_size=64, threads=2)
 
 
 @pytest.fixture(scope="module")
 def alike(scene):
-    """A scene of eight shapes."""
+    """A scene with eight distinct shapes."""
     return replace(scene, quats=scene.quats[np.arange(300) % 8], scales=scene.scales[np.arange(300) % 8])
 
 
 @pytest.fixture(scope="module")
 def kept(alike):
-    """Six tenths of its splats, their shapes by a codebook."""
+    """A file of six tenths of its splats, with a codebook of shapes."""
     return search(alike, None, SHAPES, keep=0.6)
 
 
 @pytest.mark.slow
-def test_a_share_of_the_splats_proves_what_it_states(kept, alike):
+def test_a_share_of_the_splats_is_verified(kept, alike):
     decoded, index = decode_scene(kept.data), kept.result.source_index
     assert 180 == kept.report.splats == len(decoded.model) == len(np.unique(index))
     distances = np.linalg.norm(decoded.model.means.astype(np.float64) - alike.means[index], axis=1)
@@ -287,19 +278,19 @@ def test_a_share_of_the_splats_proves_what_it_states(kept, alike):
 
 
 @pytest.mark.slow
-def test_shapes_are_clustered_by_what_the_views_say_of_them(kept):
+def test_shapes_are_clustered_by_importance(kept):
     assert 0 < kept.result.report.options["shape_codebook_size"] <= 60
 
 
 @pytest.mark.slow
-def test_what_is_left_is_fitted_to_what_the_source_looks_like(kept, alike):
+def test_kept_splats_are_refitted_to_the_source(kept, alike):
     bare = Scorer.of_source(alike, judged_by(cameras(40)).test, BLACK).psnr(alike.select(kept.result.source_index))
     assert kept.report.psnr > bare + 3.0
 
 
 @pytest.mark.slow
-def test_fitting_to_the_quantised_geometry_mends_it(scene):
-    """Coarse geometry, fine colours: fitted through the quantisers they are better in views that taught nothing."""
+def test_a_refit_through_the_quantisers_improves_test_views(scene):
+    # Coarse geometry, fine colours: a refit through the quantisers improves test views.
     coarse = EncodeOptions(opacity_levels=8, scale_step=0.3, quat_levels=8, sh0_step=0.005, sh_step=0.005)
     bare, views = replace(scene, shN=scene.shN[:, :0]), with_validation_views(judged_by(cameras(40)))
     how = replace(SMALL, effort=3, view_size=(960, 720))
@@ -309,34 +300,29 @@ def test_fitting_to_the_quantised_geometry_mends_it(scene):
     assert judge.psnr(decode(fitted)) > judge.psnr(decode(quick)) + 0.2
 
 
-def test_so_few_splats_are_fitted_as_are_asked_for(scene):
+def test_a_refit_keeps_the_requested_number(scene):
     views = with_validation_views(judged_by(cameras(40)))
     removal = Pruner(scene, views, SMALL, use_classes=False, progress=None, psnr=30.0)
     assert 3 == len(removal.refit(3, None, lambda _: 20.0).rows)
 
 
-def test_two_fits_say_how_fast_errors_grow():
-    """If the second fit errs hardly more than the first, fewer splats suffice than the second alone suggests."""
+def test_two_refits_predict_the_next_number_of_splats():
+    # If the second refit errs little more than the first, fewer splats suffice than the second alone suggests.
     alone, together = (analytic_removal(AnalyticScene()) for _ in range(2))
     together.next_at_psnr(6000, 37.0, 35.0, 0.05)
     (first, _), (second, _) = (removal.next_at_psnr(5800, 36.95, 35.0, 0.05) for removal in (alone, together))
     assert second < first
 
 
-# views
-
-
+# Views.
 @pytest.mark.parametrize("kind", ["virtual", "cameras", "photographs"])
-def test_no_view_that_judges_decides_or_teaches(many, photographs, kind):
+def test_test_views_are_neither_validation_nor_training_views(many, photographs, kind):
     given = {"virtual": around(many), "cameras": judged_by(cameras(40)), "photographs": photographs}[kind]
     views = with_validation_views(given)
-    validation_scorers = [views.validation_scorer(many)] + (
-        [views.image_validation_scorer()] if kind == "photographs" else []
-    )
-    test, validation = (
-        poses(views.test_scorer(many).cameras),
-        set.union(*(poses(one.cameras) for one in validation_scorers)),
-    )
+    validation_scorers = [views.validation_scorer(many)]
+    validation_scorers += [views.image_validation_scorer()] if kind == "photographs" else []
+    test = poses(views.test_scorer(many).cameras)
+    validation = set.union(*(poses(one.cameras) for one in validation_scorers))
     assert test == poses(given.test)
     assert validation
     assert not test & validation
@@ -347,19 +333,19 @@ def poses(seen_from):
     return {pose_key(camera) for camera in seen_from}
 
 
-def test_cameras_that_see_nothing_are_refused(scene):
+def test_cameras_without_splats_in_view_are_refused(scene):
     K = intrinsics(48, 40, 60.0)
     away = look_at((40.0, 0.0, 0.0), (80.0, 0.0, 0.0), (0, 0, 1), K, 48, 40)
     with pytest.raises(InputError, match="cameras belong to the scene"):
         search(scene, replace(views_of(cameras(12)), test=[away]), psnr=30.0)
 
 
-def test_a_loss_wants_photographs(scene):
+def test_a_psnr_drop_requires_images(scene):
     with pytest.raises(InputError, match="requires images"):
         search(scene, max_psnr_drop=0.5)
 
 
-def test_knobs_that_contradict_a_target_are_refused(scene):
+def test_options_that_contradict_a_target_are_refused(scene):
     views = judged_by(cameras(8))
     with pytest.raises(InputError, match="without splats"):
         search(scene.select(np.zeros(0, np.int64)), views, psnr=30.0)
@@ -369,9 +355,7 @@ def test_knobs_that_contradict_a_target_are_refused(scene):
         search(scene, views, keep=0.5, no_prune=True)
 
 
-# surroundings
-
-
+# Surroundings.
 @pytest.fixture(scope="module")
 def surroundings():
     source = shell(3).select(np.arange(100))
@@ -382,7 +366,7 @@ def surroundings():
 
 
 @pytest.mark.slow
-def test_inside_of_surroundings_placed_views_measure_nothing_and_the_report_warns(surroundings):
+def test_virtual_views_in_surroundings_cause_a_warning(surroundings):
     views = replace(judged_by(cameras(40)), virtual=True)
     views = replace(views, training=[resized(camera, 24, 20) for camera in views.training])
     fewer = search(surroundings, views, keep=0.8, refit=False).report
@@ -393,12 +377,10 @@ def test_inside_of_surroundings_placed_views_measure_nothing_and_the_report_warn
     assert not any("surroundings" in line for line in kept.why)
 
 
-# quantisation classes
-
-
+# Quantisation classes.
 @pytest.fixture(scope="module")
 def unequal():
-    """An object of 9,000 splats, most of them small."""
+    """An object of 9,000 mostly small splats."""
     rng = np.random.default_rng(3)
     means = rng.standard_normal((9000, 3))
     means /= np.linalg.norm(means, axis=1, keepdims=True)
@@ -419,7 +401,7 @@ def measured(unequal):
 
 
 @pytest.mark.slow
-def test_what_was_measured_grades_splats_and_makes_files_smaller_at_the_same_psnr(unequal, measured):
+def test_quantisation_classes_reduce_the_size_at_equal_psnr(unequal, measured):
     judge, files = Scorer.of_source(unequal, cameras(6), BLACK), {}
     for use_classes in (True, False):
         options = EncodeOptions(attribute_psnr=48.0 if use_classes else 47.0)
@@ -432,7 +414,7 @@ def test_what_was_measured_grades_splats_and_makes_files_smaller_at_the_same_psn
 
 
 @pytest.mark.slow
-def test_a_search_grades_by_what_it_measured_beside_an_importance_that_is_given(unequal):
+def test_a_search_uses_measured_classes_in_addition_to_a_given_importance(unequal):
     few = unequal.select(np.arange(5000))
     weights = np.linspace(1.0, 2.0, len(few))
     report = search(few, None, None, psnr=34.0, no_prune=True, importance=weights).report
@@ -441,8 +423,8 @@ def test_a_search_grades_by_what_it_measured_beside_an_importance_that_is_given(
 
 
 @pytest.mark.slow
-def test_sensitivity_is_measured_where_it_changes_something(scene, unequal, measured):
-    """An importance with curvatures is taken as it is, also inside of surroundings; one without keeps its weights."""
+def test_sensitivity_is_measured_if_it_has_an_effect(scene, unequal, measured):
+    # An importance with Gauss-Newton blocks is used unchanged, also in surroundings; one without keeps its weights.
     given = replace(measured, blocks=None)
     bare = replace(scene, shN=scene.shN[:, :0])
     views, plain = views_of(cameras(12)), EncodeOptions()
@@ -471,10 +453,8 @@ def test_sensitivity_is_measured_where_it_changes_something(scene, unequal, meas
     np.testing.assert_array_equal(weights, found.sh)
 
 
-# what is said
-
-
-def test_time_is_foretold_by_pictures_and_less_where_all_stay():
+# Reports.
+def test_the_expected_number_of_renders_depends_on_the_target():
     target, options = Target(psnr=30.0), EncodeOptions()
     assert (520.0, 3000.0) == tuple(expected_renders(options, target, no_prune=keep) for keep in (True, False))
     fast, extra = EncodeOptions(preset="fast"), EncodeOptions(keep_extra=True)
@@ -484,7 +464,7 @@ def test_time_is_foretold_by_pictures_and_less_where_all_stay():
     assert 1200.0 == expected_renders(options, target, no_prune=False, simplifying=SimplifyOptions(effort=1))
 
 
-def test_seconds_of_a_picture_are_measured_without_the_first(scene):
+def test_seconds_per_render_exclude_the_first(scene):
     views, drawn, now = comparison_cameras(scene), [], [0.0]
 
     def draw(camera):
@@ -498,14 +478,14 @@ def test_seconds_of_a_picture_are_measured_without_the_first(scene):
     assert [20] == drawn[3:]
 
 
-@pytest.mark.parametrize(("beside", "said"), [(39.5, "39.50 beside"), (37.0, "37.00 beside: up to 3.0 dB less")])
-def test_what_nobody_looked_at_is_told_and_a_loss_there_by_name(beside, said):
-    report = SearchReport({"psnr": 40.0}, 1, 1, 1, 1, 1.0, psnr=40.0, elsewhere={"beside": beside})
-    assert 1 == sum(said in line for line in report.lines())
+@pytest.mark.parametrize(("psnr", "note"), [(39.5, "39.50 beside"), (37.0, "37.00 beside: up to 3.0 dB less")])
+def test_the_psnr_of_extra_test_views_is_reported(psnr, note):
+    report = SearchReport({"psnr": 40.0}, 1, 1, 1, 1, 1.0, psnr=40.0, elsewhere={"beside": psnr})
+    assert 1 == sum(note in line for line in report.lines())
 
 
-def test_views_elsewhere_are_the_same_ones_nearer_and_farther(scene):
-    """Nearer by 0.6, or by less if they would be inside of what they look at."""
+def test_extra_test_cameras_are_nearer_and_farther(scene):
+    # Nearer by 0.6, or by less if they would be within the scene.
     centre = scene_frame(scene).centre
     near, usual, far = (extra_test_cameras(scene)[kind] for kind in ("nearer", "beside", "farther"))
     shares = []

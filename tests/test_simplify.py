@@ -1,4 +1,4 @@
-"""Simplification: which splats go, how good the rest is, and the command."""
+"""Simplification: views, pruning order, refits, SH bands, and the command."""
 
 import json
 import sys
@@ -11,7 +11,7 @@ from typer import BadParameter
 pytest.importorskip("numba", reason="simplification wants the extra [render]")
 
 from captures import views_of
-from command_line import change_options, change_views, invoke
+from command_line import call, change_options, change_views, invoke
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
@@ -42,14 +42,14 @@ pytestmark = pytest.mark.usefixtures("small_views")
 SMALL = SimplifyOptions(views=12, view_size=(48, 36), effort=1, rounds=2)
 
 
-def render_pictures(model, seen_from):
+def render_all(model, seen_from):
     draw = renderer(model, (0.0, 0.0, 0.0))
     return [draw(camera).rgb for camera in seen_from]
 
 
 @pytest.fixture(scope="module")
 def source():
-    """A shell of opaque splats, inside of it as many that nobody sees, and ten that are too faint to be drawn."""
+    """A shell of opaque splats with hidden ones inside, and ten that are too transparent to be drawn."""
     rng = np.random.default_rng(0)
     n = 300
     at = rng.standard_normal((n, 3))
@@ -72,14 +72,12 @@ def source():
 
 @pytest.fixture(scope="module")
 def given(source):
-    """Views of a user, for tests that are not about those which are found: finding them takes longer than the rest."""
+    """Views of a user, for tests that do not depend on virtual views, which take long to place."""
     return views_of(camera_sequence(source, 12, (48, 36), seed=3))
 
 
-# views
-
-
-def test_a_longer_sequence_of_cameras_begins_like_a_shorter_one(source):
+# Views.
+def test_a_sequence_of_cameras_is_a_prefix_of_a_longer_one(source):
     short, long = camera_sequence(source, 5, (40, 30)), camera_sequence(source, 9, (40, 30))
     for one, other in zip(short, long, strict=False):
         np.testing.assert_array_equal(one.viewmat, other.viewmat)
@@ -88,7 +86,7 @@ def test_a_longer_sequence_of_cameras_begins_like_a_shorter_one(source):
 
 
 @pytest.mark.slow
-def test_no_camera_looks_at_a_long_object_from_inside(source):
+def test_cameras_of_a_long_object_are_outside(source):
     long = replace(source, means=source.means * np.float32([1.0, 12.0, 1.0]))
     frame, cloud = scene_frame(long), sample_cloud(long, 20_000, np.random.default_rng(0))
     cameras = [*camera_sequence(long, 40, (40, 30)), *extra_test_cameras(long)["nearer"]]
@@ -96,7 +94,7 @@ def test_no_camera_looks_at_a_long_object_from_inside(source):
     assert all(is_clear(frame, cloud, camera) for camera in cameras)
 
 
-def test_cameras_of_the_user_are_made_smaller_and_every_eighth_is_kept_aside(source):
+def test_cameras_of_the_user_are_shrunk_and_every_eighth_is_a_validation_view(source):
     own = camera_sequence(source, 17, (200, 100))
     small = shrink_cameras(own, (48, 36))
     assert {(camera.W, camera.H) for camera in small} == {(59, 29)}
@@ -117,10 +115,8 @@ def test_views_are_added_until_others_agree(source):
     assert len(many.check) == 16
 
 
-# order
-
-
-def test_what_is_invisible_goes_first_and_what_is_unseen_stays(source):
+# Pruning order.
+def test_transparent_splats_are_pruned_first_and_unseen_ones_kept(source):
     found = find_sufficient_views(source, views_of(camera_sequence(source, 9, (48, 36))), 0.5)
     keys = pruning_keys(source.opacities, found.pruning_error)
     assert (keys[:10] == -1.0).all()
@@ -132,8 +128,8 @@ def test_what_is_invisible_goes_first_and_what_is_unseen_stays(source):
     assert len(order.rounds) == 2
 
 
-def test_rounds_ask_one_side_after_the_other(source):
-    """Each round measures one side again; the other side keeps its last errors until its turn."""
+def test_rounds_alternate_between_groups_of_views(source):
+    # Each round measures one group of views again; the other keeps its last errors until its turn.
     parts = [camera_sequence(source, 4, (48, 36), seed=seed) for seed in (1, 2)]
     view_groups = [MeasuredViews(cameras, measure_pruning_error(source, cameras, bands=False)) for cameras in parts]
     order = find_pruning_order(source, view_groups, replace(SMALL, rounds=2), len(source) // 2)
@@ -147,7 +143,7 @@ def test_rounds_ask_one_side_after_the_other(source):
 
 
 @pytest.mark.slow
-def test_exact_errors_choose_better_than_opacity(source):
+def test_exact_errors_prune_better_than_opacity(source):
     check = camera_sequence(source, 6, (64, 48), seed=9)
     judge = Scorer.of_source(source, check, (0, 0, 0))
     scores = {}
@@ -162,11 +158,9 @@ def test_exact_errors_choose_better_than_opacity(source):
     assert min(scores.values()) > max(by_opacity) + 3.0
 
 
-# the whole
-
-
+# Simplified scenes.
 @pytest.mark.slow
-def test_keeping_a_share_keeps_that_many_and_says_which(source, given):
+def test_keep_reports_the_kept_splats(source, given):
     result = simplify(source, keep=0.5, views=given, options=replace(SMALL, refit=False))
     assert len(result.model) == 225
     np.testing.assert_array_equal(source.means[result.source_index], result.model.means)
@@ -178,7 +172,7 @@ def test_keeping_a_share_keeps_that_many_and_says_which(source, given):
 
 
 @pytest.mark.slow
-def test_a_refit_gains_on_views_that_it_did_not_see(source):
+def test_a_refit_improves_validation_views(source):
     shell = source.select(slice(10, 300))
     shell = replace(shell, scales=shell.scales + np.float32(0.7), shN=shell.shN[:, :0])
     views = views_of(camera_sequence(shell, 40, (48, 36), seed=3))
@@ -186,7 +180,7 @@ def test_a_refit_gains_on_views_that_it_did_not_see(source):
     assert report["check_psnr"] > report["check_psnr_pruned"] + 1.5
 
 
-def test_a_fit_that_serves_its_own_views_alone_is_refused(source, given, monkeypatch):
+def test_a_refit_that_overfits_is_discarded(source, given, monkeypatch):
     def dark(model, *_arguments, **_options):
         return RefitResult(replace(model, sh0=model.sh0 - np.float32(1.0)), None)
 
@@ -197,9 +191,9 @@ def test_a_fit_that_serves_its_own_views_alone_is_refused(source, given, monkeyp
     np.testing.assert_array_equal(source.sh0[result.source_index], result.model.sh0)
 
 
-def test_what_no_view_shows_is_not_adjusted(source):
+def test_unseen_splats_are_not_refitted(source):
     cameras = camera_sequence(source, 4, (48, 36))[:1]
-    wanted = [picture + np.float32(0.1) for picture in render_pictures(source, cameras)]
+    wanted = [picture + np.float32(0.1) for picture in render_all(source, cameras)]
     adjusted = refit_splats(source, cameras, wanted, SMALL, steps=8)
     seen = measure_pruning_error(source, cameras).seen
     assert 0 < np.count_nonzero(seen) < len(source)
@@ -209,9 +203,9 @@ def test_what_no_view_shows_is_not_adjusted(source):
         assert (getattr(source, name)[seen] != getattr(adjusted, name)[seen]).mean() > 0.9
 
 
-def test_transparent_and_opaque_splats_stay_within_alpha(source):
+def test_alphas_of_a_refit_stay_within_0_and_1(source):
     cameras = camera_sequence(source, 4, (48, 36))
-    wanted = render_pictures(source, cameras)
+    wanted = render_all(source, cameras)
     extreme = replace(source, opacities=np.where(np.arange(len(source)) % 2, 0.0, 1.0).astype(np.float32))
     adjusted = refit_splats(extreme, cameras, wanted, SMALL, steps=8)
     assert np.isfinite(adjusted.scales).all()
@@ -228,10 +222,10 @@ def test_a_target_psnr_is_reached(source, given, goal, refit):
 
 
 @pytest.mark.slow
-def test_more_loss_lets_more_splats_go(source):
+def test_a_larger_psnr_drop_prunes_more_splats(source):
     cameras = camera_sequence(source, 16, (48, 36), seed=5)
     rng = np.random.default_rng(1)
-    noisy = [np.clip(p + 0.05 * rng.standard_normal(p.shape), 0, 1) for p in render_pictures(source, cameras)]
+    noisy = [np.clip(p + 0.05 * rng.standard_normal(p.shape), 0, 1) for p in render_all(source, cameras)]
     pictures = [PosedImage(c, np.rint(255.0 * p).astype(np.uint8)) for c, p in zip(cameras, noisy, strict=True)]
     views = views_of(cameras, pictures)
     judge = image_scorer(views.images_of(views.validation), views.background)
@@ -243,12 +237,12 @@ def test_more_loss_lets_more_splats_go(source):
     assert sizes[0] > sizes[1]
 
 
-def test_a_loss_wants_photographs(source):
+def test_a_psnr_drop_requires_images(source):
     with pytest.raises(InputError, match="name a data set"):
         simplify(source, max_psnr_drop=0.3, options=SMALL)
 
 
-def test_nothing_changes_where_everything_stays(source, given):
+def test_keeping_all_splats_changes_nothing(source, given):
     result = simplify(source, keep=1.0, views=given, options=replace(SMALL, refit=False))
     assert len(result.model) == len(source)
     np.testing.assert_array_equal(source.shN, result.model.shN)
@@ -258,12 +252,12 @@ def test_nothing_changes_where_everything_stays(source, given):
 @pytest.mark.parametrize(
     ("keep", "options", "left"),
     [
-        (0.998, {}, 449),  # less than a splat for each round
+        (0.998, {}, 449),  # less than one splat per round
         (0.98, {"rounds": 12}, 441),
         (1e-4, {"keep_unseen": False, "rounds": 1}, 1),
     ],
 )
-def test_as_many_stay_as_were_asked_for_and_one_at_least(source, given, keep, options, left):
+def test_the_requested_number_but_at_least_one_splat_is_kept(source, given, keep, options, left):
     chosen = replace(SMALL, refit=False, bands=False, **options)
     assert left == len(simplify(source, keep=keep, views=given, options=chosen).model)
 
@@ -279,10 +273,8 @@ def test_the_result_does_not_depend_on_threads(source, given):
         np.testing.assert_array_equal(getattr(one.model, name), getattr(two.model, name))
 
 
-# bands
-
-
-def test_bands_that_are_worth_less_than_their_bits_go():
+# SH bands.
+def test_bands_with_less_gain_than_cost_are_dropped():
     bands = np.array([[0.3, 0.3, 0.3], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
     zeros = np.zeros(3)
     pruning_error = PruningError(zeros, zeros, np.array([True, False, True]), bands, 1)
@@ -293,7 +285,7 @@ def test_bands_that_are_worth_less_than_their_bits_go():
 
 
 @pytest.mark.slow
-def test_bands_without_worth_are_zero_and_others_are_not(source, given):
+def test_dropped_bands_are_zero(source, given):
     result = simplify(source, keep=0.4, views=given, options=SMALL)
     kept_bands = result.kept_bands
     assert kept_bands is not None
@@ -304,9 +296,7 @@ def test_bands_without_worth_are_zero_and_others_are_not(source, given):
         assert count == np.count_nonzero(~result.model.shN[:, span].any(axis=(1, 2)))
 
 
-# errors
-
-
+# Errors.
 def test_several_targets_and_options_out_of_range_are_refused(source):
     for given, message in (({}, "no target"), ({"psnr": 40.0, "keep": 0.5}, "one of them")):
         with pytest.raises(InputError, match=message):
@@ -322,15 +312,13 @@ def test_an_empty_scene_is_refused(source):
         simplify(source.select(slice(0, 0)), keep=0.5)
 
 
-def test_decibels_are_read_with_and_without_their_unit():
+def test_decibels_are_parsed_with_and_without_unit():
     assert [0.3, 0.3, 0.3] == [parse_decibels(text, "--x") for text in ("0.3", "0.3dB", " 0.3 DB ")]
     with pytest.raises(BadParameter, match="decibels"):
         parse_decibels("much", "--x")
 
 
-# the command
-
-
+# The command.
 @pytest.mark.slow
 def test_the_command_writes_a_smaller_ply_and_a_report(source, tmp_path, monkeypatch):
     change_views(monkeypatch, 8, (48, 36))
@@ -343,13 +331,11 @@ def test_the_command_writes_a_smaller_ply_and_a_report(source, tmp_path, monkeyp
     assert "450 -> 225 splats" in result.stderr
     assert {*map(bytes, read_ply(out).means)} < {*map(bytes, read_ply(scene).means)}
     assert json.loads(report.read_text())["splats"] == 225
-    again = invoke(*words)
-    assert again.exit_code == 1
-    assert "--force replaces it" in again.stderr
+    assert "--force replaces it" in call(*words, status=1).stderr
 
 
 @pytest.mark.slow
-def test_the_command_takes_cameras_and_prints_json_and_says_how_long_it_takes(source, tmp_path, monkeypatch):
+def test_the_command_uses_cameras_prints_json_and_announces_the_time(source, tmp_path, monkeypatch):
     monkeypatch.setattr("csplat_tools.views.view_sets.render_seconds", lambda _, cameras, **__: cameras[0].W / 800)
     scene, cameras = tmp_path / "scene.ply", tmp_path / "cameras.json"
     write_ply(scene, source)
@@ -363,10 +349,10 @@ def test_the_command_takes_cameras_and_prints_json_and_says_how_long_it_takes(so
     report = json.loads(result.stdout)
     assert report["validation_psnr"] >= 30.0
     assert {"cameras": "cameras.json", "views": 10} == report["test_views"]
-    assert report["views"]["used"] >= 10  # so few are all test views; training views are virtual, without equal ones
+    assert report["views"]["used"] >= 10  # ten cameras are all test views; training views are virtual
 
 
-def test_outputs_of_one_place_and_inputs_as_outputs_are_refused(source, tmp_path):
+def test_conflicting_outputs_and_inputs_as_outputs_are_refused(source, tmp_path):
     scene, cameras, out = tmp_path / "scene.ply", tmp_path / "cameras.json", tmp_path / "out.ply"
     write_ply(scene, source)
     save_cameras(cameras, camera_sequence(source, 4, (32, 24)))
@@ -384,12 +370,12 @@ def test_outputs_of_one_place_and_inputs_as_outputs_are_refused(source, tmp_path
 @pytest.mark.parametrize(
     "words", [(), ("--keep", "0.5", "--target-psnr", "40"), ("--keep", "2"), ("--max-psnr-drop", "x")]
 )
-def test_a_wrong_target_is_a_wrong_command_line(source, tmp_path, words):
+def test_an_invalid_target_has_status_2(source, tmp_path, words):
     write_ply(tmp_path / "scene.ply", source)
     assert invoke("simplify", tmp_path / "scene.ply", tmp_path / "out.ply", *words).exit_code == 2
 
 
-def test_views_of_many_splats_are_larger_and_fewer_and_steps_as_well():
+def test_views_of_many_splats_are_larger_and_fewer():
     assert default_views(100_000) == (VIEW_COUNT, VIEW_SIZE)
     assert default_views(10_000_000) == (VIEW_COUNT // 2, (2 * VIEW_SIZE[0], 2 * VIEW_SIZE[1]))
     assert SimplifyOptions().views_and_size(100) == default_views(100)

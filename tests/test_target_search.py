@@ -1,4 +1,4 @@
-"""The search for a target, on scenes whose files follow a formula: which file is found, and after how many tries."""
+"""The search for a target on analytic scenes: the file it finds, and the number of candidates."""
 
 from dataclasses import replace
 from functools import cache
@@ -32,30 +32,28 @@ SCENES = {
     "quality far from renders": AnalyticScene(lost=16.0),
 }
 
-MOST_TRIES = 20  # files of a search; a codebook that has to grow takes some more
-LARGER = 1.1  # times as large as the smallest file that there is: the most that a search for a PSNR may find
-WORSE = (2.2, 5.0)  # dB less than the best file that there is, with all splats and with fewer: the same of a size
+MOST_TRIES = 20  # candidates; a codebook that has to grow takes some more
+LARGER = 1.1  # times the size of the smallest possible file; the limit of a search for a PSNR
+WORSE = (2.2, 5.0)  # dB below the best possible file with all splats and with fewer; the limits of a search for a size
 
 
 @cache
 def found_in(name, *, no_prune, **target):
-    """Return what is found in one of the scenes."""
+    """Search in one of the scenes, once per target."""
     return search(SCENES[name], no_prune=no_prune, **target)
 
 
 def failures(check, names=tuple(SCENES)):
-    """Return what is wrong, by scene and with all splats or fewer; a check returns a text, empty if all is well."""
+    """Return the failures of a check by scene and `no_prune`; a check returns a text, empty on success."""
     cases = [(name, no_prune) for name in names for no_prune in (True, False)]
     texts = {case: check(*case) for case in cases}
     return {case: text for case, text in texts.items() if text}
 
 
-# a PSNR
-
-
+# A PSNR.
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [30.0, 38.0])
-def test_a_psnr_is_reached_and_hardly_exceeded(goal):
+def test_a_psnr_is_reached_with_little_excess(goal):
     def check(name, no_prune):
         above = found_in(name, no_prune=no_prune, psnr=goal).file.psnr() - goal
         return "" if 0.0 <= above <= 0.25 + SCENES[name].jump else f"{above:.2f} dB above"
@@ -65,7 +63,7 @@ def test_a_psnr_is_reached_and_hardly_exceeded(goal):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [30.0, 38.0])
-def test_the_file_of_a_psnr_is_hardly_larger_than_the_smallest_that_there_is(goal):
+def test_the_file_of_a_psnr_is_nearly_the_smallest(goal):
     def check(name, no_prune):
         size = len(found_in(name, no_prune=no_prune, psnr=goal).file)
         larger = size / SCENES[name].smallest(goal, no_prune=no_prune)
@@ -76,7 +74,7 @@ def test_the_file_of_a_psnr_is_hardly_larger_than_the_smallest_that_there_is(goa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [{"psnr": 38.0}, {"size_bytes": 90_000}])
-def test_a_search_ends_after_few_tries_and_makes_no_file_twice(goal):
+def test_a_search_has_few_candidates_and_no_duplicates(goal):
     def check(name, no_prune):
         found = found_in(name, no_prune=no_prune, **goal)
         if len({repr(file.contents) for file in found.tried}) < len(found.tried):
@@ -88,14 +86,14 @@ def test_a_search_ends_after_few_tries_and_makes_no_file_twice(goal):
 
 @pytest.mark.parametrize("no_prune", [True, False])
 @pytest.mark.parametrize("ceiling", [36.0, 97.0])
-def test_a_psnr_that_no_precision_reaches_is_refused_after_few_tries(ceiling, no_prune):
+def test_an_impossible_psnr_is_refused_after_few_candidates(ceiling, no_prune):
     tried = []
     with pytest.raises(InputError, match=r"no file reaches 98.00 dB; the best found has"):
         search(replace(PLAIN, ceiling=ceiling), psnr=98.0, no_prune=no_prune, tried=tried)
     assert 0 < len(tried) <= MOST_TRIES
 
 
-def test_a_psnr_just_above_what_precision_reaches_is_refused_after_few_tries():
+def test_a_psnr_slightly_beyond_reach_is_refused_after_few_candidates():
     tried = []
     with pytest.raises(InputError, match=r"no file reaches 38.00 dB; the best found has 36"):
         search(replace(PLAIN, ceiling=36.0), psnr=38.0, no_prune=True, tried=tried)
@@ -103,25 +101,25 @@ def test_a_psnr_just_above_what_precision_reaches_is_refused_after_few_tries():
 
 
 @pytest.mark.parametrize("no_prune", [True, False])
-def test_a_psnr_below_all_files_is_exceeded_and_the_report_says_so(no_prune):
+def test_a_psnr_below_all_files_is_exceeded_with_a_note(no_prune):
     found = search(PLAIN, psnr=2.0, no_prune=no_prune)
     assert len(found.file) <= PLAIN.smallest(2.0, no_prune=True)
     assert any("no smaller file of those tried reaches the target" in line for line in found.report.why)
 
 
-def test_a_psnr_that_is_reached_exactly_is_not_said_to_be_exceeded():
+def test_a_psnr_that_is_met_has_no_note():
     assert not any("no smaller file" in line for line in found_in("plain", no_prune=True, psnr=38.0).report.why)
 
 
 def test_a_plateau_is_crossed():
-    """Between 42 and 55 dB of quality more bytes gain nothing."""
+    # Between 42 and 55 dB of quality more bytes gain nothing.
     scene = replace(WITHOUT_SH, plateau=(42.0, 55.0))
     found = search(scene, psnr=34.0, no_prune=True)
     assert 34.0 <= found.file.psnr() <= 34.3
     assert len(found.file) <= LARGER * scene.smallest(34.0, no_prune=True)
 
 
-def test_no_file_that_was_judged_reaches_a_psnr_with_fewer_bytes():
+def test_no_scored_candidate_reaches_a_psnr_with_fewer_bytes():
     def check(name, no_prune):
         found = found_in(name, no_prune=no_prune, psnr=38.0)
         packed = [file for file in found.scored if file.contents.options.deflate_level is None]
@@ -131,23 +129,21 @@ def test_no_file_that_was_judged_reaches_a_psnr_with_fewer_bytes():
     assert {} == failures(check, ("plain", "jumps", "useless codebooks"))
 
 
-def test_where_files_jump_a_smaller_one_beside_is_found():
+def test_if_sizes_jump_a_smaller_neighbour_is_found():
     scene = replace(NO_CODEBOOK, jump=1.5)
     found = search(scene, psnr=35.1, no_prune=True)
     assert found.file.psnr() >= 35.1
     assert len(found.file) <= 1.08 * scene.smallest(35.1, no_prune=True)
 
 
-def test_what_is_packed_loosely_for_speed_is_not_written():
-    """Even if it is smaller: here tighter packing makes files larger."""
+def test_a_file_of_fast_compression_is_not_written():
+    # Even if it is smaller: here stronger compression makes files larger.
     for scene in (NO_CODEBOOK, WITHOUT_SH):
         found = search(replace(scene, packing=0.97), psnr=38.0, no_prune=True)
         assert found.file.contents.options.deflate_level is None
 
 
-# a size
-
-
+# A size.
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [60_000, 90_000])
 def test_a_size_is_filled_and_not_exceeded(goal):
@@ -159,7 +155,7 @@ def test_a_size_is_filled_and_not_exceeded(goal):
 
 
 @pytest.mark.slow
-def test_the_file_of_a_size_is_hardly_worse_than_the_best_that_there_is():
+def test_the_file_of_a_size_is_nearly_the_best():
     def check(name, no_prune):
         found = found_in(name, no_prune=no_prune, size_bytes=90_000)
         less = SCENES[name].best(90_000, no_prune=no_prune) - found.file.psnr()
@@ -168,7 +164,7 @@ def test_the_file_of_a_size_is_hardly_worse_than_the_best_that_there_is():
     assert {} == failures(check)
 
 
-def test_of_a_size_fewer_splats_are_chosen_where_they_look_better():
+def test_a_size_prunes_splats_if_that_raises_the_psnr():
     better = {}
     for name in ("plain", "without SH", "many unneeded splats", "no splat to spare"):
         fewer, all_stay = (found_in(name, no_prune=no_prune, size_bytes=90_000).file for no_prune in (False, True))
@@ -178,21 +174,21 @@ def test_of_a_size_fewer_splats_are_chosen_where_they_look_better():
     assert min(better.values()) > 0.0, better
 
 
-def test_more_bytes_are_better_pictures():
+def test_more_bytes_give_a_higher_psnr():
     psnrs = [found_in("plain", no_prune=True, size_bytes=size).file.psnr() for size in (60_000, 90_000, 140_000)]
     assert psnrs[1] > psnrs[0] + 3.0
     assert psnrs[2] > psnrs[1] + 3.0
 
 
-@pytest.mark.parametrize(("no_prune", "said"), [(True, "no file with all splats has"), (False, "no file has")])
-def test_a_size_below_all_files_is_refused_after_few_tries(no_prune, said):
+@pytest.mark.parametrize(("no_prune", "message"), [(True, "no file with all splats has"), (False, "no file has")])
+def test_a_size_below_all_files_is_refused_after_few_candidates(no_prune, message):
     tried = []
-    with pytest.raises(InputError, match=f"{said} at most 300 bytes; the smallest found has"):
+    with pytest.raises(InputError, match=f"{message} at most 300 bytes; the smallest found has"):
         search(PLAIN, size_bytes=300, no_prune=no_prune, tried=tried)
     assert 0 < len(tried) <= MOST_TRIES
 
 
-def test_a_size_that_all_splats_exceed_is_met_by_fewer():
+def test_a_size_that_all_splats_exceed_is_met_by_pruning():
     with pytest.raises(InputError, match="no file with all splats has"):
         search(PLAIN, size_bytes=12_000, no_prune=True)
     found = search(PLAIN, size_bytes=12_000)
@@ -200,12 +196,10 @@ def test_a_size_that_all_splats_exceed_is_met_by_fewer():
     assert found.file.contents.splats < 4000
 
 
-# a loss against photographs
-
-
+# A PSNR drop against images.
 @pytest.mark.slow
 @pytest.mark.parametrize("loss", [0.2, 1.0])
-def test_a_loss_is_kept_to_and_its_file_hardly_larger_than_the_smallest(loss):
+def test_a_psnr_drop_is_met_by_nearly_the_smallest_file(loss):
     photographs = Views(photo_psnr=25.0)
 
     def check(name, no_prune):
@@ -218,18 +212,16 @@ def test_a_loss_is_kept_to_and_its_file_hardly_larger_than_the_smallest(loss):
     assert {} == failures(check, ("plain", "useless codebooks", "without SH"))
 
 
-def test_a_loss_that_no_file_keeps_to_is_refused():
-    """Files err by as much as photographs do, at any precision."""
+def test_an_impossible_psnr_drop_is_refused():
+    # At any precision, the error of a file equals that of the images.
     with pytest.raises(InputError, match=r"no file reaches 49.50 dB on the validation images; the best has"):
         search(replace(PLAIN, ceiling=50.0), max_psnr_drop=0.5, photo_psnr=50.0)
 
 
-# views
-
-
+# Views.
 @pytest.mark.slow
 @pytest.mark.parametrize("judging", [Views(1.5), Views(-1.5), Views(0.5, 2.0), Views(-0.5, -2.0)])
-def test_a_psnr_is_reached_where_judging_views_see_other_errors_than_those_that_decide(judging):
+def test_a_psnr_is_reached_if_test_and_validation_views_differ(judging):
     def check(name, no_prune):
         found = search(SCENES[name], psnr=38.0, judging=judging, no_prune=no_prune)
         above = found.file.psnr(judging) - 38.0
@@ -241,43 +233,41 @@ def test_a_psnr_is_reached_where_judging_views_see_other_errors_than_those_that_
 
 
 @pytest.mark.parametrize("offset", [4.0, 8.0])
-def test_views_that_judge_far_more_harshly_cost_no_more_tries(offset):
+def test_test_views_with_larger_errors_cost_no_more_candidates(offset):
     found = search(PLAIN, psnr=38.0, judging=Views(offset), no_prune=True)
     assert 0.0 <= found.file.psnr(Views(offset)) - 38.0 <= 0.2
     assert len(found.tried) <= 9
 
 
 @pytest.mark.parametrize("goal", [{"size_bytes": 90_000}, {"max_psnr_drop": 0.5, "photo_psnr": 25.0}])
-def test_judging_views_do_not_choose_the_file_of_a_size_or_a_loss(goal):
+def test_test_views_do_not_choose_the_file_of_a_size_or_drop(goal):
     one, other = (search(PLAIN, judging=judging, **goal) for judging in (Views(), Views(3.0, 5.0)))
     assert one.file.contents == other.file.contents
     assert one.report.psnr > other.report.psnr
     assert {one.file} == set(one.scored)
 
 
-def test_of_a_psnr_the_file_is_one_that_judging_views_looked_at_and_they_do_not_look_at_all():
+def test_the_file_of_a_psnr_is_scored_but_not_every_candidate():
     found = found_in("plain", no_prune=False, psnr=38.0)
     assert found.file in found.scored
     assert len(set(found.scored)) < len(found.tried)
 
 
-# what is chosen
-
-
-def test_codings_are_chosen_where_they_pay():
+# Choices.
+def test_codings_are_chosen_by_their_gain():
     scenes = {"plain": PLAIN, "useless codebooks": NO_CODEBOOK, "no SH": WITHOUT_SH, "hardly any SH": HARDLY_ANY_SH}
     chosen = {name: search(scene, psnr=38.0, no_prune=True).report for name, scene in scenes.items()}
     expected = {"plain": "codebook", "useless codebooks": "scalar", "no SH": "none", "hardly any SH": "none"}
     assert expected == {name: report.chosen["sh_coding"] for name, report in chosen.items()}
 
 
-def test_bands_that_hardly_show_are_left_out():
+def test_barely_visible_bands_are_left_out():
     scene = replace(NO_CODEBOOK, shown=(30.0, 45.0, 50.0))
     assert 1 == search(scene, psnr=38.0, no_prune=True).report.chosen["sh_degree"]
 
 
-def test_a_coding_that_more_precision_hardly_betters_is_not_chosen():
-    """Files of codebooks come within a decibel of the goal, and stay there: nearer than the others are at first."""
+def test_a_coding_that_gains_little_from_precision_is_not_chosen():
+    # Files with codebooks come within a decibel of the goal and stay there, nearer than the others at first.
     scene = replace(PLAIN, book_psnr=37.2, book_octave=0.05, index_bytes=0.1, entry_bytes=0.1)
     found = search(scene, psnr=38.0, no_prune=True)
     assert "scalar" == found.report.chosen["sh_coding"]
@@ -286,21 +276,21 @@ def test_a_coding_that_more_precision_hardly_betters_is_not_chosen():
 
 @pytest.mark.parametrize("no_prune", [True, False])
 def test_a_codebook_grows_until_the_goal_is_reached(no_prune):
-    """With smaller codebooks no precision reaches the goal."""
+    # With smaller codebooks no precision reaches the goal.
     scene, options = replace(PLAIN, book_psnr=32.0), EncodeOptions(sh_coding="codebook")
     found = search(scene, psnr=38.0, no_prune=no_prune, options=options)
     assert found.file.psnr() >= 38.0
     assert found.report.chosen["codebook_size"] >= 1024
 
 
-def test_a_codebook_grows_to_an_entry_for_four_splats():
-    """With smaller codebooks no precision reaches the goal."""
+def test_a_codebook_grows_to_one_entry_per_four_splats():
+    # With smaller codebooks no precision reaches the goal.
     scene, options = replace(PLAIN, splats=6000, book_psnr=29.0), EncodeOptions(sh_coding="codebook")
     found = search(scene, psnr=38.0, no_prune=True, options=options)
-    assert 2048 == found.report.chosen["codebook_size"]  # 1500, as a power of two
+    assert 2048 == found.report.chosen["codebook_size"]  # 1500, rounded up to a power of two
 
 
-def test_grades_are_chosen_where_they_make_files_smaller():
+def test_quantisation_classes_are_used_if_files_become_smaller():
     cheaper = replace(PLAIN, grading=0.9)
     graded, dearer, unknown = (
         search(scene, psnr=38.0, no_prune=True, grades=grades)
@@ -313,7 +303,7 @@ def test_grades_are_chosen_where_they_make_files_smaller():
 @pytest.mark.parametrize(
     "fixed", [{"sh_degree": 1, "sh_coding": "scalar"}, {"sh_coding": "codebook", "codebook_size": 64}]
 )
-def test_what_the_caller_fixed_is_not_chosen(fixed):
+def test_options_of_the_caller_are_kept(fixed):
     found = search(PLAIN, psnr=28.0, options=EncodeOptions(**fixed))
     for name, value in fixed.items():
         assert {value} == {getattr(file.contents.options, name) for file in found.tried}, name
@@ -336,10 +326,8 @@ def test_a_preset_whose_own_file_is_smaller_is_chosen(preset, goal):
     assert usual.report.chosen["attribute_psnr"] is not None
 
 
-# how many splats
-
-
-def test_splats_that_nobody_needs_are_left_out_unless_all_are_to_stay():
+# Pruning.
+def test_unneeded_splats_are_pruned_unless_pruning_is_off():
     fewer, all_stay = (found_in("many unneeded splats", no_prune=no_prune, psnr=38.0) for no_prune in (False, True))
     assert fewer.file.contents.splats <= 4000
     assert 8000 == all_stay.file.contents.splats
@@ -348,54 +336,52 @@ def test_splats_that_nobody_needs_are_left_out_unless_all_are_to_stay():
     assert len(fewer.file) < 0.6 * len(all_stay.file)
 
 
-def test_splats_that_cannot_be_spared_stay():
+def test_needed_splats_are_kept():
     assert 8000 == found_in("no splat to spare", no_prune=False, psnr=45.0).file.contents.splats
 
 
-def test_more_splats_stay_for_a_higher_psnr():
+def test_a_higher_psnr_keeps_more_splats():
     counts = [found_in("plain", no_prune=False, psnr=goal).file.contents.splats for goal in (30.0, 38.0, 45.0)]
     assert sorted(set(counts)) == counts
 
 
 @pytest.mark.parametrize(("mended", "goal"), [(1.0, 42.0), (3.0, 38.0), (12.0, 34.0)])
-def test_a_refit_that_mends_less_or_more_than_is_expected_says_how_many_splats_to_try_next(mended, goal):
+def test_the_gain_of_a_refit_predicts_the_next_number_of_splats(mended, goal):
     scene = replace(PLAIN, mended=mended)
     found = search(scene, psnr=goal)
     assert goal <= found.file.psnr() <= goal + 0.3
     assert len(found.file) <= 1.03 * scene.smallest(goal)
 
 
-def test_where_no_file_of_a_number_of_splats_reaches_the_goal_more_are_tried_before_all_stay():
-    """A refit through the quantisers of a file makes it worse by 4 dB."""
+def test_a_failed_number_of_splats_is_raised_before_pruning_is_given_up():
+    # A refit through the quantisers of a file makes it worse by 4 dB.
     found = search(replace(PLAIN, tuned=-4.0), psnr=32.0)
     assert 32.0 <= found.file.psnr() <= 32.4
     assert found.file.contents.splats < 8000
 
 
-def test_where_a_number_of_splats_fails_no_other_codings_of_it_are_tried():
+def test_other_codings_of_a_failed_number_of_splats_are_not_tried():
     found = search(replace(PLAIN, tuned=-4.0, mended=12.0), psnr=36.0)
     assert found.file.psnr() >= 36.0
     assert len(found.tried) <= 2 * MOST_TRIES
 
 
-def test_a_brief_search_tries_fewer_files():
+def test_a_low_effort_has_fewer_candidates():
     brief = search(PLAIN, psnr=38.0, effort=1)
     assert len(brief.tried) < len(found_in("plain", no_prune=False, psnr=38.0).tried)
     assert 38.0 <= brief.file.psnr() <= 38.4
 
 
-# bounds in addition to a target, and the report
-
-
+# Bounds in addition to a target, and the report.
 def test_a_file_that_exceeds_a_bound_is_no_result():
-    """Errors of means fall with the quality alone: one bound asks for more of it than the goal."""
+    # Errors of means only depend on the quality; one bound requires more of it than the goal.
     with pytest.raises(InputError, match="no file reaches"):
         search(PLAIN, no_prune=True, psnr=30.0, max_error={"means": 10.0 ** (-60.0 / 20.0)})
     loose = search(PLAIN, no_prune=True, psnr=30.0, max_error={"means": 10.0 ** (-30.0 / 20.0)})
     assert 30.0 <= loose.file.psnr() <= 30.3
 
 
-def test_the_report_names_every_file_that_was_tried():
+def test_the_report_lists_every_candidate():
     found = found_in("plain", no_prune=False, psnr=38.0)
     report = found.report
     assert {"psnr": 38.0} == report.goal

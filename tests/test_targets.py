@@ -6,21 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from checked import measure_errors
-from typer.testing import CliRunner
+from command_line import call, change_views, invoke
 
 from csplat import EncodeOptions, decode, write_ply
 from csplat.encoder import encode_with_report
 from csplat.errors import InputError
-from csplat_tools.cli.app import app
 from csplat_tools.console import parse_size_bytes
 from csplat_tools.optimise.target_encoding import encode_to, meet_bounds
 from csplat_tools.optimise.targets import Target, parse_max_error
 
 pytest.importorskip("numba", reason="targets of size and PSNR want the extra [render]")
 
-# Importing it needs what is looked for above.
 from captures import cameras, photograph, shell
-from command_line import change_views
 
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import save_cameras
@@ -34,25 +31,23 @@ def scene():
     return shell(8)
 
 
-# what is asked
-
-
-def test_sizes_are_read_as_they_are_written():
+# Options.
+def test_sizes_are_parsed():
     sizes = {"5MB": 5_000_000, "1.5 MiB": 1_572_864, "300kB": 300_000, "300KiB": 307_200, "123456": 123_456}
     assert sizes == {text: parse_size_bytes(text) for text in sizes}
 
 
 @pytest.mark.parametrize("text", ["", "MB", "5 apples", "-3MB", "0", "1e30GB", "5 M B"])
-def test_other_texts_are_no_sizes(text):
+def test_invalid_sizes_are_refused(text):
     with pytest.raises(InputError, match="a size is"):
         parse_size_bytes(text)
 
 
-def test_bounds_are_read_by_measure():
+def test_bounds_are_parsed():
     assert {"means": 0.001, "opacities": 0.01} == parse_max_error("means=0.001,opacities=1e-2", None)
 
 
-def test_a_length_with_a_unit_wants_a_scene_that_has_one():
+def test_a_length_with_a_unit_requires_a_scene_with_a_unit():
     with pytest.raises(InputError, match="--unit-metres"):
         parse_max_error("means=1mm", None)
     assert {"means": 0.002} == parse_max_error("means=1mm", 0.5)
@@ -70,7 +65,7 @@ def test_a_length_with_a_unit_wants_a_scene_that_has_one():
         ("means=1parsec", "expected one of"),
     ],
 )
-def test_other_bounds_are_refused(text, message):
+def test_invalid_bounds_are_refused(text, message):
     with pytest.raises(InputError, match=message):
         parse_max_error(text, 1.0)
 
@@ -95,18 +90,16 @@ def test_other_bounds_are_refused(text, message):
         ({"keep": 0.5, "psnr": 40.0}, "one of them"),
     ],
 )
-def test_a_target_is_one_thing_within_its_range(asked, message):
+def test_invalid_targets_are_refused(asked, message):
     with pytest.raises(InputError, match=message):
         Target(**asked)
 
 
-# largest errors
-
-
+# Largest errors.
 @pytest.mark.parametrize(
     "bounds", [{"means": 1e-4}, {"opacities": 0.004, "covariance": 0.02}, {"sh0": 0.01}, {"sh1": 0.02, "sh2": 0.05}]
 )
-def test_no_splat_errs_by_more_than_is_allowed(scene, bounds):
+def test_bounds_hold_for_every_splat(scene, bounds):
     found = encode_to(scene, errors=bounds)
     proof = measure_errors(scene, decode(found.result.data), found.result.source_index)
     for name, bound in bounds.items():
@@ -116,7 +109,7 @@ def test_no_splat_errs_by_more_than_is_allowed(scene, bounds):
 
 
 @pytest.mark.slow
-def test_outliers_keep_to_a_bound_of_the_means(scene):
+def test_a_bound_of_the_means_holds_for_outliers(scene):
     away = (scene.means[:20] * 3000.0).astype(np.float32)
     far = replace(scene, means=np.concatenate([away, scene.means[20:]]))
     coarse = encode_with_report(far, EncodeOptions(position_step=1e-4)).report.errors["means"][0]
@@ -125,12 +118,12 @@ def test_outliers_keep_to_a_bound_of_the_means(scene):
     assert any("tiles" in note for note in meet_bounds(far, EncodeOptions(), {"means": 1e-6}).result.report.notes)
 
 
-def test_a_bound_that_no_lattice_keeps_is_refused(scene):
+def test_an_impossible_bound_is_refused(scene):
     with pytest.raises(InputError, match="no lattice keeps the error of opacities within 1e-09"):
         meet_bounds(scene, EncodeOptions(), {"opacities": 1e-9})
 
 
-def test_a_knob_and_its_bound_contradict_each_other(scene):
+def test_an_option_that_contradicts_a_bound_is_refused(scene):
     with pytest.raises(InputError, match="position_step is determined"):
         meet_bounds(scene, EncodeOptions(position_step=0.1), {"means": 0.1})
     for fixed in (EncodeOptions(sh_coding="none"), EncodeOptions(adaptive=0.5)):
@@ -140,85 +133,74 @@ def test_a_knob_and_its_bound_contradict_each_other(scene):
         meet_bounds(scene, EncodeOptions(sh_coding="codebook"), {"sh1": 0.1})
 
 
-# the command
-
-
+# The command.
 @pytest.fixture
 def ply(tmp_path, scene):
     write_ply(tmp_path / "scene.ply", scene)
     return tmp_path / "scene.ply"
 
 
-def run(*arguments):
-    return CliRunner().invoke(app, [*map(str, arguments)])
-
-
 @pytest.mark.slow
-def test_the_command_meets_a_size_and_says_why(tmp_path, ply, monkeypatch):
+def test_the_command_meets_a_size_with_reasons(tmp_path, ply, monkeypatch):
     out = tmp_path / "scene.csplat"
     change_views(monkeypatch, 16, (48, 36))
-    done = run("encode", ply, out, "--target-size", "5kB", "--no-prune")
-    assert 0 == done.exit_code, done.output
+    done = call("encode", ply, out, "--target-size", "5kB", "--no-prune")
     assert 4850 <= out.stat().st_size <= 5000
-    for said in ("target: 5.0 kB", "chosen: SH degree", "measured on the file itself"):
-        assert said in done.stderr
+    for text in ("target: 5.0 kB", "chosen: SH degree", "measured on the file itself"):
+        assert text in done.stderr
 
 
 @pytest.mark.slow
-def test_the_command_reports_a_share_as_json_and_its_file_is_proved(tmp_path, ply):
+def test_the_command_reports_a_share_as_json_and_its_file_is_verified(tmp_path, ply):
     out, index = tmp_path / "scene.csplat", tmp_path / "index.npy"
     save_cameras(tmp_path / "cameras.json", cameras(40))
     words = ("encode", ply, out, "--keep", "0.5", "--effort", "1", "--cameras", tmp_path / "cameras.json")
-    done = run(*words, "--source-index", index, "--json")
-    assert 0 == done.exit_code, done.output
-    report = json.loads(done.stdout)
+    report = json.loads(call(*words, "--source-index", index, "--json").stdout)
     assert (150, {"keep": 0.5}) == (report["splats"], report["target"]["goal"])
     assert report["target"]["size_bytes"] == report["size_bytes"] == out.stat().st_size
     assert report["target"]["splats"] == report["splats"]
-    assert 0 == run("verify", out, "--source", ply, "--source-index", index).exit_code
-    assert 0 == run("verify", out, "--source", ply).exit_code
-    assert "150 pruned" in run("info", out).stdout
+    call("verify", out, "--source", ply, "--source-index", index)
+    call("verify", out, "--source", ply)
+    assert "150 pruned" in call("info", out).stdout
 
 
 @pytest.mark.slow
-def test_the_command_keeps_to_largest_errors(tmp_path, ply):
+def test_the_command_meets_largest_errors(tmp_path, ply):
     out, index = tmp_path / "scene.csplat", tmp_path / "index.npy"
     arguments = ["encode", ply, out, "--max-error", "means=2mm,sh0=0.01", "--unit-metres", "0.5", "--json", "-q"]
-    report = json.loads(run(*arguments, "--source-index", index).stdout)
+    report = json.loads(call(*arguments, "--source-index", index).stdout)
     assert report["stated_errors"]["means"]["max"] <= 0.004
     assert report["stated_errors"]["sh0"]["max"] <= 0.01
-    assert 0 == run("verify", out, "--source", ply, "--source-index", index).exit_code
+    call("verify", out, "--source", ply, "--source-index", index)
 
 
 @pytest.mark.slow
-def test_the_command_loses_no_more_against_photographs_than_is_allowed(tmp_path):
-    folder = photograph(shell(0), tmp_path)  # without SH there is one coding to try
+def test_the_command_meets_a_psnr_drop(tmp_path):
+    folder = photograph(shell(0), tmp_path)  # without SH there is only one coding
     words = ("encode", folder / "scene.ply", tmp_path / "s.csplat", "--max-psnr-drop", "1dB", "--data", folder)
-    done = run(*words, "--no-prune", "--json")
-    assert 0 == done.exit_code, done.output
-    target = json.loads(done.stdout)["target"]
+    target = json.loads(call(*words, "--no-prune", "--json").stdout)["target"]
     scores = target["photographs"]
-    # Other photographs decided, and at 62 dB, where 8 bits end, the two that judge differ by more than is allowed.
+    # The validation images decide. At 62 dB, the limit of 8 bits, the two test images differ by more than the drop.
     assert scores["source"] - 1.0 - target["spread"] <= scores["file"] < scores["source"]
 
 
-def test_long_work_is_foretold_unless_it_is_short_or_nobody_is_told(capsys):
-    told = {}
+def test_only_long_work_is_announced(capsys):
+    messages = {}
     for name, quiet, seconds in (("long", False, 170.0), ("short", False, 5.0), ("quiet", True, 170.0)):
         Output(quiet=quiet).announce_time(lambda seconds=seconds: seconds, "a preset takes seconds")
-        told[name] = capsys.readouterr().err
-    assert "this takes about 2 to 5 minutes here; a preset takes seconds" in told.pop("long")
-    assert {"short": "", "quiet": ""} == told
+        messages[name] = capsys.readouterr().err
+    assert "this takes about 2 to 5 minutes here; a preset takes seconds" in messages.pop("long")
+    assert {"short": "", "quiet": ""} == messages
 
 
-def test_the_command_foretells_a_search_before_it_begins(tmp_path, ply, monkeypatch):
-    """The search itself is refused: nothing shows in the view that judges."""
+def test_the_command_announces_the_time_of_a_search(tmp_path, ply, monkeypatch):
+    # The search itself fails: the test view shows nothing.
     monkeypatch.setattr("csplat_tools.optimise.target_search.render_seconds", lambda *_, **__: 170.0 / 520.0)
     K = intrinsics(48, 40, 60.0)
     save_cameras(tmp_path / "away.json", [look_at((40.0, 0.0, 0.0), (80.0, 0.0, 0.0), (0, 0, 1), K, 48, 40)])
     words = ("encode", ply, tmp_path / "s.csplat", "--target-psnr", "30", "--cameras", tmp_path / "away.json")
     change_views(monkeypatch, 8, None)
-    done = run(*words, "--no-prune")
+    done = invoke(*words, "--no-prune")
     assert "this takes about 2 to 5 minutes here" in done.stderr
     assert "cameras belong to the scene" in done.stderr
 
@@ -251,11 +233,11 @@ REFUSED = [
 
 
 @pytest.mark.slow
-def test_the_command_refuses_what_says_nothing(tmp_path, ply):
+def test_the_command_refuses_options_without_effect(tmp_path, ply):
     out, wrong = tmp_path / "scene.csplat", {}
     for words, status, message in REFUSED:
-        done = run("encode", ply, out, *words)
-        said = " ".join(done.stderr.replace("│", " ").split())
-        if (status, False) != (done.exit_code, out.exists()) or message not in said:
-            wrong[" ".join(words)] = (done.exit_code, said)
+        done = invoke("encode", ply, out, *words)
+        text = " ".join(done.stderr.replace("│", " ").split())
+        if (status, False) != (done.exit_code, out.exists()) or message not in text:
+            wrong[" ".join(words)] = (done.exit_code, text)
     assert {} == wrong

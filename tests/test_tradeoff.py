@@ -1,4 +1,4 @@
-"""`csplat tradeoff`: what it measures, which files it marks, what it writes, and how it fails."""
+"""`csplat tradeoff`: measurements, the Pareto front, the page, plots and commands, and errors."""
 
 import hashlib
 import html
@@ -11,14 +11,13 @@ from functools import partial
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command_line import call, invoke
 
 pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
 pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
 pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
 pytest.importorskip("matplotlib", reason="plots need matplotlib: pip install 'csplat[render]'")
 
-# Importing them needs what is looked for above.
 from captures import cameras, photograph, shell
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -30,7 +29,6 @@ from csplat.decoder import read_header
 from csplat.errors import InputError
 from csplat.scene_source import drop_bands
 from csplat_render.camera_files import save_cameras
-from csplat_tools.cli.app import app
 from csplat_tools.study import Reduction
 from csplat_tools.tradeoffs.sweep_options import USUAL, SweepOptions, parse_sweep, read_setting
 from csplat_tools.tradeoffs.sweep_points import StageClock, SweepFailure, fetched_bytes, pareto_front
@@ -56,16 +54,16 @@ POINT = {
     "render", "attribute_bytes", "first_picture_bytes", "partial",
 }  # fmt: skip
 QUICK = ["--what", "precision=36:40"]
-SPLATS = 100  # splats of the scene: the cost of a sweep is proportional to it
+SPLATS = 100  # the time of a sweep is proportional to it
 
 
-def invoke(*words):
-    return CliRunner().invoke(app, ["tradeoff", *map(str, words)])
+def sweep(*words):
+    return invoke("tradeoff", *words)
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    """A scene, photographs of it, and cameras."""
+    """A scene, images of it, and cameras."""
     folder = photograph(shell(3).select(slice(0, SPLATS)), tmp_path_factory.mktemp("capture"))
     save_cameras(folder / "cameras.json", cameras(3))
     (folder / "a & b.ply").write_bytes((folder / "scene.ply").read_bytes())
@@ -85,7 +83,7 @@ def swept(capture, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ViewSet, "__post_init__", keep)
         patch.setattr("csplat_tools.cli.tradeoff.parse_sweep", partial(parse_sweep, iterations=5))
-        result = invoke(
+        result = sweep(
             capture / "a & b.ply", "--data", capture, "--what",
             "presets,precision=40,strategies=0.3:0.97:16,targets=3kB,finetune",
             "--preset", "fast", "-o", folder / "report.html", "--report", folder / "report.json",
@@ -104,9 +102,7 @@ def measured(setting):
     return tradeoff(setting, SweepOptions(what=("presets", "precision"), attribute_psnr=(36.0,)))
 
 
-# what is measured
-
-
+# Measurements.
 @pytest.mark.slow
 def test_every_group_has_its_points(swept):
     _, _, report, _ = swept
@@ -120,7 +116,7 @@ def test_every_group_has_its_points(swept):
 
 
 @pytest.mark.slow
-def test_the_json_says_everything_of_each_point(swept):
+def test_the_json_describes_each_point(swept):
     _, _, report, _ = swept
     assert {"scene", "views", "machine", "times", "source", "pareto", "pareto_photographs", "points"} == set(report)
     for point in report["points"]:
@@ -134,7 +130,7 @@ def test_the_json_says_everything_of_each_point(swept):
 
 
 @pytest.mark.slow
-def test_a_point_that_cannot_be_made_says_why_and_takes_no_other_one_down(swept):
+def test_a_failed_point_is_reported_and_the_others_are_measured(swept):
     folder, result, report, _ = swept
     failed = [one for one in report["points"] if one["error"] is not None]
     assert ["opacity > 0.97", "SH 0, opacity > 0.97"] == [one["name"] for one in failed]
@@ -152,7 +148,7 @@ def test_targets_are_reached(swept):
 
 
 @pytest.mark.slow
-def test_what_is_searched_for_is_what_a_row_says(setting, monkeypatch):
+def test_rows_name_the_target_of_their_search(setting, monkeypatch):
     asked = []
 
     def fail(source, **words):
@@ -180,7 +176,7 @@ def roles_of(views):
 
 
 @pytest.mark.slow
-def test_no_file_is_chosen_by_what_judges(swept):
+def test_test_views_choose_no_file(swept):
     *_, made = swept
     assert len(made) > 1  # fine-tuning has views of its own
     for views in made:
@@ -193,25 +189,23 @@ def test_no_file_is_chosen_by_what_judges(swept):
 
 
 @pytest.mark.slow
-def test_tuned_files_hold_what_was_asked_for(swept):
+def test_tuned_files_have_the_requested_splats(swept):
     _, _, report, _ = swept
     points = {one["name"]: one for one in report["points"]}
     assert SPLATS / 2 == points["tuned, keep 0.5"]["splats"]
     assert SPLATS + 1 == report["scene"]["splats"]
-    assert SPLATS == points["tuned"]["splats"]  # one lies where no photograph shows it
+    assert SPLATS == points["tuned"]["splats"]  # one splat is in no image
     assert {"choosing", "encoding", "tuning"} == set(points["tuned"]["seconds"]["stages"])
 
 
 @pytest.mark.slow
-def test_numbers_are_those_of_compare(capture, swept, tmp_path):
+def test_numbers_agree_with_compare(capture, swept, tmp_path):
     _, _, report, _ = swept
     point = next(one for one in report["points"] if one["name"] == "small")
     path = tmp_path / "small.csplat"
-    words = ["encode", str(capture / "scene.ply"), str(path), "--preset", "small", "--quiet"]
-    assert 0 == CliRunner().invoke(app, words).exit_code
+    call("encode", capture / "scene.ply", path, "--preset", "small", "--quiet")
     assert path.stat().st_size == point["size_bytes"]
-    words = ["compare", str(capture / "scene.ply"), str(path), "--data", str(capture), "--json"]
-    compared = json.loads(CliRunner().invoke(app, words).stdout)
+    compared = json.loads(call("compare", capture / "scene.ply", path, "--data", capture, "--json").stdout)
     for name in ("psnr", "psnr_mean", "psnr_worst", "worst_view", "ssim"):
         assert compared[name] == point[name]
     assert compared["photographs"]["b"]["psnr"] == point["photographs"]["psnr"]
@@ -233,7 +227,7 @@ def timeless(value):
 
 
 @pytest.mark.slow
-def test_fewer_layers_take_fewer_bytes_and_look_worse(measured):
+def test_fewer_layers_have_fewer_bytes_and_a_lower_psnr(measured):
     for point in measured.measured:
         assert (len(point.partial) == 2) == (point.family == "presets")
         for fewer, more in zip(point.partial, point.partial[1:], strict=False):
@@ -244,7 +238,7 @@ def test_fewer_layers_take_fewer_bytes_and_look_worse(measured):
             assert point.psnr == point.partial[-1].quality.psnr
 
 
-def test_what_is_fetched_suffices():
+def test_fetched_bytes_suffice():
     data = bytearray(encode(shell(15), EncodeOptions(preset="fast", tile_splats=100)))
     header, wanted = read_header(bytes(data)), decode(bytes(data), sh_degree=1)
     kept = len(data)
@@ -274,16 +268,14 @@ def test_codebooks_are_fetched_with_their_layers():
 def test_stages_are_timed_by_their_names():
     now, heard = iter([0.0, 1.0, 3.0, 3.5, 4.5, 9.0]), []
     clock = StageClock(clock=lambda: next(now))
-    told = clock.listening(lambda stage, done: heard.append((stage, done)))
+    report = clock.listening(lambda stage, done: heard.append((stage, done)))
     for stage, done in (("codebook", 0.0), ("codebook", 0.5), ("codebook", 1.0), ("tiles", 0.2), ("tiles", 1.0)):
-        told(stage, done)
+        report(stage, done)
     assert [("codebook", 0.0), ("codebook", 0.5), ("codebook", 1.0), ("tiles", 0.2), ("tiles", 1.0)] == heard
     assert {"codebook": 2.5, "tiles": 5.5} == clock.seconds
 
 
-# files that no other one beats
-
-
+# The Pareto front.
 FRONTS = (
     ([], []),
     ([(10, 30.0)], [0]),
@@ -296,12 +288,12 @@ FRONTS = (
 )
 
 
-def test_the_front_is_what_no_other_file_beats():
+def test_the_front_consists_of_files_that_no_other_beats():
     assert [front for _, front in FRONTS] == [pareto_front(points) for points, _ in FRONTS]
 
 
 @pytest.mark.slow
-def test_marks_are_the_front_of_what_the_table_lists(swept):
+def test_the_front_is_marked_in_the_table(swept):
     _, result, report, _ = swept
     points = {one["name"]: one for one in report["points"] if one["error"] is None}
     front = set()
@@ -317,18 +309,16 @@ def test_marks_are_the_front_of_what_the_table_lists(swept):
     assert len(points) == len(sizes)
 
 
-# the page and the plots
-
-
+# The page and the plots.
 @pytest.mark.slow
-def test_the_page_refers_to_nothing_outside(swept):
+def test_the_page_has_no_external_references(swept):
     text = (swept[0] / "report.html").read_text()
     assert {"data:image/webp;base64", "#"} == {
         value.split(",")[0] if value.startswith("data:") else value[0]
         for value in re.findall(r'(?:src|href|action|srcset)="([^"]*)"', text)
     }
     addresses = set(re.findall(r"[a-z]+://[^\"'\s<)]+", text))
-    assert addresses == {"http://www.w3.org/2000/svg"}  # the name of a language
+    assert addresses == {"http://www.w3.org/2000/svg"}  # a namespace
     assert "default-src 'none'" in text
     assert ' style="' not in text
     assert "@import" not in text
@@ -337,7 +327,7 @@ def test_the_page_refers_to_nothing_outside(swept):
 
 
 @pytest.mark.slow
-def test_no_two_elements_of_the_page_have_one_id(swept):
+def test_ids_of_the_page_are_unique(swept):
     text = (swept[0] / "report.html").read_text()
     ids = re.findall(r'\bid="([^"]*)"', text)
     assert len(set(ids)) == len(ids) > 100
@@ -346,32 +336,32 @@ def test_no_two_elements_of_the_page_have_one_id(swept):
 
 
 @pytest.mark.slow
-def test_pictures_are_those_of_presets_and_front(measured):
+def test_images_show_presets_and_the_front(measured):
     shown = [one.name for one in shown_points(measured)]
     assert {"fast", "balanced", "small"} <= set(shown)
     assert set(shown) <= {"fast", "balanced", "small"} | {one.name for one in measured.front}
 
 
 @pytest.mark.slow
-def test_every_plot_is_shown_that_the_sweep_has_something_for(swept, measured):
+def test_plots_with_data_are_shown(swept, measured):
     assert len(PLOTS) == (swept[0] / "report.html").read_text().count('<figure class="plot">')
     assert draw_plot("size-photographs", measured, inline=False) is None
 
 
 @pytest.mark.slow
-def test_plots_of_a_page_take_its_colours(swept):
+def test_plots_of_a_page_use_its_colours(swept):
     inside = re.findall(r"<svg.*?</svg>", (swept[0] / "report.html").read_text(), re.DOTALL)
     assert len(PLOTS) == len(inside)
     assert [] == [one for one in inside if "<style" in one or "#123457" in one]
 
 
 @pytest.mark.slow
-def test_plots_repeat_themselves(measured):
+def test_plots_are_deterministic(measured):
     assert draw_plot("sh-layers", measured, inline=True) == draw_plot("sh-layers", measured, inline=True)
 
 
 @pytest.mark.slow
-def test_names_of_scenes_are_no_markup(swept):
+def test_names_of_scenes_are_escaped(swept):
     text = (swept[0] / "report.html").read_text()
     assert "a & b" not in text
     assert "<h1>a &amp; b.ply: size, quality and time</h1>" in text
@@ -429,7 +419,7 @@ def test_labels_of_a_plot_do_not_overlap(count):
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     drawn = canvas.get_renderer()
-    boxes = [Text.get_window_extent(text, drawn) for text in axes.texts]  # without the lines to the marks
+    boxes = [Text.get_window_extent(text, drawn) for text in axes.texts]  # without lines to the marks
     assert count == len(boxes)
     for place, box in enumerate(boxes):
         assert not any(box.overlaps(other) for other in boxes[:place])
@@ -438,27 +428,24 @@ def test_labels_of_a_plot_do_not_overlap(count):
         assert axes.bbox.contains(box.x1, box.y1)
 
 
-# the commands of the rows
-
-
+# Commands of rows.
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["fast", "attributes 40 dB", "SH 0", "SH 0, distilled", "k-means 16", "target 3.0 kB"])
-def test_the_command_of_a_row_makes_its_bytes(swept, tmp_path, monkeypatch, name):
+def test_the_command_of_a_row_gives_its_bytes(swept, tmp_path, monkeypatch, name):
     point = next(one for one in swept[2]["points"] if one["name"] == name)
     monkeypatch.chdir(tmp_path)
     program, *words = shlex.split(point["command"])
     if program == "csplat":
-        done = CliRunner().invoke(app, [*words, "--quiet"])
-        assert 0 == done.exit_code, done.output
+        call(*words, "--quiet")
     else:
         assert ["python", "-c"] == [program, words[0]]
-        exec(compile(words[1], "command", "exec"), {})  # noqa: S102 -- what the page offers is what is tested
+        exec(compile(words[1], "command", "exec"), {})  # noqa: S102 -- the test runs the command of the page
     (made,) = tmp_path.iterdir()
     assert point["sha256"] == hashlib.sha256(made.read_bytes()).hexdigest()
 
 
 @pytest.mark.slow
-def test_commands_quote_what_a_shell_would_read(setting):
+def test_commands_are_quoted_for_a_shell(setting):
     told = replace(
         setting, path="my scenes/it's.ply", cameras="$HOME/cams.json", background=(0.1, 0.0, 1.0),
         data=DataOptions('a "set"', (480, 270), None, 5),
@@ -475,10 +462,8 @@ def test_commands_quote_what_a_shell_would_read(setting):
     assert r'data=DataOptions("a \"set\"", (480, 270), None, 5), background=(0.1, 0.0, 1.0)' in program
 
 
-# how it fails
-
-
-def test_without_one_point_that_can_be_measured_it_fails(setting):
+# Errors.
+def test_a_sweep_without_any_point_fails(setting):
     wanted = SweepOptions(what=("strategies",), opacities=(0.99,), kmeans=())
     with pytest.raises(InputError, match=r"no point could be measured; opacity > 0.99: no splat"):
         tradeoff(replace(setting, source=drop_bands(setting.source, 0)), wanted)
@@ -498,7 +483,7 @@ def test_a_scene_without_splats_is_swept(setting, make_model, monkeypatch):
     assert make_tradeoff_page(found).startswith("<!doctype html>")
 
 
-def test_a_defect_ends_in_a_traceback(setting, monkeypatch):
+def test_a_bug_is_not_reported_as_a_failed_point(setting, monkeypatch):
     def fail(*_args, **_options):
         raise RuntimeError("a defect")
 
@@ -507,7 +492,7 @@ def test_a_defect_ends_in_a_traceback(setting, monkeypatch):
         tradeoff(setting, SweepOptions(what=("presets",)))
 
 
-def test_memory_that_runs_out_costs_one_point(setting, monkeypatch):
+def test_a_lack_of_memory_fails_one_point(setting, monkeypatch):
     from csplat_tools.tradeoffs import sweep_run
 
     whole = sweep_run.encode_with_report
@@ -523,16 +508,16 @@ def test_memory_that_runs_out_costs_one_point(setting, monkeypatch):
 
 
 @pytest.mark.slow
-def test_nothing_is_overwritten_unless_forced(capture, tmp_path):
+def test_files_are_not_replaced_without_force(capture, tmp_path):
     mine = {"-o": tmp_path / "page", "--report": tmp_path / "report"}
     words = [capture / "scene.ply", "--what", "precision=40", "--cameras", capture / "cameras.json", "--quiet"]
     for option, place in mine.items():
         place.write_text("mine")
-        refused = invoke(*words, option, place)
+        refused = sweep(*words, option, place)
         assert 1 == refused.exit_code
         assert re.fullmatch(r"error: \S+ exists: --force replaces it \(E_INPUT\)\n", refused.stderr)
         assert "mine" == place.read_text()
-    done = invoke(*words, "--report", mine["--report"], "--force")
+    done = sweep(*words, "--report", mine["--report"], "--force")
     assert (0, "") == (done.exit_code, done.stderr)
     assert "Times are single runs" in done.stdout
     assert "mine" != mine["--report"].read_text()
@@ -548,31 +533,29 @@ def test_plots_are_written_for_light_and_dark_pages(measured, tmp_path, monkeypa
         check_plots(str(tmp_path / "plots"), force=False)
     written = {path.stem: path.read_text() for path in (tmp_path / "plots").iterdir()}
     assert {"size-quality", "attribute-bytes"} <= set(written)
-    for text in written.values():  # light or dark as the reader has it
+    for text in written.values():  # light or dark by the reader's setting
         assert "prefers-color-scheme:dark" in text
         assert "currentColor" in text
         assert "#123457" not in text
 
 
 @pytest.mark.slow
-def test_json_alone_is_on_standard_output_and_what_it_does_on_standard_error(capture):
-    result = invoke(capture / "scene.ply", *QUICK, "--cameras", capture / "cameras.json", "--json")
+def test_json_goes_to_stdout_and_progress_to_stderr(capture):
+    result = sweep(capture / "scene.ply", *QUICK, "--cameras", capture / "cameras.json", "--json")
     assert ["attributes 36 dB", "attributes 40 dB"] == [one["name"] for one in json.loads(result.stdout)["points"]]
     assert "2 files to make and measure: about" in result.stderr
     assert re.search(r"1/2 attributes 36 dB: [\d.]+ kB, [\d.]+ dB, [\d.]+ s\n", result.stderr)
 
 
-def test_an_absent_file_is_one_line(tmp_path):
-    result = invoke(tmp_path / "absent.ply")
-    assert 1 == result.exit_code
-    assert (
-        f"error: {tmp_path / 'absent.ply'}: No such file or directory; is the name right? (ENOENT)\n" == result.stderr
-    )
+def test_an_absent_file_is_reported(tmp_path):
+    result = sweep(tmp_path / "absent.ply")
+    message = f"error: {tmp_path / 'absent.ply'}: No such file or directory; is the name right? (ENOENT)\n"
+    assert (1, message) == (result.exit_code, result.stderr)
 
 
-def test_a_scene_without_splats_is_one_line(tmp_path, make_model):
+def test_a_scene_without_splats_is_refused(tmp_path, make_model):
     write_ply(tmp_path / "empty.ply", make_model(0))
-    result = invoke(tmp_path / "empty.ply", "-o", tmp_path / "report.html")
+    result = sweep(tmp_path / "empty.ply", "-o", tmp_path / "report.html")
     assert 1 == result.exit_code
     assert "error: the scene has no splats (E_INPUT)\n" == result.stderr
     assert not (tmp_path / "report.html").exists()
@@ -599,11 +582,11 @@ WRONG = (
 
 
 def test_a_wrong_command_line_has_status_2(capture):
-    statuses = {" ".join(words): invoke(capture / "scene.ply", *words).exit_code for words in WRONG}
+    statuses = {" ".join(words): sweep(capture / "scene.ply", *words).exit_code for words in WRONG}
     assert {} == {words: status for words, status in statuses.items() if status != 2}
 
 
-def test_lists_are_read_in_their_order():
+def test_the_option_what_is_parsed():
     assert ("targets", "presets") == parse_sweep("targets,presets,targets").what
     assert (*USUAL, "finetune") == parse_sweep("usual, finetune").what
     wanted = parse_sweep("targets=38:2MB:.5e2:38, strategies=0.1:16:256, precision=")
@@ -613,14 +596,14 @@ def test_lists_are_read_in_their_order():
 
 
 @pytest.mark.parametrize(("module", "words"), [("numba", []), ("matplotlib", ["-o", "report.html"])])
-def test_without_the_extra_packages_one_line_says_what_to_install(tmp_path, sample_path, monkeypatch, module, words):
+def test_missing_packages_are_named(tmp_path, sample_path, monkeypatch, module, words):
     monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.chdir(tmp_path)
-    done = invoke(sample_path, *words)
+    done = sweep(sample_path, *words)
     assert 1 == done.exit_code
     assert f"error: this needs {module}: pip install 'csplat[render]' (E_INPUT)\n" == done.stderr
 
 
 def test_the_help_has_examples():
-    text = invoke("--help").stdout
+    text = sweep("--help").stdout
     assert "csplat tradeoff scene.ply -o report.html" in text

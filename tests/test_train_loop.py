@@ -1,3 +1,5 @@
+"""Training: the loop, resumed runs, and `csplat train` to a PLY or a file."""
+
 import json
 import shutil
 import sys
@@ -6,8 +8,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from command_line import call
 from PIL import Image
-from typer.testing import CliRunner
 
 from csplat import decode, read_ply, write_ply
 from csplat.encoder import PRESETS, EncodeOptions
@@ -20,7 +22,6 @@ pytest.importorskip("scipy", reason="tuning wants the extra [render]")
 
 from csplat_render.camera import Camera, intrinsics, orbit, relative_to
 from csplat_render.rasteriser import Rasteriser
-from csplat_tools.cli.app import app
 from csplat_tools.training import tuning_run
 from csplat_tools.training.training_run import tuning_after
 from csplat_tools.training.tuning_run import TuningSubset
@@ -64,7 +65,7 @@ def make_data():
 
 
 @pytest.mark.slow
-def test_nothing_is_learnt_from_pixels_that_do_not_count(make_data, make_model):
+def test_masked_pixels_do_not_influence_training(make_data, make_model):
     data = make_data(make_model, alpha=False)
     mask = np.ones((SIZE, SIZE), bool)
     mask[10:30, :20] = False
@@ -85,27 +86,27 @@ def test_nothing_is_learnt_from_pixels_that_do_not_count(make_data, make_model):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["mcmc", "gradient"])
-def test_training_ends_with_the_share_of_the_splats_that_is_wanted(make_data, make_model, tmp_path, strategy):
+def test_training_prunes_to_the_final_share(make_data, make_model, tmp_path, strategy):
     data = make_data(make_model)
     options = TrainOptions(**QUICK, strategy=strategy, final_share=0.5, refine_stop=0.5)
-    whole, _ = resumed_as_if_never_stopped(data, options, tmp_path)
+    whole, _ = assert_resumes_identically(data, options, tmp_path)
     counts = [entry["splat_count"] for entry in whole.log["entries"]]
     assert counts[1] == counts[2] == len(whole.model)
     assert len(train(data, replace(options, final_share=1.0)).model) / 2 == pytest.approx(counts[2], abs=3)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("steps", [38, 42, 60])  # while splats would go, after that, at the end
-def test_a_run_that_goes_on_late_ends_with_the_share_that_is_wanted(make_data, make_model, tmp_path, steps):
+@pytest.mark.parametrize("steps", [38, 42, 60])  # while splats are pruned, after that, at the end
+def test_a_run_resumed_late_prunes_to_the_final_share(make_data, make_model, tmp_path, steps):
     data = make_data(make_model)
     trunk = TrainOptions(**{**QUICK, "iterations": steps}, refine_stop=0.5)
     whole = train(data, trunk, outputs=Outputs(tmp_path / "trunk.npz"))
-    options = TrainOptions(**QUICK, refine_stop=0.5, final_share=0.75)  # two times that splats go, each of 100 steps
+    options = TrainOptions(**QUICK, refine_stop=0.5, final_share=0.75)  # two prunings
     left = train(data, options, outputs=Outputs(resume=tmp_path / "trunk.npz"))
     assert 0.75 * len(whole.model) == pytest.approx(len(left.model), abs=3)
 
 
-def test_a_run_begins_with_photographs_of_half_the_size(make_data, make_model, tmp_path, monkeypatch):
+def test_training_starts_with_images_of_half_the_size(make_data, make_model, tmp_path, monkeypatch):
     widths: list[int] = []
     step = CpuEngine.step
 
@@ -115,13 +116,13 @@ def test_a_run_begins_with_photographs_of_half_the_size(make_data, make_model, t
 
     monkeypatch.setattr(CpuEngine, "step", watched)
     options = TrainOptions(**QUICK, half_size=0.5)
-    resumed_as_if_never_stopped(make_data(make_model), options, tmp_path)
-    assert [SIZE // 2] * 30 + [SIZE] * 30 == widths[:60]  # widths of the run that did not stop
+    assert_resumes_identically(make_data(make_model), options, tmp_path)
+    assert [SIZE // 2] * 30 + [SIZE] * 30 == widths[:60]  # of the run without interruption
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["mcmc", "fixed", "gradient", "none"])
-def test_training_brings_the_loss_down(make_data, make_model, strategy):
+def test_training_reduces_the_loss(make_data, make_model, strategy):
     data = make_data(make_model)
     options = TrainOptions(**{**QUICK, "iterations": 150, "refine_every": 30}, strategy=strategy, lr_means=4e-3)
     result = train(data, options)
@@ -131,7 +132,7 @@ def test_training_brings_the_loss_down(make_data, make_model, strategy):
     assert len(result.model) <= 80
 
 
-def test_the_same_seed_makes_the_same_file(make_data, make_model, tmp_path):
+def test_the_same_seed_gives_the_same_file(make_data, make_model, tmp_path):
     data = make_data(make_model)
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         write_ply(tmp_path / name, train(data, TrainOptions(**QUICK, seed=seed, background="random")).model)
@@ -141,12 +142,12 @@ def test_the_same_seed_makes_the_same_file(make_data, make_model, tmp_path):
 
 
 @pytest.mark.parametrize("strategy", ["mcmc", "gradient"])
-def test_a_resumed_run_ends_like_one_that_never_stopped(make_data, make_model, tmp_path, strategy):
-    resumed_as_if_never_stopped(make_data(make_model), TrainOptions(**QUICK, strategy=strategy), tmp_path)
+def test_a_resumed_run_equals_an_uninterrupted_one(make_data, make_model, tmp_path, strategy):
+    assert_resumes_identically(make_data(make_model), TrainOptions(**QUICK, strategy=strategy), tmp_path)
 
 
 def test_a_scene_has_the_origin_of_its_data_set(make_data, make_model, tmp_path):
-    """Also if the run goes on with images that are measured from another one."""
+    # Also if the run is resumed with images that have another origin.
     data, place = make_data(make_model), np.array((500123.0, 4649876.0, 214.0))
     options = TrainOptions(**{**QUICK, "iterations": 30})
     plain = train(data, options).model
@@ -161,19 +162,18 @@ def test_a_scene_has_the_origin_of_its_data_set(make_data, make_model, tmp_path)
     assert np.allclose(plain.means - shift, again.means, atol=1e-5)
 
 
-def test_one_camera_far_away_does_not_stop_splats_from_learning(make_data, make_model):
+def test_an_outlier_camera_does_not_change_the_extent(make_data, make_model):
     data = make_data(make_model)
     away = replace(data.train[0], camera=relative_to((3e4, 0.0, 0.0), data.train[0].camera))
     far = replace(data, train=[away, *data.train[1:]])
     assert data.train == data.inliers
     assert data.train[1:] == far.inliers
-    assert measure_extent(data.train).extent == pytest.approx(
-        train(far, TrainOptions(**QUICK)).log["scene_extent"], rel=0.2
-    )
+    extent = train(far, TrainOptions(**QUICK)).log["scene_extent"]
+    assert measure_extent(data.train).extent == pytest.approx(extent, rel=0.2)
 
 
 @pytest.mark.slow
-def test_large_units_make_no_other_scene(make_data, make_model):
+def test_large_units_do_not_change_the_scene(make_data, make_model):
     data = make_data(make_model)
 
     def larger(picture: PosedImage) -> PosedImage:
@@ -187,13 +187,13 @@ def test_large_units_make_no_other_scene(make_data, make_model):
     assert large == pytest.approx(usual, abs=1.0)
 
 
-def resumed_as_if_never_stopped(data, options, folder):
-    """Compare a run with one that goes on from the middle of it; return the run and the checkpoint of that."""
+def assert_resumes_identically(data, options, folder):
+    """Compare a run with one that is resumed in its middle; return the run and the checkpoint of the middle."""
     outputs, stopped = Outputs(checkpoint=folder / "c.npz", checkpoint_every=25), folder / "stopped.npz"
 
     def stop(now):
         if now.iteration == 40:
-            stopped.write_bytes((folder / "c.npz").read_bytes())  # the one of step 25
+            stopped.write_bytes((folder / "c.npz").read_bytes())  # of step 25
 
     whole = train(data, options, on_step=stop, outputs=outputs)
     again = train(data, options, outputs=Outputs(resume=stopped))
@@ -204,7 +204,7 @@ def resumed_as_if_never_stopped(data, options, folder):
     return whole, stopped
 
 
-def test_a_run_goes_on_with_another_number_of_splats(make_data, make_model, tmp_path):
+def test_a_run_resumes_with_another_number_of_splats(make_data, make_model, tmp_path):
     data = make_data(make_model)
     train(data, TrainOptions(**QUICK, strategy="fixed"), outputs=Outputs(checkpoint=tmp_path / "c.npz"))
     for count in (50, 120):
@@ -213,14 +213,10 @@ def test_a_run_goes_on_with_another_number_of_splats(make_data, make_model, tmp_
         assert (count, 2) == (len(result.model), result.model.sh_degree)
 
 
-def test_progress_log_and_previews_tell_where_it_stands(make_data, make_model, tmp_path):
+def test_progress_log_and_previews_are_written(make_data, make_model, tmp_path):
     seen = []
-    result = train(
-        make_data(make_model),
-        TrainOptions(**QUICK),
-        on_step=seen.append,
-        outputs=Outputs(previews=tmp_path / "p", preview_every=30),
-    )
+    outputs = Outputs(previews=tmp_path / "p", preview_every=30)
+    result = train(make_data(make_model), TrainOptions(**QUICK), on_step=seen.append, outputs=outputs)
     assert [20, 40, 60] == [now.iteration for now in seen]
     assert seen[-1].seconds_left == 0
     assert ["000030.png", "000060.png"] == sorted(path.name for path in (tmp_path / "p").iterdir())
@@ -229,7 +225,7 @@ def test_progress_log_and_previews_tell_where_it_stands(make_data, make_model, t
     assert {"psnr", "ssim", "lpips", "psnr_mean"} <= set(log["metrics"])
 
 
-def test_the_hull_holds_what_all_masks_show(make_data, make_model):
+def test_splats_start_within_the_hull_of_all_masks(make_data, make_model):
     data = make_data(make_model)
     scene = measure_extent(data.train)
     assert np.linalg.norm(scene.focus) < 0.1
@@ -238,7 +234,7 @@ def test_the_hull_holds_what_all_masks_show(make_data, make_model):
     assert np.linalg.norm(found["means"], axis=1).mean() < np.linalg.norm(boxed["means"], axis=1).mean()
 
 
-def test_photographs_without_alpha_start_in_a_box(make_data, make_model):
+def test_images_without_alpha_start_in_a_box(make_data, make_model):
     data = make_data(make_model, alpha=False)
     result = train(data, TrainOptions(**QUICK))
     assert np.isfinite(result.model.means).all()
@@ -249,7 +245,7 @@ def test_photographs_without_alpha_start_in_a_box(make_data, make_model):
         train(data, TrainOptions(**QUICK, init="points"))
 
 
-def test_surroundings_are_shown_first_as_a_photograph_showed_them(make_data, make_model):
+def test_the_first_view_of_surroundings_is_a_training_camera(make_data, make_model):
     data, options = make_data(make_model), TrainOptions(**{**QUICK, "iterations": 1, "strategy": "none"})
     assert "view" not in train(data, options).model.metadata  # an object
     rng = np.random.default_rng(0)
@@ -262,7 +258,7 @@ def test_surroundings_are_shown_first_as_a_photograph_showed_them(make_data, mak
     assert (SIZE, SIZE, taken[0].near) == (view.W, view.H, view.near)
 
 
-def test_points_are_where_splats_start(make_data, make_model):
+def test_splats_start_at_the_points(make_data, make_model):
     data = make_data(make_model)
     points = np.random.default_rng(0).standard_normal((20, 3)).astype(np.float32)
     given = DataSet("made", data.train, [], points, np.full((20, 3), 0.25, np.float32))
@@ -271,7 +267,7 @@ def test_points_are_where_splats_start(make_data, make_model):
     assert result.metrics is None
 
 
-def test_points_that_no_camera_sees_are_refused(make_data, make_model):
+def test_points_outside_all_images_are_refused(make_data, make_model):
     data = replace(make_data(make_model), points=np.full((5, 3), 4e6, np.float32))
     with pytest.raises(InputError, match="no camera sees any of the data set's 5 points, expected both in the same"):
         train(data, TrainOptions(**QUICK))
@@ -295,13 +291,12 @@ def test_the_command_trains_from_a_folder(make_data, make_model, tmp_path):
     model = read_ply(tmp_path / "o.ply")
     assert (1, "RFU") == (model.sh_degree, model.coordinate_system)
     assert 5 == len(json.loads((tmp_path / "log.json").read_text())["losses"])
-    again = CliRunner().invoke(app, [*map(str, run), "--device", "mps"])
-    assert 2 == again.exit_code
+    again = call(*run, "--device", "mps", status=2)
     assert "mps is not supported" in " ".join(again.stderr.split())
 
 
 def write_set(folder, data):
-    """The pictures as a transforms.json set, which names no split."""
+    """Write the images as a transforms.json set without a split."""
     frames = []
     for number, picture in enumerate((*data.train, *data.test)):
         Image.fromarray(picture.pixels).save(folder / f"{number:02}.png")
@@ -312,12 +307,6 @@ def write_set(folder, data):
     return folder
 
 
-def call(*words):
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    assert result.exit_code == 0, (result.stderr, result.exception)
-    return result
-
-
 FEW_WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 5)
 
 
@@ -326,50 +315,50 @@ FEW_WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 5)
     ("alpha", "background", "every", "size"),
     [(True, "auto", 5, None), (False, "auto", 10, "24x20"), (False, "white", 8, None), (True, "random", 8, "24x24")],
 )
-def test_other_commands_judge_as_training_did(make_data, make_model, tmp_path, alpha, background, every, size):
+def test_compare_agrees_with_the_metrics_of_train(make_data, make_model, tmp_path, alpha, background, every, size):
     folder = write_set(tmp_path, make_data(make_model, alpha=alpha))
     reading = ["--test-every", every, *(() if size is None else ("--size", size))]
     ply, log = tmp_path / "a.ply", tmp_path / "log.json"
-    told = call("train", folder, ply, "--background", background, "--report", log, *reading, *FEW_WORDS)
-    said = TrainingRecord.of(read_ply(ply).metadata)
-    assert (every, size) == (said.test_every, None if said.size is None else "{}x{}".format(*said.size))
-    assert said.background == ((1.0, 1.0, 1.0) if alpha or background == "white" else (0.0, 0.0, 0.0))
-    assert str(said) in told.stderr
-    colour = ",".join(str(value) for value in said.background)
+    result = call("train", folder, ply, "--background", background, "--report", log, *reading, *FEW_WORDS)
+    record = TrainingRecord.of(read_ply(ply).metadata)
+    assert (every, size) == (record.test_every, None if record.size is None else "{}x{}".format(*record.size))
+    assert record.background == ((1.0, 1.0, 1.0) if alpha or background == "white" else (0.0, 0.0, 0.0))
+    assert str(record) in result.stderr
+    colour = ",".join(str(value) for value in record.background)
     again = call("compare", ply, ply, "--data", folder, "--background", colour, "--json", "--test-every", every)
-    judged = json.loads(again.stdout)["photographs"]["a"]
+    scores = json.loads(again.stdout)["photographs"]["a"]
     metrics = json.loads(log.read_text())["metrics"]
     for name in ("psnr", "psnr_mean"):
-        assert judged[name] == pytest.approx(metrics[name], abs=0.01)
+        assert scores[name] == pytest.approx(metrics[name], abs=0.01)
 
 
 @pytest.mark.parametrize(
-    "said", [TrainingRecord((1.0, 1.0, 1.0), 5), TrainingRecord((0.0, 0.0, 0.0), 10, (24, 20), 0.05)]
+    "record", [TrainingRecord((1.0, 1.0, 1.0), 5), TrainingRecord((0.0, 0.0, 0.0), 10, (24, 20), 0.05)]
 )
-def test_a_file_and_its_ply_hand_on_what_a_scene_was_trained_on(make_model, tmp_path, said):
+def test_the_training_record_survives_encode_and_decode(make_model, tmp_path, record):
     ply, file, back = (tmp_path / name for name in ("a.ply", "a.csplat", "b.ply"))
-    write_ply(ply, make_model(10, 0, metadata={"training": said.as_json()}))
+    write_ply(ply, make_model(10, 0, metadata={"training": record.as_json()}))
     call("encode", ply, file, "-q")
     call("decode", file, back, "-q")
-    assert said == TrainingRecord.of(read_ply(back).metadata)
-    assert str(said) in call("info", file).stdout
-    assert said.as_json() == json.loads(call("info", file, "--json").stdout)["metadata"]["training"]
+    assert record == TrainingRecord.of(read_ply(back).metadata)
+    assert str(record) in call("info", file).stdout
+    assert record.as_json() == json.loads(call("info", file, "--json").stdout)["metadata"]["training"]
 
 
 @pytest.mark.slow
 def test_the_command_trains_to_a_file(file_runs):
-    data, said = (file_runs.folder / "a.csplat").read_bytes(), file_runs.report
+    data, report = (file_runs.folder / "a.csplat").read_bytes(), file_runs.report
     model = decode(data)
-    assert 30 == len(said["training"]["losses"])
-    assert (len(model), len(data)) == (said["file"]["splats"], said["file"]["size_bytes"])
-    assert {"source", "before tuning", "file"} == set(said["file"]["scores"])
+    assert 30 == len(report["training"]["losses"])
+    assert (len(model), len(data)) == (report["file"]["splats"], report["file"]["size_bytes"])
+    assert {"source", "before tuning", "file"} == set(report["file"]["scores"])
     assert "held-out photographs" in file_runs.messages
     assert (1.0, 1.0, 1.0) == TrainingRecord.of(model.metadata).background
     assert (file_runs.folder / "run.tuning.npz").exists()
 
 
 @pytest.mark.slow
-def test_the_command_goes_on_where_it_stopped(file_runs, tmp_path):
+def test_the_command_resumes(file_runs, tmp_path):
     for name in ("run.npz", "run.tuning.npz"):
         shutil.copy(file_runs.folder / name, tmp_path / name)
     files = ("--keep", 1, "--checkpoint", tmp_path / "run.npz", "--resume", tmp_path / "run.npz")
@@ -381,7 +370,7 @@ def test_the_command_goes_on_where_it_stopped(file_runs, tmp_path):
 
 
 @pytest.mark.slow
-def test_from_one_training_come_several_files(file_runs):
+def test_one_training_gives_several_files(file_runs):
     trained, usual = file_runs.checkpoint.read_bytes(), file_runs.report["file"]
 
     def made(name, *more, **options):
@@ -397,49 +386,37 @@ def test_from_one_training_come_several_files(file_runs):
     assert trained == file_runs.checkpoint.read_bytes()
 
 
-def test_what_was_trained_for_longer_is_tuned_for_longer_and_in_smaller_steps():
+def test_tuning_after_a_long_training_takes_more_and_smaller_steps():
     brief, usual = (tuning_after(TrainOptions(iterations=steps, lr_exposure=0.01)) for steps in (2_000, 12_000))
     assert FinetuneOptions(lr_exposure=0.01) == brief
     assert (2_000, 0.01) == (usual.iterations, usual.lr_exposure)
     assert usual.lr_scales / brief.lr_scales == pytest.approx(1 / 3)
 
 
-def test_a_damaged_validation_picture_is_refused_before_training_begins(make_data, make_model, tmp_path, monkeypatch):
+def test_damaged_images_are_refused_before_training(make_data, make_model, tmp_path, monkeypatch):
     folder = write_set(tmp_path, make_data(make_model))
+    (folder / "11.png").write_bytes((folder / "11.png").read_bytes()[:100])
+    monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_: pytest.fail("kernels are compiled"))
+    assert "11.png is not an image that can be read" in call("train", folder, tmp_path / "a.ply", status=1).stderr
     document = json.loads((folder / "transforms.json").read_text())
     for part, rows in (("train", slice(9)), ("val", slice(9, 12))):
         frames = document["frames"][rows]
         (folder / f"transforms_{part}.json").write_text(json.dumps({**document, "frames": frames}))
-    (folder / "11.png").write_bytes((folder / "11.png").read_bytes()[:100])
-    monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_: pytest.fail("kernels are compiled"))
-    result = CliRunner().invoke(app, ["train", str(folder), str(tmp_path / "a.csplat")])
-    assert (1, False) == (result.exit_code, (tmp_path / "a.csplat").exists())
-    assert "11.png is not an image that can be read" in result.stderr
+    assert "11.png is not an image that can be read" in call("train", folder, tmp_path / "a.csplat", status=1).stderr
+    assert [] == [*tmp_path.glob("a.*")]
 
 
 @pytest.mark.parametrize(
     "words", [("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB"), ("--target-psnr", 30)]
 )
-def test_what_a_file_is_to_be_is_refused_of_a_ply(tmp_path, words):
-    result = CliRunner().invoke(app, ["train", str(tmp_path), str(tmp_path / "a.ply"), *map(str, words)])
-    assert 2 == result.exit_code
+def test_options_of_a_file_are_refused_for_a_ply(tmp_path, words):
+    result = call("train", tmp_path, tmp_path / "a.ply", *words, status=2)
     assert "expected OUT.csplat" in " ".join(result.stderr.split())
 
 
-def test_a_damaged_picture_is_refused_before_training_begins(make_data, make_model, tmp_path, monkeypatch):
-    folder = write_set(tmp_path, make_data(make_model))
-    (folder / "11.png").write_bytes((folder / "11.png").read_bytes()[:100])
-    monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_: pytest.fail("kernels are compiled"))
-    result = CliRunner().invoke(app, ["train", str(folder), str(tmp_path / "a.ply")])
-    assert 1 == result.exit_code
-    assert "11.png is not an image that can be read" in result.stderr
-    assert not (tmp_path / "a.ply").exists()
-
-
-def test_the_command_says_which_extra_is_missing(tmp_path, monkeypatch):
+def test_the_command_names_the_missing_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
-    result = CliRunner().invoke(app, ["train", ".", str(tmp_path / "o.ply")])
-    assert 1 == result.exit_code
+    result = call("train", ".", tmp_path / "o.ply", status=1)
     assert "error: this needs numba: pip install 'csplat[render]' (E_INPUT)" == result.stderr.strip()
 
 
@@ -448,14 +425,14 @@ ENTRIES = 1024
 
 
 def bytes_of(count, options, per_db):
-    """Return a size: 1,000 bytes, 10 per splat at the usual precision, and the bytes of entries beyond the usual."""
+    """Return a size: 1,000 bytes, 10 per splat at the preset's precision, and the bytes of additional entries."""
     finer = 0.0 if options.attribute_psnr is None else options.attribute_psnr - USUAL
     return round(1000 + 10 * count * np.exp(per_db * finer)) + 2 * max(0, (options.codebook_size or ENTRIES) - ENTRIES)
 
 
 @pytest.fixture
 def fit(make_model, monkeypatch):
-    """Fit 9,000 splats to a size: how many are left, the options, the bytes of their draft, and how many there were."""
+    """Return a function that fits 9,000 splats to a size: count, options, bytes of the draft, number of drafts."""
 
     def run(size_bytes, *, per_db=0.045, options=None):
         drafts = []
@@ -474,16 +451,15 @@ def fit(make_model, monkeypatch):
         def choose(count):
             return TuningSubset(whole.select(np.arange(count)), np.arange(count), None, {})
 
-        chosen, encoding = tuning_run._fit_to_size(
-            choose(9000), options or EncodeOptions("small"), size_bytes, choose, None
-        )
+        options = options or EncodeOptions("small")
+        chosen, encoding = tuning_run._fit_to_size(choose(9000), options, size_bytes, choose, None)
         return len(chosen.model), encoding, bytes_of(len(chosen.model), encoding, per_db), len(drafts)
 
     return run
 
 
 @pytest.mark.parametrize("size", [30_000, 60_000, 85_000])
-def test_fewer_splats_where_there_is_no_room(fit, size):
+def test_a_small_size_prunes_splats(fit, size):
     count, encoding, draft, _ = fit(size)
     assert 0.9 * size <= draft <= 1.021 * size
     assert count < 9000
@@ -491,18 +467,18 @@ def test_fewer_splats_where_there_is_no_room(fit, size):
 
 
 @pytest.mark.parametrize("per_db", [0.03, 0.045, 0.09])
-def test_finer_steps_and_more_entries_where_there_is(fit, per_db):
+def test_a_large_size_gives_finer_steps_and_more_entries(fit, per_db):
     count, encoding, draft, _ = fit(130_000, per_db=per_db)
     assert 9000 == count
     assert 130_000 / 1.031 <= draft <= 1.021 * 130_000
     assert ENTRIES < encoding.codebook_size <= 9000 / 3
 
 
-def test_what_fits_stays_as_it_is(fit):
+def test_a_file_that_fits_is_unchanged(fit):
     assert (9000, EncodeOptions("small"), 91_000, 1) == fit(92_000)
 
 
-def test_what_the_user_chose_stays(fit):
+def test_options_of_the_user_are_kept(fit):
     book = fit(130_000, options=EncodeOptions("small", codebook_size=512))[1]
     assert 512 == book.codebook_size
     assert book.attribute_psnr > USUAL
@@ -510,7 +486,7 @@ def test_what_the_user_chose_stays(fit):
     assert exact == fit(130_000, options=exact)[1]
 
 
-def test_renders_are_as_good_as_the_scene_at_some_precision(fit):
+def test_the_precision_is_limited(fit):
     _, encoding, _, drafts = fit(10**7)
     assert tuning_run._FINEST == encoding.attribute_psnr
     assert 2 == drafts

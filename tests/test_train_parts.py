@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_train_loop import QUICK, photographs, resumed_as_if_never_stopped
+from test_train_loop import QUICK, assert_resumes_identically, training_images
 
 from csplat.encoder import EncodeOptions, EncodePlan, fix_quantisation
 from csplat.errors import InputError
@@ -44,7 +44,7 @@ def parameters(make_model):
 
 
 @pytest.mark.parametrize("beta2", [0.999, 0.98])
-def test_adam_is_the_textbook_s(parameters, beta2):
+def test_adam_agrees_with_the_textbook(parameters, beta2):
     parameters.beta2 = beta2
     rng = np.random.default_rng(0)
     gradients = [
@@ -70,7 +70,7 @@ def test_a_splat_without_gradient_does_not_move(parameters):
         assert np.allclose(before[name], parameters.values[name], atol=1e-6)
 
 
-def test_a_model_survives_the_way_through_parameters(make_model):
+def test_parameters_of_a_model_convert_back(make_model):
     model = make_model(20, 1)
     again = to_model(from_model(model, 3))
     assert again.sh_degree == 3
@@ -81,8 +81,8 @@ def test_a_model_survives_the_way_through_parameters(make_model):
 
 @pytest.mark.parametrize("count", [2, 3, 10, 51])
 @pytest.mark.parametrize("alpha", [0.05, 0.5, 0.9])
-def test_shared_splats_cover_like_one(alpha, count):
-    # The integral of what n equal splats cover along a line through their centre is that of the one.
+def test_shared_splats_cover_as_one(alpha, count):
+    # n equal splats cover a line through their centre as much as the one, by the integral.
     shared, factor = share_opacity(np.array([alpha]), np.array([count]))
     x = np.linspace(-12, 12, 20_001)
     one = alpha * np.exp(-(x**2) / 2)
@@ -91,7 +91,7 @@ def test_shared_splats_cover_like_one(alpha, count):
     assert many.max() == pytest.approx(alpha, rel=1e-9)
 
 
-def test_dead_splats_move_onto_live_ones(parameters):
+def test_transparent_splats_are_relocated_to_others(parameters):
     parameters.values["logits"][:] = 2.0
     parameters.values["logits"][:10] = -9.0
     adam_step(parameters, {name: np.ones_like(parameters.values[name]) for name in GROUPS}, dict.fromkeys(GROUPS, 0.0))
@@ -102,7 +102,7 @@ def test_dead_splats_move_onto_live_ones(parameters):
     assert parameters.alphas.min() > 0.005
 
 
-def test_nothing_is_moved_where_all_are_dead(parameters):
+def test_nothing_is_relocated_if_all_splats_are_transparent(parameters):
     parameters.values["logits"][:] = -9.0
     assert 0 == relocate(parameters, 0.005, np.random.default_rng(0))
 
@@ -115,7 +115,7 @@ def test_growth_stops_at_the_cap(parameters):
     assert {45} == {len(part[name]) for part in (parameters.values, parameters.first) for name in GROUPS}
 
 
-def test_noise_moves_transparent_splats_alone(parameters):
+def test_noise_only_moves_transparent_splats(parameters):
     parameters.values["logits"][:20] = 3.0
     parameters.values["logits"][20:] = -8.0
     before = parameters.values["means"].copy()
@@ -142,7 +142,7 @@ def test_densification_clones_small_splits_large_and_prunes(parameters):
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_halves_of_a_needle_lie_along_it(parameters, axis):
+def test_a_needle_is_split_along_its_axis(parameters, axis):
     w, u, along = 0.4, np.array([0.2, -0.6, np.sqrt(0.44)]), np.eye(3)[axis]
     direction = along + 2.0 * w * np.cross(u, along) + 2.0 * np.cross(u, np.cross(u, along))
     parameters.values["logits"][:] = 1.0
@@ -157,7 +157,7 @@ def test_halves_of_a_needle_lie_along_it(parameters, axis):
     np.testing.assert_allclose(moved, np.outer(moved @ direction, direction), atol=1e-4)
 
 
-def test_densification_keeps_to_the_cap(parameters):
+def test_densification_stops_at_the_cap(parameters):
     parameters.values["logits"][:] = 1.0
     screen = ScreenGradients.none(40)
     screen.add(np.ones(40, np.float32), np.ones(40, bool))
@@ -175,7 +175,7 @@ def checkpoint_of(parameters: Parameters) -> TrainingCheckpoint:
     )
 
 
-def test_a_checkpoint_comes_back_whole(parameters, tmp_path):
+def test_a_checkpoint_is_saved_and_loaded(parameters, tmp_path):
     save_checkpoint(tmp_path / "run.npz", checkpoint_of(parameters))
     again = load_checkpoint(tmp_path / "run.npz")
     assert (7, [3, 1]) == (again.iteration, again.queue)
@@ -206,30 +206,24 @@ def test_a_checkpoint_adapts_to_other_options(parameters, cap, degree, strategy,
     assert (count, (degree + 1) ** 2 - 1, 3) == adapted.values["shN"].shape == adapted.second["shN"].shape
 
 
-def test_the_moving_average_is_of_the_last_values():
+def test_the_moving_average_covers_the_last_values():
     assert [1.0, 1.5, 2.5, 3.5] == moving_average([1, 2, 3, 4], 2).tolist()
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"max_splats": 0}, {"sh_degree": 4}, {"loss": "l2"}, {"lr_means": float("nan")}, {"lr_means_final": 1.0}]
-)
-def test_options_out_of_range_are_refused(wrong):
-    with pytest.raises(InputError, match="wanted"):
-        TrainOptions(**wrong)
+def test_options_out_of_range_are_refused():
+    wrong = {"max_splats": 0, "device": "mps", "sh_degree": 4, "loss": "l2", "lr_means": np.nan, "lr_means_final": 1.0}
+    for name, value in wrong.items():
+        with pytest.raises(InputError, match=r"wanted|expected|mps is not supported"):
+            TrainOptions(**{name: value})
 
 
-def test_mps_is_refused_in_one_line():
-    with pytest.raises(InputError, match="mps is not supported"):
-        TrainOptions(device="mps")
-
-
-def test_the_learning_rate_of_the_means_falls_to_its_end():
+def test_the_learning_rate_of_means_decays_to_its_final_value():
     options = TrainOptions(iterations=100)
     assert options.lr_means_final * 2 == pytest.approx(options.learning_rates(100, 2.0)["means"])
     assert options.lr_means * 2 == pytest.approx(options.learning_rates(0, 2.0)["means"])
 
 
-def test_other_learning_rates_fall_once_splats_no_longer_move():
+def test_other_learning_rates_decay_after_refinement():
     options = TrainOptions(iterations=100, refine_stop=0.6, lr_decay=0.2)
     shares = [options.learning_rates(step, 2.0)["scales"] / options.lr_scales for step in (1, 60, 80, 100)]
     assert [1.0, 1.0, 0.6, 0.2] == pytest.approx(shares)
@@ -237,7 +231,7 @@ def test_other_learning_rates_fall_once_splats_no_longer_move():
 
 
 @pytest.mark.parametrize("channels", [3, 4])
-def test_a_halved_picture_is_what_its_camera_sees(channels):
+def test_a_halved_image_agrees_with_its_camera(channels):
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 256, (7, 10, channels), dtype=np.uint8)
     mask = np.ones((7, 10), bool)
@@ -252,7 +246,7 @@ def test_a_halved_picture_is_what_its_camera_sees(channels):
     assert [[1, 2]] == np.argwhere(~half.mask).tolist()
 
 
-def test_a_picture_of_which_half_the_size_would_leave_nothing_stays_as_it_is():
+def test_an_image_without_pixels_at_half_the_size_is_kept():
     lines, narrow = np.zeros((6, 8), bool), Camera(intrinsics(1, 6, 8.0), np.eye(4), 1, 6)
     lines[:, ::2] = True
     camera = Camera(intrinsics(8, 6, 8.0), np.eye(4), 8, 6)
@@ -274,22 +268,22 @@ def test_growth_reaches_the_cap_halfway():
     assert 1.5 == TrainOptions(growth=1.5).growth_from(10)
 
 
-def test_sh_degrees_come_one_after_the_other():
+def test_sh_degrees_are_activated_one_by_one():
     options = TrainOptions(iterations=1500, sh_degree=2)
     assert [0, 1, 2, 2] == [options.active_degree(step) for step in (0, 100, 200, 1400)]
 
 
-def test_splats_go_a_few_at_a_time_and_the_last_long_before_the_end():
+def test_prunings_are_spread_and_end_early():
     options = TrainOptions(max_splats=1000, final_share=0.4, iterations=1000, refine_stop=0.6)
     left = {step: options.prunings_left(step) for step in range(1, 1001) if options.prunings_left(step)}
-    assert dict(zip(range(624, 841, 24), range(10, 0, -1), strict=True)) == left  # 600 is the last at which splats move
-    for stop, last in ((0.5, 8), (0.8, 9), (1.0, 10)):  # few steps: fewer times
+    assert dict(zip(range(624, 841, 24), range(10, 0, -1), strict=True)) == left  # splats move until step 600
+    for stop, last in ((0.5, 8), (0.8, 9), (1.0, 10)):  # few steps: fewer prunings
         short = TrainOptions(final_share=0.4, iterations=10, refine_stop=stop)
         assert [last] == [step for step in range(11) if short.prunings_left(step) == 1]
     assert not any(TrainOptions(iterations=1000).prunings_left(step) for step in range(1, 1001))
 
 
-def test_those_go_that_pictures_need_least(make_model):
+def test_splats_with_the_least_effect_are_pruned(make_model):
     cameras = orbit((0, 0, 0), 6.0, (0, 0, 1), 6, intrinsics(40, 40, 50.0), 40, 40)
     pictures = [PosedImage(camera, np.zeros((40, 40, 3), np.uint8)) for camera in cameras]
     values = from_model(make_model(40, 1, seed=3, scales=np.full((40, 3), -1.2, np.float32)), 1)
@@ -301,7 +295,7 @@ def test_those_go_that_pictures_need_least(make_model):
     assert wanted == parameters.second["means"][:, 0].tolist()
 
 
-def random_pictures(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+def random_images(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(height * width)
     x = rng.random((height, width, 3), dtype=np.float32)
     y = np.clip(x + 0.2 * rng.standard_normal((height, width, 3)), 0, 1).astype(np.float32)
@@ -311,7 +305,7 @@ def random_pictures(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("size", [(1, 1), (3, 40), (37, 21), (64, 48)])
 @pytest.mark.parametrize("weights", LOSS_WEIGHTS.values(), ids=LOSS_WEIGHTS.keys())
 def test_the_loss_equals_its_twin(size, weights):
-    x, y = random_pictures(*size)
+    x, y = random_images(*size)
     value, gradient = PhotometricLoss(*size, *weights)(x, y)
     expected, slope = photometric_loss_twin(x, y, *weights)
     assert value.loss == pytest.approx(expected.loss, rel=1e-5)
@@ -319,8 +313,8 @@ def test_the_loss_equals_its_twin(size, weights):
     assert np.abs(gradient - slope).max() <= 1e-5 * np.abs(slope).max()
 
 
-def test_the_twin_s_gradient_is_that_of_finite_differences():
-    x, y = (picture.astype(np.float64) for picture in random_pictures(13, 9))
+def test_the_gradient_of_the_twin_agrees_with_finite_differences():
+    x, y = (picture.astype(np.float64) for picture in random_images(13, 9))
     _, slope = photometric_loss_twin(x, y)
     direction = np.random.default_rng(1).standard_normal(x.shape)
     step = 1e-6
@@ -328,24 +322,24 @@ def test_the_twin_s_gradient_is_that_of_finite_differences():
     assert (slope * direction).sum() == pytest.approx((up - down) / (2 * step), rel=1e-6)
 
 
-def test_the_ssim_is_that_of_the_metrics():
+def test_the_ssim_of_the_loss_agrees_with_the_metric():
     from csplat_render.metrics import ssim
 
-    x, y = random_pictures(40, 30)
+    x, y = random_images(40, 30)
     value, _ = PhotometricLoss(40, 30)(x, y)
     assert value.ssim == pytest.approx(ssim(y, x), abs=1e-5)
 
 
-def test_equal_pictures_have_no_loss_and_no_gradient():
-    x, _ = random_pictures(20, 20)
+def test_equal_images_have_no_loss_and_no_gradient():
+    x, _ = random_images(20, 20)
     value, gradient = PhotometricLoss(20, 20)(x, x.copy())
     assert (value.l1, value.mse) == (0.0, 0.0)
     assert value.ssim == pytest.approx(1.0, abs=1e-6)
     assert np.abs(gradient).max() <= 1e-6
 
 
-def test_the_next_call_does_not_remember_the_last():
-    x, y = random_pictures(24, 24)
+def test_calls_of_a_loss_are_independent():
+    x, y = random_images(24, 24)
     loss = PhotometricLoss(24, 24)
     first = loss(x, y)[1].copy()
     loss(y, x)
@@ -353,8 +347,8 @@ def test_the_next_call_does_not_remember_the_last():
 
 
 @pytest.mark.parametrize("weights", LOSS_WEIGHTS.values(), ids=LOSS_WEIGHTS.keys())
-def test_pixels_that_do_not_count_change_nothing(weights):
-    x, y = random_pictures(32, 24)
+def test_masked_pixels_do_not_change_the_loss(weights):
+    x, y = random_images(32, 24)
     mask = np.ones((32, 24), bool)
     mask[5:20, 3:12] = False
     other = np.where(mask[..., None], y, 1.0 - y)
@@ -367,13 +361,13 @@ def test_pixels_that_do_not_count_change_nothing(weights):
     assert value.mse == pytest.approx(float(np.square(x - y)[mask].mean()), rel=1e-5)
 
 
-GAINS = np.array([0.7, 1.3, 0.8, 1.2, 0.9, 1.1, 0.75, 1.25, 1.0])  # of training photographs; test: 1
+GAINS = np.array([0.7, 1.3, 0.8, 1.2, 0.9, 1.1, 0.75, 1.25, 1.0])  # of training images; of test images: 1
 LONGER = {**QUICK, "iterations": 300, "refine_every": 50, "lr_means": 2e-3, "background": "black"}
 
 
 @pytest.fixture
 def data(make_model):
-    return photographs(make_model)
+    return training_images(make_model)
 
 
 @pytest.fixture
@@ -385,7 +379,7 @@ def uneven(data):
     return DataSet("uneven", shots, data.test)
 
 
-def test_slopes_are_those_of_the_loss_with_the_correction():
+def test_gradients_of_gains_agree_with_finite_differences():
     rng = np.random.default_rng(0)
     seen, photograph = (rng.random((20, 24, 3)).astype(np.float32) for _ in range(2))
     exposures, loss = ImageGains(2), PhotometricLoss(20, 24)
@@ -409,35 +403,35 @@ def test_slopes_are_those_of_the_loss_with_the_correction():
 
 
 @pytest.mark.slow
-def test_gains_are_found_and_the_scene_is_as_bright_as_the_mean(uneven):
+def test_gains_are_estimated_with_a_mean_of_0(uneven):
     options = TrainOptions(**{**LONGER, "iterations": 450})
     plain, corrected = (train(uneven, replace(options, lr_exposure=rate)) for rate in (0.0, 0.05))
-    assert corrected.log["entries"][-1]["psnr"] > plain.log["entries"][-1]["psnr"]  # PSNR on the training photographs
+    assert corrected.log["entries"][-1]["psnr"] > plain.log["entries"][-1]["psnr"]  # of training images
     found = np.array(corrected.log["exposures"])
     assert np.abs(found.mean(axis=0)).max() < 1e-4
-    assert np.corrcoef(np.exp(found[:, 0].mean(axis=1)), GAINS)[0, 1] > 0.5  # 80 splats hardly hold the scene
+    assert np.corrcoef(np.exp(found[:, 0].mean(axis=1)), GAINS)[0, 1] > 0.5  # 80 splats represent the scene poorly
     assert "exposures" not in plain.log
 
 
-def test_a_resumed_run_goes_on_with_its_exposures(uneven, tmp_path):
+def test_a_resumed_run_keeps_its_gains(uneven, tmp_path):
     options = TrainOptions(**QUICK, lr_exposure=0.02)
-    whole, stopped = resumed_as_if_never_stopped(uneven, options, tmp_path)
+    whole, stopped = assert_resumes_identically(uneven, options, tmp_path)
     assert np.abs(whole.log["exposures"]).max() > 0.0
     with pytest.raises(InputError, match="exposures of 9 photographs are stored, wanted those of 8"):
         train(DataSet("fewer", uneven.train[:8], uneven.test), options, outputs=Outputs(resume=stopped))
 
 
-def test_a_gpu_learns_none(uneven):
+def test_gains_are_refused_on_a_gpu(uneven):
     with pytest.raises(InputError, match="on the CPU alone"):
         train(uneven, TrainOptions(**QUICK, lr_exposure=0.02, device="cuda"))
 
 
 @pytest.mark.slow
-def test_tuning_corrects_exposures_too(make_model, uneven):
-    scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))  # that was photographed
+def test_tuning_corrects_gains(make_model, uneven):
+    scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))  # the scene of the images
     fixed = fix_quantisation(EncodePlan.of(scene, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)))
-    teach, judge = ([TuningView(one.camera, one) for one in part] for part in (uneven.train, uneven.test))
-    views = TuningViews(teach, judge, np.zeros(3, np.float32))
+    training, validation = ([TuningView(one.camera, one) for one in part] for part in (uneven.train, uneven.test))
+    views = TuningViews(training, validation, np.zeros(3, np.float32))
     plain, corrected = (
         tune(fixed, views, FinetuneOptions(iterations=200, validate_every=50, patience=0, lr_exposure=rate)).log
         for rate in (0.0, 0.05)

@@ -1,4 +1,6 @@
-# ruff: noqa: E402 -- torch may be absent, which has to be known before the trainer is imported
+# ruff: noqa: E402 -- the tests are skipped before the imports of the trainer if torch is absent
+"""The torch rasteriser, the GPU engine and the perceptual loss, against their counterparts on the CPU."""
+
 import numpy as np
 import pytest
 
@@ -31,7 +33,7 @@ def tensors_of(model, dtype):
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("degree", [0, 3])
-def test_gradients_are_those_of_finite_differences(make_model, camera, degree, antialiased):
+def test_gradients_agree_with_finite_differences(make_model, camera, degree, antialiased):
     model = make_model(
         6, degree, seed=5, scales=np.full((6, 3), -1.0, np.float32) + 0.3 * np.eye(6, 3, dtype=np.float32)
     )
@@ -43,7 +45,7 @@ def test_gradients_are_those_of_finite_differences(make_model, camera, degree, a
             torch_rasteriser.render(*tensors, camera, background=(0.2, 0.4, 0.6), antialiased=antialiased) * weight
         ).sum()
 
-    # Alpha jumps at 1/255, where the picture has no derivative: a step of 1e-7 meets few such pixels.
+    # Alpha jumps at 1/255, where the render has no derivative: a step of 1e-7 meets few such pixels.
     loss(*inputs).backward()
     rng = np.random.default_rng(1)
     for tensor in inputs:
@@ -59,7 +61,7 @@ def test_gradients_are_those_of_finite_differences(make_model, camera, degree, a
         assert float((tensor.grad * direction).sum()) == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
-def test_two_pictures_can_wait_for_their_gradients(make_model, camera):
+def test_gradients_of_two_renders_are_independent(make_model, camera):
     inputs = tensors_of(make_model(6, 1), torch.float32)
     first, second = (torch_rasteriser.render(*inputs, camera, background=(value,) * 3) for value in (0.0, 1.0))
     together = torch.autograd.grad((first + second).sum(), inputs)
@@ -81,7 +83,7 @@ def test_mixed_types_are_refused(make_model, camera):
 def rasterization(
     means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, sh_degree, backgrounds, **rest
 ):
-    """Stand in for gsplat's function of this name: render with the CPU rasteriser, with gsplat's arguments."""
+    """Render with the CPU rasteriser, with the arguments of gsplat's function of this name."""
     camera = Camera(Ks[0].double().numpy(), viewmats[0].double().numpy(), width, height, near_plane)
     picture = torch_rasteriser.render(
         means, quats, scales.log(), opacities, colors[:, 0], colors[:, 1:], camera,
@@ -92,22 +94,17 @@ def rasterization(
 
 
 @pytest.mark.parametrize("loss", ["inria", "study"])
-def test_the_engine_of_the_gpu_takes_the_same_steps(make_model, camera, loss):
+def test_the_gpu_engine_takes_the_same_steps(make_model, camera, loss):
     options = TrainOptions(strategy="fixed", loss=loss, noise=0.0, max_splats=12)
     pixels = np.random.default_rng(0).integers(0, 255, (20, 24, 4)).astype(np.uint8)
-    engines = [
-        CpuEngine(Parameters.starting_at(from_model(make_model(12, 1), 1)), options),
-        gsplat_engine.GsplatEngine(
-            Parameters.starting_at(from_model(make_model(12, 1), 1)), options, rasterization, "cpu"
-        ),
-    ]
-    figures = []
+    starts = [Parameters.starting_at(from_model(make_model(12, 1), 1)) for _ in range(2)]
+    gpu = gsplat_engine.GsplatEngine(starts[1], options, rasterization, "cpu")
+    engines, figures = [CpuEngine(starts[0], options), gpu], []
     for engine in engines:
         rng = np.random.default_rng(0)
         for step in range(1, 6):
-            value = engine.step(
-                PosedImage(camera, pixels), np.ones(3, np.float32), 1, options.learning_rates(step, 1.0), rng
-            )
+            rates = options.learning_rates(step, 1.0)
+            value = engine.step(PosedImage(camera, pixels), np.ones(3, np.float32), 1, rates, rng)
         figures.append(value)
     assert figures[0].loss == pytest.approx(figures[1].loss, rel=1e-4)
     for name in GROUPS:
@@ -116,14 +113,14 @@ def test_the_engine_of_the_gpu_takes_the_same_steps(make_model, camera, loss):
     assert np.abs(pictures[0] - pictures[1]).mean() < 1e-3
 
 
-def test_a_missing_gpu_is_refused_in_one_line():
+def test_a_missing_gpu_is_refused():
     if torch.cuda.is_available():
         pytest.skip("this machine has a GPU")
     with pytest.raises(InputError, match="finds no GPU"):
         gsplat_engine.gsplat_rasterization()
 
 
-def test_the_perceptual_loss_is_lpips_with_its_gradient():
+def test_the_perceptual_loss_agrees_with_lpips_and_finite_differences():
     rng = np.random.default_rng(0)
     shapes = [shape for shape, *_ in lpips._LAYERS]
     weights = lpips.Lpips(

@@ -1,6 +1,6 @@
-"""Photographs that NumPy draws, the scene that `csplat train` makes of them, and its file by `csplat finetune`.
+"""Images drawn by NumPy, a scene trained on them by `csplat train`, and its file by `csplat finetune`.
 
-Nothing of csplat goes into the photographs, and the rest is the command line's: these files show how the whole behaves.
+The images are independent of csplat, and the rest only uses the command line.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import change_options, invoke
+from command_line import call, change_options
 from PIL import Image
 
 from csplat_tools.training import training_run
@@ -20,22 +20,22 @@ from csplat_tools.training.training_run import tuning_after
 
 W, H = 48, 40
 FOCAL = 42.0  # pixels
-VIEWS = 16  # views, of which every eighth is held out
+VIEWS = 16  # every eighth is a test view
 DISTANCE = 3.2  # distance of the cameras from the centre of a ball of radius 1
-_SAMPLES = 3  # rays along each side of a pixel
+_SAMPLES = 3  # rays per pixel and axis
 TRAIN = ("--max-splats", 300, "--sh-degree", 1, "--iterations", 300, "--seed", 1)
 Run = Callable[..., str]
 
 
 @dataclass(frozen=True)
 class TrainedScene:
-    """A scene, and what it was made of.
+    """A trained scene and its sources.
 
     Attributes:
-        data: folder of the photographs.
+        data: folder of the images.
         ply: the scene.
         report: report of `csplat train`.
-        checkpoint: after the last step.
+        checkpoint: the checkpoint of the last step.
         messages: what the command wrote to stderr.
     """
 
@@ -48,7 +48,7 @@ class TrainedScene:
 
 @dataclass(frozen=True)
 class TunedFile:
-    """A file, and what it was made of.
+    """A tuned file and its sources.
 
     Attributes:
         source: the scene.
@@ -64,7 +64,7 @@ class TunedFile:
 
 
 def write_photographs(folder: Path) -> None:
-    """Write a transforms.json set of a ball with coloured stripes, transparent around it."""
+    """Write a transforms.json set of a ball with coloured stripes on a transparent background."""
     folder.mkdir(parents=True, exist_ok=True)
     frames = []
     for number in range(VIEWS):
@@ -82,7 +82,7 @@ def write_photographs(folder: Path) -> None:
 
 
 def _photograph(pose: np.ndarray) -> np.ndarray:
-    """Return straight RGBA, [H, W, 4] uint8, of the ball from a pose."""
+    """Return an image of the ball, [H, W, 4] uint8, straight RGBA."""
     ticks = [(np.arange(_SAMPLES * size) + 0.5) / _SAMPLES for size in (W, H)]
     x, y = np.meshgrid((ticks[0] - W / 2) / FOCAL, (H / 2 - ticks[1]) / FOCAL)
     rays = np.stack([x, y, -np.ones_like(x)], axis=2) @ pose[:3, :3].T
@@ -98,14 +98,12 @@ def _photograph(pose: np.ndarray) -> np.ndarray:
 
 
 def run_here(*words: object) -> str:
-    """Run a command in this process, which has its kernels loaded; return what it wrote to stderr."""
-    result = invoke(*words)
-    assert result.exit_code == 0, (result.stderr, result.exception)
-    return result.stderr
+    """Run `csplat WORDS` in this process, which has its kernels loaded, and return its stderr."""
+    return call(*words).stderr
 
 
 def make_trained(folder: Path, run: Run = run_here) -> TrainedScene:
-    """Take the photographs and train the scene."""
+    """Write the images and train the scene."""
     data, ply, report, checkpoint = (folder / name for name in ("photographs", "a.ply", "train.json", "train.npz"))
     write_photographs(data)
     with pytest.MonkeyPatch.context() as patch:
@@ -125,29 +123,27 @@ def make_tuned(folder: Path, source: TrainedScene, run: Run = run_here) -> Tuned
 
 
 class FileRuns:
-    """Runs of `csplat train` on the photographs, each to a file, with little training and tuning.
+    """Runs of `csplat train` to files, with little training and tuning.
 
-    The first, of all splats, leaves checkpoints of training and tuning, a report and a page.
+    The first keeps all splats and writes checkpoints of training and tuning, a report and a page.
     """
 
     WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 30)
-    TUNED = 30  # steps, usually 1,000
+    TUNED = 30  # steps; the default is 1,000
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.data = folder, folder / "photographs"
         self.checkpoint, self.page = folder / "run.npz", folder / "page.html"
         write_photographs(self.data)
-        self.report, self.messages = self.made(
-            "a.csplat", "--keep", 1, "--checkpoint", self.checkpoint, "--page", self.page
-        )
+        outputs = ("--checkpoint", self.checkpoint, "--page", self.page)
+        self.report, self.messages = self.made("a.csplat", "--keep", 1, *outputs)
 
     def made(self, name: str, *more: object, **options: object) -> tuple[dict, str]:
         """Make a file or a PLY, with options of the training; return the report and the messages."""
         report = self.folder / f"{name}.json"
         with pytest.MonkeyPatch.context() as patch:
             change_options(patch, "csplat_tools.cli.train.TrainOptions", log_every=10, **options)
-            patch.setattr(
-                training_run, "tuning_after", lambda **given: replace(tuning_after(**given), iterations=self.TUNED)
-            )
+            brief = lambda **given: replace(tuning_after(**given), iterations=self.TUNED)  # noqa: E731
+            patch.setattr(training_run, "tuning_after", brief)
             messages = run_here("train", self.data, self.folder / name, *self.WORDS, "--report", report, *more)
         return json.loads(report.read_text()), messages
